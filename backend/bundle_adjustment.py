@@ -1,0 +1,368 @@
+"""Bundle adjustment of keyframe poses and landmarks: Levenberg-Marquardt on the Schur complement.
+
+The problem is the one of ORB-SLAM2 (section III-C): reprojection errors of mono (u, v) and stereo
+(u, v, u_right) observations under the Huber loss. Landmarks are eliminated one at a time, the
+reduced camera system is dense and solved by Cholesky (Triggs et al., "Bundle adjustment - a
+modern synthesis", section 6).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.geometry import compose, orthonormalised, se3_exp
+from vslam.kernels import kernel
+
+CHI2_MONO = 5.991  # 95 % quantiles with 2 and 3 degrees of freedom
+CHI2_STEREO = 7.815
+
+
+@dataclass(frozen=True)
+class BundleProblem:
+    """Cameras, landmarks and observations, sorted by landmark.
+
+    Attributes:
+        T_cw: ``(K, 4, 4)``; the first ``n_free`` move, the others are held.
+        points: ``(P, 3)`` world.
+        first: ``(P + 1,)`` int64, observations of point p are ``first[p]:first[p + 1]``.
+        camera: ``(O,)`` int64, camera of each observation.
+        uvr: ``(O, 3)`` float64, NaN u_right for monocular ones.
+        inverse_sigma2: ``(O,)`` float64.
+        intrinsics: ``(5,)`` fx, fy, cx, cy, bf.
+    """
+
+    T_cw: NDArray[np.float64]
+    n_free: int
+    points: NDArray[np.float64]
+    first: NDArray[np.int64]
+    camera: NDArray[np.int64]
+    uvr: NDArray[np.float64]
+    inverse_sigma2: NDArray[np.float64]
+    intrinsics: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class BundleSolution:
+    """``T_cw`` ``(K, 4, 4)``, ``points`` ``(P, 3)``, final robust ``cost`` (half the sum of the
+    Huber losses), ``inlier`` ``(O,)`` bool by the chi-square test, and iterations used."""
+
+    T_cw: NDArray[np.float64]
+    points: NDArray[np.float64]
+    cost: float
+    inlier: NDArray[np.bool_]
+    iterations: int
+
+
+def adjust(
+    problem: BundleProblem,
+    *,
+    iterations: int,
+    use: NDArray[np.bool_] | None = None,
+    tolerance: float = 1e-6,
+) -> BundleSolution:
+    """Minimise the robust reprojection error. Stops when the cost falls by less than
+    ``tolerance`` (relative).
+
+    Args:
+        use: ``(O,)`` bool, observations that count; all by default.
+    """
+    used = np.ones(len(problem.camera), np.bool_) if use is None else use
+    T_cw, points, cost, inlier, count = _adjust(
+        problem.T_cw,
+        problem.n_free,
+        problem.points,
+        problem.first,
+        problem.camera,
+        problem.uvr,
+        problem.inverse_sigma2,
+        used,
+        problem.intrinsics,
+        iterations,
+        tolerance,
+    )
+    return BundleSolution(T_cw, points, cost, inlier, count)
+
+
+@kernel
+def residual(T, p, uvr, intrinsics, r, q):
+    """Reprojection error into ``r`` (3,), camera point into ``q`` (3,); returns if it is stereo."""
+    fx, fy, cx, cy, bf = intrinsics
+    for i in range(3):
+        q[i] = T[i, 0] * p[0] + T[i, 1] * p[1] + T[i, 2] * p[2] + T[i, 3]
+    iz = 1.0 / q[2]
+    u = fx * q[0] * iz + cx
+    r[0] = uvr[0] - u
+    r[1] = uvr[1] - (fy * q[1] * iz + cy)
+    stereo = uvr[2] == uvr[2]
+    r[2] = uvr[2] - (u - bf * iz) if stereo else 0.0
+    return stereo
+
+
+@kernel
+def evaluate(T_cw, points, first, camera, uvr, inverse_sigma2, used, intrinsics, inlier):
+    """Half the sum of Huber losses; sets ``inlier`` by the chi-square test."""
+    cost = 0.0
+    r, q = np.empty(3), np.empty(3)
+    for p in range(len(points)):
+        for o in range(first[p], first[p + 1]):
+            stereo = residual(T_cw[camera[o]], points[p], uvr[o], intrinsics, r, q)
+            limit = CHI2_STEREO if stereo else CHI2_MONO
+            chi2 = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]) * inverse_sigma2[o]
+            inlier[o] = q[2] > 0.0 and chi2 <= limit
+            if used[o]:
+                cost += 0.5 * chi2 if chi2 <= limit else np.sqrt(chi2 * limit) - 0.5 * limit
+    return cost
+
+
+@kernel
+def _adjust(
+    T_start,
+    n_free,
+    points_start,
+    first,
+    camera,
+    uvr,
+    inverse_sigma2,
+    used,
+    intrinsics,
+    iterations,
+    tolerance,
+):
+    n_points, n_observations = len(points_start), len(camera)
+    size = 6 * n_free
+    T_cw, points = T_start.copy(), points_start.copy()
+    T_trial, points_trial = T_start.copy(), points_start.copy()
+    inlier = np.ones(n_observations, np.bool_)
+    cost = evaluate(T_cw, points, first, camera, uvr, inverse_sigma2, used, intrinsics, inlier)
+    # W: blocks camera x point; V, g: blocks of the points; U, b: blocks of the cameras.
+    W = np.zeros((n_observations, 3, 6))
+    V, g = np.empty((n_points, 3, 3)), np.empty((n_points, 3))
+    U, b = np.empty((n_free, 6, 6)), np.empty((n_free, 6))
+    S, rhs = np.empty((size, size)), np.empty(size)
+    V_inverse = np.empty((n_points, 3, 3))
+    damping, growth = 1e-5, 2.0
+    done = 0
+    for _ in range(iterations):
+        linearise(
+            T_cw,
+            n_free,
+            points,
+            first,
+            camera,
+            uvr,
+            inverse_sigma2,
+            used,
+            intrinsics,
+            W,
+            V,
+            g,
+            U,
+            b,
+        )
+        improved, small = False, False
+        for _ in range(8):
+            reduce_points(n_free, first, camera, used, W, V, g, U, b, damping, S, rhs, V_inverse)
+            solved = cholesky_solve(S, rhs)
+            if solved:
+                step_points(n_free, first, camera, used, W, g, rhs, V_inverse, points, points_trial)
+                for k in range(n_free):
+                    twist = rhs[6 * k : 6 * k + 6]
+                    T_trial[k] = orthonormalised(compose(se3_exp(twist), T_cw[k]))
+                trial = evaluate(
+                    T_trial,
+                    points_trial,
+                    first,
+                    camera,
+                    uvr,
+                    inverse_sigma2,
+                    used,
+                    intrinsics,
+                    inlier,
+                )
+                if trial < cost:
+                    small = cost - trial < tolerance * cost
+                    cost = trial
+                    T_cw[:n_free] = T_trial[:n_free]
+                    points[:] = points_trial
+                    damping, growth, improved = max(damping * 0.1, 1e-9), 2.0, True
+                    break
+            damping *= growth * 5.0
+            growth *= 2.0
+        done += 1
+        if not improved or small:
+            break
+    cost = evaluate(T_cw, points, first, camera, uvr, inverse_sigma2, used, intrinsics, inlier)
+    return T_cw, points, cost, inlier, done
+
+
+@kernel
+def linearise(
+    T_cw, n_free, points, first, camera, uvr, inverse_sigma2, used, intrinsics, W, V, g, U, b
+):
+    """Normal equations at the current estimate, in blocks."""
+    fx, fy, cx, cy, bf = intrinsics
+    U[:] = 0.0
+    b[:] = 0.0
+    r, q = np.empty(3), np.empty(3)
+    C, P = np.empty((3, 6)), np.empty((3, 3))
+    for p in range(len(points)):
+        v00, v01, v02, v11, v12, v22 = 1e-9, 0.0, 0.0, 1e-9, 0.0, 1e-9
+        g0, g1, g2 = 0.0, 0.0, 0.0
+        for o in range(first[p], first[p + 1]):
+            if not used[o]:
+                continue
+            k = camera[o]
+            T = T_cw[k]
+            stereo = residual(T, points[p], uvr[o], intrinsics, r, q)
+            weight = inverse_sigma2[o]
+            chi2 = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]) * weight
+            limit = CHI2_STEREO if stereo else CHI2_MONO
+            if chi2 > limit:
+                weight *= np.sqrt(limit / chi2)
+            iz = 1.0 / q[2]
+            a = fx * iz
+            c = -fx * q[0] * iz * iz
+            e = fy * iz
+            f = -fy * q[1] * iz * iz
+            h = c + bf * iz * iz if stereo else 0.0
+            m = a if stereo else 0.0
+            # Rows of d(u, v, u_right)/d(point): projection times rotation.
+            for i in range(3):
+                P[0, i] = a * T[0, i] + c * T[2, i]
+                P[1, i] = e * T[1, i] + f * T[2, i]
+                P[2, i] = m * T[0, i] + h * T[2, i]
+            w0, w1, w2 = weight * r[0], weight * r[1], weight * r[2]
+            g0 += P[0, 0] * w0 + P[1, 0] * w1 + P[2, 0] * w2
+            g1 += P[0, 1] * w0 + P[1, 1] * w1 + P[2, 1] * w2
+            g2 += P[0, 2] * w0 + P[1, 2] * w1 + P[2, 2] * w2
+            v00 += weight * (P[0, 0] * P[0, 0] + P[1, 0] * P[1, 0] + P[2, 0] * P[2, 0])
+            v01 += weight * (P[0, 0] * P[0, 1] + P[1, 0] * P[1, 1] + P[2, 0] * P[2, 1])
+            v02 += weight * (P[0, 0] * P[0, 2] + P[1, 0] * P[1, 2] + P[2, 0] * P[2, 2])
+            v11 += weight * (P[0, 1] * P[0, 1] + P[1, 1] * P[1, 1] + P[2, 1] * P[2, 1])
+            v12 += weight * (P[0, 1] * P[0, 2] + P[1, 1] * P[1, 2] + P[2, 1] * P[2, 2])
+            v22 += weight * (P[0, 2] * P[0, 2] + P[1, 2] * P[1, 2] + P[2, 2] * P[2, 2])
+            if k >= n_free:
+                continue
+            x, y, z = q[0], q[1], q[2]
+            C[0, 0], C[0, 1], C[0, 2] = a, 0.0, c
+            C[0, 3], C[0, 4], C[0, 5] = c * y, a * z - c * x, -a * y
+            C[1, 0], C[1, 1], C[1, 2] = 0.0, e, f
+            C[1, 3], C[1, 4], C[1, 5] = -e * z + f * y, -f * x, e * x
+            C[2, 0], C[2, 1], C[2, 2] = m, 0.0, h
+            C[2, 3], C[2, 4], C[2, 5] = h * y, m * z - h * x, -m * y
+            block, vector = U[k], b[k]
+            for i in range(6):
+                c0, c1, c2 = weight * C[0, i], weight * C[1, i], weight * C[2, i]
+                vector[i] += c0 * r[0] + c1 * r[1] + c2 * r[2]
+                for j in range(6):
+                    block[i, j] += c0 * C[0, j] + c1 * C[1, j] + c2 * C[2, j]
+                for j in range(3):
+                    W[o, j, i] = c0 * P[0, j] + c1 * P[1, j] + c2 * P[2, j]
+        V[p, 0, 0], V[p, 0, 1], V[p, 0, 2] = v00, v01, v02
+        V[p, 1, 0], V[p, 1, 1], V[p, 1, 2] = v01, v11, v12
+        V[p, 2, 0], V[p, 2, 1], V[p, 2, 2] = v02, v12, v22
+        g[p, 0], g[p, 1], g[p, 2] = g0, g1, g2
+
+
+@kernel
+def reduce_points(n_free, first, camera, used, W, V, g, U, b, damping, S, rhs, V_inverse):
+    """Reduced camera system ``S x = rhs`` (upper triangle) after eliminating the points."""
+    S[:] = 0.0
+    for k in range(n_free):
+        for i in range(6):
+            rhs[6 * k + i] = b[k, i]
+            for j in range(6):
+                S[6 * k + i, 6 * k + j] = U[k, i, j]
+            S[6 * k + i, 6 * k + i] *= 1.0 + damping
+    Y = np.empty((3, 6))
+    for p in range(len(V)):
+        scale = 1.0 + damping
+        v00, v11, v22 = V[p, 0, 0] * scale, V[p, 1, 1] * scale, V[p, 2, 2] * scale
+        v01, v02, v12 = V[p, 0, 1], V[p, 0, 2], V[p, 1, 2]
+        i00, i01, i02 = v11 * v22 - v12 * v12, v02 * v12 - v01 * v22, v01 * v12 - v02 * v11
+        determinant = v00 * i00 + v01 * i01 + v02 * i02
+        inverse = 1.0 / determinant if determinant > 0.0 else 0.0
+        N = V_inverse[p]
+        N[0, 0], N[0, 1], N[0, 2] = i00 * inverse, i01 * inverse, i02 * inverse
+        N[1, 1] = (v00 * v22 - v02 * v02) * inverse
+        N[1, 2] = (v01 * v02 - v00 * v12) * inverse
+        N[2, 2] = (v00 * v11 - v01 * v01) * inverse
+        N[1, 0], N[2, 0], N[2, 1] = N[0, 1], N[0, 2], N[1, 2]
+        for o in range(first[p], first[p + 1]):
+            k = camera[o]
+            if k >= n_free or not used[o]:
+                continue
+            w = W[o]
+            for i in range(6):
+                w0, w1, w2 = w[0, i], w[1, i], w[2, i]
+                Y[0, i] = N[0, 0] * w0 + N[0, 1] * w1 + N[0, 2] * w2
+                Y[1, i] = N[1, 0] * w0 + N[1, 1] * w1 + N[1, 2] * w2
+                Y[2, i] = N[2, 0] * w0 + N[2, 1] * w1 + N[2, 2] * w2
+                rhs[6 * k + i] -= Y[0, i] * g[p, 0] + Y[1, i] * g[p, 1] + Y[2, i] * g[p, 2]
+            for other in range(first[p], first[p + 1]):
+                # Each pair of cameras once, in the upper triangle.
+                m = camera[other]
+                if m < k or m >= n_free or not used[other]:
+                    continue
+                w = W[other]
+                for i in range(6):
+                    y0, y1, y2 = Y[0, i], Y[1, i], Y[2, i]
+                    target = S[6 * k + i, 6 * m : 6 * m + 6]
+                    for j in range(6):
+                        target[j] -= y0 * w[0, j] + y1 * w[1, j] + y2 * w[2, j]
+
+
+@kernel
+def step_points(n_free, first, camera, used, W, g, camera_step, V_inverse, points, points_trial):
+    """Back-substitution: move each point by what the camera steps leave."""
+    for p in range(len(points)):
+        d0, d1, d2 = g[p, 0], g[p, 1], g[p, 2]
+        for o in range(first[p], first[p + 1]):
+            k = camera[o]
+            if k >= n_free or not used[o]:
+                continue
+            for i in range(6):
+                s = camera_step[6 * k + i]
+                d0 -= W[o, 0, i] * s
+                d1 -= W[o, 1, i] * s
+                d2 -= W[o, 2, i] * s
+        N = V_inverse[p]
+        for i in range(3):
+            points_trial[p, i] = points[p, i] + N[i, 0] * d0 + N[i, 1] * d1 + N[i, 2] * d2
+
+
+@kernel
+def cholesky_solve(S, x):
+    """Solve ``S x = rhs`` in place from the upper triangle of S; False if not positive definite."""
+    n = len(x)
+    for i in range(n):
+        row = S[i]
+        if not row[i] > 0.0:
+            return False
+        pivot = np.sqrt(row[i])
+        inverse = 1.0 / pivot
+        row[i] = pivot
+        for j in range(i + 1, n):
+            row[j] *= inverse
+        for k in range(i + 1, n):
+            factor = row[k]
+            if factor == 0.0:
+                continue
+            target = S[k, k:]
+            source = row[k:]
+            for j in range(np.uintp(n - k)):
+                target[j] -= factor * source[j]
+    for i in range(n):
+        value = x[i] / S[i, i]
+        x[i] = value
+        for j in range(i + 1, n):
+            x[j] -= S[i, j] * value
+    for i in range(n - 1, -1, -1):
+        value = x[i]
+        for j in range(i + 1, n):
+            value -= S[i, j] * x[j]
+        x[i] = value / S[i, i]
+    return True

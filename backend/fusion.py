@@ -1,0 +1,150 @@
+"""Fusion: landmarks that two keyframes hold of one point become one (ORB-SLAM, VI-C)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import StereoCamera
+from vslam.config import Config
+from vslam.features import CELL, FeatureGrid
+from vslam.kernels import hamming, kernel
+from vslam.map import Map, collect_landmarks, link, merge_landmarks, observed_by, predict_octave
+
+CHI2_MONO = 5.991  # 95 % quantiles with 2 and 3 degrees of freedom
+CHI2_STEREO = 7.815
+
+
+def fuse_neighbourhood(map_: Map, keyframe: int, camera: StereoCamera, config: Config) -> None:
+    """Project the landmarks of a keyframe into its neighbours and theirs into it.
+
+    A projection that meets a feature with a landmark of its own merges the two; one that meets a
+    free feature adds an observation.
+    """
+    neighbours = fusion_neighbours(map_, keyframe, config)
+    for neighbour in neighbours:
+        landmarks = map_.landmarks_of(keyframe)
+        fuse_into(map_, landmarks, neighbour, camera, config)
+    a = map_.arrays
+    landmarks = collect_landmarks(a, np.array(neighbours, np.int64), map_.n_landmarks)
+    fuse_into(map_, landmarks, keyframe, camera, config)
+
+
+def fusion_neighbours(map_: Map, keyframe: int, config: Config) -> list[int]:
+    """Best covisible keyframes, and the best five of each of those (ORB-SLAM2)."""
+    first, _ = map_.covisible(keyframe)
+    chosen = first[: config.mapping.fuse_neighbours].tolist()
+    known = {keyframe, *chosen}
+    for neighbour in list(chosen):
+        second, _ = map_.covisible(neighbour)
+        new = [k for k in second[:5].tolist() if k not in known]
+        chosen += new
+        known.update(new)
+    return chosen
+
+
+def fuse_into(
+    map_: Map, landmarks: NDArray[np.int32], keyframe: int, camera: StereoCamera, config: Config
+) -> int:
+    """Fuse ``(N,)`` landmarks with what one keyframe sees; returns how many were."""
+    a, rows = map_.arrays, map_.rows(keyframe)
+    grid = FeatureGrid.of_positions(a.xy[rows], camera.width, camera.height)
+    return _fuse(
+        a,
+        landmarks,
+        keyframe,
+        grid.start,
+        grid.items,
+        grid.columns,
+        camera.intrinsics,
+        camera.width,
+        camera.height,
+        map_.scales,
+        config.mapping.fuse_window,
+        config.mapping.fuse_distance,
+    )
+
+
+@kernel
+def _fuse(
+    a,
+    landmarks,
+    keyframe,
+    start,
+    items,
+    columns,
+    intrinsics,
+    width,
+    height,
+    scales,
+    window,
+    max_distance,
+):
+    fx, fy, cx, cy, bf = intrinsics
+    T = a.T_cw[keyframe]
+    first_row = a.first_row[keyframe]
+    grid_rows = (len(start) - 1) // columns
+    log_scale = np.log(scales[1] / scales[0])
+    centre = np.empty(3)
+    for i in range(3):
+        centre[i] = -(T[0, i] * T[0, 3] + T[1, i] * T[1, 3] + T[2, i] * T[2, 3])
+    fused = 0
+    for landmark in landmarks:
+        if not a.landmark_alive[landmark]:
+            continue
+        p = a.xyz[landmark]
+        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        if z <= 0.1:
+            continue
+        u = fx * (T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]) / z + cx
+        v = fy * (T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]) / z + cy
+        if u < 0.0 or u >= width or v < 0.0 or v >= height:
+            continue
+        dx, dy, dz = p[0] - centre[0], p[1] - centre[1], p[2] - centre[2]
+        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if distance < 0.8 * a.reach[landmark, 0] or distance > 1.2 * a.reach[landmark, 1]:
+            continue
+        normal = a.normal[landmark]
+        if dx * normal[0] + dy * normal[1] + dz * normal[2] < 0.5 * distance:
+            continue
+        if observed_by(a, landmark, keyframe) >= 0:
+            continue
+        octave = predict_octave(distance, a.reach[landmark, 1], log_scale, len(scales))
+        r = window * scales[octave]
+        u_right = u - bf / z
+        best, best_distance = -1, max_distance + 1
+        column_first, column_last = max(0, int((u - r) / CELL)), int((u + r) / CELL)
+        column_last = min(columns - 1, column_last)
+        for grid_row in range(
+            max(0, int((v - r) / CELL)), min(grid_rows - 1, int((v + r) / CELL)) + 1
+        ):
+            for k in range(
+                start[grid_row * columns + column_first],
+                start[grid_row * columns + column_last + 1],
+            ):
+                row = first_row + items[k]
+                level = int(a.octave[row])
+                if level < octave - 1 or level > octave:
+                    continue
+                e_u, e_v = a.xy[row, 0] - u, a.xy[row, 1] - v
+                chi2 = e_u * e_u + e_v * e_v
+                limit = CHI2_MONO
+                if not np.isnan(a.u_right[row]):
+                    chi2 += (a.u_right[row] - u_right) ** 2
+                    limit = CHI2_STEREO
+                if chi2 > limit * scales[level] ** 2:
+                    continue
+                bits = hamming(a.landmark_descriptor[landmark], a.descriptor[row])
+                if bits < best_distance:
+                    best, best_distance = row, bits
+        if best < 0:
+            continue
+        other = a.landmark[best]
+        if other < 0:
+            link(a, best, landmark)
+        elif a.n_observations[other] > a.n_observations[landmark]:
+            merge_landmarks(a, landmark, other)
+        else:
+            merge_landmarks(a, other, landmark)
+        fused += 1
+    return fused

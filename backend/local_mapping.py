@@ -1,0 +1,216 @@
+"""Local mapping: what happens to the map after each new keyframe (ORB-SLAM, section VI)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from vslam.backend.bundle_adjustment import BundleProblem, adjust
+from vslam.backend.fusion import fuse_neighbourhood
+from vslam.backend.triangulation import triangulate_with_neighbours
+
+from vslam.camera import StereoCamera
+from vslam.config import Config
+from vslam.kernels import kernel
+from vslam.map import Map, erase_landmark, refresh_landmarks, unlink
+
+RECENT_KEYFRAMES = 3  # a landmark is on probation for this many keyframes (ORB-SLAM, VI-B)
+
+
+def map_keyframe(map_: Map, keyframe: int, camera: StereoCamera, config: Config) -> None:
+    """Bring the map up to date with a keyframe that was just inserted and linked."""
+    cull_recent_landmarks(map_, keyframe, config)
+    triangulate_with_neighbours(map_, keyframe, camera, config)
+    refresh_keyframe(map_, keyframe)
+    fuse_neighbourhood(map_, keyframe, camera, config)
+    refresh_keyframe(map_, keyframe)
+    adjust_locally(map_, keyframe, camera, config)
+    cull_keyframes(map_, keyframe, camera, config)
+
+
+def refresh_keyframe(map_: Map, keyframe: int) -> None:
+    """Recompute descriptor, normal and reach of the landmarks that a keyframe observes."""
+    refresh_landmarks(map_.arrays, map_.landmarks_of(keyframe), map_.scales)
+
+
+def cull_recent_landmarks(map_: Map, keyframe: int, config: Config) -> None:
+    """Erase landmarks on probation that tracking rarely finds or too few keyframes see."""
+    _cull_landmarks(
+        map_.arrays,
+        int(
+            np.searchsorted(
+                map_.arrays.first_keyframe[: map_.n_landmarks], keyframe - RECENT_KEYFRAMES
+            )
+        ),
+        map_.n_landmarks,
+        keyframe,
+        config.mapping.min_found_ratio,
+    )
+
+
+@kernel
+def _cull_landmarks(a, first, last, keyframe, min_found_ratio):
+    for landmark in range(first, last):
+        if not a.landmark_alive[landmark]:
+            continue
+        rarely_found = a.found[landmark] < min_found_ratio * a.visible[landmark]
+        age = keyframe - a.first_keyframe[landmark]
+        # Three: one stereo and one monocular observation are not enough.
+        if rarely_found or (age >= 2 and a.n_observations[landmark] <= 3):
+            erase_landmark(a, landmark)
+
+
+def adjust_locally(map_: Map, keyframe: int, camera: StereoCamera, config: Config) -> None:
+    """Local bundle adjustment (ORB-SLAM, VI-D).
+
+    The keyframe and its covisible keyframes move with all landmarks that they see; other
+    keyframes that see those hold still, and so does the first keyframe, which is the world.
+    Observations that fail the chi-square test afterwards are removed.
+    """
+    free, fixed, landmarks = local_window(map_, keyframe, config)
+    problem, rows = assemble(map_, free, fixed, landmarks, camera)
+    if len(free) == 0 or len(rows) == 0:
+        return
+    coarse = adjust(problem, iterations=config.mapping.ba_iterations // 2, tolerance=1e-3)
+    refined = replace(problem, T_cw=coarse.T_cw, points=coarse.points)
+    final = adjust(
+        refined, iterations=config.mapping.ba_iterations, use=coarse.inlier, tolerance=1e-3
+    )
+    a = map_.arrays
+    a.T_cw[free] = final.T_cw[: len(free)]
+    a.xyz[landmarks] = final.points
+    remove_observations(a, rows[~final.inlier])
+    refresh_landmarks(a, landmarks, map_.scales)
+
+
+def local_window(
+    map_: Map, keyframe: int, config: Config
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
+    """Free keyframes, fixed keyframes and landmarks of local bundle adjustment."""
+    neighbours, shared = map_.covisible(keyframe)
+    # A keyframe with few neighbours keeps its best one (ORB-SLAM, III-D).
+    strong = neighbours[(shared >= config.mapping.min_shared) | (np.arange(len(shared)) == 0)]
+    window = np.concatenate([[keyframe], strong])[: config.mapping.max_ba_keyframes]
+    landmarks, others = window_landmarks(
+        map_.arrays, window.astype(np.int64), map_.n_landmarks, map_.n_keyframes
+    )
+    free = np.sort(window[window != 0])
+    fixed = np.flatnonzero(others)
+    if 0 in window:
+        fixed = np.concatenate([[0], fixed])
+    return free.astype(np.int64), fixed.astype(np.int64), landmarks
+
+
+@kernel
+def window_landmarks(a, window, n_landmarks, n_keyframes):
+    """Landmarks seen from the window, ``(P,)`` i4, and which other keyframes see them, ``(K,)``."""
+    seen = np.zeros(n_landmarks, np.bool_)
+    others = np.zeros(n_keyframes, np.bool_)
+    for keyframe in window:
+        for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
+            if a.landmark[row] >= 0:
+                seen[a.landmark[row]] = True
+    landmarks = np.flatnonzero(seen).astype(np.int32)
+    for landmark in landmarks:
+        row = a.head[landmark]
+        while row >= 0:
+            others[a.keyframe[row]] = True
+            row = a.next_row[row]
+    for keyframe in window:
+        others[keyframe] = False
+    return landmarks, others
+
+
+def assemble(
+    map_: Map,
+    free: NDArray[np.int64],
+    fixed: NDArray[np.int64],
+    landmarks: NDArray[np.int32],
+    camera: StereoCamera,
+) -> tuple[BundleProblem, NDArray[np.int64]]:
+    """The bundle problem of some keyframes and landmarks, and the map row of each observation."""
+    a = map_.arrays
+    cameras = np.concatenate([free, fixed])
+    index = np.full(map_.n_keyframes, -1, np.int64)
+    index[cameras] = np.arange(len(cameras))
+    first, rows = gather_observations(a, landmarks, index)
+    uvr = np.empty((len(rows), 3))
+    uvr[:, :2] = a.xy[rows]
+    uvr[:, 2] = a.u_right[rows]
+    problem = BundleProblem(
+        T_cw=a.T_cw[cameras],
+        n_free=len(free),
+        points=a.xyz[landmarks],
+        first=first,
+        camera=index[a.keyframe[rows]],
+        uvr=uvr,
+        inverse_sigma2=map_.scales[a.octave[rows]] ** -2.0,
+        intrinsics=camera.intrinsics,
+    )
+    return problem, rows
+
+
+@kernel
+def gather_observations(a, landmarks, index):
+    """Rows of each landmark in keyframes with an index, as ``first`` ``(P + 1,)`` and rows."""
+    first = np.zeros(len(landmarks) + 1, np.int64)
+    for i in range(len(landmarks)):
+        first[i + 1] = first[i]
+        row = a.head[landmarks[i]]
+        while row >= 0:
+            if index[a.keyframe[row]] >= 0:
+                first[i + 1] += 1
+            row = a.next_row[row]
+    rows = np.empty(first[-1], np.int64)
+    n = 0
+    for i in range(len(landmarks)):
+        row = a.head[landmarks[i]]
+        while row >= 0:
+            if index[a.keyframe[row]] >= 0:
+                rows[n] = row
+                n += 1
+            row = a.next_row[row]
+    return first, rows
+
+
+@kernel
+def remove_observations(a, rows):
+    """Unlink each of ``(N,)`` rows that still observes something."""
+    for row in rows:
+        if a.landmark[row] >= 0:
+            unlink(a, row)
+
+
+def cull_keyframes(map_: Map, keyframe: int, camera: StereoCamera, config: Config) -> None:
+    """Remove covisible keyframes most of whose close landmarks at least three others see as well,
+    at the same or a finer scale (ORB-SLAM, VI-E)."""
+    neighbours, shared = map_.covisible(keyframe)
+    close = config.stereo.close_depth_baselines * camera.baseline
+    for neighbour in neighbours[shared >= config.mapping.min_shared]:
+        if neighbour == 0:
+            continue
+        seen, redundant = count_redundant(map_.arrays, int(neighbour), camera.bf, close)
+        if redundant > config.mapping.redundant_ratio * seen:
+            map_.cull_keyframe(int(neighbour))
+
+
+@kernel
+def count_redundant(a, keyframe, bf, close_depth):
+    """Close landmarks of a keyframe, and how many of them three others see as well."""
+    seen, redundant = 0, 0
+    for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
+        landmark = a.landmark[row]
+        # A comparison with NaN is false: monocular observations do not count.
+        if landmark < 0 or not bf < close_depth * (a.xy[row, 0] - a.u_right[row]):
+            continue
+        seen += 1
+        others = 0
+        other = a.head[landmark]
+        while other >= 0 and others < 3:
+            if a.keyframe[other] != keyframe and a.octave[other] <= a.octave[row] + 1:
+                others += 1
+            other = a.next_row[other]
+        if others >= 3:
+            redundant += 1
+    return seen, redundant

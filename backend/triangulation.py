@@ -1,0 +1,214 @@
+"""New landmarks: from stereo, and from two keyframes that see the same unmapped feature."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import StereoCamera
+from vslam.config import Config
+from vslam.kernels import hamming, kernel
+from vslam.map import NONE, Map, link_many
+
+CHI2_MONO = 5.991  # 95 % quantiles with 2 and 3 degrees of freedom
+CHI2_STEREO = 7.815
+EPIPOLAR_CHI2 = 3.84  # 95 % quantile with 1 degree of freedom
+MIN_CLOSE = 100  # stereo points mapped even if none is close (ORB-SLAM2, III-E)
+
+
+def map_stereo_points(
+    map_: Map, keyframe: int, camera: StereoCamera, config: Config
+) -> NDArray[np.int32]:
+    """Map the close stereo features of a keyframe that observe no landmark yet.
+
+    If fewer than 100 features are close, the 100 nearest count (ORB-SLAM2, section III-E).
+    Returns the ids of the new landmarks.
+    """
+    a, rows = map_.arrays, map_.rows(keyframe)
+    xy = a.xy[rows].astype(np.float64)
+    depth = camera.bf / (xy[:, 0] - a.u_right[rows])
+    nearest = np.argsort(depth, kind="stable")
+    nearest = nearest[: np.count_nonzero(np.isfinite(depth))]
+    close = depth[nearest] < config.stereo.close_depth_baselines * camera.baseline
+    nearest = nearest[close | (np.arange(len(nearest)) < MIN_CLOSE)]
+    new = nearest[a.landmark[rows][nearest] == NONE]
+    T_wc = np.linalg.inv(a.T_cw[keyframe])
+    xyz = camera.backproject(xy[new], depth[new]) @ T_wc[:3, :3].T + T_wc[:3, 3]
+    ids = map_.add_landmarks(xyz, a.descriptor[rows][new], keyframe)
+    link_many(map_.arrays, rows.start + new, ids)
+    return ids
+
+
+def triangulate_with_neighbours(
+    map_: Map, keyframe: int, camera: StereoCamera, config: Config
+) -> NDArray[np.int32]:
+    """Match unmapped features of a keyframe with those of its covisible keyframes along epipolar
+    lines and triangulate them (ORB-SLAM, VI-C). Returns the ids of the new landmarks."""
+    neighbours, _ = map_.covisible(keyframe)
+    created = [np.empty(0, np.int32)]
+    for neighbour in neighbours[: config.mapping.neighbours]:
+        a = map_.arrays
+        xyz, rows_1, rows_2 = triangulate_pair(
+            a,
+            keyframe,
+            int(neighbour),
+            camera.intrinsics,
+            map_.scales,
+            camera.baseline,
+            config.mapping.epipolar_distance,
+            config.mapping.min_parallax_cosine,
+        )
+        ids = map_.add_landmarks(xyz, a.descriptor[rows_1], keyframe)
+        link_many(map_.arrays, rows_1, ids)
+        link_many(map_.arrays, rows_2, ids)
+        created.append(ids)
+    return np.concatenate(created)
+
+
+@kernel
+def unmapped_rows(a, keyframe):
+    """Rows of a keyframe that observe no landmark, ``(N,)`` int64."""
+    first, last = a.first_row[keyframe], a.first_row[keyframe + 1]
+    return first + np.flatnonzero(a.landmark[first:last] < 0)
+
+
+@kernel
+def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, max_cosine):
+    """New landmarks of two keyframes: ``xyz`` ``(N, 3)`` and the rows of both, ``(N,)`` int64."""
+    fx, fy, cx, cy, bf = intrinsics
+    T1, T2 = a.T_cw[k1], a.T_cw[k2]
+    R1, R2 = T1[:3, :3].copy(), T2[:3, :3].copy()
+    centre_1 = -np.array(
+        [R1[0, i] * T1[0, 3] + R1[1, i] * T1[1, 3] + R1[2, i] * T1[2, 3] for i in range(3)]
+    )
+    centre_2 = -np.array(
+        [R2[0, i] * T2[0, 3] + R2[1, i] * T2[1, 3] + R2[2, i] * T2[2, 3] for i in range(3)]
+    )
+    rows_1, rows_2 = unmapped_rows(a, k1), unmapped_rows(a, k2)
+    n1, n2 = len(rows_1), len(rows_2)
+    xyz = np.empty((n1, 3))
+    out_1, out_2 = np.empty(n1, np.int64), np.empty(n1, np.int64)
+    count = 0
+    gap = centre_1 - centre_2
+    if np.sqrt((gap**2).sum()) < min_baseline or n2 == 0:
+        return xyz[:0], out_1[:0], out_2[:0]
+    # Camera 1's centre in camera 2: the epipole.
+    t = np.array([R2[i, 0] * gap[0] + R2[i, 1] * gap[1] + R2[i, 2] * gap[2] for i in range(3)])
+    x2, y2 = a.xy[rows_2, 0].copy(), a.xy[rows_2, 1].copy()
+    gate = np.empty(n2, np.float32)
+    for j in range(n2):
+        gate[j] = EPIPOLAR_CHI2 * scales[a.octave[rows_2[j]]] ** 2
+    taken = np.zeros(n2, np.bool_)
+    near = np.empty(n2, np.bool_)
+    for i in range(n1):
+        row_1 = rows_1[i]
+        ray = np.array([(a.xy[row_1, 0] - cx) / fx, (a.xy[row_1, 1] - cy) / fy, 1.0])
+        # The ray in the world, then in camera 2; t x ray is normal to the epipolar plane.
+        world = np.array(
+            [R1[0, m] * ray[0] + R1[1, m] * ray[1] + R1[2, m] * ray[2] for m in range(3)]
+        )
+        d = np.array(
+            [R2[m, 0] * world[0] + R2[m, 1] * world[1] + R2[m, 2] * world[2] for m in range(3)]
+        )
+        n_x, n_y = t[1] * d[2] - t[2] * d[1], t[2] * d[0] - t[0] * d[2]
+        n_z = t[0] * d[1] - t[1] * d[0]
+        l_x, l_y = n_x / fx, n_y / fy
+        norm = np.sqrt(l_x * l_x + l_y * l_y)
+        if norm < 1e-12:
+            continue
+        p, q = np.float32(l_x / norm), np.float32(l_y / norm)
+        s = np.float32((n_z - l_x * cx - l_y * cy) / norm)
+        for j in range(np.uintp(n2)):
+            off = p * x2[j] + q * y2[j] + s
+            near[j] = off * off < gate[j]
+        stereo_1 = not np.isnan(a.u_right[row_1])
+        best, best_distance = -1, max_distance + 1
+        for j in range(n2):
+            if not near[j] or taken[j]:
+                continue
+            distance = hamming(a.descriptor[row_1], a.descriptor[rows_2[j]])
+            if distance >= best_distance:
+                continue
+            if not stereo_1 and np.isnan(a.u_right[rows_2[j]]) and t[2] > 0.0:
+                # Near the epipole two monocular rays have no parallax.
+                e_x, e_y = fx * t[0] / t[2] + cx - x2[j], fy * t[1] / t[2] + cy - y2[j]
+                if e_x * e_x + e_y * e_y < 100.0 * scales[a.octave[rows_2[j]]]:
+                    continue
+            best, best_distance = j, distance
+        if best < 0:
+            continue
+        row_2 = rows_2[best]
+        other = np.array([(x2[best] - cx) / fx, (y2[best] - cy) / fy, 1.0])
+        world_2 = np.array(
+            [R2[0, m] * other[0] + R2[1, m] * other[1] + R2[2, m] * other[2] for m in range(3)]
+        )
+        point, ok = intersect(
+            a, row_1, row_2, world, world_2, centre_1, centre_2, bf, bf / fx, max_cosine
+        )
+        if (
+            ok
+            and agrees(
+                T1, point, a.xy[row_1], a.u_right[row_1], scales[a.octave[row_1]], intrinsics
+            )
+            and agrees(
+                T2, point, a.xy[row_2], a.u_right[row_2], scales[a.octave[row_2]], intrinsics
+            )
+        ):
+            # Distances must explain the octaves within 1.5 levels (ORB-SLAM's scale test).
+            far = np.sqrt(((point - centre_1) ** 2).sum() / ((point - centre_2) ** 2).sum())
+            change = far * scales[a.octave[row_1]] / scales[a.octave[row_2]]
+            slack = 1.5 * scales[1]
+            if change * slack > 1.0 and change < slack:
+                taken[best] = True
+                xyz[count] = point
+                out_1[count], out_2[count] = row_1, row_2
+                count += 1
+    return xyz[:count].copy(), out_1[:count].copy(), out_2[:count].copy()
+
+
+@kernel
+def intersect(a, row_1, row_2, world_1, world_2, centre_1, centre_2, bf, baseline, max_cosine):
+    """World point of two rays, or of the stereo pair with more parallax than the rays have.
+
+    ``world_i`` is the ray in the world, as long as its z in its own camera is 1.
+    """
+    dot = (world_1 * world_2).sum()
+    square_1, square_2 = (world_1**2).sum(), (world_2**2).sum()
+    cosine = dot / np.sqrt(square_1 * square_2)
+    depth_1 = bf / (a.xy[row_1, 0] - a.u_right[row_1])
+    depth_2 = bf / (a.xy[row_2, 0] - a.u_right[row_2])
+    # Angle between the eyes, seen from the stereo point.
+    eyes_1 = 2.0 * np.arctan(0.5 * baseline / (depth_1 * np.sqrt(square_1)))
+    eyes_2 = 2.0 * np.arctan(0.5 * baseline / (depth_2 * np.sqrt(square_2)))
+    stereo_1, stereo_2 = depth_1 > 0.0, depth_2 > 0.0  # False for NaN
+    stereo_cosine = min(np.cos(eyes_1) if stereo_1 else 2.0, np.cos(eyes_2) if stereo_2 else 2.0)
+    if 0.0 < cosine < stereo_cosine and (stereo_1 or stereo_2 or cosine < max_cosine):
+        # Midpoint of the shortest segment between the rays; bundle adjustment does the rest.
+        gap = centre_2 - centre_1
+        on_1, on_2 = (gap * world_1).sum(), (gap * world_2).sum()
+        determinant = square_1 * square_2 - dot * dot
+        s = (square_2 * on_1 - dot * on_2) / determinant
+        t = (dot * on_1 - square_1 * on_2) / determinant
+        return 0.5 * (centre_1 + s * world_1 + centre_2 + t * world_2), s > 0.0 and t > 0.0
+    if stereo_1 and (not stereo_2 or eyes_1 >= eyes_2):
+        return centre_1 + depth_1 * world_1, True
+    if stereo_2:
+        return centre_2 + depth_2 * world_2, True
+    return centre_1, False
+
+
+@kernel
+def agrees(T, p, xy, u_right, scale, intrinsics):
+    """Whether a point in front of the camera reprojects within the chi-square limit."""
+    fx, fy, cx, cy, bf = intrinsics
+    z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+    if z <= 0.0:
+        return False
+    x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+    y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+    u = fx * x / z + cx
+    chi2 = (xy[0] - u) ** 2 + (xy[1] - fy * y / z - cy) ** 2
+    if np.isnan(u_right):
+        return chi2 <= CHI2_MONO * scale * scale
+    chi2 += (u_right - u + bf / z) ** 2
+    return chi2 <= CHI2_STEREO * scale * scale

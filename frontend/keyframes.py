@@ -1,0 +1,44 @@
+"""When a frame becomes a keyframe (ORB-SLAM2, section III-E)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vslam.config import KeyframeConfig
+
+
+@dataclass(frozen=True)
+class KeyframeEvidence:
+    """What the decision rests on.
+
+    Attributes:
+        seconds_since_keyframe: since the last one.
+        n_inliers: landmarks tracked in this frame.
+        n_reference: landmarks of the reference keyframe that at least three keyframes see
+            (all of them in a young map).
+        tracked_close: close stereo features of this frame that track a landmark.
+        untracked_close: close stereo features that do not.
+        mapping_idle: the last keyframe's local mapping is finished and merged.
+    """
+
+    seconds_since_keyframe: float
+    n_inliers: int
+    n_reference: int
+    tracked_close: int
+    untracked_close: int
+    mapping_idle: bool
+
+
+def needs_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig) -> bool:
+    """Decide. Enough new must be visible, and either mapping is free or it is urgent."""
+    starved = (
+        evidence.tracked_close < config.min_tracked_close
+        and evidence.untracked_close > config.min_new_close
+    )
+    moved_on = evidence.n_inliers < config.max_tracked_ratio * evidence.n_reference
+    if evidence.seconds_since_keyframe >= config.max_interval_s:
+        return True
+    if not (moved_on or starved):
+        return False
+    urgent = starved or evidence.n_inliers < config.urgent_ratio * evidence.n_reference
+    return evidence.mapping_idle or urgent

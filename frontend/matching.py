@@ -1,0 +1,154 @@
+"""Matching of landmarks and descriptors to the features of a frame. No state.
+
+Search by projection follows ORB-SLAM (Mur-Artal et al., T-RO 2015, V-C and V-D): a landmark is
+looked for only near its projection and near the pyramid level at which it should appear.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vslam.features import CELL
+from vslam.kernels import hamming, kernel
+
+ORIENTATION_BINS = 30
+
+
+@kernel
+def search_windows(
+    uvr,
+    radius,
+    octave_low,
+    octave_high,
+    descriptors,
+    xy,
+    octave,
+    u_right,
+    frame_descriptors,
+    free,
+    start,
+    items,
+    columns,
+    max_distance,
+    ratio,
+):
+    """Best feature for each of M projected landmarks.
+
+    Args:
+        uvr: ``(M, 3)`` float64, predicted u, v, u_right.
+        radius: ``(M,)`` float64, window half width in pixels; not positive: skip.
+        octave_low, octave_high: ``(M,)`` int, levels to accept.
+        descriptors: ``(M, 4)`` uint64; frame_descriptors: ``(N, 4)`` uint64.
+        free: ``(N,)`` bool, features that may be matched.
+        start, items, columns: the frame's grid.
+        ratio: best over second best, where both are of one level (1 switches the test off).
+
+    Returns:
+        ``(M,)`` int32 feature or -1, no feature twice (the closest descriptor keeps it), and
+        ``(M,)`` int32 distances.
+    """
+    m, n = len(uvr), len(xy)
+    rows = (len(start) - 1) // columns
+    matches = np.full(m, -1, np.int32)
+    distances = np.full(m, 257, np.int32)
+    owner = np.full(n, -1, np.int32)
+    for i in range(m):
+        r = radius[i]
+        if r <= 0:
+            continue
+        u, v = uvr[i, 0], uvr[i, 1]
+        column_first = max(0, int(np.floor((u - r) / CELL)))
+        column_last = min(columns - 1, int(np.floor((u + r) / CELL)))
+        row_first = max(0, int(np.floor((v - r) / CELL)))
+        row_last = min(rows - 1, int(np.floor((v + r) / CELL)))
+        best, best_distance, second_distance = -1, 257, 257
+        for row in range(row_first, row_last + 1):
+            for k in range(
+                start[row * columns + column_first], start[row * columns + column_last + 1]
+            ):
+                if column_first > column_last:
+                    break
+                j = items[k]
+                if not free[j] or octave[j] < octave_low[i] or octave[j] > octave_high[i]:
+                    continue
+                if abs(xy[j, 0] - u) > r or abs(xy[j, 1] - v) > r:
+                    continue
+                if u_right[j] == u_right[j] and abs(u_right[j] - uvr[i, 2]) > r:
+                    continue
+                distance = hamming(descriptors[i], frame_descriptors[j])
+                if distance < best_distance:
+                    second_distance = best_distance
+                    best, best_distance = j, distance
+                elif distance < second_distance:
+                    second_distance = distance
+        if best < 0 or best_distance > max_distance or best_distance > ratio * second_distance:
+            continue
+        previous = owner[best]
+        if previous >= 0:
+            if distances[previous] <= best_distance:
+                continue
+            matches[previous] = -1
+        owner[best] = i
+        matches[i], distances[i] = best, best_distance
+    return matches, distances
+
+
+@kernel
+def search_all(a, b, max_distance, ratio):
+    """Nearest descriptor of b for each of a, both ways, with a ratio test.
+
+    Args:
+        a, b: ``(M, 4)`` and ``(N, 4)`` uint64.
+
+    Returns:
+        ``(M,)`` int32 index into b or -1; mutual nearest neighbours only.
+    """
+    m, n = len(a), len(b)
+    best_of_a = np.full(m, -1, np.int32)
+    best_of_b = np.full(n, -1, np.int32)
+    distance_of_b = np.full(n, 257, np.int32)
+    for i in range(m):
+        best, best_distance, second_distance = -1, 257, 257
+        for j in range(n):
+            distance = hamming(a[i], b[j])
+            if distance < distance_of_b[j]:
+                distance_of_b[j], best_of_b[j] = distance, i
+            if distance < best_distance:
+                second_distance = best_distance
+                best, best_distance = j, distance
+            elif distance < second_distance:
+                second_distance = distance
+        if best_distance <= max_distance and best_distance <= ratio * second_distance:
+            best_of_a[i] = best
+    for i in range(m):
+        if best_of_a[i] >= 0 and best_of_b[best_of_a[i]] != i:
+            best_of_a[i] = -1
+    return best_of_a
+
+
+@kernel
+def consistent_orientation(angle_a, angle_b):
+    """Matches whose rotation falls in one of the three fullest of 30 bins (ORB-SLAM, V-C).
+
+    The second and third bin count only with at least a tenth of the first.
+
+    Args:
+        angle_a, angle_b: ``(N,)`` float32 radians of the matched features.
+
+    Returns:
+        ``(N,)`` bool.
+    """
+    n = len(angle_a)
+    bins = np.empty(n, np.int64)
+    count = np.zeros(ORIENTATION_BINS, np.int64)
+    turn = 2.0 * np.pi
+    for i in range(n):
+        difference = (np.float64(angle_a[i]) - np.float64(angle_b[i])) % turn
+        bins[i] = int(difference / turn * ORIENTATION_BINS + 0.5) % ORIENTATION_BINS
+        count[bins[i]] += 1
+    order = np.argsort(-count, kind="mergesort")
+    allowed = np.zeros(ORIENTATION_BINS, np.bool_)
+    for k in range(3):
+        if k == 0 or count[order[k]] * 10 >= count[order[0]]:
+            allowed[order[k]] = True
+    return allowed[bins]

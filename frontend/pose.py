@@ -1,0 +1,135 @@
+"""Pose of one camera from matched landmarks ("motion-only bundle adjustment", ORB-SLAM2, III-C)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vslam.geometry import compose, orthonormalised, se3_exp
+from vslam.kernels import kernel
+
+# 95 % quantiles of chi-square with 2 and 3 degrees of freedom (ORB-SLAM, section V).
+CHI2_MONO = 5.991
+CHI2_STEREO = 7.815
+ROUNDS = 4
+ITERATIONS = 10
+
+
+@kernel
+def solve6(H, b):
+    """Solve a symmetric positive definite ``(6, 6)`` system by Cholesky; zeros if it is not."""
+    L = np.zeros((6, 6))
+    x = np.zeros(6)
+    for i in range(6):
+        for j in range(i + 1):
+            value = H[i, j]
+            for k in range(j):
+                value -= L[i, k] * L[j, k]
+            if i == j:
+                if value <= 0.0:
+                    return np.zeros(6)
+                L[i, i] = np.sqrt(value)
+            else:
+                L[i, j] = value / L[j, j]
+    for i in range(6):
+        value = b[i]
+        for k in range(i):
+            value -= L[i, k] * x[k]
+        x[i] = value / L[i, i]
+    for i in range(5, -1, -1):
+        value = x[i]
+        for k in range(i + 1, 6):
+            value -= L[k, i] * x[k]
+        x[i] = value / L[i, i]
+    return x
+
+
+@kernel
+def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
+    """Pose that minimises the robust reprojection error of fixed landmarks.
+
+    Four rounds of Gauss-Newton; after each one the chi-square test sorts inliers from outliers,
+    and both get another chance in the next. The first two rounds use the Huber loss.
+
+    Args:
+        T_cw: ``(4, 4)`` start.
+        points: ``(N, 3)`` float64 landmarks in the world.
+        uvr: ``(N, 3)`` float64 observations u, v, u_right; NaN u_right: monocular.
+        inverse_sigma2: ``(N,)`` float64, inverse variance of a pixel coordinate.
+        intrinsics: ``(5,)`` fx, fy, cx, cy, bf.
+
+    Returns:
+        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers.
+    """
+    n = len(points)
+    fx, fy, cx, cy, bf = intrinsics
+    T = T_cw.copy()
+    inlier = np.ones(n, np.bool_)
+    for turn in range(ROUNDS):
+        robust = turn < 2
+        for _ in range(ITERATIONS):
+            H = np.zeros((6, 6))
+            b = np.zeros(6)
+            J = np.empty((3, 6))
+            r = np.empty(3)
+            used = 0
+            for i in range(n):
+                if not inlier[i]:
+                    continue
+                p = points[i]
+                x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+                y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+                z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+                if z <= 1e-6:
+                    continue
+                stereo = not np.isnan(uvr[i, 2])
+                iz = 1.0 / z
+                r[0] = uvr[i, 0] - (fx * x * iz + cx)
+                r[1] = uvr[i, 1] - (fy * y * iz + cy)
+                r[2] = uvr[i, 2] - (fx * x * iz + cx - bf * iz) if stereo else 0.0
+                chi2 = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]) * inverse_sigma2[i]
+                weight = inverse_sigma2[i]
+                limit = CHI2_STEREO if stereo else CHI2_MONO
+                if robust and chi2 > limit:
+                    weight *= np.sqrt(limit / chi2)
+                used += 1
+                # d(u, v)/d(v, w) for T <- exp([v, w]) T.
+                J[0, 0], J[0, 1], J[0, 2] = fx * iz, 0.0, -fx * x * iz * iz
+                J[1, 0], J[1, 1], J[1, 2] = 0.0, fy * iz, -fy * y * iz * iz
+                J[2, 0], J[2, 1], J[2, 2] = J[0, 0], 0.0, J[0, 2] + bf * iz * iz
+                for k in range(3 if stereo else 2):
+                    J[k, 3] = -J[k, 1] * z + J[k, 2] * y
+                    J[k, 4] = J[k, 0] * z - J[k, 2] * x
+                    J[k, 5] = -J[k, 0] * y + J[k, 1] * x
+                    for row in range(6):
+                        scaled = weight * J[k, row]
+                        b[row] += scaled * r[k]
+                        for column in range(row + 1):
+                            H[row, column] += scaled * J[k, column]
+            if used < 3:
+                return T, np.zeros(n, np.bool_)
+            for row in range(6):
+                H[row, row] *= 1.0 + 1e-9
+            step = solve6(H, b)
+            T = orthonormalised(compose(se3_exp(step), T))
+            if np.abs(step).max() < 1e-7:
+                break
+        classify(T, points, uvr, inverse_sigma2, intrinsics, inlier)
+    return T, inlier
+
+
+@kernel
+def classify(T, points, uvr, inverse_sigma2, intrinsics, inlier):
+    """Set ``inlier`` to those that pass the chi-square test at pose ``T``."""
+    fx, fy, cx, cy, bf = intrinsics
+    for i in range(len(points)):
+        p = points[i]
+        x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+        y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        u = fx * x / z + cx
+        chi2 = (uvr[i, 0] - u) ** 2 + (uvr[i, 1] - fy * y / z - cy) ** 2
+        limit = CHI2_MONO
+        if not np.isnan(uvr[i, 2]):
+            chi2 += (uvr[i, 2] - u + bf / z) ** 2
+            limit = CHI2_STEREO
+        inlier[i] = z > 0.0 and chi2 * inverse_sigma2[i] <= limit

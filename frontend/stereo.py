@@ -1,0 +1,158 @@
+"""Stereo matching of ORB features in a rectified pair (ORB-SLAM2, section III-A)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from vslam.frontend.orb import Extraction
+
+from vslam.camera import StereoCamera
+from vslam.config import StereoConfig
+from vslam.kernels import hamming, kernel
+
+MEDIAN_FACTOR = 1.5 * 1.4826  # 1.5 standard deviations, from the median of a half-normal
+
+
+def match_stereo(
+    left: Extraction, right: Extraction, camera: StereoCamera, config: StereoConfig
+) -> NDArray[np.float32]:
+    """Column in the right image of each left feature, ``(N,)`` float32, NaN without a match.
+
+    Candidates lie in the same rows (2 px at the scale of the right feature), within an octave,
+    at a disparity from 0 to that of a point one baseline away. The descriptor chooses; a SAD
+    window slid at the left feature's level then places the match to a fraction of a pixel.
+    """
+    u_right, sad = _match(
+        left.xy,
+        left.octave,
+        left.descriptors.view(np.uint64),
+        left.pyramid.pixels,
+        right.xy,
+        right.octave,
+        right.descriptors.view(np.uint64),
+        right.pyramid.pixels,
+        left.pyramid.offsets,
+        left.pyramid.shapes,
+        left.pyramid.scales,
+        camera.fx,
+        config.max_descriptor_distance,
+        config.sad_window,
+        config.sad_search,
+    )
+    matched = sad >= 0
+    if matched.any():
+        u_right[sad > MEDIAN_FACTOR * np.median(sad[matched])] = np.nan
+    return u_right
+
+
+@kernel
+def rows_to_features(xy, octave, scales, height):
+    """Features that may match in each row, as ``start`` ``(height + 1,)`` and ``items``."""
+    start = np.zeros(height + 1, np.int64)
+    n = len(xy)
+    for fill in range(2):
+        if fill == 1:
+            for row in range(height):
+                start[row + 1] += start[row]
+            items = np.empty(start[height], np.int32)
+            cursor = start[:height].copy()
+        for i in range(n):
+            band = 2.0 * scales[octave[i]]
+            first = max(0, int(np.floor(xy[i, 1] - band)))
+            last = min(height - 1, int(np.ceil(xy[i, 1] + band)))
+            for row in range(first, last + 1):
+                if fill == 0:
+                    start[row + 1] += 1
+                else:
+                    items[cursor[row]] = i
+                    cursor[row] += 1
+    return start, items
+
+
+@kernel
+def _match(
+    xy_l,
+    octave_l,
+    descriptors_l,
+    pixels_l,
+    xy_r,
+    octave_r,
+    descriptors_r,
+    pixels_r,
+    offsets,
+    shapes,
+    scales,
+    max_disparity,
+    max_distance,
+    half,
+    reach,
+):
+    """Returns ``u_right`` ``(N,)`` float32 and the SAD of each match (-1 without), ``(N,)``."""
+    n = len(xy_l)
+    u_right = np.full(n, np.nan, np.float32)
+    sad = np.full(n, -1.0, np.float32)
+    start, items = rows_to_features(xy_r, octave_r, scales, shapes[0, 0])
+    for i in range(n):
+        u, v = xy_l[i, 0], xy_l[i, 1]
+        row = int(v)
+        best, best_distance = -1, max_distance
+        for k in range(start[row], start[row + 1]):
+            j = items[k]
+            disparity = u - xy_r[j, 0]
+            if disparity < -1.0 or disparity > max_disparity:
+                continue
+            if abs(int(octave_r[j]) - int(octave_l[i])) > 1:
+                continue
+            distance = hamming(descriptors_l[i], descriptors_r[j])
+            if distance < best_distance:
+                best, best_distance = j, distance
+        if best < 0:
+            continue
+        level = octave_l[i]
+        height, width = shapes[level]
+        image_l = pixels_l[offsets[level] : offsets[level] + height * width].reshape(height, width)
+        image_r = pixels_r[offsets[level] : offsets[level] + height * width].reshape(height, width)
+        x_l, y_l = int(np.rint(u / scales[level])), int(np.rint(v / scales[level]))
+        x_r = int(np.rint(xy_r[best, 0] / scales[level]))
+        shift, score = slide(image_l, image_r, x_l, y_l, x_r, half, reach)
+        if np.isnan(shift):
+            continue
+        # The left feature keeps its sub-pixel offset within the level's pixel.
+        disparity = (x_l - x_r - shift) * scales[level]
+        if disparity < max_disparity and disparity > -1.0:
+            u_right[i] = u - max(disparity, 0.01)
+            sad[i] = score
+    return u_right, sad
+
+
+@kernel
+def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
+    """Offset from ``x_r`` at which the patches agree best, and their SAD; NaN if at the border."""
+    height, width = image_l.shape
+    if (
+        y_l < half
+        or y_l + half >= height
+        or x_l < half
+        or x_l + half >= width
+        or x_r - reach < half
+        or x_r + reach + half >= width
+    ):
+        return np.nan, np.float32(-1.0)
+    costs = np.empty(2 * reach + 1, np.int32)
+    side = np.uintp(2 * half + 1)
+    for s in range(-reach, reach + 1):
+        total = np.int32(0)
+        for dy in range(-half, half + 1):
+            a = image_l[y_l + dy, x_l - half : x_l + half + 1]
+            b = image_r[y_l + dy, x_r + s - half : x_r + s + half + 1]
+            for k in range(side):
+                total += abs(np.int32(a[k]) - np.int32(b[k]))
+        costs[s + reach] = total
+    best = int(np.argmin(costs))
+    if best == 0 or best == 2 * reach:
+        return np.nan, np.float32(-1.0)
+    before, here, after = costs[best - 1], costs[best], costs[best + 1]
+    curvature = before + after - 2 * here
+    if curvature <= 0:
+        return np.nan, np.float32(-1.0)
+    return best - reach + 0.5 * (before - after) / curvature, np.float32(here)

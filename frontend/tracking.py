@@ -1,0 +1,324 @@
+"""Tracking of one frame against the map (ORB-SLAM2, section III; ORB-SLAM, section V).
+
+Everything here is a function of the frame, the previous frame and a ``LocalMap``; the map itself
+is never touched, so that local mapping can write it meanwhile.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from vslam.frontend.matching import consistent_orientation, search_all, search_windows
+from vslam.frontend.orb import extract, scale_factors
+from vslam.frontend.pose import optimise_pose
+from vslam.frontend.stereo import match_stereo
+
+from vslam.camera import StereoCamera
+from vslam.config import Config, TrackingConfig
+from vslam.features import FeatureGrid, Features
+from vslam.geometry import transform
+from vslam.kernels import kernel
+from vslam.map import LocalMap, predict_octave
+
+NEVER = np.iinfo(np.int64).max
+
+
+@dataclass
+class Frame:
+    """A frame being tracked.
+
+    Attributes:
+        features, grid: of the left image.
+        T_cw: ``(4, 4)`` pose estimate.
+        landmark: ``(N,)`` int32, landmark that each feature tracks, or -1.
+        xyz: ``(N, 3)`` float64, its position; NaN without one.
+    """
+
+    features: Features
+    grid: FeatureGrid
+    T_cw: NDArray[np.float64]
+    landmark: NDArray[np.int32]
+    xyz: NDArray[np.float64]
+
+    @classmethod
+    def untracked(cls, features: Features, grid: FeatureGrid) -> Frame:
+        n = len(features)
+        return cls(features, grid, np.eye(4), np.full(n, -1, np.int32), np.full((n, 3), np.nan))
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """Camera and thresholds, with what follows from them."""
+
+    camera: StereoCamera
+    config: Config
+    scales: NDArray[np.float64]
+
+    @classmethod
+    def create(cls, camera: StereoCamera, config: Config) -> Tracker:
+        return cls(camera, config, scale_factors(config.orb))
+
+    @property
+    def close_depth(self) -> float:
+        """Depth (m) below which a stereo point is close (ORB-SLAM2, III-A)."""
+        return self.config.stereo.close_depth_baselines * self.camera.baseline
+
+
+def extract_features(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], tracker: Tracker
+) -> Features:
+    """ORB features of the left image with their stereo matches. A pure function."""
+    config = tracker.config
+    in_left, in_right = extract(left, config.orb), extract(right, config.orb)
+    u_right = match_stereo(in_left, in_right, tracker.camera, config.stereo)
+    return Features(in_left.xy, in_left.octave, in_left.angle, in_left.descriptors, u_right)
+
+
+def feature_depth(features: Features, camera: StereoCamera) -> NDArray[np.float64]:
+    """``(N,)`` depth in metres from stereo, NaN without a match."""
+    return camera.bf / (features.xy[:, 0].astype(np.float64) - features.u_right)
+
+
+def track_motion(frame: Frame, previous: Frame, T_cw: NDArray[np.float64], tracker: Tracker) -> int:
+    """Match what the previous frame saw near where the predicted pose puts it; refine the pose.
+
+    Besides landmarks, close stereo points of the previous frame that are not in the map take part
+    (ORB-SLAM2's visual-odometry points): they steady the pose and are then forgotten.
+
+    Returns:
+        Inliers of the pose optimisation; ``frame`` holds the pose and the matched landmarks.
+    """
+    config, camera = tracker.config.tracking, tracker.camera
+    points, source = trackable_points(previous, tracker)
+    before = previous.features
+    octave = before.octave[source].astype(np.int64)
+    in_camera = transform(T_cw, points)
+    ahead = in_camera[:, 2] > 0.1
+    uvr = camera.project(np.where(ahead[:, None], in_camera, 1.0))
+    forward = (
+        in_camera[:, 2].mean() - transform(previous.T_cw, points)[:, 2].mean()
+        if len(points)
+        else 0.0
+    )
+    # Moving on by more than the baseline, features can only grow (or shrink) in octave.
+    low, high = octave - 1, octave + 1
+    if forward < -camera.baseline:
+        low, high = octave, np.full_like(octave, NEVER)
+    elif forward > camera.baseline:
+        low, high = np.zeros_like(octave), octave
+    inliers = 0
+    for widening in (1.0, 2.0, 4.0):
+        radius = np.where(ahead, config.motion_window * widening * tracker.scales[octave], 0.0)
+        found = _search(
+            frame,
+            uvr,
+            radius,
+            low,
+            high,
+            before.descriptors[source].view(np.uint64),
+            np.ones(len(frame.features), np.bool_),
+            tracker,
+            1.0,
+        )
+        hit = np.flatnonzero(found >= 0)
+        hit = hit[
+            consistent_orientation(before.angle[source[hit]], frame.features.angle[found[hit]])
+        ]
+        if len(hit) < config.min_inliers_motion:
+            continue
+        frame.landmark[:] = -1
+        frame.xyz[:] = np.nan
+        frame.landmark[found[hit]] = previous.landmark[source[hit]]
+        frame.xyz[found[hit]] = points[hit]
+        inliers = _refine(frame, T_cw, tracker)
+        if inliers >= config.min_inliers_motion:
+            break
+    return inliers
+
+
+def trackable_points(
+    previous: Frame, tracker: Tracker
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """World points ``(M, 3)`` that a frame saw, and the ``(M,)`` features that saw them."""
+    points = previous.xyz.copy()
+    known = np.isfinite(points[:, 0])
+    depth = feature_depth(previous.features, tracker.camera)
+    close = ~known & (depth < tracker.close_depth) & (depth > 0)
+    lifted = tracker.camera.backproject(previous.features.xy[close], depth[close])
+    points[close] = transform(np.linalg.inv(previous.T_cw), lifted)
+    source = np.flatnonzero(known | close)
+    return points[source], source
+
+
+def track_descriptors(
+    frame: Frame,
+    ids: NDArray[np.int32],
+    xyz: NDArray[np.float64],
+    descriptors: NDArray[np.uint64],
+    T_cw: NDArray[np.float64],
+    tracker: Tracker,
+) -> int:
+    """Match landmarks by descriptor alone and refine the pose from ``T_cw``: no prediction needed.
+
+    Args:
+        ids, xyz, descriptors: ``(M,)``, ``(M, 3)``, ``(M, 4)`` landmarks of the reference keyframe.
+    """
+    config = tracker.config.tracking
+    found = search_all(
+        descriptors,
+        frame.features.descriptors.view(np.uint64),
+        config.reference_distance,
+        config.reference_ratio,
+    )
+    hit = np.flatnonzero(found >= 0)
+    frame.landmark[:] = -1
+    frame.xyz[:] = np.nan
+    if len(hit) < config.min_inliers_lost:
+        return 0
+    frame.landmark[found[hit]] = ids[hit]
+    frame.xyz[found[hit]] = xyz[hit]
+    return _refine(frame, T_cw, tracker)
+
+
+def track_local_map(
+    frame: Frame, local: LocalMap, tracker: Tracker, *, widening: float = 1.0
+) -> tuple[int, int, NDArray[np.int32]]:
+    """Match every local landmark that should be visible, then refine the pose with all matches.
+
+    Returns:
+        Matches, inliers, and the ids of the landmarks that should be visible.
+    """
+    config, camera = tracker.config.tracking, tracker.camera
+    points = np.flatnonzero(frame.landmark < 0)
+    frame.xyz[points] = np.nan  # points outside the map have done their work
+    tracked = np.isin(local.ids, frame.landmark[frame.landmark >= 0])
+    uvr, radius, octave = predict_view(
+        frame.T_cw,
+        local.xyz,
+        local.normal,
+        local.reach,
+        camera.intrinsics,
+        camera.width,
+        camera.height,
+        tracker.scales,
+        config.local_window * widening,
+    )
+    visible = radius > 0
+    radius[tracked] = 0.0
+    found = _search(
+        frame,
+        uvr,
+        radius,
+        octave - 1,
+        octave,
+        local.descriptor,
+        frame.landmark < 0,
+        tracker,
+        config.match_ratio,
+    )
+    hit = np.flatnonzero(found >= 0)
+    frame.landmark[found[hit]] = local.ids[hit]
+    frame.xyz[found[hit]] = local.xyz[hit]
+    matches = int(np.count_nonzero(frame.landmark >= 0))
+    inliers = _refine(frame, frame.T_cw, tracker)
+    return matches, inliers, local.ids[visible | tracked]
+
+
+@kernel
+def predict_view(T, xyz, normal, reach, intrinsics, width, height, scales, window):
+    """Where landmarks should appear (ORB-SLAM, V-D): in the image, within reach, seen from a
+    direction at most 60 degrees off the mean one.
+
+    Returns:
+        ``uvr`` ``(N, 3)``; search radius ``(N,)``, 0 if not visible; octave ``(N,)`` int64.
+    """
+    n = len(xyz)
+    fx, fy, cx, cy, bf = intrinsics
+    uvr = np.zeros((n, 3))
+    radius = np.zeros(n)
+    octave = np.zeros(n, np.int64)
+    log_scale = np.log(scales[1] / scales[0])
+    centre = np.empty(3)
+    for i in range(3):
+        centre[i] = -(T[0, i] * T[0, 3] + T[1, i] * T[1, 3] + T[2, i] * T[2, 3])
+    for i in range(n):
+        p = xyz[i]
+        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        if z <= 0.1:
+            continue
+        x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+        u = fx * x / z + cx
+        if u < 0.0 or u >= width:
+            continue
+        y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+        v = fy * y / z + cy
+        if v < 0.0 or v >= height:
+            continue
+        dx, dy, dz = p[0] - centre[0], p[1] - centre[1], p[2] - centre[2]
+        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if distance < 0.8 * reach[i, 0] or distance > 1.2 * reach[i, 1]:
+            continue
+        cos = (dx * normal[i, 0] + dy * normal[i, 1] + dz * normal[i, 2]) / distance
+        if cos < 0.5:
+            continue
+        octave[i] = predict_octave(distance, reach[i, 1], log_scale, len(scales))
+        uvr[i, 0], uvr[i, 1], uvr[i, 2] = u, v, u - bf / z
+        # Seen head-on the prediction is better.
+        radius[i] = (window if cos > 0.998 else 1.6 * window) * scales[octave[i]]
+    return uvr, radius, octave
+
+
+def _search(
+    frame: Frame,
+    uvr: NDArray[np.float64],
+    radius: NDArray[np.float64],
+    octave_low: NDArray[np.int64],
+    octave_high: NDArray[np.int64],
+    descriptors: NDArray[np.uint64],
+    free: NDArray[np.bool_],
+    tracker: Tracker,
+    ratio: float,
+) -> NDArray[np.int32]:
+    features, grid = frame.features, frame.grid
+    found, _ = search_windows(
+        uvr,
+        radius,
+        octave_low,
+        octave_high,
+        descriptors,
+        features.xy,
+        features.octave,
+        features.u_right,
+        features.descriptors.view(np.uint64),
+        free,
+        grid.start,
+        grid.items,
+        grid.columns,
+        tracker.config.tracking.match_distance,
+        ratio,
+    )
+    return found
+
+
+def _refine(frame: Frame, T_cw: NDArray[np.float64], tracker: Tracker) -> int:
+    """Optimise the pose from all matches, drop the outliers, return the number of inliers."""
+    matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
+    features = frame.features
+    uvr = np.empty((len(matched), 3))
+    uvr[:, :2] = features.xy[matched]
+    uvr[:, 2] = features.u_right[matched]
+    inverse_sigma2 = tracker.scales[features.octave[matched]] ** -2.0
+    frame.T_cw, inlier = optimise_pose(
+        T_cw, frame.xyz[matched], uvr, inverse_sigma2, tracker.camera.intrinsics
+    )
+    outliers = matched[~inlier]
+    frame.landmark[outliers] = -1
+    frame.xyz[outliers] = np.nan
+    return int(np.count_nonzero(inlier))
+
+
+def is_weak(inliers: int, config: TrackingConfig) -> bool:
+    """A pose on so few inliers is reported WEAK."""
+    return inliers < config.min_inliers

@@ -1,0 +1,276 @@
+"""The command line: quick help, plain refusals with exit code 2, and how a run is put together."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from vslam import cli, info
+from vslam.features import TrackingState, TrackResult
+from vslam.run import RunOutcome
+from vslam.trajectory import Trajectory, read_kitti_poses, write_kitti
+
+FRAMES = 12
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A KITTI tree in which the right eye lacks the last two frames."""
+    data = tmp_path / "kitti"
+    folder = data / "sequences" / "00"
+    rng = np.random.default_rng(0)
+    for eye, count in (("image_0", FRAMES), ("image_1", FRAMES - 2)):
+        (folder / eye).mkdir(parents=True)
+        for k in range(count):
+            image = rng.integers(0, 256, (32, 64), dtype=np.uint8)
+            cv2.imwrite(str(folder / eye / f"{k:06d}.png"), image)
+    (folder / "calib.txt").write_text(
+        "P0: 50 0 30 0 0 50 16 0 0 0 1 0\nP1: 50 0 30 -25 0 50 16 0 0 0 1 0\n"
+    )
+    np.savetxt(folder / "times.txt", 0.1 * np.arange(FRAMES))
+    (data / "poses").mkdir()
+    write_kitti(data / "poses" / "00.txt", circle(FRAMES))
+    return data
+
+
+def circle(n: int) -> np.ndarray:
+    T_wc = np.tile(np.eye(4), (n, 1, 1))
+    T_wc[:, 0, 3], T_wc[:, 2, 3] = np.cos(0.3 * np.arange(n)), np.sin(0.3 * np.arange(n))
+    return T_wc
+
+
+@pytest.fixture
+def call(monkeypatch, capsys, tmp_path):
+    """Run ``vslam`` with the given words in an empty folder: (exit code, stdout, stderr)."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("KITTI_ROOT", raising=False)
+
+    def run(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["vslam", *map(str, words)])
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        output = capsys.readouterr()
+        return code, output.out, output.err
+
+    return run
+
+
+@pytest.mark.parametrize("command", [[], ["run"], ["eval"], ["perturb"], ["info"]])
+def test_help_loads_nothing_heavy(command):
+    script = (
+        "import sys\n"
+        f"sys.argv = ['vslam', *{command!r}, '--help']\n"
+        "from vslam.cli import main\n"
+        "try:\n    main()\nexcept SystemExit as stop:\n    assert not stop.code\n"
+        "heavy = ('numpy', 'numba', 'cv2', 'evo', 'rerun', 'matplotlib', 'scipy', 'torch',\n"
+        "         'gtsam', 'pandas')\n"
+        "loaded = [name for name in heavy if name in sys.modules]\n"
+        "assert not loaded, loaded\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "Usage" in done.stdout
+
+
+def test_version(call):
+    assert call("--version") == (0, "0.1.0\n", "")
+
+
+def refused(result: tuple[int, str, str], *parts: str) -> None:
+    code, out, err = result
+    assert code == 2
+    assert out == ""
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    for part in parts:
+        assert part in err
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        ("--detector bow", ["--detector bow", "not built yet", "'none'"]),
+        ("--detector capsule", ["--detector capsule", "not built yet"]),
+        ("--detector orb", ["--detector orb", "unknown"]),
+        ("--sensor mono", ["--sensor mono", "not built yet", "'stereo'"]),
+        ("--sensor rgbd", ["--sensor rgbd", "not built yet"]),
+        ("--sensor lidar", ["--sensor lidar", "unknown"]),
+        ("--dataset synthetic", ["--dataset synthetic", "not built"]),
+        ("--dataset euroc", ["--dataset euroc", "unknown"]),
+        ("", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
+        ("--config nothing.json", ["nothing.json", "configuration"]),
+    ],
+)
+def test_run_refuses_without_data(call, words, parts):
+    refused(call("run", *words.split()), *parts)
+    assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        ("--seq 05", ["no such sequence", "00"]),
+        ("", ["unequal counts", "--max-frames 10"]),
+        ("--max-frames 5 --perturb fog", ["unknown law 'fog'", "brightness"]),
+        ("--max-frames 5 --start 99", ["--start 99"]),
+        ("--max-frames 5 --out kitti/poses/00.txt", ["cannot create a run folder", "--out"]),
+    ],
+)
+def test_run_refuses_bad_input(call, root, words, parts):
+    refused(call("run", "--data", root, *words.split()), *parts)
+    assert not Path("runs").exists()
+
+
+def test_root_from_the_environment(call, root, monkeypatch):
+    monkeypatch.setenv("KITTI_ROOT", str(root))
+    refused(call("run"), "unequal counts")
+
+
+def test_misspelt_option(call):
+    code, _, err = call("run", "--frames", "5")
+    assert code == 2
+    assert "No such option" in err
+
+
+def fake_result(index: int, T_wc: np.ndarray) -> TrackResult:
+    state = TrackingState.LOST if index == 3 else TrackingState.OK
+    return TrackResult(index, 0.1 * index, T_wc, state, 9, 9, 9, 9, False)
+
+
+@pytest.fixture
+def pipeline(monkeypatch) -> SimpleNamespace:
+    """In place of SLAM: returns the ground truth, shifted; notes what it was called with."""
+    calls = SimpleNamespace(interrupted=None)
+
+    def run_sequence(sequence, perturbation, settings, recorder, on_frame):
+        calls.settings, calls.recorder = settings, recorder
+        T_wc = sequence.ground_truth.copy()
+        T_wc[:, 1, 3] += 2.0
+        tracks = [fake_result(k, T_wc[k]) for k in range(len(sequence))]
+        for track in tracks:
+            on_frame(track)
+        trajectory = Trajectory(sequence.timestamps, T_wc)
+        return RunOutcome(
+            settings, sequence, trajectory, trajectory, tracks, [], wall_s=2.0, cpu_s=2.0,
+            startup_s=0.1, peak_memory_mb=1.0, n_keyframes=4, n_landmarks=99,
+            interrupted=calls.interrupted,
+        )  # fmt: skip
+
+    def write_report(outcome, evaluation, folder):
+        calls.evaluation = evaluation
+        (folder / "report.html").write_text("report")
+
+    contents = {
+        "pipeline": {"run_sequence": run_sequence},
+        "recorder": {"NullRecorder": lambda: "null", "RerunRecorder": lambda path: str(path)},
+        "report": {"write_report": write_report},
+    }
+    for name, members in contents.items():
+        module = ModuleType(f"vslam.{name}")
+        vars(module).update(members)
+        monkeypatch.setitem(sys.modules, f"vslam.{name}", module)
+    return calls
+
+
+def test_run_writes_its_folder_and_a_summary(call, root, pipeline):
+    code, out, err = call(
+        "run", "--data", root, "--max-frames", 10, "--perturb", "blur:0.5", "--threads", 3
+    )
+    assert code == 0, err
+    assert "10 done, 1 lost, 0 unreadable" in out
+    assert "5.0 fps" in out
+    assert "report.html" in out
+    assert "10/10" in err
+    folder = Path("runs/latest").resolve()
+    assert folder.name.endswith("-kitti-00-blur0.5-none")
+    assert pipeline.settings.threads == 3
+    assert pipeline.settings.perturb == "blur:0.5"
+    assert pipeline.recorder == str(Path("runs") / folder.name / "recording.rrd")
+    assert pipeline.evaluation.ate_rmse_m < 1e-9
+    assert len(read_kitti_poses(folder / "ground_truth_kitti.txt")) == 10
+    assert json.loads((folder / "config.json").read_text())["orb"]["n_features"] == 2000
+
+
+def test_quiet_run_says_nothing(call, root, pipeline):
+    assert call("run", "--data", root, "--max-frames", 10, "--no-record", "--quiet") == (0, "", "")
+    assert pipeline.recorder == "null"
+
+
+def test_clip_too_short_to_evaluate_is_reported_all_the_same(call, root, pipeline):
+    code, out, _ = call("run", "--data", root, "--max-frames", 1)
+    assert code == 0
+    assert pipeline.evaluation is None
+    assert "too little motion" in out
+
+
+def test_interrupted_run_keeps_its_results(call, root, pipeline):
+    pipeline.interrupted = "Ctrl-C"
+    code, out, _ = call("run", "--data", root, "--max-frames", 10)
+    assert code == 1
+    assert "Ctrl-C" in out
+    assert Path("runs/latest/trajectory_tum.txt").is_file()
+
+
+def test_eval(call, tmp_path):
+    T_wc = circle(50)
+    write_kitti(tmp_path / "gt.txt", T_wc)
+    T_wc[:, 1, 3] += np.tile([0.1, -0.1], 25)
+    write_kitti(tmp_path / "estimate.txt", T_wc)
+    code, out, _ = call("eval", "estimate.txt", "--gt", "gt.txt")
+    assert code == 0
+    assert "50 matched of 50" in out
+    assert "0.100 m" in out
+    assert "evo_ape kitti gt.txt estimate.txt --align\n" in out
+    code, out, _ = call("eval", "estimate.txt", "--gt", "gt.txt", "--json")
+    assert json.loads(out)["ate_rmse_m"] == pytest.approx(0.1, rel=1e-3)
+
+
+def test_eval_refusals(call, tmp_path):
+    write_kitti(tmp_path / "gt.txt", circle(50))
+    refused(call("eval", "nothing.txt", "--gt", "gt.txt"), "nothing.txt", "cannot read")
+    refused(call("eval", "gt.txt", "--gt", "gt.txt", "--align", "x"), "--align x", "se3, sim3")
+
+
+def test_perturb_writes_a_contact_sheet(call, root):
+    words = ("perturb", "--data", root, "--max-frames", 10, "--frames", 3)
+    code, out, _ = call(*words, "--out", "sheet.png")
+    assert code == 0
+    assert "frames 0, 4, 9" in out
+    assert cv2.imread("sheet.png").shape[0] == 3 * 240
+    refused(call(*words, "--out", "no/folder/sheet.png"), "no/folder/sheet.png", "--out")
+
+
+def test_info(call, root):
+    code, out, _ = call("info", "--data", root)
+    assert code == 0
+    assert "12 left, 10 right images" in out
+    for package in ("vslam", "numpy", "numba", "evo", "rerun-sdk", "opencv", "cores"):
+        assert package in out
+    code, out, _ = call("info", "--data", "nowhere")
+    assert code == 0
+    assert "nowhere: no KITTI odometry data" in out
+
+
+def test_two_opencv_wheels_are_noticed():
+    assert info.opencv_conflict({"numpy": "2", "opencv-python-headless": "5"}) is None
+    warning = info.opencv_conflict({"opencv-python": "5", "opencv-python-headless": "5"})
+    assert "opencv-python and opencv-python-headless" in warning
+
+
+def test_defects_are_not_dressed_up_as_bad_input(call, monkeypatch):
+    def broken() -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(cli, "app", broken)
+    with pytest.raises(ZeroDivisionError):
+        call("info")

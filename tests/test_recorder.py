@@ -1,0 +1,212 @@
+"""Recordings are valid, small, and never the end of a run."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+import textwrap
+from collections import namedtuple
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from vslam.camera import StereoCamera
+from vslam.features import Features, TrackingState, TrackResult
+from vslam.recorder import NullRecorder, Recorder, RerunRecorder
+from vslam.trajectory import Trajectory
+
+pytest.importorskip("rerun.chunk", reason="this rerun cannot read recordings in Python")
+
+CAMERA = StereoCamera(718.9, 718.9, 607.2, 185.2, 0.537, 1241, 376)
+FRAMES, FRAMES_PER_KEYFRAME, LANDMARKS_PER_KEYFRAME = 100, 3, 150
+
+
+def _pose(frame: int) -> NDArray[np.float64]:
+    T_wc = np.eye(4)
+    T_wc[:3, :3] = [[np.cos(0.01 * frame), 0, np.sin(0.01 * frame)], [0, 1, 0], [0, 0, 0]]
+    T_wc[2, :3] = [-np.sin(0.01 * frame), 0, np.cos(0.01 * frame)]
+    T_wc[:3, 3] = [0.1 * frame, 0.0, frame]
+    return T_wc
+
+
+def _result(frame: int) -> TrackResult:
+    stage_ms = {"extract": 16.0, "track": 5.0}
+    if is_keyframe := frame % FRAMES_PER_KEYFRAME == 0:
+        stage_ms["bundle"] = 15.0
+    state = TrackingState.LOST if 40 <= frame < 44 else TrackingState.OK
+    return TrackResult(
+        frame, 0.1 * frame, _pose(frame), state, 2000, 1100, 500, 400, is_keyframe, stage_ms
+    )
+
+
+def _image(rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Texture at several scales: a JPEG of it is somewhat larger than one of a KITTI image."""
+    import cv2
+
+    image = np.zeros((CAMERA.height, CAMERA.width))
+    for scale in (4, 8, 16, 64):
+        shape = (CAMERA.height // scale + 1, CAMERA.width // scale + 1)
+        image += cv2.resize(rng.normal(0.0, 22.0, shape), (CAMERA.width, CAMERA.height))
+    return np.clip(image + 120.0, 0, 255).astype(np.uint8)
+
+
+def _features(rng: np.random.Generator, n: int = 2000) -> Features:
+    return Features(
+        xy=(rng.random((n, 2)) * [CAMERA.width, CAMERA.height]).astype(np.float32),
+        octave=np.zeros(n, np.uint8),
+        angle=np.zeros(n, np.float32),
+        descriptors=np.zeros((n, 32), np.uint8),
+        u_right=np.full(n, np.nan, np.float32),
+    )
+
+
+def record(recorder: Recorder, frames: int = FRAMES) -> None:
+    """Play a run into a recorder as the pipeline does."""
+    rng = np.random.default_rng(0)
+    image = _image(rng)
+    poses = np.array([_pose(frame) for frame in range(frames)])
+    offset = np.eye(4)
+    offset[:3, 3] = [100.0, 0.0, 50.0]
+    recorder.begin(CAMERA, Trajectory(0.1 * np.arange(frames), offset @ poses))
+    xyz = np.zeros((0, 3))
+    for frame in range(frames):
+        result = _result(frame)
+        recorder.frame(result, result.T_wc)
+        if result.is_keyframe:
+            features = _features(rng)
+            # Equal images would be compressed away.
+            image = np.roll(image, rng.integers(1, 100), axis=1)
+            recorder.keyframe(result, image, features, rng.random(2000) < 0.25)
+            new = rng.normal(0.0, 20.0, (LANDMARKS_PER_KEYFRAME, 3)) + result.T_wc[:3, 3]
+            xyz = np.concatenate([xyz, new])
+            recorder.map(poses[: frame + 1 : FRAMES_PER_KEYFRAME], xyz)
+    recorder.finish(Trajectory(0.1 * np.arange(frames), poses), poses[::FRAMES_PER_KEYFRAME], xyz)
+
+
+def rows(path: Path, entity: str) -> list[dict[str, Any]]:
+    """All rows of an entity, static ones too, in the order of their frames."""
+    from rerun.chunk import RrdReader
+
+    found: list[dict[str, Any]] = []
+    for chunk in RrdReader(path).stream():
+        if chunk.entity_path == f"/{entity}":
+            found += chunk.to_record_batch().to_pylist()
+    return sorted(found, key=lambda row: row.get("frame", -1))
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("run") / "recording.rrd"
+    record(RerunRecorder(path))
+    return path
+
+
+def test_entities_and_their_frames(recording: Path) -> None:
+    keyframes = len(range(0, FRAMES, FRAMES_PER_KEYFRAME))
+    expected = {
+        "world": 1,
+        "world/camera": FRAMES,
+        "world/camera/image": 1 + keyframes,
+        "world/camera/image/tracked": 1 + keyframes,
+        "world/camera/image/untracked": 1 + keyframes,
+        "world/landmarks": 1 + 2 + 1,
+        "world/keyframes": 2 + 1,
+        "world/ground_truth": 1,
+        "world/trajectory": 1,
+        "points/inliers": 1 + FRAMES,
+        "stage_ms/extract": FRAMES,
+        "stage_ms/bundle": keyframes,
+        "state": 3,
+    }
+    assert {entity: len(rows(recording, entity)) for entity in expected} == expected
+
+
+def test_size_budget(recording: Path) -> None:
+    # The map grows with the run, but at 30,000 points for one in 75 frames it adds 5 MB at most.
+    assert 1000 / FRAMES * recording.stat().st_size + 5e6 < 50e6
+
+
+def test_poses_keep_their_orientation(recording: Path) -> None:
+    row = rows(recording, "world/camera")[60]
+    assert row["frame"] == 60
+    columns = np.array(row["Transform3D:mat3x3"]).reshape(3, 3)
+    np.testing.assert_allclose(columns.T, _pose(60)[:3, :3], atol=1e-6)
+    np.testing.assert_allclose(row["Transform3D:translation"][0], _pose(60)[:3, 3], atol=1e-5)
+
+
+def test_ground_truth_starts_where_the_estimate_does(recording: Path) -> None:
+    (strip,) = rows(recording, "world/ground_truth")[0]["LineStrips3D:strips"]
+    np.testing.assert_allclose(strip[0], [0.0, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(strip[-1], _pose(FRAMES - 1)[:3, 3], atol=1e-4)
+
+
+def test_image_is_half_size_jpeg(recording: Path) -> None:
+    import cv2
+
+    row = rows(recording, "world/camera/image")[-1]
+    jpeg = np.array(row["EncodedImage:blob"][0], np.uint8)
+    assert cv2.imdecode(jpeg, cv2.IMREAD_UNCHANGED).shape == (188, 620)
+    assert len(jpeg) < 35_000
+
+
+def test_a_run_without_frames(tmp_path: Path) -> None:
+    recorder = RerunRecorder(tmp_path / "recording.rrd")
+    recorder.begin(CAMERA, None)
+    recorder.finish(
+        Trajectory(np.zeros(0), np.zeros((0, 4, 4))), np.zeros((0, 4, 4)), np.zeros((0, 3))
+    )
+    assert rows(tmp_path / "recording.rrd", "world")
+
+
+def test_null_recorder_takes_every_call() -> None:
+    record(NullRecorder(), frames=4)
+
+
+def test_unwritable_path_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING, "vslam.recorder"):
+        record(RerunRecorder(tmp_path / "missing" / "recording.rrd"), frames=4)
+    assert "recording ends here" in caplog.text
+
+
+def test_almost_full_disk_ends_the_recording_cleanly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    usage = namedtuple("usage", "total used free")
+    free = iter([2**40, 2**40, 2**20])
+    monkeypatch.setattr("shutil.disk_usage", lambda _: usage(0, 0, next(free)))
+    with caplog.at_level(logging.WARNING, "vslam.recorder"):
+        record(RerunRecorder(tmp_path / "recording.rrd"), frames=20)
+    assert "almost full" in caplog.text
+    assert len(rows(tmp_path / "recording.rrd", "world/camera/image")) == 1 + 2
+    assert len(rows(tmp_path / "recording.rrd", "world/camera")) == 7
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on the size of files")
+def test_failing_disk_neither_ends_nor_hangs_the_run(tmp_path: Path) -> None:
+    # Rerun's writer thread dies at the limit; in a process of its own, for it must end, too.
+    script = """
+        import resource, sys
+        from pathlib import Path
+        import vslam.recorder
+        from test_recorder import RerunRecorder, record
+
+        vslam.recorder._FLUSH_TIMEOUT_S = 1.0
+        recorder = RerunRecorder(Path(sys.argv[1]))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+        record(recorder)
+        print("finished")
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script), str(tmp_path / "recording.rrd")],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0
+    assert done.stdout == "finished\n"
+    assert "recording ends here" in done.stderr

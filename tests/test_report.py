@@ -1,0 +1,303 @@
+"""Reports of runs in every state of completion."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from vslam.camera import StereoCamera
+from vslam.config import Config, load_config
+from vslam.evaluate import evaluate, read_pair
+from vslam.features import TrackingState, TrackResult
+from vslam.report import write_report
+from vslam.report.schema import ReportJson
+from vslam.run import LoopRow, RunOutcome, RunSettings
+from vslam.runfolder import matched_ground_truth
+from vslam.trajectory import Trajectory, read_trajectory
+
+FIGURES = {
+    "top_view",
+    "error_along_path",
+    "error_histogram",
+    "tracked_points",
+    "stage_times",
+    "stage_distribution",
+}
+
+
+@dataclass(frozen=True)
+class _Sequence:
+    timestamps: NDArray[np.float64]
+    ground_truth: NDArray[np.float64] | None
+    dataset: str = "kitti"
+    name: str = "00"
+
+    @property
+    def camera(self) -> StereoCamera:
+        return StereoCamera(718.9, 718.9, 607.2, 185.2, 0.537, 1241, 376)
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def read(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        raise AssertionError("a report must not read images")
+
+
+def _drive(frames: int) -> NDArray[np.float64]:
+    """``T_wc`` of a car on a bent loop at 1 m a frame, facing where it goes."""
+    s = np.linspace(0.0, 2.0 * np.pi * frames / 600.0, frames)
+    radius = 95.0 + 22.0 * np.sin(3.0 * s)
+    x, z = radius * (1.0 - np.cos(s)), radius * np.sin(s)
+    heading = np.arctan2(np.gradient(x), np.gradient(z)) if frames > 1 else np.zeros(1)
+    T_wc = np.tile(np.eye(4), (frames, 1, 1))
+    T_wc[:, 0, 0] = T_wc[:, 2, 2] = np.cos(heading)
+    T_wc[:, 0, 2], T_wc[:, 2, 0] = np.sin(heading), -np.sin(heading)
+    T_wc[:, 0, 3], T_wc[:, 2, 3] = x, z
+    return np.linalg.inv(T_wc[:1]) @ T_wc
+
+
+def make_outcome(
+    frames: int = 160,
+    *,
+    lost: slice = slice(100, 106),
+    ground_truth: bool = True,
+    keyframe_every: int = 4,
+) -> RunOutcome:
+    """A run with drift, weak frames around the lost ones, and slower keyframes."""
+    rng = np.random.default_rng(0)
+    timestamps = np.arange(frames) * 0.1
+    truth = _drive(frames)
+    T_wc = truth.copy()
+    T_wc[:, :3, 3] += np.cumsum(rng.normal(0.0, 0.02, (frames, 3)), axis=0)
+    states = np.full(frames, TrackingState.OK, dtype=object)
+    states[max(lost.start - 4, 0) : lost.stop + 4] = TrackingState.WEAK
+    states[lost] = TrackingState.LOST
+    tracks = []
+    for i, state in enumerate(states):
+        n_stereo = int(900 + 250 * np.sin(i / 40.0) + rng.integers(0, 60))
+        share = {TrackingState.OK: 0.42, TrackingState.WEAK: 0.03, TrackingState.LOST: 0.008}[state]
+        n_inliers = int(share * n_stereo)
+        is_keyframe = i % keyframe_every == 0
+        stage_ms = {
+            "read": rng.gamma(20.0, 0.3),
+            "extract": rng.gamma(80.0, 0.2),
+            "stereo": rng.gamma(30.0, 0.1),
+            "track": rng.gamma(25.0, 0.2),
+        }
+        if is_keyframe:
+            stage_ms |= {"map": rng.gamma(12.0, 1.0), "bundle": rng.gamma(9.0, 2.0)}
+        tracks.append(
+            TrackResult(
+                index=i,
+                timestamp=float(timestamps[i]),
+                T_wc=T_wc[i],
+                state=state,
+                n_features=2000,
+                n_stereo=n_stereo,
+                n_matches=int(1.3 * n_inliers) + 20,
+                n_inliers=n_inliers,
+                is_keyframe=is_keyframe,
+                stage_ms=stage_ms,
+            )
+        )
+    settings = RunSettings(
+        dataset="kitti",
+        sequence="00",
+        perturb="brightness:1",
+        detector="none",
+        sensor="stereo",
+        seed=3,
+        threads=2,
+        start=0,
+        every=1,
+        max_frames=frames,
+        config=Config(),
+    )
+    return RunOutcome(
+        settings=settings,
+        sequence=_Sequence(timestamps, truth if ground_truth else None),
+        trajectory=Trajectory(timestamps, T_wc),
+        keyframes=Trajectory(timestamps[::keyframe_every], T_wc[::keyframe_every]),
+        tracks=tracks,
+        skipped=[],
+        wall_s=frames * 0.04,
+        cpu_s=frames * 0.055,
+        startup_s=1.9,
+        peak_memory_mb=612.0,
+        n_keyframes=len(T_wc[::keyframe_every]),
+        n_landmarks=60 * frames,
+    )
+
+
+def report_of(outcome: RunOutcome, folder: Path) -> ReportJson:
+    """Write the report as the command line does, read back its JSON."""
+    ground_truth = matched_ground_truth(outcome)
+    evaluation = None
+    if ground_truth is not None and len(ground_truth) > 2:
+        evaluation = evaluate(outcome.trajectory, ground_truth)
+    write_report(outcome, evaluation, folder)
+    return ReportJson.model_validate_json((folder / "report.json").read_bytes())
+
+
+def figures_of(folder: Path) -> set[str]:
+    return {path.stem for path in (folder / "figures").glob("*.png")}
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunOutcome, Path]:
+    folder = tmp_path_factory.mktemp("run")
+    loops = [
+        LoopRow(140, 3, 0.93, 84, True, ""),
+        LoopRow(151, 40, 0.71, 9, False, "9 inliers, 20 needed | <b>"),
+    ]
+    outcome = replace(make_outcome(), loops=loops, skipped=["000007.png: truncated <file>"])
+    report_of(outcome, folder)
+    return outcome, folder
+
+
+def test_all_files_are_written(written: tuple[RunOutcome, Path]) -> None:
+    _, folder = written
+    names = {path.name for path in folder.iterdir()}
+    assert names >= {
+        "config.json",
+        "ground_truth_kitti.txt",
+        "keyframes.tum",
+        "report.html",
+        "report.json",
+        "report.md",
+        "trajectory_kitti.txt",
+    }
+    assert figures_of(folder) == FIGURES
+    assert load_config(folder / "config.json") == Config()
+
+
+def test_json_holds_the_numbers_of_the_run(written: tuple[RunOutcome, Path]) -> None:
+    outcome, folder = written
+    truth = matched_ground_truth(outcome)
+    assert truth is not None
+    evaluation = evaluate(outcome.trajectory, truth)
+    report = json.loads((folder / "report.json").read_text())
+    for name in ("ate_rmse_m", "rpe_m", "rpe_deg", "t_rel_percent", "alignment"):
+        assert report[name] == getattr(evaluation, name)
+    assert (report["lost_frames"], report["weak_frames"], report["frames"]) == (6, 8, 160)
+    assert (report["skipped_frames"], report["skipped_messages"]) == (1, outcome.skipped)
+    assert report["fps"] == pytest.approx(25.0)
+    assert report["cpu_ms_per_frame"] == pytest.approx(55.0)
+    assert report["keyframes"] == 40
+    assert report["landmarks"] == 9600
+    assert report["seed"] == 3
+    assert report["loops"][0] == vars(outcome.loops[0])
+    mapping = [track.stage_ms["map"] for track in outcome.tracks if track.is_keyframe]
+    assert report["stage_ms"]["map"]["mean"] == pytest.approx(np.mean(mapping))
+    assert report["stage_ms"]["map"]["median"] == pytest.approx(np.median(mapping))
+
+
+def test_json_round_trips_through_its_schema(written: tuple[RunOutcome, Path]) -> None:
+    text = (written[1] / "report.json").read_text()
+    assert ReportJson.model_validate_json(text).model_dump_json(indent=2) + "\n" == text
+
+
+def test_evo_command_names_files_that_reproduce_the_ate(written: tuple[RunOutcome, Path]) -> None:
+    _, folder = written
+    report = ReportJson.model_validate_json((folder / "report.json").read_bytes())
+    truth, estimate = folder / "ground_truth_kitti.txt", folder / "trajectory_kitti.txt"
+    assert report.evo_command == f"evo_ape kitti {truth} {estimate} --align"
+    again = evaluate(*read_pair(estimate, truth))
+    assert again.ate_rmse_m == pytest.approx(report.ate_rmse_m, abs=1e-9)
+
+
+def test_lost_frames_come_first_in_every_text(written: tuple[RunOutcome, Path]) -> None:
+    _, folder = written
+    assert next(iter(json.loads((folder / "report.json").read_text()))) == "schema_version"
+    for name in ("report.json", "report.md", "report.html"):
+        text = (folder / name).read_text().lower().replace("_", " ")
+        assert 0 < text.index("lost frames") < text.index("ate rmse")
+
+
+def test_html_is_self_contained(written: tuple[RunOutcome, Path]) -> None:
+    html = (written[1] / "report.html").read_text()
+    assert len(re.findall("<svg", html)) == len(FIGURES)
+    assert not re.search(r"(src|href|action|data)\s*=\s*[\"']?\s*(https?:)?//", html)
+    assert not re.search(r"@import|url\((?!#)|<script", html.replace("url('#", "url(#"))
+    assert "truncated &lt;file&gt;" in html
+    assert "20 needed | &lt;b&gt;" in html
+
+
+def test_svg_ids_do_not_clash_in_the_page(written: tuple[RunOutcome, Path]) -> None:
+    html = (written[1] / "report.html").read_text()
+    clips = re.findall(r"<clipPath id=\"(\w+)\"", html)
+    assert clips
+    assert len(clips) == len(set(clips))
+
+
+def test_markdown_tables_are_aligned(written: tuple[RunOutcome, Path]) -> None:
+    tables = (written[1] / "report.md").read_text().split("\n\n")
+    for table in (block for block in tables if block.startswith("|")):
+        assert len({len(line) for line in table.splitlines()}) == 1
+
+
+def test_figures_are_reproducible(written: tuple[RunOutcome, Path], tmp_path: Path) -> None:
+    outcome, folder = written
+    report_of(outcome, tmp_path)
+    for path in (folder / "figures").iterdir():
+        assert path.read_bytes() == (tmp_path / "figures" / path.name).read_bytes()
+
+
+def test_without_ground_truth(tmp_path: Path) -> None:
+    report = report_of(make_outcome(40, ground_truth=False, lost=slice(20, 21)), tmp_path)
+    assert report.ate_rmse_m is report.evo_command is report.alignment is None
+    assert not (tmp_path / "ground_truth_kitti.txt").exists()
+    assert figures_of(tmp_path) == FIGURES - {"error_along_path", "error_histogram"}
+    assert "n/a" in (tmp_path / "report.md").read_text()
+
+
+def test_of_one_frame(tmp_path: Path) -> None:
+    report = report_of(make_outcome(1, lost=slice(0, 0)), tmp_path)
+    assert (report.frames, report.keyframes, report.ate_rmse_m) == (1, 1, None)
+    assert "top_view" in figures_of(tmp_path)
+
+
+def test_of_all_frames_lost(tmp_path: Path) -> None:
+    report = report_of(make_outcome(30, lost=slice(0, 30)), tmp_path)
+    assert (report.lost_frames, report.weak_frames) == (30, 0)
+    assert "100.0 % of 30" in (tmp_path / "report.md").read_text()
+
+
+def test_interrupted_before_the_first_keyframe(tmp_path: Path) -> None:
+    outcome = make_outcome(3, lost=slice(0, 0))
+    nothing = outcome.keyframes.select(np.arange(0))
+    outcome = replace(outcome, keyframes=nothing, n_keyframes=0, interrupted="Ctrl-C")
+    assert report_of(outcome, tmp_path).interrupted == "Ctrl-C"
+    assert (tmp_path / "keyframes.tum").read_text() == ""
+    for name in ("report.md", "report.html"):
+        assert "Interrupted: Ctrl-C" in (tmp_path / name).read_text()
+
+
+def test_interrupted_before_the_first_frame(tmp_path: Path) -> None:
+    outcome = make_outcome(3, lost=slice(0, 0), ground_truth=False)
+    nothing = outcome.trajectory.select(np.arange(0))
+    outcome = replace(outcome, trajectory=nothing, keyframes=nothing, tracks=[], wall_s=0.0)
+    report = report_of(replace(outcome, interrupted="disk full"), tmp_path)
+    assert (report.frames, report.fps, report.cpu_ms_per_frame) == (0, 0.0, 0.0)
+    assert figures_of(tmp_path) == set()
+
+
+def test_ground_truth_of_the_frames_done_only(tmp_path: Path) -> None:
+    outcome = make_outcome(60, lost=slice(0, 0))
+    done = np.setdiff1d(np.arange(50), [7, 8])
+    outcome = replace(
+        outcome,
+        trajectory=outcome.trajectory.select(done),
+        tracks=[outcome.tracks[i] for i in done],
+        skipped=["7.png: damaged", "8.png: damaged"],
+    )
+    report_of(outcome, tmp_path)
+    truth = read_trajectory(tmp_path / "ground_truth_kitti.txt")
+    assert outcome.sequence.ground_truth is not None
+    np.testing.assert_allclose(truth.T_wc, outcome.sequence.ground_truth[done], atol=1e-9)

@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vslam.errors import InputError
+from vslam.trajectory import (
+    Trajectory,
+    read_kitti_poses,
+    read_trajectory,
+    trajectory_format,
+    write_kitti,
+    write_tum,
+)
+
+
+@pytest.fixture
+def trajectory() -> Trajectory:
+    rng = np.random.default_rng(0)
+    T_wc = np.tile(np.eye(4), (20, 1, 1))
+    T_wc[:, :3, :3] = Rotation.random(20, rng=rng).as_matrix()
+    T_wc[:, :3, 3] = rng.normal(0, 300, (20, 3))
+    return Trajectory(1305031102.175304 + 0.1 * np.arange(20), T_wc)
+
+
+def test_kitti_round_trip(tmp_path, trajectory):
+    path = tmp_path / "poses.txt"
+    write_kitti(path, trajectory.T_wc)
+    np.testing.assert_allclose(read_kitti_poses(path), trajectory.T_wc, atol=1e-9)
+    read = read_trajectory(path, trajectory.timestamps)
+    np.testing.assert_array_equal(read.timestamps, trajectory.timestamps)
+    np.testing.assert_array_equal(read_trajectory(path).timestamps, np.arange(20))
+    assert trajectory_format(path) == "kitti"
+
+
+def test_tum_round_trip(tmp_path, trajectory):
+    path = tmp_path / "trajectory.txt"
+    write_tum(path, trajectory)
+    read = read_trajectory(path)
+    np.testing.assert_allclose(read.timestamps, trajectory.timestamps, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(read.T_wc, trajectory.T_wc, atol=1e-8)
+    assert trajectory_format(path) == "tum"
+    assert (np.loadtxt(path)[:, 7] >= 0).all()
+
+
+def test_equal_poses_are_written_as_equal_bytes(tmp_path):
+    T_wc = np.eye(4)[None].copy()
+    write_kitti(tmp_path / "a.txt", T_wc)
+    T_wc[0, 0, 3] = -0.0
+    write_kitti(tmp_path / "b.txt", T_wc)
+    assert (tmp_path / "a.txt").read_bytes() == (tmp_path / "b.txt").read_bytes()
+
+
+def test_comments_and_blank_lines_are_passed_over(tmp_path):
+    path = tmp_path / "trajectory.txt"
+    path.write_text("# t x y z qx qy qz qw\n\n0 1 2 3 0 0 0 1\n")
+    np.testing.assert_array_equal(read_trajectory(path).T_wc[0, :3, 3], [1, 2, 3])
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("", "empty"),
+        ("0 1 2\n", "line 1 has 3 numbers where a pose takes 12 or 8"),
+        ("0 1 2 3 0 0 0 1\n1 2 3\n", "line 2 has 3 numbers where a pose takes 8"),
+        ("0 1 2 3 0 0 0 x\n", "line 1 is not a row of numbers"),
+        ("0 1 2 3 0 0 nan 1\n", "line 1 holds NaN"),
+        ("0 1 2 3 0 0 0 2\n", "quaternion is not of length 1"),
+        ("1 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n", "pose 2 is not later"),
+        ("2 0 0 0 0 2 0 0 0 0 2 0\n", "pose 1 is not a rotation"),
+        ("-1 0 0 0 0 1 0 0 0 0 1 0\n", "pose 1 is not a rotation"),
+    ],
+)
+def test_malformed_files(tmp_path, text, part):
+    path = tmp_path / "trajectory.txt"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_trajectory(path)
+    assert part in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_binary_and_missing_files(tmp_path):
+    (tmp_path / "binary").write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match="not a text file"):
+        read_trajectory(tmp_path / "binary")
+    with pytest.raises(InputError, match="cannot read"):
+        read_trajectory(tmp_path / "missing")
+
+
+def test_other_number_of_timestamps(tmp_path, trajectory):
+    write_kitti(tmp_path / "poses.txt", trajectory.T_wc)
+    with pytest.raises(InputError, match="20 poses but 3 timestamps"):
+        read_trajectory(tmp_path / "poses.txt", np.arange(3.0))

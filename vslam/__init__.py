@@ -1,0 +1,33 @@
+"""vslam: visual SLAM in pure Python.
+
+>>> from vslam import Slam
+>>> slam = Slam(camera)
+>>> result = slam.step(left, right, timestamp)
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+__all__ = ["Slam", "StereoCamera", "TrackResult", "TrackingState", "__version__"]
+
+_HOME = {
+    "Slam": "vslam.slam",
+    "StereoCamera": "vslam.camera",
+    "TrackResult": "vslam.features",
+    "TrackingState": "vslam.features",
+}
+
+if TYPE_CHECKING:
+    from vslam.camera import StereoCamera
+    from vslam.features import TrackingState, TrackResult
+    from vslam.slam import Slam
+
+
+def __getattr__(name: str) -> Any:
+    """Import the public names on first use, so that ``vslam --help`` stays instant."""
+    if name in _HOME:
+        return getattr(import_module(_HOME[name]), name)
+    raise AttributeError(f"module 'vslam' has no attribute {name!r}")

@@ -1,0 +1,56 @@
+"""Rectified pinhole cameras.
+
+Camera frame: x right, y down, z forward. Units: metres and pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class StereoCamera:
+    """A rectified stereo pair: both eyes share one focal length, rows correspond.
+
+    Attributes:
+        fx, fy: focal lengths in pixels.
+        cx, cy: principal point of the left eye in pixels.
+        baseline: distance from the left to the right eye in metres, positive.
+        width, height: image size in pixels.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    baseline: float
+    width: int
+    height: int
+
+    @property
+    def bf(self) -> float:
+        """Baseline times focal length: disparity in pixels is ``bf / z``."""
+        return self.baseline * self.fx
+
+    @property
+    def intrinsics(self) -> NDArray[np.float64]:
+        """``(5,)`` float64 ``[fx, fy, cx, cy, bf]``, the form that the kernels take."""
+        return np.array([self.fx, self.fy, self.cx, self.cy, self.bf])
+
+    def project(self, p_c: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Project ``(N, 3)`` points of the left camera to ``(N, 3)`` rows ``u, v, u_right``."""
+        x, y, z = p_c.T
+        u = self.fx * x / z + self.cx
+        return np.stack([u, self.fy * y / z + self.cy, u - self.bf / z], axis=1)
+
+    def backproject(
+        self, xy: NDArray[np.floating], depth: NDArray[np.floating]
+    ) -> NDArray[np.float64]:
+        """Lift ``(N, 2)`` pixels at ``(N,)`` depths (m) to ``(N, 3)`` points of the left camera."""
+        z = np.asarray(depth, np.float64)
+        x = (xy[:, 0] - self.cx) * z / self.fx
+        y = (xy[:, 1] - self.cy) * z / self.fy
+        return np.stack([x, y, z], axis=1)

@@ -1,0 +1,298 @@
+"""The command line. Heavy imports stay inside the commands, so that --help answers at once."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vslam import __version__
+from vslam.errors import InputError
+
+if TYPE_CHECKING:
+    from vslam.evaluate import Evaluation
+    from vslam.run import RunOutcome
+
+app = typer.Typer(
+    help="Visual SLAM in pure Python.",
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+_DETECTORS = {"none": True, "bow": False, "capsule": False, "capsule-pruned": False}
+_DETECTORS |= {"alexnet": False, "vgg16": False}
+_SENSORS = {"stereo": True, "mono": False, "rgbd": False}
+
+Data = Annotated[
+    Path,
+    typer.Option(envvar="KITTI_ROOT", help="Folder with the data set, see datasets.md."),
+]
+Dataset = Annotated[str, typer.Option(help="Data set; this version reads [b]kitti[/b].")]
+Seq = Annotated[str, typer.Option(help="Sequence, 00 for example.")]
+Perturb = Annotated[
+    str,
+    typer.Option(
+        help="Photometric laws, each with a strength, joined by commas: brightness, gamma, "
+        "flicker, noise, blur, occlusion. Example: [b]brightness:1.5,blur:0.5[/b]"
+    ),
+]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all that is random.")]
+Start = Annotated[int, typer.Option(min=0, help="First frame.")]
+Every = Annotated[int, typer.Option(min=1, help="Take every N-th frame.")]
+MaxFrames = Annotated[int | None, typer.Option(min=1, help="Stop after so many frames.")]
+
+_DATA = Path("data/kitti")
+_LOOK_AT = (("report", "report.html"), ("recording", "recording.rrd"))
+
+_RUN_EXAMPLES = """
+[b]Examples[/b]
+
+  vslam run --data ~/kitti --seq 00
+
+  vslam run --data ~/kitti --seq 06 --perturb brightness:1.5,blur:0.5 --seed 3
+
+  vslam run --seq 00 --max-frames 200 --no-record --quiet
+"""
+
+
+@app.command(epilog=_RUN_EXAMPLES)
+def run(
+    data: Data = _DATA,
+    dataset: Dataset = "kitti",
+    seq: Seq = "00",
+    perturb: Perturb = "none",
+    start: Start = 0,
+    every: Every = 1,
+    max_frames: MaxFrames = None,
+    seed: Seed = 0,
+    threads: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Threads; the result does not depend on it.", show_default="cores, up to 4"
+        ),
+    ] = None,
+    detector: Annotated[str, typer.Option(help="Loop detector; in this version: none.")] = "none",
+    sensor: Annotated[str, typer.Option(help="In this version: stereo.")] = "stereo",
+    out: Annotated[Path, typer.Option(help="Where the folders of the runs go.")] = Path("runs"),
+    config: Annotated[
+        Path | None, typer.Option(help="JSON file with thresholds, as config.json of a run.")
+    ] = None,
+    record: Annotated[bool, typer.Option(help="Write a Rerun recording.")] = True,
+    ply: Annotated[bool, typer.Option("--ply", help="Write the landmarks as map.ply.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
+) -> None:
+    """Run SLAM on a sequence and write trajectory, map, recording and report to a folder."""
+    _require_built("--detector", detector, _DETECTORS)
+    _require_built("--sensor", sensor, _SENSORS)
+
+    from vslam.config import Config, load_config
+    from vslam.datasets import open_sequence
+    from vslam.info import available_cores
+    from vslam.perturb import parse_perturbation
+    from vslam.run import RunSettings
+    from vslam.runfolder import create_run_folder, matched_ground_truth, write_trajectories
+
+    thresholds = Config() if config is None else load_config(config)
+    sequence = open_sequence(dataset, data, seq, start=start, every=every, max_frames=max_frames)
+    perturbation = parse_perturbation(perturb, seed, sequence.timestamps)
+    folder = create_run_folder(out, dataset, seq, perturbation.name, detector)
+    settings = RunSettings(
+        dataset=dataset,
+        sequence=seq,
+        perturb=perturbation.name,
+        detector=detector,
+        sensor=sensor,
+        seed=seed,
+        threads=threads or min(available_cores(), 4),
+        start=start,
+        every=every,
+        max_frames=max_frames,
+        config=thresholds,
+    )
+    (folder / "config.json").write_text(thresholds.model_dump_json(indent=2) + "\n")
+
+    from vslam.evaluate import evaluate
+    from vslam.pipeline import run_sequence
+    from vslam.progress import progress_bar
+    from vslam.recorder import NullRecorder, RerunRecorder
+    from vslam.report import write_report
+
+    recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
+    with progress_bar(len(sequence), shown=not quiet) as on_frame:
+        outcome = run_sequence(sequence, perturbation, settings, recorder, on_frame=on_frame)
+    write_trajectories(folder, outcome)
+    evaluation, remark = None, "no ground truth"
+    if (ground_truth := matched_ground_truth(outcome)) is not None:
+        try:
+            evaluation = evaluate(outcome.trajectory, ground_truth)
+        except InputError as error:  # a clip too short to align is no reason to lose the run
+            remark = str(error)
+    write_report(outcome, evaluation, folder)
+    if not quiet:
+        _print_summary(outcome, evaluation, remark, folder)
+    if outcome.interrupted:
+        raise typer.Exit(1)
+
+
+@app.command(
+    "eval",
+    epilog="[b]Example[/b]\n\n  vslam eval runs/latest/trajectory_kitti.txt "
+    "--gt runs/latest/ground_truth_kitti.txt",
+)
+def evaluate_files(
+    estimate: Annotated[Path, typer.Argument(help="Trajectory, KITTI or TUM format.")],
+    gt: Annotated[Path, typer.Option(help="Ground truth, KITTI or TUM format.")],
+    align: Annotated[str, typer.Option(help="se3, sim3 (fits the scale too) or none.")] = "se3",
+    times: Annotated[
+        Path | None, typer.Option(help="times.txt of a KITTI file, to compare it with a TUM file.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Compare a trajectory with the ground truth: ATE, RPE and KITTI drift."""
+    import json
+
+    from vslam.evaluate import evaluate, evo_command, read_pair
+    from vslam.trajectory import trajectory_format
+
+    trajectory, ground_truth = read_pair(estimate, gt, times)
+    evaluation = evaluate(trajectory, ground_truth, align)
+    if as_json:
+        typer.echo(json.dumps(evaluation.summary(), indent=2))
+        return
+    matched = f"{evaluation.frames} matched of {len(trajectory)}"
+    rows = [("frames", matched), ("alignment", align), *_evaluation_rows(evaluation)]
+    if trajectory_format(estimate) == trajectory_format(gt):
+        rows.append(("reproduce", evo_command(estimate, gt, align)))
+    _print_rows(rows)
+
+
+@app.command(
+    epilog="[b]Example[/b]\n\n  vslam perturb --seq 00 --perturb brightness:1.5 --out sheet.png"
+)
+def perturb(
+    data: Data = _DATA,
+    dataset: Dataset = "kitti",
+    seq: Seq = "00",
+    perturb: Perturb = "brightness",
+    start: Start = 0,
+    every: Every = 1,
+    max_frames: MaxFrames = None,
+    seed: Seed = 0,
+    frames: Annotated[int, typer.Option(min=1, help="Frames to show, evenly spread.")] = 8,
+    out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("perturbation.png"),
+) -> None:
+    """Preview a perturbation: the left eye as it is beside both eyes perturbed."""
+    import cv2
+    import numpy as np
+
+    from vslam.datasets import open_sequence
+    from vslam.perturb import contact_sheet, parse_perturbation
+
+    sequence = open_sequence(dataset, data, seq, start=start, every=every, max_frames=max_frames)
+    law = parse_perturbation(perturb, seed, sequence.timestamps)
+    shown = np.unique(np.linspace(0, len(sequence) - 1, frames).round().astype(int)).tolist()
+    sheet = cv2.imencode(".png", contact_sheet(sequence, law, shown))[1]
+    try:
+        out.write_bytes(sheet.tobytes())
+    except OSError as error:
+        raise InputError(
+            f"{out}: cannot be written ({error.strerror}); name another file with --out."
+        ) from error
+    typer.echo(f"{out}: {law.name}, seed {seed}, frames {', '.join(map(str, shown))}")
+
+
+@app.command()
+def info(data: Data = _DATA) -> None:
+    """Show versions, cores, compiled kernels and the data found."""
+    from vslam import info as machine
+    from vslam.datasets.kitti import list_kitti
+
+    found = machine.versions()
+    cores = machine.available_cores()
+    rows = [*found.items(), ("cores", f"{cores} (--threads {min(cores, 4)} unless given)")]
+    rows += [
+        ("numba cache", f"{folder}: {size / 2**20:.1f} MB")
+        for folder, size in machine.numba_caches().items()
+    ]
+    try:
+        rows += [
+            (f"kitti {name}", f"{left} left, {right} right images")
+            for name, left, right in list_kitti(data)
+        ]
+        rows.append(("kitti root", str(data)))
+    except InputError as error:
+        rows.append(("kitti", str(error)))
+    if warning := machine.opencv_conflict(found):
+        rows.append(("warning", warning))
+    _print_rows(rows)
+
+
+@app.callback(invoke_without_command=True)
+def version(
+    show: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
+) -> None:
+    if show:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+def main() -> None:
+    """Entry point: bad input becomes one line on stderr and exit code 2."""
+    try:
+        app()
+    except InputError as error:
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(2)
+
+
+def _require_built(option: str, value: str, known: dict[str, bool]) -> None:
+    built = ", ".join(f"'{name}'" for name, is_built in known.items() if is_built)
+    if value not in known:
+        raise InputError(f"{option} {value}: unknown; this version has only {built}.")
+    if not known[value]:
+        raise InputError(f"{option} {value}: not built yet; this version has only {built}.")
+
+
+def _evaluation_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
+    rows = [
+        ("ATE rmse", f"{evaluation.ate_rmse_m:.3f} m"),
+        ("ATE mean, max", f"{evaluation.ate_mean_m:.3f} m, {evaluation.ate_max_m:.3f} m"),
+        ("RPE per frame", f"{evaluation.rpe_m:.4f} m, {evaluation.rpe_deg:.4f} deg"),
+    ]
+    if evaluation.t_rel_percent is None:
+        return [*rows, ("drift", "path shorter than 100 m")]
+    return [
+        *rows,
+        ("t_rel", f"{evaluation.t_rel_percent:.3f} %"),
+        ("r_rel", f"{evaluation.r_rel_deg_per_100m:.3f} deg/100 m"),
+    ]
+
+
+def _print_summary(
+    outcome: RunOutcome, evaluation: Evaluation | None, remark: str, folder: Path
+) -> None:
+    from vslam.features import TrackingState
+
+    tracks = outcome.tracks
+    lost = sum(track.state is TrackingState.LOST for track in tracks)
+    rows = [
+        ("frames", f"{len(tracks)} done, {lost} lost, {len(outcome.skipped)} unreadable"),
+        *(_evaluation_rows(evaluation) if evaluation else [("evaluation", remark)]),
+        ("speed", f"{len(tracks) / outcome.wall_s:.1f} fps" if outcome.wall_s else "-"),
+        ("map", f"{outcome.n_keyframes} keyframes, {outcome.n_landmarks} landmarks"),
+        ("folder", str(folder)),
+        *((name, str(folder / file)) for name, file in _LOOK_AT if (folder / file).exists()),
+    ]
+    if outcome.interrupted:
+        rows.insert(0, ("interrupted", outcome.interrupted))
+    _print_rows(rows)
+
+
+def _print_rows(rows: list[tuple[str, str]]) -> None:
+    width = max(len(name) for name, _ in rows)
+    for name, value in rows:
+        typer.echo(f"{name:<{width}}  {value}")

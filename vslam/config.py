@@ -1,0 +1,121 @@
+"""Every threshold of the pipeline in one tree, with its unit and source.
+
+Sources: [ORB] Rublee et al., ICCV 2011; [OS1] Mur-Artal et al., ORB-SLAM, T-RO 2015;
+[OS2] Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017; [own] measured here, see docs/design.md.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from vslam.errors import InputError
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class OrbConfig(_Section):
+    """ORB extraction."""
+
+    n_features: int = Field(2000, ge=100, description="Features for each image. [OS2, IV-A]")
+    n_levels: int = Field(8, ge=1, le=16, description="Pyramid levels. [OS1, V-A]")
+    scale_factor: float = Field(1.2, gt=1.0, le=2.0, description="Between levels. [OS1, V-A]")
+    fast_threshold: int = Field(12, ge=1, le=255, description="FAST threshold, grey levels.")
+    fast_threshold_min: int = Field(
+        7, ge=1, le=255, description="Threshold in cells where the first finds nothing. [OS1, V-A]"
+    )
+    cell_size: int = Field(35, ge=16, description="Cell of the adaptive threshold, pixels.")
+
+
+class StereoConfig(_Section):
+    """Stereo matching [OS2, III-A]."""
+
+    max_descriptor_distance: int = Field(75, ge=0, le=256, description="Hamming distance, bits.")
+    sad_window: int = Field(5, ge=1, description="Half width of the SAD patch, pixels.")
+    sad_search: int = Field(5, ge=1, description="Search of the SAD refinement, pixels each way.")
+    close_depth_baselines: float = Field(
+        40.0, gt=0, description="Close: depth below this many baselines. [OS2, III-A]"
+    )
+
+
+class TrackingConfig(_Section):
+    """Frame-to-map tracking."""
+
+    match_distance: int = Field(100, ge=0, le=256, description="Projection search, bits. [OS1]")
+    match_ratio: float = Field(0.8, gt=0, le=1, description="Best over second best. [OS1, V-D]")
+    reference_distance: int = Field(50, ge=0, le=256, description="Brute-force search, bits.")
+    reference_ratio: float = Field(0.7, gt=0, le=1, description="Brute-force search. [OS1]")
+    motion_window: float = Field(7.0, gt=0, description="Radius at octave 0, pixels. [OS2]")
+    local_window: float = Field(2.5, gt=0, description="Radius in the local map, pixels. [OS1]")
+    local_keyframes: int = Field(80, ge=1, description="Keyframes of the local map. [OS1]")
+    min_stereo_start: int = Field(
+        100, ge=10, description="Stereo features that a map can start from. [own]"
+    )
+    min_inliers_motion: int = Field(20, ge=3, description="Below: try the reference keyframe.")
+    min_inliers: int = Field(30, ge=3, description="Below, the frame is WEAK. [OS1]")
+    min_inliers_lost: int = Field(15, ge=3, description="Below, the frame is LOST. [own]")
+    lost_frames_before_restart: int = Field(
+        10, ge=1, description="Lost this long, mapping restarts at the predicted pose. [own]"
+    )
+
+
+class KeyframeConfig(_Section):
+    """Keyframe decision [OS2, III-E]."""
+
+    max_interval_s: float = Field(1.0, gt=0, description="Never longer between keyframes.")
+    min_tracked_close: int = Field(100, ge=0, description="Tracked close points below this and")
+    min_new_close: int = Field(70, ge=0, description="this many untracked: insert. [OS2, III-E]")
+    max_tracked_ratio: float = Field(
+        0.75, gt=0, le=1, description="Of the points the reference keyframe tracks. [OS1, V-E]"
+    )
+    urgent_ratio: float = Field(
+        0.25, gt=0, le=1, description="Below this ratio, do not wait for local mapping. [OS2]"
+    )
+    merge_after_frames: int = Field(
+        2, ge=1, description="Local mapping is merged this many frames later. [own]"
+    )
+
+
+class MappingConfig(_Section):
+    """Local mapping and bundle adjustment."""
+
+    neighbours: int = Field(10, ge=1, description="Covisible keyframes triangulated with. [OS2]")
+    fuse_neighbours: int = Field(10, ge=1, description="Covisible keyframes fused with. [OS2]")
+    min_parallax_cosine: float = Field(0.9998, gt=0, le=1, description="Triangulation. [OS1]")
+    epipolar_distance: int = Field(50, ge=0, le=256, description="Triangulation, bits. [OS1]")
+    fuse_distance: int = Field(50, ge=0, le=256, description="Fusion, bits. [OS1]")
+    fuse_window: float = Field(3.0, gt=0, description="Radius at octave 0, pixels. [OS1]")
+    min_found_ratio: float = Field(0.25, ge=0, le=1, description="Landmark culling. [OS1, VI-B]")
+    redundant_ratio: float = Field(0.9, gt=0, le=1, description="Keyframe culling. [OS1, VI-E]")
+    min_shared: int = Field(15, ge=1, description="Landmarks that make a covisibility edge. [OS1]")
+    max_ba_keyframes: int = Field(60, ge=2, description="Free keyframes in local BA. [own]")
+    ba_iterations: int = Field(10, ge=1, description="Levenberg-Marquardt iterations at most.")
+
+
+class Config(_Section):
+    """The whole configuration, written to ``config.json`` of each run and read by --config."""
+
+    orb: OrbConfig = OrbConfig()
+    stereo: StereoConfig = StereoConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    keyframes: KeyframeConfig = KeyframeConfig()
+    mapping: MappingConfig = MappingConfig()
+
+
+def load_config(path: Path) -> Config:
+    """Read a configuration in JSON; keys left out keep their defaults.
+
+    Raises:
+        InputError: missing file, no JSON, unknown key or value out of range.
+    """
+    try:
+        return Config.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the configuration ({error.strerror}).") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "file"
+        raise InputError(f"{path}: {where}: {first['msg']}.") from error

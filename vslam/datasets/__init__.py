@@ -1,0 +1,33 @@
+"""Data sets: each reader checks its input once and then hands out calibrated, timed frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from vslam.datasets.sequence import Sequence
+from vslam.errors import InputError
+
+
+def open_sequence(
+    dataset: str,
+    root: Path,
+    name: str,
+    *,
+    start: int = 0,
+    every: int = 1,
+    max_frames: int | None = None,
+) -> Sequence:
+    """Open a sequence and check the frames that ``start``, ``every``, ``max_frames`` select.
+
+    Raises:
+        InputError: unknown data set, or bad input as the reader of the data set says.
+    """
+    if dataset == "kitti":
+        from vslam.datasets.kitti import open_kitti
+
+        return open_kitti(root, name, start=start, every=every, max_frames=max_frames)
+    if dataset == "synthetic":
+        raise InputError(
+            "--dataset synthetic: not built in this version; use --dataset kitti, see datasets.md."
+        )
+    raise InputError(f"--dataset {dataset}: unknown data set; this version reads kitti.")

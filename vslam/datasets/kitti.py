@@ -1,0 +1,310 @@
+"""KITTI odometry, grey stereo [Geiger et al., CVPR 2012].
+
+root/sequences/NN/{image_0,image_1}/000000.png   left and right eye, rectified; .jpg, .webp too
+root/sequences/NN/{calib.txt,times.txt}
+root/poses/NN.txt                                ground truth, for 00 to 10
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import StereoCamera
+from vslam.datasets.sequence import Image
+from vslam.errors import InputError, UnreadableImageError
+from vslam.trajectory import read_kitti_poses, read_table
+
+_HOME = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php"
+_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp"}
+
+
+@dataclass(frozen=True)
+class KittiSequence:
+    """The selected frames of one sequence; see :class:`vslam.datasets.sequence.Sequence`.
+
+    Attributes:
+        name: ``00`` for example.
+        camera: from P0 and P1 of the sequence's own ``calib.txt``.
+        timestamps: ``(N,)`` float64 seconds since the first frame of the whole sequence.
+        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` or None; the world is the first left camera
+            of the whole sequence.
+        left, right: N image files each, of equal stems.
+    """
+
+    name: str
+    camera: StereoCamera
+    timestamps: NDArray[np.float64]
+    ground_truth: NDArray[np.float64] | None
+    left: tuple[Path, ...]
+    right: tuple[Path, ...]
+
+    @property
+    def dataset(self) -> str:
+        return "kitti"
+
+    def __len__(self) -> int:
+        return len(self.left)
+
+    def read(self, index: int) -> tuple[Image, Image]:
+        """Left and right image ``(H, W)`` uint8 of one frame. Safe to call from several threads.
+
+        Raises:
+            UnreadableImageError: a file is missing, damaged or not of the calibrated size.
+        """
+        return self._read(self.left[index]), self._read(self.right[index])
+
+    def _read(self, path: Path) -> Image:
+        image = _decode(path)
+        wanted = (self.camera.height, self.camera.width)
+        if image.shape != wanted:
+            raise UnreadableImageError(
+                path,
+                f"{_size(image.shape)} pixels where the first image has {_size(wanted)}; "
+                "replace it by the original.",
+            )
+        return image
+
+
+def open_kitti(
+    root: Path, name: str, *, start: int = 0, every: int = 1, max_frames: int | None = None
+) -> KittiSequence:
+    """Open a sequence; only the selected frames must be complete.
+
+    Frame k belongs to row k of ``times.txt`` and of the poses. Where those files have more rows
+    than there are images, k is the number in the file name, so that an excerpt of a sequence
+    works with the files of the whole one.
+
+    Args:
+        root: folder that holds ``sequences`` (or ``dataset/sequences``, as KITTI's archives unpack)
+            and, optionally, ``poses``.
+        name: ``00`` for example.
+        start: first frame, counted over the images present.
+        every: take every N-th frame.
+        max_frames: at most so many, None for all.
+
+    Raises:
+        InputError: data missing, images unequal or empty, calibration, times or poses unusable.
+        UnreadableImageError: the first pair cannot be decoded.
+    """
+    base = _find_root(root)
+    folder = _find_sequence(base, name)
+    eyes = [_list_images(folder / "image_0"), _list_images(folder / "image_1")]
+    stems = sorted(eyes[0].keys() | eyes[1].keys(), key=_by_number)
+    chosen = _select(folder, len(stems), start, every, max_frames)
+    rows = _check_pairs(folder, eyes, [stems[k] for k in chosen])
+    left, right = zip(*rows, strict=True)
+
+    sizes = [_decode(path).shape for path in rows[0]]
+    if sizes[0] != sizes[1]:
+        raise UnreadableImageError(
+            rows[0][1],
+            f"{_size(sizes[1])} pixels but the left image has {_size(sizes[0])}; "
+            "use the rectified images of both eyes.",
+        )
+    times = _read_times(folder / "times.txt")
+    frames = _row_numbers(folder / "times.txt", stems, len(times))[chosen]
+    return KittiSequence(
+        name=name,
+        camera=read_calibration(folder / "calib.txt", width=sizes[0][1], height=sizes[0][0]),
+        timestamps=times[frames],
+        ground_truth=_read_ground_truth(base / "poses" / f"{name}.txt", stems, len(times), chosen),
+        left=left,
+        right=right,
+    )
+
+
+def list_kitti(root: Path) -> list[tuple[str, int, int]]:
+    """Name and numbers of left and right images of each sequence below ``root``.
+
+    Raises:
+        InputError: no KITTI data there.
+    """
+    folders = sorted(p for p in (_find_root(root) / "sequences").iterdir() if p.is_dir())
+    return [
+        (p.name, len(_list_images(p / "image_0")), len(_list_images(p / "image_1")))
+        for p in folders
+    ]
+
+
+def read_calibration(path: Path, *, width: int, height: int) -> StereoCamera:
+    """Read P0 and P1 of ``calib.txt``, with or without the ``P0:`` at the beginning of the line.
+
+    Args:
+        path: file to read.
+        width, height: image size in pixels, which the file does not say.
+
+    Raises:
+        InputError: missing or malformed file, NaN, or numbers that no rectified pair can have.
+    """
+    fix = "take calib.txt of this sequence from KITTI's calibration files"
+    try:
+        lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: the calibration is missing or unreadable; {fix}.") from error
+    keyed = {words[0].rstrip(":"): words[1:] for words in lines if words[0].endswith(":")}
+    try:
+        pair = [keyed["P0"], keyed["P1"]] if keyed else lines[:2]
+        P0, P1 = np.array(pair, dtype=np.float64).reshape(2, 3, 4)
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: P0 and P1 are not two rows of 12 numbers; {fix}.") from error
+    if not np.isfinite([P0, P1]).all():
+        raise InputError(f"{path}: P0 or P1 holds NaN or infinity; {fix}.")
+    fx, fy, cx, cy = P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2]
+    if not np.allclose(P0[:, :3], P1[:, :3]) or fx <= 0 or fy <= 0:
+        raise InputError(
+            f"{path}: P0 and P1 do not share one positive focal length and centre, so the pair is "
+            f"not rectified; {fix}."
+        )
+    baseline = (P0[0, 3] - P1[0, 3]) / fx
+    if baseline <= 0:
+        raise InputError(
+            f"{path}: the baseline of P0 and P1 is {baseline:.3f} m but must be positive; {fix}."
+        )
+    if not (0 < cx < width and 0 < cy < height):
+        raise InputError(
+            f"{path}: the principal point ({cx:.1f}, {cy:.1f}) lies outside the "
+            f"{width}x{height} image; {fix}."
+        )
+    return StereoCamera(float(fx), float(fy), float(cx), float(cy), float(baseline), width, height)
+
+
+def _find_root(root: Path) -> Path:
+    for base in (root, root / "dataset"):
+        if (base / "sequences").is_dir():
+            return base
+    raise InputError(
+        f"{root}: no KITTI odometry data here (no folder 'sequences'); download the grayscale "
+        f"images (22 GB), calibration files and ground truth poses from {_HOME}, unpack them into "
+        "one folder and name it with --data or $KITTI_ROOT (--dataset synthetic, which will need "
+        "no download, is not built in this version)."
+    )
+
+
+def _find_sequence(base: Path, name: str) -> Path:
+    folder = base / "sequences" / name
+    found = sorted(p.name for p in (base / "sequences").iterdir() if p.is_dir())
+    if name not in found:
+        choice = f"choose one of {', '.join(found)}" if found else "the folder is empty"
+        raise InputError(f"{folder}: no such sequence; {choice}.")
+    return folder
+
+
+def _list_images(folder: Path) -> dict[str, Path]:
+    if not folder.is_dir():
+        return {}
+    return {
+        path.stem: path
+        for path in sorted(folder.iterdir())
+        if path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
+    }
+
+
+def _by_number(stem: str) -> tuple[int, str]:
+    return (int(stem) if stem.isdecimal() else -1, stem)
+
+
+def _select(
+    folder: Path, n: int, start: int, every: int, max_frames: int | None
+) -> NDArray[np.int64]:
+    if start < 0 or every < 1 or (max_frames is not None and max_frames < 1):
+        raise InputError("--start must be at least 0, --every and --max-frames at least 1.")
+    if n == 0:
+        raise InputError(
+            f"{folder}: no images in image_0 and image_1; "
+            f"download the grayscale images (22 GB) from {_HOME}."
+        )
+    if start >= n:
+        raise InputError(f"--start {start}: {folder} has {n} frames; choose at most {n - 1}.")
+    return np.arange(start, n, every)[:max_frames]
+
+
+def _check_pairs(
+    folder: Path, eyes: list[dict[str, Path]], stems: list[str]
+) -> list[tuple[Path, Path]]:
+    for eye, images in enumerate(eyes):
+        if not images:
+            raise InputError(
+                f"{folder}/image_{eye}: no images of the {('left', 'right')[eye]} eye; stereo "
+                f"needs both, download the grayscale images (22 GB) from {_HOME}."
+            )
+    complete = [stem in eyes[0] and stem in eyes[1] for stem in stems]
+    if not all(complete):
+        first = complete.index(False)
+        eye = 0 if stems[first] not in eyes[0] else 1
+        fix = f"restore image_{eye}/{stems[first]}"
+        if first:
+            fix += f" and those after it, or add --max-frames {first}"
+        raise InputError(
+            f"{folder}: unequal counts, {len(eyes[0])} left and {len(eyes[1])} right images of "
+            f"which {len(eyes[0].keys() & eyes[1].keys())} frames have both; {fix}."
+        )
+    pairs = [(eyes[0][stem], eyes[1][stem]) for stem in stems]
+    for path in (path for pair in pairs for path in pair):
+        if _is_empty(path):
+            raise UnreadableImageError(path, "the file is empty; download it again.")
+    return pairs
+
+
+def _is_empty(path: Path) -> bool:
+    try:
+        return path.stat().st_size == 0
+    except OSError:  # a link to nowhere
+        return True
+
+
+def _decode(path: Path) -> Image:
+    import cv2
+
+    try:
+        data = np.fromfile(path, np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    except (OSError, cv2.error):
+        image = None
+    if image is None:
+        raise UnreadableImageError(path, "cannot be decoded; download the file again.")
+    return np.asarray(image, np.uint8)
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return f"{shape[1]}x{shape[0]}"
+
+
+def _read_times(path: Path) -> NDArray[np.float64]:
+    times = read_table(path, (1,), "a time in seconds")[:, 0]
+    if (bad := np.flatnonzero(np.diff(times) <= 0)).size:
+        raise InputError(
+            f"{path}: time {bad[0] + 2} is not later than the one before it; "
+            "take times.txt of this sequence from KITTI's calibration files."
+        )
+    return times
+
+
+def _row_numbers(path: Path, stems: list[str], n_rows: int) -> NDArray[np.int64]:
+    """Row of ``times.txt`` or of the poses for every image."""
+    fix = "take the file of this sequence from KITTI's archives"
+    if n_rows < len(stems):
+        raise InputError(f"{path}: only {n_rows} rows for {len(stems)} images; {fix}.")
+    if n_rows == len(stems) or not all(stem.isdecimal() for stem in stems):
+        return np.arange(len(stems))
+    rows = np.array([int(stem) for stem in stems])
+    if rows[-1] >= n_rows:
+        raise InputError(f"{path}: {n_rows} rows, none for image {stems[-1]}; {fix}.")
+    return rows
+
+
+def _read_ground_truth(
+    path: Path, stems: list[str], n_times: int, chosen: NDArray[np.int64]
+) -> NDArray[np.float64] | None:
+    if not path.exists():
+        return None
+    poses = read_kitti_poses(path)
+    if len(poses) not in (n_times, len(stems)):
+        raise InputError(
+            f"{path}: poses of another length, {len(poses)} for {len(stems)} images and "
+            f"{n_times} times; take the file of this sequence, or remove it to run without."
+        )
+    return poses[_row_numbers(path, stems, len(poses))[chosen]]

@@ -1,0 +1,20 @@
+"""The two kinds of failure a user can cause or repair."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class InputError(Exception):
+    """Bad input: one sentence that names the file or option and the fix. The CLI exits with 2."""
+
+
+class UnreadableImageError(InputError):
+    """One image of a sequence cannot be decoded or has the wrong size.
+
+    During a run such a frame is reported, skipped and counted; before a run it is an error.
+    """
+
+    def __init__(self, path: Path, why: str) -> None:
+        super().__init__(f"{path}: {why}")
+        self.path = path

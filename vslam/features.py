@@ -1,0 +1,110 @@
+"""Image features and what tracking says of a frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.kernels import kernel
+
+CELL = 16  # pixels of a FeatureGrid cell; search windows are 5 to 60 px wide
+
+
+@dataclass(frozen=True)
+class Features:
+    """ORB features of one left image, with the stereo match of each where there is one.
+
+    Attributes:
+        xy: ``(N, 2)`` float32, position at full resolution (pixels).
+        octave: ``(N,)`` uint8, pyramid level.
+        angle: ``(N,)`` float32, orientation in radians.
+        descriptors: ``(N, 32)`` uint8, 256-bit rotated BRIEF.
+        u_right: ``(N,)`` float32, column of the match in the right image, NaN without one.
+    """
+
+    xy: NDArray[np.float32]
+    octave: NDArray[np.uint8]
+    angle: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    u_right: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+
+@dataclass(frozen=True)
+class FeatureGrid:
+    """Features by image cell: those of cell c are ``items[start[c]:start[c + 1]]``."""
+
+    start: NDArray[np.int64]
+    items: NDArray[np.int32]
+    columns: int
+
+    @classmethod
+    def of_positions(cls, xy: NDArray[np.float32], width: int, height: int) -> FeatureGrid:
+        """Sort ``(N, 2)`` positions into the cells of an image."""
+        columns, rows = -(-width // CELL), -(-height // CELL)
+        start, items = build_grid(xy, columns, rows)
+        return cls(start, items, columns)
+
+
+@kernel
+def build_grid(xy, columns, rows):
+    """Counting sort of ``(N, 2)`` positions into cells, row by row."""
+    n = len(xy)
+    cell = np.empty(n, np.int64)
+    start = np.zeros(columns * rows + 1, np.int64)
+    for i in range(n):
+        column = min(max(int(xy[i, 0]) // CELL, 0), columns - 1)
+        row = min(max(int(xy[i, 1]) // CELL, 0), rows - 1)
+        cell[i] = row * columns + column
+        start[cell[i] + 1] += 1
+    for c in range(columns * rows):
+        start[c + 1] += start[c]
+    cursor = start[:-1].copy()
+    items = np.empty(n, np.int32)
+    for i in range(n):
+        items[cursor[cell[i]]] = i
+        cursor[cell[i]] += 1
+    return start, items
+
+
+class TrackingState(StrEnum):
+    """OK: enough inliers. WEAK: a pose, but on few inliers. LOST: the pose is predicted."""
+
+    OK = "OK"
+    WEAK = "WEAK"
+    LOST = "LOST"
+
+
+@dataclass(frozen=True)
+class TrackResult:
+    """Outcome of one frame; lost frames have one too.
+
+    Attributes:
+        index: frame number within the run, from 0.
+        timestamp: seconds.
+        T_wc: ``(4, 4)`` float64 pose at the time of tracking (camera to world); the final
+            trajectory, after later bundle adjustments, comes from ``Slam.trajectory()``.
+        state: OK, WEAK or LOST.
+        n_features: features extracted from the left image.
+        n_stereo: of these, features with a stereo match.
+        n_matches: landmark matches before the last pose optimisation.
+        n_inliers: matches that survived it.
+        is_keyframe: whether the frame became a keyframe.
+        stage_ms: milliseconds by stage of the pipeline (wall time of that stage).
+    """
+
+    index: int
+    timestamp: float
+    T_wc: NDArray[np.float64]
+    state: TrackingState
+    n_features: int
+    n_stereo: int
+    n_matches: int
+    n_inliers: int
+    is_keyframe: bool
+    stage_ms: dict[str, float] = field(default_factory=dict)

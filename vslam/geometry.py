@@ -1,0 +1,133 @@
+"""SE(3) algebra, for NumPy callers and for kernels alike.
+
+Conventions. Camera frame: x right, y down, z forward. World: the first left camera. ``T_a_b`` is a
+4x4 float64 matrix that maps points of frame b to frame a; ``T_cw`` is used where points are
+projected, ``T_wc`` where poses are saved. A twist is ``[v, w]``: translation first, then rotation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.kernels import kernel
+
+Matrix = NDArray[np.float64]
+
+
+@kernel
+def compose(T_a_b: Matrix, T_b_c: Matrix) -> Matrix:
+    """``T_a_c``, for ``(4, 4)`` float64."""
+    T = np.zeros((4, 4))
+    for i in range(3):
+        for j in range(4):
+            for k in range(3):
+                T[i, j] += T_a_b[i, k] * T_b_c[k, j]
+        T[i, 3] += T_a_b[i, 3]
+    T[3, 3] = 1.0
+    return T
+
+
+@kernel
+def inverse(T_a_b: Matrix) -> Matrix:
+    """``T_b_a`` of a rigid motion, ``(4, 4)``."""
+    T = np.zeros((4, 4))
+    for i in range(3):
+        for j in range(3):
+            T[i, j] = T_a_b[j, i]
+            T[i, 3] -= T_a_b[j, i] * T_a_b[j, 3]
+    T[3, 3] = 1.0
+    return T
+
+
+@kernel
+def orthonormalised(T_a_b: Matrix) -> Matrix:
+    """The rigid motion nearest to one that round-off has taken off SO(3).
+
+    One Newton step of the polar decomposition, R (3 I - R'R) / 2: enough for any drift that a
+    few compositions can cause.
+    """
+    T = T_a_b.copy()
+    for i in range(3):
+        for j in range(3):
+            value = 3.0 * T_a_b[i, j]
+            for k in range(3):
+                dot = 0.0
+                for m in range(3):
+                    dot += T_a_b[m, k] * T_a_b[m, j]
+                value -= T_a_b[i, k] * dot
+            T[i, j] = 0.5 * value
+    return T
+
+
+@kernel
+def se3_exp(twist: Matrix) -> Matrix:
+    """``(4, 4)`` motion of a ``(6,)`` twist ``[v, w]`` (Solà et al., "A micro Lie theory", D.2)."""
+    v, w = twist[:3], twist[3:]
+    angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    if angle2 < 1e-10:
+        a, b, c = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0, 1.0 / 6.0 - angle2 / 120.0
+    else:
+        angle = np.sqrt(angle2)
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
+        c = (1.0 - a) / angle2
+    T = np.zeros((4, 4))
+    W = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+    for i in range(3):
+        for j in range(3):
+            w_ij = w[i] * w[j] - (angle2 if i == j else 0.0)
+            T[i, j] = a * W[i, j] + b * w_ij + (1.0 if i == j else 0.0)
+            T[i, 3] += (b * W[i, j] + c * w_ij + (1.0 if i == j else 0.0)) * v[j]
+    T[3, 3] = 1.0
+    return T
+
+
+@kernel
+def se3_log(T: Matrix) -> Matrix:
+    """``(6,)`` twist ``[v, w]`` of a ``(4, 4)`` motion with a rotation below 180 degrees."""
+    cos = 0.5 * (T[0, 0] + T[1, 1] + T[2, 2] - 1.0)
+    w = 0.5 * np.array([T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]])
+    sin = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    angle = np.arctan2(sin, cos)
+    if sin > 1e-10:
+        w *= angle / sin
+    angle2 = angle * angle
+    if angle < 1e-4:
+        c = 1.0 / 12.0 + angle2 / 720.0
+    else:
+        c = 1.0 / angle2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
+    t = T[:3, 3]
+    cross = np.array(
+        [w[1] * t[2] - w[2] * t[1], w[2] * t[0] - w[0] * t[2], w[0] * t[1] - w[1] * t[0]]
+    )
+    dot = w[0] * t[0] + w[1] * t[1] + w[2] * t[2]
+    twist = np.empty(6)
+    for i in range(3):
+        twist[i] = t[i] - 0.5 * cross[i] + c * (w[i] * dot - angle2 * t[i])
+        twist[3 + i] = w[i]
+    return twist
+
+
+def transform(T_a_b: Matrix, p_b: Matrix) -> Matrix:
+    """Map ``(N, 3)`` points of frame b to frame a."""
+    return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def umeyama(source: Matrix, target: Matrix, *, with_scale: bool = False) -> tuple[float, Matrix]:
+    """Least-squares ``s, T_target_source`` with ``target ~ s R source + t`` (Umeyama, PAMI 1991).
+
+    Args:
+        source, target: ``(N, 3)`` corresponding points, N >= 3.
+        with_scale: estimate s; otherwise it is 1.
+    """
+    mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
+    covariance = (target - mean_t).T @ (source - mean_s) / len(source)
+    U, D, Vt = np.linalg.svd(covariance)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    R = U @ np.diag(sign) @ Vt
+    variance = ((source - mean_s) ** 2).sum(axis=1).mean()
+    scale = float(D @ sign / variance) if with_scale else 1.0
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = mean_t - scale * R @ mean_s
+    return scale, T

@@ -1,0 +1,70 @@
+"""What ``vslam info`` says of this machine. Nothing heavy is imported to find it out."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+_PACKAGES = (
+    "vslam",
+    "numpy",
+    "numba",
+    "opencv-python-headless",
+    "opencv-python",
+    "opencv-contrib-python-headless",
+    "opencv-contrib-python",
+    "evo",
+    "rerun-sdk",
+    "torch",
+    "gtsam",
+)
+
+
+def versions() -> dict[str, str]:
+    """Version of Python and of each package that is installed."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def opencv_conflict(found: dict[str, str]) -> str | None:
+    """A warning where two wheels that overwrite each other's ``cv2`` are installed."""
+    wheels = [name for name in found if name.startswith("opencv-")]
+    if len(wheels) < 2:
+        return None
+    return (
+        f"{' and '.join(wheels)} both install cv2 and overwrite each other: uninstall all, "
+        "then install opencv-python-headless"
+    )
+
+
+def available_cores() -> int:
+    """Cores that this process may use, which in a container are fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def numba_caches() -> dict[Path, int]:
+    """Folders with compiled kernels, and the bytes in each."""
+    import platformdirs
+
+    import vslam.backend
+    import vslam.frontend
+    import vslam.loopclosure
+
+    packages = (vslam, vslam.frontend, vslam.loopclosure, vslam.backend)
+    folders = [Path(next(iter(package.__path__))) / "__pycache__" for package in packages]
+    folders.append(Path(platformdirs.user_cache_dir("numba", appauthor=False)))
+    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
+        folders.append(Path(chosen))
+    sizes = {
+        folder: sum(file.stat().st_size for file in folder.rglob("*.nb[ic]")) for folder in folders
+    }
+    return {folder: size for folder, size in sizes.items() if size}

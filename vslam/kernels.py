@@ -1,0 +1,50 @@
+"""How vslam compiles its kernels, and the bit arithmetic that several of them share.
+
+A kernel is compiled once for each machine, kept in Numba's cache, and holds no GIL: threads of
+the pipeline run kernels side by side. ``error_model="numpy"`` and fused multiply-add are the only
+liberties; no re-association, so that a result never depends on how a loop was vectorised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numba
+from numba.core import types
+from numba.extending import intrinsic
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def kernel(function: Function) -> Function:
+    """Compile ``function`` as described above, on its first call."""
+    return numba.njit(
+        cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, boundscheck=False
+    )(function)
+
+
+def inline(function: Function) -> Function:
+    """Compile ``function`` into the kernels that call it."""
+    return numba.njit(inline="always", error_model="numpy")(function)
+
+
+@intrinsic
+def popcount(typing_context, value):
+    """Number of bits set in a uint64: one instruction."""
+
+    def generate(context, builder, signature, arguments):
+        return builder.ctpop(arguments[0])
+
+    return types.uint64(types.uint64), generate
+
+
+@inline
+def hamming(a, b):
+    """Hamming distance of two 256-bit descriptors given as ``(4,)`` uint64 rows."""
+    return int(
+        popcount(a[0] ^ b[0])
+        + popcount(a[1] ^ b[1])
+        + popcount(a[2] ^ b[2])
+        + popcount(a[3] ^ b[3])
+    )

@@ -1,0 +1,457 @@
+"""The map: keyframes, landmarks and observations as a structure of arrays.
+
+A *row* is one keypoint of one keyframe; rows of a keyframe are consecutive. The table of rows is
+the table of observations too: ``landmark[row]`` names the landmark that the keypoint observes, and
+``next_row`` chains the rows of each landmark. Nothing is derived twice: covisibility is counted
+from the rows when it is needed (after DPVO's PatchGraph, arrays instead of objects). Ids are
+never reused; arrays grow by half.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.features import Features
+from vslam.kernels import hamming, kernel
+
+NONE = -1
+
+
+class Arrays(NamedTuple):
+    """The map as kernels see it. K keyframes, L landmarks, R rows (capacities, not counts).
+
+    Keyframes: ``T_cw`` (K, 4, 4) f8; ``first_row`` (K + 1,) i8; ``keyframe_alive`` (K,) bool.
+    Landmarks: ``xyz`` (L, 3) f8 world; ``normal`` (L, 3) f8 mean viewing direction; ``reach``
+    (L, 2) f8 least and greatest distance at which the pyramid sees it; ``landmark_descriptor``
+    (L, 4) u8; ``first_keyframe`` (L,) i4; ``visible``, ``found`` (L,) i4 frames that should, and
+    did, see it; ``landmark_alive`` (L,) bool; ``merged_into`` (L,) i4; ``head`` (L,) i4 first row
+    of its chain; ``n_observations`` (L,) i4, stereo ones counting twice (ORB-SLAM2).
+    Rows: ``xy`` (R, 2) f4; ``u_right`` (R,) f4; ``octave`` (R,) u1; ``angle`` (R,) f4;
+    ``descriptor`` (R, 4) u8; ``keyframe`` (R,) i4; ``landmark``, ``next_row`` (R,) i4.
+    """
+
+    T_cw: NDArray[np.float64]
+    first_row: NDArray[np.int64]
+    keyframe_alive: NDArray[np.bool_]
+    xyz: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    reach: NDArray[np.float64]
+    landmark_descriptor: NDArray[np.uint64]
+    first_keyframe: NDArray[np.int32]
+    visible: NDArray[np.int32]
+    found: NDArray[np.int32]
+    landmark_alive: NDArray[np.bool_]
+    merged_into: NDArray[np.int32]
+    head: NDArray[np.int32]
+    n_observations: NDArray[np.int32]
+    xy: NDArray[np.float32]
+    u_right: NDArray[np.float32]
+    octave: NDArray[np.uint8]
+    angle: NDArray[np.float32]
+    descriptor: NDArray[np.uint64]
+    keyframe: NDArray[np.int32]
+    landmark: NDArray[np.int32]
+    next_row: NDArray[np.int32]
+
+
+KEYFRAME_FIELDS = Arrays._fields[:3]
+LANDMARK_FIELDS = Arrays._fields[3:14]
+ROW_FIELDS = Arrays._fields[14:]
+
+
+def _grown(array: NDArray, capacity: int) -> NDArray:
+    bigger = np.zeros((capacity, *array.shape[1:]), array.dtype)
+    bigger[: len(array)] = array
+    return bigger
+
+
+class Map:
+    """Growable map. One writer at a time: the caller orders tracking and local mapping.
+
+    Attributes:
+        arrays: everything that kernels touch.
+        n_keyframes, n_landmarks, n_rows: how much of the capacity is in use, dead ones included.
+        timestamps, frames, parents: of each keyframe: seconds, frame index, spanning-tree parent.
+        T_c_parent: pose relative to the parent, set when a keyframe is culled.
+    """
+
+    def __init__(self, scales: NDArray[np.float64]) -> None:
+        """``scales``: ``(levels,)`` pyramid scale factors that octaves refer to."""
+        self.scales = scales
+        self.n_keyframes = 0
+        self.n_landmarks = 0
+        self.n_rows = 0
+        self.timestamps: list[float] = []
+        self.frames: list[int] = []
+        self.parents: list[int] = []
+        self.T_c_parent: dict[int, NDArray[np.float64]] = {}
+        k, n, r = 64, 8192, 65536
+        self.arrays = Arrays(
+            T_cw=np.zeros((k, 4, 4)),
+            first_row=np.zeros(k + 1, np.int64),
+            keyframe_alive=np.zeros(k, np.bool_),
+            xyz=np.zeros((n, 3)),
+            normal=np.zeros((n, 3)),
+            reach=np.zeros((n, 2)),
+            landmark_descriptor=np.zeros((n, 4), np.uint64),
+            first_keyframe=np.zeros(n, np.int32),
+            visible=np.zeros(n, np.int32),
+            found=np.zeros(n, np.int32),
+            landmark_alive=np.zeros(n, np.bool_),
+            merged_into=np.zeros(n, np.int32),
+            head=np.zeros(n, np.int32),
+            n_observations=np.zeros(n, np.int32),
+            xy=np.zeros((r, 2), np.float32),
+            u_right=np.zeros(r, np.float32),
+            octave=np.zeros(r, np.uint8),
+            angle=np.zeros(r, np.float32),
+            descriptor=np.zeros((r, 4), np.uint64),
+            keyframe=np.zeros(r, np.int32),
+            landmark=np.zeros(r, np.int32),
+            next_row=np.zeros(r, np.int32),
+        )
+
+    def _reserve(self, fields: tuple[str, ...], used: int, extra: int) -> None:
+        capacity = len(getattr(self.arrays, fields[-1]))
+        if used + extra <= capacity:
+            return
+        target = max(used + extra, capacity + capacity // 2)
+        grown = {
+            name: _grown(getattr(self.arrays, name), target + (name == "first_row"))
+            for name in fields
+        }
+        self.arrays = self.arrays._replace(**grown)
+
+    def add_keyframe(
+        self, features: Features, T_cw: NDArray[np.float64], timestamp: float, frame: int
+    ) -> int:
+        """Append a keyframe without observations; returns its id."""
+        k, n = self.n_keyframes, len(features)
+        self._reserve(KEYFRAME_FIELDS, k, 1)
+        self._reserve(ROW_FIELDS, self.n_rows, n)
+        a = self.arrays
+        rows = slice(self.n_rows, self.n_rows + n)
+        a.xy[rows], a.u_right[rows] = features.xy, features.u_right
+        a.octave[rows], a.angle[rows] = features.octave, features.angle
+        a.descriptor[rows] = features.descriptors.view(np.uint64)
+        a.keyframe[rows] = k
+        a.landmark[rows] = NONE
+        a.next_row[rows] = NONE
+        a.T_cw[k] = T_cw
+        a.first_row[k], a.first_row[k + 1] = self.n_rows, self.n_rows + n
+        a.keyframe_alive[k] = True
+        self.timestamps.append(timestamp)
+        self.frames.append(frame)
+        self.parents.append(NONE)
+        self.n_rows += n
+        self.n_keyframes += 1
+        return k
+
+    def add_landmarks(
+        self, xyz: NDArray[np.float64], descriptors: NDArray[np.uint64], keyframe: int
+    ) -> NDArray[np.int32]:
+        """Append ``(N, 3)`` landmarks first seen by ``keyframe``; returns their ``(N,)`` ids.
+
+        They have no observation yet: link them before the next use of the map.
+        """
+        n, start = len(xyz), self.n_landmarks
+        self._reserve(LANDMARK_FIELDS, start, n)
+        a = self.arrays
+        new = slice(start, start + n)
+        a.xyz[new], a.landmark_descriptor[new] = xyz, descriptors
+        a.first_keyframe[new] = keyframe
+        a.visible[new], a.found[new] = 1, 1
+        a.landmark_alive[new] = True
+        a.merged_into[new], a.head[new] = NONE, NONE
+        a.n_observations[new] = 0
+        self.n_landmarks += n
+        return np.arange(start, start + n, dtype=np.int32)
+
+    def rows(self, keyframe: int) -> slice:
+        """Rows of one keyframe."""
+        first = self.arrays.first_row
+        return slice(int(first[keyframe]), int(first[keyframe + 1]))
+
+    def landmarks_of(self, keyframe: int) -> NDArray[np.int32]:
+        """Ids of the landmarks that a keyframe observes, by row."""
+        observed = self.arrays.landmark[self.rows(keyframe)]
+        return observed[observed != NONE]
+
+    def covisible(
+        self, keyframe: int, minimum: int = 1
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Keyframes sharing at least ``minimum`` landmarks, most first, and how many they share."""
+        counts = count_shared(self.arrays, keyframe, self.n_keyframes)
+        order = np.argsort(-counts, kind="stable")
+        order = order[counts[order] >= max(1, minimum)]
+        return order, counts[order]
+
+    def keyframe_pose(self, keyframe: int) -> NDArray[np.float64]:
+        """``T_cw``; that of a culled keyframe follows its nearest living ancestor."""
+        if self.arrays.keyframe_alive[keyframe]:
+            return self.arrays.T_cw[keyframe]
+        return self.T_c_parent[keyframe] @ self.keyframe_pose(self.parents[keyframe])
+
+    def cull_keyframe(self, keyframe: int) -> None:
+        """Remove a keyframe and its observations; its children move to its parent."""
+        parent = self.parents[keyframe]
+        a = self.arrays
+        self.T_c_parent[keyframe] = a.T_cw[keyframe] @ np.linalg.inv(self.keyframe_pose(parent))
+        detach_keyframe(a, keyframe)
+        a.keyframe_alive[keyframe] = False
+        for child in range(keyframe + 1, self.n_keyframes):
+            if self.parents[child] == keyframe and a.keyframe_alive[child]:
+                self.parents[child] = parent
+
+    def living_keyframes(self) -> NDArray[np.int64]:
+        """Ids of the keyframes that were not culled."""
+        return np.flatnonzero(self.arrays.keyframe_alive[: self.n_keyframes])
+
+    def living_landmarks(self) -> NDArray[np.int64]:
+        """Ids of the landmarks that were neither culled nor merged into another."""
+        return np.flatnonzero(self.arrays.landmark_alive[: self.n_landmarks])
+
+
+@kernel
+def count_shared(a, keyframe, n_keyframes):
+    """Landmarks shared with each keyframe, ``(n_keyframes,)`` int64; 0 for itself."""
+    counts = np.zeros(n_keyframes, np.int64)
+    for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
+        landmark = a.landmark[row]
+        if landmark < 0:
+            continue
+        other = a.head[landmark]
+        while other >= 0:
+            counts[a.keyframe[other]] += 1
+            other = a.next_row[other]
+    counts[keyframe] = 0
+    return counts
+
+
+@kernel
+def link(a, row, landmark):
+    """Let a free row observe a landmark."""
+    a.landmark[row] = landmark
+    a.next_row[row] = a.head[landmark]
+    a.head[landmark] = row
+    a.n_observations[landmark] += 1 if np.isnan(a.u_right[row]) else 2
+
+
+@kernel
+def link_many(a, rows, landmarks):
+    """Let each of ``(N,)`` free rows observe its landmark."""
+    for i in range(len(rows)):
+        link(a, rows[i], landmarks[i])
+
+
+@kernel
+def unlink(a, row):
+    """Remove one observation. A landmark left with none is dead."""
+    landmark = a.landmark[row]
+    if a.head[landmark] == row:
+        a.head[landmark] = a.next_row[row]
+    else:
+        other = a.head[landmark]
+        while a.next_row[other] != row:
+            other = a.next_row[other]
+        a.next_row[other] = a.next_row[row]
+    a.landmark[row] = -1
+    a.next_row[row] = -1
+    a.n_observations[landmark] -= 1 if np.isnan(a.u_right[row]) else 2
+    if a.head[landmark] < 0:
+        a.landmark_alive[landmark] = False
+
+
+@kernel
+def erase_landmark(a, landmark):
+    """Remove a landmark and its observations."""
+    row = a.head[landmark]
+    while row >= 0:
+        following = a.next_row[row]
+        a.landmark[row] = -1
+        a.next_row[row] = -1
+        row = following
+    a.head[landmark] = -1
+    a.n_observations[landmark] = 0
+    a.landmark_alive[landmark] = False
+
+
+@kernel
+def detach_keyframe(a, keyframe):
+    """Remove all observations of a keyframe."""
+    for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
+        if a.landmark[row] >= 0:
+            unlink(a, row)
+
+
+@kernel
+def observed_by(a, landmark, keyframe):
+    """Row of ``keyframe`` that observes the landmark, or -1."""
+    row = a.head[landmark]
+    while row >= 0:
+        if a.keyframe[row] == keyframe:
+            return row
+        row = a.next_row[row]
+    return -1
+
+
+@kernel
+def merge_landmarks(a, loser, winner):
+    """Move the observations of ``loser`` to ``winner``; a keyframe that sees both keeps one."""
+    row = a.head[loser]
+    while row >= 0:
+        following = a.next_row[row]
+        a.landmark[row] = -1
+        a.next_row[row] = -1
+        if observed_by(a, winner, a.keyframe[row]) < 0:
+            link(a, row, winner)
+        row = following
+    a.head[loser] = -1
+    a.n_observations[loser] = 0
+    a.landmark_alive[loser] = False
+    a.merged_into[loser] = winner
+    a.visible[winner] += a.visible[loser]
+    a.found[winner] += a.found[loser]
+
+
+@kernel
+def resolve(a, landmarks):
+    """Follow merges: living landmark that each id stands for today, or -1. Returns ``(N,)`` i4."""
+    out = np.empty(len(landmarks), np.int32)
+    for i in range(len(landmarks)):
+        landmark = landmarks[i]
+        while landmark >= 0 and not a.landmark_alive[landmark]:
+            landmark = a.merged_into[landmark]
+        out[i] = landmark
+    return out
+
+
+@kernel
+def refresh_landmarks(a, landmarks, scales):
+    """Recompute what follows from the observations: descriptor, normal and reach.
+
+    The descriptor is the observation's with the least median distance to the others (ORB-SLAM,
+    III-C); the reach follows from the octave in the latest observing keyframe.
+    """
+    limit = 32
+    rows = np.empty(limit, np.int64)
+    distances = np.empty((limit, limit), np.int64)
+    for i in range(len(landmarks)):
+        landmark = landmarks[i]
+        if not a.landmark_alive[landmark]:
+            continue
+        n = 0
+        first, first_row = 2**31 - 1, -1
+        nx, ny, nz = 0.0, 0.0, 0.0
+        row = a.head[landmark]
+        while row >= 0:
+            k = a.keyframe[row]
+            T = a.T_cw[k]
+            # Centre of the camera: -R' t.
+            dx = a.xyz[landmark, 0] + T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3]
+            dy = a.xyz[landmark, 1] + T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3]
+            dz = a.xyz[landmark, 2] + T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3]
+            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+            nx += dx / distance
+            ny += dy / distance
+            nz += dz / distance
+            if k < first:
+                first, first_row = k, row
+                farthest = distance * scales[a.octave[row]]
+                a.reach[landmark, 0] = farthest / scales[-1]
+                a.reach[landmark, 1] = farthest
+            if n < limit:
+                rows[n] = row
+                n += 1
+            row = a.next_row[row]
+        norm = np.sqrt(nx * nx + ny * ny + nz * nz)
+        if norm > 0:
+            a.normal[landmark, 0] = nx / norm
+            a.normal[landmark, 1] = ny / norm
+            a.normal[landmark, 2] = nz / norm
+        for p in range(n):
+            distances[p, p] = 0
+            for q in range(p):
+                d = hamming(a.descriptor[rows[p]], a.descriptor[rows[q]])
+                distances[p, q] = d
+                distances[q, p] = d
+        best, best_median = first_row, 1000
+        for p in range(n):
+            median = np.sort(distances[p, :n])[(n - 1) // 2]
+            if median < best_median:
+                best, best_median = rows[p], median
+        for word in range(4):
+            a.landmark_descriptor[landmark, word] = a.descriptor[best, word]
+
+
+@kernel
+def predict_octave(distance, farthest, log_scale, levels):
+    """Pyramid level at which a landmark should appear at a distance (ORB-SLAM, V-D)."""
+    level = int(np.ceil(np.log(farthest / distance) / log_scale))
+    return min(max(level, 0), levels - 1)
+
+
+class LocalMap(NamedTuple):
+    """A copy of the landmarks around a keyframe, so that tracking can go on while mapping writes.
+
+    ``ids`` (N,) i4; ``xyz``, ``normal`` (N, 3) f8; ``reach`` (N, 2) f8; ``descriptor`` (N, 4) u8.
+    """
+
+    ids: NDArray[np.int32]
+    xyz: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    reach: NDArray[np.float64]
+    descriptor: NDArray[np.uint64]
+
+
+def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
+    """Copy the landmarks of a keyframe, its covisible keyframes and theirs (ORB-SLAM, V-D).
+
+    Args:
+        limit: at most this many keyframes, nearest in covisibility first.
+    """
+    first, _ = map_.covisible(keyframe)
+    chosen = [keyframe, *first[: limit - 1].tolist()]
+    known = set(chosen)
+    for neighbour in chosen[1:]:
+        if len(chosen) >= limit:
+            break
+        second, _ = map_.covisible(neighbour)
+        # ORB-SLAM adds the best few neighbours of each neighbour.
+        new = [k for k in second[:10].tolist() if k not in known]
+        chosen += new[: limit - len(chosen)]
+        known.update(new)
+    a = map_.arrays
+    ids = collect_landmarks(a, np.array(chosen, np.int64), map_.n_landmarks)
+    return LocalMap(ids, a.xyz[ids], a.normal[ids], a.reach[ids], a.landmark_descriptor[ids])
+
+
+@kernel
+def collect_landmarks(a, keyframes, n_landmarks):
+    """Ids of the landmarks that any of the keyframes observes, ``(N,)`` i4, in id order."""
+    seen = np.zeros(n_landmarks, np.bool_)
+    for keyframe in keyframes:
+        for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
+            if a.landmark[row] >= 0:
+                seen[a.landmark[row]] = True
+    return np.flatnonzero(seen).astype(np.int32)
+
+
+@kernel
+def count_seen_by(a, keyframe, needed):
+    """Landmarks of a keyframe that at least ``needed`` keyframes see, it included."""
+    count = 0
+    for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
+        if a.landmark[row] < 0:
+            continue
+        seen = 0
+        other = a.head[a.landmark[row]]
+        while other >= 0 and seen < needed:
+            seen += 1
+            other = a.next_row[other]
+        if seen >= needed:
+            count += 1
+    return count

@@ -1,0 +1,47 @@
+"""The progress bar of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+from vslam.features import TrackResult
+
+
+class _FramesPerSecond(ProgressColumn):
+    def render(self, task: Task) -> Text:
+        return Text(f"{task.speed:.1f} fps" if task.speed else "- fps")
+
+
+@contextmanager
+def progress_bar(total: int, *, shown: bool) -> Iterator[Callable[[TrackResult], None]]:
+    """Yield the callable to give each tracked frame to: frames, fps, tracking state, time left.
+
+    The bar is drawn on stderr, so that stdout stays for results.
+    """
+    columns = (
+        MofNCompleteColumn(),
+        BarColumn(),
+        _FramesPerSecond(),
+        TextColumn("{task.fields[state]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
+        task = progress.add_task("", total=total, state="starting")
+
+        def on_frame(result: TrackResult) -> None:
+            progress.update(task, completed=result.index + 1, state=str(result.state))
+
+        yield on_frame

@@ -1,0 +1,170 @@
+"""``report.md`` and ``report.html``: the same numbers in the same order, lost frames first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from vslam.report.schema import ReportJson
+
+if TYPE_CHECKING:
+    from vslam.report.figures import ReportFigure
+
+_ALIGNMENTS = {
+    "se3": "SE3 alignment, no scale",
+    "sim3": "Sim3 alignment, scale fitted",
+    "none": "not aligned",
+}
+
+
+@dataclass(frozen=True)
+class Headline:
+    """One number of the summary; ``tone`` is ``good``, ``bad`` or empty."""
+
+    label: str
+    value: str
+    note: str = ""
+    tone: str = ""
+
+
+def headlines(report: ReportJson) -> list[Headline]:
+    """The summary. Lost frames come first: an ATE says little of a run that was lost for half."""
+    lost = report.lost_frames
+    share = f"{100.0 * lost / report.frames:.1f} % of" if lost else "of"
+    alignment = _ALIGNMENTS[report.alignment] if report.alignment else "no ground truth to compare"
+    rotation = _number(report.rpe_deg, "°")
+    return [
+        Headline(
+            "Lost frames",
+            str(lost),
+            f"{share} {report.frames}; {report.weak_frames} weak, {report.skipped_frames} skipped",
+            "bad" if lost else "good",
+        ),
+        Headline("ATE RMSE", _number(report.ate_rmse_m, "m"), alignment),
+        Headline("RPE", _number(report.rpe_m, "m"), f"a frame; rotation {rotation}"),
+        Headline("t_rel", _number(report.t_rel_percent, "%"), "KITTI drift over 100-800 m"),
+        Headline("r_rel", _number(report.r_rel_deg_per_100m, "°"), "every 100 m"),
+        Headline("Speed", f"{report.fps:.1f} fps", f"{report.threads} threads"),
+        Headline(
+            "CPU",
+            f"{report.cpu_ms_per_frame:.1f} ms",
+            f"a frame, of all threads; start-up {report.startup_s:.1f} s",
+        ),
+        Headline("Memory", f"{report.peak_memory_mb:.0f} MB", "at its peak"),
+        Headline("Map", f"{report.landmarks:,}", f"landmarks, {report.keyframes:,} keyframes"),
+    ]
+
+
+def render_markdown(report: ReportJson) -> str:
+    """Markdown whose tables are aligned, to be read in a terminal."""
+    lines = [f"# vslam: {report.dataset} {report.sequence}", ""]
+    if report.interrupted:
+        lines += [f"**Interrupted: {report.interrupted}.** Numbers are of the frames done.", ""]
+    lines += _table(("", "", ""), [(h.label, h.value, h.note) for h in headlines(report)])
+    if report.skipped_messages:
+        lines += ["", "## Skipped frames", "", *(f"- {text}" for text in report.skipped_messages)]
+    if report.evo_command:
+        lines += ["", "## Reproduce the ATE", "", f"    {report.evo_command}"]
+    if report.stage_ms:
+        lines += ["", "## Time per stage (ms)", ""]
+        lines += _table(("stage", "mean", "median", "p95"), stage_rows(report))
+    if report.loops:
+        lines += ["", "## Loops", ""]
+        lines += _table(
+            ("query", "match", "score", "inliers", "accepted", "reason"), loop_rows(report)
+        )
+    lines += ["", "## Run", "", *_table(("", ""), option_rows(report))]
+    lines += ["", "## Machine", "", *_table(("", ""), machine_rows(report))]
+    lines += ["", "## Recording", "", "    rerun recording.rrd", ""]
+    return "\n".join(lines)
+
+
+def render_html(report: ReportJson, config: str, figures: Sequence[ReportFigure]) -> str:
+    """One self-contained page: style, figures and numbers are inside, nothing is loaded.
+
+    Args:
+        report: the numbers.
+        config: text of ``config.json``, shown as it is.
+        figures: drawn by :func:`vslam.report.figures.draw_figures`.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("vslam.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html.jinja").render(
+        report=report,
+        headlines=headlines(report),
+        stages=stage_rows(report),
+        loops=loop_rows(report),
+        options=option_rows(report),
+        machine=machine_rows(report),
+        config=config,
+        figures=figures,
+    )
+
+
+def stage_rows(report: ReportJson) -> list[tuple[str, ...]]:
+    """Stage, mean, median and 95th percentile in milliseconds."""
+    return [
+        (name, f"{ms.mean:.2f}", f"{ms.median:.2f}", f"{ms.p95:.2f}")
+        for name, ms in report.stage_ms.items()
+    ]
+
+
+def loop_rows(report: ReportJson) -> list[tuple[str, ...]]:
+    """Query, match, score, inliers, accepted and reason of each loop candidate."""
+    return [
+        (
+            str(loop.query),
+            str(loop.match),
+            f"{loop.score:.3f}",
+            str(loop.inliers),
+            "yes" if loop.accepted else "no",
+            loop.reason,
+        )
+        for loop in report.loops
+    ]
+
+
+def option_rows(report: ReportJson) -> list[tuple[str, str]]:
+    """The options of the run, as they would be typed."""
+    names = ("dataset", "sequence", "perturb", "detector", "sensor", "seed", "threads", "start")
+    options = [(name, str(getattr(report, name))) for name in (*names, "every")]
+    limit = "all" if report.max_frames is None else str(report.max_frames)
+    return [*options, ("max-frames", limit)]
+
+
+def machine_rows(report: ReportJson) -> list[tuple[str, str]]:
+    """Where and with what the run was made."""
+    machine = report.machine
+    packages = {name: text for name, text in report.versions.items() if name != "python"}
+    return [
+        ("CPU", f"{machine.cpu}, {machine.cores} cores"),
+        ("platform", machine.platform),
+        ("Python", machine.python),
+        ("packages", ", ".join(f"{name} {text}" for name, text in packages.items())),
+        ("created", f"{report.created:%Y-%m-%d %H:%M:%S %Z}"),
+    ]
+
+
+def _number(value: float | None, unit: str) -> str:
+    if value is None:
+        return "n/a"
+    decimals = 1 if value >= 100 else 2 if value >= 10 else 3 if value >= 0.1 else 4
+    return f"{value:.{decimals}f}{unit if unit == '°' else ' ' + unit}"
+
+
+def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> list[str]:
+    rows = [tuple(cell.replace("|", "\\|").replace("\n", " ") for cell in row) for row in rows]
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    rule = tuple("-" * max(width, 3) for width in widths)
+    return [
+        "| " + " | ".join(cell.ljust(max(w, 3)) for cell, w in zip(row, widths, strict=True)) + " |"
+        for row in (head, rule, *rows)
+    ]

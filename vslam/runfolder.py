@@ -1,0 +1,65 @@
+"""The folder of one run: its name, and the trajectories in it that evo can read."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from datetime import datetime
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+
+from vslam.errors import InputError
+from vslam.run import RunOutcome
+from vslam.trajectory import Trajectory, write_kitti, write_tum
+
+
+def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, detector: str) -> Path:
+    """Create ``out/<YYYYmmdd-HHMMSS>-<dataset>-<sequence>-<perturb>-<detector>``.
+
+    A number is added to a name in use. ``out/latest`` becomes a link to the folder where the file
+    system has links.
+
+    Raises:
+        InputError: the folder cannot be created.
+    """
+    parts = [dataset, sequence, perturb.replace(":", "").replace(",", "+"), detector]
+    safe = [re.sub(r"[^A-Za-z0-9.+-]+", "_", part) for part in parts]
+    name = "-".join([f"{datetime.now():%Y%m%d-%H%M%S}", *safe])
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for number in count(1):
+            folder = out / (name if number == 1 else f"{name}-{number}")
+            with contextlib.suppress(FileExistsError):
+                folder.mkdir()
+                break
+    except OSError as error:
+        raise InputError(
+            f"{out}: cannot create a run folder here ({error.strerror}); "
+            "name a writable folder with --out."
+        ) from error
+    with contextlib.suppress(OSError):
+        (out / "latest").unlink(missing_ok=True)
+        (out / "latest").symlink_to(folder.name, target_is_directory=True)
+    return folder
+
+
+def matched_ground_truth(outcome: RunOutcome) -> Trajectory | None:
+    """The ground truth of just the frames that ``outcome.trajectory`` has, None without any."""
+    poses = outcome.sequence.ground_truth
+    if poses is None:
+        return None
+    done = np.isin(outcome.sequence.timestamps, outcome.trajectory.timestamps)
+    return Trajectory(outcome.sequence.timestamps, poses).select(np.flatnonzero(done))
+
+
+def write_trajectories(folder: Path, outcome: RunOutcome) -> None:
+    """Write the final trajectory in both formats and the ground truth of the same frames.
+
+    Files: ``trajectory_kitti.txt``, ``trajectory_tum.txt``, ``ground_truth_kitti.txt``.
+    """
+    write_kitti(folder / "trajectory_kitti.txt", outcome.trajectory.T_wc)
+    write_tum(folder / "trajectory_tum.txt", outcome.trajectory)
+    if (ground_truth := matched_ground_truth(outcome)) is not None:
+        write_kitti(folder / "ground_truth_kitti.txt", ground_truth.T_wc)

@@ -1,0 +1,180 @@
+"""Trajectories: one pose for each frame, read and written in the field's two text formats.
+
+KITTI: the 12 numbers of the upper 3x4 part of ``T_wc`` a line, row by row, without time (Geiger et
+al., CVPR 2012). TUM: ``t x y z qx qy qz qw`` a line, seconds and metres (Sturm et al., IROS 2012).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError
+
+_FORMAT_OF_COLUMNS: dict[int, Literal["kitti", "tum"]] = {12: "kitti", 8: "tum"}
+
+# Poses in the wild are rounded to 7 digits; beyond this a matrix is no rotation but a mistake.
+_ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """``timestamps`` ``(N,)`` in seconds and ``T_wc`` ``(N, 4, 4)`` float64, camera to world."""
+
+    timestamps: NDArray[np.float64]
+    T_wc: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.T_wc)
+
+    def select(self, indices: NDArray[np.int64]) -> Trajectory:
+        """The poses ``indices`` in their order."""
+        return Trajectory(self.timestamps[indices], self.T_wc[indices])
+
+
+def read_table(path: Path, columns: tuple[int, ...], what: str) -> NDArray[np.float64]:
+    """Read a text file of numbers; blank lines and lines that begin with ``#`` are passed over.
+
+    Args:
+        path: file to read.
+        columns: the numbers of columns allowed; all lines must agree.
+        what: what a line holds, for the error messages ("a pose").
+
+    Returns:
+        ``(N, C)`` float64 with N >= 1, all finite.
+
+    Raises:
+        InputError: missing, empty or malformed file, NaN or infinity in it.
+    """
+    try:
+        lines = path.read_text().splitlines()
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the file ({error.strerror}).") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file; give one with {what} on each line.") from error
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        where = f"{path}: line {number}"
+        try:
+            row = [float(word) for word in words]
+        except ValueError as error:
+            raise InputError(
+                f"{where} is not a row of numbers; repair the line or download the file again."
+            ) from error
+        wanted = (len(rows[0]),) if rows else columns
+        if len(row) not in wanted:
+            allowed = " or ".join(map(str, wanted))
+            raise InputError(
+                f"{where} has {len(row)} numbers where {what} takes {allowed}; "
+                "repair the line or download the file again."
+            )
+        if not np.isfinite(row).all():
+            raise InputError(
+                f"{where} holds NaN or infinity; repair the line or download the file again."
+            )
+        rows.append(row)
+    if not rows:
+        raise InputError(f"{path}: the file is empty; it must have {what} on each line.")
+    return np.array(rows)
+
+
+def trajectory_format(path: Path) -> Literal["kitti", "tum"]:
+    """Tell the two formats apart by the number of columns.
+
+    Raises:
+        InputError: as :func:`read_table`.
+    """
+    return _FORMAT_OF_COLUMNS[read_table(path, (12, 8), "a pose").shape[1]]
+
+
+def read_kitti_poses(path: Path) -> NDArray[np.float64]:
+    """Read a KITTI pose file into ``(N, 4, 4)`` float64 ``T_wc``.
+
+    Raises:
+        InputError: missing or malformed file, NaN, or a 3x3 part that is no rotation.
+    """
+    return _poses_of_rows(path, read_table(path, (12,), "a KITTI pose"))
+
+
+def read_trajectory(path: Path, timestamps: NDArray[np.float64] | None = None) -> Trajectory:
+    """Read a KITTI (12 columns) or TUM (8 columns) trajectory.
+
+    Args:
+        path: file to read.
+        timestamps: ``(N,)`` seconds of the poses of a KITTI file; without them the frame number
+            stands in. A TUM file has its own and ignores these.
+
+    Raises:
+        InputError: malformed file, another number of poses than of timestamps, no rotation, or
+            TUM times that do not increase.
+    """
+    rows = read_table(path, (12, 8), "a pose")
+    if _FORMAT_OF_COLUMNS[rows.shape[1]] == "kitti":
+        if timestamps is None:
+            timestamps = np.arange(len(rows), dtype=np.float64)
+        elif len(timestamps) != len(rows):
+            raise InputError(
+                f"{path}: {len(rows)} poses but {len(timestamps)} timestamps; "
+                "give the times of just these frames."
+            )
+        return Trajectory(np.asarray(timestamps, np.float64), _poses_of_rows(path, rows))
+
+    from scipy.spatial.transform import Rotation
+
+    if (bad := np.flatnonzero(np.diff(rows[:, 0]) <= 0)).size:
+        raise InputError(
+            f"{path}: the time of pose {bad[0] + 2} is not later than the one before it; "
+            "sort the poses by time."
+        )
+    if not np.allclose(np.linalg.norm(rows[:, 4:], axis=1), 1.0, atol=_ROTATION_TOLERANCE):
+        raise InputError(f"{path}: a quaternion is not of length 1; write qx qy qz qw normalised.")
+    T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_wc[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    T_wc[:, :3, 3] = rows[:, 1:4]
+    return Trajectory(rows[:, 0], T_wc)
+
+
+def write_kitti(path: Path, T_wc: NDArray[np.float64]) -> None:
+    """Write ``(N, 4, 4)`` poses in KITTI's format with 13 significant digits."""
+    rows = T_wc[:, :3, :].reshape(-1, 12) + 0.0  # no "-0": equal poses give equal bytes
+    path.write_text("".join(" ".join(f"{x:.12e}" for x in row) + "\n" for row in rows))
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write a trajectory in TUM's format: nanoseconds, nanometres, quaternions with qw >= 0."""
+    from scipy.spatial.transform import Rotation
+
+    rotations = Rotation.from_matrix(trajectory.T_wc[:, :3, :3])
+    rows = np.column_stack([trajectory.T_wc[:, :3, 3], rotations.as_quat(canonical=True)])
+    path.write_text(
+        "".join(
+            f"{t:.9f} "
+            + " ".join(f"{x:.9f}" for x in row[:3])
+            + " "
+            # Twelve digits keep the quaternion on the unit sphere to the rounding of the poses.
+            + " ".join(f"{x:.12f}" for x in row[3:])
+            + "\n"
+            for t, row in zip(trajectory.timestamps, rows, strict=True)
+        )
+    )
+
+
+def _poses_of_rows(path: Path, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_wc[:, :3, :] = rows.reshape(-1, 3, 4)
+    R_wc = T_wc[:, :3, :3]
+    error = np.abs(R_wc @ R_wc.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    bad = np.flatnonzero((error > _ROTATION_TOLERANCE) | (np.linalg.det(R_wc) < 0))
+    if bad.size:
+        raise InputError(
+            f"{path}: the 3x3 part of pose {bad[0] + 1} is not a rotation; "
+            "write the 3x4 rows of T_wc."
+        )
+    return T_wc

@@ -81,14 +81,15 @@ def feature_depth(features: Features, camera: StereoCamera) -> NDArray[np.float6
     return camera.bf / (features.xy[:, 0].astype(np.float64) - features.u_right)
 
 
-def track_motion(frame: Frame, previous: Frame, T_cw: NDArray[np.float64], tracker: Tracker) -> int:
+def track_motion(frame: Frame, previous: Frame, T_cw: NDArray[np.float64], tracker: Tracker) -> tuple[int, int]:
     """Match what the previous frame saw near where the predicted pose puts it; refine the pose.
 
     Besides landmarks, close stereo points of the previous frame that are not in the map take part
     (ORB-SLAM2's visual-odometry points): they steady the pose and are then forgotten.
 
     Returns:
-        Inliers of the pose optimisation; ``frame`` holds the pose and the matched landmarks.
+        Matches, and inliers of the pose optimisation; ``frame`` holds the pose and the matched
+        landmarks.
     """
     config, camera = tracker.config.tracking, tracker.camera
     points, source = trackable_points(previous, tracker)
@@ -108,7 +109,7 @@ def track_motion(frame: Frame, previous: Frame, T_cw: NDArray[np.float64], track
         low, high = octave, np.full_like(octave, NEVER)
     elif forward > camera.baseline:
         low, high = np.zeros_like(octave), octave
-    inliers = 0
+    matches, inliers = 0, 0
     for widening in (1.0, 2.0, 4.0):
         radius = np.where(ahead, config.motion_window * widening * tracker.scales[octave], 0.0)
         found = _search(
@@ -126,7 +127,8 @@ def track_motion(frame: Frame, previous: Frame, T_cw: NDArray[np.float64], track
         hit = hit[
             consistent_orientation(before.angle[source[hit]], frame.features.angle[found[hit]])
         ]
-        if len(hit) < config.min_inliers_motion:
+        matches = len(hit)
+        if matches < config.min_inliers_motion:
             continue
         frame.landmark[:] = -1
         frame.xyz[:] = np.nan
@@ -135,7 +137,7 @@ def track_motion(frame: Frame, previous: Frame, T_cw: NDArray[np.float64], track
         inliers = _refine(frame, T_cw, tracker)
         if inliers >= config.min_inliers_motion:
             break
-    return inliers
+    return matches, inliers
 
 
 def trackable_points(
@@ -154,20 +156,21 @@ def trackable_points(
 
 def track_descriptors(
     frame: Frame,
-    ids: NDArray[np.int32],
-    xyz: NDArray[np.float64],
-    descriptors: NDArray[np.uint64],
+    reference: LocalMap,
     T_cw: NDArray[np.float64],
     tracker: Tracker,
 ) -> int:
     """Match landmarks by descriptor alone and refine the pose from ``T_cw``: no prediction needed.
 
     Args:
-        ids, xyz, descriptors: ``(M,)``, ``(M, 3)``, ``(M, 4)`` landmarks of the reference keyframe.
+        reference: the landmarks of the reference keyframe.
+
+    Returns:
+        Inliers of the pose optimisation; ``frame`` holds the pose and the matched landmarks.
     """
     config = tracker.config.tracking
     found = search_all(
-        descriptors,
+        reference.descriptor,
         frame.features.descriptors.view(np.uint64),
         config.reference_distance,
         config.reference_ratio,
@@ -177,8 +180,8 @@ def track_descriptors(
     frame.xyz[:] = np.nan
     if len(hit) < config.min_inliers_lost:
         return 0
-    frame.landmark[found[hit]] = ids[hit]
-    frame.xyz[found[hit]] = xyz[hit]
+    frame.landmark[found[hit]] = reference.ids[hit]
+    frame.xyz[found[hit]] = reference.xyz[hit]
     return _refine(frame, T_cw, tracker)
 
 

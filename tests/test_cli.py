@@ -218,7 +218,7 @@ def test_interrupted_run_keeps_its_results(call, root, pipeline):
     code, out, _ = call("run", "--data", root, "--max-frames", 10)
     assert code == 1
     assert "Ctrl-C" in out
-    assert Path("runs/latest/trajectory_tum.txt").is_file()
+    assert Path("runs/latest/trajectory.tum").is_file()
 
 
 def test_eval(call, tmp_path):

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import StereoCamera
 from vslam.features import Features, TrackingState, TrackResult
+from vslam.map import Map
 from vslam.recorder import NullRecorder, Recorder, RerunRecorder
 from vslam.trajectory import Trajectory
 
@@ -72,7 +73,7 @@ def record(recorder: Recorder, frames: int = FRAMES) -> None:
     offset = np.eye(4)
     offset[:3, 3] = [100.0, 0.0, 50.0]
     recorder.begin(CAMERA, Trajectory(0.1 * np.arange(frames), offset @ poses))
-    xyz = np.zeros((0, 3))
+    map_ = Map(np.ones(8))
     for frame in range(frames):
         result = _result(frame)
         recorder.frame(result, result.T_wc)
@@ -82,9 +83,12 @@ def record(recorder: Recorder, frames: int = FRAMES) -> None:
             image = np.roll(image, rng.integers(1, 100), axis=1)
             recorder.keyframe(result, image, features, rng.random(2000) < 0.25)
             new = rng.normal(0.0, 20.0, (LANDMARKS_PER_KEYFRAME, 3)) + result.T_wc[:3, 3]
-            xyz = np.concatenate([xyz, new])
-            recorder.map(poses[: frame + 1 : FRAMES_PER_KEYFRAME], xyz)
-    recorder.finish(Trajectory(0.1 * np.arange(frames), poses), poses[::FRAMES_PER_KEYFRAME], xyz)
+            descriptors = np.zeros((LANDMARKS_PER_KEYFRAME, 4), np.uint64)
+            T_cw = np.linalg.inv(result.T_wc)
+            keyframe = map_.add_keyframe(_features(rng, 1), T_cw, result.timestamp, frame)
+            map_.add_landmarks(new, descriptors, keyframe)
+        recorder.map(map_)
+    recorder.finish(Trajectory(0.1 * np.arange(frames), poses), map_)
 
 
 def rows(path: Path, entity: str) -> list[dict[str, Any]]:
@@ -156,9 +160,7 @@ def test_image_is_half_size_jpeg(recording: Path) -> None:
 def test_a_run_without_frames(tmp_path: Path) -> None:
     recorder = RerunRecorder(tmp_path / "recording.rrd")
     recorder.begin(CAMERA, None)
-    recorder.finish(
-        Trajectory(np.zeros(0), np.zeros((0, 4, 4))), np.zeros((0, 4, 4)), np.zeros((0, 3))
-    )
+    recorder.finish(Trajectory(np.zeros(0), np.zeros((0, 4, 4))), Map(np.ones(8)))
     assert rows(tmp_path / "recording.rrd", "world")
 
 

@@ -264,19 +264,9 @@ def test_of_one_frame(tmp_path: Path) -> None:
 
 
 def test_of_all_frames_lost(tmp_path: Path) -> None:
-    report = report_of(make_outcome(30, lost=slice(0, 30)), tmp_path)
+    report = report_of(make_outcome(30, lost=slice(0, 30), ground_truth=False), tmp_path)
     assert (report.lost_frames, report.weak_frames) == (30, 0)
     assert "100.0 % of 30" in (tmp_path / "report.md").read_text()
-
-
-def test_interrupted_before_the_first_keyframe(tmp_path: Path) -> None:
-    outcome = make_outcome(3, lost=slice(0, 0))
-    nothing = outcome.keyframes.select(np.arange(0))
-    outcome = replace(outcome, keyframes=nothing, n_keyframes=0, interrupted="Ctrl-C")
-    assert report_of(outcome, tmp_path).interrupted == "Ctrl-C"
-    assert (tmp_path / "keyframes.tum").read_text() == ""
-    for name in ("report.md", "report.html"):
-        assert "Interrupted: Ctrl-C" in (tmp_path / name).read_text()
 
 
 def test_interrupted_before_the_first_frame(tmp_path: Path) -> None:
@@ -288,16 +278,23 @@ def test_interrupted_before_the_first_frame(tmp_path: Path) -> None:
     assert figures_of(tmp_path) == set()
 
 
-def test_ground_truth_of_the_frames_done_only(tmp_path: Path) -> None:
+def test_interrupted_with_skipped_frames_and_no_keyframe(tmp_path: Path) -> None:
     outcome = make_outcome(60, lost=slice(0, 0))
     done = np.setdiff1d(np.arange(50), [7, 8])
     outcome = replace(
         outcome,
         trajectory=outcome.trajectory.select(done),
+        keyframes=outcome.keyframes.select(np.arange(0)),
         tracks=[outcome.tracks[i] for i in done],
         skipped=["7.png: damaged", "8.png: damaged"],
+        n_keyframes=0,
+        interrupted="Ctrl-C",
     )
-    report_of(outcome, tmp_path)
+    report = report_of(outcome, tmp_path)
+    assert (report.interrupted, report.frames, report.skipped_frames) == ("Ctrl-C", 48, 2)
+    assert (tmp_path / "keyframes.tum").read_text() == ""
+    for name in ("report.md", "report.html"):
+        assert "Interrupted: Ctrl-C" in (tmp_path / name).read_text()
     truth = read_trajectory(tmp_path / "ground_truth_kitti.txt")
     assert outcome.sequence.ground_truth is not None
     np.testing.assert_allclose(truth.T_wc, outcome.sequence.ground_truth[done], atol=1e-9)

@@ -64,7 +64,7 @@ def test_ground_truth_of_just_the_frames_done(tmp_path):
     for name in ("trajectory_kitti.txt", "ground_truth_kitti.txt"):
         np.testing.assert_array_equal(read_kitti_poses(tmp_path / name)[:, 2, 3], done)
     np.testing.assert_allclose(
-        read_trajectory(tmp_path / "trajectory_tum.txt").timestamps, [0, 0.1, 0.3]
+        read_trajectory(tmp_path / "trajectory.tum").timestamps, [0, 0.1, 0.3]
     )
 
 

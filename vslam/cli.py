@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam import __version__
-from vslam.errors import InputError
+from vslam.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
     from vslam.evaluate import Evaluation
@@ -94,7 +94,7 @@ def run(
     from vslam.info import available_cores
     from vslam.perturb import parse_perturbation
     from vslam.run import RunSettings
-    from vslam.runfolder import create_run_folder, matched_ground_truth, write_trajectories
+    from vslam.runfolder import create_run_folder, write_results
 
     thresholds = Config() if config is None else load_config(config)
     sequence = open_sequence(dataset, data, seq, start=start, every=every, max_frames=max_frames)
@@ -113,25 +113,14 @@ def run(
         max_frames=max_frames,
         config=thresholds,
     )
-    (folder / "config.json").write_text(thresholds.model_dump_json(indent=2) + "\n")
-
-    from vslam.evaluate import evaluate
     from vslam.pipeline import run_sequence
     from vslam.progress import progress_bar
     from vslam.recorder import NullRecorder, RerunRecorder
-    from vslam.report import write_report
 
     recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
     with progress_bar(len(sequence), shown=not quiet) as on_frame:
         outcome = run_sequence(sequence, perturbation, settings, recorder, on_frame=on_frame)
-    write_trajectories(folder, outcome)
-    evaluation, remark = None, "no ground truth"
-    if (ground_truth := matched_ground_truth(outcome)) is not None:
-        try:
-            evaluation = evaluate(outcome.trajectory, ground_truth)
-        except InputError as error:  # a clip too short to align is no reason to lose the run
-            remark = str(error)
-    write_report(outcome, evaluation, folder)
+    evaluation, remark = write_results(folder, outcome, ply=ply)
     if not quiet:
         _print_summary(outcome, evaluation, remark, folder)
     if outcome.interrupted:
@@ -247,6 +236,9 @@ def main() -> None:
     except InputError as error:
         typer.echo(f"error: {error}", err=True)
         sys.exit(2)
+    except ResultsError as error:
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(1)
 
 
 def _require_built(option: str, value: str, known: dict[str, bool]) -> None:

@@ -55,6 +55,9 @@ class TrackingConfig(_Section):
         100, ge=10, description="Stereo features that a map can start from. [own]"
     )
     min_inliers_motion: int = Field(20, ge=3, description="Below: try the reference keyframe.")
+    min_inlier_ratio: float = Field(
+        0.3, ge=0, le=1, description="Of the motion matches; below: likewise. [own]"
+    )
     min_inliers: int = Field(30, ge=3, description="Below, the frame is WEAK. [OS1]")
     min_inliers_lost: int = Field(15, ge=3, description="Below, the frame is LOST. [own]")
     lost_frames_before_restart: int = Field(

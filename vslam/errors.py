@@ -1,4 +1,4 @@
-"""The two kinds of failure a user can cause or repair."""
+"""Failures that a user can cause or repair."""
 
 from __future__ import annotations
 
@@ -18,3 +18,7 @@ class UnreadableImageError(InputError):
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(f"{path}: {why}")
         self.path = path
+
+
+class ResultsError(Exception):
+    """Results cannot be written, on a full disk for example. The CLI exits with 1."""

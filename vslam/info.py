@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -68,3 +69,10 @@ def numba_caches() -> dict[Path, int]:
         folder: sum(file.stat().st_size for file in folder.rglob("*.nb[ic]")) for folder in folders
     }
     return {folder: size for folder, size in sizes.items() if size}
+
+
+def process_age() -> float:
+    """Seconds since this process started."""
+    import psutil
+
+    return time.time() - psutil.Process().create_time()

@@ -190,9 +190,9 @@ class Map:
         return order, counts[order]
 
     def keyframe_pose(self, keyframe: int) -> NDArray[np.float64]:
-        """``T_cw``; that of a culled keyframe follows its nearest living ancestor."""
+        """Copy of ``T_cw``; that of a culled keyframe follows its nearest living ancestor."""
         if self.arrays.keyframe_alive[keyframe]:
-            return self.arrays.T_cw[keyframe]
+            return self.arrays.T_cw[keyframe].copy()
         return self.T_c_parent[keyframe] @ self.keyframe_pose(self.parents[keyframe])
 
     def cull_keyframe(self, keyframe: int) -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import StereoCamera
 from vslam.features import Features, TrackingState, TrackResult
+from vslam.map import Map
 from vslam.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
@@ -71,20 +72,10 @@ class Recorder(Protocol):
             tracked: ``(N,)`` whether the feature is an inlier of the map.
         """
 
-    def map(self, T_wc_keyframes: NDArray[np.float64], xyz: NDArray[np.float64]) -> None:
-        """Offer the map; at each keyframe, the recorder decides which ones to log.
+    def map(self, map_: Map) -> None:
+        """Offer the map, whenever nobody writes it; the recorder decides which states to log."""
 
-        Args:
-            T_wc_keyframes: ``(K, 4, 4)`` keyframe poses in their order.
-            xyz: ``(L, 3)`` landmarks in the world, metres. Neither array is kept.
-        """
-
-    def finish(
-        self,
-        trajectory: Trajectory,
-        T_wc_keyframes: NDArray[np.float64],
-        xyz: NDArray[np.float64],
-    ) -> None:
+    def finish(self, trajectory: Trajectory, map_: Map) -> None:
         """Log the final trajectory and map, write all that is pending and close the file."""
 
 
@@ -120,8 +111,9 @@ class RerunRecorder:
 
     Failing to write never ends a run. Rerun writes in a thread of its own, whose errors only a
     later flush reports, and after an error waiting for that thread can last forever. Therefore the
-    recording ends, with a warning in the log, when the disk has less than 64 MB left, and it is
-    given up when a flush fails or takes longer than 5 s. What was written stays readable.
+    recording ends, with a warning in the log, when the disk has less than 64 MB left: it is then
+    complete up to there. When a flush fails or takes longer than 5 s, the recording is given up
+    with a warning: its file may be cut off within a message.
     """
 
     def __init__(self, path: Path) -> None:
@@ -209,22 +201,16 @@ class RerunRecorder:
             self._recording.log(f"{path}/{name}", rr.Points2D.from_fields(positions=positions))
 
     @_guarded
-    def map(self, T_wc_keyframes: NDArray[np.float64], xyz: NDArray[np.float64]) -> None:
+    def map(self, map_: Map) -> None:
         if self._keyframes < self._mapped_keyframes + _KEYFRAMES_PER_MAP:
             return
         self._mapped_keyframes = self._keyframes
-        step = -(-len(xyz) // _MAX_POINTS_PER_MAP) or 1
-        self._log_map(T_wc_keyframes, xyz[::step])
+        self._log_map(map_, _MAX_POINTS_PER_MAP)
         self._flush()
 
     @_guarded
-    def finish(
-        self,
-        trajectory: Trajectory,
-        T_wc_keyframes: NDArray[np.float64],
-        xyz: NDArray[np.float64],
-    ) -> None:
-        self._log_map(T_wc_keyframes, xyz)
+    def finish(self, trajectory: Trajectory, map_: Map) -> None:
+        self._log_map(map_, map_.n_landmarks)
         self._recording.log("world/trajectory", _path(trajectory.T_wc, _BLUE), static=True)
         self._close()
 
@@ -232,12 +218,14 @@ class RerunRecorder:
         self._recording.set_time("frame", sequence=result.index)
         self._recording.set_time("time", duration=result.timestamp)
 
-    def _log_map(self, T_wc_keyframes: NDArray[np.float64], xyz: NDArray[np.float64]) -> None:
+    def _log_map(self, map_: Map, limit: int) -> None:
         import rerun as rr
 
-        self._recording.log(
-            "world/landmarks", rr.Points3D.from_fields(positions=xyz.astype(np.float32))
-        )
+        landmarks = map_.living_landmarks()
+        landmarks = landmarks[:: -(-len(landmarks) // limit) if limit else 1]
+        xyz = map_.arrays.xyz[landmarks].astype(np.float32)
+        T_wc_keyframes = np.linalg.inv(map_.arrays.T_cw[map_.living_keyframes()])
+        self._recording.log("world/landmarks", rr.Points3D.from_fields(positions=xyz))
         self._recording.log("world/keyframes", _path(T_wc_keyframes, _AMBER))
 
     def _send_frames(self) -> None:
@@ -322,6 +310,6 @@ def _blueprint() -> Any:
     )
     return rrb.Blueprint(
         rrb.Horizontal(scene, column, column_shares=[3, 2]),
-        rrb.TimePanel(timeline="frame"),
+        rrb.TimePanel(timeline="frame", state="collapsed"),
         collapse_panels=True,
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from vslam.config import Config
 from vslam.datasets.sequence import Sequence
 from vslam.features import TrackResult
+from vslam.map import Map
 from vslam.trajectory import Trajectory
 
 
@@ -52,6 +53,7 @@ class RunOutcome:
         startup_s: seconds from the start of the process to the first frame.
         peak_memory_mb: of the process.
         n_landmarks, n_keyframes: in the final map.
+        map: the final map, None for a trajectory from elsewhere.
         interrupted: why the run ended early ("Ctrl-C", "disk full"), or None.
     """
 
@@ -67,5 +69,6 @@ class RunOutcome:
     peak_memory_mb: float
     n_keyframes: int
     n_landmarks: int
+    map: Map | None = None
     loops: list[LoopRow] = field(default_factory=list)
     interrupted: str | None = None

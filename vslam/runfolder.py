@@ -1,4 +1,4 @@
-"""The folder of one run: its name, and the trajectories in it that evo can read."""
+"""The folder of one run: its name, and everything that is written to it when the run ends."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ import re
 from datetime import datetime
 from itertools import count
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vslam.errors import InputError
+from vslam.errors import InputError, ResultsError
 from vslam.run import RunOutcome
 from vslam.trajectory import Trajectory, write_kitti, write_tum
+
+if TYPE_CHECKING:
+    from vslam.evaluate import Evaluation
 
 
 def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, detector: str) -> Path:
@@ -57,9 +61,50 @@ def matched_ground_truth(outcome: RunOutcome) -> Trajectory | None:
 def write_trajectories(folder: Path, outcome: RunOutcome) -> None:
     """Write the final trajectory in both formats and the ground truth of the same frames.
 
-    Files: ``trajectory_kitti.txt``, ``trajectory_tum.txt``, ``ground_truth_kitti.txt``.
+    Files: ``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``.
     """
     write_kitti(folder / "trajectory_kitti.txt", outcome.trajectory.T_wc)
-    write_tum(folder / "trajectory_tum.txt", outcome.trajectory)
+    write_tum(folder / "trajectory.tum", outcome.trajectory)
     if (ground_truth := matched_ground_truth(outcome)) is not None:
         write_kitti(folder / "ground_truth_kitti.txt", ground_truth.T_wc)
+
+
+def write_results(
+    folder: Path, outcome: RunOutcome, *, ply: bool = False
+) -> tuple[Evaluation | None, str]:
+    """Evaluate a run and write trajectories, report and map, what matters most first.
+
+    Args:
+        ply: write the landmarks as ``map.ply`` too.
+
+    Returns:
+        The evaluation, or None and the reason why there is none.
+
+    Raises:
+        ResultsError: a file could not be written; those before it are complete.
+    """
+    from vslam.evaluate import evaluate
+    from vslam.mapio import save_map, save_ply
+    from vslam.report import write_report
+
+    try:
+        write_trajectories(folder, outcome)
+        evaluation, remark = None, "no ground truth"
+        if (ground_truth := matched_ground_truth(outcome)) is not None:
+            try:
+                evaluation = evaluate(outcome.trajectory, ground_truth)
+            except InputError as error:  # a clip too short to align is no reason to lose the run
+                remark = str(error)
+        write_report(outcome, evaluation, folder)
+        if outcome.map is not None:
+            save_map(folder / "map.npz", outcome.map, outcome.sequence.camera)
+            if ply:
+                landmarks = outcome.map.living_landmarks()
+                save_ply(folder / "map.ply", outcome.map.arrays.xyz[landmarks])
+    except OSError as error:
+        done = ", ".join(sorted(file.name for file in folder.iterdir() if file.stat().st_size))
+        raise ResultsError(
+            f"{folder}: not all results could be written ({error.strerror}); written so far: "
+            f"{done}. Free some space or name another folder with --out."
+        ) from error
+    return evaluation, remark

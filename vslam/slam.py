@@ -81,7 +81,8 @@ class Slam:
         self._local: LocalMap | None = None
         self._reference = 0
         self._n_reference = 0
-        self._velocity = np.zeros(6)
+        self._reference_view: LocalMap | None = None
+        self._velocity: Matrix | None = None  # twist per second
         self._placed: list[_Placed] = []
         self._lost_frames = 0
         self._visible: list[NDArray[np.int32]] = []
@@ -110,16 +111,16 @@ class Slam:
         frame = self._prepare(features)
         if index - self._mapping_since >= self.config.keyframes.merge_after_frames:
             self._merge()
-            clock.lap("wait for mapping")
+            clock.lap("wait_for_mapping")
 
         if self.map.n_keyframes == 0:
             return self._start(frame, timestamp, clock)
 
         T_cw = self._predict(timestamp)
         inliers = self._track_frame(frame, T_cw)
-        clock.lap("track frame")
+        clock.lap("track_frame")
         matches, inliers, visible = self._track_map(frame, inliers)
-        clock.lap("track local map")
+        clock.lap("track_local_map")
         state = self._judge(inliers)
         if state == TrackingState.LOST:
             return self._lose(frame, T_cw, timestamp, matches, inliers, clock)
@@ -154,6 +155,11 @@ class Slam:
             self._executor.shutdown()
             self._executor = None
 
+    @property
+    def is_mapping(self) -> bool:
+        """Whether a keyframe is being mapped; only between times may others read ``map``."""
+        return self._mapping is not None
+
     def trajectory(self) -> Trajectory:
         """Final pose of every frame, lost ones included."""
         times = np.array([p.timestamp for p in self._placed])
@@ -180,17 +186,20 @@ class Slam:
         last = self._placed[-1]
         elapsed = timestamp - last.timestamp
         T_last = last.T_c_reference @ self._keyframe_pose(last.reference)
+        if self._velocity is None:
+            return T_last
         return orthonormalised(se3_exp(self._velocity * elapsed) @ T_last)
 
     def _track_frame(self, frame: Frame, T_cw: Matrix) -> int:
         """Frame to frame along the prediction, else against the reference keyframe."""
         assert self.frame is not None
-        inliers = track_motion(frame, self.frame, T_cw, self.tracker)
-        if inliers >= self.config.tracking.min_inliers_motion:
-            return inliers
-        assert self._local is not None
-        local = self._local
-        return track_descriptors(frame, local.ids, local.xyz, local.descriptor, T_cw, self.tracker)
+        if self._velocity is not None:
+            matches, inliers = track_motion(frame, self.frame, T_cw, self.tracker)
+            config = self.config.tracking
+            if inliers >= max(config.min_inliers_motion, config.min_inlier_ratio * matches):
+                return inliers
+        assert self._reference_view is not None
+        return track_descriptors(frame, self._reference_view, T_cw, self.tracker)
 
     def _track_map(self, frame: Frame, inliers: int) -> tuple[int, int, NDArray[np.int32]]:
         assert self._local is not None
@@ -245,6 +254,7 @@ class Slam:
             self._insert_keyframe(frame, timestamp)
             self.frame = frame
             self._lost_frames = 0
+            self._velocity = None
         return self._result(frame, TrackingState.LOST, matches, inliers, restart, clock)
 
     # -- mapping ----------------------------------------------------------------------------
@@ -339,6 +349,7 @@ class Slam:
     def _copy_local_map(self) -> None:
         limit = self.config.tracking.local_keyframes
         self._local = local_map(self.map, self._reference, limit)
+        self._reference_view = local_map(self.map, self._reference, 1)
         # In a young map, landmarks cannot have been seen by three keyframes.
         needed = min(3, len(self.map.living_keyframes()))
         self._n_reference = count_seen_by(self.map.arrays, self._reference, needed)

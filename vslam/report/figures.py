@@ -296,6 +296,7 @@ def _intervals(at: NDArray[np.bool_]) -> NDArray[np.int64]:
 def _save(name: str, caption: str, figure: Figure) -> ReportFigure:
     png, svg = io.BytesIO(), io.StringIO()
     figure.savefig(png, format="png", dpi=160)
+    figure.set_layout_engine("none")  # the layout is done and holds for the SVG
     # The salt keeps element ids apart between figures of one page, and equal between runs.
     with mpl.rc_context({"svg.hashsalt": name}):
         figure.savefig(svg, format="svg", metadata={"Date": None}, transparent=True)

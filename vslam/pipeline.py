@@ -1,0 +1,176 @@
+"""From a sequence to an outcome: frames are prepared ahead, tracked in order, recorded.
+
+Reading, perturbing and extracting are pure functions of a frame, done by a small pool a few
+frames ahead. Their order is kept, so that the result does not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import logging
+import resource
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.datasets.sequence import Sequence
+from vslam.errors import UnreadableImageError
+from vslam.features import Features, TrackResult
+from vslam.frontend.tracking import Tracker, extract_features
+from vslam.info import process_age
+from vslam.perturb import Perturbation
+from vslam.recorder import Recorder
+from vslam.run import RunOutcome, RunSettings
+from vslam.slam import Slam
+from vslam.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class PreparedFrame:
+    """A frame ready to be tracked, or the reason why it cannot be read."""
+
+    left: NDArray[np.uint8] | None
+    features: Features | None
+    stage_ms: dict[str, float]
+    problem: str | None = None
+
+
+def run_sequence(
+    sequence: Sequence,
+    perturbation: Perturbation,
+    settings: RunSettings,
+    recorder: Recorder,
+    *,
+    on_frame: Callable[[TrackResult], None] = lambda result: None,
+) -> RunOutcome:
+    """Run SLAM over a whole sequence.
+
+    A frame that cannot be read is skipped: it gets a predicted pose, counts as lost and is listed
+    in the outcome. Ctrl-C ends the run after the current frame; all done so far is kept.
+    """
+    cv2.setNumThreads(1)  # the pool uses the cores
+    slam = Slam(sequence.camera, settings.config, threads=settings.threads)
+    tracks: list[TrackResult] = []
+    skipped: list[str] = []
+    recorder.begin(sequence.camera, _ground_truth(sequence))
+    startup = process_age()
+    wall, cpu = time.perf_counter(), time.process_time()
+    with _stop_on_interrupt() as interrupted:
+        frames = prepared_frames(sequence, perturbation, slam.tracker, settings.threads)
+        for index, frame in enumerate(frames):
+            timestamp = float(sequence.timestamps[index])
+            if frame.features is None or frame.left is None:
+                skipped.append(f"frame {index}: {frame.problem}")
+                _log.warning("frame %d skipped: %s", index, frame.problem)
+                result = slam.skip(timestamp)
+            else:
+                result = slam.step_features(frame.features, timestamp, frame.stage_ms)
+            tracks.append(result)
+            recorder.frame(result, result.T_wc)
+            if result.is_keyframe and slam.frame is not None and frame.left is not None:
+                recorder.keyframe(result, frame.left, slam.frame.features, slam.frame.landmark >= 0)
+            if not slam.is_mapping:
+                recorder.map(slam.map)
+            on_frame(result)
+            if interrupted.is_set():
+                break
+        slam.finish()
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    trajectory = slam.trajectory()
+    recorder.finish(trajectory, slam.map)
+    return RunOutcome(
+        settings=settings,
+        sequence=sequence,
+        trajectory=trajectory,
+        keyframes=slam.keyframe_trajectory(),
+        tracks=tracks,
+        skipped=skipped,
+        wall_s=wall,
+        cpu_s=cpu,
+        startup_s=startup,
+        peak_memory_mb=_peak_memory_mb(),
+        n_keyframes=len(slam.map.living_keyframes()),
+        n_landmarks=len(slam.map.living_landmarks()),
+        map=slam.map,
+        interrupted="Ctrl-C" if interrupted.is_set() else None,
+    )
+
+
+def prepared_frames(
+    sequence: Sequence, perturbation: Perturbation, tracker: Tracker, threads: int
+) -> Iterator[PreparedFrame]:
+    """Frames in order; with more than one thread, prepared a few frames ahead."""
+    if threads == 1:
+        for index in range(len(sequence)):
+            yield prepare_frame(sequence, index, perturbation, tracker)
+        return
+    ahead: deque[Future[PreparedFrame]] = deque()
+    following = 0
+    with ThreadPoolExecutor(threads, "extraction") as pool:
+        try:
+            while following < len(sequence) or ahead:
+                while following < len(sequence) and len(ahead) < 2 * threads:
+                    arguments = (sequence, following, perturbation, tracker)
+                    ahead.append(pool.submit(prepare_frame, *arguments))
+                    following += 1
+                yield ahead.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def prepare_frame(
+    sequence: Sequence, index: int, perturbation: Perturbation, tracker: Tracker
+) -> PreparedFrame:
+    """Read, perturb and extract one frame."""
+    start = time.perf_counter()
+    try:
+        left, right = sequence.read(index)
+    except UnreadableImageError as error:
+        return PreparedFrame(None, None, {}, str(error))
+    left, right = perturbation.apply(index, left, right)
+    read = time.perf_counter()
+    features = extract_features(left, right, tracker)
+    done = time.perf_counter()
+    stage_ms = {"read": 1e3 * (read - start), "extract": 1e3 * (done - read)}
+    return PreparedFrame(left, features, stage_ms)
+
+
+def _ground_truth(sequence: Sequence) -> Trajectory | None:
+    poses = sequence.ground_truth
+    return None if poses is None else Trajectory(sequence.timestamps, poses)
+
+
+@contextmanager
+def _stop_on_interrupt() -> Iterator[threading.Event]:
+    """Turn the first Ctrl-C into a flag, so that no frame is left half done; a second one ends
+    the program at once."""
+    interrupted = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield interrupted
+        return
+
+    def note(signal_number: int, stack: object) -> None:
+        interrupted.set()
+        signal.signal(signal.SIGINT, previous)
+
+    previous = signal.signal(signal.SIGINT, note)
+    try:
+        yield interrupted
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def _peak_memory_mb() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)

@@ -203,27 +203,38 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
     capacity = (height * width) // 4 + 1
     xs, ys = np.empty(capacity, np.int32), np.empty(capacity, np.int32)
     n = 0
+    weakest = np.uint8(threshold_min)
+    length = np.uintp(width - 2 * margin)
+    # One byte for each pixel of a row, read eight at a time: most rows are mostly empty.
+    is_corner = np.zeros((width + 7) // 8 * 8, np.uint8)
+    words = is_corner.view(np.uint64)
     for y in range(margin, height - margin):
-        above, here, below = scores[y - 1], scores[y], scores[y + 1]
-        for x in range(np.uintp(margin), np.uintp(width - margin)):
-            s = here[x]
-            if s <= threshold_min:
-                continue
+        above = scores[y - 1, margin - 1 : width - margin + 1]
+        here = scores[y, margin - 1 : width - margin + 1]
+        below = scores[y + 1, margin - 1 : width - margin + 1]
+        for x in range(length):
+            s = here[x + 1]
             # Of equal neighbours the first in row order wins.
-            if (
-                s > here[x - 1]
-                and s >= here[x + 1]
-                and s > above[x]
-                and s >= below[x]
-                and s > above[x - 1]
-                and s > above[x + 1]
-                and s >= below[x - 1]
-                and s >= below[x + 1]
-            ):
-                xs[n], ys[n] = x, y
-                n += 1
-                if s > threshold:
-                    strong[y // cell, np.int64(x) // cell] = True
+            is_corner[x] = (
+                (s > weakest)
+                & (s > here[x])
+                & (s >= here[x + 2])
+                & (s > above[x])
+                & (s > above[x + 1])
+                & (s > above[x + 2])
+                & (s >= below[x])
+                & (s >= below[x + 1])
+                & (s >= below[x + 2])
+            )
+        for w in range(len(words)):
+            if words[w] == 0:
+                continue
+            for x in range(8 * w, 8 * w + 8):
+                if is_corner[x]:
+                    xs[n], ys[n] = margin + x, y
+                    n += 1
+                    if here[x + 1] > threshold:
+                        strong[y // cell, (margin + x) // cell] = True
     score = np.empty(n, np.uint8)
     kept = 0
     for i in range(n):

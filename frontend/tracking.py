@@ -81,7 +81,9 @@ def feature_depth(features: Features, camera: StereoCamera) -> NDArray[np.float6
     return camera.bf / (features.xy[:, 0].astype(np.float64) - features.u_right)
 
 
-def track_motion(frame: Frame, previous: Frame, T_cw: NDArray[np.float64], tracker: Tracker) -> tuple[int, int]:
+def track_motion(
+    frame: Frame, previous: Frame, T_cw: NDArray[np.float64], tracker: Tracker
+) -> tuple[int, int]:
     """Match what the previous frame saw near where the predicted pose puts it; refine the pose.
 
     Besides landmarks, close stereo points of the previous frame that are not in the map take part

@@ -198,7 +198,6 @@ def test_run_writes_its_folder_and_a_summary(call, root, pipeline):
     assert pipeline.recorder == str(Path("runs") / folder.name / "recording.rrd")
     assert pipeline.evaluation.ate_rmse_m < 1e-9
     assert len(read_kitti_poses(folder / "ground_truth_kitti.txt")) == 10
-    assert json.loads((folder / "config.json").read_text())["orb"]["n_features"] == 2000
 
 
 def test_quiet_run_says_nothing(call, root, pipeline):

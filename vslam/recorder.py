@@ -222,7 +222,7 @@ class RerunRecorder:
         import rerun as rr
 
         landmarks = map_.living_landmarks()
-        landmarks = landmarks[:: -(-len(landmarks) // limit) if limit else 1]
+        landmarks = landmarks[:: max(1, -(-len(landmarks) // max(1, limit)))]
         xyz = map_.arrays.xyz[landmarks].astype(np.float32)
         T_wc_keyframes = np.linalg.inv(map_.arrays.T_cw[map_.living_keyframes()])
         self._recording.log("world/landmarks", rr.Points3D.from_fields(positions=xyz))

@@ -1,0 +1,69 @@
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.PHONY: help install demo test check format clean
+
+VENV ?= .venv
+BIN := $(abspath $(VENV))/bin
+INSTALLED := $(VENV)/.installed
+
+help:  ## show this list
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
+
+install: $(INSTALLED)  ## make .venv and install vslam with its tools into it
+
+demo: kitti $(INSTALLED)  ## run on KITTI 00 under changing light and write report and recording
+	$(BIN)/vslam run --seq 00 --max-frames 200 --perturb brightness
+
+test: $(INSTALLED)  ## run the tests, then the built wheel in a clean environment
+	$(BIN)/python -m pytest
+	$(BIN)/python tools/wheel_test.py
+
+# mypy cannot follow the folders' mapping to vslam.* (pyproject.toml): it reads a plain installation.
+check: $(INSTALLED)  ## check format, lint and types
+	$(BIN)/ruff format --check
+	$(BIN)/ruff check
+	rm -rf build
+	$(BIN)/python -m pip install --quiet --no-deps --target build/typecheck .
+	cd build/typecheck && \
+	  $(BIN)/mypy --config-file $(CURDIR)/pyproject.toml --cache-dir $(CURDIR)/.mypy_cache -p vslam
+
+format: $(INSTALLED)  ## format the code and repair what lint can
+	$(BIN)/ruff format
+	$(BIN)/ruff check --fix
+
+clean:  ## remove build products and caches (.venv, data and runs stay)
+	rm -rf build dist vslam.egg-info .mypy_cache .pytest_cache .ruff_cache
+	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@set -e; \
+	if [ ! -x $(BIN)/python ]; then \
+	  for python in $(PYTHON) python3.11 python3 python3.13 python3.12; do \
+	    if $$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then break; fi; \
+	    python=; \
+	  done; \
+	  if [ -z "$$python" ]; then \
+	    echo 'vslam needs Python 3.11 or later: install it, or name one: make PYTHON=/path/to/python3' >&2; \
+	    exit 1; \
+	  fi; \
+	  echo "$$python -m venv $(VENV)"; \
+	  $$python -m venv $(VENV) || { \
+	    echo "$$python has no venv module: install it (Debian, Ubuntu: python3-venv)" >&2; exit 1; }; \
+	fi
+	$(BIN)/python -m pip install --quiet -e '.[dev]' -c constraints.txt
+	@touch $@
+
+.PHONY: kitti
+kitti:
+	@root="$${KITTI_ROOT:-data/kitti}"; \
+	if [ ! -d "$$root/sequences/00" ] && [ ! -d "$$root/dataset/sequences/00" ]; then \
+	  printf '%s\n' \
+	    "The demo needs KITTI odometry, and $$root has no sequence 00. (A synthetic data set that" \
+	    'needs no download is planned, not built.) Get the grayscale images and the calibration' \
+	    'files, and for errors in the report the ground truth poses, from' \
+	    '  https://www.cvlibs.net/datasets/kitti/eval_odometry.php' \
+	    'unpack them and name the folder that holds sequences/:' \
+	    '  export KITTI_ROOT=/path/to/kitti; make demo' \
+	    'datasets.md shows the layout.' >&2; \
+	  exit 1; \
+	fi

@@ -16,7 +16,7 @@ from vslam.frontend.pose import optimise_pose
 from vslam.frontend.stereo import match_stereo
 
 from vslam.camera import StereoCamera
-from vslam.config import Config, TrackingConfig
+from vslam.config import Config
 from vslam.features import FeatureGrid, Features
 from vslam.geometry import transform
 from vslam.kernels import kernel
@@ -322,8 +322,3 @@ def _refine(frame: Frame, T_cw: NDArray[np.float64], tracker: Tracker) -> int:
     frame.landmark[outliers] = -1
     frame.xyz[outliers] = np.nan
     return int(np.count_nonzero(inlier))
-
-
-def is_weak(inliers: int, config: TrackingConfig) -> bool:
-    """A pose on so few inliers is reported WEAK."""
-    return inliers < config.min_inliers

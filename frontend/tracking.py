@@ -18,7 +18,7 @@ from vslam.frontend.stereo import match_stereo
 from vslam.camera import StereoCamera
 from vslam.config import Config
 from vslam.features import FeatureGrid, Features
-from vslam.geometry import transform
+from vslam.geometry import inverse, transform
 from vslam.kernels import kernel
 from vslam.map import LocalMap, predict_octave
 
@@ -151,7 +151,7 @@ def trackable_points(
     depth = feature_depth(previous.features, tracker.camera)
     close = ~known & (depth < tracker.close_depth) & (depth > 0)
     lifted = tracker.camera.backproject(previous.features.xy[close], depth[close])
-    points[close] = transform(np.linalg.inv(previous.T_cw), lifted)
+    points[close] = transform(inverse(previous.T_cw), lifted)
     source = np.flatnonzero(known | close)
     return points[source], source
 

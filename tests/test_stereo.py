@@ -57,7 +57,8 @@ def seen_by_both(left: Extraction, dx: float) -> np.ndarray:
 def test_integer_disparity(disparity):
     left, found = match(disparity, noise=1.0)
     matched = np.isfinite(found)
-    assert np.count_nonzero(matched) > 0.6 * np.count_nonzero(seen_by_both(left, disparity))
+    # The coarser levels are sampled at other phases; the median of SAD rejects many of them.
+    assert matched[(left.octave == 0) & seen_by_both(left, disparity)].mean() > 0.85
     error = np.abs(found[matched] - disparity)
     assert np.median(error[left.octave[matched] == 0]) < 0.05
     assert np.median(error) < 0.1

@@ -113,6 +113,15 @@ def transform(T_a_b: Matrix, p_b: Matrix) -> Matrix:
     return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
+def inverses(T_a_b: Matrix) -> Matrix:
+    """``T_b_a`` of ``(N, 4, 4)`` rigid motions."""
+    T_b_a = np.zeros((len(T_a_b), 4, 4))
+    T_b_a[:, :3, :3] = T_a_b[:, :3, :3].transpose(0, 2, 1)
+    T_b_a[:, :3, 3] = -np.einsum("nij,nj->ni", T_b_a[:, :3, :3], T_a_b[:, :3, 3])
+    T_b_a[:, 3, 3] = 1.0
+    return T_b_a
+
+
 def umeyama(source: Matrix, target: Matrix, *, with_scale: bool = False) -> tuple[float, Matrix]:
     """Least-squares ``s, T_target_source`` with ``target ~ s R source + t`` (Umeyama, PAMI 1991).
 

@@ -21,7 +21,7 @@ from vslam.frontend.tracking import (
     track_local_map,
     track_motion,
 )
-from vslam.geometry import inverse, orthonormalised, se3_exp, se3_log
+from vslam.geometry import inverse, inverses, orthonormalised, se3_exp, se3_log
 from vslam.map import Map
 from vslam.mapping import DeferredMapping
 from vslam.trajectory import Trajectory
@@ -155,7 +155,7 @@ class Slam:
         """Final pose of every keyframe that was not culled."""
         living = self.map.living_keyframes()
         times = np.array([self.map.timestamps[k] for k in living], np.float64)
-        return Trajectory(times, np.linalg.inv(self.map.arrays.T_cw[living]))
+        return Trajectory(times, inverses(self.map.arrays.T_cw[living]))
 
     # Tracking
 

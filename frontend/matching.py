@@ -146,9 +146,11 @@ def consistent_orientation(angle_a, angle_b):
         difference = (np.float64(angle_a[i]) - np.float64(angle_b[i])) % turn
         bins[i] = int(difference / turn * ORIENTATION_BINS + 0.5) % ORIENTATION_BINS
         count[bins[i]] += 1
-    order = np.argsort(-count, kind="mergesort")
     allowed = np.zeros(ORIENTATION_BINS, np.bool_)
-    for k in range(3):
-        if k == 0 or count[order[k]] * 10 >= count[order[0]]:
-            allowed[order[k]] = True
+    fullest = count.max()
+    for _ in range(3):
+        k = int(np.argmax(count))
+        if count[k] * 10 >= fullest:
+            allowed[k] = True
+        count[k] = -1
     return allowed[bins]

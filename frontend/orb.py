@@ -265,15 +265,32 @@ def spread(x, y, score, width, height, quota):
         else:
             high = size
     cells = ((width + low - 1) // low) * ((height + low - 1) // low)
-    occupied = occupy(x, y, score, width, height, low, best_of_cell)
-    chosen = np.empty(occupied, np.int64)
-    count = 0
+    occupy(x, y, score, width, height, low, best_of_cell)
+    chosen = np.zeros(n, np.bool_)
+    counts = np.zeros(256, np.int64)
+    surplus = -quota
     for c in range(cells):
-        if best_of_cell[c] >= 0:
-            chosen[count] = best_of_cell[c]
-            count += 1
-    strongest = np.argsort(255 - score[chosen], kind="mergesort")[:quota]
-    return np.sort(chosen[strongest])
+        i = best_of_cell[c]
+        if i >= 0:
+            chosen[i] = True
+            counts[score[i]] += 1
+            surplus += 1
+    # Drop the weakest of the surplus; scores are bytes, so that counting ranks them.
+    weakest = 0
+    while counts[weakest] <= surplus:
+        surplus -= counts[weakest]
+        weakest += 1
+    kept = np.empty(quota, np.int64)
+    count = 0
+    for i in range(n):
+        if not chosen[i] or score[i] < weakest:
+            continue
+        if score[i] == weakest and surplus > 0:
+            surplus -= 1
+            continue
+        kept[count] = i
+        count += 1
+    return kept
 
 
 @kernel

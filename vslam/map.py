@@ -330,6 +330,18 @@ def resolve(a, landmarks):
 
 
 @kernel
+def lower_median(values, n):
+    """Median of the first ``n`` values, the lower one of two; sorts them by insertion."""
+    for i in range(1, n):
+        value, j = values[i], i
+        while j > 0 and values[j - 1] > value:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = value
+    return values[(n - 1) // 2]
+
+
+@kernel
 def refresh_landmarks(a, landmarks, scales):
     """Recompute what follows from the observations: descriptor, normal and reach.
 
@@ -380,7 +392,7 @@ def refresh_landmarks(a, landmarks, scales):
                 distances[q, p] = d
         best, best_median = first_row, 1000
         for p in range(n):
-            median = np.sort(distances[p, :n])[(n - 1) // 2]
+            median = lower_median(distances[p], n)
             if median < best_median:
                 best, best_median = rows[p], median
         for word in range(4):

@@ -100,7 +100,9 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
         x2[j], y2[j] = a.xy[rows_2[j], 0], a.xy[rows_2[j], 1]
         gate[j] = EPIPOLAR_CHI2 * scales[a.octave[rows_2[j]]] ** 2
     taken = np.zeros(n2, np.bool_)
-    near = np.empty(n2, np.bool_)
+    # One byte for each candidate, read eight at a time: a line passes few.
+    near = np.zeros((n2 + 7) // 8 * 8, np.uint8)
+    words = near.view(np.uint64)
     for i in range(n1):
         row_1 = rows_1[i]
         world_ray(T1, a.xy[row_1], intrinsics, ray_1)
@@ -120,18 +122,21 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
             near[j] = off * off < gate[j]
         stereo_1 = not np.isnan(a.u_right[row_1])
         best, best_distance = -1, max_distance + 1
-        for j in range(n2):
-            if not near[j] or taken[j]:
+        for w in range(len(words)):
+            if words[w] == 0:
                 continue
-            distance = hamming(a.descriptor[row_1], a.descriptor[rows_2[j]])
-            if distance >= best_distance:
-                continue
-            if not stereo_1 and np.isnan(a.u_right[rows_2[j]]) and t[2] > 0.0:
-                # Near the epipole two monocular rays have no parallax.
-                e_x, e_y = fx * t[0] / t[2] + cx - x2[j], fy * t[1] / t[2] + cy - y2[j]
-                if e_x * e_x + e_y * e_y < 100.0 * scales[a.octave[rows_2[j]]]:
+            for j in range(8 * w, 8 * w + 8):
+                if not near[j] or taken[j]:
                     continue
-            best, best_distance = j, distance
+                distance = hamming(a.descriptor[row_1], a.descriptor[rows_2[j]])
+                if distance >= best_distance:
+                    continue
+                if not stereo_1 and np.isnan(a.u_right[rows_2[j]]) and t[2] > 0.0:
+                    # Near the epipole two monocular rays have no parallax.
+                    e_x, e_y = fx * t[0] / t[2] + cx - x2[j], fy * t[1] / t[2] + cy - y2[j]
+                    if e_x * e_x + e_y * e_y < 100.0 * scales[a.octave[rows_2[j]]]:
+                        continue
+                best, best_distance = j, distance
         if best < 0:
             continue
         row_2 = rows_2[best]

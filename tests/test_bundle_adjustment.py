@@ -84,9 +84,7 @@ def robust_cost(problem: BundleProblem, T_cw: np.ndarray, points: np.ndarray) ->
 def gtsam_graph(problem: BundleProblem):
     """The same problem as a factor graph: cameras 0..K-1, then the points."""
     mono = gtsam.Cal3_S2(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy)
-    stereo = gtsam.Cal3_S2Stereo(
-        CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy, CAMERA.baseline
-    )
+    stereo = gtsam.Cal3_S2Stereo(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy, CAMERA.baseline)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     n_cameras = len(problem.T_cw)
     for k, T in enumerate(problem.T_cw):
@@ -119,7 +117,9 @@ def gtsam_graph(problem: BundleProblem):
 
 
 def pose_differences(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    return np.array([np.abs(se3_log(a @ np.linalg.inv(b))).max() for a, b in zip(A, B, strict=True)])
+    return np.array(
+        [np.abs(se3_log(a @ np.linalg.inv(b))).max() for a, b in zip(A, B, strict=True)]
+    )
 
 
 def test_cost_is_gtsams_at_the_start():

@@ -111,9 +111,7 @@ def test_the_middle_packages_do_not_know_each_other_or_the_application(package):
             name
             for name in names
             if any(within(name, other) for other in others)
-            and not any(
-                module == who and within(name, what) for who, what in GRANTED
-            )
+            and not any(module == who and within(name, what) for who, what in GRANTED)
             and name != "vslam.frontend"
         }
         assert not wrong, module
@@ -141,8 +139,7 @@ def test_the_library_does_not_print():
 
 def test_tracking_and_mapping_load_no_heavy_library():
     script = (
-        "import sys, vslam.slam\n"
-        f"sys.stdout.write(' '.join({set(ONLY_IN)} & set(sys.modules)))"
+        f"import sys, vslam.slam\nsys.stdout.write(' '.join({set(ONLY_IN)} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd="/")
     assert (done.returncode, done.stdout) == (0, ""), done.stderr

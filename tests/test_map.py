@@ -181,7 +181,15 @@ def test_resolve_follows_chains_of_merges_and_forgets_the_erased():
     for loser, winner in ((0, 1), (1, 2), (2, 3)):
         merge_landmarks(a, loser, winner)
     erase_landmark(a, 4)
-    assert resolve(a, np.array([0, 1, 2, 3, 4, 5, -1], np.int32)).tolist() == [3, 3, 3, 3, -1, 5, -1]
+    assert resolve(a, np.array([0, 1, 2, 3, 4, 5, -1], np.int32)).tolist() == [
+        3,
+        3,
+        3,
+        3,
+        -1,
+        5,
+        -1,
+    ]
     erase_landmark(a, 3)
     assert resolve(a, np.array([0, 1, 2, 3], np.int32)).tolist() == [-1] * 4
 

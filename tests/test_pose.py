@@ -77,9 +77,7 @@ def test_inliers_are_those_of_the_chi_square_test(kind):
 
 def gtsam_pose(points, uvr, inverse_sigma2) -> np.ndarray:
     """The pose that minimises the squared error, by GTSAM with the points held."""
-    stereo = gtsam.Cal3_S2Stereo(
-        CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy, CAMERA.baseline
-    )
+    stereo = gtsam.Cal3_S2Stereo(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy, CAMERA.baseline)
     mono = gtsam.Cal3_S2(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     values.insert(0, gtsam.Pose3(np.linalg.inv(START)))
@@ -93,9 +91,7 @@ def gtsam_pose(points, uvr, inverse_sigma2) -> np.ndarray:
             graph.add(gtsam.GenericProjectionFactorCal3_S2(pixel, noise, 0, i, mono))
         else:
             noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
-            graph.add(
-                gtsam.GenericStereoFactor3D(gtsam.StereoPoint2(u, r, v), noise, 0, i, stereo)
-            )
+            graph.add(gtsam.GenericStereoFactor3D(gtsam.StereoPoint2(u, r, v), noise, 0, i, stereo))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-14)
     parameters.setAbsoluteErrorTol(1e-14)

@@ -66,11 +66,15 @@ class DeferredMapping:
         T_cw: Matrix,
         timestamp: float,
         frame: int,
-    ) -> None:
+    ) -> tuple[NDArray[np.int32], Matrix]:
         """Add a keyframe, map its stereo points and start its local mapping. Merge first.
 
         Args:
             landmark: ``(N,)`` landmark that each feature tracks, or -1.
+
+        Returns:
+            The landmarks that its features observe now, new ones included, and where they are, as
+            ``current`` gives them.
         """
         map_ = self.map
         keyframe = map_.add_keyframe(features, T_cw, timestamp, frame)
@@ -83,8 +87,11 @@ class DeferredMapping:
         refresh_keyframe(map_, keyframe)
         self.reference = keyframe
         self._copy_view([keyframe])
+        # The map is the thread's from here on.
+        observed = self.current(map_.arrays.landmark[map_.rows(keyframe)])
         if keyframe > 0:
             self._pending = self._start(keyframe)
+        return observed
 
     def merge(self, reference_of_last_frame: int) -> bool:
         """Wait for the pending mapping and show its result; returns whether there was one.

@@ -268,10 +268,10 @@ class Slam:
         """Make a keyframe of the frame placed last."""
         self._merge(frame)
         timestamp, index = self._placed[-1].timestamp, len(self._placed) - 1
-        self._mapping.insert(frame.features, frame.landmark, frame.T_cw, timestamp, index)
+        frame.landmark, frame.xyz = self._mapping.insert(
+            frame.features, frame.landmark, frame.T_cw, timestamp, index
+        )
         self._placed[-1] = _Placed(timestamp, self._mapping.reference, np.eye(4))
-        rows = self.map.rows(self._mapping.reference)
-        frame.landmark, frame.xyz = self._mapping.current(self.map.arrays.landmark[rows].copy())
 
     def _mapping_is_due(self) -> bool:
         if not self._mapping.busy:

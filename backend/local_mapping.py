@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.backend.fusion import fuse_neighbourhood
 from vslam.backend.triangulation import triangulate_with_neighbours
-
 from vslam.camera import StereoCamera
 from vslam.config import Config
 from vslam.kernels import kernel

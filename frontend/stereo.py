@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from vslam.frontend.orb import Extraction
 
 from vslam.camera import StereoCamera
 from vslam.config import StereoConfig
+from vslam.frontend.orb import Extraction
 from vslam.kernels import hamming, kernel
 
 MEDIAN_FACTOR = 1.5 * 1.4826  # 1.5 standard deviations, from the median of a half-normal

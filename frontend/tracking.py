@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from vslam.frontend.matching import consistent_orientation, search_all, search_windows
-from vslam.frontend.orb import extract, scale_factors
-from vslam.frontend.pose import optimise_pose
-from vslam.frontend.stereo import match_stereo
 
 from vslam.camera import StereoCamera
 from vslam.config import Config
 from vslam.features import FeatureGrid, Features
+from vslam.frontend.matching import consistent_orientation, search_all, search_windows
+from vslam.frontend.orb import extract, scale_factors
+from vslam.frontend.pose import optimise_pose
+from vslam.frontend.stereo import match_stereo
 from vslam.geometry import inverse, transform
 from vslam.kernels import kernel
 from vslam.map import LocalMap, predict_octave

@@ -19,14 +19,14 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def kernel(function: Function) -> Function:
     """Compile ``function`` as described above, on its first call."""
-    compiled = numba.njit(
-        cache=True,
-        nogil=True,
-        error_model="numpy",
-        fastmath={"contract"},
-        no_cfunc_wrapper=True,
-    )
-    return cast(Function, compiled(function))
+    options: dict[str, Any] = {
+        "cache": True,
+        "nogil": True,
+        "error_model": "numpy",
+        "fastmath": {"contract"},
+        "no_cfunc_wrapper": True,
+    }
+    return cast(Function, numba.njit(**options)(function))
 
 
 def inline(function: Function) -> Function:

@@ -61,7 +61,7 @@ def search_windows(
         column_last = min(columns - 1, int(np.floor((u + r) / CELL)))
         row_first = max(0, int(np.floor((v - r) / CELL)))
         row_last = min(rows - 1, int(np.floor((v + r) / CELL)))
-        best, best_distance, second_distance = -1, 257, 257
+        best, best_distance, second, second_distance = -1, 257, -1, 257
         for row in range(row_first, row_last + 1):
             for k in range(
                 start[row * columns + column_first], start[row * columns + column_last + 1]
@@ -77,11 +77,14 @@ def search_windows(
                     continue
                 distance = hamming(descriptors[i], frame_descriptors[j])
                 if distance < best_distance:
-                    second_distance = best_distance
+                    second, second_distance = best, best_distance
                     best, best_distance = j, distance
                 elif distance < second_distance:
-                    second_distance = distance
-        if best < 0 or best_distance > max_distance or best_distance > ratio * second_distance:
+                    second, second_distance = j, distance
+        if best < 0 or best_distance > max_distance:
+            continue
+        rivals = second >= 0 and octave[second] == octave[best]
+        if rivals and best_distance > ratio * second_distance:
             continue
         previous = owner[best]
         if previous >= 0:

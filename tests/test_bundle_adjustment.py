@@ -7,6 +7,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+
 from vslam.backend.bundle_adjustment import (
     CHI2_MONO,
     CHI2_STEREO,
@@ -14,7 +15,6 @@ from vslam.backend.bundle_adjustment import (
     adjust,
     cholesky_solve,
 )
-
 from vslam.camera import StereoCamera
 from vslam.geometry import se3_exp, se3_log, transform
 

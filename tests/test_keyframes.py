@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from vslam.frontend.keyframes import KeyframeEvidence, needs_keyframe
 
 from vslam.config import KeyframeConfig
+from vslam.frontend.keyframes import KeyframeEvidence, needs_keyframe
 
 CONFIG = KeyframeConfig(
     max_interval_s=1.0,

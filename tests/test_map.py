@@ -237,9 +237,6 @@ def test_pose_of_a_keyframe_is_a_copy():
     np.testing.assert_array_equal(map_.arrays.T_cw[0], before)
 
 
-@pytest.mark.xfail(
-    strict=True, raises=RecursionError, reason="keyframe_pose recurses along culled ancestors"
-)
 def test_a_long_chain_of_culled_keyframes_still_has_poses():
     """A camera that stands still culls keyframes by the thousand, each the next one's parent."""
     rng = np.random.default_rng(0)

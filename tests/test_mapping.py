@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+
 from vslam.backend.fusion import fuse_into, fuse_neighbourhood
 from vslam.backend.local_mapping import (
     adjust_locally,
@@ -22,7 +23,6 @@ from vslam.backend.triangulation import (
     triangulate_pair,
     triangulate_with_neighbours,
 )
-
 from vslam.camera import StereoCamera
 from vslam.config import Config, MappingConfig, StereoConfig
 from vslam.features import Features

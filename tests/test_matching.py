@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from vslam.frontend.matching import consistent_orientation, search_all, search_windows
 
 from vslam.features import CELL, FeatureGrid
+from vslam.frontend.matching import consistent_orientation, search_all, search_windows
 from vslam.kernels import hamming as hamming_intrinsic
 from vslam.kernels import kernel
 
@@ -178,7 +178,6 @@ def test_ratio_test_of_features_on_one_level(ratio):
     assert 20 < np.count_nonzero(matches >= 0) < np.count_nonzero(without >= 0)
 
 
-@pytest.mark.xfail(strict=True, reason="the kernel compares levels with each other")
 def test_ratio_test_spares_a_rival_of_another_level():
     """ORB-SLAM compares best and second best only where both are of one pyramid level."""
     rng = np.random.default_rng(0)

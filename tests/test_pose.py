@@ -5,9 +5,9 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
-from vslam.frontend.pose import optimise_pose, solve6
 
 from vslam.camera import StereoCamera
+from vslam.frontend.pose import optimise_pose, solve6
 from vslam.geometry import inverse, se3_exp, se3_log, transform
 
 CAMERA = StereoCamera(400.0, 410.0, 320.0, 120.0, 0.5, 640, 240)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from concurrent.futures import Future
 
 import numpy as np
 import pytest
@@ -118,6 +119,29 @@ def test_landmarks_lie_on_the_walls_and_the_ground(corridor):
 def test_same_bytes_with_one_thread_and_two_and_again(corridor, config):
     runs = [bytes_of(*run(corridor, config, threads=threads)) for threads in (1, 2, 2, 1)]
     assert len(set(runs)) == 1
+
+
+class InstantExecutor:
+    """A thread so fast that it is done before ``submit`` returns."""
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def submit(self, function, *arguments) -> Future:
+        future: Future = Future()
+        future.set_result(function(*arguments))
+        return future
+
+    def shutdown(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
+def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, monkeypatch):
+    """Mapping as late as can be (when it is merged) and as early as can be: a race would show."""
+    late = bytes_of(*run(corridor, config, threads=1))
+    monkeypatch.setattr("vslam.mapping.ThreadPoolExecutor", InstantExecutor)
+    assert bytes_of(*run(corridor, config, threads=2)) == late
 
 
 def test_map_stays_sound_with_a_keyframe_each_frame(corridor, check_map):

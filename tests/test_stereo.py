@@ -5,11 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from vslam.frontend.orb import Extraction, extract
-from vslam.frontend.stereo import match_stereo, rows_to_features, slide
 
 from vslam.camera import StereoCamera
 from vslam.config import OrbConfig, StereoConfig
+from vslam.frontend.orb import Extraction, extract
+from vslam.frontend.stereo import match_stereo, rows_to_features, slide
 
 HEIGHT, WIDTH = 200, 480
 ORB = OrbConfig(n_features=600)

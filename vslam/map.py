@@ -190,21 +190,25 @@ class Map:
         return order, counts[order]
 
     def keyframe_pose(self, keyframe: int) -> NDArray[np.float64]:
-        """Copy of ``T_cw``; that of a culled keyframe follows its nearest living ancestor."""
+        """Copy of ``T_cw``; a culled keyframe follows the living one that took its place."""
         if self.arrays.keyframe_alive[keyframe]:
             return self.arrays.T_cw[keyframe].copy()
-        return self.T_c_parent[keyframe] @ self.keyframe_pose(self.parents[keyframe])
+        return self.T_c_parent[keyframe] @ self.arrays.T_cw[self.parents[keyframe]]
 
     def cull_keyframe(self, keyframe: int) -> None:
-        """Remove a keyframe and its observations; its children move to its parent."""
-        parent = self.parents[keyframe]
-        a = self.arrays
-        self.T_c_parent[keyframe] = a.T_cw[keyframe] @ np.linalg.inv(self.keyframe_pose(parent))
+        """Remove a keyframe and its observations; its children move to its parent.
+
+        Keyframes culled before it are children too: every parent is alive.
+        """
+        parent, a = self.parents[keyframe], self.arrays
+        T_c_parent = a.T_cw[keyframe] @ np.linalg.inv(a.T_cw[parent])
+        for child in [k for k, p in enumerate(self.parents) if p == keyframe]:
+            self.parents[child] = parent
+            if not a.keyframe_alive[child]:
+                self.T_c_parent[child] = self.T_c_parent[child] @ T_c_parent
+        self.T_c_parent[keyframe] = T_c_parent
         detach_keyframe(a, keyframe)
         a.keyframe_alive[keyframe] = False
-        for child in range(keyframe + 1, self.n_keyframes):
-            if self.parents[child] == keyframe and a.keyframe_alive[child]:
-                self.parents[child] = parent
 
     def living_keyframes(self) -> NDArray[np.int64]:
         """Ids of the keyframes that were not culled."""

@@ -51,7 +51,7 @@ class DeferredMapping:
         self._config = config
         self._executor = ThreadPoolExecutor(1, "mapping") if threads > 1 else None
         self._pending: Callable[[], None] | None = None
-        self._poses: dict[int, Matrix] = {}
+        self._T_reference = np.eye(4)
         self._visible: list[NDArray[np.int32]] = []
         self._found: list[NDArray[np.int32]] = []
 
@@ -86,19 +86,15 @@ class DeferredMapping:
         map_stereo_points(map_, keyframe, self._camera, self._config)
         refresh_keyframe(map_, keyframe)
         self.reference = keyframe
-        self._copy_view([keyframe])
+        self._copy_view()
         # The map is the thread's from here on.
         observed = self.current(map_.arrays.landmark[map_.rows(keyframe)])
         if keyframe > 0:
             self._pending = self._start(keyframe)
         return observed
 
-    def merge(self, reference_of_last_frame: int) -> bool:
-        """Wait for the pending mapping and show its result; returns whether there was one.
-
-        Args:
-            reference_of_last_frame: a keyframe whose pose tracking will ask for.
-        """
+    def merge(self) -> bool:
+        """Wait for the pending mapping and show its result; returns whether there was one."""
         if self._pending is None:
             return False
         self._pending()
@@ -110,7 +106,7 @@ class DeferredMapping:
             for ids in seen:
                 counter[ids] += 1
             seen.clear()
-        self._copy_view([self.reference, reference_of_last_frame])
+        self._copy_view()
         return True
 
     def close(self) -> None:
@@ -124,9 +120,11 @@ class DeferredMapping:
         self._found.append(found)
 
     def keyframe_pose(self, keyframe: int) -> Matrix:
-        """``T_cw`` as of the last merge."""
+        """``T_cw``; while a keyframe is being mapped, only that of the reference keyframe, as it
+        was inserted."""
         if self.busy:
-            return self._poses[keyframe]
+            assert keyframe == self.reference, "only the mapping thread may read the map now"
+            return self._T_reference
         return self.map.keyframe_pose(keyframe)
 
     def current(self, landmark: NDArray[np.int32]) -> tuple[NDArray[np.int32], Matrix]:
@@ -150,9 +148,9 @@ class DeferredMapping:
         future: Future[None] = self._executor.submit(map_keyframe, *arguments)
         return future.result
 
-    def _copy_view(self, keyframes: list[int]) -> None:
+    def _copy_view(self) -> None:
         self.local = local_map(self.map, self.reference, self._config.tracking.local_keyframes)
         self.reference_view = local_map(self.map, self.reference, 1)
         needed = min(3, len(self.map.living_keyframes()))
         self.n_reference = count_seen_by(self.map.arrays, self.reference, needed)
-        self._poses = {k: self.map.keyframe_pose(k) for k in keyframes}
+        self._T_reference = self.map.keyframe_pose(self.reference)

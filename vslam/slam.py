@@ -67,6 +67,7 @@ class Slam:
         self.frame: Frame | None = None
         self._mapping = DeferredMapping(self.tracker.scales, camera, self.config, threads=threads)
         self._placed: list[_Placed] = []
+        self._tracked = 0  # index of ``frame`` in _placed
         self._velocity: Matrix | None = None  # twist per second, None if unknown
         self._lost_frames = 0
 
@@ -206,7 +207,7 @@ class Slam:
             self._velocity = step / (timestamp - self._placed[-1].timestamp)
         self._lost_frames = 0
         self._place(timestamp, frame.T_cw)
-        self.frame = frame
+        self._keep(frame)
 
     def _lose(
         self,
@@ -230,7 +231,7 @@ class Slam:
             self._insert_keyframe(frame)
             self._velocity = None
             self._lost_frames = 0
-            self.frame = frame
+            self._keep(frame)
         return self._result(frame, TrackingState.LOST, matches, inliers, restart, clock)
 
     # Mapping
@@ -241,7 +242,7 @@ class Slam:
         started = self._can_start(frame)
         if started:
             self._insert_keyframe(frame)
-            self.frame = frame
+            self._keep(frame)
         inliers = int(np.count_nonzero(frame.landmark >= 0))
         state = TrackingState.OK if started else TrackingState.LOST
         clock.lap("keyframe")
@@ -284,13 +285,18 @@ class Slam:
 
         ``current`` is the frame placed last, if it is not ``self.frame`` yet.
         """
-        if not self._mapping.merge(self._placed[-1].reference if self._placed else 0):
+        if not self._mapping.merge():
             return
         for frame in {id(f): f for f in (self.frame, current) if f is not None}.values():
             frame.landmark, frame.xyz = self._mapping.current(frame.landmark)
-        newest = current or self.frame
-        if newest is not None:
-            newest.T_cw = self._pose_of(self._placed[-1])
+        if self.frame is not None:
+            self.frame.T_cw = self._pose_of(self._placed[self._tracked])
+        if current is not None:
+            current.T_cw = self._pose_of(self._placed[-1])
+
+    def _keep(self, frame: Frame) -> None:
+        """The frame placed last is the one to track the next against."""
+        self.frame, self._tracked = frame, len(self._placed) - 1
 
     def _place(self, timestamp: float, T_cw: Matrix) -> None:
         reference = self._mapping.reference

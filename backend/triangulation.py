@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from vslam.camera import StereoCamera
 from vslam.config import Config
 from vslam.kernels import hamming, kernel
-from vslam.map import NONE, Map, link_many
+from vslam.map import NONE, Map
+from vslam.observations import link_many
 
 CHI2_MONO = 5.991  # 95 % quantiles with 2 and 3 degrees of freedom
 CHI2_STEREO = 7.815

@@ -20,7 +20,8 @@ from vslam.frontend.pose import optimise_pose
 from vslam.frontend.stereo import match_stereo
 from vslam.geometry import inverse, transform
 from vslam.kernels import kernel
-from vslam.map import LocalMap, predict_octave
+from vslam.map import LocalMap
+from vslam.observations import predict_octave
 
 NEVER = np.iinfo(np.int64).max
 

@@ -21,6 +21,7 @@ VOCABULARY = {
         "errors",
         "kernels",
         "trajectory",
+        "observations",
     )
 }
 MIDDLE = ("frontend", "loopclosure", "backend")

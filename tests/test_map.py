@@ -9,16 +9,13 @@ import pytest
 
 from vslam.features import Features
 from vslam.geometry import se3_exp
-from vslam.map import (
-    LANDMARK_FIELDS,
-    ROW_FIELDS,
-    Map,
+from vslam.map import LANDMARK_FIELDS, ROW_FIELDS, Map, local_map
+from vslam.observations import (
     collect_landmarks,
     count_seen_by,
     erase_landmark,
     link,
     link_many,
-    local_map,
     merge_landmarks,
     observed_by,
     predict_octave,

@@ -27,7 +27,8 @@ from vslam.camera import StereoCamera
 from vslam.config import Config, MappingConfig, StereoConfig
 from vslam.features import Features
 from vslam.geometry import inverse, se3_exp, se3_log, transform
-from vslam.map import Map, link_many
+from vslam.map import Map
+from vslam.observations import link_many
 
 CAMERA = StereoCamera(320.0, 320.0, 319.5, 119.5, 0.5, 640, 240)
 CONFIG = Config()

@@ -183,19 +183,7 @@ def test_black_frames_are_lost_at_the_predicted_pose_and_tracking_recovers(corri
     assert rmse(errors[15:]) < 0.06
 
 
-@pytest.mark.parametrize(
-    "after",
-    [
-        pytest.param(
-            0,
-            marks=pytest.mark.xfail(
-                strict=True, reason="_merge gives self.frame the pose of the lost frame after it"
-            ),
-        ),
-        1,
-        2,
-    ],
-)
+@pytest.mark.parametrize("after", [0, 1, 2])
 def test_a_black_frame_soon_after_a_keyframe_does_not_move_the_frame_before(corridor, after):
     """The merge falls on the frame behind the black one, on the black one, or before."""
     _, plain = run(corridor)

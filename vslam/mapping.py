@@ -19,7 +19,8 @@ from vslam.backend.triangulation import map_stereo_points
 from vslam.camera import StereoCamera
 from vslam.config import Config
 from vslam.features import Features
-from vslam.map import LocalMap, Map, count_seen_by, link_many, local_map, resolve
+from vslam.map import LocalMap, Map, local_map
+from vslam.observations import count_seen_by, link_many, resolve
 
 Matrix = NDArray[np.float64]
 

@@ -200,11 +200,10 @@ class Slam:
         return TrackingState.OK
 
     def _update_motion(self, frame: Frame, timestamp: float) -> None:
-        """Place the frame; its velocity counts if the frame before was tracked, too."""
-        if self._lost_frames == 0:
-            T_last = self._pose_of(self._placed[-1])
-            step = se3_log(orthonormalised(frame.T_cw @ inverse(T_last)))
-            self._velocity = step / (timestamp - self._placed[-1].timestamp)
+        """Place the frame; the velocity is that since the last frame tracked."""
+        before = self._placed[self._tracked]
+        step = se3_log(orthonormalised(frame.T_cw @ inverse(self._pose_of(before))))
+        self._velocity = step / (timestamp - before.timestamp)
         self._lost_frames = 0
         self._place(timestamp, frame.T_cw)
         self._keep(frame)

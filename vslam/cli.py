@@ -114,12 +114,15 @@ def run(
         config=thresholds,
     )
     from vslam.pipeline import run_sequence
-    from vslam.progress import progress_bar
+    from vslam.progress import announce, progress_bar
     from vslam.recorder import NullRecorder, RerunRecorder
+    from vslam.warmup import compile_kernels
 
     recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
-    state = "starting" if numba_caches() else "compiling kernels, once"
-    with progress_bar(len(sequence), shown=not quiet, state=state) as on_frame:
+    if not numba_caches():
+        announce("first run: compiling the kernels, less than a minute ...", shown=not quiet)
+        compile_kernels()
+    with progress_bar(len(sequence), shown=not quiet) as on_frame:
         outcome = run_sequence(sequence, perturbation, settings, recorder, on_frame=on_frame)
     evaluation, remark = write_results(folder, outcome, ply=ply)
     if not quiet:

@@ -100,6 +100,9 @@ def local_window(
     fixed = np.flatnonzero(others)
     if 0 in window:
         fixed = np.concatenate([[0], fixed])
+    if len(fixed) == 0 and len(free) > 1:
+        # A part of the map that began anew: its oldest keyframe is its world.
+        free, fixed = free[1:], free[:1]
     return free.astype(np.int64), fixed.astype(np.int64), landmarks
 
 

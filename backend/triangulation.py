@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import CHI2_MONO, CHI2_STEREO, StereoCamera
 from vslam.config import Config
+from vslam.geometry import inverse
 from vslam.kernels import hamming, kernel
 from vslam.map import NONE, Map
 from vslam.observations import link_many
@@ -31,7 +32,7 @@ def map_stereo_points(
     close = depth[nearest] < config.stereo.close_depth_baselines * camera.baseline
     nearest = nearest[close | (np.arange(len(nearest)) < MIN_CLOSE)]
     new = nearest[a.landmark[rows][nearest] == NONE]
-    T_wc = np.linalg.inv(a.T_cw[keyframe])
+    T_wc = inverse(a.T_cw[keyframe])
     xyz = camera.backproject(xy[new], depth[new]) @ T_wc[:3, :3].T + T_wc[:3, 3]
     ids = map_.add_landmarks(xyz, a.descriptor[rows][new], keyframe)
     link_many(map_.arrays, rows.start + new, ids)
@@ -160,7 +161,7 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
                 T2, point, a.xy[row_2], a.u_right[row_2], scales[a.octave[row_2]], intrinsics
             )
         ):
-            # Distances must explain the octaves within 1.5 levels (ORB-SLAM's scale test).
+            # Distances must explain the octaves, up to a factor of 1.5 beyond one level.
             for m in range(3):
                 from_1[m], from_2[m] = point[m] - centre_1[m], point[m] - centre_2[m]
             far = np.sqrt(dot3(from_1, from_1) / dot3(from_2, from_2))

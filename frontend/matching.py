@@ -61,13 +61,13 @@ def search_windows(
         column_last = min(columns - 1, int(np.floor((u + r) / CELL)))
         row_first = max(0, int(np.floor((v - r) / CELL)))
         row_last = min(rows - 1, int(np.floor((v + r) / CELL)))
+        if column_first > column_last or row_first > row_last:
+            continue  # the window lies outside the image
         best, best_distance, second, second_distance = -1, 257, -1, 257
         for row in range(row_first, row_last + 1):
             for k in range(
                 start[row * columns + column_first], start[row * columns + column_last + 1]
             ):
-                if column_first > column_last:
-                    break
                 j = items[k]
                 if not free[j] or octave[j] < octave_low[i] or octave[j] > octave_high[i]:
                     continue

@@ -18,7 +18,7 @@ from vslam.frontend.matching import consistent_orientation, search_all, search_w
 from vslam.frontend.orb import extract, scale_factors
 from vslam.frontend.pose import optimise_pose
 from vslam.frontend.stereo import match_stereo
-from vslam.geometry import inverse, transform
+from vslam.geometry import compose, inverse, transform
 from vslam.kernels import kernel
 from vslam.map import LocalMap
 from vslam.observations import predict_octave
@@ -101,16 +101,12 @@ def track_motion(
     in_camera = transform(T_cw, points)
     ahead = in_camera[:, 2] > 0.1
     uvr = camera.project(np.where(ahead[:, None], in_camera, 1.0))
-    forward = (
-        in_camera[:, 2].mean() - transform(previous.T_cw, points)[:, 2].mean()
-        if len(points)
-        else 0.0
-    )
+    advance = compose(previous.T_cw, inverse(T_cw))[2, 3]
     # Moving on by more than the baseline, features can only grow (or shrink) in octave.
     low, high = octave - 1, octave + 1
-    if forward < -camera.baseline:
+    if advance > camera.baseline:
         low, high = octave, np.full_like(octave, NEVER)
-    elif forward > camera.baseline:
+    elif advance < -camera.baseline:
         low, high = np.zeros_like(octave), octave
     matches, inliers = 0, 0
     for widening in (1.0, 2.0, 4.0):
@@ -189,7 +185,7 @@ def track_descriptors(
 
 
 def track_local_map(
-    frame: Frame, local: LocalMap, tracker: Tracker, *, widening: float = 1.0
+    frame: Frame, local: LocalMap, tracker: Tracker
 ) -> tuple[int, int, NDArray[np.int32]]:
     """Match every local landmark that should be visible, then refine the pose with all matches.
 
@@ -209,7 +205,7 @@ def track_local_map(
         camera.width,
         camera.height,
         tracker.scales,
-        config.local_window * widening,
+        config.local_window,
     )
     visible = radius > 0
     radius[tracked] = 0.0

@@ -14,7 +14,6 @@ from vslam.geometry import (
     se3_exp,
     se3_log,
     transform,
-    umeyama,
 )
 
 ANGLES = [0.0, 1e-12, 1e-8, 1e-6, 9e-6, 1.1e-5, 9e-5, 1.1e-4, 1e-2, 1.0, 2.5, 3.1]
@@ -112,30 +111,3 @@ def test_orthonormalised_moves_to_the_nearest_rotation():
         U, _, Vt = np.linalg.svd(noisy[:3, :3])
         np.testing.assert_allclose(orthonormalised(noisy)[:3, :3], U @ Vt, rtol=0, atol=1e-8)
         np.testing.assert_array_equal(orthonormalised(noisy)[:3, 3], T[:3, 3])
-
-
-@pytest.mark.parametrize("scale", [1.0, 0.37, 12.0])
-def test_umeyama_recovers_a_similarity(scale):
-    T = random_poses(1, 3)[0]
-    source = np.random.default_rng(2).normal(size=(30, 3))
-    target = scale * source @ T[:3, :3].T + T[:3, 3]
-    found, T_found = umeyama(source, target, with_scale=True)
-    assert found == pytest.approx(scale, rel=1e-12)
-    np.testing.assert_allclose(T_found, T, rtol=0, atol=1e-12)
-
-
-def test_umeyama_without_scale_leaves_a_scaled_copy_scaled():
-    T = random_poses(1, 4)[0]
-    source = np.random.default_rng(2).normal(size=(30, 3))
-    target = 2.0 * source @ T[:3, :3].T + T[:3, 3]
-    scale, T_found = umeyama(source, target)
-    assert scale == 1.0
-    np.testing.assert_allclose(T_found[:3, :3], T[:3, :3], rtol=0, atol=1e-12)
-    mapped = transform(T_found, source)
-    np.testing.assert_allclose(mapped.mean(axis=0), target.mean(axis=0), rtol=0, atol=1e-12)
-
-
-def test_umeyama_never_answers_with_a_mirror():
-    source = np.random.default_rng(5).normal(size=(30, 3))
-    _, T = umeyama(source, source * [1.0, 1.0, -1.0])
-    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0, abs=1e-12)

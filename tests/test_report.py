@@ -273,7 +273,7 @@ def test_interrupted_before_the_first_frame(tmp_path: Path) -> None:
     outcome = make_outcome(3, lost=slice(0, 0), ground_truth=False)
     nothing = outcome.trajectory.select(np.arange(0))
     outcome = replace(outcome, trajectory=nothing, keyframes=nothing, tracks=[], wall_s=0.0)
-    report = report_of(replace(outcome, interrupted="disk full"), tmp_path)
+    report = report_of(replace(outcome, interrupted="Ctrl-C"), tmp_path)
     assert (report.frames, report.fps, report.cpu_ms_per_frame) == (0, 0.0, 0.0)
     assert figures_of(tmp_path) == set()
 

@@ -8,10 +8,12 @@ from concurrent.futures import Future
 import numpy as np
 import pytest
 
-from vslam.config import Config, KeyframeConfig, OrbConfig, TrackingConfig
+from vslam.backend.local_mapping import local_window
+from vslam.config import Config, KeyframeConfig, MappingConfig, OrbConfig, TrackingConfig
 from vslam.datasets.kitti import open_kitti
 from vslam.features import TrackResult
 from vslam.geometry import inverse, se3_log
+from vslam.observations import detach_keyframe
 from vslam.slam import Slam
 
 ORB = OrbConfig(n_features=800)
@@ -346,3 +348,31 @@ def test_the_kitti_tree_is_read_as_it_was_rendered(kitti_tree, corridor):
     np.testing.assert_allclose(sequence.ground_truth, corridor.T_wc, rtol=0, atol=1e-9)
     assert sequence.camera == corridor.camera
     assert len(sequence.ground_truth) == len(corridor)
+
+
+def test_a_part_of_the_map_that_began_anew_is_held_by_its_oldest_keyframe(corridor):
+    """Bundle adjustment would otherwise shift all of it at will."""
+    slam, _ = run(corridor)
+    detach_keyframe(slam.map.arrays, 0)
+    anew = [int(k) for k in slam.map.living_keyframes() if k != 0]
+    assert len(anew) >= 3
+    everything = Config(mapping=MappingConfig(min_shared=1))
+    free, fixed, _ = local_window(slam.map, anew[-1], everything)
+    assert fixed.tolist() == anew[:1]
+    assert free.tolist() == anew[1:]
+
+
+def test_images_of_floats_are_refused(corridor):
+    slam = Slam(corridor.camera)
+    with pytest.raises(ValueError, match="float64"):
+        slam.step(corridor.left[0] / 255.0, corridor.right[0] / 255.0, 0.0)
+
+
+def test_a_step_after_finish_goes_on(corridor):
+    slam = Slam(corridor.camera)
+    for k in range(len(corridor)):
+        slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
+        if k == 9:
+            slam.finish()
+    slam.finish()
+    assert rmse(position_errors(slam, corridor)) < 0.06

@@ -121,7 +121,7 @@ def run(
     recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
     if not numba_caches():
         announce("first run: compiling the kernels, less than a minute ...", shown=not quiet)
-        compile_kernels()
+    compile_kernels()
     with progress_bar(len(sequence), shown=not quiet) as on_frame:
         outcome = run_sequence(sequence, perturbation, settings, recorder, on_frame=on_frame)
     evaluation, remark = write_results(folder, outcome, ply=ply)

@@ -21,7 +21,7 @@ class OrbConfig(_Section):
     """ORB extraction."""
 
     n_features: int = Field(2000, ge=100, description="Features for each image. [OS2, IV-A]")
-    n_levels: int = Field(8, ge=1, le=16, description="Pyramid levels. [OS1, V-A]")
+    n_levels: int = Field(8, ge=2, le=16, description="Pyramid levels. [OS1, V-A]")
     scale_factor: float = Field(1.2, gt=1.0, le=2.0, description="Between levels. [OS1, V-A]")
     fast_threshold: int = Field(12, ge=1, le=255, description="FAST threshold, grey levels.")
     fast_threshold_min: int = Field(

@@ -34,6 +34,17 @@ class Features:
     def __len__(self) -> int:
         return len(self.xy)
 
+    @classmethod
+    def none(cls) -> Features:
+        """Those of a frame without images."""
+        return cls(
+            np.empty((0, 2), np.float32),
+            np.empty(0, np.uint8),
+            np.empty(0, np.float32),
+            np.empty((0, 32), np.uint8),
+            np.empty(0, np.float32),
+        )
+
 
 @dataclass(frozen=True)
 class FeatureGrid:

@@ -123,23 +123,3 @@ def inverses(T_a_b: Matrix) -> Matrix:
     T_b_a[:, :3, 3] = -np.einsum("nij,nj->ni", T_b_a[:, :3, :3], T_a_b[:, :3, 3])
     T_b_a[:, 3, 3] = 1.0
     return T_b_a
-
-
-def umeyama(source: Matrix, target: Matrix, *, with_scale: bool = False) -> tuple[float, Matrix]:
-    """Least-squares ``s, T_target_source`` with ``target ~ s R source + t`` (Umeyama, PAMI 1991).
-
-    Args:
-        source, target: ``(N, 3)`` corresponding points, N >= 3.
-        with_scale: estimate s; otherwise it is 1.
-    """
-    mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
-    covariance = (target - mean_t).T @ (source - mean_s) / len(source)
-    U, D, Vt = np.linalg.svd(covariance)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    R = U @ np.diag(sign) @ Vt
-    variance = ((source - mean_s) ** 2).sum(axis=1).mean()
-    scale = float(D @ sign / variance) if with_scale else 1.0
-    T = np.eye(4)
-    T[:3, :3] = R
-    T[:3, 3] = mean_t - scale * R @ mean_s
-    return scale, T

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.features import Features
+from vslam.geometry import compose, inverse, orthonormalised
 from vslam.observations import collect_landmarks, count_shared, detach_keyframe
 
 NONE = -1
@@ -201,11 +202,12 @@ class Map:
         Keyframes culled before it are children too: every parent is alive.
         """
         parent, a = self.parents[keyframe], self.arrays
-        T_c_parent = a.T_cw[keyframe] @ np.linalg.inv(a.T_cw[parent])
+        T_c_parent = compose(a.T_cw[keyframe], inverse(a.T_cw[parent]))
         for child in [k for k, p in enumerate(self.parents) if p == keyframe]:
             self.parents[child] = parent
             if not a.keyframe_alive[child]:
-                self.T_c_parent[child] = self.T_c_parent[child] @ T_c_parent
+                moved = compose(self.T_c_parent[child], T_c_parent)
+                self.T_c_parent[child] = orthonormalised(moved)
         self.T_c_parent[keyframe] = T_c_parent
         detach_keyframe(a, keyframe)
         a.keyframe_alive[keyframe] = False

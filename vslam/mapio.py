@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ def save_map(path: Path, map_: Map, camera: StereoCamera) -> None:
         with -1 for none, ``row_descriptor`` (R, 32).
     """
     a = map_.arrays
+    # Landmarks are in the order of their first keyframe, culled ones included; a map keeps that.
     keyframes, landmarks = map_.living_keyframes(), map_.living_landmarks()
     new_keyframe = _renumbering(keyframes, map_.n_keyframes)
     new_landmark = _renumbering(landmarks, map_.n_landmarks)
@@ -67,11 +69,11 @@ def load_map(path: Path) -> tuple[Map, StereoCamera]:
         with np.load(path, allow_pickle=False) as file:
             data = dict(file)
         schema = int(data["schema"])
-    except (OSError, ValueError, KeyError) as error:
+        values = data["camera"].tolist()
+    except (OSError, ValueError, KeyError, EOFError, TypeError, BadZipFile) as error:
         raise InputError(f"{path}: not a map of vslam ({error}); name a map.npz.") from error
     if schema != SCHEMA:
         raise InputError(f"{path}: map schema {schema}, this version reads {SCHEMA}.")
-    values = data["camera"].tolist()
     camera = StereoCamera(*values[:5], *map(int, values[5:]))
     map_ = Map(data["scales"])
     first = data["keyframe_first_row"]

@@ -77,6 +77,7 @@ class DeferredMapping:
             The landmarks that its features observe now, new ones included, and where they are, as
             ``current`` gives them.
         """
+        self._write_counts()
         map_ = self.map
         keyframe = map_.add_keyframe(features, T_cw, timestamp, frame)
         tracked = np.flatnonzero(landmark >= 0)
@@ -98,25 +99,14 @@ class DeferredMapping:
         """Wait for the pending mapping and show its result; returns whether there was one."""
         if self._pending is None:
             return False
-        self._pending()
-        self._pending = None
-        for seen, counter in (
-            (self._visible, self.map.arrays.visible),
-            (self._found, self.map.arrays.found),
-        ):
-            for ids in seen:
-                counter[ids] += 1
-            seen.clear()
+        pending, self._pending = self._pending, None
+        pending()
+        self._write_counts()
         self._copy_view()
         return True
 
-    def close(self) -> None:
-        """End the thread; merge first."""
-        if self._executor:
-            self._executor.shutdown()
-
     def count(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
-        """Remember which landmarks a frame should have seen and did; written at the next merge."""
+        """Remember which landmarks a frame should have seen and did, until the map is free."""
         self._visible.append(visible)
         self._found.append(found)
 
@@ -124,7 +114,8 @@ class DeferredMapping:
         """``T_cw``; while a keyframe is being mapped, only that of the reference keyframe, as it
         was inserted."""
         if self.busy:
-            assert keyframe == self.reference, "only the mapping thread may read the map now"
+            if keyframe != self.reference:
+                raise RuntimeError("a keyframe is being mapped: merge before reading other poses")
             return self._T_reference
         return self.map.keyframe_pose(keyframe)
 
@@ -141,6 +132,15 @@ class DeferredMapping:
         ids[repeated] = -1
         xyz = np.where((ids >= 0)[:, None], self.map.arrays.xyz[ids], np.nan)
         return ids, xyz
+
+    def _write_counts(self) -> None:
+        for seen, counter in (
+            (self._visible, self.map.arrays.visible),
+            (self._found, self.map.arrays.found),
+        ):
+            for ids in seen:
+                counter[ids] += 1
+            seen.clear()
 
     def _start(self, keyframe: int) -> Callable[[], None]:
         arguments = (self.map, keyframe, self._camera, self._config)

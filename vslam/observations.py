@@ -142,7 +142,8 @@ def refresh_landmarks(a, landmarks, scales):
     """Recompute what follows from the observations: descriptor, normal and reach.
 
     The descriptor is the observation's with the least median distance to the others (ORB-SLAM,
-    III-C); the reach follows from the octave in the latest observing keyframe.
+    III-C); the reach follows from the octave in the first keyframe that
+    observes it. At most the newest 32 observations vote on the descriptor: bounded work.
     """
     limit = 32
     rows = np.empty(limit, np.int64)

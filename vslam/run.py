@@ -54,7 +54,7 @@ class RunOutcome:
         peak_memory_mb: of the process.
         n_landmarks, n_keyframes: in the final map.
         map: the final map, None for a trajectory from elsewhere.
-        interrupted: why the run ended early ("Ctrl-C", "disk full"), or None.
+        interrupted: why the run ended early ("Ctrl-C"), or None.
     """
 
     settings: RunSettings

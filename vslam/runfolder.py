@@ -102,9 +102,10 @@ def write_results(
                 landmarks = outcome.map.living_landmarks()
                 save_ply(folder / "map.ply", outcome.map.arrays.xyz[landmarks])
     except OSError as error:
-        done = ", ".join(sorted(file.name for file in folder.iterdir() if file.stat().st_size))
+        files = sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime_ns)
         raise ResultsError(
-            f"{folder}: not all results could be written ({error.strerror}); written so far: "
-            f"{done}. Free some space or name another folder with --out."
+            f"{folder}: not all results could be written ({error.strerror or error}); there are "
+            f"{', '.join(file.name for file in files)}, the last of them incomplete. Free some "
+            "space or name another folder with --out."
         ) from error
     return evaluation, remark

@@ -91,11 +91,14 @@ class Slam:
             timestamp: seconds, later than that of the last call.
 
         Raises:
-            ValueError: images of another size than the camera's, or a timestamp that goes back.
+            ValueError: images of another size than the camera's, not of bytes, or a timestamp that
+                goes back.
         """
         expected = (self.camera.height, self.camera.width)
         if left.shape != expected or right.shape != expected:
             raise ValueError(f"images are {left.shape} and {right.shape}, the camera's {expected}")
+        if left.dtype != np.uint8 or right.dtype != np.uint8:
+            raise ValueError(f"images are of {left.dtype} and {right.dtype}, not of uint8")
         start = time.perf_counter()
         features = extract_features(left, right, self.tracker)
         return self.step_features(
@@ -135,30 +138,37 @@ class Slam:
     def skip(self, timestamp: float) -> TrackResult:
         """Account for a frame without images: it is LOST at the predicted pose."""
         self._check_time(timestamp)
-        frame = self._prepare(NO_FEATURES)
+        frame = self._prepare(Features.none())
         if self._placed:
             frame.T_cw = self._predict(timestamp)
+        if self.map.n_keyframes:
+            self._lost_frames += 1
         self._place(timestamp, frame.T_cw)
         return self._result(frame, TrackingState.LOST, 0, 0, False, _Clock())
 
     def finish(self) -> None:
         """Complete pending mapping. Call before reading the map or the final trajectory."""
         self._merge()
-        self._mapping.close()
 
     def trajectory(self) -> Trajectory:
-        """Final pose of every frame, lost ones included."""
+        """Final pose of every frame, lost ones included. Call ``finish()`` first."""
+        self._check_finished()
         times = np.array([placed.timestamp for placed in self._placed], np.float64)
         poses = [inverse(self._pose_of(placed)) for placed in self._placed]
         return Trajectory(times, np.array(poses, np.float64).reshape(-1, 4, 4))
 
     def keyframe_trajectory(self) -> Trajectory:
-        """Final pose of every keyframe that was not culled."""
+        """Final pose of every keyframe that was not culled. Call ``finish()`` first."""
+        self._check_finished()
         living = self.map.living_keyframes()
         times = np.array([self.map.timestamps[k] for k in living], np.float64)
         return Trajectory(times, inverses(self.map.arrays.T_cw[living]))
 
     # Tracking
+
+    def _check_finished(self) -> None:
+        if self._mapping.busy:
+            raise RuntimeError("a keyframe is being mapped: call finish() first")
 
     def _check_time(self, timestamp: float) -> None:
         if self._placed and not timestamp > self._placed[-1].timestamp:
@@ -330,15 +340,6 @@ class Slam:
             is_keyframe=is_keyframe,
             stage_ms=clock.laps,
         )
-
-
-NO_FEATURES = Features(
-    np.empty((0, 2), np.float32),
-    np.empty(0, np.uint8),
-    np.empty(0, np.float32),
-    np.empty((0, 32), np.uint8),
-    np.empty(0, np.float32),
-)
 
 
 @dataclass

@@ -215,6 +215,16 @@ class _Painter:
         self.box(x - w - 0.3, height - 0.15, x + w + 0.3, height, 120.0)
         self.box(x + w + 0.3, height - 1.6, x + w + 0.55, height - 1.25, 50.0)
 
+    def _goods(self, pane: Grey) -> None:
+        """What stands in a shop window, and the street that it mirrors."""
+        height, width = pane.shape
+        for _ in range(int(self.rng.integers(4, 12))):
+            w, h = (max(2, int(n * self.rng.uniform(0.06, 0.3))) for n in (width, height))
+            x, y = int(self.rng.integers(0, width)), height - h - int(self.rng.integers(0, height // 2))
+            pane[max(y, 0) : y + h, x : x + w] = float(self.rng.uniform(15, 190))
+        x = int(self.rng.integers(0, width))
+        pane[: height // 2, x : x + width // 3] += 28.0
+
     def shop(self, height: float, width: float, style: FacadeStyle, lights: Grey) -> None:
         top = height - 2.5
         self.box(0.3, top - 0.75, width - 0.3, top - 0.1, float(self.rng.uniform(30, 220)))
@@ -232,7 +242,7 @@ class _Painter:
             rows, columns = self._slices(x + 0.07, top + 0.07, x1 - 0.07, height - 0.42)
             shape = self.image[rows, columns].shape
             if min(shape) > 4:
-                goods = noise(self.rng, *shape, 0.5 * self.px, 4)
-                self.image[rows, columns] = np.clip(50 + 30 * goods, 12, 170)
+                self.image[rows, columns] = 34 + 10 * noise(self.rng, *shape, 0.8 * self.px, 3)
+                self._goods(self.image[rows, columns])
                 lights[rows, columns] = 0.7
             x = x1 + 0.25

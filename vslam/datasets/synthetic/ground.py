@@ -113,7 +113,7 @@ def _road_marks(rng: Rng, roads: Roads, style: RoadStyle) -> NDArray[np.float64]
     for k in range(2):
         walk = np.cumsum(rng.normal(0, 0.035, n))
         lane = rng.uniform(-0.9, 0.9, n // 120 + 2)[np.arange(n) // 120] * style.lane
-        fresh = rng.random(n // 60 + 2)[np.arange(n) // 60] < 0.55 * style.wear
+        fresh = rng.random(n // 60 + 2)[np.arange(n) // 60] < 0.8 * style.wear
         marks[:, k] = np.where(fresh, lane + walk % 1.1 + rng.normal(0, 0.012, n), np.nan)
     marks[:, 2] = np.where(rng.random(n) < 0.012 * style.wear, 1.0, 0.0)
     at = 0
@@ -186,7 +186,7 @@ def _paint(
                     if min(lateral - marks[i, 3], marks[i, 4] - lateral) < 0.04:
                         grey *= 0.6
                 for k in range(2):
-                    if abs(lateral - marks[i, k]) < 0.022 + 0.012 * fine:
+                    if abs(lateral - marks[i, k]) < 0.03 + 0.014 * fine:
                         grey *= 0.5
                 if marks[i, 2] > 0.0 and abs(ahead) < 0.03 + 0.02 * fine:
                     grey *= 0.55

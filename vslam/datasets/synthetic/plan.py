@@ -25,7 +25,7 @@ def rectangle(middle: Float, heading: float, width: float, depth: float) -> Floa
 
 
 class Plan:
-    """A raster of the town: taken ground and distances from roads and cameras."""
+    """A raster of the town: taken ground, sight lines and distances from roads."""
 
     def __init__(self, roads: Roads, cameras: Float) -> None:
         """``cameras``: ``(N, 2)`` float64 x and z of every camera position of every pass."""
@@ -34,7 +34,6 @@ class Plan:
         self._taken = np.zeros((rows, columns), np.uint8)
         self._tall = np.zeros((rows, columns), np.uint8)
         self._road = self._distance(roads.xz)
-        self._camera = self._distance(cameras)
         self._cameras = cKDTree(cameras)
 
     def _distance(self, xz: Float) -> NDArray[np.float32]:
@@ -59,13 +58,23 @@ class Plan:
         if (
             (self._taken[window][inside] > 0).any()
             or (self._road[window][inside] < road).any()
-            or (self._camera[window][inside] < CLEARANCE + _CELL).any()
+            or self._near_camera(corners)
         ):
             return False
         self._taken[window][inside] = 1
         if tall:
             self._tall[window][inside] = 1
         return True
+
+    def _near_camera(self, corners: Float) -> bool:
+        """Whether a camera stands nearer than `CLEARANCE` to a convex polygon."""
+        middle = corners.mean(axis=0)
+        reach = np.linalg.norm(corners - middle, axis=1).max() + CLEARANCE
+        polygon = corners.astype(np.float32)[:, None]
+        return any(
+            cv2.pointPolygonTest(polygon, self._cameras.data[k].tolist(), True) > -CLEARANCE
+            for k in self._cameras.query_ball_point(middle, reach)
+        )
 
     def road_distance(self, xz: Float) -> NDArray[np.float32]:
         """Metres from ``(N, 2)`` places to the middle of the nearest road."""

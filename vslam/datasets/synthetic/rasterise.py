@@ -274,7 +274,7 @@ def _fill_cut_out(
     along = math.hypot(u_slope - a * slope, v_slope - b * slope) * z
     across = math.hypot(q[TEXTURE + 1] - a * q[7], q[TEXTURE + 4] - b * q[7]) * z * step
     size = max(math.sqrt(along * across), 1.0)
-    level = min(int(math.log2(size) + 0.5), max(log_size[0], log_size[1]))
+    level = min(int(math.log2(size) + 0.6), max(log_size[0], log_size[1]))
     scale = 1.0 / (1 << level)
     at = offset[level]
     row_log = max(log_size[0] - level, 0)
@@ -287,16 +287,19 @@ def _fill_cut_out(
         z = 1.0 / inverse
         x = (u_value + u_slope * i) * z * scale - 0.5
         y = (v_value + v_slope * i) * z * scale - 0.5
-        x0, y0 = math.floor(x), math.floor(y)
-        fx, fy = x - x0, y - y0
-        c0, r0 = int(x0), int(y0)
-        c1, r1 = (c0 + 1) & mask_u, (r0 + 1) & mask_v
-        c0 &= mask_u
-        r0 &= mask_v
-        r0 = at + (r0 << row_log)
-        r1 = at + (r1 << row_log)
-        upper = alpha[r0 + c0] * (1.0 - fx) + alpha[r0 + c1] * fx
-        lower = alpha[r1 + c0] * (1.0 - fx) + alpha[r1 + c1] * fx
-        if upper * (1.0 - fy) + lower * fy >= 127.5:
-            inverse_depth[i] = np.float32(inverse)
-            seen[i] = number
+        if level > 0:  # texels smaller than samples: the nearest will do
+            c0, r0 = int(math.floor(x + 0.5)) & mask_u, int(math.floor(y + 0.5)) & mask_v
+            if alpha[np.uintp(at + (r0 << row_log) + c0)] < 128:
+                continue
+        else:
+            x0, y0 = math.floor(x), math.floor(y)
+            fx, fy = x - x0, y - y0
+            c0, r0 = int(x0), int(y0)
+            c1, r1 = (c0 + 1) & mask_u, at + (((r0 + 1) & mask_v) << row_log)
+            c0, r0 = c0 & mask_u, at + ((r0 & mask_v) << row_log)
+            upper = alpha[np.uintp(r0 + c0)] * (1.0 - fx) + alpha[np.uintp(r0 + c1)] * fx
+            lower = alpha[np.uintp(r1 + c0)] * (1.0 - fx) + alpha[np.uintp(r1 + c1)] * fx
+            if upper * (1.0 - fy) + lower * fy < 127.5:
+                continue
+        inverse_depth[i] = np.float32(inverse)
+        seen[i] = number

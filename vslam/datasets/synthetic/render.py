@@ -44,11 +44,11 @@ class Light:
 
     sun: NDArray[np.float64]
     direct: float = 1.0
-    ambient: float = 0.42
+    ambient: float = 0.36
     glow: float = 0.0
-    haze: float = 165.0
+    haze: float = 125.0
     visibility: float = 900.0
-    exposure: float = 1.0
+    exposure: float = 1.5
 
     def as_array(self) -> NDArray[np.float64]:
         """``(9,)`` float64, the form that the kernels take."""

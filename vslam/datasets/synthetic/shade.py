@@ -18,7 +18,10 @@ from vslam.datasets.synthetic.rasterise import (
 )
 from vslam.kernels import inline, kernel
 
-MAX_TAPS = 4  # trilinear samples along the long side of a pixel's footprint
+_SCALE = 0.5 ** np.arange(24)  # of the levels of a mipmap
+MAX_TAPS = 2  # trilinear samples along the long side of a pixel's footprint
+_DETAIL_ENDS = 12.0  # texels of the fine texture in a pixel that leave nothing of its contrast
+_SKY_HAZE = 185.0  # haze under which the panorama shows its own grey
 SKY_RISE = 1.0  # tangent of the elevation at the upper edge of the sky's panorama
 SKY_FALL = 0.1  # and of the depression at its lower edge
 _SHADE_BIAS = 0.35  # m that an occluder must rise above a point to shade it
@@ -27,20 +30,29 @@ _SHADE_BIAS = 0.35  # m that an occluder must rise above a point to shade it
 @inline
 def _bilinear(texels, at, log_w, log_h, level, u, v):
     """Texture at ``(u, v)``, given in texels of level 0; it repeats endlessly."""
-    scale = 1.0 / (1 << level)
-    x = u * scale - 0.5
-    y = v * scale - 0.5
+    scale = _SCALE[level]
+    x = u * scale - np.float32(0.5)
+    y = v * scale - np.float32(0.5)
     x0, y0 = math.floor(x), math.floor(y)
-    fx, fy = x - x0, y - y0
+    fx, fy = np.float32(x - x0), np.float32(y - y0)
     row_log = max(log_w - level, 0)
     mask_u = (1 << row_log) - 1
     mask_v = (1 << max(log_h - level, 0)) - 1
     c0, r0 = int(x0), int(y0)
     c1, r1 = (c0 + 1) & mask_u, at + (((r0 + 1) & mask_v) << row_log)
     c0, r0 = c0 & mask_u, at + ((r0 & mask_v) << row_log)
-    upper = texels[r0 + c0] * (1.0 - fx) + texels[r0 + c1] * fx
-    lower = texels[r1 + c0] * (1.0 - fx) + texels[r1 + c1] * fx
-    return upper * (1.0 - fy) + lower * fy
+    # Unsigned indices: no check for those that count from the end.
+    a, b = np.float32(texels[np.uintp(r0 + c0)]), np.float32(texels[np.uintp(r0 + c1)])
+    c, d = np.float32(texels[np.uintp(r1 + c0)]), np.float32(texels[np.uintp(r1 + c1)])
+    upper = a + (b - a) * fx
+    return upper + (c + (d - c) * fx - upper) * fy
+
+
+@inline
+def _log2(size):
+    """Integer part and, linear between powers of two, the fraction of a logarithm; size >= 1."""
+    bits = np.float32(size).view(np.int32)
+    return (int(bits) >> 23) - 127, np.float32(int(bits) & 0x7FFFFF) * np.float32(1.0 / 0x800000)
 
 
 @kernel
@@ -48,15 +60,13 @@ def _trilinear(texels, offset, log_w, log_h, size, u, v):
     """Texture at ``(u, v)`` averaged over about ``size`` texels of level 0."""
     if size <= 1.0:
         return _bilinear(texels, offset[0], log_w, log_h, 0, u, v)
-    level = math.log2(size)
+    low, part = _log2(size)
     top = max(log_w, log_h)
-    if level >= top:
-        return float(texels[offset[top]])
-    low = int(level)
-    part = level - low
+    if low >= top:
+        return np.float32(texels[np.uintp(offset[top])])
     near = _bilinear(texels, offset[low], log_w, log_h, low, u, v)
     far = _bilinear(texels, offset[low + 1], log_w, log_h, low + 1, u, v)
-    return near * (1.0 - part) + far * part
+    return near + (far - near) * part
 
 
 @kernel
@@ -85,13 +95,15 @@ def _lit(shadow, frame, lamp, x, y, z):
     level = (up + _SHADE_BIAS - frame[3]) * 100.0
     fa, fb = a - a0, b - b0
     light = 0.0
+    r, c = np.uintp(r), np.uintp(c)
+    one = np.uintp(1)
     if shadow[r, c] <= level:
         light += (1.0 - fa) * (1.0 - fb)
-    if shadow[r, c + 1] <= level:
+    if shadow[r, c + one] <= level:
         light += fa * (1.0 - fb)
-    if shadow[r + 1, c] <= level:
+    if shadow[r + one, c] <= level:
         light += (1.0 - fa) * fb
-    if shadow[r + 1, c + 1] <= level:
+    if shadow[r + one, c + one] <= level:
         light += fa * fb
     return light
 
@@ -138,20 +150,28 @@ def shade(
     for j in range(seen.shape[0] // samples):
         v = first_row + j
         for u in range(width):
-            kinds = 0
+            kinds = 1
+            first = seen[j * samples, u * samples]
+            number[0], weight[0], shift_u[0], shift_v[0] = first, samples * samples, 0.0, 0.0
+            alike = True
             for a in range(samples):
                 for b in range(samples):
-                    s = seen[j * samples + a, u * samples + b]
-                    k = 0
-                    while k < kinds and number[k] != s:
-                        k += 1
-                    if k == kinds:
-                        number[k] = s
-                        weight[k] = shift_u[k] = shift_v[k] = 0.0
-                        kinds += 1
-                    weight[k] += 1.0
-                    shift_u[k] += (b + 0.5) * step - 0.5
-                    shift_v[k] += (a + 0.5) * step - 0.5
+                    alike &= seen[j * samples + a, u * samples + b] == first
+            if not alike:
+                kinds = 0
+                for a in range(samples):
+                    for b in range(samples):
+                        s = seen[j * samples + a, u * samples + b]
+                        k = 0
+                        while k < kinds and number[k] != s:
+                            k += 1
+                        if k == kinds:
+                            number[k] = s
+                            weight[k] = shift_u[k] = shift_v[k] = 0.0
+                            kinds += 1
+                        weight[k] += 1.0
+                        shift_u[k] += (b + 0.5) * step - 0.5
+                        shift_v[k] += (a + 0.5) * step - 0.5
             total = 0.0
             nearest = 0.0
             for k in range(kinds):
@@ -163,7 +183,7 @@ def shade(
                 wz = T_wc[2, 0] * rx + T_wc[2, 1] * ry + T_wc[2, 2]
                 if number[k] < 0:
                     grey = _sky(texels, offset, log_size, sky, wx, wy, wz, 1.0 / fx)
-                    total += weight[k] * grey * lamp[6] / 165.0
+                    total += weight[k] * grey * lamp[6] / _SKY_HAZE
                     continue
                 q = visible[number[k]]
                 inverse = q[6] * x + q[7] * y + q[8]
@@ -194,7 +214,7 @@ def shade(
                 if fine >= 0:
                     detail_size = size * max(q[DETAIL_U], q[DETAIL_V])
                     log_d = log_size[fine, 0]
-                    if detail_size < (1 << log_d):
+                    if detail_size < _DETAIL_ENDS:
                         albedo *= (
                             _trilinear(
                                 texels,
@@ -218,7 +238,7 @@ def shade(
                         T_wc[2, 3] + z * wz,
                     )
                 grey = albedo * (light + q[GLOW])
-                clear = math.exp(-z * rate)
+                clear = 1.0 / (1.0 + z * rate * (1.0 + 0.5 * z * rate))
                 total += weight[k] * (grey * clear + lamp[6] * (1.0 - clear))
                 nearest = max(nearest, inverse)
             image[v, u] = total * lamp[8] / (samples * samples)

@@ -223,14 +223,15 @@ def lamp_post(height: float, arm: float, metal: int, screen: int, thing: int) ->
 
 
 def sign_post(
-    rng: Rng, height: float, metal: int, faces: Sequence[int], thing: int
+    rng: Rng, height: float, metal: int, faces: Sequence[tuple[int, int]], thing: int
 ) -> Surfaces:
-    """Signs on a pole, facing -z."""
+    """Signs on a pole, facing -z; ``faces``: textures of the front and the back of each."""
     parts = [box((-0.035, -height, -0.035), (0.035, 0.3, 0.035), metal, thing=thing)]
     top = -height
     for face in faces:
         size = float(rng.uniform(0.6, 0.95))
-        parts.append(patches(np.array([-size / 2, top, -0.05]), np.array([size, 0, 0]),
-                             np.array([0, size, 0]), face, thing=thing))  # fmt: skip
+        for z, texture in zip((-0.06, -0.045), face, strict=True):
+            parts.append(patches(np.array([-size / 2, top, z]), np.array([size, 0, 0]),
+                                 np.array([0, size, 0]), texture, thing=thing))  # fmt: skip
         top += size + 0.05
     return join(parts)

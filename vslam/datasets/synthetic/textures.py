@@ -70,7 +70,7 @@ def write(image: Grey, rng: Rng, text: str, box: tuple[int, int, int, int], grey
 
 
 def sign(rng: Rng, size: int = 128) -> tuple[Grey, Grey]:
-    """A traffic or street sign: round, triangular or square, with alpha."""
+    """A traffic or street sign: round, triangular or square; its alpha is symmetric."""
     grey = np.full((size, size), float(rng.uniform(190, 235)), np.float32)
     alpha = np.zeros((size, size), np.float32)
     middle, rim = (size // 2, size // 2), float(rng.uniform(40, 90))

@@ -97,12 +97,12 @@ class _Builder:
         self._leaves = add(40 + 22 * textures.noise(rng, 128, 128, 6.0, 3))
         self._fences = [add(*textures.fence(rng)) for _ in range(pool)]
         self._walls = [add(textures.garden_wall(rng)) for _ in range(pool)]
-        self._signs = [add(*textures.sign(rng)) for _ in range(2 * pool)]
+        self._signs = [self._sign() for _ in range(2 * pool)]
         self._posters = [add(textures.poster(rng)) for _ in range(2 * pool)]
         self._metal = add(np.full((16, 16), 92.0) + rng.normal(0, 9, (16, 16)))
         self._lamp = add(np.full((8, 8), 215.0))
         self._tiles = [add(self._roof_tiles()) for _ in range(6)]
-        self._plaster = add(textures.detail(rng, 0.07, 9.0))
+        self._plaster = add(textures.detail(rng, 0.05, 9.0))
         self._render = add(np.clip(165 + 9 * textures.noise(rng, 256, 256, 90.0, 6), 0, 255))
 
     def build(self) -> Town:
@@ -142,6 +142,11 @@ class _Builder:
 
     def _changes(self, rng: Rng, rate: float) -> bool:
         return bool(rng.random() < rate * self._variation.change)
+
+    def _sign(self) -> tuple[int, int]:
+        face, alpha = textures.sign(self._rng)
+        back = 95.0 + 5.0 * textures.noise(self._rng, *face.shape, 30.0)
+        return self._atlas.add(face, alpha), self._atlas.add(back, alpha)
 
     def _roof_tiles(self) -> textures.Grey:
         rng = self._rng
@@ -290,16 +295,19 @@ class _Builder:
             twigs = self._later_twigs if when == AFTER else self._twigs
             model = solids.tree(rng, self._needles if conifer else twigs, self._bark[self._next % 4],
                                 height=height, thing=self._next, conifer=conifer)  # fmt: skip
-            self._stand(self._pruned(model, xz), xz, float(rng.uniform(0, 6.3)), when)
+            heading = float(rng.uniform(0, 6.3))
+            if (free := self._pruned(model, xz)) is not None:
+                self._stand(free, xz, heading, when)
 
-    def _pruned(self, model: Surfaces, xz: Float) -> Surfaces:
-        """Without twigs that hang into the free space around the cameras."""
+    def _pruned(self, model: Surfaces, xz: Float) -> Surfaces | None:
+        """Without twigs that hang into the free space around the cameras; None if few remain."""
         near = float(np.min(np.linalg.norm(self._cameras - xz, axis=1)))
         middle = model.origin + 0.5 * (model.edge_s + model.edge_t)
         size = np.linalg.norm(model.edge_s, axis=1) + np.linalg.norm(model.edge_t, axis=1)
         reach = np.hypot(middle[:, 0], middle[:, 2]) + 0.5 * size
         low = middle[:, 1] + 0.5 * size > -1.65 - CLEARANCE - 0.7
-        return model.select(~((reach > near - CLEARANCE - 0.2) & low))
+        hangs = (reach > near - CLEARANCE - 0.2) & low
+        return model.select(~hangs) if hangs.mean() < 0.3 else None
 
     def _furnish(self) -> None:
         roads, style, rng = self._roads, self._style, self._rng
@@ -320,8 +328,8 @@ class _Builder:
         rng = self._rng
         along = float(np.arctan2(out[0], out[1])) - np.pi / 2
         heading = along + float(rng.choice([0.0, np.pi], p=[0.85, 0.15])) + float(rng.normal(0, 0.02))
-        near = xz + out * (style.lane + 1.0 + float(rng.normal(0, 0.07)))
-        if not self._plan.claim(rectangle(near, heading, 2.0, 4.9), road=style.lane):
+        near = xz + out * (style.lane + 1.15 + float(rng.normal(0, 0.06)))
+        if not self._plan.claim(rectangle(near, heading, 2.05, 5.2), road=style.lane - 0.6):
             return
         leaves = self._changes(rng, 0.8)
         for when in (BEFORE, AFTER) if leaves else (ALWAYS,):
@@ -376,7 +384,7 @@ class _Builder:
         if rng.random() < 0.5:
             model = solids.lamp_post(float(rng.uniform(4.8, 7.5)), 0.9, self._metal, self._lamp, thing)
         else:
-            faces = rng.choice(self._signs, int(rng.integers(1, 3))).tolist()
+            faces = [self._signs[k] for k in rng.integers(len(self._signs), size=rng.integers(1, 3))]
             model = solids.sign_post(rng, float(rng.uniform(2.3, 3.1)), self._metal, faces, thing)
             heading += -np.pi / 2 if rng.random() < 0.8 else np.pi / 2
         self._stand(model, at, heading)
@@ -410,6 +418,6 @@ class _Builder:
                     far = style.walk + float(rng.uniform(6.0, 30.0))
                     self._plant(roads.xz[at] + out * far, float(rng.uniform(6.0, 14.0)))
                 if rng.random() < 0.06:
-                    faces = rng.choice(self._signs, 1).tolist()
+                    faces = [self._signs[int(rng.integers(len(self._signs)))]]
                     sign = solids.sign_post(rng, 3.6, self._metal, faces, self._next)
                     self._stand(sign, roads.xz[at] + out * (style.walk + 1.6), heading - side * np.pi / 2)

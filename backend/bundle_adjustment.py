@@ -203,7 +203,7 @@ def linearise(
     T_cw, n_free, points, first, camera, uvr, inverse_sigma2, used, intrinsics, W, V, g, U, b
 ):
     """Normal equations at the current estimate, in blocks."""
-    fx, fy, cx, cy, bf = intrinsics
+    fx, fy, bf = intrinsics[0], intrinsics[1], intrinsics[4]
     U[:] = 0.0
     b[:] = 0.0
     r, q = np.empty(3), np.empty(3)

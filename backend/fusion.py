@@ -9,7 +9,8 @@ from vslam.camera import StereoCamera
 from vslam.config import Config
 from vslam.features import CELL, FeatureGrid
 from vslam.kernels import hamming, kernel
-from vslam.map import Map, collect_landmarks, link, merge_landmarks, observed_by, predict_octave
+from vslam.map import Map
+from vslam.observations import collect_landmarks, link, merge_landmarks, observed_by, predict_octave
 
 CHI2_MONO = 5.991  # 95 % quantiles with 2 and 3 degrees of freedom
 CHI2_STEREO = 7.815

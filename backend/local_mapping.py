@@ -6,14 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.backend.fusion import fuse_neighbourhood
 from vslam.backend.triangulation import triangulate_with_neighbours
-
 from vslam.camera import StereoCamera
 from vslam.config import Config
 from vslam.kernels import kernel
-from vslam.map import Map, erase_landmark, refresh_landmarks, unlink
+from vslam.map import Map
+from vslam.observations import erase_landmark, refresh_landmarks, unlink
 
 RECENT_KEYFRAMES = 3  # a landmark is on probation for this many keyframes (ORB-SLAM, VI-B)
 

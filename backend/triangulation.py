@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from vslam.camera import StereoCamera
 from vslam.config import Config
 from vslam.kernels import hamming, kernel
-from vslam.map import NONE, Map, link_many
+from vslam.map import NONE, Map
+from vslam.observations import link_many
 
 CHI2_MONO = 5.991  # 95 % quantiles with 2 and 3 degrees of freedom
 CHI2_STEREO = 7.815
@@ -77,39 +78,38 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
     """New landmarks of two keyframes: ``xyz`` ``(N, 3)`` and the rows of both, ``(N,)`` int64."""
     fx, fy, cx, cy, bf = intrinsics
     T1, T2 = a.T_cw[k1], a.T_cw[k2]
-    R1, R2 = T1[:3, :3].copy(), T2[:3, :3].copy()
-    centre_1 = -np.array(
-        [R1[0, i] * T1[0, 3] + R1[1, i] * T1[1, 3] + R1[2, i] * T1[2, 3] for i in range(3)]
-    )
-    centre_2 = -np.array(
-        [R2[0, i] * T2[0, 3] + R2[1, i] * T2[1, 3] + R2[2, i] * T2[2, 3] for i in range(3)]
-    )
+    centre_1, centre_2, gap = np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        centre_1[i] = -(T1[0, i] * T1[0, 3] + T1[1, i] * T1[1, 3] + T1[2, i] * T1[2, 3])
+        centre_2[i] = -(T2[0, i] * T2[0, 3] + T2[1, i] * T2[1, 3] + T2[2, i] * T2[2, 3])
+        gap[i] = centre_1[i] - centre_2[i]
     rows_1, rows_2 = unmapped_rows(a, k1), unmapped_rows(a, k2)
     n1, n2 = len(rows_1), len(rows_2)
     xyz = np.empty((n1, 3))
     out_1, out_2 = np.empty(n1, np.int64), np.empty(n1, np.int64)
     count = 0
-    gap = centre_1 - centre_2
-    if np.sqrt((gap**2).sum()) < min_baseline or n2 == 0:
+    if dot3(gap, gap) < min_baseline**2 or n2 == 0:
         return xyz[:0], out_1[:0], out_2[:0]
     # Camera 1's centre in camera 2: the epipole.
-    t = np.array([R2[i, 0] * gap[0] + R2[i, 1] * gap[1] + R2[i, 2] * gap[2] for i in range(3)])
-    x2, y2 = a.xy[rows_2, 0].copy(), a.xy[rows_2, 1].copy()
+    t, d, point = np.empty(3), np.empty(3), np.empty(3)
+    ray_1, ray_2, from_1, from_2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        t[i] = T2[i, 0] * gap[0] + T2[i, 1] * gap[1] + T2[i, 2] * gap[2]
+    x2, y2 = np.empty(n2, np.float32), np.empty(n2, np.float32)
     gate = np.empty(n2, np.float32)
     for j in range(n2):
+        x2[j], y2[j] = a.xy[rows_2[j], 0], a.xy[rows_2[j], 1]
         gate[j] = EPIPOLAR_CHI2 * scales[a.octave[rows_2[j]]] ** 2
     taken = np.zeros(n2, np.bool_)
-    near = np.empty(n2, np.bool_)
+    # One byte for each candidate, read eight at a time: a line passes few.
+    near = np.zeros((n2 + 7) // 8 * 8, np.uint8)
+    words = near.view(np.uint64)
     for i in range(n1):
         row_1 = rows_1[i]
-        ray = np.array([(a.xy[row_1, 0] - cx) / fx, (a.xy[row_1, 1] - cy) / fy, 1.0])
-        # The ray in the world, then in camera 2; t x ray is normal to the epipolar plane.
-        world = np.array(
-            [R1[0, m] * ray[0] + R1[1, m] * ray[1] + R1[2, m] * ray[2] for m in range(3)]
-        )
-        d = np.array(
-            [R2[m, 0] * world[0] + R2[m, 1] * world[1] + R2[m, 2] * world[2] for m in range(3)]
-        )
+        world_ray(T1, a.xy[row_1], intrinsics, ray_1)
+        # The ray in camera 2; t x d is normal to the epipolar plane.
+        for m in range(3):
+            d[m] = T2[m, 0] * ray_1[0] + T2[m, 1] * ray_1[1] + T2[m, 2] * ray_1[2]
         n_x, n_y = t[1] * d[2] - t[2] * d[1], t[2] * d[0] - t[0] * d[2]
         n_z = t[0] * d[1] - t[1] * d[0]
         l_x, l_y = n_x / fx, n_y / fy
@@ -123,27 +123,35 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
             near[j] = off * off < gate[j]
         stereo_1 = not np.isnan(a.u_right[row_1])
         best, best_distance = -1, max_distance + 1
-        for j in range(n2):
-            if not near[j] or taken[j]:
+        for w in range(len(words)):
+            if words[w] == 0:
                 continue
-            distance = hamming(a.descriptor[row_1], a.descriptor[rows_2[j]])
-            if distance >= best_distance:
-                continue
-            if not stereo_1 and np.isnan(a.u_right[rows_2[j]]) and t[2] > 0.0:
-                # Near the epipole two monocular rays have no parallax.
-                e_x, e_y = fx * t[0] / t[2] + cx - x2[j], fy * t[1] / t[2] + cy - y2[j]
-                if e_x * e_x + e_y * e_y < 100.0 * scales[a.octave[rows_2[j]]]:
+            for j in range(8 * w, 8 * w + 8):
+                if not near[j] or taken[j]:
                     continue
-            best, best_distance = j, distance
+                distance = hamming(a.descriptor[row_1], a.descriptor[rows_2[j]])
+                if distance >= best_distance:
+                    continue
+                if not stereo_1 and np.isnan(a.u_right[rows_2[j]]) and t[2] > 0.0:
+                    # Near the epipole two monocular rays have no parallax.
+                    e_x, e_y = fx * t[0] / t[2] + cx - x2[j], fy * t[1] / t[2] + cy - y2[j]
+                    if e_x * e_x + e_y * e_y < 100.0 * scales[a.octave[rows_2[j]]]:
+                        continue
+                best, best_distance = j, distance
         if best < 0:
             continue
         row_2 = rows_2[best]
-        other = np.array([(x2[best] - cx) / fx, (y2[best] - cy) / fy, 1.0])
-        world_2 = np.array(
-            [R2[0, m] * other[0] + R2[1, m] * other[1] + R2[2, m] * other[2] for m in range(3)]
-        )
-        point, ok = intersect(
-            a, row_1, row_2, world, world_2, centre_1, centre_2, bf, bf / fx, max_cosine
+        world_ray(T2, a.xy[row_2], intrinsics, ray_2)
+        ok = intersect(
+            bf / (a.xy[row_1, 0] - a.u_right[row_1]),
+            bf / (a.xy[row_2, 0] - a.u_right[row_2]),
+            ray_1,
+            ray_2,
+            centre_1,
+            centre_2,
+            bf / fx,
+            max_cosine,
+            point,
         )
         if (
             ok
@@ -155,28 +163,44 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
             )
         ):
             # Distances must explain the octaves within 1.5 levels (ORB-SLAM's scale test).
-            far = np.sqrt(((point - centre_1) ** 2).sum() / ((point - centre_2) ** 2).sum())
+            for m in range(3):
+                from_1[m], from_2[m] = point[m] - centre_1[m], point[m] - centre_2[m]
+            far = np.sqrt(dot3(from_1, from_1) / dot3(from_2, from_2))
             change = far * scales[a.octave[row_1]] / scales[a.octave[row_2]]
             slack = 1.5 * scales[1]
             if change * slack > 1.0 and change < slack:
                 taken[best] = True
-                xyz[count] = point
+                for m in range(3):
+                    xyz[count, m] = point[m]
                 out_1[count], out_2[count] = row_1, row_2
                 count += 1
-    return xyz[:count].copy(), out_1[:count].copy(), out_2[:count].copy()
+    return xyz[:count], out_1[:count], out_2[:count]
 
 
 @kernel
-def intersect(a, row_1, row_2, world_1, world_2, centre_1, centre_2, bf, baseline, max_cosine):
-    """World point of two rays, or of the stereo pair with more parallax than the rays have.
+def dot3(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
-    ``world_i`` is the ray in the world, as long as its z in its own camera is 1.
+
+@kernel
+def world_ray(T_cw, xy, intrinsics, ray):
+    """Viewing ray of a pixel in the world, of length 1 along the camera's z, into ``ray`` (3,)."""
+    x = (xy[0] - intrinsics[2]) / intrinsics[0]
+    y = (xy[1] - intrinsics[3]) / intrinsics[1]
+    for i in range(3):
+        ray[i] = T_cw[0, i] * x + T_cw[1, i] * y + T_cw[2, i]
+
+
+@kernel
+def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_cosine, point):
+    """Put into ``point`` (3,) where two rays meet, or the stereo point of the eye pair that has
+    more parallax than the rays have; False if neither is sound.
+
+    ``depth_i`` is the stereo depth of each feature, NaN without; ``ray_i`` its ``world_ray``.
     """
-    dot = (world_1 * world_2).sum()
-    square_1, square_2 = (world_1**2).sum(), (world_2**2).sum()
+    dot = dot3(ray_1, ray_2)
+    square_1, square_2 = dot3(ray_1, ray_1), dot3(ray_2, ray_2)
     cosine = dot / np.sqrt(square_1 * square_2)
-    depth_1 = bf / (a.xy[row_1, 0] - a.u_right[row_1])
-    depth_2 = bf / (a.xy[row_2, 0] - a.u_right[row_2])
     # Angle between the eyes, seen from the stereo point.
     eyes_1 = 2.0 * np.arctan(0.5 * baseline / (depth_1 * np.sqrt(square_1)))
     eyes_2 = 2.0 * np.arctan(0.5 * baseline / (depth_2 * np.sqrt(square_2)))
@@ -184,17 +208,23 @@ def intersect(a, row_1, row_2, world_1, world_2, centre_1, centre_2, bf, baselin
     stereo_cosine = min(np.cos(eyes_1) if stereo_1 else 2.0, np.cos(eyes_2) if stereo_2 else 2.0)
     if 0.0 < cosine < stereo_cosine and (stereo_1 or stereo_2 or cosine < max_cosine):
         # Midpoint of the shortest segment between the rays; bundle adjustment does the rest.
-        gap = centre_2 - centre_1
-        on_1, on_2 = (gap * world_1).sum(), (gap * world_2).sum()
+        on_1, on_2 = 0.0, 0.0
+        for i in range(3):
+            on_1 += (centre_2[i] - centre_1[i]) * ray_1[i]
+            on_2 += (centre_2[i] - centre_1[i]) * ray_2[i]
         determinant = square_1 * square_2 - dot * dot
         s = (square_2 * on_1 - dot * on_2) / determinant
         t = (dot * on_1 - square_1 * on_2) / determinant
-        return 0.5 * (centre_1 + s * world_1 + centre_2 + t * world_2), s > 0.0 and t > 0.0
+        for i in range(3):
+            point[i] = 0.5 * (centre_1[i] + s * ray_1[i] + centre_2[i] + t * ray_2[i])
+        return s > 0.0 and t > 0.0
     if stereo_1 and (not stereo_2 or eyes_1 >= eyes_2):
-        return centre_1 + depth_1 * world_1, True
-    if stereo_2:
-        return centre_2 + depth_2 * world_2, True
-    return centre_1, False
+        for i in range(3):
+            point[i] = centre_1[i] + depth_1 * ray_1[i]
+        return True
+    for i in range(3):
+        point[i] = centre_2[i] + depth_2 * ray_2[i]
+    return stereo_2
 
 
 @kernel

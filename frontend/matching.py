@@ -61,7 +61,7 @@ def search_windows(
         column_last = min(columns - 1, int(np.floor((u + r) / CELL)))
         row_first = max(0, int(np.floor((v - r) / CELL)))
         row_last = min(rows - 1, int(np.floor((v + r) / CELL)))
-        best, best_distance, second_distance = -1, 257, 257
+        best, best_distance, second, second_distance = -1, 257, -1, 257
         for row in range(row_first, row_last + 1):
             for k in range(
                 start[row * columns + column_first], start[row * columns + column_last + 1]
@@ -77,11 +77,14 @@ def search_windows(
                     continue
                 distance = hamming(descriptors[i], frame_descriptors[j])
                 if distance < best_distance:
-                    second_distance = best_distance
+                    second, second_distance = best, best_distance
                     best, best_distance = j, distance
                 elif distance < second_distance:
-                    second_distance = distance
-        if best < 0 or best_distance > max_distance or best_distance > ratio * second_distance:
+                    second, second_distance = j, distance
+        if best < 0 or best_distance > max_distance:
+            continue
+        rivals = second >= 0 and octave[second] == octave[best]
+        if rivals and best_distance > ratio * second_distance:
             continue
         previous = owner[best]
         if previous >= 0:
@@ -146,9 +149,11 @@ def consistent_orientation(angle_a, angle_b):
         difference = (np.float64(angle_a[i]) - np.float64(angle_b[i])) % turn
         bins[i] = int(difference / turn * ORIENTATION_BINS + 0.5) % ORIENTATION_BINS
         count[bins[i]] += 1
-    order = np.argsort(-count, kind="mergesort")
     allowed = np.zeros(ORIENTATION_BINS, np.bool_)
-    for k in range(3):
-        if k == 0 or count[order[k]] * 10 >= count[order[0]]:
-            allowed[order[k]] = True
+    fullest = count.max()
+    for _ in range(3):
+        k = int(np.argmax(count))
+        if count[k] * 10 >= fullest:
+            allowed[k] = True
+        count[k] = -1
     return allowed[bins]

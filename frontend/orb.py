@@ -97,15 +97,18 @@ def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
 def features_per_level(config: OrbConfig) -> NDArray[np.int64]:
     """Share ``n_features`` among the levels in proportion to 1 / scale (ORB-SLAM, V-A)."""
     weights = 1.0 / scale_factors(config)
-    quota = np.round(config.n_features * weights / weights.sum()).astype(np.int64)
-    quota[-1] += config.n_features - quota.sum()
-    return np.maximum(quota, 0)
+    share = config.n_features * weights / weights.sum()
+    quota = np.floor(share).astype(np.int64)
+    # What rounding down leaves goes to the levels that it cost most.
+    left = config.n_features - quota.sum()
+    quota[np.argsort(quota - share, kind="stable")[:left]] += 1
+    return quota
 
 
 def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
     """Shrink the image level by level, bilinearly."""
     scales = scale_factors(config)
-    shapes = np.array([np.round(np.array(image.shape) / s) for s in scales]).astype(np.int64)
+    shapes = np.round(np.array(image.shape) / scales[:, None]).astype(np.int64).clip(min=1)
     sizes = shapes.prod(axis=1)
     offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
     pyramid = Pyramid(np.empty(sizes.sum(), np.uint8), offsets, shapes, scales)
@@ -265,15 +268,32 @@ def spread(x, y, score, width, height, quota):
         else:
             high = size
     cells = ((width + low - 1) // low) * ((height + low - 1) // low)
-    occupied = occupy(x, y, score, width, height, low, best_of_cell)
-    chosen = np.empty(occupied, np.int64)
-    count = 0
+    occupy(x, y, score, width, height, low, best_of_cell)
+    chosen = np.zeros(n, np.bool_)
+    counts = np.zeros(256, np.int64)
+    surplus = -quota
     for c in range(cells):
-        if best_of_cell[c] >= 0:
-            chosen[count] = best_of_cell[c]
-            count += 1
-    strongest = np.argsort(255 - score[chosen], kind="mergesort")[:quota]
-    return np.sort(chosen[strongest])
+        i = best_of_cell[c]
+        if i >= 0:
+            chosen[i] = True
+            counts[score[i]] += 1
+            surplus += 1
+    # Drop the weakest of the surplus; scores are bytes, so that counting ranks them.
+    weakest = 0
+    while counts[weakest] <= surplus:
+        surplus -= counts[weakest]
+        weakest += 1
+    kept = np.empty(quota, np.int64)
+    count = 0
+    for i in range(n):
+        if not chosen[i] or score[i] < weakest:
+            continue
+        if score[i] == weakest and surplus > 0:
+            surplus -= 1
+            continue
+        kept[count] = i
+        count += 1
+    return kept
 
 
 @kernel
@@ -283,8 +303,10 @@ def occupy(x, y, score, width, height, size, best_of_cell):
     rows = (height + size - 1) // size
     best_of_cell[: columns * rows] = -1
     occupied = 0
+    inverse = np.float32(1.0 / size)  # a product is many times faster than a division
+    half = np.float32(0.5)
     for i in range(len(x)):
-        c = (y[i] // size) * columns + x[i] // size
+        c = int((y[i] + half) * inverse) * columns + int((x[i] + half) * inverse)
         if best_of_cell[c] < 0:
             occupied += 1
             best_of_cell[c] = i

@@ -10,17 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from vslam.camera import StereoCamera
+from vslam.config import Config
+from vslam.features import FeatureGrid, Features
 from vslam.frontend.matching import consistent_orientation, search_all, search_windows
 from vslam.frontend.orb import extract, scale_factors
 from vslam.frontend.pose import optimise_pose
 from vslam.frontend.stereo import match_stereo
-
-from vslam.camera import StereoCamera
-from vslam.config import Config, TrackingConfig
-from vslam.features import FeatureGrid, Features
-from vslam.geometry import transform
+from vslam.geometry import inverse, transform
 from vslam.kernels import kernel
-from vslam.map import LocalMap, predict_octave
+from vslam.map import LocalMap
+from vslam.observations import predict_octave
 
 NEVER = np.iinfo(np.int64).max
 
@@ -151,7 +152,7 @@ def trackable_points(
     depth = feature_depth(previous.features, tracker.camera)
     close = ~known & (depth < tracker.close_depth) & (depth > 0)
     lifted = tracker.camera.backproject(previous.features.xy[close], depth[close])
-    points[close] = transform(np.linalg.inv(previous.T_cw), lifted)
+    points[close] = transform(inverse(previous.T_cw), lifted)
     source = np.flatnonzero(known | close)
     return points[source], source
 
@@ -322,8 +323,3 @@ def _refine(frame: Frame, T_cw: NDArray[np.float64], tracker: Tracker) -> int:
     frame.landmark[outliers] = -1
     frame.xyz[outliers] = np.nan
     return int(np.count_nonzero(inlier))
-
-
-def is_weak(inliers: int, config: TrackingConfig) -> bool:
-    """A pose on so few inliers is reported WEAK."""
-    return inliers < config.min_inliers

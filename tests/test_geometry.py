@@ -9,6 +9,7 @@ from scipy.linalg import expm
 from vslam.geometry import (
     compose,
     inverse,
+    inverses,
     orthonormalised,
     se3_exp,
     se3_log,
@@ -74,6 +75,12 @@ def test_compose_is_the_matrix_product():
 def test_inverse_is_the_matrix_inverse():
     for T in random_poses(20):
         np.testing.assert_allclose(inverse(T), np.linalg.inv(T), rtol=0, atol=1e-13)
+
+
+def test_inverses_are_the_matrix_inverses():
+    poses = random_poses(20)
+    np.testing.assert_allclose(inverses(poses), np.linalg.inv(poses), rtol=0, atol=1e-13)
+    assert inverses(poses[:0]).shape == (0, 4, 4)
 
 
 def test_transform_maps_points_between_frames():

@@ -124,7 +124,7 @@ def test_no_two_corners_touch_and_none_is_near_the_border():
     assert len(corners) > 300
     taken = np.zeros(image.shape, np.uint8)
     taken[corners[:, 1], corners[:, 0]] = 1
-    assert cv2.boxFilter(taken, cv2.CV_32S, (3, 3), normalize=False).max() == 1
+    assert cv2.boxFilter(taken, cv2.CV_32S, (2, 2), normalize=False).max() == 1
     assert corners.min() >= MARGIN
     assert (corners < np.array(image.shape[::-1]) - MARGIN).all()
 
@@ -247,6 +247,17 @@ def test_features_per_level_sum_to_n_and_shrink_with_the_level(n, levels, factor
     assert quota.sum() == n
     assert (np.diff(quota[:-1]) <= 0).all()
     assert quota[-1] >= 0
+
+
+@pytest.mark.parametrize(("n", "levels", "factor"), [(115, 8, 1.8), (128, 12, 1.5)])
+def test_features_per_level_sum_to_n_when_the_last_level_has_nothing_to_give(n, levels, factor):
+    config = OrbConfig(n_features=n, n_levels=levels, scale_factor=factor)
+    assert features_per_level(config).sum() == n
+
+
+def test_levels_smaller_than_a_pixel_hold_no_features():
+    config = OrbConfig(n_levels=16, scale_factor=2.0)  # both are the greatest that are allowed
+    assert len(extract(textured(376, 1241), config).xy) > 100
 
 
 def test_pyramid_levels_are_views_of_the_shrunk_image():

@@ -91,7 +91,7 @@ def run(
 
     from vslam.config import Config, load_config
     from vslam.datasets import open_sequence
-    from vslam.info import available_cores
+    from vslam.info import available_cores, numba_caches
     from vslam.perturb import parse_perturbation
     from vslam.run import RunSettings
     from vslam.runfolder import create_run_folder, write_results
@@ -118,7 +118,8 @@ def run(
     from vslam.recorder import NullRecorder, RerunRecorder
 
     recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
-    with progress_bar(len(sequence), shown=not quiet) as on_frame:
+    state = "starting" if numba_caches() else "compiling kernels, once"
+    with progress_bar(len(sequence), shown=not quiet, state=state) as on_frame:
         outcome = run_sequence(sequence, perturbation, settings, recorder, on_frame=on_frame)
     evaluation, remark = write_results(folder, outcome, ply=ply)
     if not quiet:

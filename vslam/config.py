@@ -58,6 +58,7 @@ class TrackingConfig(_Section):
     min_inlier_ratio: float = Field(
         0.3, ge=0, le=1, description="Of the motion matches; below: likewise. [own]"
     )
+    min_inliers_frame: int = Field(10, ge=3, description="Below, the local map is not tried. [OS1]")
     min_inliers: int = Field(30, ge=3, description="Below, the frame is WEAK. [OS1]")
     min_inliers_lost: int = Field(15, ge=3, description="Below, the frame is LOST. [own]")
     lost_frames_before_restart: int = Field(

@@ -65,11 +65,14 @@ def se3_exp(twist: Matrix) -> Matrix:
     """``(4, 4)`` motion of a ``(6,)`` twist ``[v, w]`` (Solà et al., "A micro Lie theory", D.2)."""
     v, w = twist[:3], twist[3:]
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-    if angle2 < 1e-10:
-        a, b, c = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0, 1.0 / 6.0 - angle2 / 120.0
+    if angle2 < 1e-6:
+        a = 1.0 - angle2 / 6.0 * (1.0 - angle2 / 20.0)
+        b = 0.5 - angle2 / 24.0 * (1.0 - angle2 / 30.0)
+        c = 1.0 / 6.0 - angle2 / 120.0 * (1.0 - angle2 / 42.0)
     else:
         angle = np.sqrt(angle2)
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
+        a = np.sin(angle) / angle
+        b = 2.0 * np.sin(0.5 * angle) ** 2 / angle2
         c = (1.0 - a) / angle2
     T = np.zeros((4, 4))
     W = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
@@ -111,6 +114,15 @@ def se3_log(T: Matrix) -> Matrix:
 def transform(T_a_b: Matrix, p_b: Matrix) -> Matrix:
     """Map ``(N, 3)`` points of frame b to frame a."""
     return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def inverses(T_a_b: Matrix) -> Matrix:
+    """``T_b_a`` of ``(N, 4, 4)`` rigid motions."""
+    T_b_a = np.zeros((len(T_a_b), 4, 4))
+    T_b_a[:, :3, :3] = T_a_b[:, :3, :3].transpose(0, 2, 1)
+    T_b_a[:, :3, 3] = -np.einsum("nij,nj->ni", T_b_a[:, :3, :3], T_a_b[:, :3, 3])
+    T_b_a[:, 3, 3] = 1.0
+    return T_b_a
 
 
 def umeyama(source: Matrix, target: Matrix, *, with_scale: bool = False) -> tuple[float, Matrix]:

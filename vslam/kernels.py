@@ -8,7 +8,7 @@ liberties; no re-association, so that a result never depends on how a loop was v
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import types
@@ -19,14 +19,19 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def kernel(function: Function) -> Function:
     """Compile ``function`` as described above, on its first call."""
-    return numba.njit(
-        cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, boundscheck=False
-    )(function)
+    options: dict[str, Any] = {
+        "cache": True,
+        "nogil": True,
+        "error_model": "numpy",
+        "fastmath": {"contract"},
+        "no_cfunc_wrapper": True,
+    }
+    return cast(Function, numba.njit(**options)(function))
 
 
 def inline(function: Function) -> Function:
     """Compile ``function`` into the kernels that call it."""
-    return numba.njit(inline="always", error_model="numpy")(function)
+    return cast(Function, numba.njit(inline="always", error_model="numpy")(function))
 
 
 @intrinsic

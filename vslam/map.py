@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.features import Features
-from vslam.kernels import hamming, kernel
+from vslam.observations import collect_landmarks, count_shared, detach_keyframe
 
 NONE = -1
 
@@ -190,21 +190,25 @@ class Map:
         return order, counts[order]
 
     def keyframe_pose(self, keyframe: int) -> NDArray[np.float64]:
-        """Copy of ``T_cw``; that of a culled keyframe follows its nearest living ancestor."""
+        """Copy of ``T_cw``; a culled keyframe follows the living one that took its place."""
         if self.arrays.keyframe_alive[keyframe]:
             return self.arrays.T_cw[keyframe].copy()
-        return self.T_c_parent[keyframe] @ self.keyframe_pose(self.parents[keyframe])
+        return self.T_c_parent[keyframe] @ self.arrays.T_cw[self.parents[keyframe]]
 
     def cull_keyframe(self, keyframe: int) -> None:
-        """Remove a keyframe and its observations; its children move to its parent."""
-        parent = self.parents[keyframe]
-        a = self.arrays
-        self.T_c_parent[keyframe] = a.T_cw[keyframe] @ np.linalg.inv(self.keyframe_pose(parent))
+        """Remove a keyframe and its observations; its children move to its parent.
+
+        Keyframes culled before it are children too: every parent is alive.
+        """
+        parent, a = self.parents[keyframe], self.arrays
+        T_c_parent = a.T_cw[keyframe] @ np.linalg.inv(a.T_cw[parent])
+        for child in [k for k, p in enumerate(self.parents) if p == keyframe]:
+            self.parents[child] = parent
+            if not a.keyframe_alive[child]:
+                self.T_c_parent[child] = self.T_c_parent[child] @ T_c_parent
+        self.T_c_parent[keyframe] = T_c_parent
         detach_keyframe(a, keyframe)
         a.keyframe_alive[keyframe] = False
-        for child in range(keyframe + 1, self.n_keyframes):
-            if self.parents[child] == keyframe and a.keyframe_alive[child]:
-                self.parents[child] = parent
 
     def living_keyframes(self) -> NDArray[np.int64]:
         """Ids of the keyframes that were not culled."""
@@ -213,185 +217,6 @@ class Map:
     def living_landmarks(self) -> NDArray[np.int64]:
         """Ids of the landmarks that were neither culled nor merged into another."""
         return np.flatnonzero(self.arrays.landmark_alive[: self.n_landmarks])
-
-
-@kernel
-def count_shared(a, keyframe, n_keyframes):
-    """Landmarks shared with each keyframe, ``(n_keyframes,)`` int64; 0 for itself."""
-    counts = np.zeros(n_keyframes, np.int64)
-    for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
-        landmark = a.landmark[row]
-        if landmark < 0:
-            continue
-        other = a.head[landmark]
-        while other >= 0:
-            counts[a.keyframe[other]] += 1
-            other = a.next_row[other]
-    counts[keyframe] = 0
-    return counts
-
-
-@kernel
-def link(a, row, landmark):
-    """Let a free row observe a landmark."""
-    a.landmark[row] = landmark
-    a.next_row[row] = a.head[landmark]
-    a.head[landmark] = row
-    a.n_observations[landmark] += 1 if np.isnan(a.u_right[row]) else 2
-
-
-@kernel
-def link_many(a, rows, landmarks):
-    """Let each of ``(N,)`` free rows observe its landmark."""
-    for i in range(len(rows)):
-        link(a, rows[i], landmarks[i])
-
-
-@kernel
-def unlink(a, row):
-    """Remove one observation. A landmark left with none is dead."""
-    landmark = a.landmark[row]
-    if a.head[landmark] == row:
-        a.head[landmark] = a.next_row[row]
-    else:
-        other = a.head[landmark]
-        while a.next_row[other] != row:
-            other = a.next_row[other]
-        a.next_row[other] = a.next_row[row]
-    a.landmark[row] = -1
-    a.next_row[row] = -1
-    a.n_observations[landmark] -= 1 if np.isnan(a.u_right[row]) else 2
-    if a.head[landmark] < 0:
-        a.landmark_alive[landmark] = False
-
-
-@kernel
-def erase_landmark(a, landmark):
-    """Remove a landmark and its observations."""
-    row = a.head[landmark]
-    while row >= 0:
-        following = a.next_row[row]
-        a.landmark[row] = -1
-        a.next_row[row] = -1
-        row = following
-    a.head[landmark] = -1
-    a.n_observations[landmark] = 0
-    a.landmark_alive[landmark] = False
-
-
-@kernel
-def detach_keyframe(a, keyframe):
-    """Remove all observations of a keyframe."""
-    for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
-        if a.landmark[row] >= 0:
-            unlink(a, row)
-
-
-@kernel
-def observed_by(a, landmark, keyframe):
-    """Row of ``keyframe`` that observes the landmark, or -1."""
-    row = a.head[landmark]
-    while row >= 0:
-        if a.keyframe[row] == keyframe:
-            return row
-        row = a.next_row[row]
-    return -1
-
-
-@kernel
-def merge_landmarks(a, loser, winner):
-    """Move the observations of ``loser`` to ``winner``; a keyframe that sees both keeps one."""
-    row = a.head[loser]
-    while row >= 0:
-        following = a.next_row[row]
-        a.landmark[row] = -1
-        a.next_row[row] = -1
-        if observed_by(a, winner, a.keyframe[row]) < 0:
-            link(a, row, winner)
-        row = following
-    a.head[loser] = -1
-    a.n_observations[loser] = 0
-    a.landmark_alive[loser] = False
-    a.merged_into[loser] = winner
-    a.visible[winner] += a.visible[loser]
-    a.found[winner] += a.found[loser]
-
-
-@kernel
-def resolve(a, landmarks):
-    """Follow merges: living landmark that each id stands for today, or -1. Returns ``(N,)`` i4."""
-    out = np.empty(len(landmarks), np.int32)
-    for i in range(len(landmarks)):
-        landmark = landmarks[i]
-        while landmark >= 0 and not a.landmark_alive[landmark]:
-            landmark = a.merged_into[landmark]
-        out[i] = landmark
-    return out
-
-
-@kernel
-def refresh_landmarks(a, landmarks, scales):
-    """Recompute what follows from the observations: descriptor, normal and reach.
-
-    The descriptor is the observation's with the least median distance to the others (ORB-SLAM,
-    III-C); the reach follows from the octave in the latest observing keyframe.
-    """
-    limit = 32
-    rows = np.empty(limit, np.int64)
-    distances = np.empty((limit, limit), np.int64)
-    for i in range(len(landmarks)):
-        landmark = landmarks[i]
-        if not a.landmark_alive[landmark]:
-            continue
-        n = 0
-        first, first_row = 2**31 - 1, -1
-        nx, ny, nz = 0.0, 0.0, 0.0
-        row = a.head[landmark]
-        while row >= 0:
-            k = a.keyframe[row]
-            T = a.T_cw[k]
-            # Centre of the camera: -R' t.
-            dx = a.xyz[landmark, 0] + T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3]
-            dy = a.xyz[landmark, 1] + T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3]
-            dz = a.xyz[landmark, 2] + T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3]
-            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-            nx += dx / distance
-            ny += dy / distance
-            nz += dz / distance
-            if k < first:
-                first, first_row = k, row
-                farthest = distance * scales[a.octave[row]]
-                a.reach[landmark, 0] = farthest / scales[-1]
-                a.reach[landmark, 1] = farthest
-            if n < limit:
-                rows[n] = row
-                n += 1
-            row = a.next_row[row]
-        norm = np.sqrt(nx * nx + ny * ny + nz * nz)
-        if norm > 0:
-            a.normal[landmark, 0] = nx / norm
-            a.normal[landmark, 1] = ny / norm
-            a.normal[landmark, 2] = nz / norm
-        for p in range(n):
-            distances[p, p] = 0
-            for q in range(p):
-                d = hamming(a.descriptor[rows[p]], a.descriptor[rows[q]])
-                distances[p, q] = d
-                distances[q, p] = d
-        best, best_median = first_row, 1000
-        for p in range(n):
-            median = np.sort(distances[p, :n])[(n - 1) // 2]
-            if median < best_median:
-                best, best_median = rows[p], median
-        for word in range(4):
-            a.landmark_descriptor[landmark, word] = a.descriptor[best, word]
-
-
-@kernel
-def predict_octave(distance, farthest, log_scale, levels):
-    """Pyramid level at which a landmark should appear at a distance (ORB-SLAM, V-D)."""
-    level = int(np.ceil(np.log(farthest / distance) / log_scale))
-    return min(max(level, 0), levels - 1)
 
 
 class LocalMap(NamedTuple):
@@ -408,50 +233,15 @@ class LocalMap(NamedTuple):
 
 
 def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
-    """Copy the landmarks of a keyframe, its covisible keyframes and theirs (ORB-SLAM, V-D).
+    """Copy the landmarks of a keyframe and of its covisible keyframes (ORB-SLAM, V-D).
+
+    ORB-SLAM adds neighbours of neighbours; those changed no figure here (docs/design.md).
 
     Args:
         limit: at most this many keyframes, nearest in covisibility first.
     """
     first, _ = map_.covisible(keyframe)
     chosen = [keyframe, *first[: limit - 1].tolist()]
-    known = set(chosen)
-    for neighbour in chosen[1:]:
-        if len(chosen) >= limit:
-            break
-        second, _ = map_.covisible(neighbour)
-        # ORB-SLAM adds the best few neighbours of each neighbour.
-        new = [k for k in second[:10].tolist() if k not in known]
-        chosen += new[: limit - len(chosen)]
-        known.update(new)
     a = map_.arrays
     ids = collect_landmarks(a, np.array(chosen, np.int64), map_.n_landmarks)
     return LocalMap(ids, a.xyz[ids], a.normal[ids], a.reach[ids], a.landmark_descriptor[ids])
-
-
-@kernel
-def collect_landmarks(a, keyframes, n_landmarks):
-    """Ids of the landmarks that any of the keyframes observes, ``(N,)`` i4, in id order."""
-    seen = np.zeros(n_landmarks, np.bool_)
-    for keyframe in keyframes:
-        for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
-            if a.landmark[row] >= 0:
-                seen[a.landmark[row]] = True
-    return np.flatnonzero(seen).astype(np.int32)
-
-
-@kernel
-def count_seen_by(a, keyframe, needed):
-    """Landmarks of a keyframe that at least ``needed`` keyframes see, it included."""
-    count = 0
-    for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
-        if a.landmark[row] < 0:
-            continue
-        seen = 0
-        other = a.head[a.landmark[row]]
-        while other >= 0 and seen < needed:
-            seen += 1
-            other = a.next_row[other]
-        if seen >= needed:
-            count += 1
-    return count

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from vslam.camera import StereoCamera
 from vslam.errors import InputError
 from vslam.features import Features
-from vslam.map import Map, link_many, refresh_landmarks
+from vslam.map import Map
+from vslam.observations import link_many, refresh_landmarks
 
 SCHEMA = 1
 

@@ -1,4 +1,4 @@
-"""Seeded photometric perturbations of a stereo sequence (docs/design.md, section 6.9).
+"""Seeded photometric perturbations of a stereo sequence (docs/design.md, section 10).
 
 With v a grey value, s the strength (1 unless ``law:s`` says otherwise), t seconds since the first
 frame, k the frame and n a standard normal number:

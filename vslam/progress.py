@@ -26,7 +26,9 @@ class _FramesPerSecond(ProgressColumn):
 
 
 @contextmanager
-def progress_bar(total: int, *, shown: bool) -> Iterator[Callable[[TrackResult], None]]:
+def progress_bar(
+    total: int, *, shown: bool, state: str = "starting"
+) -> Iterator[Callable[[TrackResult], None]]:
     """Yield the callable to give each tracked frame to: frames, fps, tracking state, time left.
 
     The bar is drawn on stderr, so that stdout stays for results.
@@ -39,7 +41,7 @@ def progress_bar(total: int, *, shown: bool) -> Iterator[Callable[[TrackResult],
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
-        task = progress.add_task("", total=total, state="starting")
+        task = progress.add_task("", total=total, state=state)
 
         def on_frame(result: TrackResult) -> None:
             progress.update(task, completed=result.index + 1, state=str(result.state))

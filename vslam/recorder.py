@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import StereoCamera
 from vslam.features import Features, TrackingState, TrackResult
+from vslam.geometry import inverses
 from vslam.map import Map
 from vslam.trajectory import Trajectory
 
@@ -79,8 +80,20 @@ class Recorder(Protocol):
         """Log the final trajectory and map, write all that is pending and close the file."""
 
 
-class NullRecorder(Recorder):
-    """Records nothing (``--no-record``): the protocol's methods are empty."""
+class NullRecorder:
+    """Records nothing (``--no-record``)."""
+
+    def begin(self, camera: StereoCamera, ground_truth: Trajectory | None) -> None: ...
+    def frame(self, result: TrackResult, T_wc: NDArray[np.float64]) -> None: ...
+    def keyframe(
+        self,
+        result: TrackResult,
+        image: NDArray[np.uint8],
+        features: Features,
+        tracked: NDArray[np.bool_],
+    ) -> None: ...
+    def map(self, map_: Map) -> None: ...
+    def finish(self, trajectory: Trajectory, map_: Map) -> None: ...
 
 
 def _guarded(
@@ -224,7 +237,7 @@ class RerunRecorder:
         landmarks = map_.living_landmarks()
         landmarks = landmarks[:: max(1, -(-len(landmarks) // max(1, limit)))]
         xyz = map_.arrays.xyz[landmarks].astype(np.float32)
-        T_wc_keyframes = np.linalg.inv(map_.arrays.T_cw[map_.living_keyframes()])
+        T_wc_keyframes = inverses(map_.arrays.T_cw[map_.living_keyframes()])
         self._recording.log("world/landmarks", rr.Points3D.from_fields(positions=xyz))
         self._recording.log("world/keyframes", _path(T_wc_keyframes, _AMBER))
 

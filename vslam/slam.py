@@ -1,22 +1,13 @@
-"""SLAM on a stereo stream: ``Slam.step`` is the method section.
-
-Tracking and local mapping run side by side and still give the same bytes on every machine: the
-mapping of a keyframe starts when the keyframe is inserted and is merged at a fixed point, a set
-number of frames later or before the next keyframe, whichever comes first. Between the two,
-tracking sees only its ``LocalMap``, the copy that the last merge left.
-"""
+"""SLAM on a stereo stream: ``Slam.step`` is the method section."""
 
 from __future__ import annotations
 
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.backend.local_mapping import map_keyframe, refresh_keyframe
-from vslam.backend.triangulation import map_stereo_points
 from vslam.camera import StereoCamera
 from vslam.config import Config
 from vslam.features import FeatureGrid, Features, TrackingState, TrackResult
@@ -30,14 +21,15 @@ from vslam.frontend.tracking import (
     track_local_map,
     track_motion,
 )
-from vslam.geometry import orthonormalised, se3_exp, se3_log
-from vslam.map import LocalMap, Map, count_seen_by, link_many, local_map, resolve
+from vslam.geometry import inverse, inverses, orthonormalised, se3_exp, se3_log
+from vslam.map import Map
+from vslam.mapping import DeferredMapping
 from vslam.trajectory import Trajectory
 
 Matrix = NDArray[np.float64]
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Placed:
     """Where a frame is: relative to a keyframe, so that it follows when that one moves."""
 
@@ -56,8 +48,7 @@ class Slam:
     >>> slam.trajectory().T_wc
 
     Attributes:
-        map: keyframes, landmarks and observations; read it after ``finish()``.
-        frame: the last frame tracked, for drawing.
+        frame: the last frame tracked, for drawing; None before the first.
     """
 
     def __init__(
@@ -70,32 +61,41 @@ class Slam:
             threads: with 1, mapping runs where it is merged instead of beside tracking. The
                 result is the same.
         """
+        self.camera = camera
         self.config = config or Config()
         self.tracker = Tracker.create(camera, self.config)
-        self.camera = camera
-        self.map = Map(self.tracker.scales)
         self.frame: Frame | None = None
-        self._executor = ThreadPoolExecutor(1, "mapping") if threads > 1 else None
-        self._mapping: Future[None] | None = None
-        self._mapping_since = 0
-        self._local: LocalMap | None = None
-        self._reference = 0
-        self._n_reference = 0
-        self._reference_view: LocalMap | None = None
-        self._velocity: Matrix | None = None  # twist per second
+        self._mapping = DeferredMapping(self.tracker.scales, camera, self.config, threads=threads)
         self._placed: list[_Placed] = []
+        self._tracked = 0  # index of ``frame`` in _placed
+        self._velocity: Matrix | None = None  # twist per second, None if unknown
         self._lost_frames = 0
-        self._visible: list[NDArray[np.int32]] = []
-        self._found: list[NDArray[np.int32]] = []
+
+    @property
+    def map(self) -> Map:
+        """Keyframes, landmarks and observations; read it only while ``is_mapping`` is False."""
+        return self._mapping.map
+
+    @property
+    def is_mapping(self) -> bool:
+        """Whether a keyframe is being mapped."""
+        return self._mapping.busy
 
     def step(
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], timestamp: float
     ) -> TrackResult:
-        """Track one rectified stereo pair, ``(H, W)`` uint8 each, and map it if it is new.
+        """Track one rectified stereo pair and map it if it is new.
 
         Args:
+            left, right: ``(H, W)`` uint8.
             timestamp: seconds, later than that of the last call.
+
+        Raises:
+            ValueError: images of another size than the camera's, or a timestamp that goes back.
         """
+        expected = (self.camera.height, self.camera.width)
+        if left.shape != expected or right.shape != expected:
+            raise ValueError(f"images are {left.shape} and {right.shape}, the camera's {expected}")
         start = time.perf_counter()
         features = extract_features(left, right, self.tracker)
         return self.step_features(
@@ -106,75 +106,64 @@ class Slam:
         self, features: Features, timestamp: float, stage_ms: dict[str, float] | None = None
     ) -> TrackResult:
         """``step`` for a pair whose features were extracted elsewhere (``extract_features``)."""
-        clock = _Clock(stage_ms)
-        index = len(self._placed)
+        self._check_time(timestamp)
+        clock = _Clock(dict(stage_ms or {}))
         frame = self._prepare(features)
-        if index - self._mapping_since >= self.config.keyframes.merge_after_frames:
+        if self._mapping_is_due():
             self._merge()
-            clock.lap("wait_for_mapping")
-
+        clock.lap("wait_for_mapping")
         if self.map.n_keyframes == 0:
             return self._start(frame, timestamp, clock)
 
         T_cw = self._predict(timestamp)
-        inliers = self._track_frame(frame, T_cw)
+        inliers = self._track_previous_frame(frame, T_cw)
         clock.lap("track_frame")
-        matches, inliers, visible = self._track_map(frame, inliers)
+        matches, inliers, visible = self._track_local_map(frame, inliers)
         clock.lap("track_local_map")
         state = self._judge(inliers)
         if state == TrackingState.LOST:
             return self._lose(frame, T_cw, timestamp, matches, inliers, clock)
 
-        self._count(frame, visible)
-        self._move(frame, timestamp)
-        is_keyframe = self._is_new(frame, timestamp, inliers)
+        self._mapping.count(visible, frame.landmark[frame.landmark >= 0])
+        self._update_motion(frame, timestamp)
+        is_keyframe = self._needs_keyframe(frame, timestamp, inliers)
         if is_keyframe:
-            self._insert_keyframe(frame, timestamp)
+            self._insert_keyframe(frame)
         clock.lap("keyframe")
         return self._result(frame, state, matches, inliers, is_keyframe, clock)
 
     def skip(self, timestamp: float) -> TrackResult:
         """Account for a frame without images: it is LOST at the predicted pose."""
-        clock = _Clock(None)
-        empty = Features(
-            np.empty((0, 2), np.float32),
-            np.empty(0, np.uint8),
-            np.empty(0, np.float32),
-            np.empty((0, 32), np.uint8),
-            np.empty(0, np.float32),
-        )
-        frame = self._prepare(empty)
-        frame.T_cw = self._predict(timestamp) if self._placed else np.eye(4)
+        self._check_time(timestamp)
+        frame = self._prepare(NO_FEATURES)
+        if self._placed:
+            frame.T_cw = self._predict(timestamp)
         self._place(timestamp, frame.T_cw)
-        return self._result(frame, TrackingState.LOST, 0, 0, False, clock)
+        return self._result(frame, TrackingState.LOST, 0, 0, False, _Clock())
 
     def finish(self) -> None:
         """Complete pending mapping. Call before reading the map or the final trajectory."""
         self._merge()
-        if self._executor:
-            self._executor.shutdown()
-            self._executor = None
-
-    @property
-    def is_mapping(self) -> bool:
-        """Whether a keyframe is being mapped; only between times may others read ``map``."""
-        return self._mapping is not None
+        self._mapping.close()
 
     def trajectory(self) -> Trajectory:
         """Final pose of every frame, lost ones included."""
-        times = np.array([p.timestamp for p in self._placed])
-        poses = [
-            np.linalg.inv(p.T_c_reference @ self._keyframe_pose(p.reference)) for p in self._placed
-        ]
-        return Trajectory(times, np.array(poses).reshape(-1, 4, 4))
+        times = np.array([placed.timestamp for placed in self._placed], np.float64)
+        poses = [inverse(self._pose_of(placed)) for placed in self._placed]
+        return Trajectory(times, np.array(poses, np.float64).reshape(-1, 4, 4))
 
     def keyframe_trajectory(self) -> Trajectory:
         """Final pose of every keyframe that was not culled."""
         living = self.map.living_keyframes()
-        times = np.array([self.map.timestamps[k] for k in living])
-        return Trajectory(times, np.linalg.inv(self.map.arrays.T_cw[living]))
+        times = np.array([self.map.timestamps[k] for k in living], np.float64)
+        return Trajectory(times, inverses(self.map.arrays.T_cw[living]))
 
-    # -- tracking ---------------------------------------------------------------------------
+    # Tracking
+
+    def _check_time(self, timestamp: float) -> None:
+        if self._placed and not timestamp > self._placed[-1].timestamp:
+            last = self._placed[-1].timestamp
+            raise ValueError(f"timestamp {timestamp} s is not later than the last one, {last} s")
 
     def _prepare(self, features: Features) -> Frame:
         camera = self.camera
@@ -183,29 +172,25 @@ class Slam:
 
     def _predict(self, timestamp: float) -> Matrix:
         """Constant velocity, in seconds: dropped frames do not disturb it."""
-        last = self._placed[-1]
-        elapsed = timestamp - last.timestamp
-        T_last = last.T_c_reference @ self._keyframe_pose(last.reference)
+        T_last = self._pose_of(self._placed[-1])
         if self._velocity is None:
             return T_last
+        elapsed = timestamp - self._placed[-1].timestamp
         return orthonormalised(se3_exp(self._velocity * elapsed) @ T_last)
 
-    def _track_frame(self, frame: Frame, T_cw: Matrix) -> int:
-        """Frame to frame along the prediction, else against the reference keyframe."""
-        assert self.frame is not None
-        if self._velocity is not None:
+    def _track_previous_frame(self, frame: Frame, T_cw: Matrix) -> int:
+        """Along the prediction; where there is none or it fails, against the reference keyframe."""
+        if self._velocity is not None and self.frame is not None:
             matches, inliers = track_motion(frame, self.frame, T_cw, self.tracker)
             config = self.config.tracking
             if inliers >= max(config.min_inliers_motion, config.min_inlier_ratio * matches):
                 return inliers
-        assert self._reference_view is not None
-        return track_descriptors(frame, self._reference_view, T_cw, self.tracker)
+        return track_descriptors(frame, self._mapping.reference_view, T_cw, self.tracker)
 
-    def _track_map(self, frame: Frame, inliers: int) -> tuple[int, int, NDArray[np.int32]]:
-        assert self._local is not None
-        if inliers < min(10, self.config.tracking.min_inliers_lost):
+    def _track_local_map(self, frame: Frame, inliers: int) -> tuple[int, int, NDArray[np.int32]]:
+        if inliers < self.config.tracking.min_inliers_frame:
             return inliers, 0, np.empty(0, np.int32)
-        return track_local_map(frame, self._local, self.tracker)
+        return track_local_map(frame, self._mapping.local, self.tracker)
 
     def _judge(self, inliers: int) -> TrackingState:
         if inliers < self.config.tracking.min_inliers_lost:
@@ -214,26 +199,14 @@ class Slam:
             return TrackingState.WEAK
         return TrackingState.OK
 
-    def _move(self, frame: Frame, timestamp: float) -> None:
-        """Place the frame and update the velocity."""
-        last = self._placed[-1]
-        T_last = last.T_c_reference @ self._keyframe_pose(last.reference)
-        if self._lost_frames == 0:
-            step = se3_log(orthonormalised(frame.T_cw @ np.linalg.inv(T_last)))
-            self._velocity = step / (timestamp - last.timestamp)
+    def _update_motion(self, frame: Frame, timestamp: float) -> None:
+        """Place the frame; the velocity is that since the last frame tracked."""
+        before = self._placed[self._tracked]
+        step = se3_log(orthonormalised(frame.T_cw @ inverse(self._pose_of(before))))
+        self._velocity = step / (timestamp - before.timestamp)
         self._lost_frames = 0
         self._place(timestamp, frame.T_cw)
-        self.frame = frame
-
-    def _place(self, timestamp: float, T_cw: Matrix) -> None:
-        T_reference = self._keyframe_pose(self._reference) if self.map.n_keyframes else np.eye(4)
-        relative = orthonormalised(T_cw @ np.linalg.inv(T_reference))
-        self._placed.append(_Placed(timestamp, self._reference, relative))
-
-    def _count(self, frame: Frame, visible: NDArray[np.int32]) -> None:
-        """Remember what should be and what was seen; written to the map at the next merge."""
-        self._visible.append(visible)
-        self._found.append(frame.landmark[frame.landmark >= 0])
+        self._keep(frame)
 
     def _lose(
         self,
@@ -246,29 +219,31 @@ class Slam:
     ) -> TrackResult:
         """Keep the prediction as the pose; after a while, map anew from there."""
         frame.T_cw = T_cw
-        self._lost_frames += 1
         self._place(timestamp, T_cw)
-        restart = self._lost_frames >= self.config.tracking.lost_frames_before_restart
-        if restart and self._can_start(frame):
+        self._lost_frames += 1
+        restart = (
+            self._lost_frames >= self.config.tracking.lost_frames_before_restart
+            and self._can_start(frame)
+        )
+        if restart:
             frame.landmark[:] = -1
-            self._insert_keyframe(frame, timestamp)
-            self.frame = frame
-            self._lost_frames = 0
+            self._insert_keyframe(frame)
             self._velocity = None
+            self._lost_frames = 0
+            self._keep(frame)
         return self._result(frame, TrackingState.LOST, matches, inliers, restart, clock)
 
-    # -- mapping ----------------------------------------------------------------------------
+    # Mapping
 
     def _start(self, frame: Frame, timestamp: float, clock: _Clock) -> TrackResult:
         """The first keyframe is the world, its stereo points the first landmarks."""
-        started = self._can_start(frame)
-        frame.T_cw = np.eye(4)
         self._place(timestamp, frame.T_cw)
+        started = self._can_start(frame)
         if started:
-            self._insert_keyframe(frame, timestamp)
-            self.frame = frame
-        state = TrackingState.OK if started else TrackingState.LOST
+            self._insert_keyframe(frame)
+            self._keep(frame)
         inliers = int(np.count_nonzero(frame.landmark >= 0))
+        state = TrackingState.OK if started else TrackingState.LOST
         clock.lap("keyframe")
         return self._result(frame, state, inliers, inliers, started, clock)
 
@@ -276,92 +251,63 @@ class Slam:
         n_stereo = int(np.count_nonzero(np.isfinite(frame.features.u_right)))
         return n_stereo >= self.config.tracking.min_stereo_start
 
-    def _is_new(self, frame: Frame, timestamp: float, inliers: int) -> bool:
+    def _needs_keyframe(self, frame: Frame, timestamp: float, inliers: int) -> bool:
         close = feature_depth(frame.features, self.camera) < self.tracker.close_depth
         tracked = frame.landmark >= 0
         evidence = KeyframeEvidence(
             seconds_since_keyframe=timestamp - self.map.timestamps[-1],
             n_inliers=inliers,
-            n_reference=self._n_reference,
+            n_reference=self._mapping.n_reference,
             tracked_close=int(np.count_nonzero(close & tracked)),
             untracked_close=int(np.count_nonzero(close & ~tracked)),
-            mapping_idle=self._mapping is None,
+            mapping_idle=not self._mapping.busy,
         )
         return needs_keyframe(evidence, self.config.keyframes)
 
-    def _insert_keyframe(self, frame: Frame, timestamp: float) -> None:
-        """Add the frame to the map, with landmarks from stereo, and start its local mapping."""
-        index = len(self._placed) - 1
-        placed = self._placed[-1]
-        if self._merge(keep=frame):
-            T_reference = self._keyframe_pose(placed.reference)
-            frame.T_cw = orthonormalised(placed.T_c_reference @ T_reference)
-        keyframe = self.map.add_keyframe(frame.features, frame.T_cw, timestamp, index)
-        tracked = np.flatnonzero(frame.landmark >= 0)
-        rows = self.map.rows(keyframe).start + tracked
-        link_many(self.map.arrays, rows, frame.landmark[tracked])
-        neighbours, _ = self.map.covisible(keyframe)
-        if keyframe > 0:
-            self.map.parents[keyframe] = int(neighbours[0]) if len(neighbours) else keyframe - 1
-        map_stereo_points(self.map, keyframe, self.camera, self.config)
-        refresh_keyframe(self.map, keyframe)
-        self._reference = keyframe
-        self._placed[-1] = _Placed(timestamp, keyframe, np.eye(4))
-        observed = self.map.arrays.landmark[self.map.rows(keyframe)]
-        frame.landmark[:] = observed
-        frame.xyz[observed >= 0] = self.map.arrays.xyz[observed[observed >= 0]]
-        self._copy_local_map()
-        self._mapping_since = index
-        if keyframe == 0:
-            return
-        job = (map_keyframe, self.map, keyframe, self.camera, self.config)
-        if self._executor:
-            self._mapping = self._executor.submit(*job)
-        else:
-            self._mapping = _Lazy(*job)
+    def _insert_keyframe(self, frame: Frame) -> None:
+        """Make a keyframe of the frame placed last."""
+        self._merge(frame)
+        timestamp, index = self._placed[-1].timestamp, len(self._placed) - 1
+        frame.landmark, frame.xyz = self._mapping.insert(
+            frame.features, frame.landmark, frame.T_cw, timestamp, index
+        )
+        self._placed[-1] = _Placed(timestamp, self._mapping.reference, np.eye(4))
 
-    def _merge(self, keep: Frame | None = None) -> bool:
-        """Wait for the pending mapping and move tracking onto its result.
-
-        Returns whether there was one. ``keep`` is a frame besides the last one whose landmarks
-        are brought up to date.
-        """
-        if self._mapping is None:
+    def _mapping_is_due(self) -> bool:
+        if not self._mapping.busy:
             return False
-        self._mapping.result()
-        self._mapping = None
-        a = self.map.arrays
-        for landmarks, counter in ((self._visible, a.visible), (self._found, a.found)):
-            for ids in landmarks:
-                np.add.at(counter, ids, 1)
-            landmarks.clear()
-        last = self._placed[-1]
-        for frame in {id(f): f for f in (self.frame, keep) if f is not None}.values():
-            frame.landmark[:] = resolve(a, frame.landmark)
-            known = frame.landmark >= 0
-            frame.xyz[known] = a.xyz[frame.landmark[known]]
-            frame.xyz[~known] = np.nan
+        waited = len(self._placed) - self.map.frames[-1]
+        return waited >= self.config.keyframes.merge_after_frames
+
+    def _merge(self, current: Frame | None = None) -> None:
+        """Show tracking what local mapping has done: poses, landmarks, merged identities.
+
+        ``current`` is the frame placed last, if it is not ``self.frame`` yet.
+        """
+        if not self._mapping.merge():
+            return
+        for frame in {id(f): f for f in (self.frame, current) if f is not None}.values():
+            frame.landmark, frame.xyz = self._mapping.current(frame.landmark)
         if self.frame is not None:
-            self.frame.T_cw = last.T_c_reference @ self._keyframe_pose(last.reference)
-        self._copy_local_map()
-        return True
+            self.frame.T_cw = self._pose_of(self._placed[self._tracked])
+        if current is not None:
+            current.T_cw = self._pose_of(self._placed[-1])
 
-    def _copy_local_map(self) -> None:
-        limit = self.config.tracking.local_keyframes
-        self._local = local_map(self.map, self._reference, limit)
-        self._reference_view = local_map(self.map, self._reference, 1)
-        # In a young map, landmarks cannot have been seen by three keyframes.
-        needed = min(3, len(self.map.living_keyframes()))
-        self._n_reference = count_seen_by(self.map.arrays, self._reference, needed)
-        self._poses = {
-            k: self.map.keyframe_pose(k) for k in {self._reference, self._placed[-1].reference}
-        }
+    def _keep(self, frame: Frame) -> None:
+        """The frame placed last is the one to track the next against."""
+        self.frame, self._tracked = frame, len(self._placed) - 1
 
-    def _keyframe_pose(self, keyframe: int) -> Matrix:
-        """Pose as of the last merge while mapping runs, else of the map."""
-        if self._mapping is not None:
-            return self._poses[keyframe]
-        return self.map.keyframe_pose(keyframe)
+    def _place(self, timestamp: float, T_cw: Matrix) -> None:
+        reference = self._mapping.reference
+        T_rw = self._mapping.keyframe_pose(reference) if self.map.n_keyframes else np.eye(4)
+        relative = orthonormalised(T_cw @ inverse(T_rw))
+        self._placed.append(_Placed(timestamp, reference, relative))
+
+    def _pose_of(self, placed: _Placed) -> Matrix:
+        """``T_cw`` of a placed frame."""
+        if self.map.n_keyframes == 0:
+            return placed.T_c_reference
+        return placed.T_c_reference @ self._mapping.keyframe_pose(placed.reference)
 
     def _result(
         self,
@@ -375,7 +321,7 @@ class Slam:
         return TrackResult(
             index=len(self._placed) - 1,
             timestamp=self._placed[-1].timestamp,
-            T_wc=np.linalg.inv(frame.T_cw),
+            T_wc=inverse(frame.T_cw),
             state=state,
             n_features=len(frame.features),
             n_stereo=int(np.count_nonzero(np.isfinite(frame.features.u_right))),
@@ -386,26 +332,23 @@ class Slam:
         )
 
 
+NO_FEATURES = Features(
+    np.empty((0, 2), np.float32),
+    np.empty(0, np.uint8),
+    np.empty(0, np.float32),
+    np.empty((0, 32), np.uint8),
+    np.empty(0, np.float32),
+)
+
+
+@dataclass
 class _Clock:
     """Wall time by stage, in milliseconds."""
 
-    def __init__(self, laps: dict[str, float] | None) -> None:
-        self.laps = dict(laps or {})
-        self._last = time.perf_counter()
+    laps: dict[str, float] = field(default_factory=dict)
+    last: float = field(default_factory=time.perf_counter)
 
     def lap(self, stage: str) -> None:
         now = time.perf_counter()
-        self.laps[stage] = self.laps.get(stage, 0.0) + 1e3 * (now - self._last)
-        self._last = now
-
-
-class _Lazy(Future):  # type: ignore[type-arg]
-    """A call that runs when its result is asked for."""
-
-    def __init__(self, function, *arguments) -> None:  # type: ignore[no-untyped-def]
-        super().__init__()
-        self._call = (function, arguments)
-
-    def result(self, timeout: float | None = None) -> None:
-        function, arguments = self._call
-        function(*arguments)
+        self.laps[stage] = self.laps.get(stage, 0.0) + 1e3 * (now - self.last)
+        self.last = now

@@ -1,0 +1,68 @@
+"""Each clause of the keyframe decision, and its threshold from both sides."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from vslam.config import KeyframeConfig
+from vslam.frontend.keyframes import KeyframeEvidence, needs_keyframe
+
+CONFIG = KeyframeConfig(
+    max_interval_s=1.0,
+    min_tracked_close=100,
+    min_new_close=70,
+    max_tracked_ratio=0.75,
+    urgent_ratio=0.25,
+)
+CONTENT = KeyframeEvidence(
+    seconds_since_keyframe=0.3,
+    n_inliers=190,
+    n_reference=200,
+    tracked_close=150,
+    untracked_close=200,
+    mapping_idle=True,
+)
+
+
+def decide(**changes) -> bool:
+    return needs_keyframe(replace(CONTENT, **changes), CONFIG)
+
+
+def test_a_well_tracked_frame_is_no_keyframe():
+    assert not decide()
+    assert not decide(mapping_idle=False)
+
+
+@pytest.mark.parametrize("idle", [True, False])
+def test_time_alone_makes_a_keyframe(idle):
+    assert not decide(seconds_since_keyframe=0.999, mapping_idle=idle)
+    assert decide(seconds_since_keyframe=1.0, mapping_idle=idle)
+
+
+def test_losing_a_quarter_of_the_reference_makes_a_keyframe():
+    assert not decide(n_inliers=150)
+    assert decide(n_inliers=149)
+
+
+def test_having_moved_on_waits_for_mapping():
+    assert not decide(n_inliers=149, mapping_idle=False)
+
+
+def test_losing_three_quarters_of_the_reference_does_not_wait():
+    assert not decide(n_inliers=50, mapping_idle=False)
+    assert decide(n_inliers=49, mapping_idle=False)
+
+
+@pytest.mark.parametrize("idle", [True, False])
+def test_few_close_points_with_new_ones_in_sight_make_a_keyframe_at_once(idle):
+    assert decide(tracked_close=99, untracked_close=71, mapping_idle=idle)
+    assert not decide(tracked_close=100, untracked_close=71, mapping_idle=idle)
+    assert not decide(tracked_close=99, untracked_close=70, mapping_idle=idle)
+
+
+def test_thresholds_come_from_the_configuration():
+    evidence = replace(CONTENT, n_inliers=149)
+    assert not needs_keyframe(evidence, CONFIG.model_copy(update={"max_tracked_ratio": 0.5}))
+    assert needs_keyframe(CONTENT, CONFIG.model_copy(update={"max_interval_s": 0.2}))

@@ -1,0 +1,198 @@
+"""The main job end to end: from images on disk to trajectory, report, map and recording."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vslam.config import Config
+from vslam.datasets import open_sequence
+from vslam.evaluate import evaluate
+from vslam.features import TrackingState
+from vslam.mapio import load_map, save_map
+from vslam.perturb import parse_perturbation
+from vslam.pipeline import run_sequence
+from vslam.recorder import NullRecorder
+from vslam.run import RunOutcome, RunSettings
+from vslam.trajectory import Trajectory, read_kitti_poses
+
+KITTI = Path(__file__).parents[2] / "shared" / "data" / "kitti"
+needs_kitti = pytest.mark.skipif(not KITTI.is_dir(), reason="KITTI is not at ../shared/data")
+
+
+def run(root: Path, sequence: str = "00", *, threads: int = 2, perturb: str = "none",
+        seed: int = 0, max_frames: int | None = None) -> RunOutcome:  # fmt: skip
+    frames = open_sequence("kitti", root, sequence, max_frames=max_frames)
+    perturbation = parse_perturbation(perturb, seed, frames.timestamps)
+    settings = RunSettings(
+        "kitti", sequence, perturb, "none", "stereo", seed, threads, 0, 1, max_frames, Config()
+    )
+    return run_sequence(frames, perturbation, settings, NullRecorder())
+
+
+def vslam(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "vslam", *map(str, words)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
+
+
+def ground_truth(outcome: RunOutcome) -> Trajectory:
+    poses = outcome.sequence.ground_truth
+    assert poses is not None
+    return Trajectory(outcome.sequence.timestamps, poses)
+
+
+def test_same_bytes_with_any_number_of_threads(kitti_tree):
+    runs = [run(kitti_tree, threads=threads, perturb="brightness:1") for threads in (1, 2, 4, 2)]
+    assert len({outcome.trajectory.T_wc.tobytes() for outcome in runs}) == 1
+    assert len({outcome.map.arrays.xyz.tobytes() for outcome in runs}) == 1
+    assert all(track.state == TrackingState.OK for track in runs[0].tracks)
+
+
+def test_corridor_is_tracked_to_centimetres(kitti_tree):
+    outcome = run(kitti_tree)
+    evaluation = evaluate(outcome.trajectory, ground_truth(outcome))
+    path = evaluation.distances_m[-1]
+    assert path == pytest.approx(27 * 0.35, rel=1e-4)  # chords of the turn
+    assert evaluation.ate_rmse_m < 0.03
+    assert outcome.n_keyframes >= 3
+    assert outcome.n_landmarks > 300
+
+
+def test_truncated_image_is_skipped_and_counted(kitti_tree, tmp_path):
+    root = tmp_path / "kitti"
+    shutil.copytree(kitti_tree, root)
+    image = root / "sequences" / "00" / "image_1" / "000014.png"
+    image.write_bytes(image.read_bytes()[:2000])
+    outcome = run(root)
+    assert len(outcome.trajectory) == 28
+    assert [str(image) in message for message in outcome.skipped] == [True]
+    assert [k for k, t in enumerate(outcome.tracks) if t.state == TrackingState.LOST] == [14]
+    # The predicted pose of the frame without images is as good as constant velocity.
+    error = outcome.trajectory.T_wc[14, :3, 3] - outcome.sequence.ground_truth[14, :3, 3]
+    assert np.linalg.norm(error) < 0.1
+
+
+def test_command_line_end_to_end(kitti_tree, tmp_path):
+    done = vslam("run", "--data", kitti_tree, "--ply", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "28 done, 0 lost, 0 unreadable" in done.stdout
+    folder = tmp_path / "runs" / "latest"
+    report = json.loads((folder / "report.json").read_text())
+    assert report["frames"] == 28
+    assert report["lost_frames"] == 0
+    assert report["ate_rmse_m"] < 0.03
+    assert report["peak_memory_mb"] < 900
+    for name in ("trajectory.tum", "keyframes.tum", "report.html", "report.md", "config.json",
+                 "recording.rrd", "map.npz", "map.ply", "figures"):  # fmt: skip
+        assert (folder / name).exists(), name
+    assert len(read_kitti_poses(folder / "trajectory_kitti.txt")) == 28
+    # The command that the report prints gives the figure that it prints.
+    words = report["evo_command"].split()
+    words[0] = str(Path(sys.executable).with_name(words[0]))
+    printed = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    rmse = next(line.split()[-1] for line in printed.splitlines() if "rmse" in line)
+    assert float(rmse) == pytest.approx(report["ate_rmse_m"], abs=1e-6)
+
+
+def test_interrupt_finishes_the_report_of_the_frames_done(kitti_tree, tmp_path):
+    root = tmp_path / "kitti"
+    shutil.copytree(kitti_tree, root)
+    # The corridor there and back often enough to be still running when the signal comes.
+    folder = root / "sequences" / "00"
+    order = [*range(28), *range(26, 0, -1)] * 12
+    for eye in ("image_0", "image_1"):
+        for index, source in enumerate(order[28:], 28):
+            os.link(folder / eye / f"{source:06d}.png", folder / eye / f"{index:06d}.png")
+    (folder / "times.txt").write_text("".join(f"{0.1 * k:.6e}\n" for k in range(len(order))))
+    shutil.rmtree(root / "poses")
+    command = [sys.executable, "-m", "vslam", "run", "--data", str(root), "--no-record"]
+    process = subprocess.Popen(
+        command, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    while not list(tmp_path.glob("runs/2*")):
+        time.sleep(0.05)
+    time.sleep(3.0)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 1, err
+    report = json.loads((tmp_path / "runs" / "latest" / "report.json").read_text())
+    assert report["interrupted"] == "Ctrl-C"
+    assert 0 < report["frames"] < len(order)
+    poses = read_kitti_poses(tmp_path / "runs" / "latest" / "trajectory_kitti.txt")
+    assert len(poses) == report["frames"]
+
+
+def test_full_disk_keeps_what_was_written(kitti_tree, tmp_path, monkeypatch, capsys):
+    from vslam import cli, mapio
+
+    def full(path, *_):
+        path.write_bytes(b"half a map")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(mapio, "save_map", full)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        sys, "argv", ["vslam", "run", "--data", str(kitti_tree), "--max-frames", "5", "--no-record"]
+    )
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 1
+    message = capsys.readouterr().err
+    assert "No space left on device" in message
+    assert "trajectory_kitti.txt" in message
+    assert len(read_kitti_poses(tmp_path / "runs" / "latest" / "trajectory_kitti.txt")) == 5
+
+
+def test_map_round_trip(kitti_tree, tmp_path, check_map):
+    outcome = run(kitti_tree)
+    before, camera = outcome.map, outcome.sequence.camera
+    check_map(before)
+    save_map(tmp_path / "map.npz", before, camera)
+    after, same_camera = load_map(tmp_path / "map.npz")
+    check_map(after)
+    assert same_camera == camera
+    living = before.living_keyframes()
+    assert np.array_equal(after.arrays.T_cw[: after.n_keyframes], before.arrays.T_cw[living])
+    landmarks = before.living_landmarks()
+    assert np.array_equal(after.arrays.xyz[: after.n_landmarks], before.arrays.xyz[landmarks])
+    shared = [before.covisible(int(k))[1].tolist() for k in living]
+    assert [after.covisible(k)[1].tolist() for k in range(after.n_keyframes)] == shared
+
+
+@needs_kitti
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_kitti_06_is_tracked_through_changing_light(seed):
+    outcome = run(KITTI, "06", perturb="brightness:1", seed=seed, max_frames=51)
+    assert not [t.index for t in outcome.tracks if t.state == TrackingState.LOST]
+    assert evaluate(outcome.trajectory, ground_truth(outcome)).ate_rmse_m <= 0.07
+
+
+@needs_kitti
+def test_kitti_06_is_as_good_as_orb_slam3():
+    outcome = run(KITTI, "06", max_frames=51)
+    evaluation = evaluate(outcome.trajectory, ground_truth(outcome))
+    assert evaluation.ate_rmse_m <= 0.07
+    assert evaluation.rpe_m <= 0.015
+
+
+@needs_kitti
+def test_kitti_00_is_as_good_as_orb_slam3():
+    outcome = run(KITTI, "00", max_frames=216)
+    assert not [t.index for t in outcome.tracks if t.state == TrackingState.LOST]
+    evaluation = evaluate(outcome.trajectory, ground_truth(outcome))
+    assert evaluation.ate_rmse_m <= 0.40
+    assert evaluation.t_rel_percent is not None
+    assert evaluation.t_rel_percent <= 1.5
+    assert outcome.peak_memory_mb < 900
+    alone = run(KITTI, "00", max_frames=216, threads=1)
+    assert alone.trajectory.T_wc.tobytes() == outcome.trajectory.T_wc.tobytes()

@@ -1,0 +1,162 @@
+"""Motion-only optimisation: exact without noise, robust to outliers, the same as GTSAM."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from vslam.camera import StereoCamera
+from vslam.frontend.pose import optimise_pose, solve6
+from vslam.geometry import inverse, se3_exp, se3_log, transform
+
+CAMERA = StereoCamera(400.0, 410.0, 320.0, 120.0, 0.5, 640, 240)
+TRUTH = se3_exp(np.array([0.4, -0.2, 1.1, 0.05, -0.1, 0.02]))
+START = se3_exp(np.array([0.1, -0.08, 0.2, 0.02, 0.03, -0.02])) @ TRUTH
+KINDS = ["mono", "stereo", "mixed"]
+
+
+def observations(kind: str, n: int = 120, noise: float = 0.0, seed: int = 0):
+    """World points, what the camera at TRUTH sees of them and the inverse variances."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(3, 40, n)
+    pixels = rng.uniform([0, 0], [CAMERA.width, CAMERA.height], (n, 2))
+    in_camera = CAMERA.backproject(pixels, depth)
+    uvr = CAMERA.project(in_camera)
+    sigma = 1.2 ** rng.integers(0, 8, n)
+    uvr += noise * sigma[:, None] * rng.normal(size=(n, 3))
+    if kind != "stereo":
+        uvr[:: 1 if kind == "mono" else 2, 2] = np.nan
+    return transform(inverse(TRUTH), in_camera), uvr, sigma**-2.0
+
+
+def pose_difference(A: np.ndarray, B: np.ndarray) -> float:
+    return float(np.abs(se3_log(A @ np.linalg.inv(B))).max())
+
+
+def chi2(T: np.ndarray, points, uvr, inverse_sigma2) -> np.ndarray:
+    error = np.nan_to_num(uvr - CAMERA.project(transform(T, points)))
+    return (error**2).sum(axis=1) * inverse_sigma2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_recovers_the_pose_from_noise_free_observations(kind):
+    points, uvr, weight = observations(kind)
+    T, inlier = optimise_pose(START, points, uvr, weight, CAMERA.intrinsics)
+    assert pose_difference(START, TRUTH) > 0.1
+    assert pose_difference(T, TRUTH) < 1e-6
+    assert inlier.all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_flags_exactly_the_gross_outliers_when_they_are_two_in_five(kind):
+    points, uvr, weight = observations(kind, n=200)
+    rng = np.random.default_rng(1)
+    wrong = rng.permutation(200) < 80
+    uvr[wrong, :2] += rng.choice([-1, 1], (80, 2)) * rng.uniform(30, 80, (80, 2))
+    T, inlier = optimise_pose(START, points, uvr, weight, CAMERA.intrinsics)
+    np.testing.assert_array_equal(inlier, ~wrong)
+    assert pose_difference(T, TRUTH) < 1e-6
+
+
+def test_an_outlier_in_disparity_alone_is_flagged():
+    points, uvr, weight = observations("stereo")
+    uvr[::10, 2] -= 25.0
+    _, inlier = optimise_pose(START, points, uvr, weight, CAMERA.intrinsics)
+    assert np.flatnonzero(~inlier).tolist() == list(range(0, 120, 10))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_inliers_are_those_of_the_chi_square_test(kind):
+    points, uvr, weight = observations(kind, n=300, noise=1.3)
+    T, inlier = optimise_pose(START, points, uvr, weight, CAMERA.intrinsics)
+    limit = np.where(np.isnan(uvr[:, 2]), 5.991, 7.815)
+    np.testing.assert_array_equal(inlier, chi2(T, points, uvr, weight) <= limit)
+    assert 0.5 < inlier.mean() < 0.95
+
+
+def gtsam_pose(points, uvr, inverse_sigma2) -> np.ndarray:
+    """The pose that minimises the squared error, by GTSAM with the points held."""
+    stereo = gtsam.Cal3_S2Stereo(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy, CAMERA.baseline)
+    mono = gtsam.Cal3_S2(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    values.insert(0, gtsam.Pose3(np.linalg.inv(START)))
+    for i, (p, (u, v, r), w) in enumerate(zip(points, uvr, inverse_sigma2, strict=True), 1):
+        values.insert(i, p)
+        graph.add(gtsam.PriorFactorPoint3(i, p, gtsam.noiseModel.Constrained.All(3)))
+        sigma = w**-0.5
+        if np.isnan(r):
+            noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
+            pixel = np.array([u, v])
+            graph.add(gtsam.GenericProjectionFactorCal3_S2(pixel, noise, 0, i, mono))
+        else:
+            noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
+            graph.add(gtsam.GenericStereoFactor3D(gtsam.StereoPoint2(u, r, v), noise, 0, i, stereo))
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(1e-14)
+    parameters.setAbsoluteErrorTol(1e-14)
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    return np.linalg.inv(result.atPose3(0).matrix())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_finds_gtsams_optimum_of_the_inliers(kind):
+    points, uvr, weight = observations(kind, n=80, noise=0.7)
+    uvr[::9, :2] += 60.0
+    T, inlier = optimise_pose(START, points, uvr, weight, CAMERA.intrinsics)
+    assert np.count_nonzero(inlier) > 50
+    expected = gtsam_pose(points[inlier], uvr[inlier], weight[inlier])
+    assert pose_difference(T, expected) < 1e-6
+    assert pose_difference(T, TRUTH) > 1e-4  # noise: both are as far from the truth
+
+
+def test_octaves_weigh_the_observations():
+    """Half of the points are displaced by 1 px: the better half wins if its sigma is smaller."""
+    points, uvr, _ = observations("stereo")
+    uvr[::2, :2] += 1.0
+    weight = np.ones(120)
+    weight[::2] = 1e-4
+    T, _ = optimise_pose(TRUTH, points, uvr, weight, CAMERA.intrinsics)
+    assert pose_difference(T, TRUTH) < 1e-5
+    even, _ = optimise_pose(TRUTH, points, uvr, np.full(120, 1e-2), CAMERA.intrinsics)
+    assert pose_difference(even, TRUTH) > 5e-4
+
+
+def test_points_behind_the_camera_are_outliers():
+    points, uvr, weight = observations("stereo")
+    in_camera = transform(TRUTH, points)
+    points[:5] = transform(inverse(TRUTH), -in_camera[:5])
+    T, inlier = optimise_pose(START, points, uvr, weight, CAMERA.intrinsics)
+    assert np.flatnonzero(~inlier).tolist() == [0, 1, 2, 3, 4]
+    assert pose_difference(T, TRUTH) < 1e-6
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_fewer_than_three_points_leave_the_pose_and_have_no_inliers(n):
+    points, uvr, weight = observations("stereo", n=3)
+    T, inlier = optimise_pose(START, points[:n], uvr[:n], weight[:n], CAMERA.intrinsics)
+    assert np.array_equal(T, START)
+    assert inlier.tolist() == [False] * n
+
+
+def test_one_point_seen_many_times_leaves_the_pose_finite():
+    points, uvr, weight = observations("mono", n=1)
+    T, _ = optimise_pose(
+        START, *(np.repeat(x, 10, axis=0) for x in (points, uvr, weight)), CAMERA.intrinsics
+    )
+    assert np.isfinite(T).all()
+
+
+def test_start_is_not_written_to():
+    points, uvr, weight = observations("mixed")
+    start = START.copy()
+    optimise_pose(start, points, uvr, weight, CAMERA.intrinsics)
+    assert np.array_equal(start, START)
+
+
+def test_solve6_solves_and_gives_zeros_where_it_cannot():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(10, 6))
+    H, b = A.T @ A, rng.normal(size=6)
+    np.testing.assert_allclose(solve6(H, b), np.linalg.solve(H, b), rtol=1e-10)
+    assert np.array_equal(solve6(-H, b), np.zeros(6))

@@ -1,0 +1,348 @@
+"""The whole pipeline on a rendered corridor: accuracy, determinism, and what goes wrong in cars."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from concurrent.futures import Future
+
+import numpy as np
+import pytest
+
+from vslam.config import Config, KeyframeConfig, OrbConfig, TrackingConfig
+from vslam.datasets.kitti import open_kitti
+from vslam.features import TrackResult
+from vslam.geometry import inverse, se3_log
+from vslam.slam import Slam
+
+ORB = OrbConfig(n_features=800)
+CONFIG = Config(orb=ORB)
+# A keyframe at every frame keeps mapping and merging busy.
+EAGER = Config(orb=ORB, keyframes=KeyframeConfig(max_interval_s=0.05))
+
+
+def run(
+    sequence,
+    config: Config = CONFIG,
+    *,
+    threads: int = 1,
+    frames: Iterable[int] | None = None,
+    black: Iterable[int] = (),
+    skipped: Iterable[int] = (),
+) -> tuple[Slam, list[TrackResult]]:
+    """Track some frames, black or missing ones among them."""
+    slam = Slam(sequence.camera, config, threads=threads)
+    results = []
+    nothing = np.zeros_like(sequence.left[0])
+    for k in range(len(sequence)) if frames is None else frames:
+        if k in skipped:
+            results.append(slam.skip(sequence.timestamps[k]))
+            continue
+        dark = k in black
+        left = nothing if dark else sequence.left[k]
+        right = nothing if dark else sequence.right[k]
+        results.append(slam.step(left, right, sequence.timestamps[k]))
+    slam.finish()
+    return slam, results
+
+
+def position_errors(slam: Slam, sequence, frames=slice(None)) -> np.ndarray:
+    """Metres, without alignment: the first frame is the world of both."""
+    return np.linalg.norm(slam.trajectory().T_wc[:, :3, 3] - sequence.T_wc[frames, :3, 3], axis=1)
+
+
+def rmse(errors: np.ndarray) -> float:
+    return float(np.sqrt((errors**2).mean()))
+
+
+def states(results: list[TrackResult]) -> str:
+    """One letter a frame: O, W or L."""
+    return "".join(result.state[0] for result in results)
+
+
+def bytes_of(slam: Slam, results: list[TrackResult]) -> bytes:
+    online = np.array([r.T_wc for r in results])
+    counts = np.array([[r.n_matches, r.n_inliers, r.is_keyframe] for r in results])
+    keyframes = slam.keyframe_trajectory()
+    landmarks = slam.map.arrays.xyz[slam.map.living_landmarks()]
+    return b"".join(
+        np.ascontiguousarray(x).tobytes()
+        for x in (slam.trajectory().T_wc, online, counts, keyframes.T_wc, landmarks)
+    )
+
+
+def test_tracks_every_frame_to_centimetres(corridor, check_map):
+    slam, results = run(corridor)
+    assert states(results) == "O" * len(corridor)
+    errors = position_errors(slam, corridor)
+    assert rmse(errors) < 0.04
+    assert errors.max() < 0.08
+    for T, truth in zip(slam.trajectory().T_wc, corridor.T_wc, strict=True):
+        assert np.abs(se3_log(T @ inverse(truth))[3:]).max() < 0.006
+    check_map(slam.map)
+
+
+def test_results_account_for_every_frame(corridor):
+    slam, results = run(corridor)
+    assert [r.index for r in results] == list(range(len(corridor)))
+    np.testing.assert_array_equal([r.timestamp for r in results], corridor.timestamps)
+    np.testing.assert_array_equal(slam.trajectory().timestamps, corridor.timestamps)
+    for r in results:
+        assert 30 <= r.n_inliers <= r.n_matches <= r.n_features <= ORB.n_features
+        assert 100 < r.n_stereo <= r.n_features
+        assert r.stage_ms["extract"] > 0
+        assert np.abs(r.T_wc[:3, :3] @ r.T_wc[:3, :3].T - np.eye(3)).max() < 1e-12
+
+
+def test_keyframes_are_few_and_lie_on_the_trajectory(corridor):
+    slam, results = run(corridor)
+    made = [r.index for r in results if r.is_keyframe]
+    assert made[0] == 0
+    assert 4 <= len(made) <= 14
+    assert slam.map.frames == made
+    living = slam.map.living_keyframes()
+    keyframes, trajectory = slam.keyframe_trajectory(), slam.trajectory()
+    frames = np.array(slam.map.frames)[living]
+    np.testing.assert_array_equal(keyframes.timestamps, corridor.timestamps[frames])
+    np.testing.assert_allclose(keyframes.T_wc, trajectory.T_wc[frames], rtol=0, atol=1e-12)
+
+
+def test_landmarks_lie_on_the_walls_and_the_ground(corridor):
+    slam, _ = run(corridor)
+    x, y, z = slam.map.arrays.xyz[slam.map.living_landmarks()].T
+    assert len(x) > 500
+    distance = np.min([np.abs(y - 1.5), np.abs(x + 4.0), np.abs(x - 4.5), np.abs(z - 32.0)], axis=0)
+    assert np.median(distance) < 0.05
+    assert np.mean(distance < 0.3) > 0.8
+
+
+@pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
+def test_same_bytes_with_one_thread_and_two_and_again(corridor, config):
+    runs = [bytes_of(*run(corridor, config, threads=threads)) for threads in (1, 2, 2, 1)]
+    assert len(set(runs)) == 1
+
+
+class InstantExecutor:
+    """A thread so fast that it is done before ``submit`` returns."""
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def submit(self, function, *arguments) -> Future:
+        future: Future = Future()
+        future.set_result(function(*arguments))
+        return future
+
+    def shutdown(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
+def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, monkeypatch):
+    """Mapping as late as can be (when it is merged) and as early as can be: a race would show."""
+    late = bytes_of(*run(corridor, config, threads=1))
+    monkeypatch.setattr("vslam.mapping.ThreadPoolExecutor", InstantExecutor)
+    assert bytes_of(*run(corridor, config, threads=2)) == late
+
+
+def test_map_stays_sound_with_a_keyframe_each_frame(corridor, check_map):
+    """Fusion merges landmarks that the frame in hand tracks both."""
+    slam, results = run(corridor, EAGER)
+    assert all(r.is_keyframe for r in results)
+    assert states(results) == "O" * len(corridor)
+    check_map(slam.map)
+    assert rmse(position_errors(slam, corridor)) < 0.04
+
+
+def test_counters_of_landmarks_stay_in_order(corridor):
+    slam, _ = run(corridor)
+    a, living = slam.map.arrays, slam.map.living_landmarks()
+    assert (a.found[living] >= 1).all()
+    assert a.visible[living].max() > 10
+    assert np.mean(a.found[living] <= a.visible[living]) > 0.99
+
+
+# -- trouble --------------------------------------------------------------------------------------
+
+
+def test_black_frames_are_lost_at_the_predicted_pose_and_tracking_recovers(corridor):
+    dark = range(12, 15)
+    slam, results = run(corridor, black=dark)
+    assert states(results) == "O" * 12 + "LLL" + "O" * 13
+    for k in dark:
+        assert (results[k].n_features, results[k].n_inliers, results[k].is_keyframe) == (
+            0,
+            0,
+            False,
+        )
+    # Constant velocity: 0.35 m a frame along a gentle curve.
+    np.testing.assert_allclose(
+        [r.T_wc[:3, 3] for r in results[12:15]], corridor.T_wc[12:15, :3, 3], rtol=0, atol=0.15
+    )
+    errors = position_errors(slam, corridor)
+    assert errors[12:15].max() < 0.15
+    assert rmse(errors[15:]) < 0.06
+
+
+@pytest.mark.parametrize("after", [0, 1, 2])
+def test_a_black_frame_soon_after_a_keyframe_does_not_move_the_frame_before(corridor, after):
+    """The merge falls on the frame behind the black one, on the black one, or before."""
+    _, plain = run(corridor)
+    keyframe = next(r.index for r in plain if r.is_keyframe and r.index > 10)
+    slam = Slam(corridor.camera, CONFIG, threads=1)
+    nothing = np.zeros_like(corridor.left[0])
+    black = keyframe + 1 + after
+    for k in range(black):
+        slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
+    last = slam.frame
+    for k in (black, black + 1):  # two, so that the merge is behind us
+        slam.step(nothing, nothing, corridor.timestamps[k])
+    assert slam.frame is last
+    slam.finish()
+    expected = inverse(slam.trajectory().T_wc[black - 1])
+    np.testing.assert_allclose(last.T_cw, expected, rtol=0, atol=1e-9)
+
+
+def test_after_a_long_blackout_mapping_restarts_at_the_predicted_pose(corridor, check_map):
+    config = Config(orb=ORB, tracking=TrackingConfig(lost_frames_before_restart=4))
+    # From frame 10 on the camera is elsewhere: the images of the corridor run backwards, upside
+    # down, so that nothing can be recognised.
+    frames = list(range(20))
+    slam = Slam(corridor.camera, config, threads=1)
+    results = []
+    for k in frames:
+        left, right = corridor.left[k], corridor.right[k]
+        if k >= 10:
+            left, right = (np.ascontiguousarray(i[::-1]) for i in (left, right))
+        results.append(slam.step(left, right, corridor.timestamps[k]))
+    slam.finish()
+    assert states(results[:10]) == "O" * 10
+    assert states(results[10:14]) == "LLLL"
+    assert states(results[14:]) == "O" * 6
+    assert [r.is_keyframe for r in results[10:14]] == [False, False, False, True]
+    T_wc = slam.trajectory().T_wc
+    # Still 0.35 m a frame, seen from the prediction.
+    steps = np.linalg.norm(np.diff(T_wc[13:, :3, 3], axis=0), axis=1)
+    np.testing.assert_allclose(steps, 0.35, rtol=0, atol=0.05)
+    check_map(slam.map)
+
+
+def test_a_blackout_to_the_end_makes_no_keyframe(corridor):
+    slam, results = run(corridor, black=range(8, 28))
+    assert states(results) == "O" * 8 + "L" * 20
+    assert not any(r.is_keyframe for r in results[8:])
+    assert slam.map.n_keyframes == sum(r.is_keyframe for r in results)
+    assert np.isfinite(slam.trajectory().T_wc).all()
+
+
+def test_starts_with_the_first_frame_that_shows_something(corridor):
+    slam, results = run(corridor, black=range(3))
+    assert states(results) == "LLL" + "O" * 25
+    assert [r.is_keyframe for r in results[:4]] == [False, False, False, True]
+    T_wc = slam.trajectory().T_wc
+    np.testing.assert_array_equal(T_wc[:4], np.tile(np.eye(4), (4, 1, 1)))
+    relative = inverse(corridor.T_wc[3]) @ corridor.T_wc[-1]
+    assert np.linalg.norm(T_wc[-1, :3, 3] - relative[:3, 3]) < 0.1
+
+
+def test_nothing_but_darkness(corridor):
+    slam, results = run(corridor, frames=range(12), black=range(12))
+    assert states(results) == "L" * 12
+    np.testing.assert_array_equal(slam.trajectory().T_wc, np.tile(np.eye(4), (12, 1, 1)))
+    assert len(slam.keyframe_trajectory()) == 0
+
+
+def test_skipped_frames_are_lost_at_the_predicted_pose(corridor):
+    slam, results = run(corridor, skipped=[9, 17, 18])
+    assert [i for i, s in enumerate(states(results)) if s == "L"] == [9, 17, 18]
+    assert [r.index for r in results] == list(range(28))
+    for k in (9, 17, 18):
+        assert (results[k].n_features, results[k].is_keyframe) == (0, False)
+        assert results[k].timestamp == corridor.timestamps[k]
+    assert position_errors(slam, corridor).max() < 0.12
+    np.testing.assert_array_equal(slam.trajectory().timestamps, corridor.timestamps)
+
+
+@pytest.mark.parametrize("skipped", [[0], [0, 1], range(5)])
+def test_skipping_before_the_first_image(corridor, skipped):
+    slam, results = run(corridor, frames=range(8), skipped=skipped)
+    n = len(list(skipped))
+    assert states(results) == "L" * n + "O" * (8 - n)
+    assert len(slam.trajectory()) == 8
+
+
+def test_skipping_everything(corridor):
+    slam, results = run(corridor, frames=range(4), skipped=range(4))
+    assert states(results) == "LLLL"
+    np.testing.assert_array_equal(slam.trajectory().T_wc, np.tile(np.eye(4), (4, 1, 1)))
+
+
+def test_nothing_at_all(corridor):
+    slam, _ = run(corridor, frames=[])
+    assert slam.trajectory().T_wc.shape == (0, 4, 4)
+    assert slam.keyframe_trajectory().T_wc.shape == (0, 4, 4)
+
+
+def test_dropped_frames_do_not_disturb_the_prediction(corridor):
+    """Velocity is in seconds: a gap of two frames is predicted as two frames' motion."""
+    frames = [k for k in range(len(corridor)) if k not in (7, 14, 15, 21)]
+    slam, results = run(corridor, frames=frames)
+    assert states(results) == "O" * len(frames)
+    assert rmse(position_errors(slam, corridor, frames)) < 0.05
+
+
+def test_the_prediction_scales_with_the_time_passed(corridor):
+    ends = {}
+    for gap in (0.1, 0.2, 0.4):
+        slam = Slam(corridor.camera, CONFIG, threads=1)
+        for k in range(6):
+            slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
+        ends[gap] = slam.skip(corridor.timestamps[5] + gap).T_wc[2, 3]
+        slam.finish()
+    start = 5 * 0.35
+    for gap, z in ends.items():
+        assert z - start == pytest.approx(3.5 * gap, abs=0.05 + 0.2 * gap)
+
+
+def test_a_stationary_camera_stays_and_does_not_grow_the_map(corridor):
+    slam = Slam(corridor.camera, CONFIG, threads=1)
+    for k in range(25):
+        slam.step(corridor.left[0], corridor.right[0], 0.1 * k)
+        if k == 12:
+            halfway = slam.map.n_landmarks
+    slam.finish()
+    assert np.abs(slam.trajectory().T_wc - np.eye(4)).max() < 0.01
+    assert slam.map.n_landmarks < 1.3 * halfway
+    assert slam.map.n_keyframes <= 4
+
+
+def test_a_stationary_camera_keeps_few_of_many_keyframes(corridor, check_map):
+    slam = Slam(corridor.camera, EAGER, threads=1)
+    for k in range(15):
+        slam.step(corridor.left[0], corridor.right[0], 0.1 * k)
+    slam.finish()
+    assert slam.map.n_keyframes == 15
+    assert len(slam.map.living_keyframes()) <= 6
+    assert np.abs(slam.trajectory().T_wc - np.eye(4)).max() < 0.01
+    check_map(slam.map)
+
+
+def test_refuses_images_of_another_size_and_time_that_stands_still(corridor):
+    slam = Slam(corridor.camera, CONFIG, threads=1)
+    with pytest.raises(ValueError, match="camera"):
+        slam.step(corridor.left[0][:-1], corridor.right[0], 0.0)
+    slam.step(corridor.left[0], corridor.right[0], 1.0)
+    for time in (1.0, 0.5, float("nan")):
+        with pytest.raises(ValueError, match="timestamp"):
+            slam.step(corridor.left[1], corridor.right[1], time)
+        with pytest.raises(ValueError, match="timestamp"):
+            slam.skip(time)
+    assert len(slam.trajectory()) == 1
+    slam.finish()
+
+
+def test_the_kitti_tree_is_read_as_it_was_rendered(kitti_tree, corridor):
+    sequence = open_kitti(kitti_tree, "00")
+    assert sequence.ground_truth is not None
+    np.testing.assert_allclose(sequence.ground_truth, corridor.T_wc, rtol=0, atol=1e-9)
+    assert sequence.camera == corridor.camera
+    assert len(sequence.ground_truth) == len(corridor)

@@ -1,0 +1,206 @@
+"""Run vslam and ORB-SLAM3 (pyorbslam3) on the same images in turn and print a table of medians.
+
+Each system runs as a process of its own, alternately and never at once, after one round that is
+not counted (compiled kernels, disk cache). Wall time, CPU time and peak memory are the kernel's
+figures for the whole process: start, vocabulary, files written and all. Errors come from
+vslam.evaluate for both, on the trajectory files that they wrote.
+
+The peer is a script that takes VOCABULARY SEQUENCE_FOLDER OUT --frames N, writes a pose a frame to
+OUT in KITTI's format and prints a JSON object with frames, fps, cpu_ms_per_frame and lost.
+
+usage: python tools/compare_peer.py --data KITTI --seq 06 --frames 51 --repeats 3 \
+           --peer-python PY --peer-script run_orbslam3.py --vocabulary voc.txt
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+PEER_PACKAGE = "pyorbslam3"
+MEASURES = (  # key, title with an arrow to the better side, format
+    ("process_fps", "frames/s, whole process ↑", ".1f"),
+    ("loop_fps", "frames/s, frame loop ↑", ".1f"),
+    ("process_cpu_ms", "CPU ms/frame, whole process ↓", ".1f"),
+    ("loop_cpu_ms", "CPU ms/frame, frame loop ↓", ".1f"),
+    ("wall_s", "wall time, s ↓", ".1f"),
+    ("cpu_s", "CPU time, s ↓", ".1f"),
+    ("memory_mb", "peak memory, MB ↓", ".0f"),
+    ("lost", "lost frames ↓", ".0f"),
+    ("ate_m", "ATE, SE3-aligned, m ↓", ".3f"),
+    ("rpe_m", "RPE per frame, m ↓", ".4f"),
+    ("t_rel", "t_rel, % ↓", ".3f"),
+)
+
+
+class Process(NamedTuple):
+    """A process that has ended: its output and the kernel's account of it and its children."""
+
+    output: str
+    wall_s: float
+    cpu_s: float
+    memory_mb: float
+
+
+class Run(NamedTuple):
+    """One run: what the system reports of itself (``frames``, ``fps`` and ``cpu_ms_per_frame`` of
+    the frame loop, and more), its lost frames, and its trajectory in KITTI's format."""
+
+    process: Process
+    report: dict[str, Any]
+    lost: int
+    trajectory: str
+
+
+def measure(command: list[str], folder: Path) -> Process:
+    """Run a command to its end and account for it. Nothing heavy may be imported before: the
+    peak memory of a child starts at that of its parent."""
+    log = folder / "output.txt"
+    start = time.perf_counter()
+    with log.open("wb") as output:
+        child = subprocess.Popen(command, cwd=folder, stdout=output, stderr=subprocess.STDOUT)
+        _, status, usage = os.wait4(child.pid, 0)
+        wall = time.perf_counter() - start
+        child.returncode = os.waitstatus_to_exitcode(status)
+    text = log.read_text(errors="replace")
+    if child.returncode:
+        sys.exit(f"{text}\n{' '.join(command)}: exit code {child.returncode}")
+    return Process(text, wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
+
+
+def run_vslam(options: argparse.Namespace, folder: Path) -> Run:
+    command = [options.vslam, "run", "--data", str(options.data), "--seq", options.seq]
+    command += ["--max-frames", str(options.frames), "--no-record", "--quiet", "--out", "runs"]
+    if options.threads:
+        command += ["--threads", str(options.threads)]
+    process = measure(command, folder)
+    results = folder / "runs" / "latest"
+    report = json.loads((results / "report.json").read_text())
+    trajectory = (results / "trajectory_kitti.txt").read_text()
+    return Run(process, report, report["lost_frames"], trajectory)
+
+
+def run_peer(options: argparse.Namespace, folder: Path) -> Run:
+    sequence = options.data / "sequences" / options.seq
+    command = [str(options.peer_python), str(options.peer_script), str(options.vocabulary)]
+    command += [str(sequence), "out.kitti", "--frames", str(options.frames)]
+    process = measure(command, folder)
+    said = next(line for line in reversed(process.output.splitlines()) if line.startswith("{"))
+    report = json.loads(said)
+    return Run(process, report, report["lost"], (folder / "out.kitti").read_text())
+
+
+def figures(run: Run, options: argparse.Namespace) -> dict[str, float]:
+    """Every measure of one run; NaN where it has no value, as t_rel on a path below 100 m."""
+    import numpy as np
+
+    from vslam.datasets import open_sequence
+    from vslam.evaluate import evaluate
+    from vslam.trajectory import Trajectory
+
+    process, frames = run.process, run.report["frames"]
+    found = {
+        "process_fps": frames / process.wall_s,
+        "loop_fps": run.report["fps"],
+        "process_cpu_ms": 1e3 * process.cpu_s / frames,
+        "loop_cpu_ms": run.report["cpu_ms_per_frame"],
+        "wall_s": process.wall_s,
+        "cpu_s": process.cpu_s,
+        "memory_mb": process.memory_mb,
+        "lost": float(run.lost),
+    }
+    nan = float("nan")
+    found |= dict.fromkeys(("ate_m", "rpe_m", "t_rel"), nan)
+    sequence = open_sequence("kitti", options.data, options.seq, max_frames=options.frames)
+    rows = np.array([line.split() for line in run.trajectory.splitlines()], np.float64)
+    if sequence.ground_truth is None or len(rows) != len(sequence):
+        return found  # which pose belongs to which frame is not known
+    T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_wc[:, :3] = rows.reshape(-1, 3, 4)
+    errors = evaluate(
+        Trajectory(sequence.timestamps, T_wc),
+        Trajectory(sequence.timestamps, sequence.ground_truth),
+    )
+    t_rel = errors.t_rel_percent
+    found |= {"ate_m": errors.ate_rmse_m, "rpe_m": errors.rpe_m}
+    return found | {"t_rel": nan if t_rel is None else t_rel}
+
+
+def table(ours: list[dict[str, float]], peers: list[dict[str, float]]) -> str:
+    """Markdown: median (least - greatest) of each, and the ratio of the medians."""
+    lines = ["| | vslam | ORB-SLAM3 | ratio |", "|---|---|---|---|"]
+    for name, title, form in MEASURES:
+        cells, medians = [], []
+        for runs in (ours, peers):
+            values = sorted(run[name] for run in runs)
+            medians.append(statistics.median(values))
+            low, high = format(values[0], form), format(values[-1], form)
+            cell = format(medians[-1], form)
+            cells.append(cell if low == high else f"{cell} ({low} - {high})")
+        ratio = f"{medians[0] / medians[1]:.2f}" if medians[1] else "-"
+        row = f"| {title} | {cells[0]} | {cells[1]} | {ratio} |"
+        lines.append(row.replace("nan", "-"))
+    return "\n".join(lines)
+
+
+def setting(report: dict[str, Any], options: argparse.Namespace) -> str:
+    """Machine, versions and the number of runs, as one paragraph, from a report of vslam."""
+    ask = f"from importlib.metadata import version; print(version('{PEER_PACKAGE}'))"
+    peer = subprocess.run([options.peer_python, "-c", ask], capture_output=True, text=True)
+    machine = report["machine"]
+    ours = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
+    return (
+        f"KITTI {options.seq}, frames 0-{options.frames - 1}, median (least - greatest) of "
+        f"{options.repeats} runs each, in turn, {time.strftime('%Y-%m-%d')}. "
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. {ours}; "
+        f"{PEER_PACKAGE} {peer.stdout.strip() or '(version unknown)'}."
+    )
+
+
+def parse_options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--data", type=Path, required=True, help="folder with sequences and poses")
+    parser.add_argument("--seq", default="00")
+    parser.add_argument("--frames", type=int, required=True, help="frames, from the first one")
+    parser.add_argument("--repeats", type=int, default=3, help="counted runs of each system")
+    parser.add_argument("--threads", type=int, help="of vslam; its default unless given")
+    parser.add_argument("--vslam", default=str(Path(sys.executable).with_name("vslam")))
+    parser.add_argument("--peer-python", type=Path, required=True)
+    parser.add_argument("--peer-script", type=Path, required=True)
+    parser.add_argument("--vocabulary", type=Path, required=True)
+    options = parser.parse_args()
+    # The runs have working folders of their own. A link to the interpreter is what makes an
+    # environment: it is not followed.
+    for name in ("data", "peer_python", "peer_script", "vocabulary"):
+        path = getattr(options, name).absolute()
+        if not path.exists():
+            parser.error(f"--{name.replace('_', '-')} {path}: not there")
+        setattr(options, name, path)
+    return options
+
+
+def main() -> None:
+    options = parse_options()
+    runs: dict[str, list[Run]] = {"vslam": [], "ORB-SLAM3": []}
+    with tempfile.TemporaryDirectory(prefix="vslam-peer-") as scratch:
+        for repeat in range(options.repeats + 1):
+            for name, start in (("vslam", run_vslam), ("ORB-SLAM3", run_peer)):
+                run = start(options, Path(scratch))
+                counted = f"{repeat} of {options.repeats}" if repeat else "not counted"
+                print(f"{name}: {run.process.wall_s:.1f} s, {counted}", file=sys.stderr)
+                if repeat:
+                    runs[name].append(run)
+    ours, peers = ([figures(run, options) for run in done] for done in runs.values())
+    print(f"{table(ours, peers)}\n\n{setting(runs['vslam'][0].report, options)}")
+
+
+if __name__ == "__main__":
+    main()

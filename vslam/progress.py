@@ -12,6 +12,7 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     Task,
+    TaskID,
     TextColumn,
     TimeRemainingColumn,
 )
@@ -45,5 +46,26 @@ def progress_bar(
 
         def on_frame(result: TrackResult) -> None:
             progress.update(task, completed=result.index + 1, state=str(result.state))
+
+        yield on_frame
+
+
+@contextmanager
+def render_bar(*, shown: bool) -> Iterator[Callable[[int, int], None]]:
+    """Yield the callable that takes frames rendered and in all; no bar until its first call."""
+    columns = (
+        TextColumn("rendering"),
+        MofNCompleteColumn(),
+        BarColumn(),
+        _FramesPerSecond(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
+        tasks: list[TaskID] = []
+
+        def on_frame(done: int, total: int) -> None:
+            if not tasks:
+                tasks.append(progress.add_task("", total=total, completed=done))
+            progress.update(tasks[0], completed=done)
 
         yield on_frame

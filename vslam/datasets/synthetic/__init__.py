@@ -47,8 +47,14 @@ def open_synthetic(
         InputError: unknown route, or as `render_sequence` and `open_kitti`.
     """
     route = built_in_route(name)
+    until = None if max_frames is None else start + every * max_frames
     root = render_sequence(
-        route, variation or Variation(), cache_folder(), threads=threads, on_frame=on_frame
+        route,
+        variation or Variation(),
+        cache_folder(),
+        until=until,
+        threads=threads,
+        on_frame=on_frame,
     )
     found = open_kitti(root, name, start=start, every=every, max_frames=max_frames)
     return SyntheticSequence(**vars(replace(found)))

@@ -220,7 +220,10 @@ class _Painter:
         height, width = pane.shape
         for _ in range(int(self.rng.integers(4, 12))):
             w, h = (max(2, int(n * self.rng.uniform(0.06, 0.3))) for n in (width, height))
-            x, y = int(self.rng.integers(0, width)), height - h - int(self.rng.integers(0, height // 2))
+            x, y = (
+                int(self.rng.integers(0, width)),
+                height - h - int(self.rng.integers(0, height // 2)),
+            )
             pane[max(y, 0) : y + h, x : x + w] = float(self.rng.uniform(15, 190))
         x = int(self.rng.integers(0, width))
         pane[: height // 2, x : x + width // 3] += 28.0

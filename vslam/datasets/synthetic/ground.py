@@ -69,9 +69,7 @@ def make_ground(
         _paint(image, x, z, TILE / side, nearest, 0.4, roads.xz, roads.heading, roads.along,
                roads.junction, marks, section, grain, shift)  # fmt: skip
         texture = atlas.add(image)
-        parts.append(
-            _tile(x, z, terrain, texture, asphalt if distance < 9.0 else meadow)
-        )
+        parts.append(_tile(x, z, terrain, texture, asphalt if distance < 9.0 else meadow))
     return join(parts)
 
 

@@ -73,7 +73,9 @@ class Passes:
         azimuth += np.radians(110) * change * progress
         night = max(0.0, change - 0.7) / 0.3 * progress
         rise *= 1.0 - 0.35 * change * progress
-        sun = np.array([np.sin(azimuth) * np.cos(rise), -np.sin(rise), np.cos(azimuth) * np.cos(rise)])
+        sun = np.array(
+            [np.sin(azimuth) * np.cos(rise), -np.sin(rise), np.cos(azimuth) * np.cos(rise)]
+        )
         light = Light(
             sun,
             direct=1.0 - night,

@@ -16,7 +16,17 @@ _SEAM = 1e-6  # overlap of neighbours, in parts of an edge, so that no sample fa
 # Columns of a row of ``find_visible``: three affine functions of the pixel (u, v) for s/z, t/z and
 # 1/z, two for the texture coordinates over z, then the rest.
 PLANE, TEXTURE, FIRST_ROW, LAST_ROW, TRIANGLE, LAYER = 0, 9, 15, 16, 17, 18
-NUMBER, DETAIL_U, DETAIL_V, DETAIL, AMBIENT, SUN, GLOW, KEY, COLUMNS = 19, 20, 21, 22, 23, 24, 25, 26, 27
+NUMBER, DETAIL_U, DETAIL_V, DETAIL, AMBIENT, SUN, GLOW, KEY, COLUMNS = (
+    19,
+    20,
+    21,
+    22,
+    23,
+    24,
+    25,
+    26,
+    27,
+)
 
 
 @kernel
@@ -261,7 +271,20 @@ def _fill(value, slope, number, begin, inverse_depth, seen):
 
 @kernel
 def _fill_cut_out(
-    q, number, v, begin, end, step, shift, value, slope, alpha, offset, log_size, inverse_depth, seen
+    q,
+    number,
+    v,
+    begin,
+    end,
+    step,
+    shift,
+    value,
+    slope,
+    alpha,
+    offset,
+    log_size,
+    inverse_depth,
+    seen,
 ):
     """As :func:`_fill` where the alpha of the texture is at least one half."""
     u_slope, v_slope = q[TEXTURE] * step, q[TEXTURE + 3] * step

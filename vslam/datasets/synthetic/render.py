@@ -158,7 +158,10 @@ class Renderer:
             )
 
         # Defaults bind the loop's values.
-        return view, [
-            lambda a=a, b=b: band(a, b)  # type: ignore[misc]
-            for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
-        ]
+        return (
+            view,
+            [
+                lambda a=a, b=b: band(a, b)  # type: ignore[misc]
+                for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
+            ],
+        )

@@ -208,8 +208,10 @@ def _round_corners(leg: _Leg) -> tuple[Float, Float]:
         angle = np.linspace(0, 1, 40)
         v0, v1 = start - centre, end - centre
         sweep = np.pi - opening
-        arc = (np.sin((1 - angle) * sweep)[:, None] * v0 + np.sin(angle * sweep)[:, None] * v1)
-        points.append(centre + arc / np.sin(sweep) if np.sin(sweep) > 1e-3 else np.stack([start, end]))
+        arc = np.sin((1 - angle) * sweep)[:, None] * v0 + np.sin(angle * sweep)[:, None] * v1
+        points.append(
+            centre + arc / np.sin(sweep) if np.sin(sweep) > 1e-3 else np.stack([start, end])
+        )
         lane.append(np.full(len(points[-1]), lanes[k]))
     points.append(corners[-1][None])
     lane.append(lanes[-1:])
@@ -246,7 +248,9 @@ def _drive(path: Float, speed: float) -> Float:
     keep = np.r_[True, np.diff(along) > 1e-9]
     along, path = along[keep], path[keep]
     curvature = np.abs(np.gradient(_headings(path), along))
-    limit = np.minimum(speed, np.sqrt(2.4 / np.maximum(_smooth(curvature[:, None], 41)[:, 0], 1e-4)))
+    limit = np.minimum(
+        speed, np.sqrt(2.4 / np.maximum(_smooth(curvature[:, None], 41)[:, 0], 1e-4))
+    )
     limit = np.maximum(_smooth(limit[:, None], 61)[:, 0], 2.5)
     time = np.cumsum(np.r_[0, np.diff(along) / (0.5 * (limit[1:] + limit[:-1]))])
     at = np.interp(np.arange(0, time[-1], 1 / RATE), time, along)
@@ -264,9 +268,7 @@ def _poses(xz: Float, terrain: Terrain) -> Float:
     pitch = pitch + 0.0022 * np.sin(8.2 * t) * np.sin(0.7 * t) + 0.001 * np.sin(11.0 * t + 1)
     roll = 0.0025 * np.sin(5.1 * t + 2) * np.sin(0.43 * t)
     T = np.tile(np.eye(4), (len(xz), 1, 1))
-    ch, sh, cp, sp, cr, sr = (
-        f(a) for a in (heading, pitch, roll) for f in (np.cos, np.sin)
-    )
+    ch, sh, cp, sp, cr, sr = (f(a) for a in (heading, pitch, roll) for f in (np.cos, np.sin))
     zero, one = np.zeros_like(t), np.ones_like(t)
     yaw = np.array([[ch, zero, sh], [zero, one, zero], [-sh, zero, ch]]).transpose(2, 0, 1)
     nod = np.array([[one, zero, zero], [zero, cp, -sp], [zero, sp, cp]]).transpose(2, 0, 1)

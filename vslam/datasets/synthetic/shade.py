@@ -192,7 +192,10 @@ def shade(
                 t = (q[TEXTURE + 3] * x + q[TEXTURE + 4] * y + q[TEXTURE + 5]) * z
                 s_u, t_u = (q[TEXTURE] - s * q[6]) * z, (q[TEXTURE + 3] - t * q[6]) * z
                 s_v, t_v = (q[TEXTURE + 1] - s * q[7]) * z, (q[TEXTURE + 4] - t * q[7]) * z
-                along_u, along_v = math.sqrt(s_u * s_u + t_u * t_u), math.sqrt(s_v * s_v + t_v * t_v)
+                along_u, along_v = (
+                    math.sqrt(s_u * s_u + t_u * t_u),
+                    math.sqrt(s_v * s_v + t_v * t_v),
+                )
                 if along_u > along_v:
                     long, short, ds, dt = along_u, along_v, s_u, t_u
                 else:

@@ -98,6 +98,7 @@ def render_sequence(
     cache: Path,
     *,
     depth: bool = False,
+    until: int | None = None,
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> Path:
@@ -108,6 +109,7 @@ def render_sequence(
         variation: of the town.
         cache: folder for the trees; see `cache_folder`.
         depth: write ``depth_0``, 16-bit PNG in centimetres of the left eye, too.
+        until: render the frames before this one only; a later call goes on from there.
         threads: frames in work at a time; the bytes do not depend on it.
         on_frame: called with frames done and in all.
 
@@ -123,10 +125,10 @@ def render_sequence(
             return root
     elif folder.exists():
         shutil.rmtree(folder)
-    n = len(route.T_wc)
+    n = min(until or len(route.T_wc), len(route.T_wc))
     missing = [k for k in range(n) if not all(p.exists() for p in _files(folder, k, depth))]
-    _check_disk(cache, len(missing), depth)
-    with _writing(cache):
+    check_disk(cache, len(missing), depth)
+    with writing(cache):
         for name in ("image_0", "image_1", *(("depth_0",) if depth else ())):
             (folder / name).mkdir(parents=True, exist_ok=True)
         _write(folder / _RECORD, json.dumps(wanted).encode())
@@ -136,6 +138,8 @@ def render_sequence(
         write_kitti(root / "poses" / f"{route.name}.txt", route.ground_truth)
         if missing:
             _render(route, variation, folder, missing, depth, threads, on_frame)
+        if n < len(route.T_wc):
+            return root
         sums = [_checksum(_files(folder, k, depth)) for k in range(n)]
         _write(folder / _RECORD, json.dumps({**wanted, "checksums": sums}).encode())
     return root
@@ -168,12 +172,13 @@ def _render(
                 night=moment.night,
                 key=(variation.seed, k, eye),
             )
-            _write_png(path, image, 1)
+            write_png(path, image, 1)
         if depth:
             steps = np.clip(np.rint(views[0].depth * _DEPTH_SCALE), 0, 65535).astype(np.uint16)
-            _write_png(paths[2], steps, 1)
+            write_png(paths[2], steps, 1)
 
-    done = len(route.T_wc) - len(missing)
+    total = missing[-1] + 1
+    done = total - len(missing)
     with ThreadPoolExecutor(threads) as pool:
         running: deque[Future[None]] = deque()
         try:
@@ -183,12 +188,12 @@ def _render(
                     running.popleft().result()
                     done += 1
                     if on_frame:
-                        on_frame(done, len(route.T_wc))
+                        on_frame(done, total)
             while running:
                 running.popleft().result()
                 done += 1
                 if on_frame:
-                    on_frame(done, len(route.T_wc))
+                    on_frame(done, total)
         finally:
             for job in running:
                 job.cancel()
@@ -232,7 +237,8 @@ def _write(path: Path, data: bytes) -> None:
     os.replace(part, path)
 
 
-def _write_png(path: Path, image: NDArray[Any], level: int) -> None:
+def write_png(path: Path, image: NDArray[Any], level: int) -> None:
+    """Write a PNG whole or not at all."""
     data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, level])[1]
     _write(path, data.tobytes())
 
@@ -246,7 +252,8 @@ def _calibration(camera: StereoCamera) -> str:
     return "".join(lines)
 
 
-def _check_disk(cache: Path, frames: int, depth: bool) -> None:
+def check_disk(cache: Path, frames: int, depth: bool) -> None:
+    """Refuse, with what it needs, to render ``frames`` pairs of images onto a disk too small."""
     needed = frames * (2 * _IMAGE_BYTES + (_DEPTH_BYTES if depth else 0))
     there = cache
     while not there.exists() and there != there.parent:
@@ -261,7 +268,8 @@ def _check_disk(cache: Path, frames: int, depth: bool) -> None:
 
 
 @contextmanager
-def _writing(cache: Path) -> Iterator[None]:
+def writing(cache: Path) -> Iterator[None]:
+    """Turn what the file system refuses into one sentence."""
     try:
         yield
     except OSError as error:

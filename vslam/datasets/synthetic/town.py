@@ -201,9 +201,7 @@ class _Builder:
             for across, front in walls:
                 grey, lit = facade(rng, lived, style, (across, height), front=front)
                 sides.append(self._atlas.add(grey))
-                lights.append(
-                    self._atlas.add(120 + 110 * lit, 255 * (lit > 0)) if night else -1
-                )
+                lights.append(self._atlas.add(120 + 110 * lit, 255 * (lit > 0)) if night else -1)
             thing = self._next
             house = solids.join([
                 solids.walls(size, sides, lights, self._plaster, thing=thing),
@@ -217,7 +215,9 @@ class _Builder:
     ) -> bool:
         ahead = np.array([np.sin(heading), np.cos(heading)])
         middle = front + 0.5 * size[2] * ahead
-        if not self._plan.claim(rectangle(middle, heading, size[0], size[2]), road=clear, tall=True):
+        if not self._plan.claim(
+            rectangle(middle, heading, size[0], size[2]), road=clear, tall=True
+        ):
             return False
         self._house(front, heading, size)
         return True
@@ -226,7 +226,11 @@ class _Builder:
         if self._variation.aliased:
             rng = np.random.default_rng([self._variation.seed, 6, self._next % _ALIASES])
         tall = 3.0 * int(rng.integers(2, 6 if self._route.land == "town" else 4))
-        return float(rng.uniform(8, 17)), tall + float(rng.uniform(0.3, 1.2)), float(rng.uniform(8, 12))
+        return (
+            float(rng.uniform(8, 17)),
+            tall + float(rng.uniform(0.3, 1.2)),
+            float(rng.uniform(8, 12)),
+        )
 
     def _line_with_houses(self) -> None:
         """Fronts along both sides of every road."""
@@ -327,7 +331,9 @@ class _Builder:
     def _park(self, xz: Float, out: Float, style: RoadStyle) -> None:
         rng = self._rng
         along = float(np.arctan2(out[0], out[1])) - np.pi / 2
-        heading = along + float(rng.choice([0.0, np.pi], p=[0.85, 0.15])) + float(rng.normal(0, 0.02))
+        heading = (
+            along + float(rng.choice([0.0, np.pi], p=[0.85, 0.15])) + float(rng.normal(0, 0.02))
+        )
         near = xz + out * (style.lane + 1.15 + float(rng.normal(0, 0.06)))
         if not self._plan.claim(rectangle(near, heading, 2.05, 5.2), road=style.lane - 0.6):
             return
@@ -346,16 +352,26 @@ class _Builder:
         length = float(rng.uniform(3.0, 6.4))
         heading = float(np.arctan2(out[0], out[1]))
         at = xz + out * (style.walk + float(rng.uniform(0.1, 0.5)))
-        if not self._plan.claim(rectangle(at + 0.4 * out, heading, length, 0.8), road=style.walk - 0.2):
+        if not self._plan.claim(
+            rectangle(at + 0.4 * out, heading, length, 0.8), road=style.walk - 0.2
+        ):
             return
         kind = rng.random()
         if kind < 0.5:
             model = solids.hedge(rng, length, float(rng.uniform(0.9, 2.2)),
                                  int(rng.choice(self._hedges)), self._leaves, thing)  # fmt: skip
         elif kind < 0.7:
-            model = solids.panel(length, float(rng.uniform(0.8, 1.4)), int(rng.choice(self._fences)), thing)
+            model = solids.panel(
+                length, float(rng.uniform(0.8, 1.4)), int(rng.choice(self._fences)), thing
+            )
         elif kind < 0.92:
-            model = solids.panel(length, float(rng.uniform(0.5, 1.5)), int(rng.choice(self._walls)), thing, depth=0.25)
+            model = solids.panel(
+                length,
+                float(rng.uniform(0.5, 1.5)),
+                int(rng.choice(self._walls)),
+                thing,
+                depth=0.25,
+            )
         else:
             for when in (BEFORE, AFTER) if self._changes(rng, 1.0) else (ALWAYS,):
                 face = int(rng.choice(self._posters))
@@ -367,7 +383,9 @@ class _Builder:
 
     def _kerb_tree(self, xz: Float, out: Float, style: RoadStyle) -> None:
         rng = self._rng
-        self._plant(xz + out * (style.parking + float(rng.uniform(0.5, 2.5))), float(rng.uniform(5.0, 10.5)))
+        self._plant(
+            xz + out * (style.parking + float(rng.uniform(0.5, 2.5))), float(rng.uniform(5.0, 10.5))
+        )
 
     def _shrub(self, xz: Float, out: Float, style: RoadStyle) -> None:
         rng, height = self._rng, float(self._rng.uniform(0.7, 2.4))
@@ -382,9 +400,13 @@ class _Builder:
             return
         heading = float(np.arctan2(out[0], out[1]))
         if rng.random() < 0.5:
-            model = solids.lamp_post(float(rng.uniform(4.8, 7.5)), 0.9, self._metal, self._lamp, thing)
+            model = solids.lamp_post(
+                float(rng.uniform(4.8, 7.5)), 0.9, self._metal, self._lamp, thing
+            )
         else:
-            faces = [self._signs[k] for k in rng.integers(len(self._signs), size=rng.integers(1, 3))]
+            faces = [
+                self._signs[k] for k in rng.integers(len(self._signs), size=rng.integers(1, 3))
+            ]
             model = solids.sign_post(rng, float(rng.uniform(2.3, 3.1)), self._metal, faces, thing)
             heading += -np.pi / 2 if rng.random() < 0.8 else np.pi / 2
         self._stand(model, at, heading)
@@ -399,12 +421,18 @@ class _Builder:
                 out = roads.right[at + 8] * side
                 heading = float(np.arctan2(out[0], out[1]))
                 xz, thing = roads.xz[at + 8], self._next
-                rail = solids.box((-2.02, -0.75, 0), (2.02, -0.42, 0.08), self._metal, thing=thing, gain=1.4)
-                post = solids.box((-0.06, -0.7, 0.05), (0.06, 0.3, 0.15), self._metal, thing=thing, gain=0.7)
+                rail = solids.box(
+                    (-2.02, -0.75, 0), (2.02, -0.42, 0.08), self._metal, thing=thing, gain=1.4
+                )
+                post = solids.box(
+                    (-0.06, -0.7, 0.05), (0.06, 0.3, 0.15), self._metal, thing=thing, gain=0.7
+                )
                 self._stand(join([rail, post]), xz + out * (style.walk + 0.4), heading)
                 if rng.random() < 0.25:
                     height = float(rng.uniform(0.9, 1.2))
-                    mark = solids.box((-0.06, -height, 0), (0.06, 0.2, 0.08), self._lamp, thing=self._next)
+                    mark = solids.box(
+                        (-0.06, -height, 0), (0.06, 0.2, 0.08), self._lamp, thing=self._next
+                    )
                     self._stand(mark, xz + out * (style.walk + 1.0), heading)
             barrier = False
             for at in range(0, len(roads.xz) - 20, 20):
@@ -412,7 +440,9 @@ class _Builder:
                 heading = float(np.arctan2(out[0], out[1]))
                 barrier ^= bool(rng.random() < 0.05)
                 if barrier:
-                    wall = solids.panel(5.05, 3.0, int(rng.choice(self._walls)), self._next, depth=0.2)
+                    wall = solids.panel(
+                        5.05, 3.0, int(rng.choice(self._walls)), self._next, depth=0.2
+                    )
                     self._stand(wall, roads.xz[at] + out * (style.walk + 4.0), heading)
                 elif rng.random() < 0.5:
                     far = style.walk + float(rng.uniform(6.0, 30.0))
@@ -420,4 +450,6 @@ class _Builder:
                 if rng.random() < 0.06:
                     faces = [self._signs[int(rng.integers(len(self._signs)))]]
                     sign = solids.sign_post(rng, 3.6, self._metal, faces, self._next)
-                    self._stand(sign, roads.xz[at] + out * (style.walk + 1.6), heading - side * np.pi / 2)
+                    self._stand(
+                        sign, roads.xz[at] + out * (style.walk + 1.6), heading - side * np.pi / 2
+                    )

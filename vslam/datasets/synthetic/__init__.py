@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 from vslam.datasets.kitti import KittiSequence, open_kitti
 from vslam.datasets.synthetic.routes import ROUTES, Route, built_in_route, route_of_poses

@@ -38,8 +38,9 @@ class FacadeStyle:
 def random_style(rng: Rng, *, town: bool) -> FacadeStyle:
     """A style; a town has shops, a suburb shutters."""
     brick = bool(rng.random() < 0.22)
+    low, high = (75, 125) if brick else (165, 225) if rng.random() < 0.6 else (110, 170)
     return FacadeStyle(
-        wall=float(rng.uniform(75, 125) if brick else rng.choice([rng.uniform(165, 225), rng.uniform(110, 170)], p=[0.6, 0.4])),
+        wall=float(rng.uniform(low, high)),
         frame=float(rng.choice([215.0, 225.0, 60.0, 130.0])),
         glass=float(rng.uniform(22, 60)),
         brick=brick,
@@ -50,7 +51,7 @@ def random_style(rng: Rng, *, town: bool) -> FacadeStyle:
         balconies=bool(rng.random() < 0.25),
         shop=bool(town and rng.random() < 0.4),
         bands=bool(rng.random() < 0.4),
-    )  # fmt: skip
+    )
 
 
 def facade(

@@ -59,15 +59,16 @@ def make_ground(
                         float(style.edge_line)])  # fmt: skip
     parts = []
     for (x, z), distance in zip(corner[far < _REACH], far[far < _REACH], strict=True):
-        fine = distance < style.walk + 0.75 * TILE
-        side = _FINE if fine else _COARSE
+        # Half the diagonal of a tile is 0.71 of its side.
+        side = _COARSE
+        if distance < style.walk + 0.71 * TILE:
+            side = _FINE if distance < style.lane + 0.6 * TILE else _FINE // 2
         nodes = np.arange(0.0, TILE + 0.4, 0.4)
         at = np.stack(np.meshgrid(x + nodes, z + nodes), axis=-1)
         nearest = tree.query(at.reshape(-1, 2))[1].reshape(len(nodes), len(nodes))
         image = np.empty((side, side), np.float32)
-        shift = rng.integers(0, 1024, 2)
         _paint(image, x, z, TILE / side, nearest, 0.4, roads.xz, roads.heading, roads.along,
-               roads.junction, marks, section, grain, shift)  # fmt: skip
+               roads.junction, marks, section, grain)  # fmt: skip
         texture = atlas.add(image)
         parts.append(_tile(x, z, terrain, texture, asphalt if distance < 9.0 else meadow))
     return join(parts)
@@ -125,7 +126,8 @@ def _road_marks(rng: Rng, roads: Roads, style: RoadStyle) -> NDArray[np.float64]
     for at in np.flatnonzero(rng.random(n) < 0.008):
         across = float(rng.uniform(-0.8, 0.8)) * style.lane
         marks[max(at - 3, 0) : at + 4, 6:8] = roads.along[at], across
-    tone = np.interp(np.arange(n), np.arange(0, n + 200, 200), rng.uniform(0.85, 1.15, n // 200 + 2)[: len(np.arange(0, n + 200, 200))])  # fmt: skip
+    knots = np.arange(0, n + 200, 200)
+    tone = np.interp(np.arange(n), knots, rng.uniform(0.85, 1.15, len(knots)))
     marks[:, 8] = tone
     marks[:, 9] = rng.choice([0.85, 1.0, 1.2], n // 300 + 1)[np.arange(n) // 300]
     return marks
@@ -145,7 +147,7 @@ def _hash(a, b):
 
 @kernel
 def _paint(
-    image, x0, z0, texel, nearest, mesh, xz, heading, along, junction, marks, section, grain, shift
+    image, x0, z0, texel, nearest, mesh, xz, heading, along, junction, marks, section, grain
 ):
     """Albedo of a tile whose corner is ``(x0, z0)``; ``nearest``: road sample on a coarse mesh."""
     rows, columns = image.shape
@@ -161,7 +163,7 @@ def _paint(
             # The mesh is coarser than the samples: walk to the nearest one.
             fs, fc = math.sin(heading[i]), math.cos(heading[i])
             ahead = (x - xz[i, 0]) * fs + (z - xz[i, 1]) * fc
-            j = min(max(i + int(round(ahead / 0.25)), 0), len(xz) - 1)
+            j = min(max(i + round(ahead / 0.25), 0), len(xz) - 1)
             if abs(along[j] - along[i]) < 2.0:
                 i = j
             fs, fc = math.sin(heading[i]), math.cos(heading[i])
@@ -171,7 +173,7 @@ def _paint(
             off = math.sqrt(dx * dx + dz * dz)
             side = -1.0 if lateral < 0.0 else 1.0
             s = along[i] + ahead
-            wide = grain[0, (int(z / 0.06) + shift[1] * 0) & 1023, int(x / 0.06) & 1023]
+            wide = grain[0, int(z / 0.06) & 1023, int(x / 0.06) & 1023]
             fine = grain[1, int(z / texel) & 1023, (int(x / texel) + 331) & 1023]
             edge = off + 0.02 * fine
             if edge < lane:
@@ -199,7 +201,7 @@ def _paint(
                     if section[5] > 0.0 and abs(off - lane + 0.35) < 0.08:
                         grey = 180.0 + 20.0 * fine
             elif edge < parking:
-                slab = int(math.floor(s / 0.22)) * 4096 + int(math.floor(lateral / 0.22))
+                slab = math.floor(s / 0.22) * 4096 + math.floor(lateral / 0.22)
                 tone = _hash(slab, 17)
                 grey = (84.0 + 26.0 * tone) * (1.0 + 0.06 * wide + 0.06 * fine)
                 if (s / 0.22) % 1.0 < 0.12 or (abs(lateral) / 0.22) % 1.0 < 0.12:
@@ -211,14 +213,14 @@ def _paint(
                 grey *= 0.55 if edge < parking + 0.035 else 1.0
             elif edge < walk:
                 size = 0.5
-                row, column = int(math.floor(s / size)), int(math.floor((off - parking) / size))
+                row, column = math.floor(s / size), math.floor((off - parking) / size)
                 tone = _hash(row, column + (1000 if side > 0.0 else 0))
                 grey = (108.0 + 24.0 * tone) * marks[i, 9] * (1.0 + 0.07 * wide + 0.05 * fine)
                 if (s / size) % 1.0 < 0.05 or ((off - parking) / size) % 1.0 < 0.05:
                     grey *= 0.66
             else:
                 # Gardens, drives and paths alternate behind the pavement.
-                lot = int(math.floor(s / 5.0))
+                lot = math.floor(s / 5.0)
                 kind = _hash(lot, 7 if side > 0.0 else 8)
                 grey = 62.0 * (1.0 + 0.25 * wide + 0.2 * fine)
                 if kind < 0.22:

@@ -79,10 +79,11 @@ class Passes:
         light = Light(
             sun,
             direct=1.0 - night,
-            ambient=0.36 * (1 - 0.86 * night),
+            ambient=0.36 * (1 - 0.7 * night),
             glow=0.9 * night,
             haze=125.0 * (1 - 0.93 * night),
-            exposure=1.5 + 1.6 * night,
+            headlight=0.5 * night,
+            exposure=1.5 * (1 + 1.7 * night),
         )
         return light, night
 

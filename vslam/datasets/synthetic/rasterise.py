@@ -59,7 +59,6 @@ def find_visible(
     n = 0
     corner = np.empty((4, 3))
     left, right = (-1.0 - cx) / fx, (width - cx) / fx
-    top, bottom = (-1.0 - cy) / fy, (height - cy) / fy
     for q in range(len(origin)):
         # Camera coordinates by hand: three-vectors are too short for a matrix product.
         ox, oy, oz = origin[q, 0] - T_wc[0, 3], origin[q, 1] - T_wc[1, 3], origin[q, 2] - T_wc[2, 3]
@@ -78,7 +77,6 @@ def find_visible(
         slack = radius * (1.0 + max(abs(left), abs(right)))
         if xc < left * reach - slack or xc > right * reach + slack:
             continue
-        yc = T_wc[0, 1] * mx + T_wc[1, 1] * my + T_wc[2, 1] * mz
         ax, ay, az = _turn(T_wc, ox, oy, oz)
         bx, by, bz = _turn(T_wc, sx, sy, sz)
         dx, dy, dz = _turn(T_wc, tx, ty, tz)
@@ -127,7 +125,7 @@ def find_visible(
         row[DETAIL] = detail[q]
         if detail[q] >= 0:
             # Texels of the fine texture for one texel of the first, along u and v.
-            span_u = max(abs(uv[q, 1]) + abs(uv[q, 4]) * 0.0, abs(uv[q, 2]), 1e-9)
+            span_u = max(abs(uv[q, 1]), abs(uv[q, 2]), 1e-9)
             length_s = math.sqrt(sx * sx + sy * sy + sz * sz)
             length_t = math.sqrt(tx * tx + ty * ty + tz * tz)
             metres_u = (length_s if abs(uv[q, 1]) >= abs(uv[q, 2]) else length_t) / span_u
@@ -239,14 +237,16 @@ def rasterise(visible, first_row, samples, alpha, alpha_offset, log_size, invers
                     high = min(high, -value / slope)
                 elif value < 0.0:
                     high = -1.0
-            begin, end = int(math.ceil(low)), int(math.floor(high)) + 1
+            begin, end = math.ceil(low), math.floor(high) + 1
             if begin >= end:
                 continue
             slope = q[6] * step
             value = q[6] * shift + q[7] * v + q[8]
             if cut_out:
-                _fill_cut_out(q, k, v, begin, end, step, shift, value, slope, alpha,
-                              alpha_offset[number], log_size[number], inverse_depth[j], seen[j])  # fmt: skip
+                _fill_cut_out(
+                    q, k, v, begin, end, step, shift, value, slope,
+                    alpha, alpha_offset[number], log_size[number], inverse_depth[j], seen[j],
+                )  # fmt: skip
             else:
                 _fill(
                     value * q[LAYER],
@@ -311,7 +311,7 @@ def _fill_cut_out(
         x = (u_value + u_slope * i) * z * scale - 0.5
         y = (v_value + v_slope * i) * z * scale - 0.5
         if level > 0:  # texels smaller than samples: the nearest will do
-            c0, r0 = int(math.floor(x + 0.5)) & mask_u, int(math.floor(y + 0.5)) & mask_v
+            c0, r0 = math.floor(x + 0.5) & mask_u, math.floor(y + 0.5) & mask_v
             if alpha[np.uintp(at + (r0 << row_log) + c0)] < 128:
                 continue
         else:

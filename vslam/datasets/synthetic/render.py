@@ -40,6 +40,7 @@ class Light:
         haze: grey of the air, 0 to 255.
         visibility: metres at which a contrast falls to 1/e.
         exposure: factor from radiance to grey levels.
+        headlight: brightness of the car's own lamps 10 m ahead.
     """
 
     sun: NDArray[np.float64]
@@ -49,11 +50,12 @@ class Light:
     haze: float = 125.0
     visibility: float = 900.0
     exposure: float = 1.5
+    headlight: float = 0.0
 
     def as_array(self) -> NDArray[np.float64]:
-        """``(9,)`` float64, the form that the kernels take."""
-        values = (self.direct, self.ambient, self.glow, self.haze, self.visibility, self.exposure)
-        return np.array([*self.sun, *values])
+        """``(10,)`` float64, the form that the kernels take."""
+        air = (self.haze, self.visibility, self.exposure)
+        return np.array([*self.sun, self.direct, self.ambient, self.glow, *air, self.headlight])
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,9 @@ _BUILT_IN = {
         "one loop round a block", "town", "00-02",
         _Leg(((0, 0), (0, 80), (62, 96), (84, 20), (0, -10), (0, 62)))),
     "00": _BuiltIn(
-        "town; five revisits, one on the other lane, one in the opposite direction", "town", "00-02",
+        "town; five revisits, one on the other lane, one in the opposite direction",
+        "town",
+        "00-02",
         _Leg(((0, 0), (0, 180), (120, 180), (120, 0), (-4, -18), (0, 60), (0, 180), (-110, 195),
               (-120, 70), (0, 62), (120, 70), (120, 180), (0, 180), (0, 62), (-120, 70),
               (-130, -40), (0, -40), (0, 100)),

@@ -202,7 +202,7 @@ def shade(
                     long, short, ds, dt = along_v, along_u, s_v, t_v
                 taps = 1
                 if long > 1.0:
-                    taps = min(int(math.ceil(long / max(short, 1.0) - 0.25)), MAX_TAPS)
+                    taps = min(math.ceil(long / max(short, 1.0) - 0.25), MAX_TAPS)
                 size = max(long / taps, short)
                 texture = int(q[NUMBER])
                 log_w, log_h = log_size[texture, 0], log_size[texture, 1]
@@ -240,6 +240,9 @@ def shade(
                         T_wc[1, 3] + z * wy,
                         T_wc[2, 3] + z * wz,
                     )
+                if lamp[9] > 0.0:
+                    beam = math.exp(-3.0 * rx * rx - 30.0 * (ry - 0.08) * (ry - 0.08))
+                    light += lamp[9] * beam * 200.0 / (100.0 + z * z)
                 grey = albedo * (light + q[GLOW])
                 clear = 1.0 / (1.0 + z * rate * (1.0 + 0.5 * z * rate))
                 total += weight[k] * (grey * clear + lamp[6] * (1.0 - clear))

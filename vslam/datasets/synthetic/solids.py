@@ -7,6 +7,7 @@ viewer, so that the front lies in z = 0 or faces -z.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +112,8 @@ def roof(
         parts.append(box((x - 0.7, -up - 1.3, 0.08 * d), (x + 0.7, -up + 0.3, 0.4 * d), wall,
                          thing=thing, gain=0.9))  # fmt: skip
         parts.append(patches(np.array([x - 0.5, -up - 1.1, 0.08 * d]), np.array([1.0, 0, 0]),
-                             np.array([0, 1.0, 0]), tiles, layer=1, gain=0.4, thing=thing))  # fmt: skip
+                             np.array([0, 1.0, 0]), tiles, layer=1, gain=0.4,
+                             thing=thing))  # fmt: skip
     return join(parts)
 
 
@@ -190,12 +192,13 @@ def hedge(rng: Rng, length: float, height: float, texture: int, top: int, thing:
     along, down = np.array([length, 0.0, 0.0]), np.array([0.0, height + 0.3, 0.0])
     ends = np.array([0.0, 0.0, depth])
     lid = -0.92 * height
-    kind = {"thing": thing, "material": FOLIAGE}
+    kind: dict[str, Any] = {"thing": thing, "material": FOLIAGE}
+    side = (0, 0.15, 0, 0, 0, 1)
     return join([
         patches(np.array([x0, -height, 0.0]), along, down, texture, uv=uv, **kind),
         patches(np.array([x0, -height, depth]), along, down, texture, uv=uv, **kind),
-        patches(np.array([x0, -height, 0.0]), ends, down, texture, uv=(0, 0.15, 0, 0, 0, 1), **kind),
-        patches(np.array([x1, -height, 0.0]), ends, down, texture, uv=(0, 0.15, 0, 0, 0, 1), **kind),
+        patches(np.array([x0, -height, 0.0]), ends, down, texture, uv=side, **kind),
+        patches(np.array([x1, -height, 0.0]), ends, down, texture, uv=side, **kind),
         patches(np.array([x0, lid, 0.0]), along, ends, top, uv=uv, **kind),
     ])  # fmt: skip
 

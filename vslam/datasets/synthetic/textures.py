@@ -22,25 +22,25 @@ def noise(rng: Rng, height: int, width: int, cell: float, octaves: int = 4) -> G
     Args:
         cell: texels of the coarsest grid's mesh; each octave halves it at 0.7 of the contrast.
     """
-    total = np.zeros((height, width), np.float32)
+    total = np.zeros((1, 1), np.float32)
     for octave in range(octaves):
         mesh = max(cell * 0.5**octave, 1.0)
-        grid = rng.standard_normal(
-            (max(2, round(height / mesh)), max(2, round(width / mesh))), np.float32
-        )
-        # A border of repeated cells makes the cubic interpolation wrap around.
-        border = 2
-        grid = np.pad(grid, border, mode="wrap")
-        rows = (np.arange(height) + 0.5) * (grid.shape[0] - 2 * border) / height - 0.5 + border
-        columns = (np.arange(width) + 0.5) * (grid.shape[1] - 2 * border) / width - 0.5 + border
-        layer = cv2.remap(
-            grid,
-            np.broadcast_to(columns.astype(np.float32), (height, width)),
-            np.broadcast_to(rows.astype(np.float32)[:, None], (height, width)),
-            cv2.INTER_LINEAR,
-        )
-        total += 0.7**octave * layer
-    return total / max(float(total.std()), 1e-6)
+        shape = max(2, round(height / mesh)), max(2, round(width / mesh))
+        total = _stretch(total, *shape) + 0.7**octave * rng.standard_normal(shape, np.float32)
+    total = _stretch(total, height, width)
+    return np.asarray((total - total.mean()) / max(float(total.std()), 1e-6), np.float32)
+
+
+def _stretch(grid: Grey, height: int, width: int) -> Grey:
+    """Linear interpolation on a torus."""
+    if grid.shape == (height, width):
+        return grid
+    border = 1
+    padded = np.pad(grid, border, mode="wrap")
+    rows = (np.arange(height, dtype=np.float32) + 0.5) * (grid.shape[0] / height) - 0.5 + border
+    columns = (np.arange(width, dtype=np.float32) + 0.5) * (grid.shape[1] / width) - 0.5 + border
+    at = np.meshgrid(columns, rows)
+    return np.asarray(cv2.remap(padded, at[0], at[1], cv2.INTER_LINEAR), np.float32)
 
 
 def detail(rng: Rng, contrast: float, cell: float = 8.0, size: int = 256) -> Grey:
@@ -220,7 +220,7 @@ def sky(rng: Rng, *, treeline: bool = True) -> Grey:
     image = np.minimum(image, 250.0)
     if treeline:
         for far, tone in ((0.050, 150.0), (0.032, 118.0)):
-            top = far + 0.4 * far * noise(rng, 1, width, 160.0, 7)[0]
+            top = far + 0.25 * far * noise(rng, 1, width, 240.0, 7)[0]
             rough = noise(rng, height, width, 10.0, 3)
             trees = rise < top + 0.002 * rough
             image = np.where(trees, tone + 9.0 * rough, image).astype(np.float32)

@@ -241,7 +241,8 @@ class _Builder:
                 size = self._size(rng)
                 middle = min(at + int(2 * size[0]), len(roads.xz) - 1)
                 if rng.random() < 0.45:
-                    setback = self._style.walk + float(rng.uniform(0.3, 4.0) if town else rng.uniform(3.5, 9.0))  # fmt: skip
+                    low, high = (0.3, 4.0) if town else (3.5, 9.0)
+                    setback = self._style.walk + float(rng.uniform(low, high))
                 out = roads.right[middle] * side
                 front = roads.xz[middle] + setback * out
                 heading = float(np.arctan2(out[0], out[1])) + float(rng.normal(0, 0.015))
@@ -297,8 +298,10 @@ class _Builder:
         for when in (BEFORE, AFTER) if changes else (ALWAYS,):
             rng.bit_generator.state = state
             twigs = self._later_twigs if when == AFTER else self._twigs
-            model = solids.tree(rng, self._needles if conifer else twigs, self._bark[self._next % 4],
-                                height=height, thing=self._next, conifer=conifer)  # fmt: skip
+            model = solids.tree(
+                rng, self._needles if conifer else twigs, self._bark[self._next % 4],
+                height=height, thing=self._next, conifer=conifer,
+            )  # fmt: skip
             heading = float(rng.uniform(0, 6.3))
             if (free := self._pruned(model, xz)) is not None:
                 self._stand(free, xz, heading, when)

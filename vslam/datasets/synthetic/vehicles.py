@@ -14,7 +14,8 @@ from vslam.datasets.synthetic.textures import Grey, Rng, letters, noise, write
 # height); the third number tells what covers the strip that begins there: paint or glass.
 _OUTLINES = {
     "hatchback": ((0.0, 0.16, 0), (0.0, 0.42, 0), (0.05, 0.52, 0), (0.27, 0.62, 1),
-                  (0.45, 0.97, 0), (0.62, 1.0, 0), (0.86, 0.93, 1), (0.97, 0.62, 0), (1.0, 0.17, 0)),
+                  (0.45, 0.97, 0), (0.62, 1.0, 0), (0.86, 0.93, 1), (0.97, 0.62, 0),
+                  (1.0, 0.17, 0)),
     "saloon": ((0.0, 0.17, 0), (0.0, 0.44, 0), (0.05, 0.53, 0), (0.28, 0.62, 1), (0.43, 0.97, 0),
                (0.56, 1.0, 0), (0.67, 0.95, 1), (0.83, 0.66, 0), (0.98, 0.62, 0), (1.0, 0.18, 0)),
     "estate": ((0.0, 0.16, 0), (0.0, 0.42, 0), (0.05, 0.52, 0), (0.26, 0.6, 1), (0.42, 0.96, 0),
@@ -67,7 +68,6 @@ def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Car:
                 thing=thing,
             )
         )
-    # Pull the cabin in: the roof is narrower than the doors.
     for k in range(len(points) - 1):
         a, b = points[k], points[k + 1]
         low = min(outline[k, 1], outline[k + 1, 1])
@@ -123,7 +123,7 @@ def _paint_side(
     for x in (int(width * 0.185), int(width * 0.80)):
         centre, rim = (x, height - 29), float(rng.uniform(90, 190))
         axes = np.array([37, 28])
-        cv2.ellipse(grey, centre, (axes + [6, 4]).tolist(), 0, 0, 360, 14.0, -1)
+        cv2.ellipse(grey, centre, (43, 32), 0, 0, 360, 14.0, -1)
         cv2.ellipse(alpha, centre, axes.tolist(), 0, 0, 360, 255.0, -1)
         cv2.ellipse(grey, centre, axes.tolist(), 0, 0, 360, 24.0, -1)
         cv2.ellipse(grey, centre, (axes * 0.64).astype(int).tolist(), 0, 0, 360, rim, -1)

@@ -263,7 +263,7 @@ class _Builder:
             last = xz
             heading = float(np.arctan2(T[0, 2], T[2, 2]))
             for angle in np.radians(np.arange(-42, 43, 3)):
-                line = self._plan.open_ray(xz, heading + angle, 130.0)
+                line = self._plan.open_ray(xz, heading + angle, 230.0)
                 if line is None:
                     continue
                 distance = self._plan.road_distance(line)

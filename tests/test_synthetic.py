@@ -59,7 +59,7 @@ def dotted_world():
     from_dot = ((x % pitch) - pitch / 2) ** 2 + ((y % pitch) - pitch / 2) ** 2
     atlas = AtlasBuilder()
     wall = atlas.add(20 + 180 * np.exp(-0.5 * from_dot / 9.0**2))
-    plain = atlas.add(np.full((4, 4), 90.0))
+    plain = atlas.add(np.full((4, 4), 4.0))
     origin, s, t = (
         np.array([-4.0, -3.2, 11.0]),
         np.array([7.6, 0.1, 3.0]),
@@ -113,8 +113,7 @@ def test_projection_and_disparity_are_exact(yaw):
     assert len(uvr) > 25
     seen = centroids(left.image, uvr[:, :2])
     error = np.linalg.norm(seen - uvr[:, :2], axis=1)
-    assert np.sqrt(np.mean(error**2)) < 0.05
-    assert error.max() < 0.1
+    assert error.max() < 0.05
     seen_right = centroids(right.image, uvr[:, [2, 1]])
     at = np.rint(uvr[:, :2]).astype(int)
     z = left.depth[at[:, 1], at[:, 0]]

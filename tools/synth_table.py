@@ -1,4 +1,4 @@
-"""Write docs/results.md: vslam, and a peer if given, on rendered routes, clean and under brightness.
+"""Write docs/results.md: vslam, and a peer if given, on rendered routes, clean and perturbed.
 
     python tools/synth_table.py --routes demo,03,04 --out docs/results.md \
         [--peer PYTHON,RUN_ORBSLAM3.py,VOCABULARY]
@@ -52,7 +52,7 @@ def _run_vslam(root: Path, name: str, light: str) -> tuple[Path, int, float]:
     words += ["--perturb", "brightness"] if light == "brightness" else []
     subprocess.run(words, check=True)
     report = json.loads((out / "latest" / "report.json").read_text())
-    return out / "latest" / "trajectory_kitti.txt", report["lost"], report["fps"]
+    return out / "latest" / "trajectory_kitti.txt", report["lost_frames"], report["fps"]
 
 
 def _run_peer(root: Path, name: str, light: str, peer: list[str]) -> tuple[Path, int, float]:

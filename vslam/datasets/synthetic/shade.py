@@ -56,16 +56,16 @@ def _log2(size):
 
 
 @kernel
-def _trilinear(texels, offset, log_w, log_h, size, u, v):
-    """Texture at ``(u, v)`` averaged over about ``size`` texels of level 0."""
+def _trilinear(texels, offset, number, log_w, log_h, size, u, v):
+    """Texture ``number`` at ``(u, v)`` averaged over about ``size`` texels of level 0."""
     if size <= 1.0:
-        return _bilinear(texels, offset[0], log_w, log_h, 0, u, v)
+        return _bilinear(texels, offset[number, 0], log_w, log_h, 0, u, v)
     low, part = _log2(size)
     top = max(log_w, log_h)
     if low >= top:
-        return np.float32(texels[np.uintp(offset[top])])
-    near = _bilinear(texels, offset[low], log_w, log_h, low, u, v)
-    far = _bilinear(texels, offset[low + 1], log_w, log_h, low + 1, u, v)
+        return np.float32(texels[np.uintp(offset[number, top])])
+    near = _bilinear(texels, offset[number, low], log_w, log_h, low, u, v)
+    far = _bilinear(texels, offset[number, low + 1], log_w, log_h, low + 1, u, v)
     return near + (far - near) * part
 
 
@@ -78,7 +78,7 @@ def _sky(texels, offset, log_size, number, x, y, z, pixel):
     u = (math.atan2(x, z) / (2.0 * math.pi) + 0.5) * (1 << log_w)
     v = min(max(rise, 0.0), 0.9999) * ((1 << log_h) - 1) + 0.5
     size = pixel * max((1 << log_w) / (2.0 * math.pi), (1 << log_h) / (SKY_RISE + SKY_FALL))
-    return _trilinear(texels, offset[number], log_w, log_h, size, u, v)
+    return _trilinear(texels, offset, number, log_w, log_h, size, u, v)
 
 
 @kernel
@@ -185,13 +185,26 @@ def shade(
                     grey = _sky(texels, offset, log_size, sky, wx, wy, wz, 1.0 / fx)
                     total += weight[k] * grey * lamp[6] / _SKY_HAZE
                     continue
-                q = visible[number[k]]
-                inverse = q[6] * x + q[7] * y + q[8]
+                # No row view here: counting its references costs more than the arithmetic.
+                n = np.uintp(number[k])
+                inverse = visible[n, 6] * x + visible[n, 7] * y + visible[n, 8]
                 z = 1.0 / inverse
-                s = (q[TEXTURE] * x + q[TEXTURE + 1] * y + q[TEXTURE + 2]) * z
-                t = (q[TEXTURE + 3] * x + q[TEXTURE + 4] * y + q[TEXTURE + 5]) * z
-                s_u, t_u = (q[TEXTURE] - s * q[6]) * z, (q[TEXTURE + 3] - t * q[6]) * z
-                s_v, t_v = (q[TEXTURE + 1] - s * q[7]) * z, (q[TEXTURE + 4] - t * q[7]) * z
+                s = (
+                    visible[n, TEXTURE] * x + visible[n, TEXTURE + 1] * y + visible[n, TEXTURE + 2]
+                ) * z
+                t = (
+                    visible[n, TEXTURE + 3] * x
+                    + visible[n, TEXTURE + 4] * y
+                    + visible[n, TEXTURE + 5]
+                ) * z
+                s_u, t_u = (
+                    (visible[n, TEXTURE] - s * visible[n, 6]) * z,
+                    (visible[n, TEXTURE + 3] - t * visible[n, 6]) * z,
+                )
+                s_v, t_v = (
+                    (visible[n, TEXTURE + 1] - s * visible[n, 7]) * z,
+                    (visible[n, TEXTURE + 4] - t * visible[n, 7]) * z,
+                )
                 along_u, along_v = (
                     math.sqrt(s_u * s_u + t_u * t_u),
                     math.sqrt(s_v * s_v + t_v * t_v),
@@ -204,35 +217,36 @@ def shade(
                 if long > 1.0:
                     taps = min(math.ceil(long / max(short, 1.0) - 0.25), MAX_TAPS)
                 size = max(long / taps, short)
-                texture = int(q[NUMBER])
+                texture = int(visible[n, NUMBER])
                 log_w, log_h = log_size[texture, 0], log_size[texture, 1]
                 albedo = 0.0
                 for tap in range(taps):
                     f = (tap + 0.5) / taps - 0.5
                     albedo += _trilinear(
-                        texels, offset[texture], log_w, log_h, size, s + f * ds, t + f * dt
+                        texels, offset, texture, log_w, log_h, size, s + f * ds, t + f * dt
                     )
                 albedo /= taps
-                fine = int(q[DETAIL])
+                fine = int(visible[n, DETAIL])
                 if fine >= 0:
-                    detail_size = size * max(q[DETAIL_U], q[DETAIL_V])
+                    detail_size = size * max(visible[n, DETAIL_U], visible[n, DETAIL_V])
                     log_d = log_size[fine, 0]
                     if detail_size < _DETAIL_ENDS:
                         albedo *= (
                             _trilinear(
                                 texels,
-                                offset[fine],
+                                offset,
+                                fine,
                                 log_d,
                                 log_d,
                                 detail_size,
-                                s * q[DETAIL_U],
-                                t * q[DETAIL_V],
+                                s * visible[n, DETAIL_U],
+                                t * visible[n, DETAIL_V],
                             )
                             / 128.0
                         )
-                light = q[AMBIENT]
-                if q[SUN] > 0.0:
-                    light += q[SUN] * _lit(
+                light = visible[n, AMBIENT]
+                if visible[n, SUN] > 0.0:
+                    light += visible[n, SUN] * _lit(
                         shadow,
                         frame,
                         lamp,
@@ -243,7 +257,7 @@ def shade(
                 if lamp[9] > 0.0:
                     beam = math.exp(-3.0 * rx * rx - 30.0 * (ry - 0.08) * (ry - 0.08))
                     light += lamp[9] * beam * 200.0 / (100.0 + z * z)
-                grey = albedo * (light + q[GLOW])
+                grey = albedo * (light + visible[n, GLOW])
                 clear = 1.0 / (1.0 + z * rate * (1.0 + 0.5 * z * rate))
                 total += weight[k] * (grey * clear + lamp[6] * (1.0 - clear))
                 nearest = max(nearest, inverse)

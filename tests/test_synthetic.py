@@ -229,9 +229,13 @@ def test_places_match_themselves_only(route, town):
 
 
 @pytest.fixture(scope="module")
-def rendered(route, tmp_path_factory):
+def rendered(route, town, tmp_path_factory):
     cache = tmp_path_factory.mktemp("cache")
-    return store.render_sequence(route, Variation(seed=3), cache, until=3, depth=True, threads=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store, "build_town", lambda *_: town)
+        return store.render_sequence(
+            route, Variation(seed=3), cache, until=3, depth=True, threads=1
+        )
 
 
 def tree(root):
@@ -256,7 +260,8 @@ def test_tree_is_kitti_with_depth(route, rendered):
     assert depth[-1, 620] / 100 == pytest.approx(foot, abs=0.05)
 
 
-def test_rendering_resumes_after_a_kill(route, rendered, tmp_path):
+def test_rendering_resumes_after_a_kill(route, town, rendered, tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "build_town", lambda *_: town)
     whole = tree(rendered)
     shutil.copytree(rendered, tmp_path / rendered.name)
     folder = tmp_path / rendered.name / "sequences/street"
@@ -300,10 +305,11 @@ class Renderings:
 
 
 def test_change_between_passes():
-    there_and_back = np.concatenate([straight(110), straight(110)])
-    there_and_back[110:, 2, 3] = there_and_back[109::-1, 2, 3]
-    there_and_back[110:, 0, 3] -= 3.2
-    there_and_back[110:, :3, :3] = turn(np.pi)
+    n = 85
+    there_and_back = np.concatenate([straight(n), straight(n)])
+    there_and_back[n:, 2, 3] = there_and_back[n - 1 :: -1, 2, 3]
+    there_and_back[n:, 0, 3] -= 3.2
+    there_and_back[n:, :3, :3] = turn(np.pi)
     route = route_of_poses(there_and_back, "twice")
     variation = Variation(change=1.0, moving=3)
     town = build_town(route, variation)

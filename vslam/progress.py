@@ -60,12 +60,17 @@ def render_bar(*, shown: bool) -> Iterator[Callable[[int, int], None]]:
         _FramesPerSecond(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
-        tasks: list[TaskID] = []
+    progress = Progress(*columns, console=Console(stderr=True), disable=not shown)
+    tasks: list[TaskID] = []
 
-        def on_frame(done: int, total: int) -> None:
-            if not tasks:
-                tasks.append(progress.add_task("", total=total, completed=done))
-            progress.update(tasks[0], completed=done)
+    def on_frame(done: int, total: int) -> None:
+        if not tasks:
+            progress.start()
+            tasks.append(progress.add_task("", total=total, completed=done))
+        progress.update(tasks[0], completed=done)
 
+    try:
         yield on_frame
+    finally:
+        if tasks:
+            progress.stop()

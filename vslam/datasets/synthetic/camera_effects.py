@@ -35,8 +35,10 @@ def sensor_image(
     image = radiance
     streak = abs(yaw_rate) * SHUTTER * (1 + 2 * night) * camera.fx
     if streak > 0.2:
-        image = cv2.filter2D(image, -1, _streak(streak)[None, :], borderType=cv2.BORDER_REPLICATE)
-    image = cv2.GaussianBlur(image, (0, 0), _BLUR)
+        kernel = _streak(streak)[None, :]
+        blurred = cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE)
+        image = np.asarray(blurred, np.float32)
+    image = np.asarray(cv2.GaussianBlur(image, (0, 0), _BLUR), np.float32)
     image = image * _vignette(camera)
     over = np.maximum(image - _KNEE, 0)
     room = 255.0 - _KNEE

@@ -246,7 +246,9 @@ class _Painter:
             rows, columns = self._slices(x + 0.07, top + 0.07, x1 - 0.07, height - 0.42)
             shape = self.image[rows, columns].shape
             if min(shape) > 4:
-                self.image[rows, columns] = 34 + 10 * noise(self.rng, *shape, 0.8 * self.px, 3)
+                self.image[rows, columns] = 34 + 10 * noise(
+                    self.rng, shape[0], shape[1], 0.8 * self.px, 3
+                )
                 self._goods(self.image[rows, columns])
                 lights[rows, columns] = 0.7
             x = x1 + 0.25

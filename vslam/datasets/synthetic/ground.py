@@ -123,7 +123,7 @@ def _road_marks(rng: Rng, roads: Roads, style: RoadStyle) -> NDArray[np.float64]
             b = a + float(rng.uniform(0.5, 3.2))
             marks[at : at + length, 3:6] = a, b, float(rng.choice([0.72, 0.84, 1.14, 1.22]))
         at += length + gap
-    for at in np.flatnonzero(rng.random(n) < 0.008):
+    for at in np.flatnonzero(rng.random(n) < 0.008).tolist():
         across = float(rng.uniform(-0.8, 0.8)) * style.lane
         marks[max(at - 3, 0) : at + 4, 6:8] = roads.along[at], across
     knots = np.arange(0, n + 200, 200)

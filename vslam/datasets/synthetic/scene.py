@@ -159,7 +159,8 @@ def _pyramid(image: NDArray[np.floating]) -> list[NDArray[np.uint8]]:
     levels = [level]
     while max(level.shape) > 1:
         height, width = (max(1, n // 2) for n in level.shape)
-        level = cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA)
+        smaller = cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA)
+        level = np.asarray(smaller, np.float32)
         levels.append(level)
     return [np.clip(np.rint(x), 0, 255).astype(np.uint8) for x in levels]
 

@@ -93,7 +93,7 @@ def roof(
     for sign in (-1, 1):
         eave = np.array([-w / 2 - over, -h + drop, d / 2 + sign * (d / 2 + over)])
         top = np.array([-w / 2 - over, ridge[1], ridge[2]])
-        length = np.linalg.norm(eave - top)
+        length = float(np.linalg.norm(eave - top))
         parts.append(patches(top, np.array([w + 2 * over, 0, 0]), eave - top, tiles,
                              uv=(rng.random(), w / 5.0, 0, rng.random(), 0, length / 5.0),
                              detail=fine, detail_size=0.9, gain=tone, thing=thing))  # fmt: skip

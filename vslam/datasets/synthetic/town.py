@@ -145,7 +145,7 @@ class _Builder:
 
     def _sign(self) -> tuple[int, int]:
         face, alpha = textures.sign(self._rng)
-        back = 95.0 + 5.0 * textures.noise(self._rng, *face.shape, 30.0)
+        back = 95.0 + 5.0 * textures.noise(self._rng, face.shape[0], face.shape[1], 30.0)
         return self._atlas.add(face, alpha), self._atlas.add(back, alpha)
 
     def _roof_tiles(self) -> textures.Grey:
@@ -201,7 +201,7 @@ class _Builder:
             for across, front in walls:
                 grey, lit = facade(rng, lived, style, (across, height), front=front)
                 sides.append(self._atlas.add(grey))
-                lights.append(self._atlas.add(120 + 110 * lit, 255 * (lit > 0)) if night else -1)
+                lights.append(self._atlas.add(120 + 110 * lit, 255.0 * (lit > 0)) if night else -1)
             thing = self._next
             house = solids.join([
                 solids.walls(size, sides, lights, self._plaster, thing=thing),

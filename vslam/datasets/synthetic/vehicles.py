@@ -103,7 +103,7 @@ def _paint_side(
     cabin = np.zeros((height, width), np.uint8)
     cv2.fillPoly(cabin, [at], 255)
     cabin[belt:] = 0
-    cabin = cv2.erode(cabin, np.ones((9, 19), np.uint8), borderValue=0)
+    cabin = np.asarray(cv2.erode(cabin, np.ones((9, 19), np.uint8), borderValue=0), np.uint8)
     shine = 24 + 22 * np.clip(noise(rng, height, width, 90.0, 3), -1, 2)
     grey = np.where(cabin > 0, shine, grey).astype(np.float32)
     starts = [x for x, g in zip(at[:, 0], glass, strict=True) if g]

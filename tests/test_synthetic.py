@@ -24,8 +24,9 @@ from vslam.datasets.synthetic.routes import (
 )
 from vslam.datasets.synthetic.scene import AtlasBuilder, join, patches
 from vslam.datasets.synthetic.shadows import cast_shadows
+from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.solids import turn
-from vslam.datasets.synthetic.town import Variation, build_town
+from vslam.datasets.synthetic.town import build_town
 from vslam.errors import InputError
 
 CAMERA = StereoCamera(360.0, 360.0, 300.3, 95.7, 0.54, 620, 190)

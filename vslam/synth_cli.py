@@ -61,7 +61,7 @@ def synth(
 ) -> None:
     """Render a town in KITTI format, with exact ground truth."""
     from vslam.datasets.synthetic import ROUTES, built_in_route, route_of_poses, store
-    from vslam.datasets.synthetic.town import Variation
+    from vslam.datasets.synthetic.site import Variation
     from vslam.info import available_cores
     from vslam.progress import render_bar
     from vslam.trajectory import read_kitti_poses

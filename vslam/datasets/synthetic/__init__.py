@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from vslam.datasets.kitti import KittiSequence, open_kitti
 from vslam.datasets.synthetic.routes import ROUTES, Route, built_in_route, route_of_poses
+from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import OnFrame, cache_folder, render_sequence
-from vslam.datasets.synthetic.town import Variation
 
 __all__ = [
     "ROUTES",

@@ -14,8 +14,9 @@ from vslam.datasets.synthetic.camera_effects import sensor_image
 from vslam.datasets.synthetic.passes import Passes
 from vslam.datasets.synthetic.render import Renderer
 from vslam.datasets.synthetic.routes import Route
+from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import OnFrame, check_disk, write_png, writing
-from vslam.datasets.synthetic.town import Variation, build_town
+from vslam.datasets.synthetic.town import build_town
 
 _LATERAL, _HEADING, _HEIGHT = 1.4, 14.0, 0.25  # largest changes: m, degrees, m
 _APART = 40.0  # m between different places

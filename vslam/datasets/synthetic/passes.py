@@ -13,7 +13,8 @@ from vslam.datasets.synthetic.render import Light
 from vslam.datasets.synthetic.routes import CAMERA_HEIGHT, Route
 from vslam.datasets.synthetic.scene import Surfaces, join
 from vslam.datasets.synthetic.shadows import ShadowMap, cast_shadows
-from vslam.datasets.synthetic.town import AFTER, BEFORE, Town, Variation
+from vslam.datasets.synthetic.site import AFTER, BEFORE, Variation
+from vslam.datasets.synthetic.town import Town
 
 _NEAR, _LEFT = 60.0, 75.0  # m: a place was passed, and has been left again
 _SUN_STEP = 40  # frames between two positions of the sun

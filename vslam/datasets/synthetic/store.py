@@ -23,7 +23,8 @@ from vslam.datasets.synthetic.camera_effects import sensor_image
 from vslam.datasets.synthetic.passes import Passes
 from vslam.datasets.synthetic.render import Renderer
 from vslam.datasets.synthetic.routes import RATE, Route
-from vslam.datasets.synthetic.town import Variation, build_town
+from vslam.datasets.synthetic.site import Variation
+from vslam.datasets.synthetic.town import build_town
 from vslam.errors import InputError
 from vslam.trajectory import write_kitti
 

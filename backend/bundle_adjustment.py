@@ -13,11 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.camera import CHI2_MONO, CHI2_STEREO
 from vslam.geometry import compose, orthonormalised, se3_exp
 from vslam.kernels import kernel
-
-CHI2_MONO = 5.991  # 95 % quantiles with 2 and 3 degrees of freedom
-CHI2_STEREO = 7.815
 
 
 @dataclass(frozen=True)

@@ -5,15 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import StereoCamera
+from vslam.camera import CHI2_MONO, CHI2_STEREO, StereoCamera
 from vslam.config import Config
 from vslam.features import CELL, FeatureGrid
 from vslam.kernels import hamming, kernel
 from vslam.map import Map
 from vslam.observations import collect_landmarks, link, merge_landmarks, observed_by, predict_octave
-
-CHI2_MONO = 5.991  # 95 % quantiles with 2 and 3 degrees of freedom
-CHI2_STEREO = 7.815
 
 
 def fuse_neighbourhood(map_: Map, keyframe: int, camera: StereoCamera, config: Config) -> None:

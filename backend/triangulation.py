@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import StereoCamera
+from vslam.camera import CHI2_MONO, CHI2_STEREO, StereoCamera
 from vslam.config import Config
 from vslam.kernels import hamming, kernel
 from vslam.map import NONE, Map
 from vslam.observations import link_many
 
-CHI2_MONO = 5.991  # 95 % quantiles with 2 and 3 degrees of freedom
-CHI2_STEREO = 7.815
 EPIPOLAR_CHI2 = 3.84  # 95 % quantile with 1 degree of freedom
 MIN_CLOSE = 100  # stereo points mapped even if none is close (ORB-SLAM2, III-E)
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from vslam.camera import CHI2_MONO, CHI2_STEREO
 from vslam.geometry import compose, orthonormalised, se3_exp
 from vslam.kernels import kernel
 
-# 95 % quantiles of chi-square with 2 and 3 degrees of freedom (ORB-SLAM, section V).
-CHI2_MONO = 5.991
-CHI2_STEREO = 7.815
 ROUNDS = 4
 ITERATIONS = 10
 

@@ -111,7 +111,7 @@ def test_landmarks_lie_on_the_walls_and_the_ground(corridor):
     x, y, z = slam.map.arrays.xyz[slam.map.living_landmarks()].T
     assert len(x) > 500
     distance = np.min([np.abs(y - 1.5), np.abs(x + 4.0), np.abs(x - 4.5), np.abs(z - 32.0)], axis=0)
-    assert np.median(distance) < 0.05
+    assert np.median(distance) < 0.08  # metres; far points of coarse octaves count as much
     assert np.mean(distance < 0.3) > 0.8
 
 

@@ -10,6 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+# 95 % quantiles of chi-square with 2 and 3 degrees of freedom: the largest reprojection error, in
+# variances, of an inlier seen by one eye (u, v) or by both (u, v, u_right). ORB-SLAM2, III-C.
+CHI2_MONO = 5.991
+CHI2_STEREO = 7.815
+
 
 @dataclass(frozen=True)
 class StereoCamera:

@@ -94,11 +94,12 @@ def run(
     from vslam.datasets import open_sequence
     from vslam.info import available_cores, numba_caches
     from vslam.perturb import parse_perturbation
-    from vslam.progress import progress_bar, render_bar
+    from vslam.progress import announce, progress_bar, render_bar
     from vslam.run import RunSettings
     from vslam.runfolder import create_run_folder, write_results
 
     thresholds = Config() if config is None else load_config(config)
+    first_run = not numba_caches()  # rendering leaves caches, too
     with render_bar(shown=not quiet) as on_render:
         sequence = open_sequence(
             dataset, data, seq,
@@ -121,10 +122,13 @@ def run(
     )
     from vslam.pipeline import run_sequence
     from vslam.recorder import NullRecorder, RerunRecorder
+    from vslam.warmup import compile_kernels
 
     recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
-    state = "starting" if numba_caches() else "compiling kernels, once"
-    with progress_bar(len(sequence), shown=not quiet, state=state) as on_frame:
+    if first_run:
+        announce("first run: compiling the kernels, less than a minute ...", shown=not quiet)
+        compile_kernels()
+    with progress_bar(len(sequence), shown=not quiet) as on_frame:
         outcome = run_sequence(sequence, perturbation, settings, recorder, on_frame=on_frame)
     evaluation, remark = write_results(folder, outcome, ply=ply)
     if not quiet:

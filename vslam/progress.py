@@ -27,9 +27,7 @@ class _FramesPerSecond(ProgressColumn):
 
 
 @contextmanager
-def progress_bar(
-    total: int, *, shown: bool, state: str = "starting"
-) -> Iterator[Callable[[TrackResult], None]]:
+def progress_bar(total: int, *, shown: bool) -> Iterator[Callable[[TrackResult], None]]:
     """Yield the callable to give each tracked frame to: frames, fps, tracking state, time left.
 
     The bar is drawn on stderr, so that stdout stays for results.
@@ -42,7 +40,7 @@ def progress_bar(
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
-        task = progress.add_task("", total=total, state=state)
+        task = progress.add_task("", total=total, state="starting")
 
         def on_frame(result: TrackResult) -> None:
             progress.update(task, completed=result.index + 1, state=str(result.state))
@@ -74,3 +72,9 @@ def render_bar(*, shown: bool) -> Iterator[Callable[[int, int], None]]:
     finally:
         if tasks:
             progress.stop()
+
+
+def announce(message: str, *, shown: bool) -> None:
+    """Say on stderr what takes a while."""
+    if shown:
+        Console(stderr=True).print(message)

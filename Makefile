@@ -11,8 +11,8 @@ help:  ## show this list
 
 install: $(INSTALLED)  ## make .venv and install vslam with its tools into it
 
-demo: kitti $(INSTALLED)  ## run on KITTI 00 under changing light and write report and recording
-	$(BIN)/vslam run --seq 00 --max-frames 200 --perturb brightness
+demo: $(INSTALLED)  ## render a town, run on it under changing light, write report and recording
+	$(BIN)/vslam run --dataset synthetic --seq demo --perturb brightness
 
 test: $(INSTALLED)  ## run the tests, then the built wheel in a clean environment
 	$(BIN)/python -m pytest
@@ -52,18 +52,3 @@ $(INSTALLED): pyproject.toml constraints.txt
 	fi
 	$(BIN)/python -m pip install --quiet -e '.[dev]' -c constraints.txt
 	@touch $@
-
-.PHONY: kitti
-kitti:
-	@root="$${KITTI_ROOT:-data/kitti}"; \
-	if [ ! -d "$$root/sequences/00" ] && [ ! -d "$$root/dataset/sequences/00" ]; then \
-	  printf '%s\n' \
-	    "The demo needs KITTI odometry, and $$root has no sequence 00. (A synthetic data set that" \
-	    'needs no download is planned, not built.) Get the grayscale images and the calibration' \
-	    'files, and for errors in the report the ground truth poses, from' \
-	    '  https://www.cvlibs.net/datasets/kitti/eval_odometry.php' \
-	    'unpack them and name the folder that holds sequences/:' \
-	    '  export KITTI_ROOT=/path/to/kitti; make demo' \
-	    'datasets.md shows the layout.' >&2; \
-	  exit 1; \
-	fi

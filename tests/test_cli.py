@@ -105,7 +105,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--sensor mono", ["--sensor mono", "not built yet", "'stereo'"]),
         ("--sensor rgbd", ["--sensor rgbd", "not built yet"]),
         ("--sensor lidar", ["--sensor lidar", "unknown"]),
-        ("--dataset synthetic", ["--dataset synthetic", "not built"]),
+        ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
         ("--dataset euroc", ["--dataset euroc", "unknown"]),
         ("", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
         ("--config nothing.json", ["nothing.json", "configuration"]),

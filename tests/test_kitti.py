@@ -136,8 +136,7 @@ def test_missing_root_says_where_to_get_the_data(tmp_path):
         "22 GB",
         "--data",
         "$KITTI_ROOT",
-        "synthetic",
-        "not built",
+        "--dataset synthetic needs no download",
     )
 
 
@@ -282,11 +281,9 @@ def test_bad_poses(root, line, part):
     refused(root, "poses/00.txt", part)
 
 
-def test_unknown_and_unbuilt_data_sets(root):
+def test_unknown_data_set(root):
     with pytest.raises(InputError, match="--dataset euroc: unknown"):
         open_sequence("euroc", root, "00")
-    with pytest.raises(InputError, match="--dataset synthetic: not built in this version"):
-        open_sequence("synthetic", root, "00")
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="KITTI sample absent")

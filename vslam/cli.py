@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam import __version__
+from vslam import __version__, synth_cli
 from vslam.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-
 _DETECTORS = {"none": True, "bow": False, "capsule": False, "capsule-pruned": False}
 _DETECTORS |= {"alexnet": False, "vgg16": False}
 _SENSORS = {"stereo": True, "mono": False, "rgbd": False}
@@ -31,7 +30,7 @@ Data = Annotated[
     Path,
     typer.Option(envvar="KITTI_ROOT", help="Folder with the data set, see datasets.md."),
 ]
-Dataset = Annotated[str, typer.Option(help="Data set; this version reads [b]kitti[/b].")]
+Dataset = Annotated[str, typer.Option(help="Data set: [b]kitti[/b] or [b]synthetic[/b].")]
 Seq = Annotated[str, typer.Option(help="Sequence, 00 for example.")]
 Perturb = Annotated[
     str,
@@ -54,6 +53,8 @@ _RUN_EXAMPLES = """
   vslam run --data ~/kitti --seq 00
 
   vslam run --data ~/kitti --seq 06 --perturb brightness:1.5,blur:0.5 --seed 3
+
+  vslam run --dataset synthetic --seq demo
 
   vslam run --seq 00 --max-frames 200 --no-record --quiet
 """
@@ -93,11 +94,17 @@ def run(
     from vslam.datasets import open_sequence
     from vslam.info import available_cores, numba_caches
     from vslam.perturb import parse_perturbation
+    from vslam.progress import announce, progress_bar, render_bar
     from vslam.run import RunSettings
     from vslam.runfolder import create_run_folder, write_results
 
     thresholds = Config() if config is None else load_config(config)
-    sequence = open_sequence(dataset, data, seq, start=start, every=every, max_frames=max_frames)
+    first_run = not numba_caches()  # rendering leaves caches, too
+    with render_bar(shown=not quiet) as on_render:
+        sequence = open_sequence(
+            dataset, data, seq,
+            start=start, every=every, max_frames=max_frames, on_render=on_render,
+        )  # fmt: skip
     perturbation = parse_perturbation(perturb, seed, sequence.timestamps)
     folder = create_run_folder(out, dataset, seq, perturbation.name, detector)
     settings = RunSettings(
@@ -114,12 +121,11 @@ def run(
         config=thresholds,
     )
     from vslam.pipeline import run_sequence
-    from vslam.progress import announce, progress_bar
     from vslam.recorder import NullRecorder, RerunRecorder
     from vslam.warmup import compile_kernels
 
     recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
-    if not numba_caches():
+    if first_run:
         announce("first run: compiling the kernels, less than a minute ...", shown=not quiet)
     compile_kernels()
     with progress_bar(len(sequence), shown=not quiet) as on_frame:
@@ -222,6 +228,9 @@ def info(data: Data = _DATA) -> None:
     if warning := machine.opencv_conflict(found):
         rows.append(("warning", warning))
     _print_rows(rows)
+
+
+synth_cli.register(app)
 
 
 @app.callback(invoke_without_command=True)

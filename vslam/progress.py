@@ -12,6 +12,7 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     Task,
+    TaskID,
     TextColumn,
     TimeRemainingColumn,
 )
@@ -45,6 +46,32 @@ def progress_bar(total: int, *, shown: bool) -> Iterator[Callable[[TrackResult],
             progress.update(task, completed=result.index + 1, state=str(result.state))
 
         yield on_frame
+
+
+@contextmanager
+def render_bar(*, shown: bool) -> Iterator[Callable[[int, int], None]]:
+    """Yield the callable that takes frames rendered and in all; no bar until its first call."""
+    columns = (
+        TextColumn("rendering"),
+        MofNCompleteColumn(),
+        BarColumn(),
+        _FramesPerSecond(),
+        TimeRemainingColumn(),
+    )
+    progress = Progress(*columns, console=Console(stderr=True), disable=not shown)
+    tasks: list[TaskID] = []
+
+    def on_frame(done: int, total: int) -> None:
+        if not tasks:
+            progress.start()
+            tasks.append(progress.add_task("", total=total, completed=done))
+        progress.update(tasks[0], completed=done)
+
+    try:
+        yield on_frame
+    finally:
+        if tasks:
+            progress.stop()
 
 
 def announce(message: str, *, shown: bool) -> None:

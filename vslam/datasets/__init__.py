@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from vslam.datasets.sequence import Sequence
@@ -16,8 +17,12 @@ def open_sequence(
     start: int = 0,
     every: int = 1,
     max_frames: int | None = None,
+    on_render: Callable[[int, int], None] | None = None,
 ) -> Sequence:
     """Open a sequence and check the frames that ``start``, ``every``, ``max_frames`` select.
+
+    A synthetic sequence has no ``root``: it is rendered into the user's cache on first use, and
+    ``on_render`` is told the frames done and in all.
 
     Raises:
         InputError: unknown data set, or bad input as the reader of the data set says.
@@ -27,7 +32,11 @@ def open_sequence(
 
         return open_kitti(root, name, start=start, every=every, max_frames=max_frames)
     if dataset == "synthetic":
-        raise InputError(
-            "--dataset synthetic: not built in this version; use --dataset kitti, see datasets.md."
+        from vslam.datasets.synthetic import open_synthetic
+
+        return open_synthetic(
+            name, start=start, every=every, max_frames=max_frames, on_frame=on_render
         )
-    raise InputError(f"--dataset {dataset}: unknown data set; this version reads kitti.")
+    raise InputError(
+        f"--dataset {dataset}: unknown data set; this version reads kitti and synthetic."
+    )

@@ -179,8 +179,7 @@ def _find_root(root: Path) -> Path:
     raise InputError(
         f"{root}: no KITTI odometry data here (no folder 'sequences'); download the grayscale "
         f"images (22 GB), calibration files and ground truth poses from {_HOME}, unpack them into "
-        "one folder and name it with --data or $KITTI_ROOT (--dataset synthetic, which will need "
-        "no download, is not built in this version)."
+        "one folder and name it with --data or $KITTI_ROOT; --dataset synthetic needs no download."
     )
 
 

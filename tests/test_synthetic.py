@@ -1,0 +1,387 @@
+"""The rendered towns: exact geometry, reproducible bytes, bad input."""
+
+from __future__ import annotations
+
+import shutil
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from vslam.camera import StereoCamera
+from vslam.datasets import open_sequence
+from vslam.datasets.kitti import open_kitti
+from vslam.datasets.synthetic import store
+from vslam.datasets.synthetic.camera_effects import sensor_image
+from vslam.datasets.synthetic.passes import Passes
+from vslam.datasets.synthetic.render import Light, Renderer
+from vslam.datasets.synthetic.routes import (
+    CAMERA_HEIGHT,
+    ROUTES,
+    built_in_route,
+    route_of_poses,
+)
+from vslam.datasets.synthetic.scene import AtlasBuilder, join, patches
+from vslam.datasets.synthetic.shadows import cast_shadows
+from vslam.datasets.synthetic.site import Variation
+from vslam.datasets.synthetic.solids import turn
+from vslam.datasets.synthetic.town import build_town
+from vslam.errors import InputError
+
+CAMERA = StereoCamera(360.0, 360.0, 300.3, 95.7, 0.54, 620, 190)
+BY_DAY = Light(np.array([0.0, -0.8, -0.6]), visibility=1e9, haze=0.0)
+SIDE = 1024
+DOTS = 8  # a row and a column
+
+
+def straight(n=64, step=1.0):
+    """Poses of a straight drive with a little sway."""
+    T = np.tile(np.eye(4), (n, 1, 1))
+    T[:, 2, 3] = step * np.arange(n)
+    T[:, 0, 3] = 0.2 * np.sin(0.1 * np.arange(n))
+    return T
+
+
+@pytest.fixture(scope="module")
+def route():
+    return route_of_poses(straight(), "street")
+
+
+@pytest.fixture(scope="module")
+def town(route):
+    return build_town(route, Variation(seed=3))
+
+
+def dotted_world():
+    """A wall with bright dots that stands askew before grey ground; dots in world coordinates."""
+    y, x = np.mgrid[0:SIDE, 0:SIDE] + 0.5
+    pitch = SIDE / DOTS
+    from_dot = ((x % pitch) - pitch / 2) ** 2 + ((y % pitch) - pitch / 2) ** 2
+    atlas = AtlasBuilder()
+    wall = atlas.add(20 + 180 * np.exp(-0.5 * from_dot / 9.0**2))
+    plain = atlas.add(np.full((4, 4), 4.0))
+    origin, s, t = (
+        np.array([-4.0, -3.2, 11.0]),
+        np.array([7.6, 0.1, 3.0]),
+        np.array([0.2, 4.1, 0.3]),
+    )
+    surfaces = join(
+        [
+            patches(origin, s, t, wall, thing=0),
+            patches(
+                np.array([-40.0, 1.65, -10.0]),
+                np.array([80.0, 0, 0]),
+                np.array([0, 0, 90.0]),
+                plain,
+            ),
+        ]
+    )
+    at = (np.stack(np.meshgrid(np.arange(DOTS), np.arange(DOTS)), -1).reshape(-1, 2) + 0.5) / DOTS
+    return surfaces, atlas.build(), plain, origin + at[:, :1] * s + at[:, 1:] * t
+
+
+def draw(surfaces, atlas, sky, T_wc, threads=1):
+    renderer = Renderer(CAMERA, atlas, sky, threads)
+    empty = cast_shadows(surfaces.select(surfaces.thing < -1), atlas, BY_DAY.sun)
+    views = renderer.stereo(surfaces, empty, BY_DAY, T_wc)
+    renderer.close()
+    return views
+
+
+def centroids(image, near):
+    """Centres of gravity of bright dots close to the places ``near``."""
+    found = []
+    for u, v in near:
+        c, r = round(u), round(v)
+        patch = image[r - 6 : r + 7, c - 6 : c + 7].astype(np.float64)
+        weight = np.clip(patch - 1.25 * np.percentile(patch, 20), 0, None) ** 2
+        rows, columns = np.mgrid[r - 6 : r + 7, c - 6 : c + 7]
+        found.append([(columns * weight).sum(), (rows * weight).sum()] / weight.sum())
+    return np.array(found)
+
+
+@pytest.mark.parametrize("yaw", [-0.12, 0.0, 0.2])
+def test_projection_and_disparity_are_exact(yaw):
+    surfaces, atlas, sky, dots = dotted_world()
+    T_wc = np.eye(4)
+    T_wc[:3, :3] = turn(yaw)
+    T_wc[:3, 3] = [0.3, -0.4, 0.7]
+    left, right = draw(surfaces, atlas, sky, T_wc)
+    uvr = CAMERA.project((dots - T_wc[:3, 3]) @ T_wc[:3, :3])
+    inside = (uvr > 16).all(1) & (uvr[:, :2] < [604, 174]).all(1)
+    uvr = uvr[inside]
+    assert len(uvr) > 25
+    seen = centroids(left.image, uvr[:, :2])
+    error = np.linalg.norm(seen - uvr[:, :2], axis=1)
+    assert error.max() < 0.05
+    seen_right = centroids(right.image, uvr[:, [2, 1]])
+    at = np.rint(uvr[:, :2]).astype(int)
+    z = left.depth[at[:, 1], at[:, 0]]
+    # The depth belongs to the pixel's centre, the disparity to the dot.
+    slope = np.abs(np.gradient(left.depth, axis=1)[at[:, 1], at[:, 0]])
+    assert (
+        np.abs(seen[:, 0] - seen_right[:, 0] - CAMERA.bf / z).max()
+        < 0.05 + (CAMERA.bf / z**2 * slope).max()
+    )
+
+
+def test_depth_is_that_of_the_plane():
+    surfaces, atlas, sky, _ = dotted_world()
+    left, _ = draw(surfaces, atlas, sky, np.eye(4))
+    v = np.arange(150, 190)
+    expected = 1.65 * CAMERA.fy / (v - CAMERA.cy)
+    np.testing.assert_allclose(left.depth[150:, 40], expected, rtol=1e-5)
+    assert left.depth[2, 2] == 0  # sky
+
+
+def test_ground_under_the_camera_is_clipped_not_torn():
+    surfaces, atlas, sky, _ = dotted_world()
+    down = np.eye(4)
+    down[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # looks at the ground below
+    left, _ = draw(surfaces, atlas, sky, down)
+    np.testing.assert_allclose(left.depth, 1.65, rtol=1e-5)
+
+
+def test_cut_outs_layers_and_near_before_far():
+    atlas = AtlasBuilder()
+    holes = np.zeros((8, 8))
+    holes[:, 4:] = 255
+    plain = [atlas.add(np.full((8, 8), grey)) for grey in (40.0, 160.0)]
+    cut = atlas.add(np.full((8, 8), 100.0), holes)
+    wide = np.array([40.0, 0, 0]), np.array([0, 30.0, 0])
+    far = patches(np.array([-20.0, -15.0, 20.0]), *wide, plain[0], thing=0)
+    marked = patches(np.array([-20.0, -15.0, 20.0]), *wide, plain[1], layer=1, thing=0)
+    near = patches(np.array([-20.0, -15.0, 10.0]), *wide, cut, thing=0)
+    middle = CAMERA.height // 2
+    alone, _ = draw(far, atlas.build(), plain[0], np.eye(4))
+    left, _ = draw(join([marked, near, far]), atlas.build(), plain[0], np.eye(4))
+    assert left.depth[middle, 500] == pytest.approx(10.0)
+    assert left.depth[middle, 100] == pytest.approx(20.0)
+    assert left.image[middle, 100] == pytest.approx(4 * alone.image[middle, 100], rel=1e-4)
+
+
+def test_shadow_falls_away_from_the_sun():
+    atlas = AtlasBuilder()
+    grey = atlas.add(np.full((4, 4), 100.0))
+    ground = patches(
+        np.array([-40.0, 1.65, 0.0]), np.array([80.0, 0, 0]), np.array([0, 0, 80.0]), grey
+    )
+    wall = patches(
+        np.array([0.0, -2.35, 10.0]), np.array([0, 0, 6.0]), np.array([0, 4.0, 0]), grey, thing=0
+    )
+    scene = join([ground, wall])
+    built = atlas.build()
+    light = Light(np.array([-0.6, -0.8, 0.0]), visibility=1e9, haze=0.0)  # from the left
+    renderer = Renderer(CAMERA, built, grey)
+    left, _ = renderer.stereo(scene, cast_shadows(scene, built, light.sun), light, np.eye(4))
+    u, v, _ = CAMERA.project(np.array([[-1.5, 1.65, 13.0], [1.5, 1.65, 13.0], [4.0, 1.65, 13.0]])).T
+    sunny, shaded, beyond = left.image[np.rint(v).astype(int), np.rint(u).astype(int)]
+    assert shaded < 0.5 * sunny
+    assert beyond == pytest.approx(sunny, rel=1e-3)
+
+
+def test_nothing_stands_near_a_camera(route, town):
+    solid = town.surfaces.select(town.surfaces.thing >= 0)
+    s, t = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, 15), np.linspace(0, 1, 15)))
+    points = (
+        solid.origin[:, None]
+        + s[:, None] * solid.edge_s[:, None]
+        + t[:, None] * solid.edge_t[:, None]
+    ).reshape(-1, 3)
+    for camera in route.T_wc[:, :3, 3]:
+        assert np.linalg.norm(points - camera, axis=1).min() >= 2.5
+
+
+def test_streets_end_in_something(route, town):
+    """Straight ahead and to the sides, no ray runs free for 150 m."""
+    renderer = Renderer(route.camera, town.atlas, town.sky)
+    moment = Passes(route, town, Variation(seed=3)).at(30)
+    left, _ = renderer.stereo(moment.surfaces, moment.shadows, moment.light, route.T_wc[30])
+    horizon = round(route.camera.cy) - 6
+    row = left.depth[horizon - 12 : horizon].max(axis=0)
+    assert (row > 0).mean() > 0.97
+
+
+def test_places_match_themselves_only(route, town):
+    renderer = Renderer(route.camera, town.atlas, town.sky)
+    moment = Passes(route, town, Variation(seed=3)).at(0)
+    orb = cv2.ORB_create(1500)
+    described = []
+    for frame, aside in ((4, 0.0), (4, 0.5), (56, 0.0)):
+        T = route.T_wc[frame].copy()
+        T[0, 3] += aside
+        view, _ = renderer.stereo(moment.surfaces, moment.shadows, moment.light, T)
+        image = sensor_image(view.image, route.camera, yaw_rate=0.0, night=0.0, key=(0, frame, 0))
+        described.append(orb.detectAndCompute(image, None))
+
+    def agreeing(a, b):
+        pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(a[1], b[1], k=2)
+        good = [m for m, n in pairs if m.distance < 0.75 * n.distance]
+        if len(good) < 8:
+            return 0
+        xy = [np.float32([p[0][i].pt for i in k]) for p, k in (
+            (a, [m.queryIdx for m in good]), (b, [m.trainIdx for m in good]))]  # fmt: skip
+        _, inliers = cv2.findFundamentalMat(*xy, cv2.FM_RANSAC, 1.0, 0.999)
+        return 0 if inliers is None else int(inliers.sum())
+
+    assert agreeing(described[0], described[1]) > 150
+    assert agreeing(described[0], described[2]) < 25
+
+
+@pytest.fixture(scope="module")
+def rendered(route, town, tmp_path_factory):
+    cache = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store, "build_town", lambda *_: town)
+        return store.render_sequence(
+            route, Variation(seed=3), cache, until=3, depth=True, threads=1
+        )
+
+
+def tree(root):
+    return {p.relative_to(root): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+def test_same_seed_same_bytes_on_any_number_of_threads(route, rendered, tmp_path):
+    again = store.render_sequence(
+        route, Variation(seed=3), tmp_path, until=3, depth=True, threads=2
+    )
+    assert tree(again) == tree(rendered)
+
+
+def test_tree_is_kitti_with_depth(route, rendered):
+    sequence = open_kitti(rendered, "street")
+    assert len(sequence) == 3
+    assert sequence.camera == route.camera
+    np.testing.assert_allclose(sequence.ground_truth, route.ground_truth[:3], atol=1e-9)
+    depth = cv2.imread(str(rendered / "sequences/street/depth_0/000001.png"), cv2.IMREAD_UNCHANGED)
+    assert depth.dtype == np.uint16
+    foot = 1.65 * route.camera.fy / (route.camera.height - 1 - route.camera.cy)
+    assert depth[-1, 620] / 100 == pytest.approx(foot, abs=0.05)
+
+
+def test_rendering_resumes_after_a_kill(route, town, rendered, tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "build_town", lambda *_: town)
+    whole = tree(rendered)
+    shutil.copytree(rendered, tmp_path / rendered.name)
+    folder = tmp_path / rendered.name / "sequences/street"
+    kept = folder / "image_0/000000.png"
+    before = kept.stat().st_mtime_ns
+    (folder / "image_1/000001.png").unlink()
+    (folder / "image_0/.000002.png.99").write_bytes(b"cut sho")
+    calls = []
+    root = store.render_sequence(
+        route, Variation(seed=3), tmp_path, until=3, depth=True,
+        on_frame=lambda *done: calls.append(done),
+    )  # fmt: skip
+    (folder / "image_0/.000002.png.99").unlink()
+    assert len(calls) == 1
+    assert kept.stat().st_mtime_ns == before
+    assert tree(root) == whole
+
+
+def test_whole_sequence_has_a_manifest_and_is_not_rendered_twice(tmp_path, monkeypatch):
+    small = route_of_poses(straight(24), "short")
+    monkeypatch.setattr(store, "_render", fake := Renderings())
+    root = store.render_sequence(small, Variation(), tmp_path)
+    store.render_sequence(small, Variation(), tmp_path)
+    assert fake.calls == 1
+    (found,) = store.list_stored(tmp_path)
+    assert (found.name, found.frames, found.complete, found.root) == ("short", 24, True, root)
+    assert store.clean(tmp_path, "short") > 0
+    assert not store.list_stored(tmp_path)
+
+
+class Renderings:
+    """Stands in for the renderer: writes files without looking at the town."""
+
+    calls = 0
+
+    def __call__(self, route, variation, folder, missing, depth, *_):
+        self.calls += 1
+        for k in missing:
+            for eye in ("image_0", "image_1"):
+                (folder / eye / f"{k:06d}.png").write_bytes(b"png")
+
+
+def test_change_between_passes():
+    n = 85
+    there_and_back = np.concatenate([straight(n), straight(n)])
+    there_and_back[n:, 2, 3] = there_and_back[n - 1 :: -1, 2, 3]
+    there_and_back[n:, 0, 3] -= 3.2
+    there_and_back[n:, :3, :3] = turn(np.pi)
+    route = route_of_poses(there_and_back, "twice")
+    variation = Variation(change=1.0, moving=3)
+    town = build_town(route, variation)
+    passes = Passes(route, town, variation)
+    first, last = passes.at(5), passes.at(len(route.T_wc) - 5)
+    assert first.night < 0.05 < 0.8 < last.night
+    assert first.light.sun @ last.light.sun < 0.9
+    things = [set(m.surfaces.thing.tolist()) for m in (first, last)]
+    assert len(things[0] - things[1]) > 10
+    assert len(things[1] - things[0]) > 10
+
+
+@pytest.mark.parametrize("name", ROUTES)
+def test_routes(name):
+    route = built_in_route(name)
+    xyz = route.T_wc[:, :3, 3]
+    steps = np.linalg.norm(np.diff(xyz, axis=0), axis=1)
+    assert steps.max() < 3.0
+    up = route.terrain.height(xyz[:, [0, 2]])
+    np.testing.assert_allclose(-xyz[:, 1] - up, CAMERA_HEIGHT, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(route.T_wc[:, :3, :3]), 1.0, atol=1e-12)
+    assert revisits(xyz) >= {"demo": 1, "00": 4, "02": 2, "05": 3}.get(name, 0)
+    if name == "00":
+        assert len(route.T_wc) >= 1500
+
+
+def revisits(xyz):
+    """Stretches of at least 15 frames within 4 m of a place passed 150 frames before."""
+    near = [
+        i >= 150 and np.linalg.norm(xyz[: i - 149] - xyz[i], axis=1).min() < 4.0
+        for i in range(len(xyz))
+    ]
+    edges = np.flatnonzero(np.diff(np.r_[0, near, 0]))
+    return int((np.diff(edges)[::2] >= 15).sum())
+
+
+def test_a_road_has_one_height_though_the_poses_disagree():
+    T = np.concatenate([straight(), straight()])
+    T = T[np.r_[0:64, 127:63:-1]]  # there and back
+    T[64:, 1, 3] -= 1.2
+    route = route_of_poses(T, "drift")
+    np.testing.assert_allclose(route.T_wc[10, 1, 3], route.T_wc[117, 1, 3], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "part"),
+    [
+        (lambda T: T[:10], "at least 20"),
+        (lambda T: np.where(np.arange(len(T))[:, None, None] == 7, np.nan, T), "NaN"),
+        (lambda T: T * [[[1, 1, 1, 8]]], "pose 1 is 8.0 m from the one before it"),
+        (lambda T: T * [[[1, 1, 1, 0.1]]], "at least 20 m"),
+    ],
+)
+def test_impossible_trajectories(spoil, part):
+    with pytest.raises(InputError, match=part):
+        route_of_poses(spoil(straight()), "mine")
+
+
+def test_unknown_route():
+    with pytest.raises(InputError, match="choose one of demo, 00"):
+        open_sequence("synthetic", None, "77")
+
+
+def test_disk_too_small_says_how_much_it_needs(route, tmp_path, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1_000_000))
+    with pytest.raises(InputError, match=r"needs 0\.0\d? GB|needs 0\.\d GB"):
+        store.render_sequence(route, Variation(), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_unwritable_cache(route, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"cannot be written.*VSLAM_CACHE"):
+        store.render_sequence(route, Variation(), tmp_path / "file" / "cache")

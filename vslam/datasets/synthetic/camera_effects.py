@@ -1,0 +1,65 @@
+"""From light to bytes: what lens and sensor add. Deterministic by seed, frame and eye."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import StereoCamera
+
+SHUTTER = 0.004  # s
+_BLUR = 0.55  # px, deviation of the lens
+_VIGNETTE = 0.22  # light lost in the corners
+_READ_NOISE, _SHOT_NOISE = 0.9, 0.022  # grey levels; grey levels squared for each grey level
+_KNEE = 190.0  # grey where the response bends towards saturation
+
+
+def sensor_image(
+    radiance: NDArray[np.float32],
+    camera: StereoCamera,
+    *,
+    yaw_rate: float,
+    night: float,
+    key: tuple[int, int, int],
+) -> NDArray[np.uint8]:
+    """What the camera writes.
+
+    Args:
+        radiance: ``(H, W)`` from `render.View.image`.
+        camera: for the scale of motion blur.
+        yaw_rate: rad/s.
+        night: 0 to 1; longer exposure and more gain.
+        key: seed, frame, eye.
+    """
+    image = radiance
+    streak = abs(yaw_rate) * SHUTTER * (1 + 2 * night) * camera.fx
+    if streak > 0.2:
+        kernel = _streak(streak)[None, :]
+        blurred = cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE)
+        image = np.asarray(blurred, np.float32)
+    image = np.asarray(cv2.GaussianBlur(image, (0, 0), _BLUR), np.float32)
+    image = image * _vignette(camera)
+    over = np.maximum(image - _KNEE, 0)
+    room = 255.0 - _KNEE
+    image = np.minimum(image, _KNEE) + room * over / (over + room)
+    rng = np.random.default_rng(key)
+    gain = 1.0 + 5.0 * night
+    deviation = np.sqrt(_READ_NOISE**2 + _SHOT_NOISE * np.maximum(image, 0)) * np.float32(gain)
+    image = image + deviation * rng.standard_normal(image.shape, np.float32)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def _streak(length: float) -> NDArray[np.float32]:
+    """Box of ``length`` pixels about its middle, the ends weighted by the part they cover."""
+    half = int(np.ceil(length / 2 + 0.5))
+    at = np.arange(-half, half + 1)
+    weight = np.clip(length / 2 + 0.5 - np.abs(at), 0, 1)
+    return np.asarray(weight / weight.sum(), np.float32)
+
+
+def _vignette(camera: StereoCamera) -> NDArray[np.float32]:
+    u = (np.arange(camera.width) - camera.cx) / camera.fx
+    v = (np.arange(camera.height) - camera.cy) / camera.fx
+    square = (u[None, :] ** 2 + v[:, None] ** 2) / (u.max() ** 2 + v.max() ** 2)
+    return np.asarray(1.0 - _VIGNETTE * square**1.5, np.float32)

@@ -1,0 +1,69 @@
+"""The textures that a whole town shares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vslam.datasets.synthetic import textures
+from vslam.datasets.synthetic.scene import AtlasBuilder
+from vslam.datasets.synthetic.textures import Rng
+
+
+@dataclass(frozen=True)
+class Palette:
+    """Numbers of textures in the atlas; ``signs`` are pairs of front and back."""
+
+    sky: int
+    twigs: list[int]
+    later_twigs: list[int]
+    needles: list[int]
+    bark: list[int]
+    hedges: list[int]
+    leaves: int
+    fences: list[int]
+    walls: list[int]
+    signs: list[tuple[int, int]]
+    posters: list[int]
+    metal: int
+    lamp: int
+    tiles: list[int]
+    plaster: int
+    render: int
+
+
+def make_palette(rng: Rng, atlas: AtlasBuilder, pool: int) -> Palette:
+    """Paint the textures; ``pool``: how many of what varies most."""
+    add = atlas.add
+    return Palette(
+        sky=add(textures.sky(rng)),
+        twigs=[add(*textures.foliage(rng)) for _ in range(pool)],
+        later_twigs=[add(*textures.foliage(rng, density=0.55)) for _ in range(pool)],
+        needles=[add(*textures.foliage(rng, density=1.6)) for _ in range(6)],
+        bark=[add(textures.bark(rng)) for _ in range(4)],
+        hedges=[add(*textures.hedge(rng)) for _ in range(5)],
+        leaves=add(40 + 22 * textures.noise(rng, 128, 128, 6.0, 3)),
+        fences=[add(*textures.fence(rng)) for _ in range(pool)],
+        walls=[add(textures.garden_wall(rng)) for _ in range(pool)],
+        signs=[_sign(rng, atlas) for _ in range(2 * pool)],
+        posters=[add(textures.poster(rng)) for _ in range(2 * pool)],
+        metal=add(np.full((16, 16), 92.0) + rng.normal(0, 9, (16, 16))),
+        lamp=add(np.full((8, 8), 215.0)),
+        tiles=[add(_roof_tiles(rng)) for _ in range(6)],
+        plaster=add(textures.detail(rng, 0.05, 9.0)),
+        render=add(np.clip(165 + 9 * textures.noise(rng, 256, 256, 90.0, 6), 0, 255)),
+    )
+
+
+def _sign(rng: Rng, atlas: AtlasBuilder) -> tuple[int, int]:
+    face, alpha = textures.sign(rng)
+    back = 95.0 + 5.0 * textures.noise(rng, face.shape[0], face.shape[1], 30.0)
+    return atlas.add(face, alpha), atlas.add(back, alpha)
+
+
+def _roof_tiles(rng: Rng) -> textures.Grey:
+    y, x = np.mgrid[0:256, 0:256]
+    course = 60 + 40 * rng.random() + 13 * np.sin(2 * np.pi * x / 12.8)
+    course = course - 24 * ((y % 16) < 3)
+    return np.clip(course * (1 + 0.13 * textures.noise(rng, 256, 256, 60.0, 6)), 5, 240)

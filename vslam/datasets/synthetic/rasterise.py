@@ -1,0 +1,328 @@
+"""Which surface each sample of an image sees: projection, culling and the z-buffer."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from vslam.kernels import inline, kernel
+
+NEAR = 0.2  # m
+FAR = 400.0  # m
+LAYER_STEP = 1e-3  # relative gain in depth of one layer over another in the same plane
+_SEAM = 1e-6  # overlap of neighbours, in parts of an edge, so that no sample falls between them
+
+# Columns of a row of ``find_visible``: three affine functions of the pixel (u, v) for s/z, t/z and
+# 1/z, two for the texture coordinates over z, then the rest.
+PLANE, TEXTURE, FIRST_ROW, LAST_ROW, TRIANGLE, LAYER = 0, 9, 15, 16, 17, 18
+NUMBER, DETAIL_U, DETAIL_V, DETAIL, AMBIENT, SUN, GLOW, KEY, COLUMNS = (
+    19,
+    20,
+    21,
+    22,
+    23,
+    24,
+    25,
+    26,
+    27,
+)
+
+
+@kernel
+def find_visible(
+    origin,
+    edge_s,
+    edge_t,
+    uv,
+    texture,
+    detail,
+    detail_size,
+    gain,
+    triangle,
+    layer,
+    material,
+    log_size,
+    T_wc,
+    intrinsics,
+    height,
+    width,
+    lamp,
+):
+    """Project the surfaces that a camera may see, nearest first.
+
+    Returns:
+        ``(V, COLUMNS)`` float64; the columns are named above.
+    """
+    fx, fy, cx, cy = intrinsics
+    found = np.empty((1024, COLUMNS))
+    n = 0
+    corner = np.empty((4, 3))
+    left, right = (-1.0 - cx) / fx, (width - cx) / fx
+    for q in range(len(origin)):
+        # Camera coordinates by hand: three-vectors are too short for a matrix product.
+        ox, oy, oz = origin[q, 0] - T_wc[0, 3], origin[q, 1] - T_wc[1, 3], origin[q, 2] - T_wc[2, 3]
+        sx, sy, sz = edge_s[q, 0], edge_s[q, 1], edge_s[q, 2]
+        tx, ty, tz = edge_t[q, 0], edge_t[q, 1], edge_t[q, 2]
+        # Bounding sphere against the frustum.
+        mx, my, mz = ox + 0.5 * (sx + tx), oy + 0.5 * (sy + ty), oz + 0.5 * (sz + tz)
+        radius = 0.5 * (
+            math.sqrt(sx * sx + sy * sy + sz * sz) + math.sqrt(tx * tx + ty * ty + tz * tz)
+        )
+        zc = T_wc[0, 2] * mx + T_wc[1, 2] * my + T_wc[2, 2] * mz
+        if zc < NEAR - radius or zc > FAR + radius:
+            continue
+        xc = T_wc[0, 0] * mx + T_wc[1, 0] * my + T_wc[2, 0] * mz
+        reach = max(zc, 0.0)
+        slack = radius * (1.0 + max(abs(left), abs(right)))
+        if xc < left * reach - slack or xc > right * reach + slack:
+            continue
+        ax, ay, az = _turn(T_wc, ox, oy, oz)
+        bx, by, bz = _turn(T_wc, sx, sy, sz)
+        dx, dy, dz = _turn(T_wc, tx, ty, tz)
+        # [edge_s edge_t origin]^-1 by cross products.
+        nx, ny, nz = by * dz - bz * dy, bz * dx - bx * dz, bx * dy - by * dx
+        det = nx * ax + ny * ay + nz * az
+        norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+        if abs(det) <= 1e-7 * norm or norm == 0.0:
+            continue
+        for k in range(4):
+            a = 1.0 if k == 1 or k == 2 else 0.0
+            b = 1.0 if k >= 2 else 0.0
+            if triangle[q] and k == 2:
+                b = 0.0
+            corner[k, 0] = ax + a * bx + b * dx
+            corner[k, 1] = ay + a * by + b * dy
+            corner[k, 2] = az + a * bz + b * dz
+        u0, u1, v0, v1 = _box(corner, fx, fy, cx, cy)
+        if u1 < -1.0 or u0 > width or v1 < -1.0 or v0 > height or v0 > v1:
+            continue
+        if n == len(found):
+            grown = np.empty((2 * n, COLUMNS))
+            grown[:n] = found
+            found = grown
+        row = found[n]
+        n += 1
+        _affine(row, 0, (dy * az - dz * ay) / det, (dz * ax - dx * az) / det,
+                (dx * ay - dy * ax) / det, fx, fy, cx, cy)  # fmt: skip
+        _affine(row, 3, (ay * bz - az * by) / det, (az * bx - ax * bz) / det,
+                (ax * by - ay * bx) / det, fx, fy, cx, cy)  # fmt: skip
+        _affine(row, 6, nx / det, ny / det, nz / det, fx, fy, cx, cy)
+        number = texture[q]
+        texels_u, texels_v = float(1 << log_size[number, 0]), float(1 << log_size[number, 1])
+        for k in range(3):
+            row[TEXTURE + k] = texels_u * (
+                uv[q, 0] * row[6 + k] + uv[q, 1] * row[k] + uv[q, 2] * row[3 + k]
+            )
+            row[TEXTURE + 3 + k] = texels_v * (
+                uv[q, 3] * row[6 + k] + uv[q, 4] * row[k] + uv[q, 5] * row[3 + k]
+            )
+        row[FIRST_ROW] = max(math.floor(v0) - 1.0, 0.0)
+        row[LAST_ROW] = min(math.ceil(v1) + 1.0, height - 1.0)
+        row[TRIANGLE] = 1.0 if triangle[q] else 0.0
+        row[LAYER] = 1.0 + LAYER_STEP * layer[q]
+        row[NUMBER] = number
+        row[DETAIL] = detail[q]
+        if detail[q] >= 0:
+            # Texels of the fine texture for one texel of the first, along u and v.
+            span_u = max(abs(uv[q, 1]), abs(uv[q, 2]), 1e-9)
+            length_s = math.sqrt(sx * sx + sy * sy + sz * sz)
+            length_t = math.sqrt(tx * tx + ty * ty + tz * tz)
+            metres_u = (length_s if abs(uv[q, 1]) >= abs(uv[q, 2]) else length_t) / span_u
+            span_v = max(abs(uv[q, 4]), abs(uv[q, 5]), 1e-9)
+            metres_v = (length_s if abs(uv[q, 4]) > abs(uv[q, 5]) else length_t) / span_v
+            fine = float(1 << log_size[detail[q], 0])
+            row[DETAIL_U] = metres_u / texels_u / detail_size[q] * fine
+            row[DETAIL_V] = metres_v / texels_v / detail_size[q] * fine
+        # World normal, on the side of the camera.
+        wx, wy, wz = sy * tz - sz * ty, sz * tx - sx * tz, sx * ty - sy * tx
+        sign = -1.0 / norm if wx * ox + wy * oy + wz * oz > 0.0 else 1.0 / norm
+        up = -sign * wy
+        facing = sign * (wx * lamp[0] + wy * lamp[1] + wz * lamp[2])
+        if material[q] == 1:
+            row[AMBIENT] = gain[q] * lamp[4] * 0.75
+            row[SUN] = gain[q] * lamp[3] * (0.42 + 0.2 * facing)
+        else:
+            row[AMBIENT] = gain[q] * lamp[4] * (0.62 + 0.38 * up)
+            row[SUN] = gain[q] * lamp[3] * max(facing, 0.0)
+        row[GLOW] = gain[q] * lamp[5] if material[q] == 2 else 0.0
+        row[KEY] = mx * mx + my * my + mz * mz - radius * radius
+    found = found[:n]
+    return found[np.argsort(found[:, KEY], kind="mergesort")]
+
+
+@inline
+def _turn(T_wc, x, y, z):
+    """World direction to camera direction."""
+    return (
+        T_wc[0, 0] * x + T_wc[1, 0] * y + T_wc[2, 0] * z,
+        T_wc[0, 1] * x + T_wc[1, 1] * y + T_wc[2, 1] * z,
+        T_wc[0, 2] * x + T_wc[1, 2] * y + T_wc[2, 2] * z,
+    )
+
+
+@inline
+def _affine(row, at, x, y, z, fx, fy, cx, cy):
+    """Write ``(x, y, z) . K^-1 (u, v, 1)`` as coefficients of u, v and 1."""
+    row[at] = x / fx
+    row[at + 1] = y / fy
+    row[at + 2] = z - x * cx / fx - y * cy / fy
+
+
+@kernel
+def _box(corner, fx, fy, cx, cy):
+    """Pixel box ``u0, u1, v0, v1`` of a quadrilateral clipped at the near plane."""
+    u0, u1, v0, v1 = 1e9, -1e9, 1e9, -1e9
+    for k in range(4):
+        a, b = corner[k], corner[(k + 1) % 4]
+        for end in range(2):
+            x, y, z = a[0], a[1], a[2]
+            if end == 1:
+                if (a[2] < NEAR) == (b[2] < NEAR):
+                    continue
+                f = (NEAR - a[2]) / (b[2] - a[2])
+                x, y, z = a[0] + f * (b[0] - a[0]), a[1] + f * (b[1] - a[1]), NEAR
+            elif z < NEAR:
+                continue
+            u, v = fx * x / z + cx, fy * y / z + cy
+            u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
+    return u0, u1, v0, v1
+
+
+@kernel
+def rasterise(visible, first_row, samples, alpha, alpha_offset, log_size, inverse_depth, seen):
+    """Draw a band of sample rows.
+
+    Args:
+        visible: from :func:`find_visible`.
+        first_row: number of the band's first row of samples in the whole image.
+        samples: samples a pixel in each direction.
+        alpha, alpha_offset, log_size: see `scene.Atlas`.
+        inverse_depth: ``(h, w)`` float32, updated: 1/z of the nearest surface, 0 without one.
+        seen: ``(h, w)`` int32, updated: its row in ``visible``.
+    """
+    height, width = inverse_depth.shape
+    step = 1.0 / samples
+    shift = 0.5 * step - 0.5  # pixel coordinate of sample 0
+    bound = np.empty((6, 3))
+    for k in range(len(visible)):
+        q = visible[k]
+        first = max(int(q[FIRST_ROW]) * samples - first_row, 0)
+        last = min((int(q[LAST_ROW]) + 1) * samples - first_row, height)
+        if first >= last:
+            continue
+        for i in range(3):
+            bound[0, i] = q[i] + _SEAM * q[6 + i]
+            bound[1, i] = q[3 + i] + _SEAM * q[6 + i]
+            bound[2, i] = (1.0 + _SEAM) * q[6 + i] - q[i]
+            bound[3, i] = (1.0 + _SEAM) * q[6 + i] - q[3 + i]
+            if q[TRIANGLE] > 0.0:
+                bound[2, i] = (1.0 + _SEAM) * q[6 + i] - q[i] - q[3 + i]
+                bound[3, i] = bound[2, i]
+            bound[4, i] = q[6 + i]
+            bound[5, i] = -q[6 + i]
+        bound[4, 2] -= 1.0 / FAR
+        bound[5, 2] += 1.0 / NEAR
+        number = int(q[NUMBER])
+        cut_out = alpha_offset[number, 0] >= 0
+        for j in range(first, last):
+            v = (j + first_row) * step + shift
+            low, high = 0.0, width - 1.0
+            for i in range(6):
+                slope = bound[i, 0] * step
+                value = bound[i, 0] * shift + bound[i, 1] * v + bound[i, 2]
+                if slope > 0.0:
+                    low = max(low, -value / slope)
+                elif slope < 0.0:
+                    high = min(high, -value / slope)
+                elif value < 0.0:
+                    high = -1.0
+            begin, end = math.ceil(low), math.floor(high) + 1
+            if begin >= end:
+                continue
+            slope = q[6] * step
+            value = q[6] * shift + q[7] * v + q[8]
+            if cut_out:
+                _fill_cut_out(
+                    q, k, v, begin, end, step, shift, value, slope,
+                    alpha, alpha_offset[number], log_size[number], inverse_depth[j], seen[j],
+                )  # fmt: skip
+            else:
+                _fill(
+                    value * q[LAYER],
+                    slope * q[LAYER],
+                    k,
+                    float(begin),
+                    inverse_depth[j, begin:end],
+                    seen[j, begin:end],
+                )
+
+
+@kernel
+def _fill(value, slope, number, begin, inverse_depth, seen):
+    value += slope * begin
+    for i in range(np.uintp(len(seen))):
+        near = np.float32(value + slope * np.float64(np.int32(i)))
+        old = inverse_depth[i]
+        nearer = near > old
+        inverse_depth[i] = near if nearer else old
+        seen[i] = number if nearer else seen[i]
+
+
+@kernel
+def _fill_cut_out(
+    q,
+    number,
+    v,
+    begin,
+    end,
+    step,
+    shift,
+    value,
+    slope,
+    alpha,
+    offset,
+    log_size,
+    inverse_depth,
+    seen,
+):
+    """As :func:`_fill` where the alpha of the texture is at least one half."""
+    u_slope, v_slope = q[TEXTURE] * step, q[TEXTURE + 3] * step
+    u_value = q[TEXTURE] * shift + q[TEXTURE + 1] * v + q[TEXTURE + 2]
+    v_value = q[TEXTURE + 3] * shift + q[TEXTURE + 4] * v + q[TEXTURE + 5]
+    # One level for the whole row of a cut-out: it is small or far.
+    middle = 0.5 * (begin + end)
+    z = 1.0 / (value + slope * middle)
+    a, b = (u_value + u_slope * middle) * z, (v_value + v_slope * middle) * z
+    along = math.hypot(u_slope - a * slope, v_slope - b * slope) * z
+    across = math.hypot(q[TEXTURE + 1] - a * q[7], q[TEXTURE + 4] - b * q[7]) * z * step
+    size = max(math.sqrt(along * across), 1.0)
+    level = min(int(math.log2(size) + 0.6), max(log_size[0], log_size[1]))
+    scale = 1.0 / (1 << level)
+    at = offset[level]
+    row_log = max(log_size[0] - level, 0)
+    mask_u = (1 << row_log) - 1
+    mask_v = (1 << max(log_size[1] - level, 0)) - 1
+    for i in range(begin, end):
+        inverse = value + slope * i
+        if np.float32(inverse) <= inverse_depth[i]:
+            continue
+        z = 1.0 / inverse
+        x = (u_value + u_slope * i) * z * scale - 0.5
+        y = (v_value + v_slope * i) * z * scale - 0.5
+        if level > 0:  # texels smaller than samples: the nearest will do
+            c0, r0 = math.floor(x + 0.5) & mask_u, math.floor(y + 0.5) & mask_v
+            if alpha[np.uintp(at + (r0 << row_log) + c0)] < 128:
+                continue
+        else:
+            x0, y0 = math.floor(x), math.floor(y)
+            fx, fy = x - x0, y - y0
+            c0, r0 = int(x0), int(y0)
+            c1, r1 = (c0 + 1) & mask_u, at + (((r0 + 1) & mask_v) << row_log)
+            c0, r0 = c0 & mask_u, at + ((r0 & mask_v) << row_log)
+            upper = alpha[np.uintp(r0 + c0)] * (1.0 - fx) + alpha[np.uintp(r0 + c1)] * fx
+            lower = alpha[np.uintp(r1 + c0)] * (1.0 - fx) + alpha[np.uintp(r1 + c1)] * fx
+            if upper * (1.0 - fy) + lower * fy < 127.5:
+                continue
+        inverse_depth[i] = np.float32(inverse)
+        seen[i] = number

@@ -1,0 +1,320 @@
+"""Where the camera drives: the built-in routes, and routes along given poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import StereoCamera
+from vslam.datasets.synthetic.terrain import Roads, Terrain, roads_of
+from vslam.errors import InputError
+
+Float = NDArray[np.float64]
+
+CAMERA_HEIGHT = 1.65  # m
+RATE = 10.0  # frames a second
+_MAX_STEP = 5.0  # m between frames
+_LANE = 1.6  # m from the middle of the road to the middle of a lane
+_CAMERAS = {  # as in KITTI's three recording periods: 00-02, 03, 04-12
+    "00-02": StereoCamera(718.856, 718.856, 607.1928, 185.2157, 0.53716, 1241, 376),
+    "03": StereoCamera(721.5377, 721.5377, 609.5593, 172.854, 0.53715, 1242, 375),
+    "04-12": StereoCamera(707.0912, 707.0912, 601.8873, 183.1104, 0.53715, 1226, 370),
+}
+
+
+@dataclass(frozen=True)
+class Route:
+    """A drive.
+
+    Attributes:
+        name: ``demo`` for example.
+        about: what it is for, in a few words.
+        land: ``town``, ``suburb`` or ``motorway``.
+        camera: the stereo rig.
+        T_wc: ``(N, 4, 4)`` float64 left camera to the town's world (y = 0 is the datum).
+        roads, terrain: what the drive runs on.
+    """
+
+    name: str
+    about: str
+    land: str
+    camera: StereoCamera
+    T_wc: Float
+    roads: Roads
+    terrain: Terrain
+
+    @property
+    def timestamps(self) -> Float:
+        return np.arange(len(self.T_wc)) / RATE
+
+    @property
+    def ground_truth(self) -> Float:
+        """``(N, 4, 4)`` float64 ``T_wc`` with the first left camera as the world, as in KITTI."""
+        first: Float = np.linalg.inv(self.T_wc[0])
+        return first @ self.T_wc
+
+
+@dataclass(frozen=True)
+class _Leg:
+    """Corner points ``(x, z)`` in metres with the lane from there on: 1 right, -1 left."""
+
+    corners: tuple[tuple[float, float], ...]
+    lanes: tuple[float, ...] = ()
+    radius: float = 11.0
+    speed: float = 8.5  # m/s
+
+
+@dataclass(frozen=True)
+class _BuiltIn:
+    about: str
+    land: str
+    camera: str
+    leg: _Leg
+    hills: float = 0.4  # m
+
+
+def _winding() -> tuple[tuple[float, float], ...]:
+    z = np.linspace(0, 560, 40)
+    x = 45 * np.sin(z / 75) + 22 * np.sin(z / 41 + 1) + 0.1 * z
+    return tuple(zip(x.tolist(), z.tolist(), strict=True))
+
+
+def _bend() -> tuple[tuple[float, float], ...]:
+    z = np.linspace(0, 1200, 30)
+    return tuple(zip((150 * np.sin(z / 520)).tolist(), z.tolist(), strict=True))
+
+
+_BUILT_IN = {
+    "demo": _BuiltIn(
+        "one loop round a block", "town", "00-02",
+        _Leg(((0, 0), (0, 80), (62, 96), (84, 20), (0, -10), (0, 62)))),
+    "00": _BuiltIn(
+        "town; five revisits, one on the other lane, one in the opposite direction",
+        "town",
+        "00-02",
+        _Leg(((0, 0), (0, 180), (120, 180), (120, 0), (-4, -18), (0, 60), (0, 180), (-110, 195),
+              (-120, 70), (0, 62), (120, 70), (120, 180), (0, 180), (0, 62), (-120, 70),
+              (-130, -40), (0, -40), (0, 100)),
+             (1, 1, 1, 1, 1, -1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1))),
+    "01": _BuiltIn("motorway at 25 m/s, sparse texture", "motorway", "00-02",
+                   _Leg(_bend(), radius=180, speed=25.0), hills=3.0),
+    "02": _BuiltIn(
+        "long suburb with hills and two revisits", "suburb", "00-02",
+        _Leg(((0, 0), (30, 150), (-20, 330), (140, 420), (260, 330), (220, 180), (300, 40),
+              (160, -60), (0, -30), (30, 150), (-20, 330), (-180, 380), (-240, 220), (-130, 120),
+              (0, 0), (160, -60), (230, -85)), radius=20.0), hills=7.0),
+    "03": _BuiltIn("winding road", "suburb", "03", _Leg(_winding(), radius=25.0), hills=2.5),
+    "04": _BuiltIn("straight road", "town", "04-12",
+                   _Leg(((0, 0), (0, 200), (3, 400)), radius=200.0, speed=14.0)),
+    "05": _BuiltIn(
+        "town grid with four revisits", "town", "04-12",
+        _Leg(((0, 0), (0, 180), (90, 180), (90, 90), (0, 90), (0, 180), (180, 180), (180, 0),
+              (90, 0), (0, 0), (0, 90), (-80, 90), (-80, 0), (0, 0), (90, 0), (90, 160)))),
+}  # fmt: skip
+
+ROUTES = {name: route.about for name, route in _BUILT_IN.items()}
+
+
+def built_in_route(name: str) -> Route:
+    """One of `ROUTES`.
+
+    Raises:
+        InputError: unknown name.
+    """
+    if name not in _BUILT_IN:
+        raise InputError(f"synthetic route {name}: unknown; choose one of {', '.join(ROUTES)}.")
+    plan = _BUILT_IN[name]
+    leg = plan.leg
+    middle, lane = _round_corners(leg)
+    heading = _headings(middle)
+    right = np.stack([np.cos(heading), -np.sin(heading)], axis=1)
+    path = middle + right * (_LANE * lane)[:, None]
+    xz = _drive(path, leg.speed)
+    ahead = middle[-1] + np.outer(np.linspace(0, 130, 200), middle[-1] - middle[-8]) / (
+        np.linalg.norm(middle[-1] - middle[-8])
+    )
+    behind = middle[0] + np.outer(np.linspace(40, 0, 80), middle[0] - middle[8]) / (
+        np.linalg.norm(middle[0] - middle[8])
+    )
+    roads = roads_of([np.vstack([behind, middle, ahead])])
+    seed = sum(map(ord, name))
+    terrain = _terrain(roads.xz, lambda at: plan.hills * _waves(at, seed))
+    camera = _CAMERAS[plan.camera]
+    return Route(name, plan.about, plan.land, camera, _poses(xz, terrain), roads, terrain)
+
+
+def route_of_poses(T_wc: Float, name: str, camera: str = "00-02") -> Route:
+    """A route along given poses, KITTI's for example.
+
+    The heights of all passes over a place are averaged, so that each road has one height; heading,
+    pitch and roll stay as given. The poses are those of ``ground_truth``, not the given ones.
+
+    Args:
+        T_wc: ``(N, 4, 4)`` float64, y down.
+        name: of the route.
+        camera: recording period whose calibration to use.
+
+    Raises:
+        InputError: NaN, fewer than 20 poses, less than 20 m, or a jump of more than 5 m.
+    """
+    if not np.isfinite(T_wc).all():
+        raise InputError(f"{name}: a pose holds NaN or infinity; repair the trajectory.")
+    if len(T_wc) < 20:
+        raise InputError(f"{name}: {len(T_wc)} poses; a trajectory needs at least 20.")
+    steps = np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1)
+    if (far := np.flatnonzero(steps > _MAX_STEP)).size:
+        raise InputError(
+            f"{name}: pose {far[0] + 1} is {steps[far[0]]:.1f} m from the one before it; give "
+            f"poses at {RATE:.0f} Hz, at most {_MAX_STEP:.0f} m apart."
+        )
+    if steps.sum() < 20.0:
+        raise InputError(f"{name}: only {steps.sum():.1f} m long; drive at least 20 m.")
+    xz = T_wc[:, [0, 2], 3]
+    moving = np.r_[True, np.linalg.norm(np.diff(_smooth(xz, 5), axis=0), axis=1) > 0.02]
+    path = _smooth(xz[moving], 9)
+    heading = _headings(path)
+    right = np.stack([np.cos(heading), -np.sin(heading)], axis=1)
+    middle = path - _LANE * right
+    direction = np.array([np.sin(heading[[0, -1]]), np.cos(heading[[0, -1]])]).T
+    behind = middle[0] - np.linspace(40, 0.5, 80)[:, None] * direction[0]
+    ahead = middle[-1] + np.linspace(0.5, 130, 200)[:, None] * direction[1]
+    roads = roads_of([np.vstack([behind, middle, ahead])], same_road=5.0)
+    terrain = _terrain(roads.xz, _heights_of(xz, -T_wc[:, 1, 3] - CAMERA_HEIGHT))
+    poses = T_wc.copy()
+    poses[:, 1, 3] = -terrain.height(xz) - CAMERA_HEIGHT
+    return Route(name, f"{len(T_wc)} given poses", "town", _CAMERAS[camera], poses, roads, terrain)
+
+
+def _round_corners(leg: _Leg) -> tuple[Float, Float]:
+    """Middle line each 0.25 m with arcs at the corners, and the lane at each point."""
+    corners = np.array(leg.corners, np.float64)
+    lanes = np.array(leg.lanes or (1.0,) * len(corners))
+    points, lane = [corners[0][None]], [lanes[:1]]
+    for k in range(1, len(corners) - 1):
+        a, b = corners[k - 1] - corners[k], corners[k + 1] - corners[k]
+        la, lb = np.linalg.norm(a), np.linalg.norm(b)
+        a, b = a / la, b / lb
+        opening = np.arccos(np.clip(a @ b, -1, 1))
+        reach = min(leg.radius / np.tan(opening / 2), 0.49 * min(la, lb))
+        start, end = corners[k] + reach * a, corners[k] + reach * b
+        radius = reach * np.tan(opening / 2)
+        bisector = a + b
+        if np.linalg.norm(bisector) < 1e-3:
+            points.append(corners[k][None])
+            lane.append(lanes[k : k + 1])
+            continue
+        centre = corners[k] + bisector / np.linalg.norm(bisector) * radius / np.sin(opening / 2)
+        angle = np.linspace(0, 1, 40)
+        v0, v1 = start - centre, end - centre
+        sweep = np.pi - opening
+        arc = np.sin((1 - angle) * sweep)[:, None] * v0 + np.sin(angle * sweep)[:, None] * v1
+        points.append(
+            centre + arc / np.sin(sweep) if np.sin(sweep) > 1e-3 else np.stack([start, end])
+        )
+        lane.append(np.full(len(points[-1]), lanes[k]))
+    points.append(corners[-1][None])
+    lane.append(lanes[-1:])
+    line, value = np.vstack(points), np.concatenate(lane)
+    along = np.cumsum(np.r_[0, np.linalg.norm(np.diff(line, axis=0), axis=1)])
+    keep = np.r_[True, np.diff(along) > 1e-9]
+    at = np.arange(0, along[-1], 0.25)
+    dense = np.stack([np.interp(at, along[keep], line[keep, i]) for i in (0, 1)], axis=1)
+    # A change of lanes takes some 20 m.
+    return _smooth(dense, 25), _smooth(np.interp(at, along[keep], value[keep])[:, None], 81)[:, 0]
+
+
+def _smooth(values: Float, window: int) -> Float:
+    """Moving average twice over; the ends keep their place."""
+    half = window // 2
+    for _ in range(2):
+        first, last = values[:1], values[-1:]
+        head = 2 * first - values[half:0:-1]
+        tail = 2 * last - values[-2 : -half - 2 : -1]
+        padded = np.vstack([head, values, tail])
+        total = np.cumsum(np.vstack([np.zeros((1, values.shape[1])), padded]), axis=0)
+        values = (total[window:] - total[:-window])[: len(values)] / window
+    return values
+
+
+def _headings(line: Float) -> Float:
+    step = np.gradient(line, axis=0)
+    return np.unwrap(np.arctan2(step[:, 0], step[:, 1]))
+
+
+def _drive(path: Float, speed: float) -> Float:
+    """Places ``(N, 2)`` at 10 Hz along a path ``(K, 2)``, slower in bends."""
+    along = np.cumsum(np.r_[0, np.linalg.norm(np.diff(path, axis=0), axis=1)])
+    keep = np.r_[True, np.diff(along) > 1e-9]
+    along, path = along[keep], path[keep]
+    curvature = np.abs(np.gradient(_headings(path), along))
+    limit = np.minimum(
+        speed, np.sqrt(2.4 / np.maximum(_smooth(curvature[:, None], 41)[:, 0], 1e-4))
+    )
+    limit = np.maximum(_smooth(limit[:, None], 61)[:, 0], 2.5)
+    time = np.cumsum(np.r_[0, np.diff(along) / (0.5 * (limit[1:] + limit[:-1]))])
+    at = np.interp(np.arange(0, time[-1], 1 / RATE), time, along)
+    return np.stack([np.interp(at, along, path[:, k]) for k in (0, 1)], axis=1)
+
+
+def _poses(xz: Float, terrain: Terrain) -> Float:
+    """Camera poses over the terrain: heading and pitch along the way, a little sway."""
+    up = terrain.height(xz)
+    smooth = _smooth(np.column_stack([xz, up]), 7)
+    step = np.gradient(smooth, axis=0)
+    heading = np.unwrap(np.arctan2(step[:, 0], step[:, 1]))
+    t = np.arange(len(xz)) / RATE
+    pitch = np.arctan2(step[:, 2], np.hypot(step[:, 0], step[:, 1]))
+    pitch = pitch + 0.0022 * np.sin(8.2 * t) * np.sin(0.7 * t) + 0.001 * np.sin(11.0 * t + 1)
+    roll = 0.0025 * np.sin(5.1 * t + 2) * np.sin(0.43 * t)
+    T = np.tile(np.eye(4), (len(xz), 1, 1))
+    ch, sh, cp, sp, cr, sr = (f(a) for a in (heading, pitch, roll) for f in (np.cos, np.sin))
+    zero, one = np.zeros_like(t), np.ones_like(t)
+    yaw = np.array([[ch, zero, sh], [zero, one, zero], [-sh, zero, ch]]).transpose(2, 0, 1)
+    nod = np.array([[one, zero, zero], [zero, cp, -sp], [zero, sp, cp]]).transpose(2, 0, 1)
+    lean = np.array([[cr, -sr, zero], [sr, cr, zero], [zero, zero, one]]).transpose(2, 0, 1)
+    T[:, :3, :3] = yaw @ nod @ lean
+    T[:, 0, 3], T[:, 2, 3] = xz.T
+    T[:, 1, 3] = -up - CAMERA_HEIGHT
+    return T
+
+
+def _waves(xz: Float, seed: int) -> Float:
+    """Hills of unit height."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros(len(xz))
+    for k in range(4):
+        angle, phase = rng.uniform(0, np.pi), rng.uniform(0, 2 * np.pi)
+        length = (420.0, 330.0, 260.0, 180.0)[k]
+        way = xz @ np.array([np.cos(angle), np.sin(angle)])
+        total += (0.4, 0.3, 0.2, 0.1)[k] * np.sin(2 * np.pi * way / length + phase)
+    return total
+
+
+def _terrain(xz: Float, height: Callable[[Float], Float]) -> Terrain:
+    low, high = xz.min(axis=0) - 170.0, xz.max(axis=0) + 170.0
+    cell = 6.4
+    low = np.floor(low / cell) * cell
+    columns, rows = np.ceil((high - low) / cell).astype(int) + 1
+    at = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 2)
+    return Terrain(low, cell, height(low + cell * at).reshape(rows, columns))
+
+
+def _heights_of(xz: Float, up: Float) -> Callable[[Float], Float]:
+    """Smooth heights through the given ones, averaged where they disagree."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(xz)
+    averaged = np.array([up[near].mean() for near in tree.query_ball_point(xz, 6.0)])
+
+    def height(at: Float) -> Float:
+        distance, near = tree.query(at, k=min(24, len(xz)))
+        # Beyond the road the land keeps its height.
+        scale = np.maximum(distance[:, :1], 8.0)
+        weight = np.exp(-0.5 * ((distance - distance[:, :1]) / scale) ** 2)
+        total: Float = (averaged[near] * weight).sum(axis=1) / weight.sum(axis=1)
+        return total
+
+    return height

@@ -1,0 +1,182 @@
+"""What the renderer draws: flat textured surfaces and the mipmaps they are painted with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+# How a surface answers light: an opaque wall has a lit and a dark side, foliage lets light
+# through, a screen (lamp, lit window) shines by itself.
+OPAQUE, FOLIAGE, SCREEN = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Q parallelograms (or triangles) ``origin + s edge_s + t edge_t``, s and t in [0, 1].
+
+    Attributes:
+        origin, edge_s, edge_t: ``(Q, 3)`` float64 metres, world (x right, y down, z forward).
+        uv: ``(Q, 6)`` float64 ``u0 us ut v0 vs vt``: the texture coordinates
+            ``u = u0 + us s + ut t`` and v alike, where 1 is the width or height of the texture.
+        texture: ``(Q,)`` int32 into the atlas; one with alpha makes a cut-out.
+        detail: ``(Q,)`` int32 fine texture that multiplies the first, -1 for none.
+        detail_size: ``(Q,)`` float64 metres that one repeat of the fine texture covers.
+        gain: ``(Q,)`` float64 factor on the albedo.
+        triangle: ``(Q,)`` bool, keep only ``s + t <= 1``.
+        layer: ``(Q,)`` uint8; of two surfaces in one plane the higher layer is seen.
+        material: ``(Q,)`` uint8 ``OPAQUE``, ``FOLIAGE`` or ``SCREEN``.
+        thing: ``(Q,)`` int32 number of the object that the surface is a part of, -1 for ground.
+    """
+
+    origin: Float
+    edge_s: Float
+    edge_t: Float
+    uv: Float
+    texture: NDArray[np.int32]
+    detail: NDArray[np.int32]
+    detail_size: Float
+    gain: Float
+    triangle: NDArray[np.bool_]
+    layer: NDArray[np.uint8]
+    material: NDArray[np.uint8]
+    thing: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.origin)
+
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Surfaces:
+        """The surfaces ``rows``, a mask or indices."""
+        return Surfaces(*(np.ascontiguousarray(getattr(self, f.name)[rows]) for f in fields(self)))
+
+    def moved(self, R: Float, t: Float) -> Surfaces:
+        """The surfaces turned by ``R`` ``(3, 3)`` and then shifted by ``t`` ``(3,)``."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values["origin"] = self.origin @ R.T + t
+        values["edge_s"] = self.edge_s @ R.T
+        values["edge_t"] = self.edge_t @ R.T
+        return Surfaces(**values)
+
+
+def join(parts: Sequence[Surfaces]) -> Surfaces:
+    """All surfaces of ``parts`` (at least one) in their order."""
+    return Surfaces(
+        *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Surfaces))
+    )
+
+
+def patches(
+    origin: Float,
+    edge_s: Float,
+    edge_t: Float,
+    texture: int,
+    *,
+    uv: Sequence[float] | Float = (0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
+    detail: int = -1,
+    detail_size: float = 1.0,
+    gain: float = 1.0,
+    triangle: bool = False,
+    layer: int = 0,
+    material: int = OPAQUE,
+    thing: int = -1,
+) -> Surfaces:
+    """Surfaces that share all but place and texture coordinates; arrays as in `Surfaces`."""
+    o, s, t = (np.atleast_2d(np.asarray(x, np.float64)) for x in (origin, edge_s, edge_t))
+    n = max(len(o), len(s), len(t))
+    o, s, t = (np.broadcast_to(x, (n, 3)).copy() for x in (o, s, t))
+    return Surfaces(
+        o,
+        s,
+        t,
+        np.broadcast_to(np.asarray(uv, np.float64), (n, 6)).copy(),
+        np.full(n, texture, np.int32),
+        np.full(n, detail, np.int32),
+        np.full(n, detail_size),
+        np.full(n, gain),
+        np.full(n, triangle),
+        np.full(n, layer, np.uint8),
+        np.full(n, material, np.uint8),
+        np.full(n, thing, np.int32),
+    )
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """T textures with their mipmaps, flat, so that a kernel takes them as four arrays.
+
+    Attributes:
+        texels: uint8 grey of all levels of all textures.
+        alpha: uint8, opaque from 128 on, of the textures that have alpha.
+        offset: ``(T, L)`` int64 where a level begins in ``texels``.
+        alpha_offset: ``(T, L)`` int64 likewise in ``alpha``; -1 for an opaque texture.
+        log_size: ``(T, 2)`` int64 binary logarithms of width and height of level 0.
+    """
+
+    texels: NDArray[np.uint8]
+    alpha: NDArray[np.uint8]
+    offset: NDArray[np.int64]
+    alpha_offset: NDArray[np.int64]
+    log_size: NDArray[np.int64]
+
+
+class AtlasBuilder:
+    """Collects textures and hands out their numbers."""
+
+    def __init__(self) -> None:
+        self._grey: list[list[NDArray[np.uint8]]] = []
+        self._alpha: list[list[NDArray[np.uint8]] | None] = []
+
+    def add(self, grey: NDArray[np.floating], alpha: NDArray[np.floating] | None = None) -> int:
+        """Add a texture.
+
+        Args:
+            grey: ``(H, W)`` albedo, 0 to 255; H and W are powers of two. Row 0 is v = 0.
+            alpha: ``(H, W)`` 0 to 255, or None if opaque.
+
+        Returns:
+            The number of the texture in the atlas.
+        """
+        if any(n & (n - 1) for n in grey.shape):
+            raise ValueError(f"texture of {grey.shape} texels: sides must be powers of two")
+        self._grey.append(_pyramid(grey))
+        self._alpha.append(None if alpha is None else _pyramid(alpha))
+        return len(self._grey) - 1
+
+    def build(self) -> Atlas:
+        offset, texels = _flatten(self._grey)
+        alpha_offset, alpha = _flatten(self._alpha)
+        log_size = [[int(n).bit_length() - 1 for n in p[0].shape[::-1]] for p in self._grey]
+        return Atlas(texels, alpha, offset, alpha_offset, np.array(log_size, np.int64))
+
+
+def _pyramid(image: NDArray[np.floating]) -> list[NDArray[np.uint8]]:
+    level = np.asarray(image, np.float32)
+    levels = [level]
+    while max(level.shape) > 1:
+        height, width = (max(1, n // 2) for n in level.shape)
+        smaller = cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA)
+        level = np.asarray(smaller, np.float32)
+        levels.append(level)
+    return [np.clip(np.rint(x), 0, 255).astype(np.uint8) for x in levels]
+
+
+def _flatten(
+    pyramids: Sequence[list[NDArray[np.uint8]] | None],
+) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    depth = max(len(p) for p in pyramids if p is not None) if any(pyramids) else 1
+    offset = np.full((len(pyramids), depth), -1, np.int64)
+    flat: list[NDArray[np.uint8]] = []
+    end = 0
+    for row, pyramid in zip(offset, pyramids, strict=True):
+        for level, image in enumerate(pyramid or ()):
+            row[level] = end
+            flat.append(image.ravel())
+            end += image.size
+        if pyramid:
+            row[len(pyramid) :] = row[len(pyramid) - 1]
+    return offset, np.concatenate(flat) if flat else np.zeros(1, np.uint8)

@@ -1,0 +1,118 @@
+"""Cast shadows: the highest occluder on each ray of the sun."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.datasets.synthetic.scene import Atlas, Surfaces
+from vslam.kernels import kernel
+
+_MAX_CELLS = 30e6
+_FINEST = 0.08  # m
+
+
+@dataclass(frozen=True)
+class ShadowMap:
+    """All points of one sun ray share a cell: the point where the ray meets height 0.
+
+    Attributes:
+        height_cm: ``(R, C)`` uint16 height above the datum ``frame[3]`` of the highest occluder
+            on the ray in centimetres, 0 for none; rows along z, columns along x.
+        frame: ``(4,)`` float64 x and z of the corner of cell (0, 0), size of a cell and height of
+            the datum, metres.
+    """
+
+    height_cm: NDArray[np.uint16]
+    frame: NDArray[np.float64]
+
+
+def cast_shadows(surfaces: Surfaces, atlas: Atlas, sun: NDArray[np.float64]) -> ShadowMap:
+    """Shadows of all surfaces but the ground (``thing`` -1) in light from ``sun`` ``(3,)``."""
+    casts = surfaces.select(surfaces.thing >= 0)
+    if len(casts) == 0:
+        return ShadowMap(np.zeros((1, 1), np.uint16), np.array([0.0, 0.0, 1.0, 0.0]))
+    corners = np.stack(
+        [
+            casts.origin + a * casts.edge_s + b * casts.edge_t
+            for a, b in ((0, 0), (1, 0), (0, 1), (1, 1))
+        ]
+    )
+    slope = sun[[0, 2]] / max(-sun[1], 0.05)
+    up = -corners[..., 1]
+    cast = corners[..., [0, 2]] - up[..., None] * slope
+    low, high = cast.min(axis=(0, 1)) - 1.0, cast.max(axis=(0, 1)) + 1.0
+    cell = max(_FINEST, math.sqrt(float(np.prod(high - low)) / _MAX_CELLS))
+    columns, rows = np.ceil((high - low) / cell).astype(int) + 1
+    frame = np.array([low[0], low[1], cell, float(up.min()) - 1.0])
+    height_cm = np.zeros((rows, columns), np.uint16)
+    _cast(
+        casts.origin,
+        casts.edge_s,
+        casts.edge_t,
+        casts.uv,
+        casts.texture,
+        casts.triangle,
+        atlas.alpha,
+        atlas.alpha_offset,
+        atlas.log_size,
+        slope,
+        frame,
+        height_cm,
+    )
+    return ShadowMap(height_cm, frame)
+
+
+@kernel
+def _cast(
+    origin,
+    edge_s,
+    edge_t,
+    uv,
+    texture,
+    triangle,
+    alpha,
+    alpha_offset,
+    log_size,
+    slope,
+    frame,
+    height_cm,
+):
+    rows, columns = height_cm.shape
+    for q in range(len(origin)):
+        up = -origin[q, 1]
+        x = (origin[q, 0] - slope[0] * up - frame[0]) / frame[2]
+        z = (origin[q, 2] - slope[1] * up - frame[1]) / frame[2]
+        sx = (edge_s[q, 0] + slope[0] * edge_s[q, 1]) / frame[2]
+        sz = (edge_s[q, 2] + slope[1] * edge_s[q, 1]) / frame[2]
+        tx = (edge_t[q, 0] + slope[0] * edge_t[q, 1]) / frame[2]
+        tz = (edge_t[q, 2] + slope[1] * edge_t[q, 1]) / frame[2]
+        det = sx * tz - sz * tx
+        if abs(det) < 1e-6:
+            continue
+        number = texture[q]
+        cut_out = alpha_offset[number, 0] >= 0
+        log_w, log_h = log_size[number, 0], log_size[number, 1]
+        first_row = max(int(z + min(0.0, sz) + min(0.0, tz)), 0)
+        last_row = min(int(z + max(0.0, sz) + max(0.0, tz)) + 1, rows - 1)
+        first = max(int(x + min(0.0, sx) + min(0.0, tx)), 0)
+        last = min(int(x + max(0.0, sx) + max(0.0, tx)) + 1, columns - 1)
+        for r in range(first_row, last_row + 1):
+            for c in range(first, last + 1):
+                dx, dz = c + 0.5 - x, r + 0.5 - z
+                s = (dx * tz - dz * tx) / det
+                t = (sx * dz - sz * dx) / det
+                if s < 0.0 or t < 0.0 or s > 1.0 or t > 1.0 or (triangle[q] and s + t > 1.0):
+                    continue
+                if cut_out:
+                    u = int((uv[q, 0] + uv[q, 1] * s + uv[q, 2] * t) * (1 << log_w))
+                    v = int((uv[q, 3] + uv[q, 4] * s + uv[q, 5] * t) * (1 << log_h))
+                    u &= (1 << log_w) - 1
+                    v &= (1 << log_h) - 1
+                    if alpha[alpha_offset[number, 0] + (v << log_w) + u] < 128:
+                        continue
+                height = up - s * edge_s[q, 1] - t * edge_t[q, 1] - frame[3]
+                height_cm[r, c] = max(height_cm[r, c], np.uint16(max(height, 0.0) * 100.0))

@@ -1,0 +1,240 @@
+"""Houses, trees and street furniture as flat surfaces.
+
+All stand at the origin of their own frame: x right, y down with the ground at 0, z away from the
+viewer, so that the front lies in z = 0 or faces -z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.datasets.synthetic.scene import FOLIAGE, SCREEN, Surfaces, join, patches
+from vslam.datasets.synthetic.textures import Rng
+
+FOUNDATION = 1.2  # m that walls reach below the ground, for slopes
+
+Vector = Sequence[float] | NDArray[np.float64]
+
+
+def turn(heading: float) -> NDArray[np.float64]:
+    """Rotation ``(3, 3)`` that takes z to ``heading`` (radians, 0 along +z, towards +x)."""
+    c, s = np.cos(heading), np.sin(heading)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def box(
+    low: Vector, high: Vector, texture: int, *, thing: int, repeat: float = 0.0, gain: float = 1.0,
+    material: int = 0,
+) -> Surfaces:  # fmt: skip
+    """Sides and top of an upright box; ``repeat``: metres a texture covers, 0 stretches it."""
+    (x0, y0, z0), (x1, y1, z1) = low, high
+    w, h, d = x1 - x0, y1 - y0, z1 - z0
+    origin = [[x0, y0, z0], [x1, y0, z0], [x1, y0, z1], [x0, y0, z1], [x0, y0, z1]]
+    s = [[w, 0, 0], [0, 0, d], [-w, 0, 0], [0, 0, -d], [w, 0, 0]]
+    t = [[0, h, 0]] * 4 + [[0, 0, -d]]
+    uv = np.tile([0.0, 1.0, 0.0, 0.0, 0.0, 1.0], (5, 1))
+    if repeat > 0:
+        uv[:, 1] = np.array([w, d, w, d, w]) / repeat
+        uv[:, 5] = np.array([h, h, h, h, d]) / repeat
+        uv[:, 0] = np.arange(5) * 0.37
+    return patches(np.array(origin), np.array(s, float), np.array(t, float), texture, uv=uv,
+                   thing=thing, gain=gain, material=material)  # fmt: skip
+
+
+def walls(
+    size: tuple[float, float, float], textures: Sequence[int], lights: Sequence[int], fine: int,
+    *, thing: int,
+) -> Surfaces:  # fmt: skip
+    """Front, right, back and left of a house ``(width, height, depth)``.
+
+    Args:
+        size: metres.
+        textures: of the four sides; the lowest texels belong to the ground line.
+        lights: of the lit windows over them, -1 for none.
+        fine: detail texture.
+        thing: number of the house.
+    """
+    w, h, d = size
+    origin = np.array([[-w / 2, -h, 0], [w / 2, -h, 0], [w / 2, -h, d], [-w / 2, -h, d]])
+    s = np.array([[w, 0, 0], [0, 0, d], [-w, 0, 0], [0, 0, -d]])
+    down = np.array([0.0, h, 0.0])
+    parts = []
+    for k in range(4):
+        side = patches(origin[k], s[k], down, textures[k], detail=fine, detail_size=1.3,
+                       thing=thing)  # fmt: skip
+        below = patches(origin[k] + down, s[k], np.array([0.0, FOUNDATION, 0.0]), textures[k],
+                        uv=(0, 1, 0, 0.985, 0, 0.01), gain=0.8, thing=thing)  # fmt: skip
+        parts += [side, below]
+        if lights[k] >= 0:
+            parts.append(patches(origin[k], s[k], down, lights[k], layer=1, material=SCREEN,
+                                 thing=thing))  # fmt: skip
+    return join(parts)
+
+
+def roof(
+    rng: Rng, size: tuple[float, float, float], tiles: int, wall: int, fine: int, *, thing: int
+) -> Surfaces:
+    """Gable or flat roof with chimneys over a house ``(width, height, depth)``."""
+    w, h, d = size
+    tone = float(rng.uniform(0.6, 1.4))
+    over = 0.45
+    if rng.random() < 0.15:
+        rim = box((-w / 2 - 0.2, -h - 0.5, -0.2), (w / 2 + 0.2, -h, d + 0.2), wall, thing=thing,
+                  repeat=3.0, gain=0.7)  # fmt: skip
+        return rim
+    rise = float(rng.uniform(0.32, 0.55)) * d
+    parts = []
+    drop = over * rise / (d / 2)
+    ridge = np.array([0.0, -h - rise, d / 2])
+    for sign in (-1, 1):
+        eave = np.array([-w / 2 - over, -h + drop, d / 2 + sign * (d / 2 + over)])
+        top = np.array([-w / 2 - over, ridge[1], ridge[2]])
+        length = float(np.linalg.norm(eave - top))
+        parts.append(patches(top, np.array([w + 2 * over, 0, 0]), eave - top, tiles,
+                             uv=(rng.random(), w / 5.0, 0, rng.random(), 0, length / 5.0),
+                             detail=fine, detail_size=0.9, gain=tone, thing=thing))  # fmt: skip
+    for x in (-w / 2, w / 2):
+        parts.append(patches(np.array([x, -h, 0.0]), np.array([0, 0, d]),
+                             np.array([0, -rise, d / 2]), wall, triangle=True,
+                             uv=(0.1, 0.5, 0.2, 0.1, 0, 0.3), detail=fine, detail_size=1.3,
+                             thing=thing))  # fmt: skip
+    for _ in range(int(rng.integers(0, 3))):
+        x, z = float(rng.uniform(-0.4, 0.4)) * w, d * float(rng.uniform(0.3, 0.7))
+        parts.append(box((x - 0.35, -h - rise - 0.9, z - 0.3), (x + 0.35, -h - 0.3, z + 0.3),
+                         wall, thing=thing, gain=0.6))  # fmt: skip
+    for _ in range(int(rng.integers(0, 4))):
+        x = float(rng.uniform(-0.38, 0.38)) * w
+        up = h + 0.25 * rise
+        parts.append(box((x - 0.7, -up - 1.3, 0.08 * d), (x + 0.7, -up + 0.3, 0.4 * d), wall,
+                         thing=thing, gain=0.9))  # fmt: skip
+        parts.append(patches(np.array([x - 0.5, -up - 1.1, 0.08 * d]), np.array([1.0, 0, 0]),
+                             np.array([0, 1.0, 0]), tiles, layer=1, gain=0.4,
+                             thing=thing))  # fmt: skip
+    return join(parts)
+
+
+def tree(
+    rng: Rng, twigs: Sequence[int], bark: int, *, height: float, thing: int, conifer: bool = False
+) -> Surfaces:
+    """Trunk and a crown of see-through twigs."""
+    radius = float(rng.uniform(0.018, 0.028)) * height
+    clear = height * (0.12 if conifer else float(rng.uniform(0.28, 0.4)))
+    parts = [_trunk(radius, clear + 0.25 * height, bark, thing)]
+    if conifer:
+        cards = int(rng.integers(18, 26))
+        level = np.linspace(0.02, 0.97, cards)
+        spread = 0.24 * height * (1.05 - level)
+        middle = np.column_stack([
+            rng.normal(0, 0.25, cards) * spread, -(clear + level * (height - clear)),
+            rng.normal(0, 0.25, cards) * spread])  # fmt: skip
+        size = np.clip(2.1 * spread, 0.8, None)
+    else:
+        cards = int(rng.integers(16, 24))
+        wide, tall = 0.30 * height * float(rng.uniform(0.85, 1.15)), 0.5 * (height - clear)
+        direction = rng.normal(0, 1, (cards, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        reach = rng.uniform(0.25, 0.8, (cards, 1))
+        middle = direction * reach * [wide, tall, wide] + [0, -(clear + tall), 0]
+        size = rng.uniform(0.32, 0.5, cards) * height * 0.62
+    parts += [
+        _card(rng, at, float(a), int(rng.choice(twigs)), thing, 0.8 if conifer else 1.0)
+        for at, a in zip(middle, size, strict=True)
+    ]
+    return join(parts)
+
+
+def bush(rng: Rng, twigs: Sequence[int], *, height: float, thing: int) -> Surfaces:
+    """Twigs from the ground on."""
+    cards = int(rng.integers(4, 8))
+    middle = np.column_stack([
+        rng.normal(0, 0.3 * height, cards), rng.uniform(-0.75, -0.4, cards) * height,
+        rng.normal(0, 0.3 * height, cards)])  # fmt: skip
+    return join([
+        _card(rng, at, float(rng.uniform(0.7, 1.1)) * height, int(rng.choice(twigs)), thing, 0.9)
+        for at in middle
+    ])  # fmt: skip
+
+
+def _trunk(radius: float, height: float, bark: int, thing: int) -> Surfaces:
+    angle = 2 * np.pi * np.arange(7) / 6
+    ring = radius * np.column_stack([np.cos(angle), np.zeros(7), np.sin(angle)])
+    return patches(
+        ring[:-1] - [0, height, 0],
+        np.diff(ring, axis=0),
+        np.array([0.0, height + 0.5, 0.0]),
+        bark,
+        uv=np.column_stack([angle[:-1], np.full(6, 0.17), np.zeros((6, 3)), np.full(6, height)]),
+        thing=thing,
+    )
+
+
+def _card(rng: Rng, middle: Vector, size: float, twig: int, thing: int, gain: float) -> Surfaces:
+    heading, tilt, roll = rng.uniform(0, 2 * np.pi), rng.uniform(-0.6, 0.6), rng.uniform(0, 6.3)
+    across = np.array([np.cos(heading), 0.0, -np.sin(heading)])
+    normal = np.array([np.sin(heading), np.sin(tilt), np.cos(heading)])
+    up = np.cross(normal / np.linalg.norm(normal), across)
+    s = np.cos(roll) * across + np.sin(roll) * up
+    t = np.cos(roll) * up - np.sin(roll) * across
+    corner = np.asarray(middle) - 0.5 * size * (s + t)
+    return patches(corner, size * s, size * t, twig, material=FOLIAGE, thing=thing,
+                   gain=gain * float(rng.uniform(0.8, 1.25)))  # fmt: skip
+
+
+def hedge(rng: Rng, length: float, height: float, texture: int, top: int, thing: int) -> Surfaces:
+    """A clipped hedge along x."""
+    depth, shift = float(rng.uniform(0.5, 0.9)), float(rng.random())
+    uv = (shift, length / 4.0, 0, 0, 0, 1)
+    x0, x1 = -length / 2, length / 2
+    along, down = np.array([length, 0.0, 0.0]), np.array([0.0, height + 0.3, 0.0])
+    ends = np.array([0.0, 0.0, depth])
+    lid = -0.92 * height
+    kind: dict[str, Any] = {"thing": thing, "material": FOLIAGE}
+    side = (0, 0.15, 0, 0, 0, 1)
+    return join([
+        patches(np.array([x0, -height, 0.0]), along, down, texture, uv=uv, **kind),
+        patches(np.array([x0, -height, depth]), along, down, texture, uv=uv, **kind),
+        patches(np.array([x0, -height, 0.0]), ends, down, texture, uv=side, **kind),
+        patches(np.array([x1, -height, 0.0]), ends, down, texture, uv=side, **kind),
+        patches(np.array([x0, lid, 0.0]), along, ends, top, uv=uv, **kind),
+    ])  # fmt: skip
+
+
+def panel(
+    length: float, height: float, texture: int, thing: int, *, depth: float = 0.0
+) -> Surfaces:
+    """A fence, or a wall if it has depth, along x; the texture covers 4 m of it."""
+    if depth > 0:
+        return box((-length / 2, -height, 0), (length / 2, 0.4, depth), texture, thing=thing,
+                   repeat=4.0)  # fmt: skip
+    return patches(np.array([-length / 2, -height, 0.0]), np.array([length, 0, 0]),
+                   np.array([0, height, 0]), texture, uv=(0, length / 4.0, 0, 0, 0, 1),
+                   thing=thing)  # fmt: skip
+
+
+def lamp_post(height: float, arm: float, metal: int, screen: int, thing: int) -> Surfaces:
+    """Street lamp whose arm reaches towards -z."""
+    return join([
+        box((-0.07, -height, -0.07), (0.07, 0.3, 0.07), metal, thing=thing),
+        box((-0.04, -height - 0.05, -arm), (0.04, -height + 0.03, 0.05), metal, thing=thing),
+        box((-0.16, -height - 0.08, -arm - 0.5), (0.16, -height + 0.06, -arm), screen,
+            thing=thing, material=SCREEN, gain=0.8),
+    ])  # fmt: skip
+
+
+def sign_post(
+    rng: Rng, height: float, metal: int, faces: Sequence[tuple[int, int]], thing: int
+) -> Surfaces:
+    """Signs on a pole, facing -z; ``faces``: textures of the front and the back of each."""
+    parts = [box((-0.035, -height, -0.035), (0.035, 0.3, 0.035), metal, thing=thing)]
+    top = -height
+    for face in faces:
+        size = float(rng.uniform(0.6, 0.95))
+        for z, texture in zip((-0.06, -0.045), face, strict=True):
+            parts.append(patches(np.array([-size / 2, top, z]), np.array([size, 0, 0]),
+                                 np.array([0, size, 0]), texture, thing=thing))  # fmt: skip
+        top += size + 0.05
+    return join(parts)

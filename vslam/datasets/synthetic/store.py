@@ -1,0 +1,279 @@
+"""Rendered sequences on disk: a KITTI tree in the user's cache, complete or resumable."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import StereoCamera
+from vslam.datasets.synthetic.camera_effects import sensor_image
+from vslam.datasets.synthetic.passes import Passes
+from vslam.datasets.synthetic.render import Renderer
+from vslam.datasets.synthetic.routes import RATE, Route
+from vslam.datasets.synthetic.site import Variation
+from vslam.datasets.synthetic.town import build_town
+from vslam.errors import InputError
+from vslam.trajectory import write_kitti
+
+VERSION = 1  # raise it whenever the same seed gives other bytes
+_IMAGE_BYTES, _DEPTH_BYTES = 380_000, 330_000  # of one file, generous
+_RESERVE = 200_000_000  # bytes left free
+_DEPTH_SCALE = 100.0  # 16-bit depth counts centimetres
+_RECORD = "manifest.json"
+
+OnFrame = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Stored:
+    """One rendered sequence: ``root`` is its KITTI tree, ``name`` the sequence in it."""
+
+    root: Path
+    name: str
+    frames: int
+    complete: bool
+    size: int
+
+
+def cache_folder() -> Path:
+    """Where rendered sequences live; ``$VSLAM_CACHE`` moves it."""
+    from platformdirs import user_cache_path
+
+    return Path(os.environ.get("VSLAM_CACHE") or user_cache_path("vslam")) / "synthetic"
+
+
+def folder_name(variation: Variation) -> str:
+    """Sequences of one variation share a KITTI tree of this name."""
+    name = f"v{VERSION}-seed{variation.seed}"
+    name += "-aliased" if variation.aliased else ""
+    name += f"-moving{variation.moving}" if variation.moving else ""
+    return name + (f"-change{variation.change:g}" if variation.change else "")
+
+
+def list_stored(cache: Path) -> list[Stored]:
+    """Every sequence below a cache folder, complete or not."""
+    found = []
+    for record in sorted(cache.glob(f"*/sequences/*/{_RECORD}")):
+        manifest = _read_record(record.parent)
+        if manifest:
+            size = sum(p.stat().st_size for p in record.parent.rglob("*") if p.is_file())
+            found.append(
+                Stored(
+                    record.parents[2],
+                    record.parent.name,
+                    int(manifest["route"]["frames"]),
+                    "checksums" in manifest,
+                    size,
+                )
+            )
+    return found
+
+
+def clean(cache: Path, name: str | None = None) -> int:
+    """Remove one route's sequences of all variations, or everything; return the bytes freed."""
+    freed = 0
+    for stored in list_stored(cache):
+        if name in (None, stored.name):
+            freed += stored.size
+            shutil.rmtree(stored.root / "sequences" / stored.name)
+            (stored.root / "poses" / f"{stored.name}.txt").unlink(missing_ok=True)
+    return freed
+
+
+def render_sequence(
+    route: Route,
+    variation: Variation,
+    cache: Path,
+    *,
+    depth: bool = False,
+    until: int | None = None,
+    threads: int = 2,
+    on_frame: OnFrame | None = None,
+) -> Path:
+    """Render a route, or what is missing of it, and return the KITTI tree that holds it.
+
+    Args:
+        route: drive to render.
+        variation: of the town.
+        cache: folder for the trees; see `cache_folder`.
+        depth: write ``depth_0``, 16-bit PNG in centimetres of the left eye, too.
+        until: render the frames before this one only; a later call goes on from there.
+        threads: frames in work at a time; the bytes do not depend on it.
+        on_frame: called with frames done and in all.
+
+    Raises:
+        InputError: the folder cannot be written or the disk is too small.
+    """
+    root = cache / folder_name(variation)
+    folder = root / "sequences" / route.name
+    wanted = _record_of(route, variation, depth)
+    found = _read_record(folder)
+    if found is not None and {**found, "checksums": None} == {**wanted, "checksums": None}:
+        if "checksums" in found:
+            return root
+    elif folder.exists():
+        shutil.rmtree(folder)
+    n = min(until or len(route.T_wc), len(route.T_wc))
+    missing = [k for k in range(n) if not all(p.exists() for p in _files(folder, k, depth))]
+    check_disk(cache, len(missing), depth)
+    with writing(cache):
+        for name in ("image_0", "image_1", *(("depth_0",) if depth else ())):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        _write(folder / _RECORD, json.dumps(wanted).encode())
+        _write(folder / "times.txt", "".join(f"{t:.6e}\n" for t in route.timestamps).encode())
+        _write(folder / "calib.txt", _calibration(route.camera).encode())
+        (root / "poses").mkdir(exist_ok=True)
+        write_kitti(root / "poses" / f"{route.name}.txt", route.ground_truth)
+        if missing:
+            _render(route, variation, folder, missing, depth, threads, on_frame)
+        if n < len(route.T_wc):
+            return root
+        sums = [_checksum(_files(folder, k, depth)) for k in range(n)]
+        _write(folder / _RECORD, json.dumps({**wanted, "checksums": sums}).encode())
+    return root
+
+
+def _render(
+    route: Route,
+    variation: Variation,
+    folder: Path,
+    missing: list[int],
+    depth: bool,
+    threads: int,
+    on_frame: OnFrame | None,
+) -> None:
+    town = build_town(route, variation)
+    passes = Passes(route, town, variation)
+    renderer = Renderer(route.camera, town.atlas, town.sky, threads)
+    heading = np.unwrap(np.arctan2(route.T_wc[:, 0, 2], route.T_wc[:, 2, 2]))
+    yaw_rate = np.gradient(heading) * RATE
+
+    def frame(k: int) -> None:
+        moment = passes.at(k)
+        views = renderer.stereo(moment.surfaces, moment.shadows, moment.light, route.T_wc[k])
+        paths = _files(folder, k, depth)
+        for eye, (view, path) in enumerate(zip(views, paths, strict=False)):
+            image = sensor_image(
+                view.image,
+                route.camera,
+                yaw_rate=float(yaw_rate[k]),
+                night=moment.night,
+                key=(variation.seed, k, eye),
+            )
+            write_png(path, image, 1)
+        if depth:
+            steps = np.clip(np.rint(views[0].depth * _DEPTH_SCALE), 0, 65535).astype(np.uint16)
+            write_png(paths[2], steps, 1)
+
+    total = missing[-1] + 1
+    done = total - len(missing)
+    with ThreadPoolExecutor(threads) as pool:
+        running: deque[Future[None]] = deque()
+        try:
+            for k in missing:
+                running.append(pool.submit(frame, k))
+                if len(running) > 2 * threads:
+                    running.popleft().result()
+                    done += 1
+                    if on_frame:
+                        on_frame(done, total)
+            while running:
+                running.popleft().result()
+                done += 1
+                if on_frame:
+                    on_frame(done, total)
+        finally:
+            for job in running:
+                job.cancel()
+    renderer.close()
+
+
+def _record_of(route: Route, variation: Variation, depth: bool) -> dict[str, Any]:
+    drive = hashlib.sha256(route.T_wc.tobytes()).hexdigest()
+    return {
+        "version": VERSION,
+        "variation": asdict(variation),
+        "depth": depth,
+        "route": {"name": route.name, "frames": len(route.T_wc), "poses_sha256": drive},
+    }
+
+
+def _read_record(folder: Path) -> dict[str, Any] | None:
+    try:
+        record = json.loads((folder / _RECORD).read_text())
+        return record if isinstance(record, dict) else None
+    except (OSError, ValueError):
+        return None
+
+
+def _files(folder: Path, frame: int, depth: bool) -> list[Path]:
+    names = ("image_0", "image_1", *(("depth_0",) if depth else ()))
+    return [folder / name / f"{frame:06d}.png" for name in names]
+
+
+def _checksum(paths: list[Path]) -> str:
+    digest = hashlib.sha256()
+    for path in paths:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Whole or not at all."""
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    part.write_bytes(data)
+    os.replace(part, path)
+
+
+def write_png(path: Path, image: NDArray[Any], level: int) -> None:
+    """Write a PNG whole or not at all."""
+    data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, level])[1]
+    _write(path, data.tobytes())
+
+
+def _calibration(camera: StereoCamera) -> str:
+    lines = []
+    for eye in range(4):
+        shift = -camera.bf if eye % 2 else 0.0
+        numbers = [camera.fx, 0, camera.cx, shift, 0, camera.fy, camera.cy, 0, 0, 0, 1, 0]
+        lines.append(f"P{eye}: " + " ".join(f"{x:.12e}" for x in numbers) + "\n")
+    return "".join(lines)
+
+
+def check_disk(cache: Path, frames: int, depth: bool) -> None:
+    """Refuse, with what it needs, to render ``frames`` pairs of images onto a disk too small."""
+    needed = frames * (2 * _IMAGE_BYTES + (_DEPTH_BYTES if depth else 0))
+    there = cache
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    free = shutil.disk_usage(there).free
+    if frames and needed + _RESERVE > free:
+        raise InputError(
+            f"{cache}: rendering {frames} frames needs {needed / 1e9:.1f} GB and "
+            f"{_RESERVE / 1e9:.1f} GB to spare but {free / 1e9:.1f} GB are free; "
+            "free some space or set $VSLAM_CACHE to another disk."
+        )
+
+
+@contextmanager
+def writing(cache: Path) -> Iterator[None]:
+    """Turn what the file system refuses into one sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{cache}: cannot be written ({error.strerror}); set $VSLAM_CACHE to another folder."
+        ) from error

@@ -1,0 +1,168 @@
+"""Parked and moving cars: an outline, extruded, with painted sides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from vslam.datasets.synthetic.scene import AtlasBuilder, Surfaces, join, patches
+from vslam.datasets.synthetic.textures import Grey, Rng, letters, noise, write
+
+# Outlines from the front bumper over the roof to the rear: (part of the length, part of the
+# height); the third number tells what covers the strip that begins there: paint or glass.
+_OUTLINES = {
+    "hatchback": ((0.0, 0.16, 0), (0.0, 0.42, 0), (0.05, 0.52, 0), (0.27, 0.62, 1),
+                  (0.45, 0.97, 0), (0.62, 1.0, 0), (0.86, 0.93, 1), (0.97, 0.62, 0),
+                  (1.0, 0.17, 0)),
+    "saloon": ((0.0, 0.17, 0), (0.0, 0.44, 0), (0.05, 0.53, 0), (0.28, 0.62, 1), (0.43, 0.97, 0),
+               (0.56, 1.0, 0), (0.67, 0.95, 1), (0.83, 0.66, 0), (0.98, 0.62, 0), (1.0, 0.18, 0)),
+    "estate": ((0.0, 0.16, 0), (0.0, 0.42, 0), (0.05, 0.52, 0), (0.26, 0.6, 1), (0.42, 0.96, 0),
+               (0.6, 1.0, 0), (0.92, 0.94, 1), (0.98, 0.58, 0), (1.0, 0.17, 0)),
+    "van": ((0.0, 0.13, 0), (0.0, 0.4, 0), (0.03, 0.47, 0), (0.16, 0.53, 1), (0.29, 0.95, 0),
+            (0.4, 1.0, 0), (0.96, 0.98, 1), (0.99, 0.55, 0), (1.0, 0.13, 0)),
+}  # fmt: skip
+_SIZES = {  # length, width, height in metres
+    "hatchback": (3.9, 1.70, 1.46),
+    "saloon": (4.6, 1.80, 1.43),
+    "estate": (4.5, 1.78, 1.50),
+    "van": (4.9, 1.92, 1.95),
+}
+
+
+@dataclass(frozen=True)
+class Car:
+    """A car at the origin: forward is +z, wheels on y = 0, and its half length and width in m."""
+
+    surfaces: Surfaces
+    half: tuple[float, float]
+
+
+def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Car:
+    """A car of its own shape, colour and plate."""
+    kind = str(rng.choice(list(_OUTLINES), p=[0.4, 0.24, 0.24, 0.12]))
+    length, width, height = (float(x * rng.uniform(0.94, 1.06)) for x in _SIZES[kind])
+    outline = np.array([(x, y) for x, y, _ in _OUTLINES[kind]])
+    outline[1:-1] += rng.normal(0, 0.008, outline[1:-1].shape)
+    glass = [bool(g) for *_, g in _OUTLINES[kind]]
+    paint = float(rng.choice([18, 28, 45, 75, 110, 150, 190, 225]) * rng.uniform(0.9, 1.1))
+    side, alpha = _paint_side(rng, outline, glass, paint)
+    side_id = atlas.add(side, alpha)
+    end_ids = [atlas.add(_paint_end(rng, paint, front=front)) for front in (True, False)]
+    strip_ids = [atlas.add(_paint_strip(rng, paint)), atlas.add(_paint_strip(rng, 30.0))]
+
+    points = np.stack(
+        [np.zeros(len(outline)), -height * outline[:, 1], length * (0.5 - outline[:, 0])], axis=1
+    )
+    parts = []
+    across = np.array([width, 0.0, 0.0])
+    corner = np.array([-width / 2, 0.0, 0.0])
+    for x in (-width / 2, width / 2):
+        parts.append(
+            patches(
+                np.array([x, -height, length / 2]),
+                np.array([0.0, 0.0, -length]),
+                np.array([0.0, height, 0.0]),
+                side_id,
+                thing=thing,
+            )
+        )
+    for k in range(len(points) - 1):
+        a, b = points[k], points[k + 1]
+        low = min(outline[k, 1], outline[k + 1, 1])
+        if k == 0 or k == len(points) - 2:
+            end = end_ids[0 if k == 0 else 1]
+            top, bottom = (b, a) if k == 0 else (a, b)
+            parts.append(patches(top + corner, across, bottom - top, end, thing=thing))
+        else:
+            texture = strip_ids[1 if glass[k] and low > 0.4 else 0]
+            parts.append(patches(a + corner, across, b - a, texture, thing=thing))
+    shade = patches(
+        np.array([-width / 2, -0.14, length / 2]),
+        across,
+        np.array([0.0, 0.0, -length]),
+        strip_ids[1],
+        gain=0.2,
+        thing=thing,
+    )
+    return Car(join([*parts, shade]), (length / 2, width / 2))
+
+
+def _paint_side(
+    rng: Rng, outline: np.ndarray, glass: list[bool], paint: float
+) -> tuple[Grey, Grey]:
+    width, height = 512, 128
+    at = (outline * [width - 1, -(height - 1)] + [0, height - 1]).round().astype(np.int32)
+    grey = np.full((height, width), paint, np.float32)
+    grey *= np.linspace(1.15, 0.75, height, dtype=np.float32)[:, None]
+    alpha = np.zeros((height, width), np.float32)
+    cv2.fillPoly(alpha, [at], 255.0)
+    # Side windows: the outline above the belt line, shrunk.
+    belt = int(height * 0.40)
+    cabin = np.zeros((height, width), np.uint8)
+    cv2.fillPoly(cabin, [at], 255)
+    cabin[belt:] = 0
+    cabin = np.asarray(cv2.erode(cabin, np.ones((9, 19), np.uint8), borderValue=0), np.uint8)
+    shine = 24 + 22 * np.clip(noise(rng, height, width, 90.0, 3), -1, 2)
+    grey = np.where(cabin > 0, shine, grey).astype(np.float32)
+    starts = [x for x, g in zip(at[:, 0], glass, strict=True) if g]
+    left = int(starts[0]) if starts else width // 4
+    for part in np.cumsum(rng.uniform(0.22, 0.32, 2)):
+        x = int(left + (width - left) * (part + 0.05))
+        cv2.line(grey, (x, 12), (x, belt), paint, 7)
+        cv2.line(grey, (x, belt), (x - 6, int(0.82 * height)), paint * 0.45, 1, cv2.LINE_AA)
+        cv2.line(grey, (x + 12, belt + 10), (x + 26, belt + 10), paint * 0.5 + 60, 2)
+    y = int(height * rng.uniform(0.55, 0.66))
+    cv2.line(grey, (8, y), (width - 8, y - 3), paint * 0.7, 2, cv2.LINE_AA)
+    cv2.line(grey, (8, y + 3), (width - 8, y), min(paint * 1.25 + 12, 245), 1, cv2.LINE_AA)
+    cv2.rectangle(grey, (0, int(0.45 * height)), (22, int(0.55 * height)), 205.0, -1)
+    cv2.rectangle(grey, (width - 16, int(0.42 * height)), (width, int(0.6 * height)), 85.0, -1)
+    grey[int(0.87 * height) :] = 26.0
+    # Wheels reach the ground; they are ellipses because a texel is not square.
+    for x in (int(width * 0.185), int(width * 0.80)):
+        centre, rim = (x, height - 29), float(rng.uniform(90, 190))
+        axes = np.array([37, 28])
+        cv2.ellipse(grey, centre, (43, 32), 0, 0, 360, 14.0, -1)
+        cv2.ellipse(alpha, centre, axes.tolist(), 0, 0, 360, 255.0, -1)
+        cv2.ellipse(grey, centre, axes.tolist(), 0, 0, 360, 24.0, -1)
+        cv2.ellipse(grey, centre, (axes * 0.64).astype(int).tolist(), 0, 0, 360, rim, -1)
+        spokes = int(rng.integers(5, 10))
+        for k in range(spokes):
+            a = 2 * np.pi * k / spokes + 0.3
+            end = (int(x + 22 * np.cos(a)), int(centre[1] + 16 * np.sin(a)))
+            cv2.line(grey, centre, end, rim * 0.35, 4)
+    return np.clip(grey, 5, 250), alpha
+
+
+def _paint_end(rng: Rng, paint: float, *, front: bool) -> Grey:
+    size = 128
+    grey = np.full((size, size), paint, np.float32)
+    grey *= np.linspace(1.1, 0.8, size, dtype=np.float32)[:, None]
+    lamp = 215.0 if front else 70.0
+    top = int(size * (0.12 if front else 0.1))
+    tall = int(size * (0.22 if front else rng.uniform(0.2, 0.4)))
+    wide = int(size * rng.uniform(0.14, 0.24))
+    for x in (3, size - 3 - wide):
+        cv2.rectangle(grey, (x, top), (x + wide, top + tall), lamp, -1)
+        cv2.rectangle(grey, (x, top), (x + wide, top + tall), 35.0, 2)
+        cv2.circle(grey, (x + wide // 2, top + tall // 2), 6, 240.0 if front else 150.0, -1)
+    if front:
+        cv2.rectangle(grey, (size // 4, top + 4), (3 * size // 4, top + tall), 25.0, -1)
+        for y in range(top + 7, top + tall, 5):
+            cv2.line(grey, (size // 4, y), (3 * size // 4, y), paint * 0.6 + 40, 1)
+    else:
+        cv2.line(grey, (4, int(0.52 * size)), (size - 4, int(0.52 * size)), paint * 0.45, 2)
+    plate = int(size * rng.uniform(0.55, 0.66))
+    cv2.rectangle(grey, (36, plate), (92, plate + 15), 228.0, -1)
+    write(grey, rng, letters(rng, 6, 8), (38, plate + 1, 90, plate + 14), 25.0)
+    grey[int(0.88 * size) :] = 28.0
+    return np.clip(grey + 3 * noise(rng, size, size, 40.0), 5, 250)
+
+
+def _paint_strip(rng: Rng, paint: float) -> Grey:
+    grey = np.full((64, 64), paint, np.float32) * (1.0 + 0.15 * noise(rng, 64, 64, 40.0, 3))
+    grey[:, :2] *= 0.6
+    grey[:, -2:] *= 0.6
+    grey[:2] *= 0.6
+    return np.clip(grey, 5, 250)

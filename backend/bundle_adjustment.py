@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import CHI2_MONO, CHI2_STEREO
 from vslam.geometry import compose, orthonormalised, se3_exp
-from vslam.kernels import kernel
+from vslam.kernels import inner_kernel, kernel
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def adjust(
     return BundleSolution(T_cw, points, cost, inlier, count)
 
 
-@kernel
+@inner_kernel
 def residual(T, p, uvr, intrinsics, r, q):
     """Reprojection error into ``r`` (3,), camera point into ``q`` (3,); returns if it is stereo."""
     fx, fy, cx, cy, bf = intrinsics
@@ -99,7 +99,7 @@ def residual(T, p, uvr, intrinsics, r, q):
     return stereo
 
 
-@kernel
+@inner_kernel
 def evaluate(T_cw, points, first, camera, uvr, inverse_sigma2, used, intrinsics, inlier):
     """Half the sum of Huber losses; sets ``inlier`` by the chi-square test."""
     cost = 0.0
@@ -196,7 +196,7 @@ def _adjust(
     return T_cw, points, cost, inlier, done
 
 
-@kernel
+@inner_kernel
 def linearise(
     T_cw, n_free, points, first, camera, uvr, inverse_sigma2, used, intrinsics, W, V, g, U, b
 ):
@@ -265,7 +265,7 @@ def linearise(
         g[p, 0], g[p, 1], g[p, 2] = g0, g1, g2
 
 
-@kernel
+@inner_kernel
 def reduce_points(n_free, first, camera, used, W, V, g, U, b, damping, S, rhs, V_inverse):
     """Reduced camera system ``S x = rhs`` (upper triangle) after eliminating the points."""
     S[:] = 0.0
@@ -313,7 +313,7 @@ def reduce_points(n_free, first, camera, used, W, V, g, U, b, damping, S, rhs, V
                         target[j] -= y0 * w[0, j] + y1 * w[1, j] + y2 * w[2, j]
 
 
-@kernel
+@inner_kernel
 def step_points(n_free, first, camera, used, W, g, camera_step, V_inverse, points, points_trial):
     """Back-substitution: move each point by what the camera steps leave."""
     for p in range(len(points)):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from vslam.camera import CHI2_MONO, CHI2_STEREO, StereoCamera
 from vslam.config import Config
 from vslam.geometry import inverse
-from vslam.kernels import hamming, kernel
+from vslam.kernels import hamming, inner_kernel, kernel
 from vslam.map import NONE, Map
 from vslam.observations import link_many
 
@@ -65,7 +65,7 @@ def triangulate_with_neighbours(
     return np.concatenate(created)
 
 
-@kernel
+@inner_kernel
 def unmapped_rows(a, keyframe):
     """Rows of a keyframe that observe no landmark, ``(N,)`` int64."""
     first, last = a.first_row[keyframe], a.first_row[keyframe + 1]
@@ -176,12 +176,12 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
     return xyz[:count], out_1[:count], out_2[:count]
 
 
-@kernel
+@inner_kernel
 def dot3(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@kernel
+@inner_kernel
 def world_ray(T_cw, xy, intrinsics, ray):
     """Viewing ray of a pixel in the world, of length 1 along the camera's z, into ``ray`` (3,)."""
     x = (xy[0] - intrinsics[2]) / intrinsics[0]
@@ -190,7 +190,7 @@ def world_ray(T_cw, xy, intrinsics, ray):
         ray[i] = T_cw[0, i] * x + T_cw[1, i] * y + T_cw[2, i]
 
 
-@kernel
+@inner_kernel
 def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_cosine, point):
     """Put into ``point`` (3,) where two rays meet, or the stereo point of the eye pair that has
     more parallax than the rays have; False if neither is sound.
@@ -226,7 +226,7 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
     return stereo_2
 
 
-@kernel
+@inner_kernel
 def agrees(T, p, xy, u_right, scale, intrinsics):
     """Whether a point in front of the camera reprojects within the chi-square limit."""
     fx, fy, cx, cy, bf = intrinsics

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import OrbConfig
-from vslam.kernels import kernel
+from vslam.kernels import inner_kernel, kernel
 
 PATCH_RADIUS = 15  # of the intensity centroid (Rublee et al., section 3.2)
 MARGIN = 19  # reach of a rotated test point (13 sqrt 2) from a keypoint, rounded up
@@ -296,7 +296,7 @@ def spread(x, y, score, width, height, quota):
     return kept
 
 
-@kernel
+@inner_kernel
 def occupy(x, y, score, width, height, size, best_of_cell):
     """Fill ``best_of_cell`` for cells of ``size`` pixels; returns how many are occupied."""
     columns = (width + size - 1) // size

@@ -6,7 +6,7 @@ import numpy as np
 
 from vslam.camera import CHI2_MONO, CHI2_STEREO
 from vslam.geometry import compose, orthonormalised, se3_exp
-from vslam.kernels import kernel
+from vslam.kernels import inner_kernel, kernel
 
 ROUNDS = 4
 ITERATIONS = 10
@@ -115,7 +115,7 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
     return T, inlier
 
 
-@kernel
+@inner_kernel
 def classify(T, points, uvr, inverse_sigma2, intrinsics, inlier):
     """Set ``inlier`` to those that pass the chi-square test at pose ``T``."""
     fx, fy, cx, cy, bf = intrinsics

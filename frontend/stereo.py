@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from vslam.camera import StereoCamera
 from vslam.config import StereoConfig
 from vslam.frontend.orb import Extraction
-from vslam.kernels import hamming, kernel
+from vslam.kernels import hamming, inner_kernel, kernel
 
 MEDIAN_FACTOR = 1.5 * 1.4826  # 1.5 standard deviations, from the median of a half-normal
 
@@ -162,7 +162,7 @@ def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
     return best - reach + refined, np.float32(here)
 
 
-@kernel
+@inner_kernel
 def refine_shift(image_l, image_r, x_l, y_l, x_r, shift, half):
     """Shift in pixels that minimises the squared differences, from ``shift`` in (-1, 1).
 

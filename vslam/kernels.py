@@ -17,16 +17,23 @@ from numba.extending import intrinsic
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
+_OPTIONS: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract"},
+    "no_cfunc_wrapper": True,
+}
+
+
 def kernel(function: Function) -> Function:
     """Compile ``function`` as described above, on its first call."""
-    options: dict[str, Any] = {
-        "cache": True,
-        "nogil": True,
-        "error_model": "numpy",
-        "fastmath": {"contract"},
-        "no_cfunc_wrapper": True,
-    }
-    return cast(Function, numba.njit(**options)(function))
+    return cast(Function, numba.njit(**_OPTIONS)(function))
+
+
+def inner_kernel(function: Function) -> Function:
+    """A kernel that only kernels call: it compiles faster, since Python cannot call it."""
+    return cast(Function, numba.njit(no_cpython_wrapper=True, **_OPTIONS)(function))
 
 
 def inline(function: Function) -> Function:

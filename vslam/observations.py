@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vslam.kernels import hamming, kernel
+from vslam.kernels import hamming, inner_kernel, kernel
 
 
 @kernel
@@ -125,7 +125,7 @@ def resolve(a, landmarks):
     return out
 
 
-@kernel
+@inner_kernel
 def lower_median(values, n):
     """Median of the first ``n`` values, the lower one of two; sorts them by insertion."""
     for i in range(1, n):

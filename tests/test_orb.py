@@ -241,7 +241,7 @@ def test_descriptors_turn_with_the_image():
 
 
 @pytest.mark.parametrize("n", [100, 101, 999, 1000, 2000, 5001])
-@pytest.mark.parametrize(("levels", "factor"), [(1, 1.2), (4, 1.5), (8, 1.2), (16, 1.1)])
+@pytest.mark.parametrize(("levels", "factor"), [(2, 1.2), (4, 1.5), (8, 1.2), (16, 1.1)])
 def test_features_per_level_sum_to_n_and_shrink_with_the_level(n, levels, factor):
     quota = features_per_level(OrbConfig(n_features=n, n_levels=levels, scale_factor=factor))
     assert quota.sum() == n

@@ -33,7 +33,8 @@ def kernel(function: Function) -> Function:
 
 def inner_kernel(function: Function) -> Function:
     """A kernel that only kernels call: it compiles faster, since Python cannot call it."""
-    return cast(Function, numba.njit(no_cpython_wrapper=True, **_OPTIONS)(function))
+    options = _OPTIONS | {"no_cpython_wrapper": True}
+    return cast(Function, numba.njit(**options)(function))
 
 
 def inline(function: Function) -> Function:

@@ -20,6 +20,7 @@ VOCABULARY = {
         "config",
         "errors",
         "kernels",
+        "loops",
         "trajectory",
         "observations",
     )

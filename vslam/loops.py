@@ -49,3 +49,21 @@ class LoopEdge:
     T_query_match: NDArray[np.float64] | None = None
     features: NDArray[np.int32] | None = None
     landmarks: NDArray[np.int32] | None = None
+
+
+@dataclass(frozen=True)
+class Closure:
+    """What one closed loop did to the map.
+
+    Attributes:
+        edge: the loop.
+        keyframes: ``(N,)`` living keyframes at the time.
+        T_cw_before, T_cw_after: ``(N, 4, 4)`` their poses before and after the pose graph.
+        seconds: wall time of the correction, global bundle adjustment not included.
+    """
+
+    edge: LoopEdge
+    keyframes: NDArray[np.int64]
+    T_cw_before: NDArray[np.float64]
+    T_cw_after: NDArray[np.float64]
+    seconds: float

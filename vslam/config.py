@@ -7,6 +7,7 @@ Sources: [ORB] Rublee et al., ICCV 2011; [OS1] Mur-Artal et al., ORB-SLAM, T-RO 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -99,6 +100,20 @@ class MappingConfig(_Section):
     ba_iterations: int = Field(10, ge=1, description="Levenberg-Marquardt iterations at most.")
 
 
+class SiameseConfig(_Section):
+    """Learned loop detectors. [ZS]: Zhou and Sun, Sci Rep 15, 7644 (2025)."""
+
+    threshold: float = Field(0.9, ge=0, le=1, description="Similarity of a loop. [ZS]")
+    max_candidates: int = Field(5, ge=1, description="Candidates of a query, best first. [own]")
+    recent_keyframes: int = Field(10, ge=0, description="Newest keyframes never asked. [own]")
+    min_shared: int = Field(
+        15, ge=1, description="Landmarks shared with a better candidate: the same place. [OS1]"
+    )
+    fit: Literal["squash", "crop"] = Field(
+        "squash", description="Whole view squashed into the network's square, or its centre. [own]"
+    )
+
+
 class Config(_Section):
     """The whole configuration, written to ``config.json`` of each run and read by --config."""
 
@@ -107,6 +122,7 @@ class Config(_Section):
     tracking: TrackingConfig = TrackingConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
     mapping: MappingConfig = MappingConfig()
+    siamese: SiameseConfig = SiameseConfig()
 
 
 def load_config(path: Path) -> Config:

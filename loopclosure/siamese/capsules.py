@@ -21,7 +21,7 @@ _TINY = 1e-12  # keeps the square root differentiable at 0
 
 
 def squash(s: Tensor) -> Tensor:
-    """Eq. 8: ``|s|² / (1 + |s|²) · s / |s|`` along the last axis: direction kept, length below 1."""
+    """Eq. 8: ``|s|² / (1 + |s|²) · s / |s|`` along the last axis; the length is below 1."""
     squared = (s * s).sum(-1, keepdim=True)
     return s * (torch.sqrt(squared + _TINY) / (1.0 + squared))
 
@@ -107,12 +107,17 @@ def route_factored(
     _, _, outputs, depth = W.shape
     W_j = W.permute(2, 0, 1, 3).reshape(outputs, types * size, depth)
     rows = u.reshape(n * types, places, size)
+    present = None if alive is None else alive.view(types, 1, places)
 
-    def combined(c: Tensor) -> Tensor:
-        """Couplings ``(N, T, J, P)`` to sums ``(N, J, D)``."""
-        pooled = torch.bmm(c.view(n * types, outputs, places), rows).view(n, types, outputs, size)
+    def sums(pooled: Tensor) -> Tensor:
+        """``Σ_p c u`` of each type and output ``(N, T, J, A)`` to ``s`` ``(N, J, D)``."""
         s = torch.bmm(pooled.permute(2, 0, 1, 3).reshape(outputs, n, types * size), W_j)
         return s.transpose(0, 1)
+
+    def combined(c: Tensor) -> Tensor:
+        """Couplings ``(N, T, J, P)`` to ``s`` ``(N, J, D)``."""
+        pooled = torch.bmm(c.view(n * types, outputs, places), rows)
+        return sums(pooled.view(n, types, outputs, size))
 
     def agreements(v: Tensor) -> Tensor:
         """Outputs ``(N, J, D)`` to agreements ``(N, T, J, P)``."""
@@ -122,18 +127,27 @@ def route_factored(
 
     def couplings(b: Tensor) -> Tensor:
         """Eq. 6 for logits ``(N, T, J, P)``."""
-        if alive is not None:
-            b = b.masked_fill(~alive.view(types, 1, places), -torch.inf)
         if over == "output":
-            return torch.nan_to_num(torch.softmax(b, dim=2), nan=0.0)
-        e = torch.exp(b - b.amax((1, 3), keepdim=True))
-        return e / e.sum((1, 3), keepdim=True)
+            c = torch.softmax(b, dim=2)
+            return c if present is None else c * present
+        if present is not None:
+            b = b.masked_fill(~present, -torch.inf)
+        e = (b - b.amax((1, 3), keepdim=True)).exp_()
+        return e.div_(e.sum((1, 3), keepdim=True))
 
     with torch.no_grad():
-        b = u.new_zeros((n, types, outputs, places))
-        for _ in range(iterations - 1):
-            b = b + agreements(squash(combined(couplings(b))))
-        c = couplings(b)
+        # With b = 0 all capsules count alike: the first sums are means, without a softmax.
+        here = rows if present is None else rows * present.view(types, places, 1).repeat(n, 1, 1)
+        count = places * types if alive is None else alive.sum()
+        share = 1.0 / (count if over == "primary" else outputs)
+        means = here.sum(1).view(n, types, 1, size).expand(-1, -1, outputs, -1) * share
+        if iterations == 1:
+            c = couplings(u.new_zeros((n, types, outputs, places)))
+        else:
+            b = agreements(squash(sums(means)))
+            for _ in range(iterations - 2):
+                b += agreements(squash(combined(couplings(b))))
+            c = couplings(b)
     return squash(combined(c)), c.transpose(1, 2).flatten(2)
 
 

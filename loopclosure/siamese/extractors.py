@@ -11,14 +11,12 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from vslam.loopclosure.siamese.capsules import squash
 
-
 Block = tuple[int, int, int]
 """Channels, stride and dilation of a separable convolution; the first is the stem."""
 
 LIGHT_BLOCKS: tuple[Block, ...] = (
     (32, 4, 1),  # 57 places a side for 227 pixels
-    (64, 1, 1),
-    (128, 2, 1),  # 29
+    (64, 2, 1),  # 29
     (128, 1, 2),
     (192, 2, 3),  # 15
     (256, 1, 2),
@@ -59,11 +57,11 @@ class Separable(nn.Module):
 
 
 class Stem(nn.Module):
-    """The one ordinary convolution, 7x7 with stride 4; three channels are too few to separate."""
+    """The one ordinary convolution, 7x7; three channels are too few to separate."""
 
-    def __init__(self, outputs: int) -> None:
+    def __init__(self, outputs: int, stride: int) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(3, outputs, 7, 4, 3, bias=False)
+        self.conv = nn.Conv2d(3, outputs, 7, stride, 3, bias=False)
         self.norm: nn.Module = nn.BatchNorm2d(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -99,7 +97,7 @@ class LightExtractor(nn.Sequential):
 
     def __init__(self, blocks: Sequence[Block] = LIGHT_BLOCKS) -> None:
         stem, *rest = blocks
-        layers: list[nn.Module] = [Stem(stem[0])]
+        layers: list[nn.Module] = [Stem(stem[0], stem[1])]
         inputs = stem[0]
         for outputs, stride, dilation in rest:
             layers.append(Separable(inputs, outputs, stride=stride, dilation=dilation))

@@ -338,9 +338,7 @@ def _read_photo_set(folder: Path) -> Places:
     apart = np.abs(position[:, None] - position[None])
     relation[together & (apart <= reach)] = SAME
     family = exception.family or folder.name
-    return Places(
-        folder.name, family, _names(files), tuple(files), relation, unit.astype(np.int32)
-    )
+    return Places(folder.name, family, _names(files), tuple(files), relation, unit.astype(np.int32))
 
 
 def _images(folder: Path) -> list[Path]:
@@ -396,7 +394,9 @@ def read_pack(path: Path) -> list[Places]:
                 relation, unit = content[f"{k}_relation"], content[f"{k}_unit"]
                 sources.append(Places(name, family, tuple(names), images, relation, unit))
     except (OSError, KeyError, ValueError, BadZipFile) as error:
-        raise InputError(f"{path}: not a pack of places; write it with 'vslam train pack'.") from error
+        raise InputError(
+            f"{path}: not a pack of places; write it with 'vslam train pack'."
+        ) from error
     return sources
 
 

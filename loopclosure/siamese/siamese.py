@@ -32,7 +32,7 @@ class DistanceHead(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.log_a = nn.Parameter(torch.tensor(1.5))
+        self.log_a = nn.Parameter(torch.tensor(0.7))
         self.log_b = nn.Parameter(torch.tensor(2.0))
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
@@ -191,10 +191,7 @@ def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
 
 
 def for_inference(network: SiameseNetwork) -> SiameseNetwork:
-    """Eval mode, no gradients, normalisations folded, memory laid out for speed; in place."""
+    """Eval mode, no gradients, normalisations folded into convolutions; in place."""
     network.eval().requires_grad_(False)
     fold_batch_norms(network)
-    if isinstance(network.branch, CapsuleBranch):
-        network.branch.extractor.to(memory_format=torch.channels_last)
-        network.branch.primary.to(memory_format=torch.channels_last)
     return network

@@ -137,7 +137,8 @@ def test_the_card_tells_where_the_weights_come_from(tmp_path):
     written = json.loads(paths[0].read_text())
     assert written["sources"] == {"blobs": 40}
     assert written["validation"]["average_precision"] == outcome.figures["average_precision"]
-    assert written["commit"] and written["settings"]["seed"] == 0
+    assert written["commit"]
+    assert written["settings"]["seed"] == 0
     assert "--data pairs:x" in paths[1].read_text()
 
 

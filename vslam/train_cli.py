@@ -31,19 +31,19 @@ _EXPORT_EXAMPLES = """
 
   vslam export onnx --weights training/capsule/capsule.safetensors --out capsule.onnx
 """
+_PLACES_EXAMPLES = """
+[b]Example[/b]
 
-export = typer.Typer(help="Export a trained network.", no_args_is_help=True)
+  vslam export places --data "kitti:~/kitti\\[first=250,last=1500]" --data photos:~/places
+"""
+
+export = typer.Typer(help="Export a trained network, or images to train on.", no_args_is_help=True)
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the application."""
     app.command(epilog=_TRAIN_EXAMPLES)(train)
     app.add_typer(export, name="export")
-
-
-@export.callback()
-def _export() -> None:
-    """Export a trained network."""
 
 
 DataSources = Annotated[
@@ -56,9 +56,7 @@ DataSources = Annotated[
 
 
 def train(
-    network: Annotated[
-        str, typer.Argument(help="capsule, capsule-pruned, alexnet, vgg16; or pack: see --out.")
-    ],
+    network: Annotated[str, typer.Argument(help="capsule, capsule-pruned, alexnet or vgg16.")],
     data: DataSources,
     preset: Annotated[str, typer.Option(help="paper or best.")] = "paper",
     settings: Annotated[
@@ -96,7 +94,7 @@ def train(
     """Train a loop detector; writes weights, log, pairs, checkpoints and a model card."""
     from vslam.info import available_cores
     from vslam.loopclosure.siamese.data import load, refuse_test_data
-    from vslam.loopclosure.siamese.places import open_source, write_pack
+    from vslam.loopclosure.siamese.places import open_source
     from vslam.loopclosure.siamese.runtime import set_threads
     from vslam.loopclosure.siamese.settings import PRESETS, load_settings
 
@@ -107,11 +105,6 @@ def train(
     if not allow_test_data:
         refuse_test_data(sources)
     chosen = load_settings(settings) if settings else PRESETS[preset]
-    if network == "pack":
-        file = out or Path("places.npz")
-        write_pack(sources, file, chosen.shape.pixels, chosen.fit)
-        typer.echo(f"{file}: {sum(map(len, sources))} images, {file.stat().st_size / 1e6:.1f} MB")
-        return
     given = {"epochs": epochs, "pairs": pairs, "seed": seed, "network": network}
     chosen = chosen.model_copy(update={k: v for k, v in given.items() if v is not None})
     folder = out or Path("training") / f"{network}-{preset}"
@@ -185,3 +178,20 @@ def onnx(
         f"{network.pixels}) to descriptor (1, {network.dimensions}); differs from torch by at "
         f"most {difference:.1e}"
     )
+
+
+@export.command("places", epilog=_PLACES_EXAMPLES)
+def places(
+    data: DataSources,
+    fit: Annotated[str, typer.Option(help="squash or crop.")] = "squash",
+    pixels: Annotated[int, typer.Option(min=32, help="Side of the squares.")] = 227,
+    out: Annotated[Path, typer.Option(help="File to write.")] = Path("places.npz"),
+) -> None:
+    """Write sources of images as one small file, for training on another machine."""
+    from vslam.loopclosure.siamese.places import open_source, write_pack
+
+    if fit not in ("squash", "crop"):
+        raise InputError(f"--fit {fit}: must be squash or crop.")
+    sources = [source for spec in data for source in open_source(spec)]
+    write_pack(sources, out, pixels, "squash" if fit == "squash" else "crop")
+    typer.echo(f"{out}: {sum(map(len, sources))} images, {out.stat().st_size / 1e6:.1f} MB")

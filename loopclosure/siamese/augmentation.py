@@ -45,9 +45,8 @@ def augment(
     moved = corners + rng.uniform(-1, 1, (4, 2)).astype(np.float32) * strength.homography * side
     moved[:, 0] += rng.uniform(-1, 1) * strength.shift * side
     H = cv2.getPerspectiveTransform(corners, moved)
-    out = cv2.warpPerspective(
-        image, H, (side, side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
-    )
+    way = {"flags": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REFLECT_101}
+    out = np.asarray(cv2.warpPerspective(image, H, (side, side), **way), np.uint8)
     for _ in range(int(rng.integers(strength.masks + 1))):
         _cover(out, strength.mask_area, rng)
     grey = np.arange(256) / 255.0

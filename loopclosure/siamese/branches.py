@@ -64,8 +64,8 @@ class CapsuleBranch(nn.Module):
             self.extractor = nn.Identity()
             self.primary = OriginalExtractor(shape.types, shape.size)
         # Depthwise convolutions are faster so, forward by a third and backward by a quarter.
-        self.extractor.to(memory_format=torch.channels_last)
-        self.primary.to(memory_format=torch.channels_last)
+        for module in (self.extractor, self.primary):
+            module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.capsules = CapsuleLayer(
             shape.types, shape.places, shape.size, shape.outputs, shape.depth,
             shape.iterations, shape.over, shape.kept,
@@ -99,6 +99,9 @@ class ConvolutionalBranch(nn.Module):
     ``features`` and ``classifier``.
     """
 
+    mean: Tensor
+    deviation: Tensor
+
     def __init__(
         self, name: str, features: nn.Sequential, classifier: nn.Sequential, side: int
     ) -> None:
@@ -118,7 +121,7 @@ class ConvolutionalBranch(nn.Module):
         """``(N, 3, 227, 227)`` float32 in [0, 1] to ``(N, 1024)``, not yet normalised."""
         x: Tensor = self.features((images - self.mean) / self.deviation)
         x = self.classifier(self.pool(x).flatten(1))
-        return self.descriptor(x)  # type: ignore[no-any-return]
+        return self.descriptor(x)
 
     def load_torchvision(self, path: Path) -> None:
         """Take over the weights of a torchvision file (``alexnet-*.pth``, ``vgg16-*.pth``).

@@ -10,7 +10,7 @@ Sources are named on the command line as ``kind:path``, with options in brackets
 ``fabmap:DIR[truth=FILE.mat]``             Oxford CityCentre or NewCollege (Cummins and Newman 2008)
 ``pairs:DIR``                              what ``vslam synth --pairs`` wrote
 ``photos:DIR``                             folders of photographs with a NOTES.txt, see below
-``pack:FILE.npz``                          what ``vslam train pack`` wrote of any of these
+``pack:FILE.npz``                          what ``vslam export places`` wrote of any of these
 """
 
 from __future__ import annotations
@@ -395,7 +395,7 @@ def read_pack(path: Path) -> list[Places]:
                 sources.append(Places(name, family, tuple(names), images, relation, unit))
     except (OSError, KeyError, ValueError, BadZipFile) as error:
         raise InputError(
-            f"{path}: not a pack of places; write it with 'vslam train pack'."
+            f"{path}: not a pack of places; write it with 'vslam export places'."
         ) from error
     return sources
 

@@ -66,7 +66,7 @@ class ConcatenationHead(nn.Module):
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
         """Logits ``(N,)`` of pairs of ``(N, D)`` descriptors."""
         both = torch.cat([torch.cat([a, b], 1), torch.cat([b, a], 1)])
-        return self.layers(both).view(2, -1).mean(0)  # type: ignore[no-any-return]
+        return self.layers(both).view(2, -1).mean(0)
 
     def compare(self, query: Tensor, gallery: Tensor) -> Tensor:
         """Logits ``(M,)`` of one ``(D,)`` descriptor with each of ``(M, D)``."""
@@ -98,7 +98,7 @@ class SiameseNetwork(nn.Module):
 
     def logits(self, a: Tensor, b: Tensor) -> Tensor:
         """Logit of ``similarity``, what training works on."""
-        return self.head(a, b)  # type: ignore[no-any-return]
+        return self.head(a, b)
 
     def similarity(self, a: Tensor, b: Tensor) -> Tensor:
         """Probability ``(N,)`` in (0, 1) that pairs of ``(N, D)`` descriptors show one place."""

@@ -216,7 +216,7 @@ def _step(
     value = loss.item()
     if math.isfinite(value):
         optimiser.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         optimiser.step()
     return value
 

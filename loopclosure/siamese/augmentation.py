@@ -45,23 +45,25 @@ def augment(
     moved = corners + rng.uniform(-1, 1, (4, 2)).astype(np.float32) * strength.homography * side
     moved[:, 0] += rng.uniform(-1, 1) * strength.shift * side
     H = cv2.getPerspectiveTransform(corners, moved)
-    way = {"flags": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REFLECT_101}
-    out = np.asarray(cv2.warpPerspective(image, H, (side, side), **way), np.uint8)
+    warped = cv2.warpPerspective(
+        image, H, (side, side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
+    )
+    out = np.asarray(warped, np.uint8)
     for _ in range(int(rng.integers(strength.masks + 1))):
         _cover(out, strength.mask_area, rng)
     grey = np.arange(256) / 255.0
     curve = 255.0 * grey ** np.exp(strength.log_gamma * rng.standard_normal())
     curve = np.exp(strength.log_gain * rng.standard_normal()) * curve
     curve += strength.bias * rng.standard_normal()
-    out = cv2.LUT(out, np.clip(np.rint(curve), 0, 255).astype(np.uint8))
+    out = np.asarray(cv2.LUT(out, np.clip(np.rint(curve), 0, 255).astype(np.uint8)), np.uint8)
     # Every second image stays sharp and clean: most real ones are.
     blur, noise = rng.uniform(-1, 1, 2) * (strength.blur, strength.noise)
     if blur > 0.2:
-        out = cv2.GaussianBlur(out, (0, 0), float(blur))
+        out = np.asarray(cv2.GaussianBlur(out, (0, 0), float(blur)), np.uint8)
     if noise > 0.5:
         grain = rng.standard_normal(out.shape, dtype=np.float32)
-        out = np.clip(np.rint(out + np.float32(noise) * grain), 0, 255)
-    return np.asarray(out, np.uint8)
+        out = np.clip(np.rint(out + np.float32(noise) * grain), 0, 255).astype(np.uint8)
+    return out
 
 
 def _cover(image: NDArray[np.uint8], largest: float, rng: np.random.Generator) -> None:

@@ -32,8 +32,9 @@ class DistanceHead(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.log_a = nn.Parameter(torch.tensor(0.7))
-        self.log_b = nn.Parameter(torch.tensor(2.0))
+        # p = 0.5 at d = 1.1, between pairs of one and of two places under random weights.
+        self.log_a = nn.Parameter(torch.tensor(1.5))
+        self.log_b = nn.Parameter(torch.tensor(1.4))
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
         """Logits ``(N,)`` of pairs of ``(N, D)`` unit descriptors."""

@@ -70,7 +70,7 @@ def test_routing_turns_to_the_majority():
 
 def test_one_iteration_by_hand():
     u = torch.tensor([[[[1.0, 0.0], [0.0, 1.0]]]])  # one image, one type, two places
-    W = torch.tensor([[[[2.0, 0.0]], [[0.0, 4.0]]]])  # (T, A, J, D) = (1, 2, 1, 2)
+    W = torch.tensor([[[[2.0, 0.0], [0.0, 4.0]]]])  # (J, T, A, D) = (1, 1, 2, 2)
     v, c = capsules.route_factored(u, W, iterations=2)
     # s = (1, 2), |s|² = 5; agreement of (2, 0) and (0, 4) with v = s sqrt(5) / 6
     b = torch.tensor([2.0, 8.0]) * 5**0.5 / 6
@@ -85,7 +85,7 @@ def test_one_iteration_by_hand():
 @pytest.mark.parametrize("some_dead", [False, True])
 def test_factored_routing_is_the_paper_s_routing(over, iterations, some_dead):
     torch.manual_seed(2)
-    u, W = capsules.squash(torch.randn(3, 5, 9, 4) * 2), torch.randn(5, 4, 6, 7)
+    u, W = capsules.squash(torch.randn(3, 5, 9, 4) * 2), torch.randn(6, 5, 4, 7)
     alive = torch.rand(45) > 0.3 if some_dead else None
     wanted = capsules.route(capsules.predict(u, W), iterations, over, alive)
     for mine, reference in zip(
@@ -97,7 +97,7 @@ def test_factored_routing_is_the_paper_s_routing(over, iterations, some_dead):
 def test_gradients_are_finite_and_pass_through_the_last_iteration_only():
     torch.manual_seed(3)
     u = capsules.squash(torch.randn(2, 3, 4, 5)).requires_grad_()
-    W = torch.randn(3, 5, 2, 6, requires_grad=True)
+    W = torch.randn(2, 3, 5, 6, requires_grad=True)
     v, c = capsules.route_factored(u, W, 3)
     assert not c.requires_grad
     by_hand = capsules.squash(capsules.combine(c, capsules.predict(u, W)))

@@ -37,7 +37,7 @@ def _one_thread():
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize(("loss", "epochs"), [("bce", 12), ("bce+contrast", 6)])
+@pytest.mark.parametrize(("loss", "epochs"), [("bce", 14), ("bce+contrast", 12)])
 def test_64_pairs_are_learned_by_heart(tmp_path, loss, epochs):
     collection = views(46)
     settings = small_settings(

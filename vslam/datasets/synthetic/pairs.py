@@ -74,7 +74,9 @@ def render_pairs(
                 T = route.T_wc[frame]
                 T = T if eye == 0 else _shifted(T, *shift.tolist())
                 moment = passes.at(when)
-                view, _ = renderer.stereo(moment.surfaces, moment.shadows, moment.light, T)
+                view, _ = renderer.stereo(
+                    moment.surfaces, moment.shadows, moment.light, T, moment.pools
+                )
                 image = sensor_image(view.image, route.camera, yaw_rate=0.0, night=moment.night,
                                      key=(variation.seed, k, eye))  # fmt: skip
                 names.append(f"images/{k:06d}_{'ab'[eye]}.png")

@@ -25,6 +25,7 @@ from vslam.datasets.synthetic.town import Town
 
 _NEAR, _LEFT = 60.0, 75.0  # m: a place was passed, and has been left again
 _AGAIN, _STRETCH = 60, 15  # frames: a place is passed again after so many, for so many
+_CASTS = 3  # shadow maps kept
 _CLOUD = 12.0  # frames that a cloud hides the sun while it moves between two passes
 _CAR_REACH = np.array([1.1, 2.7])  # half width and length of the largest car, m
 
@@ -61,8 +62,9 @@ class Passes:
                 middle = (*self._starts, len(self._route.T_wc))[number : number + 2]
                 there = self._standing(sum(middle) // 2)
                 shadows = cast_shadows(there, self._town.atlas, light.sun)
-                self._casts = {k: v for k, v in self._casts.items() if k >= number - 1}
                 self._casts[number] = shadows
+                while len(self._casts) > _CASTS:
+                    del self._casts[next(iter(self._casts))]
             shadows = self._casts[number]
         cars = self._cars(frame)
         surfaces = join([standing, *cars]) if cars else standing

@@ -166,9 +166,7 @@ def _adjust(
             solved = cholesky_solve(S, rhs)
             if solved:
                 step_points(n_free, first, camera, used, W, g, rhs, V_inverse, points, points_trial)
-                for k in range(n_free):
-                    twist = rhs[6 * k : 6 * k + 6]
-                    T_trial[k] = orthonormalised(compose(se3_exp(twist), T_cw[k]))
+                step_cameras(n_free, rhs, T_cw, T_trial)
                 trial = evaluate(
                     T_trial,
                     points_trial,
@@ -183,8 +181,9 @@ def _adjust(
                 if trial < cost:
                     small = cost - trial < tolerance * cost
                     cost = trial
-                    T_cw[:n_free] = T_trial[:n_free]
-                    points[:] = points_trial
+                    # What is left behind in the trial is overwritten by the next step.
+                    T_cw, T_trial = T_trial, T_cw
+                    points, points_trial = points_trial, points
                     damping, growth, improved = max(damping * 0.1, 1e-9), 2.0, True
                     break
             damping *= growth * 5.0
@@ -330,6 +329,17 @@ def step_points(n_free, first, camera, used, W, g, camera_step, V_inverse, point
         N = V_inverse[p]
         for i in range(3):
             points_trial[p, i] = points[p, i] + N[i, 0] * d0 + N[i, 1] * d1 + N[i, 2] * d2
+
+
+@inner_kernel
+def step_cameras(n_free, camera_step, T_cw, T_trial):
+    """Move each free camera by its twist. Element by element: assigning a whole matrix would make
+    Numba compile the message of a broadcasting error, which takes seconds."""
+    for k in range(n_free):
+        T = orthonormalised(compose(se3_exp(camera_step[6 * k : 6 * k + 6]), T_cw[k]))
+        for i in range(4):
+            for j in range(4):
+                T_trial[k, i, j] = T[i, j]
 
 
 @kernel

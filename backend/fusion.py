@@ -110,7 +110,8 @@ def _fuse(
         octave = predict_octave(distance, a.reach[landmark, 1], log_scale, len(scales))
         r = window * scales[octave]
         u_right = u - bf / z
-        best, best_distance = -1, max_distance + 1
+        # A bare -1 would make Numba compile ``link`` for the constant as well.
+        best, best_distance = np.int64(-1), max_distance + 1
         column_first, column_last = max(0, int((u - r) / CELL)), int((u + r) / CELL)
         column_last = min(columns - 1, column_last)
         for grid_row in range(

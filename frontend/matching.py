@@ -150,9 +150,10 @@ def consistent_orientation(angle_a, angle_b):
         bins[i] = int(difference / turn * ORIENTATION_BINS + 0.5) % ORIENTATION_BINS
         count[bins[i]] += 1
     allowed = np.zeros(ORIENTATION_BINS, np.bool_)
-    fullest = count.max()
+    fullest = 0
     for _ in range(3):
         k = int(np.argmax(count))
+        fullest = max(fullest, count[k])
         if count[k] * 10 >= fullest:
             allowed[k] = True
         count[k] = -1

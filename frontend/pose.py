@@ -109,7 +109,10 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
                 H[row, row] *= 1.0 + 1e-9
             step = solve6(H, b)
             T = orthonormalised(compose(se3_exp(step), T))
-            if np.abs(step).max() < 1e-7:
+            moved = False
+            for k in range(6):
+                moved |= not abs(step[k]) < 1e-7
+            if not moved:
                 break
         classify(T, points, uvr, inverse_sigma2, intrinsics, inlier)
     return T, inlier

@@ -92,14 +92,13 @@ def run(
 
     from vslam.config import Config, load_config
     from vslam.datasets import open_sequence
-    from vslam.info import available_cores, numba_caches
+    from vslam.info import available_cores
     from vslam.perturb import parse_perturbation
     from vslam.progress import announce, progress_bar, render_bar
     from vslam.run import RunSettings
     from vslam.runfolder import create_run_folder, write_results
 
     thresholds = Config() if config is None else load_config(config)
-    first_run = not numba_caches()  # rendering leaves caches, too
     with render_bar(shown=not quiet) as on_render:
         sequence = open_sequence(
             dataset, data, seq,
@@ -122,12 +121,12 @@ def run(
     )
     from vslam.pipeline import run_sequence
     from vslam.recorder import NullRecorder, RerunRecorder
-    from vslam.warmup import compile_kernels
+    from vslam.warmup import compile_kernels, is_cold
 
     recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
-    if first_run:
+    if is_cold():
         announce("first run: compiling the kernels, less than a minute ...", shown=not quiet)
-    compile_kernels()
+    compile_kernels(processes=min(settings.threads, 2))
     with progress_bar(len(sequence), shown=not quiet) as on_frame:
         outcome = run_sequence(sequence, perturbation, settings, recorder, on_frame=on_frame)
     evaluation, remark = write_results(folder, outcome, ply=ply)

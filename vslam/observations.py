@@ -96,13 +96,16 @@ def observed_by(a, landmark, keyframe):
 
 @kernel
 def merge_landmarks(a, loser, winner):
-    """Move the observations of ``loser`` to ``winner``; a keyframe that sees both keeps one."""
-    row = a.head[loser]
+    """Move the observations of ``loser`` to ``winner``; a keyframe that sees both keeps one.
+
+    int64 is what other callers give ``link`` and ``observed_by``: compiled once, not twice.
+    """
+    row = np.int64(a.head[loser])
     while row >= 0:
-        following = a.next_row[row]
+        following = np.int64(a.next_row[row])
         a.landmark[row] = -1
         a.next_row[row] = -1
-        if observed_by(a, winner, a.keyframe[row]) < 0:
+        if observed_by(a, winner, np.int64(a.keyframe[row])) < 0:
             link(a, row, winner)
         row = following
     a.head[loser] = -1

@@ -136,7 +136,7 @@ def track_motion(
         frame.xyz[:] = np.nan
         frame.landmark[found[hit]] = previous.landmark[source[hit]]
         frame.xyz[found[hit]] = points[hit]
-        inliers = _refine(frame, T_cw, tracker)
+        inliers = refine(frame, T_cw, tracker)
         if inliers >= config.min_inliers_motion:
             break
     return matches, inliers
@@ -184,13 +184,16 @@ def track_descriptors(
         return 0
     frame.landmark[found[hit]] = reference.ids[hit]
     frame.xyz[found[hit]] = reference.xyz[hit]
-    return _refine(frame, T_cw, tracker)
+    return refine(frame, T_cw, tracker)
 
 
 def track_local_map(
-    frame: Frame, local: LocalMap, tracker: Tracker
+    frame: Frame, local: LocalMap, tracker: Tracker, window: float | None = None
 ) -> tuple[int, int, NDArray[np.int32]]:
     """Match every local landmark that should be visible, then refine the pose with all matches.
+
+    Args:
+        window: search radius at octave 0, pixels; None: ``tracking.local_window``.
 
     Returns:
         Matches, inliers, and the ids of the landmarks that should be visible.
@@ -208,7 +211,7 @@ def track_local_map(
         camera.width,
         camera.height,
         tracker.scales,
-        config.local_window,
+        config.local_window if window is None else window,
     )
     visible = radius > 0
     radius[tracked] = 0.0
@@ -227,7 +230,7 @@ def track_local_map(
     frame.landmark[found[hit]] = local.ids[hit]
     frame.xyz[found[hit]] = local.xyz[hit]
     matches = int(np.count_nonzero(frame.landmark >= 0))
-    inliers = _refine(frame, frame.T_cw, tracker)
+    inliers = refine(frame, frame.T_cw, tracker)
     return matches, inliers, local.ids[visible | tracked]
 
 
@@ -263,18 +266,27 @@ def _search(
     return found
 
 
-def _refine(frame: Frame, T_cw: NDArray[np.float64], tracker: Tracker) -> int:
+def refine(frame: Frame, T_cw: NDArray[np.float64], tracker: Tracker) -> int:
     """Optimise the pose from all matches, drop the outliers, return the number of inliers."""
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
-    features = frame.features
-    uvr = np.empty((len(matched), 3))
-    uvr[:, :2] = features.xy[matched]
-    uvr[:, 2] = features.u_right[matched]
-    inverse_sigma2 = tracker.scales[features.octave[matched]] ** -2.0
     frame.T_cw, inlier = optimise_pose(
-        T_cw, frame.xyz[matched], uvr, inverse_sigma2, tracker.camera.intrinsics
+        T_cw,
+        frame.xyz[matched],
+        *observations(frame, matched, tracker),
+        tracker.camera.intrinsics,
     )
     outliers = matched[~inlier]
     frame.landmark[outliers] = -1
     frame.xyz[outliers] = np.nan
     return int(np.count_nonzero(inlier))
+
+
+def observations(
+    frame: Frame, feature: NDArray[np.integer], tracker: Tracker
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """``(N, 3)`` u, v, u_right of ``(N,)`` features, and ``(N,)`` their inverse variances."""
+    features = frame.features
+    uvr = np.empty((len(feature), 3))
+    uvr[:, :2] = features.xy[feature]
+    uvr[:, 2] = features.u_right[feature]
+    return uvr, tracker.scales[features.octave[feature]] ** -2.0

@@ -325,14 +325,14 @@ def _judge(
         y = scale * (T[1, 0] * b[0] + T[1, 1] * b[1] + T[1, 2] * b[2]) + T[1, 3]
         z = scale * (T[2, 0] * b[0] + T[2, 1] * b[1] + T[2, 2] * b[2]) + T[2, 3]
         in_a = _error(x, y, z, uvr_a[i], weight_a[i], intrinsics)
-        if in_a > 1.0:
+        if not in_a <= 1.0:  # NaN: the refinement went astray
             continue
         dx, dy, dz = points_a[i, 0] - T[0, 3], points_a[i, 1] - T[1, 3], points_a[i, 2] - T[2, 3]
         x = (T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz) / scale
         y = (T[0, 1] * dx + T[1, 1] * dy + T[2, 1] * dz) / scale
         z = (T[0, 2] * dx + T[1, 2] * dy + T[2, 2] * dz) / scale
         in_b = _error(x, y, z, uvr_b[i], weight_b[i], intrinsics)
-        if in_b > 1.0:
+        if not in_b <= 1.0:
             continue
         inlier[i] = True
         count += 1

@@ -8,7 +8,7 @@ import pytest
 
 from vslam.camera import StereoCamera
 from vslam.frontend.pose import optimise_pose
-from vslam.geometry import inverse, se3_exp, se3_log, transform, solve_positive
+from vslam.geometry import inverse, se3_exp, se3_log, solve_positive, transform
 
 CAMERA = StereoCamera(400.0, 410.0, 320.0, 120.0, 0.5, 640, 240)
 TRUTH = se3_exp(np.array([0.4, -0.2, 1.1, 0.05, -0.1, 0.02]))

@@ -130,6 +130,35 @@ class VerificationConfig(_Section):
     max_distance: float = Field(15.0, gt=0, description="Between the two cameras, metres. [own]")
 
 
+class ConsistencyConfig(_Section):
+    """What makes verified candidates a loop [OS1, VII-A]."""
+
+    min_keyframes: int = Field(
+        2, ge=1, description="Keyframes in a row that a place must resemble; OS1 has 3. [own]"
+    )
+    max_gap: int = Field(1, ge=0, description="Keyframes in between that may not. [own]")
+    min_shared: int = Field(
+        30, ge=1, description="Landmarks that make a keyframe part of a candidate's group. [own]"
+    )
+    min_verified: int = Field(2, ge=1, description="Verified keyframes that must agree. [own]")
+    verified_memory: int = Field(5, ge=1, description="Keyframes that a verified one counts. [own]")
+    max_apart: float = Field(0.5, gt=0, description="Of agreeing loops, metres. [own]")
+    max_turn: float = Field(1.0, gt=0, description="Of agreeing loops, degrees. [own]")
+
+
+class RelocalizationConfig(_Section):
+    """Finding a lost camera [OS1, V-C]."""
+
+    match_distance: int = Field(50, ge=0, le=256, description="Descriptor search, bits. [OS1]")
+    match_ratio: float = Field(0.75, gt=0, le=1, description="Best over second best. [OS1]")
+    min_matches: int = Field(15, ge=4, description="Landmarks matched by descriptor. [OS1]")
+    max_draws: int = Field(600, ge=1, description="RANSAC draws. [own]")
+    confidence: float = Field(0.99, gt=0, lt=1, description="That RANSAC missed nothing. [OS1]")
+    min_consensus: int = Field(10, ge=4, description="Inliers of RANSAC. [OS1]")
+    first_window: float = Field(8.0, gt=0, description="Projection search, pixels. [OS1]")
+    min_inliers: int = Field(50, ge=6, description="Of the frame once it is found. [OS1]")
+
+
 class Config(_Section):
     """The whole configuration, written to ``config.json`` of each run and read by --config."""
 
@@ -139,6 +168,8 @@ class Config(_Section):
     keyframes: KeyframeConfig = KeyframeConfig()
     mapping: MappingConfig = MappingConfig()
     verification: VerificationConfig = VerificationConfig()
+    consistency: ConsistencyConfig = ConsistencyConfig()
+    relocalization: RelocalizationConfig = RelocalizationConfig()
 
 
 def load_config(path: Path) -> Config:

@@ -10,8 +10,53 @@ import numpy as np
 
 from vslam.features import CELL
 from vslam.kernels import hamming, kernel
+from vslam.observations import predict_octave
 
 ORIENTATION_BINS = 30
+
+
+@kernel
+def predict_view(T, xyz, normal, reach, intrinsics, width, height, scales, window):
+    """Where landmarks should appear (ORB-SLAM, V-D): in the image, within reach, seen from a
+    direction at most 60 degrees off the mean one.
+
+    Returns:
+        ``uvr`` ``(N, 3)``; search radius ``(N,)``, 0 if not visible; octave ``(N,)`` int64.
+    """
+    n = len(xyz)
+    fx, fy, cx, cy, bf = intrinsics
+    uvr = np.zeros((n, 3))
+    radius = np.zeros(n)
+    octave = np.zeros(n, np.int64)
+    log_scale = np.log(scales[1] / scales[0])
+    centre = np.empty(3)
+    for i in range(3):
+        centre[i] = -(T[0, i] * T[0, 3] + T[1, i] * T[1, 3] + T[2, i] * T[2, 3])
+    for i in range(n):
+        p = xyz[i]
+        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        if z <= 0.1:
+            continue
+        x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+        u = fx * x / z + cx
+        if u < 0.0 or u >= width:
+            continue
+        y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+        v = fy * y / z + cy
+        if v < 0.0 or v >= height:
+            continue
+        dx, dy, dz = p[0] - centre[0], p[1] - centre[1], p[2] - centre[2]
+        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if distance < 0.8 * reach[i, 0] or distance > 1.2 * reach[i, 1]:
+            continue
+        cos = (dx * normal[i, 0] + dy * normal[i, 1] + dz * normal[i, 2]) / distance
+        if cos < 0.5:
+            continue
+        octave[i] = predict_octave(distance, reach[i, 1], log_scale, len(scales))
+        uvr[i, 0], uvr[i, 1], uvr[i, 2] = u, v, u - bf / z
+        # Seen head-on the prediction is better.
+        radius[i] = (window if cos > 0.998 else 1.6 * window) * scales[octave[i]]
+    return uvr, radius, octave
 
 
 @kernel

@@ -23,6 +23,7 @@ VOCABULARY = {
         "loops",
         "trajectory",
         "observations",
+        "sampling",
     )
 }
 MIDDLE = ("frontend", "loopclosure", "backend")

@@ -99,6 +99,66 @@ class MappingConfig(_Section):
     ba_iterations: int = Field(10, ge=1, description="Levenberg-Marquardt iterations at most.")
 
 
+class VerificationConfig(_Section):
+    """When a loop candidate is a revisit [OS1, VII-B; OS2, III-C]."""
+
+    match_distance: int = Field(50, ge=0, le=256, description="Descriptor search, bits. [OS1]")
+    match_ratio: float = Field(0.8, gt=0, le=1, description="Best over second best. [OS1]")
+    min_matches: int = Field(20, ge=3, description="Landmarks matched by descriptor. [OS1, VII-B]")
+    max_draws: int = Field(600, ge=1, description="RANSAC draws. [own]")
+    confidence: float = Field(0.99, gt=0, lt=1, description="That RANSAC missed nothing. [OS1]")
+    min_consensus: int = Field(15, ge=6, description="Inliers of RANSAC. [own]")
+    place_keyframes: int = Field(
+        10, ge=0, description="Covisible keyframes that make up a place with the match. [own]"
+    )
+    first_window: float = Field(8.0, gt=0, description="Guided search, radius in pixels. [OS1]")
+    second_window: float = Field(4.0, gt=0, description="Its repetition, likewise. [own]")
+    guided_distance: int = Field(64, ge=0, le=256, description="Guided search, bits. [own]")
+    min_inliers: int = Field(40, ge=6, description="After guided search. [OS1, VII-B]")
+    min_inlier_ratio: float = Field(
+        0.5, ge=0, le=1, description="Of the guided matches that fit one pose. [own]"
+    )
+    min_seen_ratio: float = Field(
+        0.3, ge=0, le=1, description="Of a keyframe's landmarks that the other must see. [own]"
+    )
+    min_cells: int = Field(
+        8, ge=1, description="Cells of a grid of 8 x 4 over the image that hold inliers. [own]"
+    )
+    min_cell_ratio: float = Field(
+        0.4, ge=0, le=1, description="Of the cells where the place should appear. [own]"
+    )
+    max_distance: float = Field(15.0, gt=0, description="Between the two cameras, metres. [own]")
+
+
+class ConsistencyConfig(_Section):
+    """What makes verified candidates a loop [OS1, VII-A]."""
+
+    min_keyframes: int = Field(
+        2, ge=1, description="Keyframes in a row that a place must resemble; OS1 has 3. [own]"
+    )
+    max_gap: int = Field(1, ge=0, description="Keyframes in between that may not. [own]")
+    min_shared: int = Field(
+        30, ge=1, description="Landmarks that make a keyframe part of a candidate's group. [own]"
+    )
+    min_verified: int = Field(2, ge=1, description="Verified keyframes that must agree. [own]")
+    verified_memory: int = Field(5, ge=1, description="Keyframes that a verified one counts. [own]")
+    max_apart: float = Field(0.5, gt=0, description="Of agreeing loops, metres. [own]")
+    max_turn: float = Field(1.0, gt=0, description="Of agreeing loops, degrees. [own]")
+
+
+class RelocalizationConfig(_Section):
+    """Finding a lost camera [OS1, V-C]."""
+
+    match_distance: int = Field(50, ge=0, le=256, description="Descriptor search, bits. [OS1]")
+    match_ratio: float = Field(0.75, gt=0, le=1, description="Best over second best. [OS1]")
+    min_matches: int = Field(15, ge=4, description="Landmarks matched by descriptor. [OS1]")
+    max_draws: int = Field(600, ge=1, description="RANSAC draws. [own]")
+    confidence: float = Field(0.99, gt=0, lt=1, description="That RANSAC missed nothing. [OS1]")
+    min_consensus: int = Field(10, ge=4, description="Inliers of RANSAC. [OS1]")
+    first_window: float = Field(8.0, gt=0, description="Projection search, pixels. [OS1]")
+    min_inliers: int = Field(50, ge=6, description="Of the frame once it is found. [OS1]")
+
+
 class Config(_Section):
     """The whole configuration, written to ``config.json`` of each run and read by --config."""
 
@@ -107,6 +167,9 @@ class Config(_Section):
     tracking: TrackingConfig = TrackingConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
     mapping: MappingConfig = MappingConfig()
+    verification: VerificationConfig = VerificationConfig()
+    consistency: ConsistencyConfig = ConsistencyConfig()
+    relocalization: RelocalizationConfig = RelocalizationConfig()
 
 
 def load_config(path: Path) -> Config:

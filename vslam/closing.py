@@ -7,6 +7,7 @@ later that depends on the size of the problem alone, so that a run has one resul
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -29,10 +30,10 @@ from vslam.camera import StereoCamera
 from vslam.config import Config
 from vslam.features import Features
 from vslam.geometry import compose, inverse, orthonormalised
-from vslam.loopclosure.consistency import Consistency
+from vslam.loopclosure.consistency import LoopConsistency
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.verification import verify
-from vslam.loops import Closure, LoopEdge
+from vslam.loops import Closure, LoopCandidate, LoopEdge
 from vslam.map import Map
 
 Matrix = NDArray[np.float64]
@@ -55,7 +56,7 @@ class LoopClosing:
         self.closures: list[Closure] = []
         self._camera = camera
         self._config = config
-        self._consistency = Consistency(config.loops)
+        self._consistency = LoopConsistency(config.consistency)
         self._executor = ThreadPoolExecutor(1, "global-adjustment") if threads > 1 else None
         self._global: _PendingAdjustment | None = None
 
@@ -69,15 +70,16 @@ class LoopClosing:
         candidates = self.detector.query(keyframe, map_)
         consistent, rejected = self._consistency.update(keyframe, candidates, map_)
         self.edges += rejected
-        closed = False
-        for candidate in consistent:
-            edge = verify(map_, candidate, self._camera, self._config)
-            if edge.accepted and closed:
-                edge = replace(edge, accepted=False, reason="another loop was closed here")
-            elif edge.accepted:
+        for number, candidate in enumerate(consistent):
+            edge = verify(map_, candidate, self._camera, self._config.verification)
+            edge = self._consistency.confirm(edge, map_)
+            if edge.accepted:
                 edge = self._close(map_, edge)
-                closed = edge.accepted
             self.edges.append(edge)
+            if edge.accepted:
+                self._consistency.reset()
+                self.edges += [_superseded(other) for other in consistent[number + 1 :]]
+                break
 
     def finish(self, map_: Map) -> None:
         """Merge the global bundle adjustment that is under way, if there is one."""
@@ -143,15 +145,20 @@ class LoopClosing:
         config = self._config.loops
         snapshot = take_snapshot(map_, self._camera)
         wait = 1 + len(snapshot.problem.camera) // config.observations_per_keyframe
-        stop = np.zeros(1, np.bool_)
+        stop = threading.Event()
 
         def work() -> BundleSolution:
             return adjust_globally(
-                snapshot.problem, iterations=config.global_iterations, tolerance=1e-4, stop=stop
+                snapshot.problem, iterations=config.global_iterations, tolerance=1e-4, stop=stop.is_set
             )
 
         solution = work if self._executor is None else self._executor.submit(work).result
         return _PendingAdjustment(snapshot, solution, keyframe + wait, stop)
+
+
+def _superseded(candidate: LoopCandidate) -> LoopEdge:
+    reason = "another loop was closed at this keyframe"
+    return LoopEdge(candidate.query, candidate.match, candidate.score, False, reason)
 
 
 @dataclass(frozen=True)
@@ -159,7 +166,7 @@ class _PendingAdjustment:
     snapshot: GlobalSnapshot
     solution: Callable[[], BundleSolution]
     due: int
-    stop: NDArray[np.bool_]
+    stop: threading.Event
 
     def cancel(self) -> None:
-        self.stop[0] = True
+        self.stop.set()

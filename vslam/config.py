@@ -157,6 +157,21 @@ class RelocalizationConfig(_Section):
     min_consensus: int = Field(10, ge=4, description="Inliers of RANSAC. [OS1]")
     first_window: float = Field(8.0, gt=0, description="Projection search, pixels. [OS1]")
     min_inliers: int = Field(50, ge=6, description="Of the frame once it is found. [OS1]")
+    max_candidates: int = Field(5, ge=1, description="Places tried for each lost frame. [own]")
+    neighbours: int = Field(20, ge=1, description="Keyframes whose landmarks are searched. [own]")
+
+
+class LoopConfig(_Section):
+    """Closing a verified loop [OS1, VII]."""
+
+    global_iterations: int = Field(
+        10, ge=1, description="Of global bundle adjustment, at most. [OS2]"
+    )
+    observations_per_keyframe: int = Field(
+        25000,
+        ge=1,
+        description="Global bundle adjustment is merged after one keyframe for so many. [own]",
+    )
 
 
 class Config(_Section):
@@ -170,6 +185,7 @@ class Config(_Section):
     verification: VerificationConfig = VerificationConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
     relocalization: RelocalizationConfig = RelocalizationConfig()
+    loops: LoopConfig = LoopConfig()
 
 
 def load_config(path: Path) -> Config:

@@ -259,7 +259,7 @@ class Slam:
         for candidate in candidates[: config.max_candidates]:
             place = local_map(self.map, candidate.match, 1)
             around = local_map(self.map, candidate.match, config.neighbours)
-            inliers = relocalise(frame, place, around, self.tracker)
+            inliers = relocalise(frame, place, around, self.tracker, seed=candidate.match)
             if inliers:
                 self._mapping.look_at(candidate.match)
                 return inliers

@@ -83,7 +83,7 @@ def test_the_fit_of_a_mirrored_set_is_still_a_rotation():
 
 def test_points_of_weight_zero_do_not_count():
     p = np.random.default_rng(3).normal(size=(8, 3))
-    moved = p + [1.0, 2.0, 3.0]
+    moved = p + np.array([1.0, 2.0, 3.0])
     moved[5:] += 100.0
     weights = np.array([1.0] * 5 + [0.0] * 3)
     np.testing.assert_allclose(fit_motion(moved, p, weights, True)[0][:3, 3], [1, 2, 3])

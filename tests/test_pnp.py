@@ -34,10 +34,10 @@ def test_p3p_finds_the_pose_and_only_poses():
 
 
 @pytest.mark.parametrize(
-    "points", [np.ones((3, 3)), np.outer([1.0, 2.0, 4.0], [1.0, 0.0, 0.0]) + [0, 0, 9]]
+    "points", [np.ones((3, 3)), np.outer([1.0, 2.0, 4.0], [1.0, 0.0, 0.0]) + np.array([0, 0, 9])]
 )
 def test_p3p_refuses_points_on_a_line_and_on_each_other(points):
-    assert solve_p3p(points, unit(points + [0, 0.1, 1]), np.empty((4, 4, 4))) == 0
+    assert solve_p3p(points, unit(points + np.array([0, 0.1, 1])), np.empty((4, 4, 4))) == 0
 
 
 def scene(seed: int, *, n: int = 100, outliers: float = 0.7, mono: bool = False):

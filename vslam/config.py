@@ -118,14 +118,19 @@ class VerificationConfig(_Section):
     min_inlier_ratio: float = Field(
         0.5, ge=0, le=1, description="Of the guided matches that fit one pose. [own]"
     )
-    min_seen_ratio: float = Field(
-        0.3, ge=0, le=1, description="Of a keyframe's landmarks that the other must see. [own]"
+    min_elsewhere: int = Field(
+        12,
+        ge=0,
+        description="Inliers outside the third of the image, as a strip, with the most. [own]",
     )
     min_cells: int = Field(
         8, ge=1, description="Cells of a grid of 8 x 4 over the image that hold inliers. [own]"
     )
     min_cell_ratio: float = Field(
-        0.4, ge=0, le=1, description="Of the cells where the place should appear. [own]"
+        0.3, ge=0, le=1, description="Of the cells where the place should appear. [own]"
+    )
+    min_seen_ratio: float = Field(
+        0.07, ge=0, le=1, description="Of a keyframe's landmarks that the other must see. [own]"
     )
     max_distance: float = Field(15.0, gt=0, description="Between the two cameras, metres. [own]")
 

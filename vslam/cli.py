@@ -19,7 +19,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-_DETECTORS = {"none": True, "bow": False, "capsule": False, "capsule-pruned": False}
+_DETECTORS = {"none": True, "bow": True, "capsule": False, "capsule-pruned": False}
 _DETECTORS |= {"alexnet": False, "vgg16": False}
 _SENSORS = {"stereo": True, "mono": False, "rgbd": False}
 
@@ -72,7 +72,9 @@ def run(
             min=1, help="Threads; the result does not depend on it.", show_default="cores, up to 4"
         ),
     ] = None,
-    detector: Annotated[str, typer.Option(help="Loop detector; in this version: none.")] = "none",
+    detector: Annotated[
+        str, typer.Option(help="Loop detector: [b]bow[/b], or [b]none[/b] for odometry only.")
+    ] = "bow",
     sensor: Annotated[str, typer.Option(help="In this version: stereo.")] = "stereo",
     out: Annotated[Path, typer.Option(help="Where the folders of the runs go.")] = Path("runs"),
     config: Annotated[

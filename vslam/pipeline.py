@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.sequence import Sequence
+from vslam.detectors import create_detector
 from vslam.errors import UnreadableImageError
 from vslam.features import Features, TrackResult
 from vslam.frontend.tracking import Tracker, extract_features
@@ -60,7 +61,8 @@ def run_sequence(
     in the outcome. Ctrl-C ends the run after the current frame; all done so far is kept.
     """
     cv2.setNumThreads(1)  # the pool uses the cores
-    slam = Slam(sequence.camera, settings.config, threads=settings.threads)
+    detector = create_detector(settings.detector, settings.config)
+    slam = Slam(sequence.camera, settings.config, detector, threads=settings.threads)
     tracks: list[TrackResult] = []
     skipped: list[str] = []
     n_told = 0  # loops that the recorder knows of

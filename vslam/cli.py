@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam import __version__, synth_cli
+from vslam import __version__, synth_cli, vocabulary_cli
 from vslam.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
@@ -231,6 +231,7 @@ def info(data: Data = _DATA) -> None:
 
 
 synth_cli.register(app)
+vocabulary_cli.register(app)
 
 
 @app.callback(invoke_without_command=True)

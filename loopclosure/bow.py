@@ -54,13 +54,13 @@ class Postings(NamedTuple):
     A block has room for 8, 16, 32 ... postings. A word that outgrows its block moves to one of
     twice the size and leaves the old one to other words.
 
-    ``start`` (W,) i8 first posting of each word; ``count`` (W,) i4; ``free`` (40,) i8 first
+    ``start`` (W,) i8 first posting of each word; ``size`` (W,) i4; ``free`` (40,) i8 first
     free block of each size, -1 for none, whose first entry names the next; ``pool`` (P,) i8
     postings, ``keyframe << 32 | weight``.
     """
 
     start: NDArray[np.int64]
-    count: NDArray[np.int32]
+    size: NDArray[np.int32]
     free: NDArray[np.int64]
     pool: NDArray[np.int64]
 
@@ -100,7 +100,7 @@ class BowDetector:
         words = self.vocabulary.words(features.descriptors)
         self._index_features(keyframe, words)
         bag = bow_vector(self.vocabulary, words)
-        count = self._postings.count[bag.words].astype(np.int64)
+        count = self._postings.size[bag.words].astype(np.int64)
         growing = np.where(count == 0, FIRST_BLOCK, 2 * count)[is_full(count)]
         needed, pool = self._used + int(growing.sum()), self._postings.pool
         if needed > len(pool):
@@ -219,29 +219,29 @@ def post(postings, used, keyframe, words, weights):
 
     The pool must have room for a new block of each word whose block is full.
     """
-    start, count, free, pool = postings
+    start, sizes, free, pool = postings
     for i in range(len(words)):
         word = words[i]
-        n = np.int64(count[word])
+        n = np.int64(sizes[word])
         if n == 0 or (n >= FIRST_BLOCK and n & (n - 1) == 0):  # full
-            size, room = 0, FIRST_BLOCK  # room = FIRST_BLOCK * 2^size
+            kind, room = 0, FIRST_BLOCK  # room = FIRST_BLOCK * 2^kind
             while room <= n:
-                size += 1
+                kind += 1
                 room *= 2
-            block = free[size]
+            block = free[kind]
             if block >= 0:
-                free[size] = pool[block]
+                free[kind] = pool[block]
             else:
                 block = used
                 used += room
             for j in range(n):
                 pool[block + j] = pool[start[word] + j]
             if n > 0:
-                pool[start[word]] = free[size - 1]
-                free[size - 1] = start[word]
+                pool[start[word]] = free[kind - 1]
+                free[kind - 1] = start[word]
             start[word] = block
         pool[start[word] + n] = keyframe << 32 | weights[i]
-        count[word] = n + 1
+        sizes[word] = n + 1
     return used
 
 
@@ -251,11 +251,11 @@ def compare_with_all(postings, n_keyframes, words, weights):
 
     One sum for both: a posting costs one addition. Returns ``(K,)`` int64.
     """
-    start, count, _, pool = postings
+    start, sizes, _, pool = postings
     sums = np.zeros(n_keyframes, np.int64)
     for i in range(len(words)):
         first = start[words[i]]
-        for j in range(first, first + count[words[i]]):
+        for j in range(first, first + sizes[words[i]]):
             posting = pool[j]
             sums[posting >> 32] += SHARED + min(weights[i], posting & 0xFFFFFFFF)
     return sums

@@ -10,6 +10,12 @@ import typer
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from vslam.config import OrbConfig
     from vslam.loopclosure.vocabulary import Vocabulary
 
 _IMAGES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
@@ -156,20 +162,21 @@ def _find(images: list[str]) -> list[Path]:
     return list(found)
 
 
-def _extract_all(paths, config):
+def _extract_all(paths: list[Path], config: OrbConfig) -> Iterator[NDArray[np.uint8] | None]:
     """Yield the ``(n, 32)`` descriptors of each image in turn, None if it cannot be read."""
     from concurrent.futures import ThreadPoolExecutor
 
     import cv2
+    import numpy as np
 
     from vslam.frontend.orb import extract
     from vslam.info import available_cores
 
-    def one(path: Path):
+    def one(path: Path) -> NDArray[np.uint8] | None:
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        return None if image is None else extract(image, config).descriptors
+        return None if image is None else extract(np.asarray(image, np.uint8), config).descriptors
 
     threads = min(available_cores(), 4)
     with ThreadPoolExecutor(threads) as pool:
-        for start in range(0, len(paths), 16 * threads):  # images wait in no queue
+        for start in range(0, len(paths), 16 * threads):  # few descriptors wait
             yield from pool.map(one, paths[start : start + 16 * threads])

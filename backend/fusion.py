@@ -61,7 +61,8 @@ def fuse_loop(
     Returns:
         How many landmarks and features were fused.
     """
-    assert edge.features is not None and edge.landmarks is not None
+    assert edge.features is not None
+    assert edge.landmarks is not None
     a = map_.arrays
     first = map_.rows(edge.query).start
     fused = _fuse_pairs(a, first + edge.features.astype(np.int64), edge.landmarks, edge.query)

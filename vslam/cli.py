@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from vslam import __version__, synth_cli
+from vslam import __version__, synth_cli, vocabulary_cli
 from vslam.console import evaluation_rows, print_rows, print_summary
 from vslam.errors import InputError, ResultsError
 
@@ -238,6 +238,7 @@ def info(data: Data = _DATA) -> None:
 
 
 synth_cli.register(app)
+vocabulary_cli.register(app)
 
 
 @app.callback(invoke_without_command=True)

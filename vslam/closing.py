@@ -16,16 +16,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.backend.fusion import fuse_loop
-from vslam.backend.global_bundle_adjustment import (
-    GlobalSnapshot,
-    adjust_globally,
-    merge_solution,
-    take_snapshot,
-)
 from vslam.backend.bundle_adjustment import BundleSolution
+from vslam.backend.fusion import fuse_loop
+from vslam.backend.global_bundle_adjustment import adjust_globally
+from vslam.backend.global_mapping import GlobalSnapshot, merge_solution, take_snapshot
 from vslam.backend.local_mapping import adjust_locally, strong_neighbours
 from vslam.backend.loop_correction import move_keyframes
+from vslam.backend.pose_graph import consistency, essential_graph, optimise
 from vslam.camera import StereoCamera
 from vslam.config import Config
 from vslam.features import Features
@@ -63,7 +60,7 @@ class LoopClosing:
     def process(
         self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
     ) -> None:
-        """Look for loops at a keyframe whose local mapping is done, and close the first real one."""
+        """Look for loops at a keyframe whose local mapping is done; close the first real one."""
         if self._global is not None and keyframe >= self._global.due:
             self.finish(map_)
         self.detector.add(keyframe, image, features)
@@ -84,19 +81,18 @@ class LoopClosing:
     def finish(self, map_: Map) -> None:
         """Merge the global bundle adjustment that is under way, if there is one."""
         if self._global is not None:
-            merge_solution(map_, self._global.snapshot, self._global.solution(), self._camera)
+            merge_solution(map_, self._global.snapshot, self._global.solution())
             self._global = None
 
     def _close(self, map_: Map, edge: LoopEdge) -> LoopEdge:
         """Correct the map by a verified loop; if it contradicts the rest, leave the map alone."""
-        from vslam.backend.pose_graph import consistency, essential_graph, optimise
-
         start = time.perf_counter()
         config = self._config
         accepted = [closure.edge for closure in self.closures]
-        graph = essential_graph(map_, [*accepted, edge], self._aligned(map_, edge), config.loops)
-        T_cw = optimise(graph)
-        verdict = consistency(graph, T_cw, config.loops)
+        graph = essential_graph(map_, [*accepted, edge], config.pose_graph, weak=map_.restarts)
+        graph = replace(graph, T_cw=self._aligned(map_, edge)[graph.keyframes])
+        T_cw = optimise(graph, config.pose_graph)
+        verdict = consistency(graph, T_cw, config.pose_graph)
         if not verdict.consistent:
             return replace(edge, accepted=False, reason=verdict.reason)
         if self._global is not None:  # it knows nothing of this loop
@@ -134,7 +130,7 @@ class LoopClosing:
         return T_cw
 
     def joined_submaps(self, map_: Map) -> NDArray[np.int64]:
-        """``(n_keyframes,)`` the sub-map of each keyframe; sub-maps joined by loops count as one."""
+        """``(n_keyframes,)`` sub-map of each keyframe; those joined by loops count as one."""
         submap = map_.submaps()
         for closure in self.closures:
             one, other = submap[closure.edge.query], submap[closure.edge.match]
@@ -149,7 +145,10 @@ class LoopClosing:
 
         def work() -> BundleSolution:
             return adjust_globally(
-                snapshot.problem, iterations=config.global_iterations, tolerance=1e-4, stop=stop.is_set
+                snapshot.problem,
+                iterations=config.global_iterations,
+                tolerance=1e-4,
+                stop=stop.is_set,
             )
 
         solution = work if self._executor is None else self._executor.submit(work).result

@@ -179,6 +179,30 @@ class LoopConfig(_Section):
     )
 
 
+class BowConfig(_Section):
+    """Loop candidates by bag of words [OS1, III-E and VII-A]."""
+
+    min_shared: int = Field(15, ge=1, description="Landmarks that make neighbours. [OS1, III-D]")
+    exclude_recent: int = Field(
+        20, ge=1, description="The query and the keyframes before it, so many in all. [own]"
+    )
+    common_words_ratio: float = Field(
+        0.8, ge=0, le=1, description="Of the most words that any keyframe shares. [OS1]"
+    )
+    group_size: int = Field(
+        10, ge=0, description="Best covisible keyframes that add to a group's score. [OS1]"
+    )
+    group_score_ratio: float = Field(
+        0.75, ge=0, le=1, description="Of the best group's score. [OS1, III-E]"
+    )
+    max_groups: int = Field(
+        30, ge=1, description="Keyframes whose group is counted, best first: bounds work. [own]"
+    )
+    direct_level: int = Field(
+        2, ge=1, le=10, description="Level of the direct index, root 0: about k^2 nodes. [own]"
+    )
+
+
 class Config(_Section):
     """The whole configuration, written to ``config.json`` of each run and read by --config."""
 
@@ -191,6 +215,7 @@ class Config(_Section):
     consistency: ConsistencyConfig = ConsistencyConfig()
     relocalization: RelocalizationConfig = RelocalizationConfig()
     loops: LoopConfig = LoopConfig()
+    bow: BowConfig = BowConfig()
 
 
 def load_config(path: Path) -> Config:

@@ -17,7 +17,7 @@ def create_detector(name: str, config: Config) -> LoopDetector:
         return NoDetector()
     if name == "bow":
         from vslam.loopclosure.bow import BowDetector
-        from vslam.loopclosure.vocabulary import load_vocabulary
+        from vslam.loopclosure.vocabulary import load
 
-        return BowDetector(load_vocabulary(config.bow.vocabulary), config.bow)
+        return BowDetector(load(), config.bow)
     raise ValueError(f"no loop detector {name!r}")

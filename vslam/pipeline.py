@@ -78,9 +78,7 @@ def run_sequence(
                 _log.warning("frame %d skipped: %s", index, frame.problem)
                 result = slam.skip(timestamp)
             else:
-                result = slam.step_features(
-                    frame.features, timestamp, frame.left, frame.stage_ms
-                )
+                result = slam.step_features(frame.features, timestamp, frame.left, frame.stage_ms)
             tracks.append(result)
             recorder.frame(result, result.T_wc)
             if result.is_keyframe and slam.frame is not None and frame.left is not None:

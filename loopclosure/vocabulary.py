@@ -1,0 +1,465 @@
+"""Visual words: a tree of binary descriptors, and the bag of words of an image.
+
+The tree is the hierarchical vocabulary of Nister and Stewenius (CVPR 2006) over binary
+descriptors (Galvez-Lopez and Tardos, T-RO 2012, section III): each node splits its descriptors
+into k clusters by Hamming distance, the centre of a cluster is the majority of each bit, and the
+leaves are the words. Nodes are numbered breadth first, so that the children of a node are
+neighbours in memory: going down a level reads one piece of 32 k bytes.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError, ResultsError
+from vslam.kernels import hamming, inner_kernel, kernel
+
+SCHEMA = 1
+SHIPPED = Path(__file__).with_name("vocabulary.npz")
+MAX_BRANCHING, MAX_LEVELS = 20, 10  # what DBoW2's text format admits, too
+TRIALS = 4  # about 2 + ln k, of greedy k-means++
+ITERATIONS = 12  # of the majority vote in a node; most nodes settle earlier
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """A tree of N nodes with W leaves, the words. Node 0 is the root and has no descriptor.
+
+    Attributes:
+        branching: children that a node has at most, the k of the field.
+        levels: edges from the root to a leaf at most, the L of the field.
+        descriptors: ``(N, 4)`` uint64, centre of each node; zero for the root.
+        first_child: ``(N,)`` int32, children are ``first_child ... + n_children - 1``.
+        n_children: ``(N,)`` uint8, 0 for a leaf.
+        parent: ``(N,)`` int32, -1 for the root.
+        level: ``(N,)`` uint8, edges from the root.
+        word: ``(N,)`` int32, the word that a leaf is, in order of the nodes; -1 for others.
+        weight: ``(W,)`` float32, inverse document frequency ln(images / images with the word).
+    """
+
+    branching: int
+    levels: int
+    descriptors: NDArray[np.uint64]
+    first_child: NDArray[np.int32]
+    n_children: NDArray[np.uint8]
+    parent: NDArray[np.int32]
+    level: NDArray[np.uint8]
+    word: NDArray[np.int32]
+    weight: NDArray[np.float32]
+
+    @property
+    def n_words(self) -> int:
+        return len(self.weight)
+
+    def words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
+        """Word of each of ``(M, 32)`` uint8 descriptors, ``(M,)`` int32."""
+        return descend(
+            np.ascontiguousarray(descriptors).view(np.uint64),
+            self.descriptors,
+            self.first_child,
+            self.n_children,
+            self.word,
+        )
+
+    def ancestors(self, level: int) -> NDArray[np.int32]:
+        """Node of each word at a level counted from the root, ``(W,)`` int32.
+
+        A word that lies above that level is its own ancestor.
+        """
+        nodes = np.flatnonzero(self.word >= 0).astype(np.int32)
+        while (deep := self.level[nodes] > level).any():
+            nodes[deep] = self.parent[nodes[deep]]
+        return nodes
+
+
+class BowVector(NamedTuple):
+    """Bag of words of an image: ``words`` (N,) i4 ascending; ``weights`` (N,) f4 of sum 1."""
+
+    words: NDArray[np.int32]
+    weights: NDArray[np.float32]
+
+
+def bow_vector(vocabulary: Vocabulary, words: NDArray[np.int32]) -> BowVector:
+    """tf-idf weights of an image's ``(M,)`` words, scaled to an L1 norm of 1 (Nister, section 4).
+
+    Words of weight 0, those seen in every training image, say nothing and are left out.
+    """
+    unique, count = np.unique(words, return_counts=True)
+    weights = count * vocabulary.weight[unique].astype(np.float64)
+    telling = weights > 0
+    weights = weights[telling]
+    return BowVector(unique[telling], (weights / max(weights.sum(), 1e-300)).astype(np.float32))
+
+
+def score(a: BowVector, b: BowVector) -> float:
+    """Likeness of two images in [0, 1]: 1 - |a - b| / 2 (T-RO 2012, equation 2).
+
+    With weights that are positive and sum to 1, that is the sum of the lesser weight of each
+    word that both have (Nister and Stewenius, section 4, equation 5, rearranged).
+    """
+    _, in_a, in_b = np.intersect1d(a.words, b.words, assume_unique=True, return_indices=True)
+    return float(np.minimum(a.weights[in_a], b.weights[in_b]).sum(dtype=np.float64))
+
+
+@kernel
+def descend(queries, descriptors, first_child, n_children, word):
+    """Follow the nearest child, the first of equals, from the root to a leaf.
+
+    Args:
+        queries: ``(M, 4)`` uint64; the others as in ``Vocabulary``.
+
+    Returns:
+        ``(M,)`` int32 words.
+    """
+    out = np.empty(len(queries), np.int32)
+    for i in range(len(queries)):
+        query = queries[i]
+        node = 0
+        while n_children[node] > 0:
+            first = first_child[node]
+            nearest, least = first, hamming(query, descriptors[first])
+            for child in range(first + 1, first + np.int64(n_children[node])):
+                distance = hamming(query, descriptors[child])
+                if distance < least:
+                    nearest, least = child, distance
+            node = nearest
+        out[i] = word[node]
+    return out
+
+
+# -- from its parts -------------------------------------------------------------------------------
+
+
+def from_children(
+    branching: int,
+    levels: int,
+    descriptors: NDArray[np.uint64],
+    n_children: NDArray[np.uint8],
+    weight: NDArray[np.float32],
+) -> Vocabulary:
+    """The vocabulary that the nodes in breadth-first order make.
+
+    Raises:
+        ValueError: what of the parts does not fit together.
+    """
+    n = len(n_children)
+    if not 2 <= branching <= MAX_BRANCHING:
+        raise ValueError(f"branching {branching} is not in 2 to {MAX_BRANCHING}")
+    if not 1 <= levels <= MAX_LEVELS:
+        raise ValueError(f"{levels} levels are not 1 to {MAX_LEVELS}")
+    if n < 2 or descriptors.shape != (n, 4):
+        raise ValueError(f"there are {n} nodes and descriptors of shape {descriptors.shape}")
+    if n_children.max() > branching:
+        raise ValueError(f"a node has {n_children.max()} children, more than {branching}")
+    children = n_children.astype(np.int64)
+    first_child = 1 + np.cumsum(children) - children
+    inner = np.flatnonzero(children)
+    if children.sum() != n - 1 or (first_child[inner] <= inner).any():
+        raise ValueError("the numbers of children do not make a tree")
+    parent = np.concatenate([[-1], np.repeat(np.arange(n), children)]).astype(np.int32)
+    level = np.zeros(n, np.uint8)
+    start, stop, depth = 1, 1 + int(children[0]), 1
+    while start < stop:  # the next level: the children of this one
+        if depth > levels:
+            raise ValueError(f"the tree is deeper than {levels} levels")
+        level[start:stop] = depth
+        start, stop, depth = stop, stop + int(children[start:stop].sum()), depth + 1
+    leaf = children == 0
+    if weight.shape != (np.count_nonzero(leaf),):
+        raise ValueError(f"{np.count_nonzero(leaf)} leaves have {len(weight)} weights")
+    if not (np.isfinite(weight).all() and (weight >= 0).all()):
+        raise ValueError("a weight is negative or not finite")
+    word = np.full(n, -1, np.int32)
+    word[leaf] = np.arange(len(weight), dtype=np.int32)
+    return Vocabulary(
+        branching=branching,
+        levels=levels,
+        descriptors=descriptors,
+        first_child=first_child.astype(np.int32),
+        n_children=n_children,
+        parent=parent,
+        level=level,
+        word=word,
+        weight=weight,
+    )
+
+
+def save(vocabulary: Vocabulary, path: Path) -> None:
+    """Write as npz, not compressed: random bits would not shrink, and it loads at once.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
+    try:
+        with path.open("wb") as file:
+            np.savez(
+                file,
+                schema=np.int64(SCHEMA),
+                branching=np.int64(vocabulary.branching),
+                levels=np.int64(vocabulary.levels),
+                descriptors=vocabulary.descriptors,
+                n_children=vocabulary.n_children,
+                weight=vocabulary.weight,
+            )
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error
+
+
+def load(path: Path = SHIPPED) -> Vocabulary:
+    """Read what ``save`` wrote; without a path, the vocabulary that comes with vslam.
+
+    Raises:
+        InputError: no such file, damaged, of another schema, or not a vocabulary.
+    """
+    again = "make it again with vslam vocabulary train or convert"
+    try:
+        with np.load(path, allow_pickle=False) as parts:
+            if "schema" not in parts or "n_children" not in parts:
+                raise InputError(f"{path}: holds no vocabulary; {again}.")
+            if (schema := int(parts["schema"])) != SCHEMA:
+                raise InputError(f"{path}: schema {schema}, this version reads {SCHEMA}; {again}.")
+            return from_children(
+                int(parts["branching"]),
+                int(parts["levels"]),
+                parts["descriptors"].astype(np.uint64, copy=False),
+                parts["n_children"].astype(np.uint8, copy=False),
+                parts["weight"].astype(np.float32, copy=False),
+            )
+    except OSError as error:
+        why = error.strerror or "not an npz file"
+        raise InputError(f"{path}: cannot read the vocabulary ({why}); {again}.") from error
+    except (ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: damaged vocabulary ({error}); {again}.") from error
+
+
+# -- training -------------------------------------------------------------------------------------
+
+
+def train(
+    descriptors_of_images: Sequence[NDArray[np.uint8]],
+    branching: int = 10,
+    levels: int = 5,
+    seed: int = 0,
+    on_level: Callable[[int, int], None] | None = None,
+) -> Vocabulary:
+    """Grow a tree on the ``(n, 32)`` uint8 descriptors of each image; the same for the same seed.
+
+    Args:
+        on_level: told the levels done and the nodes so far.
+
+    Raises:
+        ValueError: branching or levels out of range, or fewer than two different descriptors.
+    """
+    if not (2 <= branching <= MAX_BRANCHING and 1 <= levels <= MAX_LEVELS):
+        raise ValueError(
+            f"branching is 2 to {MAX_BRANCHING} and levels 1 to {MAX_LEVELS}, "
+            f"not {branching} and {levels}"
+        )
+    counts = [len(one) for one in descriptors_of_images]
+    if sum(counts) == 0:
+        raise ValueError("there are no descriptors to train on")
+    data = np.ascontiguousarray(np.concatenate(descriptors_of_images)).view(np.uint64)
+    order = np.arange(len(data), dtype=np.int64)
+    centres, n_children = [np.zeros((1, 4), np.uint64)], []
+    starts = np.array([0, len(data)], np.int64)  # of the nodes of a level within `order`
+    for level in range(levels):
+        stream = np.uint64((seed * MAX_LEVELS + level) % 2**64)
+        new, split, starts = split_level(data, order, starts, branching, stream, ITERATIONS)
+        centres.append(new)
+        n_children.append(split)
+        if on_level is not None:
+            on_level(level + 1, sum(map(len, centres)))
+    if len(centres[1]) < 2:
+        raise ValueError("all descriptors are the same")
+    n_children.append(np.zeros(len(centres[-1]), np.uint8))
+    nodes, children = np.concatenate(centres), np.concatenate(n_children)
+    n_leaves = int(np.count_nonzero(children == 0))
+    tree = from_children(branching, levels, nodes, children, np.ones(n_leaves, np.float32))
+    seen_in = np.zeros(n_leaves, np.int64)
+    for one in descriptors_of_images:
+        seen_in[np.unique(tree.words(one))] += 1
+    # Every leaf is the nearest of some training descriptor: none is seen nowhere.
+    weight = np.log(len(counts) / np.maximum(seen_in, 1)).astype(np.float32)
+    return from_children(branching, levels, nodes, children, weight)
+
+
+@inner_kernel
+def uniform(state):
+    """Next number of [0, 1) and the state after it: splitmix64 (Steele et al., OOPSLA 2014)."""
+    state = state + np.uint64(0x9E3779B97F4A7C15)
+    z = state
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z = z ^ (z >> np.uint64(31))
+    return np.float64(z >> np.uint64(11)) / 9007199254740992.0, state
+
+
+@inner_kernel
+def seed_centres(data, members, branching, state, nearest, centres):
+    """Choose up to ``branching`` different members, far from each other.
+
+    k-means++ (Arthur and Vassilvitskii, SODA 2007) draws a member by its squared distance to the
+    nearest centre so far; of bit vectors, that is the Hamming distance itself. Of ``TRIALS``
+    drawn, the one that brings all members nearest is taken (their section 7).
+
+    Args:
+        members: ``(n,)`` indices into data; nearest: ``(n,)`` int64 workspace.
+        centres: ``(branching, 4)`` uint64, written.
+
+    Returns:
+        How many there are; fewer only if there are no more different descriptors.
+    """
+    n = len(members)
+    draw, state = uniform(state)
+    chosen = members[min(int(draw * n), n - 1)]
+    for i in range(n):
+        nearest[i] = 257
+    for k in range(branching):
+        for w in range(4):
+            centres[k, w] = data[chosen, w]
+        total = 0
+        for i in range(n):
+            distance = hamming(data[members[i]], centres[k])
+            if distance < nearest[i]:
+                nearest[i] = distance
+            total += nearest[i]
+        if total == 0 or k == branching - 1:
+            return k + 1
+        least_left = total + 1
+        for _ in range(TRIALS):
+            draw, state = uniform(state)
+            target, drawn = int(draw * total), 0
+            while target >= nearest[drawn] and drawn < n - 1:
+                target -= nearest[drawn]
+                drawn += 1
+            left = 0
+            for i in range(n):
+                left += min(nearest[i], hamming(data[members[i]], data[members[drawn]]))
+            if left < least_left:
+                least_left = left
+                chosen = members[drawn]
+    return branching
+
+
+@inner_kernel
+def assign(data, members, centres, n_centres, label):
+    """Give each member the nearest centre, the first of equals; returns how many changed."""
+    changed = 0
+    for i in range(len(members)):
+        nearest, least = 0, 257
+        for k in range(n_centres):
+            distance = hamming(data[members[i]], centres[k])
+            if distance < least:
+                nearest, least = k, distance
+        if label[i] != nearest:
+            label[i] = nearest
+            changed += 1
+    return changed
+
+
+@inner_kernel
+def vote(data, members, label, n_centres, ones, size, centres):
+    """Set each bit of a centre that more than half of its members have; the others keep theirs.
+
+    Args:
+        ones: ``(branching, 256)`` int64, and size: ``(branching,)`` int64, workspace.
+    """
+    for k in range(n_centres):
+        size[k] = 0
+        for bit in range(256):
+            ones[k, bit] = 0
+    for i in range(len(members)):
+        k = label[i]
+        size[k] += 1
+        for w in range(4):
+            value = data[members[i], w]
+            for bit in range(64):
+                ones[k, 64 * w + bit] += np.int64((value >> np.uint64(bit)) & np.uint64(1))
+    for k in range(n_centres):
+        if size[k] == 0:
+            continue
+        for w in range(4):
+            value = np.uint64(0)
+            for bit in range(64):
+                if 2 * ones[k, 64 * w + bit] > size[k]:
+                    value |= np.uint64(1) << np.uint64(bit)
+            centres[k, w] = value
+
+
+@kernel
+def split_level(data, order, starts, branching, stream, iterations):
+    """Split each node of a level into clusters, and sort ``order`` by them.
+
+    Args:
+        data: ``(M, 4)`` uint64; order: ``(M,)`` int64 indices into it, grouped by node, written.
+        starts: ``(n + 1,)`` int64, where the group of each of the n nodes starts; groups of
+            nodes that are leaves already have been left out of ``order``'s range.
+        stream: uint64 that the random numbers of this level follow from.
+
+    Returns:
+        centres: ``(c, 4)`` uint64 of the children, node by node.
+        n_children: ``(n,)`` uint8; a node with one descriptor only, many times, has none.
+        child_starts: ``(c + 1,)`` int64.
+    """
+    n_nodes = len(starts) - 1
+    centres = np.zeros((n_nodes * branching, 4), np.uint64)
+    n_children = np.zeros(n_nodes, np.uint8)
+    child_starts = np.zeros(n_nodes * branching + 1, np.int64)
+    largest = 0
+    for node in range(n_nodes):
+        largest = max(largest, starts[node + 1] - starts[node])
+    label, nearest = np.empty(largest, np.int64), np.empty(largest, np.int64)
+    sorted_members = np.empty(largest, np.int64)
+    own = np.empty((branching, 4), np.uint64)
+    ones = np.empty((branching, 256), np.int64)
+    size, cursor = np.empty(branching, np.int64), np.empty(branching, np.int64)
+    total, filled = 0, 0
+    for node in range(n_nodes):
+        members = order[starts[node] : starts[node + 1]]
+        n = len(members)
+        # Far apart for each node, so that no two read the same stretch of the sequence.
+        state = stream * np.uint64(0xD1342543DE82EF95) + np.uint64(node) * np.uint64(1 << 40)
+        n_centres = seed_centres(data, members, branching, state, nearest, own)
+        if n_centres == 1:
+            continue  # one descriptor: a leaf
+        for i in range(n):
+            label[i] = -1
+        changed = assign(data, members, own, n_centres, label)
+        iteration = 0
+        # The last step is an assignment: members are where a descent will find them.
+        while changed > 0 and iteration < iterations:
+            vote(data, members, label, n_centres, ones, size, own)
+            changed = assign(data, members, own, n_centres, label)
+            iteration += 1
+        for k in range(n_centres):
+            size[k] = 0
+        for i in range(n):
+            size[label[i]] += 1
+        position = 0
+        for k in range(n_centres):
+            cursor[k] = position
+            position += size[k]
+        for i in range(n):
+            sorted_members[cursor[label[i]]] = members[i]
+            cursor[label[i]] += 1
+        # Leaves of upper levels leave holes: what is split moves together.
+        for i in range(n):
+            order[filled + i] = sorted_members[i]
+        for k in range(n_centres):
+            if size[k] == 0:
+                continue
+            for w in range(4):
+                centres[total, w] = own[k, w]
+            child_starts[total] = filled
+            filled += size[k]
+            total += 1
+            n_children[node] += 1
+        child_starts[total] = filled
+    return centres[:total].copy(), n_children, child_starts[: total + 1].copy()

@@ -162,6 +162,9 @@ class RelocalizationConfig(_Section):
     min_consensus: int = Field(10, ge=4, description="Inliers of RANSAC. [OS1]")
     first_window: float = Field(8.0, gt=0, description="Projection search, pixels. [OS1]")
     min_inliers: int = Field(50, ge=6, description="Of the frame once it is found. [OS1]")
+    min_elsewhere: int = Field(
+        12, ge=0, description="Of these, outside the third of the image with the most. [own]"
+    )
 
 
 class Config(_Section):

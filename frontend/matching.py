@@ -7,6 +7,7 @@ looked for only near its projection and near the pyramid level at which it shoul
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.features import CELL
 from vslam.kernels import hamming, kernel
@@ -203,3 +204,16 @@ def consistent_orientation(angle_a, angle_b):
             allowed[k] = True
         count[k] = -1
     return allowed[bins]
+
+
+def count_elsewhere(u: NDArray[np.floating], width: int) -> int:
+    """How many of ``(N,)`` columns lie outside the strip, a third of the image, with the most.
+
+    What looks alike at two places is one object: a facade, a parked car. It may bring a hundred
+    inliers and fix a pose to a centimetre, but all of them lie together; the rest of the scene
+    does not fit. A place that is seen again has inliers all over the image.
+    """
+    columns = np.sort(u)
+    ends = np.searchsorted(columns, columns + width / 3, side="right")
+    strip = ends - np.arange(len(columns))
+    return len(columns) - int(strip.max(initial=0))

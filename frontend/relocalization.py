@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vslam.frontend.matching import search_all
+from vslam.frontend.matching import count_elsewhere, search_all
 from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.tracking import Frame, Tracker, observations, refine, track_local_map
 from vslam.map import LocalMap
@@ -26,10 +26,13 @@ def relocalise(
         seed: of the draws; the same seed gives the same result.
 
     Returns:
-        Inliers, at least ``relocalization.min_inliers``; 0 without success.
+        Inliers, at least ``relocalization.min_inliers`` and not all on one object; 0 without
+        success.
     """
     inliers = _locate(frame, place, surroundings, tracker, seed)
-    if inliers >= tracker.config.relocalization.min_inliers:
+    config = tracker.config.relocalization
+    elsewhere = count_elsewhere(frame.features.xy[frame.landmark >= 0, 0], tracker.camera.width)
+    if inliers >= config.min_inliers and elsewhere >= config.min_elsewhere:
         return inliers
     frame.T_cw = np.eye(4)
     frame.landmark[:] = -1

@@ -19,6 +19,7 @@ from vslam.config import VerificationConfig
 from vslam.features import FeatureGrid
 from vslam.frontend.matching import (
     consistent_orientation,
+    count_elsewhere,
     predict_view,
     search_all,
     search_windows,
@@ -100,7 +101,7 @@ def verify(
 
 
 def _with(edge: LoopEdge, **changes: object) -> LoopEdge:
-    return LoopEdge(**(vars(edge) | changes))  # type: ignore[arg-type]
+    return LoopEdge(**(vars(edge) | changes))
 
 
 def match_keyframes(
@@ -245,7 +246,7 @@ def _objection(
     expected, occupied = occupied_cells(view, camera)
     if occupied < max(config.min_cells, config.min_cell_ratio * expected):
         return f"inliers in {occupied} of {expected} cells of the image only"
-    elsewhere = inliers_elsewhere(view, camera)
+    elsewhere = count_elsewhere(view.uv[view.seen, 0], camera.width)
     if elsewhere < config.min_elsewhere:
         return f"only {elsewhere} inliers outside one third of the image"
     seen, total = seen_of(map_, edge.match, view)
@@ -281,16 +282,3 @@ def occupied_cells(view: View, camera: StereoCamera) -> tuple[int, int]:
     row = (view.uv[:, 1] * GRID_ROWS / camera.height).astype(np.int64)
     cell = row * GRID_COLUMNS + column
     return len(np.unique(cell)), len(np.unique(cell[view.seen]))
-
-
-def inliers_elsewhere(view: View, camera: StereoCamera) -> int:
-    """Inliers left without the strip, a third of the image wide, that holds the most of them.
-
-    What looks alike at two places is one object: a facade, a parked car. It may bring a hundred
-    inliers and fix a pose to a centimetre, but all of them lie together; the rest of the scene
-    does not fit. A true revisit has inliers all over the image.
-    """
-    columns = np.sort(view.uv[view.seen, 0])
-    ends = np.searchsorted(columns, columns + camera.width / 3, side="right")
-    strip = ends - np.arange(len(columns))
-    return len(columns) - int(strip.max(initial=0))

@@ -7,7 +7,7 @@ import pytest
 from test_mapping import CAMERA, World, make_world
 from test_verification import forward, in_strip, link_pass
 
-from vslam.config import Config
+from vslam.config import Config, RelocalizationConfig
 from vslam.features import FeatureGrid, Features
 from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracking import Frame, Tracker
@@ -108,3 +108,13 @@ def test_a_frame_that_is_not_found_is_left_untracked(case):
     np.testing.assert_array_equal(frame.T_cw, np.eye(4))
     assert (frame.landmark == -1).all()
     assert np.isnan(frame.xyz).all()
+
+
+def test_one_object_that_looks_the_same_brings_inliers_but_is_no_place():
+    world = mapped_street()
+    frame = lost_frame(world, forward(1.2, 0.3), among=in_strip(world, 200, 390))
+    assert find(world, frame) == 0
+    config = Config(relocalization=RelocalizationConfig(min_elsewhere=0))
+    tracker = Tracker.create(CAMERA, config)
+    place, surroundings = local_map(world.map, 1, 1), local_map(world.map, 1, 80)
+    assert relocalise(frame, place, surroundings, tracker, 0) >= 50

@@ -8,7 +8,7 @@ from test_mapping import CAMERA, World, make_world
 
 from vslam.config import VerificationConfig
 from vslam.geometry import inverse, se3_exp, se3_log
-from vslam.loopclosure.verification import inliers_elsewhere, look, look_back, verify
+from vslam.loopclosure.verification import look, look_back, verify
 from vslam.loops import LoopCandidate
 from vslam.observations import link_many, refresh_landmarks
 
@@ -228,15 +228,3 @@ def test_a_keyframe_finds_the_landmarks_it_sees():
     assert np.abs(se3_log(view.T_cw @ inverse(world.truth[1]))).max() < 0.02
     rows = world.map.arrays.first_row[1] + view.feature[view.seen]
     assert np.mean(world.map.arrays.landmark[rows] == view.landmarks[view.seen]) > 0.99
-
-
-def test_inliers_elsewhere_counts_those_outside_the_fullest_strip():
-    world = street()
-    view = look(world.map, 1, world.map.landmarks_of(1), world.map.keyframe_pose(1), CAMERA, CONFIG)
-    columns = view.uv[view.seen, 0]
-    fullest = max(
-        np.count_nonzero((columns >= c) & (columns <= c + CAMERA.width / 3)) for c in columns
-    )
-    assert inliers_elsewhere(view, CAMERA) == len(columns) - fullest
-    nothing = view._replace(feature=np.full_like(view.feature, -1))
-    assert inliers_elsewhere(nothing, CAMERA) == 0

@@ -200,6 +200,10 @@ class BowConfig(_Section):
     )
     direct_level: int = Field(
         2, ge=1, le=10, description="Level of the direct index, root 0: about k^2 nodes. [own]"
+
+
+    min_elsewhere: int = Field(
+        12, ge=0, description="Of these, outside the third of the image with the most. [own]"
     )
 
 

@@ -276,18 +276,8 @@ def reduce_points(n_free, first, camera, used, W, V, g, U, b, damping, S, rhs, V
             S[6 * k + i, 6 * k + i] *= 1.0 + damping
     Y = np.empty((3, 6))
     for p in range(len(V)):
-        scale = 1.0 + damping
-        v00, v11, v22 = V[p, 0, 0] * scale, V[p, 1, 1] * scale, V[p, 2, 2] * scale
-        v01, v02, v12 = V[p, 0, 1], V[p, 0, 2], V[p, 1, 2]
-        i00, i01, i02 = v11 * v22 - v12 * v12, v02 * v12 - v01 * v22, v01 * v12 - v02 * v11
-        determinant = v00 * i00 + v01 * i01 + v02 * i02
-        inverse = 1.0 / determinant if determinant > 0.0 else 0.0
         N = V_inverse[p]
-        N[0, 0], N[0, 1], N[0, 2] = i00 * inverse, i01 * inverse, i02 * inverse
-        N[1, 1] = (v00 * v22 - v02 * v02) * inverse
-        N[1, 2] = (v01 * v02 - v00 * v12) * inverse
-        N[2, 2] = (v00 * v11 - v01 * v01) * inverse
-        N[1, 0], N[2, 0], N[2, 1] = N[0, 1], N[0, 2], N[1, 2]
+        invert_damped(V[p], damping, N)
         for o in range(first[p], first[p + 1]):
             k = camera[o]
             if k >= n_free or not used[o]:
@@ -310,6 +300,23 @@ def reduce_points(n_free, first, camera, used, W, V, g, U, b, damping, S, rhs, V
                     target = S[6 * k + i, 6 * m : 6 * m + 6]
                     for j in range(6):
                         target[j] -= y0 * w[0, j] + y1 * w[1, j] + y2 * w[2, j]
+
+
+@inner_kernel
+def invert_damped(V, damping, N):
+    """Inverse of a point's ``(3, 3)`` block into ``N``, its diagonal raised by the damping; zero
+    if it is singular, so that the point stays where it is."""
+    scale = 1.0 + damping
+    v00, v11, v22 = V[0, 0] * scale, V[1, 1] * scale, V[2, 2] * scale
+    v01, v02, v12 = V[0, 1], V[0, 2], V[1, 2]
+    i00, i01, i02 = v11 * v22 - v12 * v12, v02 * v12 - v01 * v22, v01 * v12 - v02 * v11
+    determinant = v00 * i00 + v01 * i01 + v02 * i02
+    inverse = 1.0 / determinant if determinant > 0.0 else 0.0
+    N[0, 0], N[0, 1], N[0, 2] = i00 * inverse, i01 * inverse, i02 * inverse
+    N[1, 1] = (v00 * v22 - v02 * v02) * inverse
+    N[1, 2] = (v01 * v02 - v00 * v12) * inverse
+    N[2, 2] = (v00 * v11 - v01 * v01) * inverse
+    N[1, 0], N[2, 0], N[2, 1] = N[0, 1], N[0, 2], N[1, 2]
 
 
 @inner_kernel

@@ -13,7 +13,7 @@ from vslam.map import Map
 from vslam.loops import LoopCandidate
 
 CAMERA = StereoCamera(500.0, 500.0, 400.0, 150.0, 0.5, 800, 300)
-RADIUS, STEP = 25.0, 0.8  # metres: of the road, and between frames
+RADIUS, STEP = 50.0, 1.5  # metres: of the road, and between frames
 LAP = round(2 * np.pi * RADIUS / STEP)  # frames
 
 
@@ -30,7 +30,7 @@ class Ring:
     focal_error: float = 0.0
 
     @classmethod
-    def create(cls, seed: int = 0, n: int = 9000, focal_error: float = 0.0) -> Ring:
+    def create(cls, seed: int = 0, n: int = 12000, focal_error: float = 0.0) -> Ring:
         rng = np.random.default_rng(seed)
         angle = rng.uniform(0, 2 * np.pi, n)
         inner = rng.random(n) < 0.5
@@ -56,7 +56,7 @@ class Ring:
         T_cw = inverse(self.pose(k))
         p = self.points @ T_cw[:3, :3].T + T_cw[:3, 3]
         focal = CAMERA.fx * (1.0 + self.focal_error)
-        ahead = (p[:, 2] > 3.0) & (np.linalg.norm(p, axis=1) < 20.0)
+        ahead = (p[:, 2] > 3.0) & (np.linalg.norm(p, axis=1) < 30.0)
         z = np.where(ahead, p[:, 2], 1.0)
         u, v = focal * p[:, 0] / z + CAMERA.cx, focal * p[:, 1] / z + CAMERA.cy
         inside = (u > 0) & (u < CAMERA.width - 1) & (v > 0) & (v < CAMERA.height - 1)

@@ -105,6 +105,7 @@ class LoopClosing:
         move_keyframes(map_, keyframes, T_cw)
         fuse_loop(map_, edge, query_side, match_side, self._camera, config)
         adjust_locally(map_, edge.query, self._camera, config)
+        edge = replace(edge, reason="closed")
         closure = Closure(edge, keyframes, before, T_cw, time.perf_counter() - start)
         self.closures.append(closure)
         self._global = self._start_global(map_, edge.query)

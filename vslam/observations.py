@@ -229,3 +229,44 @@ def count_seen_by(a, keyframe, needed):
         if seen >= needed:
             count += 1
     return count
+
+
+@kernel
+def covisible_pairs(a, keyframes, n_keyframes, minimum):
+    """Pairs of ``(N,)`` keyframes that share at least ``minimum`` landmarks, in one pass.
+
+    Returns ``(M, 2)`` int64 with the lower id first, in ascending order, and ``(M,)`` how many
+    landmarks each pair shares.
+    """
+    counts = np.zeros(n_keyframes, np.int64)
+    touched = np.empty(n_keyframes, np.int64)
+    listed = np.zeros(n_keyframes, np.bool_)
+    for keyframe in keyframes:
+        listed[keyframe] = True
+    pairs, shared = np.empty((64, 2), np.int64), np.empty(64, np.int64)
+    n = 0
+    for keyframe in range(n_keyframes):
+        if not listed[keyframe]:
+            continue
+        n_touched = 0
+        for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
+            if a.landmark[row] < 0:
+                continue
+            other = a.head[a.landmark[row]]
+            while other >= 0:
+                k = a.keyframe[other]
+                if k > keyframe and listed[k]:
+                    if counts[k] == 0:
+                        touched[n_touched] = k
+                        n_touched += 1
+                    counts[k] += 1
+                other = a.next_row[other]
+        for k in np.sort(touched[:n_touched]):
+            if counts[k] >= minimum:
+                if n == len(pairs):
+                    pairs = np.concatenate((pairs, np.empty_like(pairs)))
+                    shared = np.concatenate((shared, np.empty_like(shared)))
+                pairs[n, 0], pairs[n, 1], shared[n] = keyframe, k, counts[k]
+                n += 1
+            counts[k] = 0
+    return pairs[:n], shared[:n]

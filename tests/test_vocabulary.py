@@ -22,9 +22,9 @@ from vslam.loopclosure.vocabulary import (
     load,
     save,
     score,
-    train,
 )
 from vslam.loopclosure.vocabulary_text import read_text, write_text
+from vslam.loopclosure.vocabulary_training import train
 
 
 def bits(descriptors: np.ndarray) -> np.ndarray:

@@ -45,7 +45,7 @@ def train(
 ) -> None:
     """Train a vocabulary on images: better on many places than on many views of one."""
     from vslam.config import OrbConfig
-    from vslam.loopclosure import vocabulary
+    from vslam.loopclosure import vocabulary_training
     from vslam.loopclosure.vocabulary_text import is_text, write_vocabulary
     from vslam.progress import announce, count_bar
 
@@ -69,7 +69,7 @@ def train(
         announce(f"level {level}: {nodes} nodes", shown=not quiet)
 
     try:
-        trained = vocabulary.train(descriptors, k, levels, seed, on_level)
+        trained = vocabulary_training.train(descriptors, k, levels, seed, on_level)
     except ValueError as error:
         raise InputError(
             f"vslam vocabulary train: {error}; {unreadable} of {len(paths)} images cannot be read."

@@ -1,68 +1,23 @@
-"""Loop detection by bag of words: inverted index, direct index and choice of candidates.
+"""Loop detection by bag of words.
 
-The indices are those of Galvez-Lopez and Tardos (T-RO 2012, section IV); candidates are chosen as
-in ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-E and VII-A): by shared words, by likeness
-compared with the query's own neighbours, and by groups of covisible keyframes.
-
-The L1 score of two bags is the sum of the lesser weights of the words they share (vocabulary.py).
-So one pass over the postings of the query's words gives the shared words and the score of *every*
-keyframe at once: those of its neighbours, which set the bar, and those of all candidates. The
-price is a weight in each posting; the gain is work that does not depend on the number of
-candidates.
+Candidates are chosen as in ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-E and VII-A): by
+shared words, by likeness compared with the query's own neighbours, and by groups of covisible
+keyframes. The index gives the score of every keyframe at once, the neighbours' included.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import BowConfig
 from vslam.features import Features
-from vslam.kernels import hamming, inner_kernel, kernel
-from vslam.loopclosure.vocabulary import BowVector, Vocabulary, bow_vector
+from vslam.kernels import inner_kernel, kernel
+from vslam.loopclosure.bow_index import InvertedIndex, Likeness, NodeIndex, grown
+from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
 from vslam.loops import LoopCandidate
 from vslam.map import Map
 from vslam.observations import count_shared
-
-FIRST_BLOCK = 8  # postings: one cache line
-UNIT = 2**31 - 1  # weights are whole multiples of 1 / UNIT: sums are exact in any order
-SHARED = 1 << 40  # counts shared words above the bits of a sum of weights
-
-
-class NodeIndex(NamedTuple):
-    """Direct index of an image: its features by the node of the tree under which their words lie.
-
-    ``node`` (N,) i4 ascending; ``feature`` (N,) i4, index within the image.
-    """
-
-    node: NDArray[np.int32]
-    feature: NDArray[np.int32]
-
-
-class Likeness(NamedTuple):
-    """An image against each keyframe: ``shared`` (K,) i4 words; ``score`` (K,) f8 in [0, 1]."""
-
-    shared: NDArray[np.int32]
-    score: NDArray[np.float64]
-
-
-class Postings(NamedTuple):
-    """Inverted index of W words: those of a word lie in one block, read as one stream.
-
-    A block has room for 8, 16, 32 ... postings. A word that outgrows its block moves to one of
-    twice the size and leaves the old one to other words.
-
-    ``start`` (W,) i8 first posting of each word; ``size`` (W,) i4; ``free`` (40,) i8 first
-    free block of each size, -1 for none, whose first entry names the next; ``pool`` (P,) i8
-    postings, ``keyframe << 32 | weight``.
-    """
-
-    start: NDArray[np.int64]
-    size: NDArray[np.int32]
-    free: NDArray[np.int64]
-    pool: NDArray[np.int64]
 
 
 class BowDetector:
@@ -74,14 +29,7 @@ class BowDetector:
         self.vocabulary = vocabulary
         self.config = config or BowConfig()
         self._node_of_word = vocabulary.ancestors(self.config.direct_level)
-        n = vocabulary.n_words
-        self._postings = Postings(
-            np.zeros(n, np.int64),
-            np.zeros(n, np.int32),
-            np.full(40, -1, np.int64),
-            np.empty(65536, np.int64),
-        )
-        self._used = 0  # of the pool
+        self._index = InvertedIndex(vocabulary.n_words)
         # Features of all keyframes, sorted by node within each: those of keyframe k are entries
         # start[k] to start[k + 1]. Keyframes that were never added have none.
         self._start = np.zeros(65, np.int64)
@@ -99,14 +47,7 @@ class BowDetector:
             raise ValueError(f"keyframe {keyframe} comes after {self._n_keyframes - 1}")
         words = self.vocabulary.words(features.descriptors)
         self._index_features(keyframe, words)
-        bag = bow_vector(self.vocabulary, words)
-        count = self._postings.size[bag.words].astype(np.int64)
-        growing = np.where(count == 0, FIRST_BLOCK, 2 * count)[is_full(count)]
-        needed, pool = self._used + int(growing.sum()), self._postings.pool
-        if needed > len(pool):
-            pool = _grown(pool, max(needed, len(pool) * 3 // 2))
-            self._postings = self._postings._replace(pool=pool)
-        self._used = post(self._postings, self._used, keyframe, bag.words, fixed(bag.weights))
+        self._index.add(keyframe, bow_vector(self.vocabulary, words))
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
         """Living keyframes, not recent and not covisible, that look like a keyframe added before.
@@ -115,11 +56,10 @@ class BowDetector:
         """
         config = self.config
         entries = self._entries(keyframe)
-        likeness = self.compare(bow_vector(self.vocabulary, self._word[entries]))
+        likeness = self._index.compare(bow_vector(self.vocabulary, self._word[entries]))
         n = len(likeness.score)
         eligible = map_.arrays.keyframe_alive[:n].copy()
         eligible[max(0, keyframe + 1 - config.exclude_recent) :] = False
-        eligible[keyframe:] = False
         covisible, _ = map_.covisible(keyframe, config.min_shared)
         covisible = covisible[(covisible < n) & (covisible != keyframe)]
         eligible[covisible] = False
@@ -132,14 +72,9 @@ class BowDetector:
     ) -> list[LoopCandidate]:
         """Living keyframes that look like a frame outside the map, best first."""
         words = self.vocabulary.words(features.descriptors)
-        likeness = self.compare(bow_vector(self.vocabulary, words))
+        likeness = self._index.compare(bow_vector(self.vocabulary, words))
         eligible = map_.arrays.keyframe_alive[: len(likeness.score)].copy()
         return self._candidates(-1, likeness, eligible, 0.0, map_)
-
-    def compare(self, bag: BowVector) -> Likeness:
-        """Shared words and score of an image with every keyframe id up to the newest."""
-        sums = compare_with_all(self._postings, self._n_keyframes, bag.words, fixed(bag.weights))
-        return Likeness((sums // SHARED).astype(np.int32), sums % SHARED / UNIT)
 
     def node_index(self, keyframe: int) -> NodeIndex:
         """Direct index of a keyframe added before."""
@@ -155,12 +90,8 @@ class BowDetector:
     def _index_features(self, keyframe: int, words: NDArray[np.int32]) -> None:
         first = int(self._start[self._n_keyframes])
         last = first + len(words)
-        if keyframe + 2 > len(self._start):
-            self._start = _grown(self._start, max(keyframe + 2, len(self._start) * 3 // 2))
-        if last > len(self._word):
-            capacity = max(last, len(self._word) * 3 // 2)
-            self._word = _grown(self._word, capacity)
-            self._feature = _grown(self._feature, capacity)
+        self._start = grown(self._start, keyframe + 2)
+        self._word, self._feature = grown(self._word, last), grown(self._feature, last)
         order = np.argsort(self._node_of_word[words], kind="stable")
         self._feature[first:last], self._word[first:last] = order, words[order]
         self._start[self._n_keyframes : keyframe + 1] = first
@@ -195,70 +126,6 @@ class BowDetector:
             config.max_groups,
         )
         return [LoopCandidate(query, k, float(likeness.score[k])) for k in chosen.tolist()]
-
-
-def _grown(array: NDArray, capacity: int) -> NDArray:
-    bigger = np.empty((capacity, *array.shape[1:]), array.dtype)
-    bigger[: len(array)] = array
-    return bigger
-
-
-def fixed(weights: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Weights of a bag, in [0, 1], in whole units."""
-    return np.rint(weights.astype(np.float64) * UNIT).astype(np.int64)
-
-
-def is_full(count: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether blocks with so many postings have no room, ``(N,)`` bool: as ``post`` fills them."""
-    return (count & (count - 1) == 0) & ((count == 0) | (count >= FIRST_BLOCK))
-
-
-@kernel
-def post(postings, used, keyframe, words, weights):
-    """Add a keyframe's bag to the inverted index; returns how much of the pool is in use.
-
-    The pool must have room for a new block of each word whose block is full.
-    """
-    start, sizes, free, pool = postings
-    for i in range(len(words)):
-        word = words[i]
-        n = np.int64(sizes[word])
-        if n == 0 or (n >= FIRST_BLOCK and n & (n - 1) == 0):  # full
-            kind, room = 0, FIRST_BLOCK  # room = FIRST_BLOCK * 2^kind
-            while room <= n:
-                kind += 1
-                room *= 2
-            block = free[kind]
-            if block >= 0:
-                free[kind] = pool[block]
-            else:
-                block = used
-                used += room
-            for j in range(n):
-                pool[block + j] = pool[start[word] + j]
-            if n > 0:
-                pool[start[word]] = free[kind - 1]
-                free[kind - 1] = start[word]
-            start[word] = block
-        pool[start[word] + n] = keyframe << 32 | weights[i]
-        sizes[word] = n + 1
-    return used
-
-
-@kernel
-def compare_with_all(postings, n_keyframes, words, weights):
-    """For each keyframe ``SHARED`` times the words in common, plus the sum of lesser weights.
-
-    One sum for both: a posting costs one addition. Returns ``(K,)`` int64.
-    """
-    start, sizes, _, pool = postings
-    sums = np.zeros(n_keyframes, np.int64)
-    for i in range(len(words)):
-        first = start[words[i]]
-        for j in range(first, first + sizes[words[i]]):
-            posting = pool[j]
-            sums[posting >> 32] += SHARED + min(weights[i], posting & 0xFFFFFFFF)
-    return sums
 
 
 @inner_kernel
@@ -358,62 +225,3 @@ def choose_candidates(
             chosen[m] = representative[g]
             m += 1
     return chosen[:m].copy()
-
-
-@kernel
-def match_by_node(
-    node_a,
-    feature_a,
-    descriptors_a,
-    use_a,
-    node_b,
-    feature_b,
-    descriptors_b,
-    use_b,
-    max_distance,
-    ratio,
-):
-    """Match features of two images whose words lie under the same node of the vocabulary.
-
-    Args:
-        node_a, feature_a: direct index of image a (``NodeIndex``); likewise b.
-        descriptors_a, descriptors_b: ``(M, 4)`` and ``(N, 4)`` uint64, of all features.
-        use_a, use_b: ``(M,)`` and ``(N,)`` bool, features that may be matched.
-        max_distance: bits; ratio: best over second best under the node (1 switches it off).
-
-    Returns:
-        ``(M,)`` int32 feature of b or -1, none twice (the closest keeps it).
-    """
-    matches = np.full(len(descriptors_a), -1, np.int32)
-    distances = np.full(len(descriptors_a), 257, np.int64)
-    owner = np.full(len(descriptors_b), -1, np.int64)
-    first, n_a, n_b = 0, len(node_a), len(node_b)
-    for i in range(n_a):
-        while first < n_b and node_b[first] < node_a[i]:
-            first += 1
-        feature = feature_a[i]
-        if not use_a[feature]:
-            continue
-        best, least, second = -1, 257, 257
-        j = first
-        while j < n_b and node_b[j] == node_a[i]:
-            other = feature_b[j]
-            j += 1
-            if not use_b[other]:
-                continue
-            distance = hamming(descriptors_a[feature], descriptors_b[other])
-            if distance < least:
-                second = least
-                best, least = other, distance
-            elif distance < second:
-                second = distance
-        if best < 0 or least > max_distance or least > ratio * second:
-            continue
-        previous = owner[best]
-        if previous >= 0:
-            if distances[previous] <= least:
-                continue
-            matches[previous] = -1
-        owner[best] = feature
-        matches[feature], distances[feature] = best, least
-    return matches

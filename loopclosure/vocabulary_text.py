@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError, ResultsError
 from vslam.kernels import inner_kernel, kernel
-from vslam.loopclosure.vocabulary import MAX_BRANCHING, MAX_LEVELS, Vocabulary, from_children
+from vslam.loopclosure.vocabulary import (
+    MAX_BRANCHING,
+    MAX_LEVELS,
+    Vocabulary,
+    from_children,
+    load,
+    save,
+)
 
 NUMBERS = 35  # in the line of a node: parent, leaf, 32 bytes, weight
 L1_NORM, TF_IDF = 0, 0  # DBoW2's numbers for the scoring and weighting that we have
@@ -30,6 +37,36 @@ _FAULTS = {
     _NO_PARENT: "names a parent that does not come before it",
     _NO_WEIGHT: "has a weight that is negative or too large",
 }
+
+
+def read_vocabulary(path: Path) -> Vocabulary:
+    """Read an npz file, or DBoW2's text if the name ends in .txt.
+
+    Raises:
+        InputError: another ending, or as ``load`` and ``read_text``.
+    """
+    return read_text(path) if is_text(path) else load(path)
+
+
+def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
+    """Write an npz file, or DBoW2's text if the name ends in .txt.
+
+    Raises:
+        InputError: another ending.
+        ResultsError: the file cannot be written.
+    """
+    (write_text if is_text(path) else save)(vocabulary, path)
+
+
+def is_text(path: Path) -> bool:
+    """Whether the name says DBoW2's text rather than npz.
+
+    Raises:
+        InputError: it says neither.
+    """
+    if path.suffix not in (".txt", ".npz"):
+        raise InputError(f"{path}: a vocabulary's name ends in .npz or in .txt (DBoW2's format).")
+    return path.suffix == ".txt"
 
 
 def read_text(path: Path) -> Vocabulary:

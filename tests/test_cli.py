@@ -65,7 +65,9 @@ def call(monkeypatch, capsys, tmp_path):
     return run
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["eval"], ["perturb"], ["info"]])
+@pytest.mark.parametrize(
+    "command", [[], ["run"], ["eval"], ["perturb"], ["info"], ["vocabulary", "train"]]
+)
 def test_help_loads_nothing_heavy(command):
     script = (
         "import sys\n"

@@ -22,9 +22,9 @@ from vslam.loopclosure.vocabulary import (
     load,
     save,
     score,
-    train,
 )
 from vslam.loopclosure.vocabulary_text import read_text, write_text
+from vslam.loopclosure.vocabulary_training import train
 
 
 def bits(descriptors: np.ndarray) -> np.ndarray:
@@ -432,10 +432,11 @@ def test_commands_train_convert_and_show(call, tmp_path):
     [
         (("train", "nowhere"), "nowhere: no image there"),
         (("train", "broken.jpg"), "1 of 1 images cannot be read"),
-        (("train", "broken.jpg", "--out", "v.dat"), "name a file that ends in .npz or .txt"),
-        (("convert", "v.npz", "v.dat"), "name a file that ends in .npz or .txt"),
+        (("train", "broken.jpg", "--out", "v.dat"), "name ends in .npz or in .txt"),
+        (("train", "broken.jpg", "--out", "none/v.npz"), "there is no folder none"),
+        (("convert", "v.npz", "v.dat"), "name ends in .npz or in .txt"),
         (("convert", "v.npz", "v.txt"), "v.npz: cannot read the vocabulary (No such file"),
-        (("info", "broken.jpg"), "name a file that ends in .npz or .txt"),
+        (("info", "broken.jpg"), "name ends in .npz or in .txt"),
     ],
 )
 def test_commands_refuse(call, tmp_path, words, why):

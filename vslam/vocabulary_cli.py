@@ -16,10 +16,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vslam.config import OrbConfig
-    from vslam.loopclosure.vocabulary import Vocabulary
 
 _IMAGES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
-_TEXT, _NPZ = ".txt", ".npz"
 
 commands = typer.Typer(
     help="Train, convert and look at vocabularies of visual words.", no_args_is_help=True
@@ -46,11 +44,14 @@ def train(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
     """Train a vocabulary on images: better on many places than on many views of one."""
-    _format(out)
     from vslam.config import OrbConfig
-    from vslam.loopclosure import vocabulary
+    from vslam.loopclosure import vocabulary_training
+    from vslam.loopclosure.vocabulary_text import is_text, write_vocabulary
     from vslam.progress import announce, count_bar
 
+    is_text(out)  # refuse what cannot be written before the work, not after
+    if not out.parent.is_dir():
+        raise InputError(f"{out}: there is no folder {out.parent}; make it or choose another.")
     paths = _find(images)
     descriptors, unreadable = [], 0
     with count_bar("images", len(paths), shown=not quiet) as advance:
@@ -68,12 +69,12 @@ def train(
         announce(f"level {level}: {nodes} nodes", shown=not quiet)
 
     try:
-        trained = vocabulary.train(descriptors, k, levels, seed, on_level)
+        trained = vocabulary_training.train(descriptors, k, levels, seed, on_level)
     except ValueError as error:
         raise InputError(
             f"vslam vocabulary train: {error}; {unreadable} of {len(paths)} images cannot be read."
         ) from error
-    _write(trained, out)
+    write_vocabulary(trained, out)
     typer.echo(
         f"{out}: {trained.n_words} words from {n} descriptors of {len(descriptors)} images, "
         f"k {k}, levels {levels}, seed {seed}"
@@ -86,9 +87,11 @@ def convert(
     target: Annotated[Path, typer.Argument(help="File to write, .npz or .txt (DBoW2).")],
 ) -> None:
     """Convert between vslam's npz and the text format of DBoW2 and ORB-SLAM."""
-    _format(target)
-    read = _read(source)
-    _write(read, target)
+    from vslam.loopclosure.vocabulary_text import is_text, read_vocabulary, write_vocabulary
+
+    is_text(target)
+    read = read_vocabulary(source)
+    write_vocabulary(read, target)
     typer.echo(f"{target}: {read.n_words} words, {target.stat().st_size / 1e6:.1f} MB")
 
 
@@ -104,10 +107,11 @@ def info(
     import numpy as np
 
     from vslam.loopclosure.vocabulary import SHIPPED
+    from vslam.loopclosure.vocabulary_text import read_vocabulary
 
     file = file or SHIPPED
     start = time.perf_counter()
-    v = _read(file)
+    v = read_vocabulary(file)
     elapsed = time.perf_counter() - start
     depth = v.level[v.word >= 0]
     idf = np.percentile(v.weight, [0, 5, 50, 95, 100])
@@ -120,27 +124,6 @@ def info(
     ]
     for name, value in rows:
         typer.echo(f"{name:<10}{value}")
-
-
-def _format(path: Path) -> str:
-    if path.suffix not in (_TEXT, _NPZ):
-        raise InputError(f"{path}: name a file that ends in {_NPZ} or {_TEXT} (DBoW2's format).")
-    return path.suffix
-
-
-def _read(path: Path) -> Vocabulary:
-    from vslam.loopclosure import vocabulary, vocabulary_text
-
-    return vocabulary_text.read_text(path) if _format(path) == _TEXT else vocabulary.load(path)
-
-
-def _write(vocabulary_: Vocabulary, path: Path) -> None:
-    from vslam.loopclosure import vocabulary, vocabulary_text
-
-    if _format(path) == _TEXT:
-        vocabulary_text.write_text(vocabulary_, path)
-    else:
-        vocabulary.save(vocabulary_, path)
 
 
 def _find(images: list[str]) -> list[Path]:

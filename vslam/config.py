@@ -119,7 +119,7 @@ class VerificationConfig(_Section):
         0.5, ge=0, le=1, description="Of the guided matches that fit one pose. [own]"
     )
     min_elsewhere: int = Field(
-        12,
+        15,
         ge=0,
         description="Inliers outside the third of the image, as a strip, with the most. [own]",
     )
@@ -163,7 +163,7 @@ class RelocalizationConfig(_Section):
     first_window: float = Field(8.0, gt=0, description="Projection search, pixels. [OS1]")
     min_inliers: int = Field(50, ge=6, description="Of the frame once it is found. [OS1]")
     min_elsewhere: int = Field(
-        12, ge=0, description="Of these, outside the third of the image with the most. [own]"
+        15, ge=0, description="Of these, outside the third of the image with the most. [own]"
     )
     max_candidates: int = Field(5, ge=1, description="Places tried for each lost frame. [own]")
     neighbours: int = Field(20, ge=1, description="Keyframes whose landmarks are searched. [own]")

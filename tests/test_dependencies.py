@@ -28,6 +28,7 @@ VOCABULARY = {
 }
 MIDDLE = ("frontend", "loopclosure", "backend")
 APPLICATION = ("slam", "cli", "report", "recorder", "pipeline", "run", "runfolder", "evaluate")
+APPLICATION += ("comparison", "console", "loop_evaluation")
 # Verification of loops uses the frontend's matching and pose.
 GRANTED = {
     ("vslam.loopclosure.verification", "vslam.frontend.matching"),

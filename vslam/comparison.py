@@ -82,9 +82,12 @@ def comparison_rows(with_: LoopFigures, without: LoopFigures) -> list[tuple[str,
         ("lost frames", "lost_frames", "{}"),
         ("loops closed", "loops_closed", "{}"),
     )
-    rows = []
-    for title, name, form in measures:
-        values = (getattr(with_, name), getattr(without, name))
-        cells = ["n/a" if value is None else form.format(value) for value in values]
-        rows.append((title, *cells))
-    return rows
+
+    def cell(figures: LoopFigures, name: str, form: str) -> str:
+        value = getattr(figures, name)
+        return "n/a" if value is None else form.format(value)
+
+    return [
+        (title, cell(with_, name, form), cell(without, name, form))
+        for title, name, form in measures
+    ]

@@ -148,5 +148,5 @@ def _aligned(outcome: RunOutcome, evaluation: Evaluation | None, points: Points)
     p, q = estimate[:, :3, 3], aligned[:, :3, 3]
     scale = 1.0
     if evaluation.alignment == "sim3":
-        scale = np.linalg.norm(q - q.mean(axis=0)) / np.linalg.norm(p - p.mean(axis=0))
+        scale = float(np.linalg.norm(q - q.mean(axis=0)) / np.linalg.norm(p - p.mean(axis=0)))
     return scale * (points - p.mean(axis=0)) @ R.T + q.mean(axis=0)

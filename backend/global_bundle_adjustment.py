@@ -48,8 +48,10 @@ def adjust_globally(
     used = np.ones(n_observations, np.bool_) if use is None else use
     pairs = coupled_cameras(problem.first, problem.camera, used, n_free)
     structure = analyse(n_free, pairs)
-    cameras, points_order, order = elimination_order(problem, structure.order)
+    # Free cameras come as they are eliminated, and held ones after them.
+    cameras = np.concatenate([structure.order, np.arange(n_free, len(problem.T_cw))])
     rank = np.argsort(cameras)
+    points_order, order = working_order(problem.first, rank[problem.camera], len(cameras))
     observations = (
         np.concatenate([[0], np.cumsum(np.diff(problem.first)[points_order])]),
         rank[problem.camera[order]],
@@ -107,23 +109,39 @@ def adjust_globally(
     return BundleSolution(T_cw[rank], points_trial, cost, inlier_as_given, done)
 
 
-def elimination_order(
-    problem: BundleProblem, free: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Cameras, points and observations of the problem in the order in which they are worked on.
+@kernel
+def working_order(first, rank, n_cameras):
+    """Points ``(P,)`` and observations ``(O,)`` in the order in which they are worked on.
 
-    Free cameras come as they are eliminated, and so do the observations of each point: the first
-    of any two names the column, the second the row. Points come by their first camera: what is
-    written to one after the other lies side by side.
+    Observations of a point come as their cameras, of which ``rank`` ``(O,)`` is the place in the
+    elimination: of any two the first names the column and the second the row. Points come by their
+    first camera: blocks that are written one after the other lie side by side.
     """
-    n_cameras, n_points = len(problem.T_cw), len(problem.points)
-    cameras = np.concatenate([free, np.arange(problem.n_free, n_cameras)])
-    rank = np.argsort(cameras)[problem.camera]
-    point = np.repeat(np.arange(n_points), np.diff(problem.first))
-    first_rank = np.full(n_points, n_cameras)
-    np.minimum.at(first_rank, point, rank)
-    points = np.argsort(first_rank, kind="stable")
-    return cameras, points, np.lexsort((rank, np.argsort(points)[point]))
+    n_points = len(first) - 1
+    start = np.zeros(n_cameras + 2, np.int64)
+    earliest = np.full(n_points, n_cameras)
+    for p in range(n_points):
+        for o in range(first[p], first[p + 1]):
+            earliest[p] = min(earliest[p], rank[o])
+        start[earliest[p] + 1] += 1
+    for k in range(n_cameras + 1):
+        start[k + 1] += start[k]
+    points = np.empty(n_points, np.int64)
+    for p in range(n_points):
+        points[start[earliest[p]]] = p
+        start[earliest[p]] += 1
+    observations = np.empty(len(rank), np.int64)
+    n = 0
+    for p in points:
+        begin = n
+        for o in range(first[p], first[p + 1]):
+            k = n
+            while k > begin and rank[observations[k - 1]] > rank[o]:
+                observations[k] = observations[k - 1]
+                k -= 1
+            observations[k] = o
+            n += 1
+    return points, observations
 
 
 @kernel

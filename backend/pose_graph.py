@@ -54,8 +54,8 @@ class Consistency:
     Attributes:
         consistent: whether the closure may stand.
         reason: "consistent", or in a few words what speaks against it.
-        strain: chi-square of all edges but loops: how much drift, in the units of the drift
-            model, the closure implies.
+        strain: chi-square of the tree and covisibility edges: how much drift, in the units of the
+            drift model, the closure implies.
         closed: loop edges that were open before: what the strain is to be shared by.
         loop_error: ``(E,)`` chi-square of the loop edges, NaN for others.
     """
@@ -210,13 +210,12 @@ def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     for (i, j), T_i_j, kind, sigma in zip(
         graph.edges.tolist(), graph.T_i_j, graph.kind.tolist(), sigmas, strict=True
     ):
-        model = noise.Diagonal.Sigmas(sigma)
-        if kind == LOOP:
-            model = noise.Robust.Create(cauchy, model)
+        plain = noise.Diagonal.Sigmas(sigma)
+        model = noise.Robust.Create(cauchy, plain) if kind == LOOP else plain
         factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(T_i_j), model))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(config.iterations)
-    parameters.setRelativeErrorTol(1e-6)
+    parameters.setRelativeErrorTol(1e-5)
     result = gtsam.LevenbergMarquardtOptimizer(factors, start, parameters).optimize()
     T_wc = np.array([result.atPose3(i).matrix() for i in range(len(graph.T_cw))])
     T_cw = inverses(T_wc)
@@ -230,9 +229,10 @@ def consistency(
     """Whether an optimised graph makes sense, or a loop was wrong and is to be undone.
 
     Two tests. A loop edge far from its measurement contradicts the others or more of the path than
-    the loss would give up. The strain, chi-square of what all other edges were bent by, has six
-    degrees of freedom for each loop that was closed if drift is what the model says; beyond several
-    times that no plausible drift explains the loop.
+    the loss would give up. The strain, chi-square of what tree and covisibility edges were bent by,
+    has six degrees of freedom for each loop that was closed if drift is what the model says; beyond
+    several times that no plausible drift explains the loop. Nothing can be said against a single
+    loop across a weak edge: it strains nothing.
 
     Args:
         T_cw: ``(N, 4, 4)`` result of ``optimise``.
@@ -241,7 +241,7 @@ def consistency(
     after = edge_errors(T_cw, graph.edges, graph.T_i_j, graph.sigmas)
     loop = graph.kind == LOOP
     loop_error = np.where(loop, after, np.nan)
-    strain = float(after[~loop].sum())
+    strain = float(after[~loop & (graph.kind != WEAK)].sum())
     closed = int(np.count_nonzero(before[loop] > config.max_loop_error))
     reason = "consistent"
     if loop.any() and np.nanmax(loop_error) > config.max_loop_error:

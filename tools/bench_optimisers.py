@@ -18,8 +18,21 @@ import numpy as np
 
 from vslam.backend.bundle_adjustment import BundleProblem
 from vslam.backend.global_bundle_adjustment import adjust_globally
+from vslam.backend.pose_graph import (
+    COVISIBLE,
+    LOOP,
+    TREE,
+    PoseGraph,
+    edge_sigmas,
+    essential_graph,
+    optimise,
+)
 from vslam.camera import StereoCamera
-from vslam.geometry import inverses, se3_exp
+from vslam.config import PoseGraphConfig
+from vslam.features import Features
+from vslam.geometry import inverse, inverses, se3_exp
+from vslam.map import Map
+from vslam.observations import covisible_pairs, link_many
 
 CAMERA = StereoCamera(718.0, 718.0, 607.0, 185.0, 0.54, 1241, 376)
 BLOCK = (200.0, 120.0)  # sides of the block of houses that the car drives round, metres
@@ -139,7 +152,78 @@ def bench_bundle() -> None:
         )
 
 
-BENCHES = {"bundle": bench_bundle}
+def simulated_graph(n: int, reach: int, config: PoseGraphConfig) -> tuple[PoseGraph, np.ndarray]:
+    """Odometry of a drive, 1.2 m between keyframes, edges to the next ``reach``, and a loop at each
+    later lap, fifty keyframes apart; the true ``T_wc``."""
+    rng = np.random.default_rng(0)
+    truth = drive(n, 1.2)
+    lap = round(2 * sum(BLOCK) / 1.2)
+    T_wc = truth.copy()
+    for k in range(1, n):
+        error = se3_exp(rng.normal(size=6) * [0.02, 0.02, 0.02, 3e-4, 1e-3, 3e-4])
+        T_wc[k] = T_wc[k - 1] @ inverse(truth[k - 1]) @ truth[k] @ error
+    path = [(i, i + s) for s in range(1, reach + 1) for i in range(n - s)]
+    loops = [(k, k - lap) for k in range(lap + 10, n, 50)]
+    edges = np.array(path + loops)
+    source = np.repeat([True, False], [len(path), len(loops)])[:, None, None]
+    T_i_j = np.where(
+        source,
+        inverses(T_wc)[edges[:, 0]] @ T_wc[edges[:, 1]],
+        inverses(truth)[edges[:, 0]] @ truth[edges[:, 1]],
+    )
+    kind = np.repeat([TREE, COVISIBLE, LOOP], [n - 1, len(path) - n + 1, len(loops)])
+    kind = kind.astype(np.uint8)
+    sigmas = edge_sigmas(edges, T_i_j, kind, n, config)
+    graph = PoseGraph(np.arange(n), inverses(T_wc), edges, T_i_j, kind, sigmas, np.arange(n) == 0)
+    return graph, truth
+
+
+def bench_graph() -> None:
+    config = PoseGraphConfig()
+    optimise(simulated_graph(10, 2, config)[0], config)
+    graph, truth = simulated_graph(1500, 4, config)
+    seconds, T_cw = best_time(lambda: optimise(graph, config), repeats=5)
+    before, after = (position_error(T, inverses(truth)) for T in (graph.T_cw, T_cw))
+    print(
+        f"graph: {len(graph.T_cw)} keyframes, {len(graph.edges)} edges, "
+        f"{np.count_nonzero(graph.kind == LOOP)} loops: {seconds:.3f} s, "
+        f"position error {before:.2f} -> {after:.2f} m"
+    )
+
+
+def bench_covisibility() -> None:
+    """The essential graph of a map whose keyframes observe 300 landmarks, each seen by seven."""
+    rng = np.random.default_rng(0)
+    for n in (10, 1500, 5000):
+        map_ = Map(1.2 ** np.arange(8))
+        each, new = 300, 43
+        features = Features(
+            xy=rng.uniform(0, 300, (each, 2)).astype(np.float32),
+            octave=np.zeros(each, np.uint8),
+            angle=np.zeros(each, np.float32),
+            descriptors=rng.integers(0, 256, (each, 32), dtype=np.uint8),
+            u_right=np.full(each, np.nan, np.float32),
+        )
+        for k, T_cw in enumerate(inverses(drive(n, 1.0))):
+            map_.add_keyframe(features, T_cw, 0.1 * k, k)
+            map_.parents[k] = k - 1
+            descriptors = features.descriptors[:new].copy().view(np.uint64)
+            map_.add_landmarks(np.zeros((new, 3)), descriptors, k)
+            seen = np.arange(max(0, new * k + new - each), new * (k + 1))
+            link_many(map_.arrays, np.arange(each * k, each * k + len(seen)), seen)
+        config = PoseGraphConfig()
+        seconds, graph = best_time(lambda m=map_, c=config: essential_graph(m, [], c))
+        living = map_.living_keyframes()
+        pairs, _ = best_time(
+            lambda m=map_, ids=living: covisible_pairs(m.arrays, ids, len(ids), 100)
+        )
+        print(
+            f"covisibility: {n} keyframes, {len(graph.edges)} edges: {seconds:.3f} s, "
+            f"of these {pairs:.3f} s counting shared landmarks"
+        )
+
+
+BENCHES = {"bundle": bench_bundle, "graph": bench_graph, "covisibility": bench_covisibility}
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or BENCHES:

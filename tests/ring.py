@@ -9,8 +9,8 @@ import numpy as np
 from vslam.camera import StereoCamera
 from vslam.features import Features
 from vslam.geometry import inverse
-from vslam.map import Map
 from vslam.loops import LoopCandidate
+from vslam.map import Map
 
 CAMERA = StereoCamera(500.0, 500.0, 400.0, 150.0, 0.5, 800, 300)
 RADIUS, STEP = 50.0, 1.5  # metres: of the road, and between frames

@@ -14,7 +14,7 @@ from vslam.loopclosure.detector import NoDetector
 from vslam.loops import LoopCandidate
 from vslam.slam import Slam
 
-ROUND = [float(k) for k in range(LAP + 25)]
+ROUND = [float(k) for k in range(LAP + 40)]
 DRIFTING = Ring.create(focal_error=0.01)
 EXACT = Ring.create()
 
@@ -30,7 +30,7 @@ class Deceived(Oracle):
 
 
 def run(ring, frames, detector=None, *, threads=1, dark=(), finish=True):
-    """Drive along ``frames`` of the ring, one each tenth of a second; ``dark`` ones show nothing."""
+    """Drive along ``frames`` of the ring, ten a second; ``dark`` ones show nothing."""
     slam = Slam(CAMERA, None, detector, threads=threads)
     results = []
     for i, k in enumerate(frames):

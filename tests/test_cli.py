@@ -102,8 +102,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        ("--detector bow", ["--detector bow", "not built yet", "'none'"]),
-        ("--detector capsule", ["--detector capsule", "not built yet"]),
+        ("--detector capsule", ["--detector capsule", "not built yet", "'none', 'bow'"]),
         ("--detector orb", ["--detector orb", "unknown"]),
         ("--sensor mono", ["--sensor mono", "not built yet", "'stereo'"]),
         ("--sensor rgbd", ["--sensor rgbd", "not built yet"]),
@@ -112,7 +111,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--dataset euroc", ["--dataset euroc", "unknown"]),
         ("", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
         ("--config nothing.json", ["nothing.json", "configuration"]),
-        ("--compare-loops", ["--compare-loops", "--detector none"]),
+        ("--compare-loops --detector none", ["--compare-loops", "--detector none"]),
     ],
 )
 def test_run_refuses_without_data(call, words, parts):
@@ -202,7 +201,7 @@ def test_run_writes_its_folder_and_a_summary(call, root, pipeline):
     assert "report.html" in out
     assert "10/10" in err
     folder = Path("runs/latest").resolve()
-    assert folder.name.endswith("-kitti-00-blur0.5-none")
+    assert folder.name.endswith("-kitti-00-blur0.5-bow")
     assert pipeline.settings.threads == 3
     assert pipeline.settings.perturb == "blur:0.5"
     assert pipeline.recorder == str(Path("runs") / folder.name / "recording.rrd")
@@ -215,8 +214,7 @@ REJECTED = LoopEdge(2, 0, 0.2, False, "too few matches")
 
 
 @pytest.fixture
-def with_detector(pipeline, monkeypatch) -> SimpleNamespace:
-    monkeypatch.setitem(cli._DETECTORS, "bow", True)
+def with_detector(pipeline) -> SimpleNamespace:
     pipeline.loops = [CLOSED, REJECTED, REJECTED]
     return pipeline
 
@@ -233,7 +231,7 @@ def test_summary_counts_loops(call, root, with_detector):
 
 
 def test_summary_without_a_detector(call, root, pipeline):
-    _, out, _ = call("run", "--data", root, "--max-frames", 10)
+    _, out, _ = call("run", "--data", root, "--max-frames", 10, "--detector", "none")
     assert "not looked for, 0 missed" in out
 
 

@@ -103,7 +103,10 @@ class DeferredMapping:
         self._copy_view()
         # The map is the thread's from here on.
         observed = self.current(map_.arrays.landmark[map_.rows(keyframe)])
-        self._pending = self._start(keyframe, features, image)
+        if keyframe > 0:
+            self._pending = self._start(keyframe, features, image)
+        else:
+            self._closing.process(map_, keyframe, features, image)
         return observed
 
     def merge(self) -> bool:
@@ -169,8 +172,7 @@ class DeferredMapping:
         self, keyframe: int, features: Features, image: NDArray[np.uint8] | None
     ) -> Callable[[], None]:
         def work() -> None:
-            if keyframe > 0:
-                map_keyframe(self.map, keyframe, self._camera, self._config)
+            map_keyframe(self.map, keyframe, self._camera, self._config)
             self._closing.process(self.map, keyframe, features, image)
 
         if self._executor is None:

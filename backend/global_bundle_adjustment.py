@@ -20,9 +20,9 @@ from vslam.backend.bundle_adjustment import (
     evaluate,
     invert_damped,
     linearise,
+    step_cameras,
     step_points,
 )
-from vslam.geometry import compose, orthonormalised, se3_exp
 from vslam.kernels import inner_kernel, kernel
 
 
@@ -262,6 +262,6 @@ def subtract_coupling(Y, W, o, S, offset, width):
 
 @kernel
 def _step(n_free, first, camera, used, W, g, x, V_inverse, T_cw, points, T_trial, points_trial):
-    step_points(n_free, first, camera, used, W, g, x.reshape(-1), V_inverse, points, points_trial)
-    for k in range(n_free):
-        T_trial[k] = orthonormalised(compose(se3_exp(x[k]), T_cw[k]))
+    twists = x.reshape(-1)
+    step_points(n_free, first, camera, used, W, g, twists, V_inverse, points, points_trial)
+    step_cameras(n_free, twists, T_cw, T_trial)

@@ -277,7 +277,10 @@ def refine_motion(
             T[row, 3] *= growth
         scale *= growth
         T = orthonormalised(compose(se3_exp(step[:6]), T))
-        if np.abs(step).max() < 1e-6:
+        largest = 0.0
+        for k in range(7):
+            largest = max(largest, abs(step[k]))
+        if largest < 1e-6:
             break
     return T, scale
 

@@ -242,7 +242,6 @@ def covisible_pairs(a, keyframes, n_keyframes, minimum):
     landmarks each pair shares.
     """
     counts = np.zeros(n_keyframes, np.int64)
-    touched = np.empty(n_keyframes, np.int64)
     listed = np.zeros(n_keyframes, np.bool_)
     for keyframe in keyframes:
         listed[keyframe] = True
@@ -251,7 +250,6 @@ def covisible_pairs(a, keyframes, n_keyframes, minimum):
     for keyframe in range(n_keyframes):
         if not listed[keyframe]:
             continue
-        n_touched = 0
         for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
             if a.landmark[row] < 0:
                 continue
@@ -259,13 +257,10 @@ def covisible_pairs(a, keyframes, n_keyframes, minimum):
             while other >= 0:
                 k = a.keyframe[other]
                 if k > keyframe and listed[k]:
-                    if counts[k] == 0:
-                        touched[n_touched] = k
-                        n_touched += 1
                     counts[k] += 1
                 other = a.next_row[other]
-        for k in np.sort(touched[:n_touched]):
-            if counts[k] >= minimum:
+        for k in range(keyframe + 1, n_keyframes):
+            if counts[k] >= max(1, minimum):
                 if n == len(pairs):
                     pairs = np.concatenate((pairs, np.empty_like(pairs)))
                     shared = np.concatenate((shared, np.empty_like(shared)))

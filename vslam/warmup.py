@@ -3,13 +3,14 @@
 Compiling takes longer than anything else in a first run, and one process compiles one kernel at a
 time: Numba holds a lock. Two processes share the work, and find each other's in Numba's cache:
 
-- *this* process calls ``HERE``: what comes before and around local mapping;
-- a *second* one, ``python -m vslam.warmup``, calls ``BESIDE``: local mapping;
-- then this process runs a small SLAM over everything. It loads what was compiled, and compiles
-  what the second process did not, all of it if there was none.
+- *this* process calls ``HERE``: what comes before and around local mapping, and finds loops;
+- a *second* one, ``python -m vslam.warmup``, calls ``BESIDE``: local mapping, and closing loops;
+- then this process calls ``EVERYTHING``. It loads what was compiled, and compiles what the second
+  process did not, all of it if there was none.
 
 A module with new kernels adds a function that calls them to the shorter of ``HERE`` and ``BESIDE``
-(and to ``run_everything``, if the small SLAM does not reach them). Which one is shorter:
+(and to ``EVERYTHING``, if the small SLAM there does not reach them; and its last kernel to
+``TELLING``). Which one is shorter:
 
     for half in HERE BESIDE; do
         NUMBA_CACHE_DIR=$(mktemp -d) python -c "
@@ -28,17 +29,39 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
 
-from vslam.backend import bundle_adjustment
+from vslam.backend import (
+    block_cholesky,
+    bundle_adjustment,
+    global_bundle_adjustment,
+    global_mapping,
+)
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
+from vslam.backend.fusion import fuse_loop
+from vslam.backend.global_bundle_adjustment import adjust_globally
+from vslam.backend.global_mapping import merge_solution, take_snapshot
+from vslam.backend.loop_correction import move_keyframes
+from vslam.backend.pose_graph import consistency, essential_graph
 from vslam.camera import StereoCamera
+from vslam.closing import LoopClosing
 from vslam.config import Config, KeyframeConfig, MappingConfig
-from vslam.features import Features
+from vslam.features import FeatureGrid, Features
+from vslam.frontend import pnp
 from vslam.frontend.orb import scale_factors
+from vslam.frontend.relocalization import relocalise
+from vslam.frontend.tracking import Frame, Tracker
 from vslam.info import available_cores
+from vslam.loopclosure import alignment, bow
+from vslam.loopclosure.bow import BowDetector
+from vslam.loopclosure.detector import NoDetector
+from vslam.loopclosure.verification import verify
+from vslam.loopclosure.vocabulary import Vocabulary, from_children
+from vslam.loops import LoopCandidate, LoopEdge
+from vslam.map import Map, local_map
 from vslam.mapping import DeferredMapping
 from vslam.slam import Slam
 
@@ -55,22 +78,31 @@ def compile_kernels(*, processes: int = 2) -> None:
         processes: with 1 no second process is started, nor if the kernels are compiled already or
             there is one core only.
     """
-    if processes > 1 and available_cores() > 1 and is_cold():
+    cold = is_cold()
+    if cold and processes > 1 and available_cores() > 1:
         with second_process() as is_running:
             if is_running:
                 for share in HERE:
                     share()
-    run_everything()
+    # Kernels of loop closing need not be loaded now: few runs close a loop in their first seconds.
+    for share in EVERYTHING if cold else EVERYTHING[:1]:
+        share()
 
 
 def is_cold() -> bool:
-    """Whether kernels must be compiled: the largest one is not in Numba's cache, or older than its
-    source."""
-    source = Path(bundle_adjustment.__file__)
-    largest = bundle_adjustment._adjust
-    cache = Path(largest.stats.cache_path)  # type: ignore[attr-defined]
-    indices = cache.glob(f"{source.stem}.{largest.__name__}-*.nbi")
-    return all(index.stat().st_mtime < source.stat().st_mtime for index in indices)
+    """Whether kernels must be compiled: one of ``TELLING`` is not in Numba's cache, or older there
+    than its source."""
+    return any(not is_cached(module, name) for module, name in TELLING)
+
+
+def is_cached(module: ModuleType, name: str) -> bool:
+    """Whether Numba's cache has a kernel as its module's source has it now."""
+    source = Path(str(module.__file__))
+    cache = Path(getattr(module, name).stats.cache_path)
+    changed = source.stat().st_mtime
+    return any(
+        index.stat().st_mtime >= changed for index in cache.glob(f"{source.stem}.{name}-*.nbi")
+    )
 
 
 @contextmanager
@@ -140,15 +172,18 @@ def compile_local_mapping() -> None:
     map_synthetic(4)
 
 
-def map_synthetic(keyframes: int) -> None:
+def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     """Map a camera that moves sideways past a cloud of points, without images.
+
+    Returns the map, and what the last keyframe saw.
 
     Every keyframe sees all points. The first half of them are near and have a stereo match, the
     rest are left for triangulation. A keyframe is redundant from one landmark, so that the fourth
     insertion culls one.
     """
     config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
-    mapping = DeferredMapping(scale_factors(config.orb), CAMERA, config, threads=1)
+    closing = LoopClosing(NoDetector(), CAMERA, config, threads=1)
+    mapping = DeferredMapping(scale_factors(config.orb), CAMERA, config, closing, threads=1)
     rng = np.random.default_rng(0)
     n = 400
     points = rng.uniform([-5.0, -4.0, 9.0], [9.0, 4.0, 12.0], (n, 3))
@@ -169,6 +204,48 @@ def map_synthetic(keyframes: int) -> None:
         landmark, _ = mapping.insert(features, landmark, T_cw, 0.1 * k, k)
         mapping.merge()
         landmark, _ = mapping.current(landmark)
+    return mapping.map, features
+
+
+def compile_recognition() -> None:
+    """Loop detection, verification and relocalisation: a keyframe is compared with itself."""
+    config = Config()
+    map_, features = map_synthetic(1)
+    verify(map_, LoopCandidate(0, 0, 1.0), CAMERA, config.verification)
+
+    grid = FeatureGrid.of_positions(features.xy, CAMERA.width, CAMERA.height)
+    place = local_map(map_, 0, 1)
+    tracker = Tracker.create(CAMERA, config)
+    relocalise(Frame.untracked(features, grid), place, place, tracker, seed=0)
+
+    detector = BowDetector(smallest_vocabulary())
+    detector.add(0, None, features)
+    detector.query(0, map_)
+
+
+def compile_correction() -> None:
+    """Pose graph, loop fusion and global bundle adjustment: the steps of ``LoopClosing``.
+
+    GTSAM alone is left out: it takes a second to import and has nothing to compile.
+    """
+    config = Config()
+    map_, _ = map_synthetic(3)
+    nothing = np.empty(0, np.int32)
+    edge = LoopEdge(
+        2, 0, 1.0, True, "", T_query_match=np.eye(4), features=nothing, landmarks=nothing
+    )
+    graph = essential_graph(map_, [edge], config.pose_graph)
+    consistency(graph, graph.T_cw, config.pose_graph)
+    move_keyframes(map_, graph.keyframes, graph.T_cw)
+    fuse_loop(map_, edge, [2], [0], CAMERA, config)
+    snapshot = take_snapshot(map_, CAMERA)
+    merge_solution(map_, snapshot, adjust_globally(snapshot.problem, iterations=1))
+
+
+def smallest_vocabulary() -> Vocabulary:
+    """Two words."""
+    centres = np.array([[0] * 4, [0] * 4, [2**64 - 1] * 4], np.uint64)
+    return from_children(2, 1, centres, np.array([2, 0, 0], np.uint8), np.ones(2, np.float32))
 
 
 def compile_bundle_adjustment() -> None:
@@ -190,8 +267,27 @@ def compile_bundle_adjustment() -> None:
 
 # ``BESIDE`` starts with what it needs alone: when it comes to insert keyframes, the kernels for
 # that are in the cache, because ``HERE`` starts with them.
-HERE: tuple[Callable[[], None], ...] = (compile_insertion, compile_tracking)
-BESIDE: tuple[Callable[[], None], ...] = (compile_bundle_adjustment, compile_local_mapping)
+HERE: tuple[Callable[[], None], ...] = (compile_insertion, compile_tracking, compile_recognition)
+BESIDE: tuple[Callable[[], None], ...] = (
+    compile_bundle_adjustment,
+    compile_local_mapping,
+    compile_correction,
+)
+EVERYTHING: tuple[Callable[[], None], ...] = (
+    run_everything,
+    compile_recognition,
+    compile_correction,
+)
+# Of each module with much to compile the kernel that is compiled last.
+TELLING: tuple[tuple[ModuleType, str], ...] = (
+    (bundle_adjustment, "_adjust"),
+    (alignment, "_ransac"),
+    (pnp, "ransac_pose"),
+    (bow, "choose_candidates"),
+    (global_bundle_adjustment, "_step"),
+    (block_cholesky, "factor_solve"),
+    (global_mapping, "remove_unchanged"),
+)
 
 
 if __name__ == "__main__":

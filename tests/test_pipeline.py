@@ -5,11 +5,11 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -155,12 +155,22 @@ def test_interrupt_finishes_the_report_of_the_frames_done(kitti_tree, tmp_path):
     (folder / "times.txt").write_text("".join(f"{0.1 * k:.6e}\n" for k in range(len(order))))
     shutil.rmtree(root / "poses")
     command = [sys.executable, "-m", "vslam", "run", "--data", str(root), "--no-record"]
+    environment = {**os.environ, "FORCE_COLOR": "1"}  # or no bar is drawn into a pipe
     process = subprocess.Popen(
-        command, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        command,
+        cwd=tmp_path,
+        env=environment,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        errors="replace",
     )
-    while not list(tmp_path.glob("runs/2*")):
-        time.sleep(0.05)
-    time.sleep(3.0)
+    assert process.stderr is not None
+    drawn = ""
+    while not re.search(r"\d\d/", drawn):  # ten frames done
+        character = process.stderr.read(1)
+        assert character, f"ended too soon: {drawn}"
+        drawn += character
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=120)
     assert process.returncode == 1, err

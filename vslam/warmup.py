@@ -24,6 +24,7 @@ types: for one signature two writers of Numba's cache cannot harm each other, fo
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -78,31 +79,57 @@ def compile_kernels(*, processes: int = 2) -> None:
         processes: with 1 no second process is started, nor if the kernels are compiled already or
             there is one core only.
     """
-    cold = is_cold()
-    if cold and processes > 1 and available_cores() > 1:
-        with second_process() as is_running:
-            if is_running:
-                for share in HERE:
-                    share()
-    # Kernels of loop closing need not be loaded now: few runs close a loop in their first seconds.
-    for share in EVERYTHING if cold else EVERYTHING[:1]:
-        share()
+    if not is_cold():
+        # Kernels of loop closing need not be loaded now: few runs close a loop at once.
+        EVERYTHING[0]()
+        return
+    with no_garbage_collection():
+        if processes > 1 and available_cores() > 1:
+            with second_process() as is_running:
+                if is_running:
+                    for share in HERE:
+                        share()
+        for share in EVERYTHING:
+            share()
+    mark_warm()
 
 
 def is_cold() -> bool:
     """Whether kernels must be compiled: one of ``TELLING`` is not in Numba's cache, or older there
     than its source."""
-    return any(not is_cached(module, name) for module, name in TELLING)
-
-
-def is_cached(module: ModuleType, name: str) -> bool:
-    """Whether Numba's cache has a kernel as its module's source has it now."""
-    source = Path(str(module.__file__))
-    cache = Path(getattr(module, name).stats.cache_path)
-    changed = source.stat().st_mtime
     return any(
-        index.stat().st_mtime >= changed for index in cache.glob(f"{source.stem}.{name}-*.nbi")
+        all(index.stat().st_mtime < source.stat().st_mtime for index in indexes)
+        for source, indexes in map(cached, TELLING)
     )
+
+
+def mark_warm() -> None:
+    """Date what is cached now: Numba compares the content of a source, and keeps a kernel whose
+    source has only a new date, as after a change of branch."""
+    for _, indexes in map(cached, TELLING):
+        for index in indexes:
+            with suppress(OSError):
+                index.touch()
+
+
+def cached(kernel: tuple[ModuleType, str]) -> tuple[Path, list[Path]]:
+    """The source of a kernel, and its index files in Numba's cache."""
+    module, name = kernel
+    source = Path(str(module.__file__))
+    folder = Path(getattr(module, name).stats.cache_path)
+    return source, list(folder.glob(f"{source.stem}.{name}-*.nbi"))
+
+
+@contextmanager
+def no_garbage_collection() -> Iterator[None]:
+    """Collect no garbage: searching for it is 14 % of compiling, which keeps most that it makes."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 @contextmanager
@@ -291,5 +318,6 @@ TELLING: tuple[tuple[ModuleType, str], ...] = (
 
 
 if __name__ == "__main__":
-    for share in BESIDE:
-        share()
+    with no_garbage_collection():
+        for share in BESIDE:
+            share()

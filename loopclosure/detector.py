@@ -1,0 +1,55 @@
+"""What a loop detector is: the plug-in point of the learned detectors and of the bag of words."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.features import Features
+from vslam.loops import LoopCandidate
+from vslam.map import Map
+
+
+class LoopDetector(Protocol):
+    """Remembers keyframes by their looks and finds those that look alike.
+
+    Calls come in the order of the keyframes, from one thread at a time. Everything after a
+    detector (consistency, verification, correction) is shared, so that a comparison of runs
+    isolates the detector.
+    """
+
+    name: str
+
+    def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
+        """Remember a keyframe. ``image`` is its ``(H, W)`` left image, None if it was not kept."""
+        ...
+
+    def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
+        """Places that look like a keyframe added before, best first: living keyframes that are
+        neither recent nor covisible with it."""
+        ...
+
+    def locate(
+        self, image: NDArray[np.uint8] | None, features: Features, map_: Map
+    ) -> list[LoopCandidate]:
+        """Living keyframes that look like a frame outside the map, best first, with query -1."""
+        ...
+
+
+class NoDetector:
+    """Finds nothing: odometry only."""
+
+    name = "none"
+
+    def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
+        pass
+
+    def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
+        return []
+
+    def locate(
+        self, image: NDArray[np.uint8] | None, features: Features, map_: Map
+    ) -> list[LoopCandidate]:
+        return []

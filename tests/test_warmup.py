@@ -1,4 +1,4 @@
-"""Compiling in two processes: the halves cover everything, and nothing depends on the second."""
+"""Compiling in two processes: the halves cover everything, and nothing depends on them."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ def signatures():
     ours = (k for k in kernels if k.py_func.__module__.startswith("vslam."))
     return {(k.py_func.__module__, k.py_func.__name__): set(k.signatures) for k in ours}
 
-for share in warmup.HERE:
+for share in warmup.HALVES["first"]:
     share()
-here = signatures()
-for share in warmup.BESIDE:
+first = signatures()
+for share in warmup.HALVES["second"]:
     share()
 both = signatures()
-for name, known in here.items():
+for name, known in first.items():
     assert not known or both[name] == known, f"both halves compile {name}, for other types"
 for share in warmup.EVERYTHING:
     share()
@@ -83,63 +83,72 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     made: list[str] = []
     monkeypatch.setattr(warmup, "is_cold", lambda: True)
     monkeypatch.setattr(warmup, "available_cores", lambda: 2)
-    monkeypatch.setattr(warmup, "HERE", (lambda: made.append("here"),))
     monkeypatch.setattr(warmup, "EVERYTHING", (lambda: made.append("everything"),))
     return made
 
 
-def second_is(monkeypatch: pytest.MonkeyPatch, folder: Path, script: str) -> Path:
-    """Let a shell script stand for Python; returns the file in which it leaves its process id."""
-    python, trace = folder / "python", folder / "pid"
-    python.write_text(f"#!/bin/sh\necho $$ > {trace}.new\nmv {trace}.new {trace}\n{script}\n")
+def python_is(monkeypatch: pytest.MonkeyPatch, folder: Path, script: str) -> Path:
+    """Let a shell script stand for Python; it leaves its process id in the folder returned, in a
+    file named as its last argument."""
+    python, traces = folder / "python", folder / "started"
+    traces.mkdir()
+    leave = f"echo $$ > {folder}/$4 && mv {folder}/$4 {traces}/"
+    python.write_text(f"#!/bin/sh\n{leave}\n{script}\n")
     python.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(python))
-    return trace
+    return traces
 
 
-def test_a_second_process_that_fails_costs_only_its_help(
+def assert_both_ended(traces: Path) -> None:
+    assert {trace.name for trace in traces.iterdir()} == set(warmup.HALVES)
+    for trace in traces.iterdir():
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(trace.read_text()), 0)
+
+
+def test_processes_that_fail_cost_only_their_help(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, calls: list[str]
 ) -> None:
-    trace = second_is(monkeypatch, tmp_path, "exit 1")
+    traces = python_is(monkeypatch, tmp_path, "exit 1")
     warmup.compile_kernels()
-    assert trace.exists()
-    assert calls == ["here", "everything"]
+    assert_both_ended(traces)
+    assert calls == ["everything"]
 
 
-def test_a_second_process_that_hangs_is_ended(
+def test_processes_that_hang_are_ended(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, calls: list[str]
 ) -> None:
-    trace = second_is(monkeypatch, tmp_path, "exec sleep 60")
+    traces = python_is(monkeypatch, tmp_path, "exec sleep 60")
     monkeypatch.setattr(warmup, "PATIENCE_S", 0.5)
     warmup.compile_kernels()
-    assert calls == ["here", "everything"]
-    with pytest.raises(ProcessLookupError):
-        os.kill(int(trace.read_text()), 0)
+    assert_both_ended(traces)
+    assert calls == ["everything"]
 
 
-def test_an_interrupt_ends_the_second_process(
+def test_an_interrupt_ends_the_processes(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, calls: list[str]
 ) -> None:
-    trace = second_is(monkeypatch, tmp_path, "exec sleep 60")
+    traces = python_is(monkeypatch, tmp_path, "exec sleep 60")
 
-    def interrupt() -> None:
-        while not trace.exists():
+    def interrupt(*_: object) -> None:
+        while len(list(traces.iterdir())) < 2:
             pass
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(warmup, "HERE", (interrupt,))
+    wait = subprocess.Popen.wait
+    waits = iter([interrupt, wait, wait])
+    monkeypatch.setattr(subprocess.Popen, "wait", lambda *a, **k: next(waits)(*a, **k))
     with pytest.raises(KeyboardInterrupt):
         warmup.compile_kernels()
     assert calls == []
-    with pytest.raises(ProcessLookupError):
-        os.kill(int(trace.read_text()), 0)
+    assert_both_ended(traces)
 
 
 @pytest.mark.parametrize("why", ["warm", "one core", "one process", "frozen", "no Python"])
-def test_no_second_process_where_it_cannot_help(
+def test_no_other_process_where_it_cannot_help(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, calls: list[str], why: str
 ) -> None:
-    trace = second_is(monkeypatch, tmp_path, "exit 0")
+    traces = python_is(monkeypatch, tmp_path, "exit 0")
     if why == "warm":
         monkeypatch.setattr(warmup, "is_cold", lambda: False)
     elif why == "one core":
@@ -150,4 +159,4 @@ def test_no_second_process_where_it_cannot_help(
         monkeypatch.setattr(sys, "executable", str(tmp_path / "absent"))
     warmup.compile_kernels(processes=1 if why == "one process" else 2)
     assert calls == ["everything"]
-    assert not trace.exists()
+    assert not list(traces.iterdir())

@@ -1,21 +1,17 @@
 """Compile every kernel before the first frame, so that no run is timed while it compiles.
 
 Compiling takes longer than anything else in a first run, and one process compiles one kernel at a
-time: Numba holds a lock. Two processes share the work, and find each other's in Numba's cache:
+time: Numba holds a lock. Two processes, ``python -m vslam.warmup first`` and ``... second``, share
+the work and find each other's in Numba's cache. The process that is to run then calls
+``EVERYTHING``: it loads what was compiled, and compiles what the two did not, all of it if there
+were none. It holds no compiler's memory.
 
-- *this* process calls ``HERE``: what comes before and around local mapping, and finds loops;
-- a *second* one, ``python -m vslam.warmup``, calls ``BESIDE``: local mapping, and closing loops;
-- then this process calls ``EVERYTHING``. It loads what was compiled, and compiles what the second
-  process did not, all of it if there was none.
+A module with new kernels adds a function that calls them to the shorter of ``HALVES`` (and to
+``EVERYTHING``, if the small SLAM there does not reach them; and its last kernel to ``TELLING``).
+Which one is shorter:
 
-A module with new kernels adds a function that calls them to the shorter of ``HERE`` and ``BESIDE``
-(and to ``EVERYTHING``, if the small SLAM there does not reach them; and its last kernel to
-``TELLING``). Which one is shorter:
-
-    for half in HERE BESIDE; do
-        NUMBA_CACHE_DIR=$(mktemp -d) python -c "
-    import time; from vslam import warmup
-    [share() for share in warmup.$half]; print('$half', time.process_time(), 's')"
+    for half in first second; do
+        time NUMBA_CACHE_DIR=$(mktemp -d) python -m vslam.warmup $half
     done
 
 A kernel that both need is compiled by whoever comes to it first. Both must call it with the same
@@ -27,8 +23,8 @@ from __future__ import annotations
 import gc
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 
@@ -68,29 +64,25 @@ from vslam.slam import Slam
 
 WIDTH, HEIGHT, DISPARITY, STEP, FRAMES = 480, 240, 12, 6, 6
 CAMERA = StereoCamera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
-# A second process that takes longer is stuck: it has less to do than this one.
-PATIENCE_S = 60.0
+# A process that takes longer is stuck: both have less than a minute's work on a slow machine.
+PATIENCE_S = 300.0
 
 
 def compile_kernels(*, processes: int = 2) -> None:
     """Call every kernel once; Numba caches what it compiles.
 
     Args:
-        processes: with 1 no second process is started, nor if the kernels are compiled already or
+        processes: with 1 no other process is started, nor if the kernels are compiled already or
             there is one core only.
     """
     if not is_cold():
         # Kernels of loop closing need not be loaded now: few runs close a loop at once.
         EVERYTHING[0]()
         return
-    with no_garbage_collection():
-        if processes > 1 and available_cores() > 1:
-            with second_process() as is_running:
-                if is_running:
-                    for share in HERE:
-                        share()
-        for share in EVERYTHING:
-            share()
+    if processes > 1 and available_cores() > 1:
+        compile_halves()
+    for share in EVERYTHING:
+        share()
     mark_warm()
 
 
@@ -120,43 +112,30 @@ def cached(kernel: tuple[ModuleType, str]) -> tuple[Path, list[Path]]:
     return source, list(folder.glob(f"{source.stem}.{name}-*.nbi"))
 
 
-@contextmanager
-def no_garbage_collection() -> Iterator[None]:
-    """Collect no garbage: searching for it is 14 % of compiling, which keeps most that it makes."""
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
+def compile_halves() -> None:
+    """Run each of ``HALVES`` in a process of its own and wait for both.
 
-
-@contextmanager
-def second_process() -> Iterator[bool]:
-    """Run ``BESIDE`` in another process and wait for it on leaving; gives whether one was started.
-
-    If it fails, nothing is lost but its help. An exception, Ctrl-C above all, ends it.
+    One that fails costs only its help. An exception, Ctrl-C above all, ends them.
     """
-    process = None
     # The executable of a frozen application is not Python.
-    if sys.executable and not getattr(sys, "frozen", False):
-        # -P: not from a folder "vslam" that happens to be where we are.
-        command = [sys.executable, "-P", "-m", "vslam.warmup"]
-        quiet = subprocess.DEVNULL
-        with suppress(OSError):
-            process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)
-    if process is None:
-        yield False
+    if not sys.executable or getattr(sys, "frozen", False):
         return
+    processes = []
+    quiet = subprocess.DEVNULL
     try:
-        yield True
-        process.wait(PATIENCE_S)
-    except subprocess.TimeoutExpired:
+        for half in HALVES:
+            # -P: not from a folder "vslam" that happens to be where we are.
+            command = [sys.executable, "-P", "-m", "vslam.warmup", half]
+            process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)
+            processes.append(process)
+        for process in processes:
+            process.wait(PATIENCE_S)
+    except (OSError, subprocess.TimeoutExpired):
         pass
     finally:
-        process.kill()
-        process.wait()
+        for process in processes:
+            process.kill()
+            process.wait()
 
 
 def run_everything() -> None:
@@ -292,14 +271,12 @@ def compile_bundle_adjustment() -> None:
     adjust(problem, iterations=1)
 
 
-# ``BESIDE`` starts with what it needs alone: when it comes to insert keyframes, the kernels for
-# that are in the cache, because ``HERE`` starts with them.
-HERE: tuple[Callable[[], None], ...] = (compile_insertion, compile_tracking, compile_recognition)
-BESIDE: tuple[Callable[[], None], ...] = (
-    compile_bundle_adjustment,
-    compile_local_mapping,
-    compile_correction,
-)
+# The second starts with what it needs alone: when it comes to insert keyframes, the kernels for
+# that are in the cache, because the first starts with them.
+HALVES: dict[str, tuple[Callable[[], None], ...]] = {
+    "first": (compile_insertion, compile_tracking, compile_recognition),
+    "second": (compile_bundle_adjustment, compile_local_mapping, compile_correction),
+}
 EVERYTHING: tuple[Callable[[], None], ...] = (
     run_everything,
     compile_recognition,
@@ -318,6 +295,7 @@ TELLING: tuple[tuple[ModuleType, str], ...] = (
 
 
 if __name__ == "__main__":
-    with no_garbage_collection():
-        for share in BESIDE:
-            share()
+    # Searching for garbage is 14 % of compiling, which keeps most of what it makes.
+    gc.disable()
+    for share in HALVES[sys.argv[1]]:
+        share()

@@ -160,9 +160,14 @@ def _look_alikes(route: Route, town: Town, passes: Passes, threads: int) -> NDAr
     chosen = np.unique(np.linspace(0, len(route.T_wc) - 1, _PLACES).astype(int))
     camera = route.camera
     small = StereoCamera(
-        *(x / _SMALL for x in (camera.fx, camera.fy, camera.cx, camera.cy)),
-        camera.baseline, camera.width // _SMALL, camera.height // _SMALL,
-    )  # fmt: skip
+        camera.fx / _SMALL,
+        camera.fy / _SMALL,
+        camera.cx / _SMALL,
+        camera.cy / _SMALL,
+        camera.baseline,
+        camera.width // _SMALL,
+        camera.height // _SMALL,
+    )
     renderer = Renderer(small, town.atlas, town.sky, threads)
     moment = passes.at(0)
     seen = []

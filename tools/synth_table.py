@@ -6,10 +6,12 @@
 
 A drive is a built-in route; with ``--along`` the poses of a KITTI sequence (KITTI/poses/NN.txt) in
 a rendered town; with ``--aliased ROUTE:N`` a built-in route through N towns of few facades. What is
-missing is rendered first. Under a perturbation the perturbed images are written to a folder and
-every system reads those. Each finished row is kept in a JSON file beside the table and not
-measured again unless the bytes of the drives changed or ``--again`` names its system. The table is
-always written whole. For what a peer's script takes and prints see compare_peer.py.
+missing is rendered first. A light is ``clean``, a perturbation as of ``vslam run --perturb``, or
+a kidnapping: ``cut:300`` takes 300 frames out, ``black:20`` blackens 20. What is changed is written
+to a folder, and every system reads the same images. Each finished row is kept in a JSON file beside
+the table and not measured again unless the bytes of the drives changed or ``--again`` names its
+system. The table is always written whole. For what a peer's script takes and prints see
+compare_peer.py.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ import compare_peer
 
 OURS = {"vslam": "bow", "vslam without loops": "none"}
 PEER = "ORB-SLAM3"
+GAPS = ("cut", "black")
 HEAD = """# Results on rendered drives
 
 Written by `python tools/synth_table.py`, one run each on the images of one folder, one at a time.
@@ -57,7 +60,9 @@ def main() -> None:
     parser.add_argument("--kitti", type=Path, help="KITTI root, for its poses")
     parser.add_argument("--along", default="", help="KITTI sequences whose poses to drive")
     parser.add_argument("--aliased", default="", metavar="ROUTE:N", help="towns of few facades")
-    parser.add_argument("--lights", default="clean", help="perturbations, with semicolons")
+    parser.add_argument(
+        "--lights", default="clean", help="clean, perturbations, kidnappings; with semicolons"
+    )
     parser.add_argument("--out", type=Path, default=Path("docs/results.md"))
     parser.add_argument("--again", default="", help="systems to measure again, with commas")
     parser.add_argument("--peer-python", type=Path)
@@ -103,8 +108,13 @@ def _drives(options: argparse.Namespace) -> Iterator[Drive]:
 
 @contextmanager
 def _in_light(drive: Drive, light: str) -> Iterator[Path]:
-    """A KITTI tree with the drive's images as they are or, in a temporary folder, perturbed."""
+    """A KITTI tree with the drive's images as they are or, in a temporary folder, changed.
+
+    ``cut:N`` takes N frames out, a third of the way; ``black:N`` blackens N frames there. Anything
+    else is a perturbation of ``vslam run``.
+    """
     import cv2
+    import numpy as np
 
     from vslam.datasets import open_sequence
     from vslam.perturb import parse_perturbation
@@ -113,24 +123,32 @@ def _in_light(drive: Drive, light: str) -> Iterator[Path]:
         yield drive.root
         return
     sequence = open_sequence("kitti", drive.root, drive.name)
-    law = parse_perturbation(light, 0, sequence.timestamps)
-    source = drive.root / "sequences" / drive.name
+    kind, _, count = light.partition(":")
+    gap = range(len(sequence) // 3, len(sequence) // 3 + int(count)) if kind in GAPS else range(0)
+    law = parse_perturbation("none" if gap else light, 0, sequence.timestamps)
+    frames = [k for k in range(len(sequence)) if kind != "cut" or k not in gap]
     with tempfile.TemporaryDirectory(prefix="vslam-light-") as scratch:
         root = Path(scratch)
         folder = root / "sequences" / drive.name
         eyes = [folder / "image_0", folder / "image_1"]
-        for eye in eyes:
-            eye.mkdir(parents=True)
-        for file in ("calib.txt", "times.txt"):
-            (folder / file).write_bytes((source / file).read_bytes())
-        (root / "poses").symlink_to(drive.root / "poses")
+        for made in (*eyes, root / "poses"):
+            made.mkdir(parents=True)
+        source = drive.root / "sequences" / drive.name
+        (folder / "calib.txt").write_bytes((source / "calib.txt").read_bytes())
+        for file in (Path("sequences", drive.name, "times.txt"), Path(f"poses/{drive.name}.txt")):
+            lines = (drive.root / file).read_text().splitlines()
+            (root / file).write_text("".join(f"{lines[k]}\n" for k in frames))
 
-        def perturb(k: int) -> None:
-            for eye, image in zip(eyes, law.apply(k, *sequence.read(k)), strict=True):
-                cv2.imwrite(str(eye / f"{k:06d}.png"), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        def write(number: int) -> None:
+            k = frames[number]
+            images = law.apply(k, *sequence.read(k))
+            for eye, image in zip(eyes, images, strict=True):
+                image = np.zeros_like(image) if kind == "black" and k in gap else image
+                path = eye / f"{number:06d}.png"
+                cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 
         with ThreadPoolExecutor(2) as pool:
-            list(pool.map(perturb, range(len(sequence))))
+            list(pool.map(write, range(len(frames))))
         yield root
 
 

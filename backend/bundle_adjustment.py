@@ -166,9 +166,7 @@ def _adjust(
             solved = cholesky_solve(S, rhs)
             if solved:
                 step_points(n_free, first, camera, used, W, g, rhs, V_inverse, points, points_trial)
-                for k in range(n_free):
-                    twist = rhs[6 * k : 6 * k + 6]
-                    T_trial[k] = orthonormalised(compose(se3_exp(twist), T_cw[k]))
+                step_cameras(n_free, rhs, T_cw, T_trial)
                 trial = evaluate(
                     T_trial,
                     points_trial,
@@ -183,8 +181,9 @@ def _adjust(
                 if trial < cost:
                     small = cost - trial < tolerance * cost
                     cost = trial
-                    T_cw[:n_free] = T_trial[:n_free]
-                    points[:] = points_trial
+                    # What is left behind in the trial is overwritten by the next step.
+                    T_cw, T_trial = T_trial, T_cw
+                    points, points_trial = points_trial, points
                     damping, growth, improved = max(damping * 0.1, 1e-9), 2.0, True
                     break
             damping *= growth * 5.0
@@ -277,18 +276,8 @@ def reduce_points(n_free, first, camera, used, W, V, g, U, b, damping, S, rhs, V
             S[6 * k + i, 6 * k + i] *= 1.0 + damping
     Y = np.empty((3, 6))
     for p in range(len(V)):
-        scale = 1.0 + damping
-        v00, v11, v22 = V[p, 0, 0] * scale, V[p, 1, 1] * scale, V[p, 2, 2] * scale
-        v01, v02, v12 = V[p, 0, 1], V[p, 0, 2], V[p, 1, 2]
-        i00, i01, i02 = v11 * v22 - v12 * v12, v02 * v12 - v01 * v22, v01 * v12 - v02 * v11
-        determinant = v00 * i00 + v01 * i01 + v02 * i02
-        inverse = 1.0 / determinant if determinant > 0.0 else 0.0
         N = V_inverse[p]
-        N[0, 0], N[0, 1], N[0, 2] = i00 * inverse, i01 * inverse, i02 * inverse
-        N[1, 1] = (v00 * v22 - v02 * v02) * inverse
-        N[1, 2] = (v01 * v02 - v00 * v12) * inverse
-        N[2, 2] = (v00 * v11 - v01 * v01) * inverse
-        N[1, 0], N[2, 0], N[2, 1] = N[0, 1], N[0, 2], N[1, 2]
+        invert_damped(V[p], damping, N)
         for o in range(first[p], first[p + 1]):
             k = camera[o]
             if k >= n_free or not used[o]:
@@ -314,6 +303,23 @@ def reduce_points(n_free, first, camera, used, W, V, g, U, b, damping, S, rhs, V
 
 
 @inner_kernel
+def invert_damped(V, damping, N):
+    """Inverse of a point's ``(3, 3)`` block into ``N``, its diagonal raised by the damping; zero
+    if it is singular, so that the point stays where it is."""
+    scale = 1.0 + damping
+    v00, v11, v22 = V[0, 0] * scale, V[1, 1] * scale, V[2, 2] * scale
+    v01, v02, v12 = V[0, 1], V[0, 2], V[1, 2]
+    i00, i01, i02 = v11 * v22 - v12 * v12, v02 * v12 - v01 * v22, v01 * v12 - v02 * v11
+    determinant = v00 * i00 + v01 * i01 + v02 * i02
+    inverse = 1.0 / determinant if determinant > 0.0 else 0.0
+    N[0, 0], N[0, 1], N[0, 2] = i00 * inverse, i01 * inverse, i02 * inverse
+    N[1, 1] = (v00 * v22 - v02 * v02) * inverse
+    N[1, 2] = (v01 * v02 - v00 * v12) * inverse
+    N[2, 2] = (v00 * v11 - v01 * v01) * inverse
+    N[1, 0], N[2, 0], N[2, 1] = N[0, 1], N[0, 2], N[1, 2]
+
+
+@inner_kernel
 def step_points(n_free, first, camera, used, W, g, camera_step, V_inverse, points, points_trial):
     """Back-substitution: move each point by what the camera steps leave."""
     for p in range(len(points)):
@@ -330,6 +336,17 @@ def step_points(n_free, first, camera, used, W, g, camera_step, V_inverse, point
         N = V_inverse[p]
         for i in range(3):
             points_trial[p, i] = points[p, i] + N[i, 0] * d0 + N[i, 1] * d1 + N[i, 2] * d2
+
+
+@inner_kernel
+def step_cameras(n_free, camera_step, T_cw, T_trial):
+    """Move each free camera by its twist. Element by element: assigning a whole matrix would make
+    Numba compile the message of a broadcasting error, which takes seconds."""
+    for k in range(n_free):
+        T = orthonormalised(compose(se3_exp(camera_step[6 * k : 6 * k + 6]), T_cw[k]))
+        for i in range(4):
+            for j in range(4):
+                T_trial[k, i, j] = T[i, j]
 
 
 @kernel

@@ -9,6 +9,7 @@ from vslam.camera import CHI2_MONO, CHI2_STEREO, StereoCamera
 from vslam.config import Config
 from vslam.features import CELL, FeatureGrid
 from vslam.kernels import hamming, kernel
+from vslam.loops import LoopEdge
 from vslam.map import Map
 from vslam.observations import collect_landmarks, link, merge_landmarks, observed_by, predict_octave
 
@@ -39,6 +40,58 @@ def fusion_neighbours(map_: Map, keyframe: int, config: Config) -> list[int]:
         chosen += new
         known.update(new)
     return chosen
+
+
+def fuse_loop(
+    map_: Map,
+    edge: LoopEdge,
+    query_side: list[int],
+    match_side: list[int],
+    camera: StereoCamera,
+    config: Config,
+) -> int:
+    """Make one what the two sides of a loop hold twice (ORB-SLAM, VII-D).
+
+    First the pairs that verification matched, which need no geometry; then each side's landmarks
+    are projected into the keyframes of the other.
+
+    Args:
+        query_side, match_side: keyframes around the two ends, poses corrected.
+
+    Returns:
+        How many landmarks and features were fused.
+    """
+    assert edge.features is not None
+    assert edge.landmarks is not None
+    a = map_.arrays
+    first = map_.rows(edge.query).start
+    fused = _fuse_pairs(a, first + edge.features.astype(np.int64), edge.landmarks, edge.query)
+    old = collect_landmarks(a, np.array(match_side, np.int64), map_.n_landmarks)
+    for keyframe in query_side:
+        fused += fuse_into(map_, old, keyframe, camera, config)
+    new = collect_landmarks(a, np.array(query_side, np.int64), map_.n_landmarks)
+    for keyframe in match_side:
+        fused += fuse_into(map_, new, keyframe, camera, config)
+    return fused
+
+
+@kernel
+def _fuse_pairs(a, rows, landmarks, keyframe):
+    """Let each row observe its landmark; one that observes another brings that one along."""
+    fused = 0
+    for i in range(len(rows)):
+        row, landmark = rows[i], landmarks[i]
+        own = a.landmark[row]
+        if not a.landmark_alive[landmark] or own == landmark:
+            continue
+        if own >= 0:
+            merge_landmarks(a, own, landmark)
+        elif observed_by(a, landmark, keyframe) < 0:
+            link(a, row, landmark)
+        else:
+            continue
+        fused += 1
+    return fused
 
 
 def fuse_into(
@@ -110,7 +163,8 @@ def _fuse(
         octave = predict_octave(distance, a.reach[landmark, 1], log_scale, len(scales))
         r = window * scales[octave]
         u_right = u - bf / z
-        best, best_distance = -1, max_distance + 1
+        # A bare -1 would make Numba compile ``link`` for the constant as well.
+        best, best_distance = np.int64(-1), max_distance + 1
         column_first, column_last = max(0, int((u - r) / CELL)), int((u + r) / CELL)
         column_last = min(columns - 1, column_last)
         for grid_row in range(

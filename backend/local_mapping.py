@@ -89,9 +89,7 @@ def local_window(
     map_: Map, keyframe: int, config: Config
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
     """Free keyframes, fixed keyframes and landmarks of local bundle adjustment."""
-    neighbours, shared = map_.covisible(keyframe)
-    # A keyframe with few neighbours keeps its best one (ORB-SLAM, III-D).
-    strong = neighbours[(shared >= config.mapping.min_shared) | (np.arange(len(shared)) == 0)]
+    strong = strong_neighbours(map_, keyframe, config)
     window = np.concatenate([[keyframe], strong])[: config.mapping.max_ba_keyframes]
     landmarks, others = window_landmarks(
         map_.arrays, window.astype(np.int64), map_.n_landmarks, map_.n_keyframes
@@ -104,6 +102,15 @@ def local_window(
         # A part of the map that began anew: its oldest keyframe is its world.
         free, fixed = free[1:], free[:1]
     return free.astype(np.int64), fixed.astype(np.int64), landmarks
+
+
+def strong_neighbours(map_: Map, keyframe: int, config: Config) -> NDArray[np.int64]:
+    """Keyframes joined to one in the covisibility graph, most shared landmarks first.
+
+    A keyframe with weak neighbours only keeps its best one (ORB-SLAM, III-D).
+    """
+    neighbours, shared = map_.covisible(keyframe)
+    return neighbours[(shared >= config.mapping.min_shared) | (np.arange(len(shared)) == 0)]
 
 
 @kernel
@@ -192,8 +199,8 @@ def cull_keyframes(map_: Map, keyframe: int, camera: StereoCamera, config: Confi
     neighbours, shared = map_.covisible(keyframe)
     close = config.stereo.close_depth_baselines * camera.baseline
     for neighbour in neighbours[shared >= config.mapping.min_shared]:
-        if neighbour == 0:
-            continue
+        if neighbour == 0 or neighbour in map_.restarts:
+            continue  # the world of its sub-map
         seen, redundant = count_redundant(map_.arrays, int(neighbour), camera.bf, close)
         if redundant > config.mapping.redundant_ratio * seen:
             map_.cull_keyframe(int(neighbour))

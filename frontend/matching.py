@@ -7,11 +7,57 @@ looked for only near its projection and near the pyramid level at which it shoul
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.features import CELL
 from vslam.kernels import hamming, kernel
+from vslam.observations import predict_octave
 
 ORIENTATION_BINS = 30
+
+
+@kernel
+def predict_view(T, xyz, normal, reach, intrinsics, width, height, scales, window):
+    """Where landmarks should appear (ORB-SLAM, V-D): in the image, within reach, seen from a
+    direction at most 60 degrees off the mean one.
+
+    Returns:
+        ``uvr`` ``(N, 3)``; search radius ``(N,)``, 0 if not visible; octave ``(N,)`` int64.
+    """
+    n = len(xyz)
+    fx, fy, cx, cy, bf = intrinsics
+    uvr = np.zeros((n, 3))
+    radius = np.zeros(n)
+    octave = np.zeros(n, np.int64)
+    log_scale = np.log(scales[1] / scales[0])
+    centre = np.empty(3)
+    for i in range(3):
+        centre[i] = -(T[0, i] * T[0, 3] + T[1, i] * T[1, 3] + T[2, i] * T[2, 3])
+    for i in range(n):
+        p = xyz[i]
+        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        if z <= 0.1:
+            continue
+        x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+        u = fx * x / z + cx
+        if u < 0.0 or u >= width:
+            continue
+        y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+        v = fy * y / z + cy
+        if v < 0.0 or v >= height:
+            continue
+        dx, dy, dz = p[0] - centre[0], p[1] - centre[1], p[2] - centre[2]
+        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if distance < 0.8 * reach[i, 0] or distance > 1.2 * reach[i, 1]:
+            continue
+        cos = (dx * normal[i, 0] + dy * normal[i, 1] + dz * normal[i, 2]) / distance
+        if cos < 0.5:
+            continue
+        octave[i] = predict_octave(distance, reach[i, 1], log_scale, len(scales))
+        uvr[i, 0], uvr[i, 1], uvr[i, 2] = u, v, u - bf / z
+        # Seen head-on the prediction is better.
+        radius[i] = (window if cos > 0.998 else 1.6 * window) * scales[octave[i]]
+    return uvr, radius, octave
 
 
 @kernel
@@ -150,10 +196,24 @@ def consistent_orientation(angle_a, angle_b):
         bins[i] = int(difference / turn * ORIENTATION_BINS + 0.5) % ORIENTATION_BINS
         count[bins[i]] += 1
     allowed = np.zeros(ORIENTATION_BINS, np.bool_)
-    fullest = count.max()
+    fullest = 0
     for _ in range(3):
         k = int(np.argmax(count))
+        fullest = max(fullest, count[k])
         if count[k] * 10 >= fullest:
             allowed[k] = True
         count[k] = -1
     return allowed[bins]
+
+
+def count_elsewhere(u: NDArray[np.floating], width: int) -> int:
+    """How many of ``(N,)`` columns lie outside the strip, a third of the image, with the most.
+
+    What looks alike at two places is one object: a facade, a parked car. It may bring a hundred
+    inliers and fix a pose to a centimetre, but all of them lie together; the rest of the scene
+    does not fit. A place that is seen again has inliers all over the image.
+    """
+    columns = np.sort(u)
+    ends = np.searchsorted(columns, columns + width / 3, side="right")
+    strip = ends - np.arange(len(columns))
+    return len(columns) - int(strip.max(initial=0))

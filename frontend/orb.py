@@ -256,8 +256,11 @@ def spread(x, y, score, width, height, quota):
     suppression", PRL 2018). Returns ``(n,)`` int64 indices in row order of the corners.
     """
     n = len(x)
+    kept = np.empty(min(n, quota), np.int64)
     if n <= quota:
-        return np.arange(n)
+        for i in range(n):
+            kept[i] = i
+        return kept
     # More cells than the quota fit only below this size; corners are at least 2 px apart.
     low, high = 1, int(np.sqrt(width * height / quota)) + 2
     best_of_cell = np.empty(width * height, np.int32)
@@ -283,7 +286,6 @@ def spread(x, y, score, width, height, quota):
     while counts[weakest] <= surplus:
         surplus -= counts[weakest]
         weakest += 1
-    kept = np.empty(quota, np.int64)
     count = 0
     for i in range(n):
         if not chosen[i] or score[i] < weakest:

@@ -5,40 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from vslam.camera import CHI2_MONO, CHI2_STEREO
-from vslam.geometry import compose, orthonormalised, se3_exp
+from vslam.geometry import compose, orthonormalised, se3_exp, solve_positive
 from vslam.kernels import inner_kernel, kernel
 
 ROUNDS = 4
 ITERATIONS = 10
-
-
-@kernel
-def solve6(H, b):
-    """Solve a symmetric positive definite ``(6, 6)`` system by Cholesky; zeros if it is not."""
-    L = np.zeros((6, 6))
-    x = np.zeros(6)
-    for i in range(6):
-        for j in range(i + 1):
-            value = H[i, j]
-            for k in range(j):
-                value -= L[i, k] * L[j, k]
-            if i == j:
-                if value <= 0.0:
-                    return np.zeros(6)
-                L[i, i] = np.sqrt(value)
-            else:
-                L[i, j] = value / L[j, j]
-    for i in range(6):
-        value = b[i]
-        for k in range(i):
-            value -= L[i, k] * x[k]
-        x[i] = value / L[i, i]
-    for i in range(5, -1, -1):
-        value = x[i]
-        for k in range(i + 1, 6):
-            value -= L[k, i] * x[k]
-        x[i] = value / L[i, i]
-    return x
 
 
 @kernel
@@ -107,9 +78,12 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
                 return T, np.zeros(n, np.bool_)
             for row in range(6):
                 H[row, row] *= 1.0 + 1e-9
-            step = solve6(H, b)
+            step = solve_positive(H, b)
             T = orthonormalised(compose(se3_exp(step), T))
-            if np.abs(step).max() < 1e-7:
+            moved = False
+            for k in range(6):
+                moved |= not abs(step[k]) < 1e-7
+            if not moved:
                 break
         classify(T, points, uvr, inverse_sigma2, intrinsics, inlier)
     return T, inlier

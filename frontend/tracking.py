@@ -14,14 +14,17 @@ from numpy.typing import NDArray
 from vslam.camera import StereoCamera
 from vslam.config import Config
 from vslam.features import FeatureGrid, Features
-from vslam.frontend.matching import consistent_orientation, search_all, search_windows
+from vslam.frontend.matching import (
+    consistent_orientation,
+    predict_view,
+    search_all,
+    search_windows,
+)
 from vslam.frontend.orb import extract, scale_factors
 from vslam.frontend.pose import optimise_pose
 from vslam.frontend.stereo import match_stereo
 from vslam.geometry import compose, inverse, transform
-from vslam.kernels import kernel
 from vslam.map import LocalMap
-from vslam.observations import predict_octave
 
 NEVER = np.iinfo(np.int64).max
 
@@ -133,7 +136,7 @@ def track_motion(
         frame.xyz[:] = np.nan
         frame.landmark[found[hit]] = previous.landmark[source[hit]]
         frame.xyz[found[hit]] = points[hit]
-        inliers = _refine(frame, T_cw, tracker)
+        inliers = refine(frame, T_cw, tracker)
         if inliers >= config.min_inliers_motion:
             break
     return matches, inliers
@@ -181,13 +184,16 @@ def track_descriptors(
         return 0
     frame.landmark[found[hit]] = reference.ids[hit]
     frame.xyz[found[hit]] = reference.xyz[hit]
-    return _refine(frame, T_cw, tracker)
+    return refine(frame, T_cw, tracker)
 
 
 def track_local_map(
-    frame: Frame, local: LocalMap, tracker: Tracker
+    frame: Frame, local: LocalMap, tracker: Tracker, window: float | None = None
 ) -> tuple[int, int, NDArray[np.int32]]:
     """Match every local landmark that should be visible, then refine the pose with all matches.
+
+    Args:
+        window: search radius at octave 0, pixels; None: ``tracking.local_window``.
 
     Returns:
         Matches, inliers, and the ids of the landmarks that should be visible.
@@ -205,7 +211,7 @@ def track_local_map(
         camera.width,
         camera.height,
         tracker.scales,
-        config.local_window,
+        config.local_window if window is None else window,
     )
     visible = radius > 0
     radius[tracked] = 0.0
@@ -224,52 +230,8 @@ def track_local_map(
     frame.landmark[found[hit]] = local.ids[hit]
     frame.xyz[found[hit]] = local.xyz[hit]
     matches = int(np.count_nonzero(frame.landmark >= 0))
-    inliers = _refine(frame, frame.T_cw, tracker)
+    inliers = refine(frame, frame.T_cw, tracker)
     return matches, inliers, local.ids[visible | tracked]
-
-
-@kernel
-def predict_view(T, xyz, normal, reach, intrinsics, width, height, scales, window):
-    """Where landmarks should appear (ORB-SLAM, V-D): in the image, within reach, seen from a
-    direction at most 60 degrees off the mean one.
-
-    Returns:
-        ``uvr`` ``(N, 3)``; search radius ``(N,)``, 0 if not visible; octave ``(N,)`` int64.
-    """
-    n = len(xyz)
-    fx, fy, cx, cy, bf = intrinsics
-    uvr = np.zeros((n, 3))
-    radius = np.zeros(n)
-    octave = np.zeros(n, np.int64)
-    log_scale = np.log(scales[1] / scales[0])
-    centre = np.empty(3)
-    for i in range(3):
-        centre[i] = -(T[0, i] * T[0, 3] + T[1, i] * T[1, 3] + T[2, i] * T[2, 3])
-    for i in range(n):
-        p = xyz[i]
-        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
-        if z <= 0.1:
-            continue
-        x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
-        u = fx * x / z + cx
-        if u < 0.0 or u >= width:
-            continue
-        y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
-        v = fy * y / z + cy
-        if v < 0.0 or v >= height:
-            continue
-        dx, dy, dz = p[0] - centre[0], p[1] - centre[1], p[2] - centre[2]
-        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-        if distance < 0.8 * reach[i, 0] or distance > 1.2 * reach[i, 1]:
-            continue
-        cos = (dx * normal[i, 0] + dy * normal[i, 1] + dz * normal[i, 2]) / distance
-        if cos < 0.5:
-            continue
-        octave[i] = predict_octave(distance, reach[i, 1], log_scale, len(scales))
-        uvr[i, 0], uvr[i, 1], uvr[i, 2] = u, v, u - bf / z
-        # Seen head-on the prediction is better.
-        radius[i] = (window if cos > 0.998 else 1.6 * window) * scales[octave[i]]
-    return uvr, radius, octave
 
 
 def _search(
@@ -304,18 +266,27 @@ def _search(
     return found
 
 
-def _refine(frame: Frame, T_cw: NDArray[np.float64], tracker: Tracker) -> int:
+def refine(frame: Frame, T_cw: NDArray[np.float64], tracker: Tracker) -> int:
     """Optimise the pose from all matches, drop the outliers, return the number of inliers."""
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
-    features = frame.features
-    uvr = np.empty((len(matched), 3))
-    uvr[:, :2] = features.xy[matched]
-    uvr[:, 2] = features.u_right[matched]
-    inverse_sigma2 = tracker.scales[features.octave[matched]] ** -2.0
     frame.T_cw, inlier = optimise_pose(
-        T_cw, frame.xyz[matched], uvr, inverse_sigma2, tracker.camera.intrinsics
+        T_cw,
+        frame.xyz[matched],
+        *observations(frame, matched, tracker),
+        tracker.camera.intrinsics,
     )
     outliers = matched[~inlier]
     frame.landmark[outliers] = -1
     frame.xyz[outliers] = np.nan
     return int(np.count_nonzero(inlier))
+
+
+def observations(
+    frame: Frame, feature: NDArray[np.integer], tracker: Tracker
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """``(N, 3)`` u, v, u_right of ``(N,)`` features, and ``(N,)`` their inverse variances."""
+    features = frame.features
+    uvr = np.empty((len(feature), 3))
+    uvr[:, :2] = features.xy[feature]
+    uvr[:, 2] = features.u_right[feature]
+    return uvr, tracker.scales[features.octave[feature]] ** -2.0

@@ -14,6 +14,7 @@ import pytest
 
 from vslam import cli, info
 from vslam.features import TrackingState, TrackResult
+from vslam.loops import LoopEdge
 from vslam.run import RunOutcome
 from vslam.trajectory import Trajectory, read_kitti_poses, write_kitti
 
@@ -65,7 +66,9 @@ def call(monkeypatch, capsys, tmp_path):
     return run
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["eval"], ["perturb"], ["info"]])
+@pytest.mark.parametrize(
+    "command", [[], ["run"], ["eval"], ["perturb"], ["info"], ["vocabulary", "train"]]
+)
 def test_help_loads_nothing_heavy(command):
     script = (
         "import sys\n"
@@ -99,8 +102,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        ("--detector bow", ["--detector bow", "not built yet", "'none'"]),
-        ("--detector capsule", ["--detector capsule", "not built yet"]),
+        ("--detector capsule", ["--detector capsule", "not built yet", "'none', 'bow'"]),
         ("--detector orb", ["--detector orb", "unknown"]),
         ("--sensor mono", ["--sensor mono", "not built yet", "'stereo'"]),
         ("--sensor rgbd", ["--sensor rgbd", "not built yet"]),
@@ -109,6 +111,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--dataset euroc", ["--dataset euroc", "unknown"]),
         ("", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
         ("--config nothing.json", ["nothing.json", "configuration"]),
+        ("--compare-loops --detector none", ["--compare-loops", "--detector none"]),
     ],
 )
 def test_run_refuses_without_data(call, words, parts):
@@ -150,12 +153,16 @@ def fake_result(index: int, T_wc: np.ndarray) -> TrackResult:
 @pytest.fixture
 def pipeline(monkeypatch) -> SimpleNamespace:
     """In place of SLAM: returns the ground truth, shifted; notes what it was called with."""
-    calls = SimpleNamespace(interrupted=None)
+    calls = SimpleNamespace(interrupted=None, interrupted_without=None, loops=[], runs=[])
 
     def run_sequence(sequence, perturbation, settings, recorder, on_frame):
+        looped = settings.detector != "none" or not calls.runs
+        calls.runs.append((settings.detector, recorder))
         calls.settings, calls.recorder = settings, recorder
-        T_wc = sequence.ground_truth.copy()
+        T_wc = circle(len(sequence))  # the ground truth, if it has one
         T_wc[:, 1, 3] += 2.0
+        if not looped:
+            T_wc[::2, 1, 3] += 0.2
         tracks = [fake_result(k, T_wc[k]) for k in range(len(sequence))]
         for track in tracks:
             on_frame(track)
@@ -163,11 +170,13 @@ def pipeline(monkeypatch) -> SimpleNamespace:
         return RunOutcome(
             settings, sequence, trajectory, trajectory, tracks, [], wall_s=2.0, cpu_s=2.0,
             startup_s=0.1, peak_memory_mb=1.0, n_keyframes=4, n_landmarks=99,
-            interrupted=calls.interrupted,
+            loops=calls.loops if settings.detector != "none" else [],
+            keyframe_frames=np.arange(0, len(sequence), 3),
+            n_submaps=2, interrupted=calls.interrupted if looped else calls.interrupted_without,
         )  # fmt: skip
 
     def write_report(outcome, evaluation, folder):
-        calls.evaluation = evaluation
+        calls.evaluation, calls.outcome = evaluation, outcome
         (folder / "report.html").write_text("report")
 
     contents = {
@@ -192,12 +201,71 @@ def test_run_writes_its_folder_and_a_summary(call, root, pipeline):
     assert "report.html" in out
     assert "10/10" in err
     folder = Path("runs/latest").resolve()
-    assert folder.name.endswith("-kitti-00-blur0.5-none")
+    assert folder.name.endswith("-kitti-00-blur0.5-bow")
     assert pipeline.settings.threads == 3
     assert pipeline.settings.perturb == "blur:0.5"
     assert pipeline.recorder == str(Path("runs") / folder.name / "recording.rrd")
     assert pipeline.evaluation.ate_rmse_m < 1e-9
     assert len(read_kitti_poses(folder / "ground_truth_kitti.txt")) == 10
+
+
+CLOSED = LoopEdge(3, 0, 0.6, True, "closed", 80, 60)  # no pose: neither right nor wrong
+REJECTED = LoopEdge(2, 0, 0.2, False, "too few matches")
+
+
+@pytest.fixture
+def with_detector(pipeline) -> SimpleNamespace:
+    pipeline.loops = [CLOSED, REJECTED, REJECTED]
+    return pipeline
+
+
+def test_summary_counts_loops(call, root, with_detector):
+    code, out, err = call("run", "--data", root, "--max-frames", 10, "--detector", "bow")
+    assert code == 0, err
+    assert "loops          1 closed, 0 missed, 0 wrong, 2 candidates rejected\n" in out
+    assert "99 landmarks in 2 sub-maps" in out
+    assert "without" not in out
+    (root / "poses" / "00.txt").unlink()
+    _, out, _ = call("run", "--data", root, "--max-frames", 10, "--detector", "bow")
+    assert "1 closed, 2 candidates rejected" in out
+
+
+def test_summary_without_a_detector(call, root, pipeline):
+    _, out, _ = call("run", "--data", root, "--max-frames", 10, "--detector", "none")
+    assert "not looked for, 0 missed" in out
+
+
+def test_compare_loops_runs_twice_and_prints_both(call, root, with_detector):
+    words = ("run", "--data", root, "--max-frames", 10, "--detector", "bow", "--compare-loops")
+    code, out, err = call(*words)
+    assert code == 0, err
+    assert [run[0] for run in with_detector.runs] == ["bow", "none"]
+    assert with_detector.runs[0][1].endswith("recording.rrd")
+    assert with_detector.runs[1][1] == "null"
+    table = {line.split("  ")[0]: line.split()[-4:] for line in out.splitlines()[-6:]}
+    assert table["ATE rmse"][:2] == ["0.000", "m"]
+    assert float(table["ATE rmse"][2]) == pytest.approx(0.1, rel=0.02)
+    assert table["loops closed"][-2:] == ["1", "0"]
+    assert table["lost frames"][-2:] == ["1", "1"]
+    assert table["t_rel"][-2:] == ["n/a", "n/a"]
+    assert with_detector.outcome.without_loops.settings.detector == "none"
+    assert with_detector.evaluation.ate_rmse_m < 1e-9
+    folder = Path("runs/latest").resolve()
+    assert folder.name.endswith("-bow")
+
+
+def test_compare_loops_interrupted(call, root, with_detector):
+    words = ("run", "--data", root, "--max-frames", 10, "--detector", "bow", "--compare-loops")
+    with_detector.interrupted_without = "Ctrl-C"
+    code, out, _ = call(*words)
+    assert code == 1
+    assert "Ctrl-C, in the run without loops" in out
+    assert "10 done" in out
+    assert with_detector.outcome.without_loops is None
+    with_detector.interrupted = "Ctrl-C"
+    with_detector.runs.clear()
+    assert call(*words)[0] == 1
+    assert len(with_detector.runs) == 1
 
 
 def test_quiet_run_says_nothing(call, root, pipeline):

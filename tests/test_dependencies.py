@@ -23,10 +23,12 @@ VOCABULARY = {
         "loops",
         "trajectory",
         "observations",
+        "sampling",
     )
 }
 MIDDLE = ("frontend", "loopclosure", "backend")
 APPLICATION = ("slam", "cli", "report", "recorder", "pipeline", "run", "runfolder", "evaluate")
+APPLICATION += ("comparison", "console", "loop_evaluation")
 # Verification of loops uses the frontend's matching and pose.
 GRANTED = {
     ("vslam.loopclosure.verification", "vslam.frontend.matching"),

@@ -376,3 +376,14 @@ def test_grows_to_5000_keyframes_and_a_million_landmarks_in_bounded_memory():
     assert peak < 2.0 * held
     # Geometric growth: as many copies as log 1.5, not one for each keyframe.
     assert len(seen_arrays) <= 1 + np.ceil(np.log(1_000_000 / 8192) / np.log(1.5))
+
+
+def test_submaps_begin_at_restarts_and_pass_to_children():
+    rng = np.random.default_rng(0)
+    map_ = Map(1.2 ** np.arange(8.0))
+    for keyframe in range(6):
+        add_keyframe(map_, rng)
+        map_.parents[keyframe] = keyframe - 1
+    map_.restarts.append(3)
+    map_.parents[5] = 1
+    assert map_.submaps().tolist() == [0, 0, 0, 3, 3, 0]

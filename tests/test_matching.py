@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from vslam.features import CELL, FeatureGrid
-from vslam.frontend.matching import consistent_orientation, search_all, search_windows
+from vslam.frontend.matching import (
+    consistent_orientation,
+    count_elsewhere,
+    search_all,
+    search_windows,
+)
 from vslam.kernels import hamming as hamming_intrinsic
 from vslam.kernels import kernel
 
@@ -285,3 +290,15 @@ def test_second_and_third_bin_count_from_a_tenth_of_the_first():
 def test_consistent_orientation_of_nothing():
     nothing = np.empty(0, np.float32)
     assert consistent_orientation(nothing, nothing).shape == (0,)
+
+
+# -- spread over the image ------------------------------------------------------------------------
+
+
+def test_elsewhere_is_outside_the_fullest_third():
+    assert count_elsewhere(np.array([10.0, 20, 50, 100, 111, 200, 280]), 300) == 3
+    assert count_elsewhere(np.array([150.0] * 9 + [40.0]), 300) == 1
+    assert count_elsewhere(np.empty(0), 300) == 0
+    u = np.random.default_rng(0).uniform(0, WIDTH, 200)
+    fullest = max(np.count_nonzero((u >= c) & (u <= c + WIDTH / 3)) for c in u)
+    assert count_elsewhere(u, WIDTH) == 200 - fullest

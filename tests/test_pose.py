@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from vslam.camera import StereoCamera
-from vslam.frontend.pose import optimise_pose, solve6
-from vslam.geometry import inverse, se3_exp, se3_log, transform
+from vslam.frontend.pose import optimise_pose
+from vslam.geometry import inverse, se3_exp, se3_log, solve_positive, transform
 
 CAMERA = StereoCamera(400.0, 410.0, 320.0, 120.0, 0.5, 640, 240)
 TRUTH = se3_exp(np.array([0.4, -0.2, 1.1, 0.05, -0.1, 0.02]))
@@ -154,9 +154,9 @@ def test_start_is_not_written_to():
     assert np.array_equal(start, START)
 
 
-def test_solve6_solves_and_gives_zeros_where_it_cannot():
+def test_solve_positive_solves_and_gives_zeros_where_it_cannot():
     rng = np.random.default_rng(0)
     A = rng.normal(size=(10, 6))
     H, b = A.T @ A, rng.normal(size=6)
-    np.testing.assert_allclose(solve6(H, b), np.linalg.solve(H, b), rtol=1e-10)
-    assert np.array_equal(solve6(-H, b), np.zeros(6))
+    np.testing.assert_allclose(solve_positive(H, b), np.linalg.solve(H, b), rtol=1e-10)
+    assert np.array_equal(solve_positive(-H, b), np.zeros(6))

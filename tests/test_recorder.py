@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import StereoCamera
 from vslam.features import Features, TrackingState, TrackResult
+from vslam.loops import LoopEdge
 from vslam.map import Map
 from vslam.recorder import NullRecorder, Recorder, RerunRecorder
 from vslam.trajectory import Trajectory
@@ -24,6 +25,12 @@ pytest.importorskip("rerun.chunk", reason="this rerun cannot read recordings in 
 
 CAMERA = StereoCamera(718.9, 718.9, 607.2, 185.2, 0.537, 1241, 376)
 FRAMES, FRAMES_PER_KEYFRAME, LANDMARKS_PER_KEYFRAME = 100, 3, 150
+
+REJECTED = LoopEdge(3, 0, 0.2, False, "too few inliers", 14, 7)
+LOST = LoopEdge(-1, 2, 0.3, False, "too few matches", 8)
+CLOSED = LoopEdge(12, 1, 0.6, True, "closed", 90, 60)
+LOOPS = {12: [REJECTED], 42: [REJECTED, CLOSED, LOST], 45: [CLOSED], 70: [LOST]}
+SHIFTED_AT = 60
 
 
 def _pose(frame: int) -> NDArray[np.float64]:
@@ -88,6 +95,10 @@ def record(recorder: Recorder, frames: int = FRAMES) -> None:
             keyframe = map_.add_keyframe(_features(rng, 1), T_cw, result.timestamp, frame)
             map_.add_landmarks(new, descriptors, keyframe)
         recorder.map(map_)
+        if frame in LOOPS:
+            recorder.loops(LOOPS[frame], map_)
+        if frame == SHIFTED_AT:  # as by a correction
+            map_.arrays.T_cw[: map_.n_keyframes, 1, 3] -= 5.0
     recorder.finish(Trajectory(0.1 * np.arange(frames), poses), map_)
 
 
@@ -117,8 +128,11 @@ def test_entities_and_their_frames(recording: Path) -> None:
         "world/camera/image": 1 + keyframes,
         "world/camera/image/tracked": 1 + keyframes,
         "world/camera/image/untracked": 1 + keyframes,
-        "world/landmarks": 1 + 2 + 1,
+        "world/landmarks": 1 + 2 + 1,  # the first keyframe, a loop (25 more to go), the end
         "world/keyframes": 2 + 1,
+        "world/loops/accepted": 2 + 1,  # decided twice, at the end
+        "world/loops/rejected": 6,  # shown and hidden
+        "state/loops": 6,
         "world/ground_truth": 1,
         "world/trajectory": 1,
         "points/inliers": 1 + FRAMES,
@@ -146,6 +160,36 @@ def test_ground_truth_starts_where_the_estimate_does(recording: Path) -> None:
     (strip,) = rows(recording, "world/ground_truth")[0]["LineStrips3D:strips"]
     np.testing.assert_allclose(strip[0], [0.0, 0.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(strip[-1], _pose(FRAMES - 1)[:3, 3], atol=1e-4)
+
+
+def _strips(row: dict[str, Any]) -> NDArray[np.float32]:
+    return np.array(row["LineStrips3D:strips"], np.float32).reshape(-1, 2, 3)
+
+
+def test_rejected_loops_are_shown_for_a_while(recording: Path) -> None:
+    shown = rows(recording, "world/loops/rejected")
+    assert [row["frame"] for row in shown] == [12, 32, 42, 62, 70, 90]
+    # The frame that is not in the map has no place: one line of two candidates.
+    assert [len(_strips(row)) for row in shown] == [1, 0, 1, 0, 0, 0]
+    ends = [_pose(0)[:3, 3], _pose(3 * FRAMES_PER_KEYFRAME)[:3, 3]]
+    np.testing.assert_allclose(_strips(shown[0])[0], ends, atol=1e-5)
+
+
+def test_accepted_loops_stay_and_move_with_the_map(recording: Path) -> None:
+    shown = rows(recording, "world/loops/accepted")
+    assert [row["frame"] for row in shown] == [42, 45, 99]
+    assert [len(_strips(row)) for row in shown] == [1, 2, 2]
+    before, after = _strips(shown[1]), _strips(shown[2])
+    np.testing.assert_allclose(after - before, np.full((2, 2, 3), [0, 5, 0]), atol=1e-5)
+    # A loop closed shows the map corrected, unless one was shown just before.
+    assert [row["frame"] for row in rows(recording, "world/keyframes")] == [0, 42, 99]
+
+
+def test_loops_are_told_with_their_reasons(recording: Path) -> None:
+    told = [row["TextLog:text"][0] for row in rows(recording, "state/loops")]
+    assert told[0] == "frame 9 to frame 0: too few inliers, 7 inliers of 14 matches"
+    assert any(text.startswith("a lost frame to frame 6: too few matches") for text in told)
+    assert told[-2] == "frame 36 to frame 3: closed, 60 inliers of 90 matches"
 
 
 def test_image_is_half_size_jpeg(recording: Path) -> None:

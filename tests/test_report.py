@@ -15,14 +15,20 @@ from vslam.camera import StereoCamera
 from vslam.config import Config, load_config
 from vslam.evaluate import evaluate, read_pair
 from vslam.features import TrackingState, TrackResult
+from vslam.loop_evaluation import evaluate_loops
+from vslam.loops import Closure, LoopEdge
 from vslam.report import write_report
+from vslam.report.maps import loop_closing, top_view
+from vslam.report.render import headlines
 from vslam.report.schema import ReportJson
-from vslam.run import LoopRow, RunOutcome, RunSettings
+from vslam.report.summary import summarize
+from vslam.run import RunOutcome, RunSettings
 from vslam.runfolder import matched_ground_truth
 from vslam.trajectory import Trajectory, read_trajectory
 
 FIGURES = {
     "top_view",
+    "loop_closing",
     "error_along_path",
     "error_histogram",
     "tracked_points",
@@ -135,6 +141,60 @@ def make_outcome(
     )
 
 
+def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
+    """A run twice around a circle of 200 m with four loops, one of them wrong, and 300 rejected."""
+    plain = make_outcome(frames, lost=slice(0, 0), keyframe_every=keyframe_every)
+    angle = 2.0 * np.pi * np.arange(frames) / 250.0
+    truth = np.tile(np.eye(4), (frames, 1, 1))
+    truth[:, 0, 0] = truth[:, 2, 2] = np.cos(angle)
+    truth[:, 0, 2], truth[:, 2, 0] = np.sin(angle), -np.sin(angle)
+    truth[:, 0, 3], truth[:, 2, 3] = 32.0 * (1.0 - np.cos(angle)), 32.0 * np.sin(angle)
+    estimate = truth.copy()
+    estimate[:, 0, 3] += 0.2 * np.sin(7.0 * angle)
+    keyframe_frames = np.arange(0, frames, keyframe_every)
+
+    def edge(query: int, match: int, accepted: bool, reason: str, shift: float = 0.0) -> LoopEdge:
+        T_wq, T_wm = (truth[keyframe_frames[k]] for k in (query, match))
+        T_query_match = np.linalg.inv(T_wq) @ T_wm
+        T_query_match[0, 3] += shift
+        return LoopEdge(query, match, 0.7, accepted, reason, 120, 84, T_query_match)
+
+    rejected = [
+        LoopEdge(70 + k % 20, k % 9, 0.3, False, f"{k % 14} inliers, 20 needed | <b>", 40, k % 14)
+        for k in range(299)
+    ]
+    loops = [
+        edge(66, 3, True, "closed"),
+        *rejected[:150],
+        edge(80, 17, True, "closed", shift=0.5),
+        edge(90, 50, True, "closed", shift=30.0),
+        *rejected[150:],
+        edge(92, 29, False, "not consistent with the group"),
+        edge(100, 37, True, "closed"),
+    ]
+    closures = []
+    for loop in (loop for loop in loops if loop.accepted):
+        living = np.setdiff1d(np.arange(loop.query + 1), [50])
+        T_wc = truth[keyframe_frames[living]].copy()
+        T_cw_after = np.linalg.inv(T_wc)
+        T_wc[:, 0, 3] += 8.0 * living / len(keyframe_frames)  # drift before, none after
+        closures.append(Closure(loop, living, np.linalg.inv(T_wc), T_cw_after, 0.12))
+    timestamps = np.arange(frames) * 0.1
+    settings = replace(plain.settings, detector="bow", perturb="none")
+    return replace(
+        plain,
+        settings=settings,
+        sequence=_Sequence(timestamps, truth),
+        trajectory=Trajectory(timestamps, estimate),
+        keyframes=Trajectory(timestamps[keyframe_frames], estimate[keyframe_frames]),
+        loops=loops,
+        closures=closures,
+        keyframe_frames=keyframe_frames,
+        n_submaps=2,
+        without_loops=replace(plain, sequence=_Sequence(timestamps, truth)),
+    )
+
+
 def report_of(outcome: RunOutcome, folder: Path) -> ReportJson:
     """Write the report as the command line does, read back its JSON."""
     ground_truth = matched_ground_truth(outcome)
@@ -152,11 +212,15 @@ def figures_of(folder: Path) -> set[str]:
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunOutcome, Path]:
     folder = tmp_path_factory.mktemp("run")
-    loops = [
-        LoopRow(140, 3, 0.93, 84, True, ""),
-        LoopRow(151, 40, 0.71, 9, False, "9 inliers, 20 needed | <b>"),
-    ]
-    outcome = replace(make_outcome(), loops=loops, skipped=["000007.png: truncated <file>"])
+    outcome = replace(make_outcome(), skipped=["000007.png: truncated <file>"])
+    report_of(outcome, folder)
+    return outcome, folder
+
+
+@pytest.fixture(scope="module")
+def looped(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunOutcome, Path]:
+    folder = tmp_path_factory.mktemp("loops")
+    outcome = two_laps()
     report_of(outcome, folder)
     return outcome, folder
 
@@ -173,7 +237,7 @@ def test_all_files_are_written(written: tuple[RunOutcome, Path]) -> None:
         "report.md",
         "trajectory_kitti.txt",
     }
-    assert figures_of(folder) == FIGURES
+    assert figures_of(folder) == FIGURES - {"loop_closing"}
     assert load_config(folder / "config.json") == Config()
 
 
@@ -192,13 +256,21 @@ def test_json_holds_the_numbers_of_the_run(written: tuple[RunOutcome, Path]) -> 
     assert report["keyframes"] == 40
     assert report["landmarks"] == 9600
     assert report["seed"] == 3
-    assert report["loops"][0] == vars(outcome.loops[0])
+    assert report["schema_version"] == 2
+    assert (report["loops"], report["revisits"], report["without_loops"]) == ([], [], None)
+    assert (report["loops_closed"], report["loops_missed"], report["revisit_stretches"]) == (
+        0,
+        0,
+        0,
+    )
     mapping = [track.stage_ms["map"] for track in outcome.tracks if track.is_keyframe]
     assert report["stage_ms"]["map"]["mean"] == pytest.approx(np.mean(mapping))
     assert report["stage_ms"]["map"]["median"] == pytest.approx(np.median(mapping))
 
 
-def test_json_round_trips_through_its_schema(written: tuple[RunOutcome, Path]) -> None:
+@pytest.mark.parametrize("fixture", ["written", "looped"])
+def test_json_round_trips_through_its_schema(fixture: str, request: pytest.FixtureRequest) -> None:
+    written = request.getfixturevalue(fixture)
     text = (written[1] / "report.json").read_text()
     assert ReportJson.model_validate_json(text).model_dump_json(indent=2) + "\n" == text
 
@@ -220,24 +292,27 @@ def test_lost_frames_come_first_in_every_text(written: tuple[RunOutcome, Path]) 
         assert 0 < text.index("lost frames") < text.index("ate rmse")
 
 
-def test_html_is_self_contained(written: tuple[RunOutcome, Path]) -> None:
-    html = (written[1] / "report.html").read_text()
-    assert len(re.findall("<svg", html)) == len(FIGURES)
+@pytest.mark.parametrize(("fixture", "figures"), [("written", 6), ("looped", 7)])
+def test_html_is_self_contained(fixture: str, figures: int, request: pytest.FixtureRequest) -> None:
+    html = (request.getfixturevalue(fixture)[1] / "report.html").read_text()
+    assert len(re.findall("<svg", html)) == figures
     assert not re.search(r"(src|href|action|data)\s*=\s*[\"']?\s*(https?:)?//", html)
     assert not re.search(r"@import|url\((?!#)|<script", html.replace("url('#", "url(#"))
-    assert "truncated &lt;file&gt;" in html
-    assert "20 needed | &lt;b&gt;" in html
+    if fixture == "written":
+        assert "truncated &lt;file&gt;" in html
+    else:
+        assert "20 needed | &lt;b&gt;" in html
 
 
-def test_svg_ids_do_not_clash_in_the_page(written: tuple[RunOutcome, Path]) -> None:
-    html = (written[1] / "report.html").read_text()
+def test_svg_ids_do_not_clash_in_the_page(looped: tuple[RunOutcome, Path]) -> None:
+    html = (looped[1] / "report.html").read_text()
     clips = re.findall(r"<clipPath id=\"(\w+)\"", html)
     assert clips
     assert len(clips) == len(set(clips))
 
 
-def test_markdown_tables_are_aligned(written: tuple[RunOutcome, Path]) -> None:
-    tables = (written[1] / "report.md").read_text().split("\n\n")
+def test_markdown_tables_are_aligned(looped: tuple[RunOutcome, Path]) -> None:
+    tables = (looped[1] / "report.md").read_text().split("\n\n")
     for table in (block for block in tables if block.startswith("|")):
         assert len({len(line) for line in table.splitlines()}) == 1
 
@@ -249,11 +324,130 @@ def test_figures_are_reproducible(written: tuple[RunOutcome, Path], tmp_path: Pa
         assert path.read_bytes() == (tmp_path / "figures" / path.name).read_bytes()
 
 
+def test_json_judges_every_loop(looped: tuple[RunOutcome, Path]) -> None:
+    outcome, folder = looped
+    report = json.loads((folder / "report.json").read_text())
+    assert len(report["loops"]) == len(outcome.loops) == 304
+    counts = ("loops_closed", "loops_rejected", "loops_found", "loops_missed", "loops_wrong")
+    assert [report[name] for name in counts] == [4, 300, 1, 0, 1]
+    assert report["submaps"] == 2
+    first = report["loops"][0]
+    assert (first["query_frame"], first["match_frame"]) == (264, 12)
+    assert (first["matches"], first["inliers"], first["accepted"]) == (120, 84, True)
+    assert first["correction_s"] == 0.12
+    assert first["moved_m"] == pytest.approx(8.0 * 66 / 125)
+    assert [x["right"] for x in report["loops"] if x["accepted"]] == [True, True, False, True]
+    assert [x["right"] for x in report["loops"] if not x["accepted"]] == [None] * 299 + [True]
+    assert report["revisit_stretches"] == 1
+    (stretch,) = report["revisits"]
+    assert stretch["loop_frame"] == 264
+    assert stretch["length_m"] == pytest.approx(2 * np.pi * 32 + 5, abs=2)
+
+
+def test_comparison_is_in_every_text(looped: tuple[RunOutcome, Path]) -> None:
+    outcome, folder = looped
+    without, truth = outcome.without_loops, matched_ground_truth(outcome)
+    assert without is not None
+    assert truth is not None
+    expected = evaluate(without.trajectory, truth)
+    report = ReportJson.model_validate_json((folder / "report.json").read_bytes())
+    assert report.without_loops is not None
+    assert report.without_loops.ate_rmse_m == expected.ate_rmse_m
+    assert report.without_loops.loops_closed == 0
+    assert report.ate_rmse_m is not None
+    for name in ("report.md", "report.html"):
+        text = (folder / name).read_text()
+        assert "With and without loop closing" in text
+        assert f"{report.ate_rmse_m:.3f} m" in text
+        assert f"{expected.ate_rmse_m:.3f} m" in text
+
+
+def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) -> None:
+    text = (looped[1] / "report.md").read_text()
+    blocks = {block.split("\n", 1)[0]: block for block in text.split("## ")}
+    closed = blocks["Loops closed"].splitlines()
+    rows = [line for line in closed if line.startswith("|")][2:]
+    assert [row.split("|")[1].strip() for row in rows] == [
+        "360",
+        "264",
+        "320",
+        "400",
+    ]  # wrong first
+    assert "wrong" in rows[0]
+    reasons = [line for line in blocks["Loops rejected"].splitlines() if line.startswith("|")][2:]
+    assert len(reasons) == 2
+    assert "N inliers, N needed \\| <b>" in reasons[0]
+    assert [cell.strip() for cell in reasons[0].rsplit("|", 4)[1:4]] == ["299", "13", "n/a"]
+    assert [cell.strip() for cell in reasons[1].rsplit("|", 4)[1:4]] == ["1", "84", "1 of 1"]
+    assert text.count("needed") <= 14
+    assert "1 of 1 revisits found, 0 missed, 1 wrong, 300 candidates rejected" in text
+
+
+def test_missed_revisit_is_named(tmp_path: Path) -> None:
+    outcome = two_laps()
+    report = report_of(replace(outcome, loops=outcome.loops[1:3], closures=[]), tmp_path)
+    assert (report.loops_closed, report.loops_missed, report.loops_wrong) == (0, 1, 0)
+    assert report.revisits[0].loop_frame is None
+    assert "missed" in (tmp_path / "report.md").read_text().split("## Revisits")[1]
+    assert "revisit missed (1)" in (tmp_path / "report.html").read_text()
+
+
+def test_loops_without_ground_truth() -> None:
+    outcome = two_laps()
+    sequence = _Sequence(outcome.sequence.timestamps, None)
+    lost = LoopEdge(-1, 3, 0.4, False, "too few matches")
+    outcome = replace(outcome, sequence=sequence, loops=[*outcome.loops, lost], without_loops=None)
+    report = summarize(outcome, None, evaluate_loops(outcome), None)
+    assert (report.loops_found, report.loops_missed, report.loops_wrong) == (None, None, None)
+    assert report.revisit_stretches is None
+    assert (report.loops_closed, report.loops_rejected) == (4, 301)
+    assert {loop.right for loop in report.loops} == {None}
+    assert report.loops[-1].query_frame is None
+    assert (headlines(report)[-1].value, headlines(report)[-1].note) == (
+        "4 closed",
+        "301 candidates rejected",
+    )
+    labels = top_view(outcome, None, None, None).axes[0].get_legend_handles_labels()[1]
+    assert labels == ["estimate", "start", "weak (4)", "loop (4)"]
+    labels = loop_closing(outcome, None, None).axes[0].get_legend_handles_labels()[1]
+    assert labels == ["before", "after", "loop, before (3)"]  # the match of one was culled
+
+
+def test_interrupted_run_is_not_blamed_for_revisits_to_come() -> None:
+    outcome = two_laps()
+    done = np.arange(240)
+    outcome = replace(outcome, trajectory=outcome.trajectory.select(done), loops=[], closures=[])
+    report = summarize(outcome, None, evaluate_loops(outcome), None)
+    assert (report.revisit_stretches, report.loops_missed) == (0, 0)
+
+
+def test_before_is_drawn_in_the_frame_of_the_ground_truth() -> None:
+    """An estimate in a world of its own, aligned: the keyframes before follow the alignment."""
+    outcome = two_laps()
+    T = np.eye(4)
+    T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
+    T[:3, 3] = [50.0, 0.0, -20.0]
+    first = outcome.closures[0]
+    turned = replace(first, T_cw_before=first.T_cw_after @ np.linalg.inv(T))
+    truth = matched_ground_truth(outcome)
+    assert truth is not None
+    trajectory = Trajectory(outcome.trajectory.timestamps, T @ truth.T_wc)
+    outcome = replace(outcome, trajectory=trajectory, closures=[turned])
+    for scale, alignment in ((1.0, "se3"), (1.5, "sim3")):
+        poses = truth.T_wc.copy()
+        poses[:, :3, 3] *= scale
+        evaluation = evaluate(trajectory, Trajectory(truth.timestamps, poses), alignment)
+        axes = loop_closing(outcome, evaluation, truth).axes[0]
+        (before,) = (line for line in axes.lines if line.get_label() == "before")
+        expected = scale * truth.T_wc[outcome.keyframe_frames[turned.keyframes]][:, [0, 2], 3]
+        np.testing.assert_allclose(before.get_xydata(), expected, atol=1e-6)
+
+
 def test_without_ground_truth(tmp_path: Path) -> None:
     report = report_of(make_outcome(40, ground_truth=False, lost=slice(20, 21)), tmp_path)
     assert report.ate_rmse_m is report.evo_command is report.alignment is None
     assert not (tmp_path / "ground_truth_kitti.txt").exists()
-    assert figures_of(tmp_path) == FIGURES - {"error_along_path", "error_histogram"}
+    assert figures_of(tmp_path) == FIGURES - {"loop_closing", "error_along_path", "error_histogram"}
     assert "n/a" in (tmp_path / "report.md").read_text()
 
 

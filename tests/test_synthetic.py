@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import csv
+import os
 import shutil
+from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from vslam.camera import StereoCamera
 from vslam.datasets import open_sequence
 from vslam.datasets.kitti import open_kitti
-from vslam.datasets.synthetic import store
+from vslam.datasets.synthetic import houses, store, textures, vehicles
+from vslam.datasets.synthetic import town as town_module
 from vslam.datasets.synthetic.camera_effects import sensor_image
-from vslam.datasets.synthetic.passes import Passes
+from vslam.datasets.synthetic.pairs import render_pairs
+from vslam.datasets.synthetic.passes import Passes, pass_starts
 from vslam.datasets.synthetic.render import Light, Renderer
 from vslam.datasets.synthetic.routes import (
     CAMERA_HEIGHT,
@@ -23,8 +30,8 @@ from vslam.datasets.synthetic.routes import (
     route_of_poses,
 )
 from vslam.datasets.synthetic.scene import AtlasBuilder, join, patches
-from vslam.datasets.synthetic.shadows import cast_shadows
-from vslam.datasets.synthetic.site import Variation
+from vslam.datasets.synthetic.shadows import cast_shadows, lamp_pools
+from vslam.datasets.synthetic.site import ALIASES, Variation
 from vslam.datasets.synthetic.solids import turn
 from vslam.datasets.synthetic.town import build_town
 from vslam.errors import InputError
@@ -181,26 +188,96 @@ def test_shadow_falls_away_from_the_sun():
     assert beyond == pytest.approx(sunny, rel=1e-3)
 
 
-def test_nothing_stands_near_a_camera(route, town):
-    solid = town.surfaces.select(town.surfaces.thing >= 0)
-    s, t = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, 15), np.linspace(0, 1, 15)))
+@pytest.fixture
+def unpainted(monkeypatch):
+    """Towns of the real shape whose textures cost nothing; their ground is far below."""
+    plain = np.full((2, 2), 99.0, np.float32)
+    twice = (plain, plain)
+    for module, names, value in (
+        (houses, ["facade"], twice),
+        (vehicles, ["_paint_side"], twice),
+        (vehicles, ["_paint_end", "_paint_strip", "_paint_glass"], plain),
+        (textures, ["foliage", "hedge", "fence", "sign"], twice),
+        (textures, ["sky", "poster", "garden_wall", "bark"], plain),
+    ):
+        for name in names:
+            monkeypatch.setattr(module, name, lambda *_, value=value, **__: value)
+    below = patches(np.array([0.0, 1e4, 0.0]), np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), 0)
+    monkeypatch.setattr(town_module, "make_ground", lambda *_: below)
+
+
+def clearance(surfaces, cameras):
+    """Smallest distance of cameras from surfaces, as far as it is below some 4 m."""
+    tree = cKDTree(cameras)
+    middle = surfaces.origin + 0.5 * (surfaces.edge_s + surfaces.edge_t)
+    lengths = [np.linalg.norm(edge, axis=1) for edge in (surfaces.edge_s, surfaces.edge_t)]
+    near = surfaces.select(tree.query(middle)[0] < 0.5 * (lengths[0] + lengths[1]) + 4.0)
+    grid = np.linspace(0, 1, 21)
+    s, t = (x.ravel()[:, None] for x in np.meshgrid(grid, grid))
     points = (
-        solid.origin[:, None]
-        + s[:, None] * solid.edge_s[:, None]
-        + t[:, None] * solid.edge_t[:, None]
-    ).reshape(-1, 3)
-    for camera in route.T_wc[:, :3, 3]:
-        assert np.linalg.norm(points - camera, axis=1).min() >= 2.5
+        near.origin + s[..., None] * near.edge_s + t[..., None] * near.edge_t
+    )  # (grid, surfaces, 3)
+    points = points[((s + t <= 1.0) | ~near.triangle)]
+    return tree.query(points)[0].min(initial=np.inf)
 
 
-def test_streets_end_in_something(route, town):
-    """Straight ahead and to the sides, no ray runs free for 150 m."""
-    renderer = Renderer(route.camera, town.atlas, town.sky)
-    moment = Passes(route, town, Variation(seed=3)).at(30)
-    left, _ = renderer.stereo(moment.surfaces, moment.shadows, moment.light, route.T_wc[30])
+@pytest.mark.parametrize("name", ROUTES)
+def test_nothing_stands_near_a_camera_of_any_route(name, unpainted):
+    route = built_in_route(name)
+    town = build_town(route, Variation(change=0.5))
+    built = town.surfaces.select(np.arange(1, len(town.surfaces)))
+    assert len(built) > 1000
+    assert clearance(built, route.T_wc[:, :3, 3]) >= 2.5
+
+
+def test_pairs_keep_clear_of_the_town_beside_the_route(route, unpainted):
+    town = build_town(route, Variation(), sway=1.4)
+    built = town.surfaces.select(np.arange(1, len(town.surfaces)))
+    for aside in (-1.4, -0.7, 0.7, 1.4):
+        cameras = route.T_wc[:, :3, 3] + aside * route.T_wc[:, :3, 0]
+        assert clearance(built, cameras) >= 2.5
+
+
+def test_moving_cars_keep_clear(unpainted):
+    route = built_in_route("demo")
+    variation = Variation(moving=5)
+    passes = Passes(route, town := build_town(route, variation), variation)
+    standing = len(town.surfaces)
+    seen = 0
+    for frame in range(0, len(route.T_wc), 6):
+        moment = passes.at(frame)
+        cars = moment.surfaces.select(np.arange(standing, len(moment.surfaces)))
+        seen += len(cars) > 0
+        assert clearance(cars, route.T_wc[frame : frame + 1, :3, 3]) >= 2.5
+    assert seen > 20
+
+
+def test_sight_lines_are_closed_at_bends(unpainted):
+    """All over the demo's loop hardly a ray near the horizon meets nothing."""
+    route = built_in_route("demo")
+    town = build_town(route, Variation())
+    renderer = Renderer(route.camera, town.atlas, town.sky, 2)
+    moment = Passes(route, town, Variation()).at(0)
     horizon = round(route.camera.cy) - 6
-    row = left.depth[horizon - 12 : horizon].max(axis=0)
-    assert (row > 0).mean() > 0.97
+    for frame in range(5, len(route.T_wc), 50):
+        left, _ = renderer.stereo(moment.surfaces, moment.shadows, moment.light, route.T_wc[frame])
+        row = left.depth[horizon - 12 : horizon].max(axis=0)
+        assert (row > 0).mean() > 0.97, frame
+    renderer.close()
+
+
+def test_aliased_facades_repeat(route, monkeypatch, unpainted):
+    painted = []
+    monkeypatch.setattr(
+        houses, "facade", lambda rng, *rest, **_: painted.append((rng.random(), rest[2]))
+        or (np.full((2, 2), 9.0),) * 2,
+    )  # fmt: skip
+    build_town(route, Variation())
+    assert len(set(painted)) == len(painted) > 40
+    painted.clear()
+    build_town(route, Variation(aliased=True))
+    assert len(painted) > 40
+    assert len(set(painted)) <= 4 * ALIASES
 
 
 def test_places_match_themselves_only(route, town):
@@ -293,25 +370,72 @@ def test_whole_sequence_has_a_manifest_and_is_not_rendered_twice(tmp_path, monke
     assert not store.list_stored(tmp_path)
 
 
+def test_damaged_frames_are_found_and_rendered_again(tmp_path, monkeypatch, caplog):
+    small = route_of_poses(straight(24), "short")
+    monkeypatch.setattr(store, "_render", fake := Renderings())
+    root = store.render_sequence(small, Variation(), tmp_path)
+    images = root / "sequences/short/image_0"
+    (images / "000007.png").write_bytes(b"pn")  # another size
+    store.render_sequence(small, Variation(), tmp_path)
+    assert (fake.calls, fake.missing) == (2, [7])
+    assert "1 damaged, rendered again: 7" in caplog.text
+    (images / "000008.png").write_bytes(b"xxx")  # the same size
+    store.render_sequence(small, Variation(), tmp_path)
+    assert fake.calls == 2
+    store.render_sequence(small, Variation(), tmp_path, verify=True)
+    assert (fake.calls, fake.missing) == (3, [8])
+    store.render_sequence(small, Variation(), tmp_path, verify=True)
+    assert fake.calls == 3
+
+
+def test_another_calibration_is_another_sequence(tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "_render", fake := Renderings())
+    for calibration in ("00-02", "04-12", "04-12"):
+        route = route_of_poses(straight(24), "short", calibration)
+        store.render_sequence(route, Variation(), tmp_path)
+    assert fake.calls == 2
+    with pytest.raises(InputError, match="choose one of 00-02, 03, 04-12"):
+        route_of_poses(straight(24), "short", "13")
+
+
+def test_two_processes_do_not_render_one_sequence(tmp_path, monkeypatch):
+    small = route_of_poses(straight(24), "short")
+    monkeypatch.setattr(store, "_render", fake := Renderings())
+    folder = tmp_path / store.folder_name(Variation()) / "sequences"
+    folder.mkdir(parents=True)
+    (folder / ".short.lock").write_text(str(os.getppid()))
+    with pytest.raises(InputError, match=rf"process {os.getppid()} is rendering it"):
+        store.render_sequence(small, Variation(), tmp_path)
+    (folder / ".short.lock").write_text("999999999")  # killed long ago
+    store.render_sequence(small, Variation(), tmp_path)
+    assert fake.calls == 1
+    assert not list(folder.glob(".short*"))
+
+
 class Renderings:
     """Stands in for the renderer: writes files without looking at the town."""
 
     calls = 0
+    missing = None
 
     def __call__(self, route, variation, folder, missing, depth, *_):
         self.calls += 1
+        self.missing = missing
         for k in missing:
             for eye in ("image_0", "image_1"):
                 (folder / eye / f"{k:06d}.png").write_bytes(b"png")
 
 
-def test_change_between_passes():
-    n = 85
-    there_and_back = np.concatenate([straight(n), straight(n)])
-    there_and_back[n:, 2, 3] = there_and_back[n - 1 :: -1, 2, 3]
-    there_and_back[n:, 0, 3] -= 3.2
-    there_and_back[n:, :3, :3] = turn(np.pi)
-    route = route_of_poses(there_and_back, "twice")
+def there_and_back(n=85):
+    T = np.concatenate([straight(n), straight(n)])
+    T[n:, 2, 3] = T[n - 1 :: -1, 2, 3]
+    T[n:, 0, 3] -= 3.2
+    T[n:, :3, :3] = turn(np.pi)
+    return T
+
+
+def test_change_between_passes(unpainted):
+    route = route_of_poses(there_and_back(), "twice")
     variation = Variation(change=1.0, moving=3)
     town = build_town(route, variation)
     passes = Passes(route, town, variation)
@@ -321,6 +445,66 @@ def test_change_between_passes():
     things = [set(m.surfaces.thing.tolist()) for m in (first, last)]
     assert len(things[0] - things[1]) > 10
     assert len(things[1] - things[0]) > 10
+
+
+def test_sun_stands_still_within_a_pass_and_moves_behind_a_cloud(route, town):
+    poses = there_and_back()
+    drive = SimpleNamespace(T_wc=poses)
+    passes = Passes(drive, town, Variation(change=0.6))
+    starts = pass_starts(poses)
+    assert len(starts) == 2
+    lights = [passes._light(k, k >= starts[1])[0] for k in range(len(poses))]
+    turned = [not np.array_equal(a.sun, b.sun) for a, b in pairwise(lights)]
+    assert np.flatnonzero(turned).tolist() == [starts[1] - 1]
+    assert lights[starts[1]].direct < 0.02
+    assert lights[10].direct == pytest.approx(1.0)
+    brightness = np.array([light.direct for light in lights])
+    assert np.abs(np.diff(brightness)).max() < 0.12
+
+
+def test_lamps_cast_pools():
+    pools = lamp_pools(np.array([[0.0, 0.0], [30.0, 4.0]]))
+    at = np.rint((np.array([[0, 0], [6, 0], [15, -15], [30, 4]]) - pools.frame[:2]) / 0.5)
+    under, aside, away, other = pools.light[tuple(at.astype(int).T[::-1])]
+    assert under == pytest.approx(other) == pytest.approx(1.0, abs=0.05)
+    assert 0.1 < aside < 0.4
+    assert away < 0.02
+
+
+def rounds(n, radius=32.0, laps=1.6):
+    """Poses of a drive round a circle."""
+    angle = np.linspace(0, 2 * np.pi * laps, n)
+    T = np.stack([turn(a) for a in angle])
+    T = np.concatenate([T, np.zeros((n, 3, 1))], axis=2)
+    T = np.concatenate([T, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (n, 1, 1))], axis=1)
+    T[:, 0, 3], T[:, 2, 3] = -radius * np.cos(angle), radius * np.sin(angle)
+    return T
+
+
+def test_pairs_are_labelled(tmp_path):
+    route = route_of_poses(rounds(160), "round")
+    cheap = replace(route, camera=StereoCamera(180.0, 180.0, 155.0, 47.0, 0.54, 310, 94))
+    render_pairs(cheap, Variation(seed=1, change=0.6), tmp_path, 20)
+    rows = list(csv.DictReader((tmp_path / "pairs.csv").open()))
+    assert {row["kind"] for row in rows} == {"shift", "pass", "alike", "random"}
+    orb = cv2.ORB_create(600)
+    alike = {"1": [], "0": []}
+    for row in rows:
+        same = row["kind"] in ("shift", "pass")
+        assert row["same"] == str(int(same))
+        assert (float(row["distance_m"]) < 4.0) == same
+        assert abs(float(row["lateral_m"])) <= 1.4
+        assert abs(float(row["heading_deg"])) <= 14.0
+        assert abs(float(row["height_m"])) <= 0.25
+        images = [cv2.imread(str(tmp_path / row[eye]), cv2.IMREAD_UNCHANGED) for eye in "ab"]
+        assert all(image.shape == (94, 310) and image.std() > 15 for image in images)
+        ratio = images[1].mean() / images[0].mean()
+        assert not same or 0.3 < ratio / float(row["exposure_ratio"]) < 3.0
+        features = [orb.detectAndCompute(image, None)[1] for image in images]
+        found = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(*features, k=2)
+        close = [m for m, n in (p for p in found if len(p) == 2) if m.distance < 0.8 * n.distance]
+        alike[row["same"]].append(len(close))
+    assert np.median(alike["1"]) > 1.5 * np.median(alike["0"])
 
 
 @pytest.mark.parametrize("name", ROUTES)

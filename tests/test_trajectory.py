@@ -5,8 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vslam.errors import InputError
+from vslam.geometry import se3_exp
 from vslam.trajectory import (
     Trajectory,
+    bridge_gaps,
     read_kitti_poses,
     read_trajectory,
     trajectory_format,
@@ -93,3 +95,14 @@ def test_other_number_of_timestamps(tmp_path, trajectory):
     write_kitti(tmp_path / "poses.txt", trajectory.T_wc)
     with pytest.raises(InputError, match="20 poses but 3 timestamps"):
         read_trajectory(tmp_path / "poses.txt", np.arange(3.0))
+
+
+def test_gaps_are_bridged_at_constant_velocity():
+    times = np.array([0.0, 1.0, 2.0, 4.0, 5.0])
+    twist = np.array([1.0, 0.2, 0.0, 0.0, 0.1, 0.0])  # a second
+    T_wc = np.array([se3_exp(twist * t) for t in times])
+    known = np.array([True, False, False, True, False])
+    guessed = np.where(known[:, None, None], T_wc, np.eye(4))
+    bridged = bridge_gaps(Trajectory(times, guessed), known)
+    np.testing.assert_allclose(bridged.T_wc[:4], T_wc[:4], atol=1e-12)
+    np.testing.assert_array_equal(bridged.T_wc[4], np.eye(4))  # nothing known after it

@@ -6,7 +6,9 @@ figures for the whole process: start, vocabulary, files written and all. Errors 
 vslam.evaluate for both, on the trajectory files that they wrote.
 
 The peer is a script that takes VOCABULARY SEQUENCE_FOLDER OUT --frames N, writes a pose a frame to
-OUT in KITTI's format and prints a JSON object with frames, fps, cpu_ms_per_frame and lost.
+OUT in KITTI's format and prints a JSON object with frames, fps, cpu_ms_per_frame and lost. Loops
+are found, missed and wrong by the ground truth for vslam (vslam.loop_evaluation); of the peer only
+the closed ones are known: ``loops`` of that object, or the lines that ORB-SLAM3 prints for them.
 
 usage: python tools/compare_peer.py --data KITTI --seq 06 --frames 51 --repeats 3 \
            --peer-python PY --peer-script run_orbslam3.py --vocabulary voc.txt
@@ -26,6 +28,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 PEER_PACKAGE = "pyorbslam3"
+PEER_LOOP = "*Loop detected"  # printed once for each loop that it closes
 MEASURES = (  # key, title with an arrow to the better side, format
     ("process_fps", "frames/s, whole process ↑", ".1f"),
     ("loop_fps", "frames/s, frame loop ↑", ".1f"),
@@ -35,6 +38,9 @@ MEASURES = (  # key, title with an arrow to the better side, format
     ("cpu_s", "CPU time, s ↓", ".1f"),
     ("memory_mb", "peak memory, MB ↓", ".0f"),
     ("lost", "lost frames ↓", ".0f"),
+    ("loops_closed", "loops closed", ".0f"),
+    ("loops_missed", "revisits without a loop ↓", ".0f"),
+    ("loops_wrong", "wrong loops ↓", ".0f"),
     ("ate_m", "ATE, SE3-aligned, m ↓", ".3f"),
     ("rpe_m", "RPE per frame, m ↓", ".4f"),
     ("t_rel", "t_rel, % ↓", ".3f"),
@@ -52,11 +58,13 @@ class Process(NamedTuple):
 
 class Run(NamedTuple):
     """One run: what the system reports of itself (``frames``, ``fps`` and ``cpu_ms_per_frame`` of
-    the frame loop, and more), its lost frames, and its trajectory in KITTI's format."""
+    the frame loop, and more), its lost frames, its loops closed, missed and wrong (None where it
+    does not say), and its trajectory in KITTI's format."""
 
     process: Process
     report: dict[str, Any]
     lost: int
+    loops: tuple[int | None, int | None, int | None]
     trajectory: str
 
 
@@ -79,13 +87,15 @@ def measure(command: list[str], folder: Path) -> Process:
 def run_vslam(options: argparse.Namespace, folder: Path) -> Run:
     command = [options.vslam, "run", "--data", str(options.data), "--seq", options.seq]
     command += ["--max-frames", str(options.frames), "--no-record", "--quiet", "--out", "runs"]
+    command += ["--detector", options.detector]
     if options.threads:
         command += ["--threads", str(options.threads)]
     process = measure(command, folder)
     results = folder / "runs" / "latest"
     report = json.loads((results / "report.json").read_text())
     trajectory = (results / "trajectory_kitti.txt").read_text()
-    return Run(process, report, report["lost_frames"], trajectory)
+    loops = report["loops_closed"], report["loops_missed"], report["loops_wrong"]
+    return Run(process, report, report["lost_frames"], loops, trajectory)
 
 
 def run_peer(options: argparse.Namespace, folder: Path) -> Run:
@@ -95,7 +105,9 @@ def run_peer(options: argparse.Namespace, folder: Path) -> Run:
     process = measure(command, folder)
     said = next(line for line in reversed(process.output.splitlines()) if line.startswith("{"))
     report = json.loads(said)
-    return Run(process, report, report["lost"], (folder / "out.kitti").read_text())
+    loops = report.get("loops", process.output.count(PEER_LOOP))
+    trajectory = (folder / "out.kitti").read_text()
+    return Run(process, report, report["lost"], (loops, None, None), trajectory)
 
 
 def figures(run: Run, options: argparse.Namespace) -> dict[str, float]:
@@ -118,6 +130,8 @@ def figures(run: Run, options: argparse.Namespace) -> dict[str, float]:
         "lost": float(run.lost),
     }
     nan = float("nan")
+    for name, count in zip(("closed", "missed", "wrong"), run.loops, strict=True):
+        found[f"loops_{name}"] = nan if count is None else float(count)
     found |= dict.fromkeys(("ate_m", "rpe_m", "t_rel"), nan)
     sequence = open_sequence("kitti", options.data, options.seq, max_frames=options.frames)
     rows = np.array([line.split() for line in run.trajectory.splitlines()], np.float64)
@@ -145,7 +159,8 @@ def table(ours: list[dict[str, float]], peers: list[dict[str, float]]) -> str:
             low, high = format(values[0], form), format(values[-1], form)
             cell = format(medians[-1], form)
             cells.append(cell if low == high else f"{cell} ({low} - {high})")
-        ratio = f"{medians[0] / medians[1]:.2f}" if medians[1] else "-"
+        counted = name.startswith("loops_")  # a ratio of counts says nothing
+        ratio = "-" if counted or not medians[1] else f"{medians[0] / medians[1]:.2f}"
         row = f"| {title} | {cells[0]} | {cells[1]} | {ratio} |"
         lines.append(row.replace("nan", "-"))
     return "\n".join(lines)
@@ -159,7 +174,8 @@ def setting(report: dict[str, Any], options: argparse.Namespace) -> str:
     ours = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
     return (
         f"KITTI {options.seq}, frames 0-{options.frames - 1}, median (least - greatest) of "
-        f"{options.repeats} runs each, in turn, {time.strftime('%Y-%m-%d')}. "
+        f"{options.repeats} runs each, in turn, --detector {options.detector}, "
+        f"{time.strftime('%Y-%m-%d')}. "
         f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. {ours}; "
         f"{PEER_PACKAGE} {peer.stdout.strip() or '(version unknown)'}."
     )
@@ -172,6 +188,7 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--frames", type=int, required=True, help="frames, from the first one")
     parser.add_argument("--repeats", type=int, default=3, help="counted runs of each system")
     parser.add_argument("--threads", type=int, help="of vslam; its default unless given")
+    parser.add_argument("--detector", default="none", help="loop detector of vslam")
     parser.add_argument("--vslam", default=str(Path(sys.executable).with_name("vslam")))
     parser.add_argument("--peer-python", type=Path, required=True)
     parser.add_argument("--peer-script", type=Path, required=True)

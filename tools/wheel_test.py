@@ -101,6 +101,8 @@ def main() -> None:
         if "run" not in run(vslam, "--help", cwd=scratch):
             sys.exit("wheel test: failed; vslam --help does not name its commands")
         print(run(vslam, "info", "--data", scratch / "kitti", cwd=scratch))
+        if "100000" not in run(vslam, "vocabulary", "info", cwd=scratch):
+            sys.exit("wheel test: failed; the vocabulary of 100000 words is not in the wheel")
         run(vslam, "run", "--data", scratch / "kitti", "--perturb", "brightness:0.5", cwd=scratch)
         check_run(scratch / "runs" / "latest")
     print("wheel test: ok")

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from vslam import __version__, synth_cli, train_cli
+from vslam import __version__, synth_cli, train_cli, vocabulary_cli
+from vslam.console import evaluation_rows, print_rows, print_summary
 from vslam.errors import InputError, ResultsError
-
-if TYPE_CHECKING:
-    from vslam.evaluate import Evaluation
-    from vslam.run import RunOutcome
 
 app = typer.Typer(
     help="Visual SLAM in pure Python.",
@@ -22,7 +19,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-_DETECTORS = {"none": True, "bow": False, "capsule": False, "capsule-pruned": False}
+_DETECTORS = {"none": True, "bow": True, "capsule": False, "capsule-pruned": False}
 _DETECTORS |= {"alexnet": False, "vgg16": False}
 _SENSORS = {"stereo": True, "mono": False, "rgbd": False}
 
@@ -45,7 +42,6 @@ Every = Annotated[int, typer.Option(min=1, help="Take every N-th frame.")]
 MaxFrames = Annotated[int | None, typer.Option(min=1, help="Stop after so many frames.")]
 
 _DATA = Path("data/kitti")
-_LOOK_AT = (("report", "report.html"), ("recording", "recording.rrd"))
 
 _RUN_EXAMPLES = """
 [b]Examples[/b]
@@ -76,12 +72,18 @@ def run(
             min=1, help="Threads; the result does not depend on it.", show_default="cores, up to 4"
         ),
     ] = None,
-    detector: Annotated[str, typer.Option(help="Loop detector; in this version: none.")] = "none",
+    detector: Annotated[
+        str, typer.Option(help="Loop detector: [b]bow[/b], or [b]none[/b] for odometry only.")
+    ] = "bow",
     sensor: Annotated[str, typer.Option(help="In this version: stereo.")] = "stereo",
     out: Annotated[Path, typer.Option(help="Where the folders of the runs go.")] = Path("runs"),
     config: Annotated[
         Path | None, typer.Option(help="JSON file with thresholds, as config.json of a run.")
     ] = None,
+    compare_loops: Annotated[
+        bool,
+        typer.Option("--compare-loops", help="Run again without loop closing; print both."),
+    ] = False,
     record: Annotated[bool, typer.Option(help="Write a Rerun recording.")] = True,
     ply: Annotated[bool, typer.Option("--ply", help="Write the landmarks as map.ply.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
@@ -89,17 +91,18 @@ def run(
     """Run SLAM on a sequence and write trajectory, map, recording and report to a folder."""
     _require_built("--detector", detector, _DETECTORS)
     _require_built("--sensor", sensor, _SENSORS)
+    if compare_loops and detector == "none":
+        raise InputError("--compare-loops: nothing to compare with --detector none; name another.")
 
     from vslam.config import Config, load_config
     from vslam.datasets import open_sequence
-    from vslam.info import available_cores, numba_caches
+    from vslam.info import available_cores
     from vslam.perturb import parse_perturbation
     from vslam.progress import announce, progress_bar, render_bar
     from vslam.run import RunSettings
     from vslam.runfolder import create_run_folder, write_results
 
     thresholds = Config() if config is None else load_config(config)
-    first_run = not numba_caches()  # rendering leaves caches, too
     with render_bar(shown=not quiet) as on_render:
         sequence = open_sequence(
             dataset, data, seq,
@@ -120,19 +123,23 @@ def run(
         max_frames=max_frames,
         config=thresholds,
     )
+    from vslam.comparison import with_comparison
     from vslam.pipeline import run_sequence
     from vslam.recorder import NullRecorder, RerunRecorder
-    from vslam.warmup import compile_kernels
+    from vslam.warmup import compile_kernels, is_cold
 
     recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
-    if first_run:
+    if is_cold():
         announce("first run: compiling the kernels, less than a minute ...", shown=not quiet)
-    compile_kernels()
+    compile_kernels(processes=min(settings.threads, 2))
     with progress_bar(len(sequence), shown=not quiet) as on_frame:
         outcome = run_sequence(sequence, perturbation, settings, recorder, on_frame=on_frame)
+    if compare_loops and not outcome.interrupted:
+        with progress_bar(len(sequence), shown=not quiet) as on_frame:
+            outcome = with_comparison(outcome, perturbation, on_frame=on_frame)
     evaluation, remark = write_results(folder, outcome, ply=ply)
     if not quiet:
-        _print_summary(outcome, evaluation, remark, folder)
+        print_summary(outcome, evaluation, remark, folder)
     if outcome.interrupted:
         raise typer.Exit(1)
 
@@ -163,10 +170,10 @@ def evaluate_files(
         typer.echo(json.dumps(evaluation.summary(), indent=2))
         return
     matched = f"{evaluation.frames} matched of {len(trajectory)}"
-    rows = [("frames", matched), ("alignment", align), *_evaluation_rows(evaluation)]
+    rows = [("frames", matched), ("alignment", align), *evaluation_rows(evaluation)]
     if trajectory_format(estimate) == trajectory_format(gt):
         rows.append(("reproduce", evo_command(estimate, gt, align)))
-    _print_rows(rows)
+    print_rows(rows)
 
 
 @app.command(
@@ -227,11 +234,12 @@ def info(data: Data = _DATA) -> None:
         rows.append(("kitti", str(error)))
     if warning := machine.opencv_conflict(found):
         rows.append(("warning", warning))
-    _print_rows(rows)
+    print_rows(rows)
 
 
 synth_cli.register(app)
 train_cli.register(app)
+vocabulary_cli.register(app)
 
 
 @app.callback(invoke_without_command=True)
@@ -261,44 +269,3 @@ def _require_built(option: str, value: str, known: dict[str, bool]) -> None:
         raise InputError(f"{option} {value}: unknown; this version has only {built}.")
     if not known[value]:
         raise InputError(f"{option} {value}: not built yet; this version has only {built}.")
-
-
-def _evaluation_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
-    rows = [
-        ("ATE rmse", f"{evaluation.ate_rmse_m:.3f} m"),
-        ("ATE mean, max", f"{evaluation.ate_mean_m:.3f} m, {evaluation.ate_max_m:.3f} m"),
-        ("RPE per frame", f"{evaluation.rpe_m:.4f} m, {evaluation.rpe_deg:.4f} deg"),
-    ]
-    if evaluation.t_rel_percent is None:
-        return [*rows, ("drift", "path shorter than 100 m")]
-    return [
-        *rows,
-        ("t_rel", f"{evaluation.t_rel_percent:.3f} %"),
-        ("r_rel", f"{evaluation.r_rel_deg_per_100m:.3f} deg/100 m"),
-    ]
-
-
-def _print_summary(
-    outcome: RunOutcome, evaluation: Evaluation | None, remark: str, folder: Path
-) -> None:
-    from vslam.features import TrackingState
-
-    tracks = outcome.tracks
-    lost = sum(track.state is TrackingState.LOST for track in tracks)
-    rows = [
-        ("frames", f"{len(tracks)} done, {lost} lost, {len(outcome.skipped)} unreadable"),
-        *(_evaluation_rows(evaluation) if evaluation else [("evaluation", remark)]),
-        ("speed", f"{len(tracks) / outcome.wall_s:.1f} fps" if outcome.wall_s else "-"),
-        ("map", f"{outcome.n_keyframes} keyframes, {outcome.n_landmarks} landmarks"),
-        ("folder", str(folder)),
-        *((name, str(folder / file)) for name, file in _LOOK_AT if (folder / file).exists()),
-    ]
-    if outcome.interrupted:
-        rows.insert(0, ("interrupted", outcome.interrupted))
-    _print_rows(rows)
-
-
-def _print_rows(rows: list[tuple[str, str]]) -> None:
-    width = max(len(name) for name, _ in rows)
-    for name, value in rows:
-        typer.echo(f"{name:<{width}}  {value}")

@@ -114,6 +114,147 @@ class SiameseConfig(_Section):
     )
 
 
+class VerificationConfig(_Section):
+    """When a loop candidate is a revisit [OS1, VII-B; OS2, III-C]."""
+
+    match_distance: int = Field(50, ge=0, le=256, description="Descriptor search, bits. [OS1]")
+    match_ratio: float = Field(0.8, gt=0, le=1, description="Best over second best. [OS1]")
+    min_matches: int = Field(20, ge=3, description="Landmarks matched by descriptor. [OS1, VII-B]")
+    max_draws: int = Field(600, ge=1, description="RANSAC draws. [own]")
+    confidence: float = Field(0.99, gt=0, lt=1, description="That RANSAC missed nothing. [OS1]")
+    min_consensus: int = Field(15, ge=6, description="Inliers of RANSAC. [own]")
+    place_keyframes: int = Field(
+        10, ge=0, description="Covisible keyframes that make up a place with the match. [own]"
+    )
+    first_window: float = Field(8.0, gt=0, description="Guided search, radius in pixels. [OS1]")
+    second_window: float = Field(4.0, gt=0, description="Its repetition, likewise. [own]")
+    guided_distance: int = Field(64, ge=0, le=256, description="Guided search, bits. [own]")
+    min_inliers: int = Field(40, ge=6, description="After guided search. [OS1, VII-B]")
+    min_inlier_ratio: float = Field(
+        0.5, ge=0, le=1, description="Of the guided matches that fit one pose. [own]"
+    )
+    min_elsewhere: int = Field(
+        15,
+        ge=0,
+        description="Inliers outside the third of the image, as a strip, with the most. [own]",
+    )
+    min_cells: int = Field(
+        8, ge=1, description="Cells of a grid of 8 x 4 over the image that hold inliers. [own]"
+    )
+    min_cell_ratio: float = Field(
+        0.3, ge=0, le=1, description="Of the cells where the place should appear. [own]"
+    )
+    min_seen_ratio: float = Field(
+        0.07, ge=0, le=1, description="Of a keyframe's landmarks that the other must see. [own]"
+    )
+    max_distance: float = Field(15.0, gt=0, description="Between the two cameras, metres. [own]")
+
+
+class ConsistencyConfig(_Section):
+    """What makes verified candidates a loop [OS1, VII-A]."""
+
+    min_keyframes: int = Field(
+        2, ge=1, description="Keyframes in a row that a place must resemble; OS1 has 3. [own]"
+    )
+    max_gap: int = Field(1, ge=0, description="Keyframes in between that may not. [own]")
+    min_shared: int = Field(
+        30, ge=1, description="Landmarks that make a keyframe part of a candidate's group. [own]"
+    )
+    min_verified: int = Field(2, ge=1, description="Verified keyframes that must agree. [own]")
+    verified_memory: int = Field(5, ge=1, description="Keyframes that a verified one counts. [own]")
+    max_apart: float = Field(0.5, gt=0, description="Of agreeing loops, metres. [own]")
+    max_turn: float = Field(1.0, gt=0, description="Of agreeing loops, degrees. [own]")
+
+
+class RelocalizationConfig(_Section):
+    """Finding a lost camera [OS1, V-C]."""
+
+    match_distance: int = Field(50, ge=0, le=256, description="Descriptor search, bits. [OS1]")
+    match_ratio: float = Field(0.75, gt=0, le=1, description="Best over second best. [OS1]")
+    min_matches: int = Field(15, ge=4, description="Landmarks matched by descriptor. [OS1]")
+    max_draws: int = Field(600, ge=1, description="RANSAC draws. [own]")
+    confidence: float = Field(0.99, gt=0, lt=1, description="That RANSAC missed nothing. [OS1]")
+    min_consensus: int = Field(10, ge=4, description="Inliers of RANSAC. [OS1]")
+    first_window: float = Field(8.0, gt=0, description="Projection search, pixels. [OS1]")
+    min_inliers: int = Field(50, ge=6, description="Of the frame once it is found. [OS1]")
+    min_elsewhere: int = Field(
+        15, ge=0, description="Of these, outside the third of the image with the most. [own]"
+    )
+    max_candidates: int = Field(5, ge=1, description="Places tried for each lost frame. [own]")
+    neighbours: int = Field(20, ge=1, description="Keyframes whose landmarks are searched. [own]")
+
+
+class LoopConfig(_Section):
+    """Closing a verified loop [OS1, VII]."""
+
+    global_iterations: int = Field(
+        10, ge=1, description="Of global bundle adjustment, at most. [OS2]"
+    )
+    observations_per_keyframe: int = Field(
+        25000,
+        ge=1,
+        description="Global bundle adjustment is merged after one keyframe for so many. [own]",
+    )
+
+
+class BowConfig(_Section):
+    """Loop candidates by bag of words [OS1, III-E and VII-A]."""
+
+    min_shared: int = Field(15, ge=1, description="Landmarks that make neighbours. [OS1, III-D]")
+    exclude_recent: int = Field(
+        20, ge=1, description="The query and the keyframes before it, so many in all. [own]"
+    )
+    common_words_ratio: float = Field(
+        0.8, ge=0, le=1, description="Of the most words that any keyframe shares. [OS1]"
+    )
+    group_size: int = Field(
+        10, ge=0, description="Best covisible keyframes that add to a group's score. [OS1]"
+    )
+    group_score_ratio: float = Field(
+        0.75, ge=0, le=1, description="Of the best group's score. [OS1, III-E]"
+    )
+    max_groups: int = Field(
+        30, ge=1, description="Keyframes whose group is counted, best first: bounds work. [own]"
+    )
+    direct_level: int = Field(
+        2, ge=1, le=10, description="Level of the direct index, root 0: about k^2 nodes. [own]"
+    )
+
+
+class PoseGraphConfig(_Section):
+    """Pose graph behind a loop closure: what edges are trusted with, and when a loop is refused.
+
+    Drift is modelled as a random walk, its deviation growing with the root of the path. At these
+    values 400 m of odometry may be off by 1.2 % (one sigma), nearly all of it by rotation.
+    """
+
+    min_shared: int = Field(
+        100, ge=1, description="Landmarks that make a strong covisibility edge. [OS1, III-D]"
+    )
+    min_shared_tree: int = Field(
+        15, ge=1, description="Below, a tree edge past a restart of tracking is weak. [OS1, III-D]"
+    )
+    translation_drift: float = Field(0.03, gt=0, description="m per root of a metre. [own]")
+    rotation_drift: float = Field(0.001, gt=0, description="rad per root of a metre. [own]")
+    min_length: float = Field(
+        0.3, gt=0, description="No edge is trusted as if it were shorter than this, m. [own]"
+    )
+    loop_translation: float = Field(0.1, gt=0, description="Sigma of a verified loop, m. [own]")
+    loop_rotation: float = Field(0.005, gt=0, description="Sigma of a verified loop, rad. [own]")
+    weak_translation: float = Field(
+        100.0, gt=0, description="Sigma where tracking was lost, m. [own]"
+    )
+    weak_rotation: float = Field(1.0, gt=0, description="Sigma where tracking was lost, rad. [own]")
+    robust_scale: float = Field(3.0, gt=0, description="Of the Cauchy loss on loops, sigmas. [own]")
+    iterations: int = Field(50, ge=1, description="Levenberg-Marquardt iterations at most.")
+    max_loop_error: float = Field(
+        30.0, gt=0, description="Chi-square of a loop beyond which it is contradicted. [own]"
+    )
+    max_strain: float = Field(
+        60.0, gt=0, description="Chi-square of the drift that closing one loop may imply. [own]"
+    )
+
+
 class Config(_Section):
     """The whole configuration, written to ``config.json`` of each run and read by --config."""
 
@@ -122,6 +263,12 @@ class Config(_Section):
     tracking: TrackingConfig = TrackingConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
     mapping: MappingConfig = MappingConfig()
+    verification: VerificationConfig = VerificationConfig()
+    consistency: ConsistencyConfig = ConsistencyConfig()
+    relocalization: RelocalizationConfig = RelocalizationConfig()
+    loops: LoopConfig = LoopConfig()
+    bow: BowConfig = BowConfig()
+    pose_graph: PoseGraphConfig = PoseGraphConfig()
     siamese: SiameseConfig = SiameseConfig()
 
 

@@ -111,6 +111,82 @@ def se3_log(T: Matrix) -> Matrix:
     return twist
 
 
+@kernel
+def solve_positive(H: Matrix, b: Matrix) -> Matrix:
+    """Solve a small symmetric positive definite system by Cholesky; zeros if it is not.
+
+    Args:
+        H: ``(n, n)``, of which the lower triangle is read; b: ``(n,)``.
+    """
+    n = len(b)
+    L = np.zeros((n, n))
+    x = np.zeros(n)
+    for i in range(n):
+        for j in range(i + 1):
+            value = H[i, j]
+            for k in range(j):
+                value -= L[i, k] * L[j, k]
+            if i == j:
+                if value <= 0.0:
+                    return np.zeros(n)
+                L[i, i] = np.sqrt(value)
+            else:
+                L[i, j] = value / L[j, j]
+    for i in range(n):
+        value = b[i]
+        for k in range(i):
+            value -= L[i, k] * x[k]
+        x[i] = value / L[i, i]
+    for i in range(n - 1, -1, -1):
+        value = x[i]
+        for k in range(i + 1, n):
+            value -= L[k, i] * x[k]
+        x[i] = value / L[i, i]
+    return x
+
+
+@kernel
+def symmetric_eigen(A: Matrix) -> tuple[Matrix, Matrix]:
+    """Eigenvalues ``(n,)``, in no order, and eigenvectors (columns) of a small symmetric matrix.
+
+    Cyclic Jacobi rotations (Golub and Van Loan, "Matrix Computations", 8.5): exact to round-off,
+    and multiple eigenvalues do no harm.
+    """
+    n = len(A)
+    D, V = A.copy(), np.eye(n)
+    for _ in range(30):
+        off, size = 0.0, 0.0
+        for p in range(n):
+            size += D[p, p] * D[p, p]
+            for q in range(p):
+                off += D[p, q] * D[p, q]
+        if off <= 1e-32 * size or off == 0.0:
+            break
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                if D[p, q] == 0.0:
+                    continue
+                theta = 0.5 * (D[q, q] - D[p, p]) / D[p, q]
+                t = 1.0 / (abs(theta) + np.sqrt(theta * theta + 1.0))
+                if theta < 0.0:
+                    t = -t
+                c = 1.0 / np.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(n):
+                    x, y = D[k, p], D[k, q]
+                    D[k, p], D[k, q] = c * x - s * y, s * x + c * y
+                for k in range(n):
+                    x, y = D[p, k], D[q, k]
+                    D[p, k], D[q, k] = c * x - s * y, s * x + c * y
+                for k in range(n):
+                    x, y = V[k, p], V[k, q]
+                    V[k, p], V[k, q] = c * x - s * y, s * x + c * y
+    values = np.empty(n)
+    for p in range(n):
+        values[p] = D[p, p]
+    return values, V
+
+
 def transform(T_a_b: Matrix, p_b: Matrix) -> Matrix:
     """Map ``(N, 3)`` points of frame b to frame a."""
     return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]

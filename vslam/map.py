@@ -77,6 +77,8 @@ class Map:
         n_keyframes, n_landmarks, n_rows: how much of the capacity is in use, dead ones included.
         timestamps, frames, parents: of each keyframe: seconds, frame index, spanning-tree parent.
         T_c_parent: pose relative to the parent, set when a keyframe is culled.
+        restarts: keyframes at which mapping began anew after the camera was lost, in order; each
+            is the root of a sub-map, its pose relative to its parent only a prediction.
     """
 
     def __init__(self, scales: NDArray[np.float64]) -> None:
@@ -89,6 +91,7 @@ class Map:
         self.frames: list[int] = []
         self.parents: list[int] = []
         self.T_c_parent: dict[int, NDArray[np.float64]] = {}
+        self.restarts: list[int] = []
         k, n, r = 64, 8192, 65536
         self.arrays = Arrays(
             T_cw=np.zeros((k, 4, 4)),
@@ -211,6 +214,14 @@ class Map:
         self.T_c_parent[keyframe] = T_c_parent
         detach_keyframe(a, keyframe)
         a.keyframe_alive[keyframe] = False
+
+    def submaps(self) -> NDArray[np.int64]:
+        """``(n_keyframes,)`` the sub-map of each keyframe, by the keyframe at which it began."""
+        root = np.zeros(self.n_keyframes, np.int64)
+        for keyframe in range(1, self.n_keyframes):
+            restarted = keyframe in self.restarts
+            root[keyframe] = keyframe if restarted else root[self.parents[keyframe]]
+        return root
 
     def living_keyframes(self) -> NDArray[np.int64]:
         """Ids of the keyframes that were not culled."""

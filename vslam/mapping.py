@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from vslam.backend.local_mapping import map_keyframe, refresh_keyframe
 from vslam.backend.triangulation import map_stereo_points
 from vslam.camera import StereoCamera
+from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.features import Features
 from vslam.map import LocalMap, Map, local_map
@@ -44,12 +45,19 @@ class DeferredMapping:
     n_reference: int
 
     def __init__(
-        self, scales: NDArray[np.float64], camera: StereoCamera, config: Config, *, threads: int
+        self,
+        scales: NDArray[np.float64],
+        camera: StereoCamera,
+        config: Config,
+        closing: LoopClosing,
+        *,
+        threads: int,
     ) -> None:
         self.map = Map(scales)
         self.reference = 0
         self._camera = camera
         self._config = config
+        self._closing = closing
         self._executor = ThreadPoolExecutor(1, "mapping") if threads > 1 else None
         self._pending: Callable[[], None] | None = None
         self._T_reference = np.eye(4)
@@ -67,11 +75,13 @@ class DeferredMapping:
         T_cw: Matrix,
         timestamp: float,
         frame: int,
+        image: NDArray[np.uint8] | None = None,
     ) -> tuple[NDArray[np.int32], Matrix]:
         """Add a keyframe, map its stereo points and start its local mapping. Merge first.
 
         Args:
             landmark: ``(N,)`` landmark that each feature tracks, or -1.
+            image: the left image, for loop detectors that look at it.
 
         Returns:
             The landmarks that its features observe now, new ones included, and where they are, as
@@ -85,6 +95,8 @@ class DeferredMapping:
         if keyframe > 0:
             neighbours, _ = map_.covisible(keyframe)
             map_.parents[keyframe] = int(neighbours[0]) if len(neighbours) else self.reference
+            if len(neighbours) == 0:
+                map_.restarts.append(keyframe)
         map_stereo_points(map_, keyframe, self._camera, self._config)
         refresh_keyframe(map_, keyframe)
         self.reference = keyframe
@@ -92,7 +104,9 @@ class DeferredMapping:
         # The map is the thread's from here on.
         observed = self.current(map_.arrays.landmark[map_.rows(keyframe)])
         if keyframe > 0:
-            self._pending = self._start(keyframe)
+            self._pending = self._start(keyframe, features, image)
+        else:
+            self._closing.process(map_, keyframe, features, image)
         return observed
 
     def merge(self) -> bool:
@@ -104,6 +118,13 @@ class DeferredMapping:
         self._write_counts()
         self._copy_view()
         return True
+
+    def finish(self) -> None:
+        """Complete all that is pending, global bundle adjustment included."""
+        self.merge()
+        self._closing.finish(self.map)
+        if self.map.n_keyframes:
+            self._copy_view()
 
     def count(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
         """Remember which landmarks a frame should have seen and did, until the map is free."""
@@ -142,11 +163,21 @@ class DeferredMapping:
                 counter[ids] += 1
             seen.clear()
 
-    def _start(self, keyframe: int) -> Callable[[], None]:
-        arguments = (self.map, keyframe, self._camera, self._config)
+    def look_at(self, keyframe: int) -> None:
+        """Make another keyframe the reference, and show tracking what is around it."""
+        self.reference = keyframe
+        self._copy_view()
+
+    def _start(
+        self, keyframe: int, features: Features, image: NDArray[np.uint8] | None
+    ) -> Callable[[], None]:
+        def work() -> None:
+            map_keyframe(self.map, keyframe, self._camera, self._config)
+            self._closing.process(self.map, keyframe, features, image)
+
         if self._executor is None:
-            return lambda: map_keyframe(*arguments)
-        future: Future[None] = self._executor.submit(map_keyframe, *arguments)
+            return work
+        future: Future[None] = self._executor.submit(work)
         return future.result
 
     def _copy_view(self) -> None:

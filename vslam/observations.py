@@ -96,13 +96,16 @@ def observed_by(a, landmark, keyframe):
 
 @kernel
 def merge_landmarks(a, loser, winner):
-    """Move the observations of ``loser`` to ``winner``; a keyframe that sees both keeps one."""
-    row = a.head[loser]
+    """Move the observations of ``loser`` to ``winner``; a keyframe that sees both keeps one.
+
+    int64 is what other callers give ``link`` and ``observed_by``: compiled once, not twice.
+    """
+    row = np.int64(a.head[loser])
     while row >= 0:
-        following = a.next_row[row]
+        following = np.int64(a.next_row[row])
         a.landmark[row] = -1
         a.next_row[row] = -1
-        if observed_by(a, winner, a.keyframe[row]) < 0:
+        if observed_by(a, winner, np.int64(a.keyframe[row])) < 0:
             link(a, row, winner)
         row = following
     a.head[loser] = -1
@@ -229,3 +232,39 @@ def count_seen_by(a, keyframe, needed):
         if seen >= needed:
             count += 1
     return count
+
+
+@kernel
+def covisible_pairs(a, keyframes, n_keyframes, minimum):
+    """Pairs of ``(N,)`` keyframes that share at least ``minimum`` landmarks, in one pass.
+
+    Returns ``(M, 2)`` int64 with the lower id first, in ascending order, and ``(M,)`` how many
+    landmarks each pair shares.
+    """
+    counts = np.zeros(n_keyframes, np.int64)
+    listed = np.zeros(n_keyframes, np.bool_)
+    for keyframe in keyframes:
+        listed[keyframe] = True
+    pairs, shared = np.empty((64, 2), np.int64), np.empty(64, np.int64)
+    n = 0
+    for keyframe in range(n_keyframes):
+        if not listed[keyframe]:
+            continue
+        for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
+            if a.landmark[row] < 0:
+                continue
+            other = a.head[a.landmark[row]]
+            while other >= 0:
+                k = a.keyframe[other]
+                if k > keyframe and listed[k]:
+                    counts[k] += 1
+                other = a.next_row[other]
+        for k in range(keyframe + 1, n_keyframes):
+            if counts[k] >= max(1, minimum):
+                if n == len(pairs):
+                    pairs = np.concatenate((pairs, np.empty_like(pairs)))
+                    shared = np.concatenate((shared, np.empty_like(shared)))
+                pairs[n, 0], pairs[n, 1], shared[n] = keyframe, k, counts[k]
+                n += 1
+            counts[k] = 0
+    return pairs[:n], shared[:n]

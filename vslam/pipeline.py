@@ -15,14 +15,16 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.sequence import Sequence
+from vslam.detectors import create_detector
 from vslam.errors import UnreadableImageError
 from vslam.features import Features, TrackResult
 from vslam.frontend.tracking import Tracker, extract_features
@@ -60,9 +62,11 @@ def run_sequence(
     in the outcome. Ctrl-C ends the run after the current frame; all done so far is kept.
     """
     cv2.setNumThreads(1)  # the pool uses the cores
-    slam = Slam(sequence.camera, settings.config, threads=settings.threads)
+    detector = create_detector(settings.detector, settings.config)
+    slam = Slam(sequence.camera, settings.config, detector, threads=settings.threads)
     tracks: list[TrackResult] = []
     skipped: list[str] = []
+    n_told = 0  # loops that the recorder knows of
     recorder.begin(sequence.camera, _ground_truth(sequence))
     startup = process_age()
     wall, cpu = time.perf_counter(), time.process_time()
@@ -75,18 +79,20 @@ def run_sequence(
                 _log.warning("frame %d skipped: %s", index, frame.problem)
                 result = slam.skip(timestamp)
             else:
-                result = slam.step_features(frame.features, timestamp, frame.stage_ms)
+                result = slam.step_features(frame.features, timestamp, frame.left, frame.stage_ms)
             tracks.append(result)
             recorder.frame(result, result.T_wc)
             if result.is_keyframe and slam.frame is not None and frame.left is not None:
                 recorder.keyframe(result, frame.left, slam.frame.features, slam.frame.landmark >= 0)
             if not slam.is_mapping:
                 recorder.map(slam.map)
+                n_told = _tell_loops(recorder, slam, n_told)
             on_frame(result)
             if interrupted.is_set():
                 break
         slam.finish()
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    _tell_loops(recorder, slam, n_told)
     trajectory = slam.trajectory()
     recorder.finish(trajectory, slam.map)
     return RunOutcome(
@@ -103,6 +109,10 @@ def run_sequence(
         n_keyframes=len(slam.map.living_keyframes()),
         n_landmarks=len(slam.map.living_landmarks()),
         map=slam.map,
+        loops=slam.loops,
+        closures=slam.closures,
+        keyframe_frames=np.array(slam.map.frames, np.int64),
+        n_submaps=len({0, *slam.map.restarts}) if slam.map.n_keyframes else 0,
         interrupted="Ctrl-C" if interrupted.is_set() else None,
     )
 
@@ -146,6 +156,13 @@ def prepare_frame(
     return PreparedFrame(left, features, stage_ms)
 
 
+def _tell_loops(recorder: Recorder, slam: Slam, n_told: int) -> int:
+    """Show the recorder the loops decided since it was told of ``n_told``; returns how many now."""
+    if len(slam.loops) > n_told:
+        recorder.loops(slam.loops[n_told:], slam.map)
+    return len(slam.loops)
+
+
 def _ground_truth(sequence: Sequence) -> Trajectory | None:
     poses = sequence.ground_truth
     return None if poses is None else Trajectory(sequence.timestamps, poses)
@@ -172,5 +189,10 @@ def _stop_on_interrupt() -> Iterator[threading.Event]:
 
 
 def _peak_memory_mb() -> float:
+    # Linux's getrusage counts what the parent had before this process was its own program.
+    with suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 2**10
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (2**20 if sys.platform == "darwin" else 2**10)

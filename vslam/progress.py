@@ -95,6 +95,15 @@ def training_bar(*, shown: bool) -> Iterator[Callable[[int, int, int, float], No
         yield on_step
 
 
+@contextmanager
+def count_bar(what: str, total: int, *, shown: bool) -> Iterator[Callable[[], None]]:
+    """Yield the callable to call after each of ``total`` things."""
+    columns = (TextColumn(what), MofNCompleteColumn(), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
+        task = progress.add_task("", total=total)
+        yield lambda: progress.advance(task)
+
+
 def announce(message: str, *, shown: bool) -> None:
     """Say on stderr what takes a while."""
     if shown:

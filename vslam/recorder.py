@@ -9,7 +9,7 @@ import ctypes
 import functools
 import logging
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Protocol
 
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from vslam.camera import StereoCamera
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.geometry import inverses
+from vslam.loops import LoopEdge
 from vslam.map import Map
 from vslam.trajectory import Trajectory
 
@@ -27,18 +28,22 @@ _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 
 # Budget: 50 MB for 1,000 frames. At 350 keyframes of 1241x376 with 2,000 features, images take
-# about 11 MB, keypoints 6 MB, 14 maps 5 MB and all that is logged each frame 0.3 MB.
+# about 11 MB, keypoints 6 MB, 14 maps 5 MB and all that is logged each frame 0.3 MB. A map after
+# each loop, at most one in ten keyframes, can add 35 x 0.36 = 13 MB; loops themselves are lines.
 _IMAGE_SCALE = 0.5
 _JPEG_QUALITY = 75
 _KEYFRAMES_PER_MAP = 25
+_KEYFRAMES_PER_CORRECTED_MAP = 10
 _MAX_POINTS_PER_MAP = 30_000  # the last map is complete
 
+_REJECTED_SHOWN_FRAMES = 20  # then the lines of rejected loops vanish
 _FRAMES_PER_BATCH = 50
 _FLUSH_TIMEOUT_S = 5.0
 _RESERVED_BYTES = 64 * 2**20  # left on the disk for the map, the trajectories and the report
 
 _GREEN, _AMBER, _RED = (16, 185, 129), (245, 158, 11), (239, 68, 68)
 _BLUE, _GREY = (59, 130, 246), (148, 163, 184)
+_FAINT_RED = (239, 68, 68, 80)
 _STATE_COLORS = {TrackingState.OK: _GREEN, TrackingState.WEAK: _AMBER, TrackingState.LOST: _RED}
 _POINT_SERIES = {"stereo": _GREY, "matches": _AMBER, "inliers": _BLUE}
 
@@ -76,6 +81,14 @@ class Recorder(Protocol):
     def map(self, map_: Map) -> None:
         """Offer the map, whenever nobody writes it; the recorder decides which states to log."""
 
+    def loops(self, edges: Sequence[LoopEdge], map_: Map) -> None:
+        """Log loops just decided, accepted or not, after :meth:`frame` while nobody writes the map.
+
+        Args:
+            edges: those decided since the last call.
+            map_: after their correction.
+        """
+
     def finish(self, trajectory: Trajectory, map_: Map) -> None:
         """Log the final trajectory and map, write all that is pending and close the file."""
 
@@ -93,6 +106,7 @@ class NullRecorder:
         tracked: NDArray[np.bool_],
     ) -> None: ...
     def map(self, map_: Map) -> None: ...
+    def loops(self, edges: Sequence[LoopEdge], map_: Map) -> None: ...
     def finish(self, trajectory: Trajectory, map_: Map) -> None: ...
 
 
@@ -118,9 +132,11 @@ class RerunRecorder:
 
     Entities: ``world/camera`` (every frame), ``world/camera/image`` with ``tracked`` and
     ``untracked`` keypoints (keyframes, half size), ``world/landmarks`` and ``world/keyframes``
-    (every 25 keyframes and at the end), ``world/ground_truth`` and ``world/trajectory`` (static),
-    ``points/*`` and ``stage_ms/*`` (every frame), ``state`` (on change). The world is the one of
-    the estimate: first frame of the run, x right, y down, z forward.
+    (every 25 keyframes, after a loop and at the end), ``world/loops/accepted`` (green, from the
+    loop on) and ``rejected`` (faint red, for 20 frames), ``world/ground_truth`` and
+    ``world/trajectory`` (static), ``points/*`` and ``stage_ms/*`` (every frame), ``state`` (on
+    change) and ``state/loops`` (each with its reason). The world is the one of the estimate: first
+    frame of the run, x right, y down, z forward.
 
     Failing to write never ends a run. Rerun writes in a thread of its own, whose errors only a
     later flush reports, and after an error waiting for that thread can last forever. Therefore the
@@ -137,9 +153,12 @@ class RerunRecorder:
         self._recording = rr.RecordingStream("vslam")
         self._open = True
         self._state: TrackingState | None = None
+        self._index = 0  # of the last frame
         self._frames: list[tuple[TrackResult, NDArray[np.float64]]] = []
         self._keyframes = 0
         self._mapped_keyframes = -_KEYFRAMES_PER_MAP
+        self._accepted: list[LoopEdge] = []
+        self._hide_rejected_at: int | None = None  # frame
         try:
             self._recording.set_log_time_enabled(False)  # would be the viewer's default timeline
             self._recording.save(path)  # before the first log call, or that one is lost
@@ -179,6 +198,7 @@ class RerunRecorder:
 
         # Sent in columns: four times faster than one log call for each value.
         self._frames.append((result, T_wc.copy()))
+        self._index = result.index
         if len(self._frames) == _FRAMES_PER_BATCH:
             self._send_frames()
         self._set_time(result)
@@ -186,6 +206,9 @@ class RerunRecorder:
             self._state = result.state
             text = f"{result.state} with {result.n_inliers} inliers"
             self._recording.log("state", rr.TextLog(text, color=_STATE_COLORS[result.state]))
+        if self._hide_rejected_at is not None and result.index >= self._hide_rejected_at:
+            self._recording.log("world/loops/rejected", rr.LineStrips3D([]))
+            self._hide_rejected_at = None
 
     @_guarded
     def keyframe(
@@ -217,9 +240,27 @@ class RerunRecorder:
     def map(self, map_: Map) -> None:
         if self._keyframes < self._mapped_keyframes + _KEYFRAMES_PER_MAP:
             return
-        self._mapped_keyframes = self._keyframes
         self._log_map(map_, _MAX_POINTS_PER_MAP)
         self._flush()
+
+    @_guarded
+    def loops(self, edges: Sequence[LoopEdge], map_: Map) -> None:
+        import rerun as rr
+
+        accepted = [edge for edge in edges if edge.accepted]
+        rejected = [edge for edge in edges if not edge.accepted]
+        if rejected:
+            self._log_lines("rejected", rejected, map_, _FAINT_RED)
+            self._hide_rejected_at = self._index + _REJECTED_SHOWN_FRAMES
+        if accepted:
+            self._accepted += accepted
+            if self._keyframes >= self._mapped_keyframes + _KEYFRAMES_PER_CORRECTED_MAP:
+                self._log_map(map_, _MAX_POINTS_PER_MAP)
+            else:
+                self._log_lines("accepted", self._accepted, map_, _GREEN)
+        for edge in edges:
+            color = _GREEN if edge.accepted else _GREY
+            self._recording.log("state/loops", rr.TextLog(_in_words(edge, map_), color=color))
 
     @_guarded
     def finish(self, trajectory: Trajectory, map_: Map) -> None:
@@ -234,12 +275,27 @@ class RerunRecorder:
     def _log_map(self, map_: Map, limit: int) -> None:
         import rerun as rr
 
+        self._mapped_keyframes = self._keyframes
         landmarks = map_.living_landmarks()
         landmarks = landmarks[:: max(1, -(-len(landmarks) // max(1, limit)))]
         xyz = map_.arrays.xyz[landmarks].astype(np.float32)
         T_wc_keyframes = inverses(map_.arrays.T_cw[map_.living_keyframes()])
         self._recording.log("world/landmarks", rr.Points3D.from_fields(positions=xyz))
         self._recording.log("world/keyframes", _path(T_wc_keyframes, _AMBER))
+        if self._accepted:
+            self._log_lines("accepted", self._accepted, map_, _GREEN)
+
+    def _log_lines(
+        self, name: str, edges: list[LoopEdge], map_: Map, color: tuple[int, ...]
+    ) -> None:
+        """From the query to the match of each loop; a frame outside the map has no place yet."""
+        import rerun as rr
+
+        ends = [(edge.match, edge.query) for edge in edges if edge.query >= 0]
+        poses = np.array([[map_.keyframe_pose(k) for k in pair] for pair in ends])
+        centres = inverses(poses.reshape(-1, 4, 4))[:, :3, 3].reshape(-1, 2, 3).astype(np.float32)
+        lines = rr.LineStrips3D(list(centres), colors=[color], radii=[-1.5])
+        self._recording.log(f"world/loops/{name}", lines)
 
     def _send_frames(self) -> None:
         import rerun as rr
@@ -295,6 +351,12 @@ def _path(T_wc: NDArray[np.float64], color: tuple[int, int, int]) -> Any:
 
     points = T_wc[:, :3, 3].astype(np.float32)
     return rr.LineStrips3D([points], colors=[color], radii=[-1.0])
+
+
+def _in_words(edge: LoopEdge, map_: Map) -> str:
+    query = f"frame {map_.frames[edge.query]}" if edge.query >= 0 else "a lost frame"
+    evidence = f"{edge.n_inliers} inliers of {edge.n_matches} matches"
+    return f"{query} to frame {map_.frames[edge.match]}: {edge.reason}, {evidence}"
 
 
 def _half(xy: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from vslam.config import Config
 from vslam.datasets.sequence import Sequence
 from vslam.features import TrackResult
+from vslam.loops import Closure, LoopEdge
 from vslam.map import Map
 from vslam.trajectory import Trajectory
 
@@ -29,18 +33,6 @@ class RunSettings:
 
 
 @dataclass(frozen=True)
-class LoopRow:
-    """One loop candidate for the loop table: rejected ones are listed with their reason."""
-
-    query: int
-    match: int
-    score: float
-    inliers: int
-    accepted: bool
-    reason: str
-
-
-@dataclass(frozen=True)
 class RunOutcome:
     """All that the report needs.
 
@@ -54,7 +46,13 @@ class RunOutcome:
         peak_memory_mb: of the process.
         n_landmarks, n_keyframes: in the final map.
         map: the final map, None for a trajectory from elsewhere.
+        loops: all that became of loop candidates, in the order of their decision.
+        closures: what the accepted ones did to the map, in order.
+        keyframe_frames: ``(K,)`` int64, the frame of this run that each keyframe was, culled ones
+            included: loops speak of keyframes, people of frames.
+        n_submaps: how often mapping began, the first time included; 0 before the first keyframe.
         interrupted: why the run ended early ("Ctrl-C"), or None.
+        without_loops: the same run without a loop detector, if one was made to compare.
     """
 
     settings: RunSettings
@@ -70,5 +68,9 @@ class RunOutcome:
     n_keyframes: int
     n_landmarks: int
     map: Map | None = None
-    loops: list[LoopRow] = field(default_factory=list)
+    loops: list[LoopEdge] = field(default_factory=list)
+    closures: list[Closure] = field(default_factory=list)
+    keyframe_frames: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    n_submaps: int = 1
     interrupted: str | None = None
+    without_loops: RunOutcome | None = None

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import StereoCamera
+from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.features import FeatureGrid, Features, TrackingState, TrackResult
 from vslam.frontend.keyframes import KeyframeEvidence, needs_keyframe
+from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracking import (
     Frame,
     Tracker,
@@ -22,9 +24,11 @@ from vslam.frontend.tracking import (
     track_motion,
 )
 from vslam.geometry import inverse, inverses, orthonormalised, se3_exp, se3_log
-from vslam.map import Map
+from vslam.loopclosure.detector import LoopDetector, NoDetector
+from vslam.loops import Closure, LoopEdge
+from vslam.map import Map, local_map
 from vslam.mapping import DeferredMapping
-from vslam.trajectory import Trajectory
+from vslam.trajectory import Trajectory, bridge_gaps
 
 Matrix = NDArray[np.float64]
 
@@ -36,6 +40,7 @@ class _Placed:
     timestamp: float
     reference: int
     T_c_reference: Matrix
+    tracked: bool
 
 
 class Slam:
@@ -52,12 +57,19 @@ class Slam:
     """
 
     def __init__(
-        self, camera: StereoCamera, config: Config | None = None, *, threads: int = 2
+        self,
+        camera: StereoCamera,
+        config: Config | None = None,
+        detector: LoopDetector | None = None,
+        *,
+        threads: int = 2,
     ) -> None:
         """
         Args:
             camera: the rectified pair that the images come from.
             config: thresholds; the defaults are those of the papers.
+            detector: finds loops and relocalises (``vslam.detectors``); without one there is
+                odometry only.
             threads: with 1, mapping runs where it is merged instead of beside tracking. The
                 result is the same.
         """
@@ -65,11 +77,16 @@ class Slam:
         self.config = config or Config()
         self.tracker = Tracker.create(camera, self.config)
         self.frame: Frame | None = None
-        self._mapping = DeferredMapping(self.tracker.scales, camera, self.config, threads=threads)
+        self._detector = detector or NoDetector()
+        self._closing = LoopClosing(self._detector, camera, self.config, threads=threads)
+        self._mapping = DeferredMapping(
+            self.tracker.scales, camera, self.config, self._closing, threads=threads
+        )
         self._placed: list[_Placed] = []
         self._tracked = 0  # index of ``frame`` in _placed
         self._velocity: Matrix | None = None  # twist per second, None if unknown
         self._lost_frames = 0
+        self._image: NDArray[np.uint8] | None = None  # left image of the frame in work
 
     @property
     def map(self) -> Map:
@@ -80,6 +97,16 @@ class Slam:
     def is_mapping(self) -> bool:
         """Whether a keyframe is being mapped."""
         return self._mapping.busy
+
+    @property
+    def loops(self) -> list[LoopEdge]:
+        """Every loop candidate and what became of it. Call ``finish()`` first."""
+        return self._closing.edges
+
+    @property
+    def closures(self) -> list[Closure]:
+        """What each closed loop did to the keyframes. Call ``finish()`` first."""
+        return self._closing.closures
 
     def step(
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], timestamp: float
@@ -101,15 +128,23 @@ class Slam:
             raise ValueError(f"images are of {left.dtype} and {right.dtype}, not of uint8")
         start = time.perf_counter()
         features = extract_features(left, right, self.tracker)
-        return self.step_features(
-            features, timestamp, {"extract": 1e3 * (time.perf_counter() - start)}
-        )
+        stage_ms = {"extract": 1e3 * (time.perf_counter() - start)}
+        return self.step_features(features, timestamp, left, stage_ms)
 
     def step_features(
-        self, features: Features, timestamp: float, stage_ms: dict[str, float] | None = None
+        self,
+        features: Features,
+        timestamp: float,
+        image: NDArray[np.uint8] | None = None,
+        stage_ms: dict[str, float] | None = None,
     ) -> TrackResult:
-        """``step`` for a pair whose features were extracted elsewhere (``extract_features``)."""
+        """``step`` for a pair whose features were extracted elsewhere (``extract_features``).
+
+        Args:
+            image: the left image, for loop detectors that look at it.
+        """
         self._check_time(timestamp)
+        self._image = image
         clock = _Clock(dict(stage_ms or {}))
         frame = self._prepare(features)
         if self._mapping_is_due():
@@ -123,12 +158,17 @@ class Slam:
         clock.lap("track_frame")
         matches, inliers, visible = self._track_local_map(frame, inliers)
         clock.lap("track_local_map")
-        state = self._judge(inliers)
+        state, relocalised = self._judge(inliers), False
+        if state == TrackingState.LOST:
+            matches = inliers = self._relocalise(frame)
+            state = self._judge(inliers)
+            relocalised = state != TrackingState.LOST
+            clock.lap("relocalise")
         if state == TrackingState.LOST:
             return self._lose(frame, T_cw, timestamp, matches, inliers, clock)
 
         self._mapping.count(visible, frame.landmark[frame.landmark >= 0])
-        self._update_motion(frame, timestamp)
+        self._update_motion(frame, timestamp, relocalised)
         is_keyframe = self._needs_keyframe(frame, timestamp, inliers)
         if is_keyframe:
             self._insert_keyframe(frame)
@@ -143,19 +183,27 @@ class Slam:
             frame.T_cw = self._predict(timestamp)
         if self.map.n_keyframes:
             self._lost_frames += 1
-        self._place(timestamp, frame.T_cw)
+        self._place(timestamp, frame.T_cw, tracked=False)
         return self._result(frame, TrackingState.LOST, 0, 0, False, _Clock())
 
     def finish(self) -> None:
         """Complete pending mapping. Call before reading the map or the final trajectory."""
         self._merge()
+        self._mapping.finish()
+        self._follow_map(self.frame)
 
     def trajectory(self) -> Trajectory:
-        """Final pose of every frame, lost ones included. Call ``finish()`` first."""
+        """Final pose of every frame, lost ones included. Call ``finish()`` first.
+
+        Where the camera was lost, its motion is interpolated between the frames tracked before
+        and after.
+        """
         self._check_finished()
         times = np.array([placed.timestamp for placed in self._placed], np.float64)
         poses = [inverse(self._pose_of(placed)) for placed in self._placed]
-        return Trajectory(times, np.array(poses, np.float64).reshape(-1, 4, 4))
+        tracked = np.array([placed.tracked for placed in self._placed], np.bool_)
+        T_wc = np.array(poses, np.float64).reshape(-1, 4, 4)
+        return bridge_gaps(Trajectory(times, T_wc), tracked)
 
     def keyframe_trajectory(self) -> Trajectory:
         """Final pose of every keyframe that was not culled. Call ``finish()`` first."""
@@ -202,6 +250,21 @@ class Slam:
             return inliers, 0, np.empty(0, np.int32)
         return track_local_map(frame, self._mapping.local, self.tracker)
 
+    def _relocalise(self, frame: Frame) -> int:
+        """Look for a lost frame in the whole map; returns inliers, 0 if it was found nowhere."""
+        if self._mapping.busy:
+            return 0
+        config = self.config.relocalization
+        candidates = self._detector.locate(self._image, frame.features, self.map)
+        for candidate in candidates[: config.max_candidates]:
+            place = local_map(self.map, candidate.match, 1)
+            around = local_map(self.map, candidate.match, config.neighbours)
+            inliers = relocalise(frame, place, around, self.tracker, seed=candidate.match)
+            if inliers:
+                self._mapping.look_at(candidate.match)
+                return inliers
+        return 0
+
     def _judge(self, inliers: int) -> TrackingState:
         if inliers < self.config.tracking.min_inliers_lost:
             return TrackingState.LOST
@@ -209,11 +272,12 @@ class Slam:
             return TrackingState.WEAK
         return TrackingState.OK
 
-    def _update_motion(self, frame: Frame, timestamp: float) -> None:
+    def _update_motion(self, frame: Frame, timestamp: float, relocalised: bool) -> None:
         """Place the frame; the velocity is that since the last frame tracked."""
         before = self._placed[self._tracked]
         step = se3_log(orthonormalised(frame.T_cw @ inverse(self._pose_of(before))))
-        self._velocity = step / (timestamp - before.timestamp)
+        # A leap to where the camera was found again is no motion.
+        self._velocity = None if relocalised else step / (timestamp - before.timestamp)
         self._lost_frames = 0
         self._place(timestamp, frame.T_cw)
         self._keep(frame)
@@ -229,7 +293,7 @@ class Slam:
     ) -> TrackResult:
         """Keep the prediction as the pose; after a while, map anew from there."""
         frame.T_cw = T_cw
-        self._place(timestamp, T_cw)
+        self._place(timestamp, T_cw, tracked=False)
         self._lost_frames += 1
         restart = (
             self._lost_frames >= self.config.tracking.lost_frames_before_restart
@@ -247,7 +311,7 @@ class Slam:
 
     def _start(self, frame: Frame, timestamp: float, clock: _Clock) -> TrackResult:
         """The first keyframe is the world, its stereo points the first landmarks."""
-        self._place(timestamp, frame.T_cw)
+        self._place(timestamp, frame.T_cw, tracked=False)
         started = self._can_start(frame)
         if started:
             self._insert_keyframe(frame)
@@ -279,9 +343,9 @@ class Slam:
         self._merge(frame)
         timestamp, index = self._placed[-1].timestamp, len(self._placed) - 1
         frame.landmark, frame.xyz = self._mapping.insert(
-            frame.features, frame.landmark, frame.T_cw, timestamp, index
+            frame.features, frame.landmark, frame.T_cw, timestamp, index, self._image
         )
-        self._placed[-1] = _Placed(timestamp, self._mapping.reference, np.eye(4))
+        self._placed[-1] = _Placed(timestamp, self._mapping.reference, np.eye(4), True)
 
     def _mapping_is_due(self) -> bool:
         if not self._mapping.busy:
@@ -296,22 +360,26 @@ class Slam:
         """
         if not self._mapping.merge():
             return
-        for frame in {id(f): f for f in (self.frame, current) if f is not None}.values():
-            frame.landmark, frame.xyz = self._mapping.current(frame.landmark)
-        if self.frame is not None:
-            self.frame.T_cw = self._pose_of(self._placed[self._tracked])
-        if current is not None:
+        self._follow_map(self.frame)
+        if current is not None and current is not self.frame:
+            current.landmark, current.xyz = self._mapping.current(current.landmark)
             current.T_cw = self._pose_of(self._placed[-1])
+
+    def _follow_map(self, frame: Frame | None) -> None:
+        """Bring the frame tracked last to where the map has moved."""
+        if frame is not None:
+            frame.landmark, frame.xyz = self._mapping.current(frame.landmark)
+            frame.T_cw = self._pose_of(self._placed[self._tracked])
 
     def _keep(self, frame: Frame) -> None:
         """The frame placed last is the one to track the next against."""
         self.frame, self._tracked = frame, len(self._placed) - 1
 
-    def _place(self, timestamp: float, T_cw: Matrix) -> None:
+    def _place(self, timestamp: float, T_cw: Matrix, *, tracked: bool = True) -> None:
         reference = self._mapping.reference
         T_rw = self._mapping.keyframe_pose(reference) if self.map.n_keyframes else np.eye(4)
         relative = orthonormalised(T_cw @ inverse(T_rw))
-        self._placed.append(_Placed(timestamp, reference, relative))
+        self._placed.append(_Placed(timestamp, reference, relative, tracked))
 
     def _pose_of(self, placed: _Placed) -> Matrix:
         """``T_cw`` of a placed frame."""

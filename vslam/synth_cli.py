@@ -16,7 +16,7 @@ _EXAMPLES = """
 
   vslam synth 05 --change 0.5 --dynamic 6
 
-  vslam synth mine --trajectory poses/07.txt
+  vslam synth mine --trajectory poses/07.txt --calibration 04-12
 
   vslam synth demo --pairs 1000 --aliased --change 0.8 --out pairs
 """
@@ -31,6 +31,16 @@ def synth(
     route: Annotated[str, typer.Argument(help="Built-in route, or a name for --trajectory.")] = "",
     trajectory: Annotated[
         Path | None, typer.Option(help="KITTI poses to drive along, at 10 Hz.")
+    ] = None,
+    calibration: Annotated[
+        str,
+        typer.Option(
+            metavar="NN",
+            help="Camera of which KITTI sequences, with --trajectory: 00-02, 03 or 04-12.",
+        ),
+    ] = "00-02",
+    max_frames: Annotated[
+        int | None, typer.Option(min=1, help="Render only so many frames; more can follow later.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the town.")] = 0,
     aliased: Annotated[bool, typer.Option("--aliased", help="Few facades, again and again.")] = (
@@ -53,6 +63,10 @@ def synth(
     ),
     clean: Annotated[
         bool, typer.Option("--clean", help="Remove what is rendered, of ROUTE or all.")
+    ] = False,
+    verify: Annotated[
+        bool,
+        typer.Option("--verify", help="Compare all checksums; render damaged frames again."),
     ] = False,
     threads: Annotated[
         int | None, typer.Option(min=1, help="Threads; the bytes do not depend on it.")
@@ -84,7 +98,7 @@ def synth(
     drive = (
         built_in_route(route)
         if trajectory is None
-        else route_of_poses(read_kitti_poses(trajectory), route)
+        else route_of_poses(read_kitti_poses(trajectory), route, calibration)
     )
     variation = Variation(seed, aliased, change, dynamic)
     threads = threads or min(available_cores(), 4)
@@ -96,6 +110,13 @@ def synth(
             render_pairs(drive, variation, root, pairs, threads=threads, on_frame=on_frame)
         else:
             root = store.render_sequence(
-                drive, variation, cache, depth=depth, threads=threads, on_frame=on_frame
+                drive,
+                variation,
+                cache,
+                depth=depth,
+                until=max_frames,
+                verify=verify,
+                threads=threads,
+                on_frame=on_frame,
             )
     typer.echo(f"{root}: " + (f"{pairs} pairs" if pairs else f"sequence {route}"))

@@ -7,6 +7,7 @@ al., CVPR 2012). TUM: ``t x y z qx qy qz qw`` a line, seconds and metres (Sturm 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError
+from vslam.geometry import compose, inverse, orthonormalised, se3_exp, se3_log
 
 _FORMAT_OF_COLUMNS: dict[int, Literal["kitti", "tum"]] = {12: "kitti", 8: "tum"}
 
@@ -34,6 +36,24 @@ class Trajectory:
     def select(self, indices: NDArray[np.int64]) -> Trajectory:
         """The poses ``indices`` in their order."""
         return Trajectory(self.timestamps[indices], self.T_wc[indices])
+
+
+def bridge_gaps(trajectory: Trajectory, known: NDArray[np.bool_]) -> Trajectory:
+    """Replace poses between known ones by those of a constant velocity from one to the next.
+
+    Args:
+        known: ``(N,)`` poses to keep; those before the first and after the last are kept as well.
+    """
+    T_wc, times = trajectory.T_wc.copy(), trajectory.timestamps
+    anchors = np.flatnonzero(known)
+    for before, after in pairwise(anchors.tolist()):
+        if after == before + 1:
+            continue
+        twist = se3_log(orthonormalised(compose(inverse(T_wc[before]), T_wc[after])))
+        for k in range(before + 1, after):
+            share = (times[k] - times[before]) / (times[after] - times[before])
+            T_wc[k] = orthonormalised(compose(T_wc[before], se3_exp(twist * share)))
+    return Trajectory(times, T_wc)
 
 
 def read_table(path: Path, columns: tuple[int, ...], what: str) -> NDArray[np.float64]:

@@ -28,6 +28,7 @@ def write_report(outcome: RunOutcome, evaluation: Evaluation | None, folder: Pat
         OSError: a file cannot be written.
     """
     from vslam.evaluate import evo_command
+    from vslam.loop_evaluation import evaluate_loops
     from vslam.report.figures import draw_figures
     from vslam.report.render import render_html, render_markdown
     from vslam.report.summary import summarize
@@ -45,11 +46,12 @@ def write_report(outcome: RunOutcome, evaluation: Evaluation | None, folder: Pat
             folder / f"{name}_kitti.txt" for name in ("trajectory", "ground_truth")
         )
         command = evo_command(estimate, ground_truth, evaluation.alignment)
-    report = summarize(outcome, evaluation, command)
+    verdict = evaluate_loops(outcome)
+    report = summarize(outcome, evaluation, verdict, command)
     (folder / "report.json").write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
     (folder / "report.md").write_text(render_markdown(report), encoding="utf-8")
 
-    figures = draw_figures(outcome, evaluation, matched_ground_truth(outcome))
+    figures = draw_figures(outcome, evaluation, matched_ground_truth(outcome), verdict)
     (folder / "figures").mkdir(exist_ok=True)
     for figure in figures:
         (folder / "figures" / f"{figure.name}.png").write_bytes(figure.png)

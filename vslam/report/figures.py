@@ -1,26 +1,37 @@
-"""The figures of a report: top view, errors, tracking and times.
-
-Every figure is drawn once in light colours and saved twice: as PNG, and as SVG whose neutral
-colours are CSS variables, so that the HTML report follows the reader's light or dark theme.
-"""
+"""The figures of a report: maps, errors, tracking and times."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib import style
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from vslam.evaluate import Evaluation
 from vslam.features import TrackingState
+from vslam.loop_evaluation import LoopEvaluation
+from vslam.report.drawing import (
+    AMBER,
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    LOW,
+    MUTED,
+    RED,
+    STATE_COLORS,
+    STYLE,
+    VIOLET,
+    ReportFigure,
+    add_legend,
+    new_figure,
+    save,
+)
+from vslam.report.maps import loop_closing, top_view
 from vslam.report.summary import stage_names
 from vslam.run import RunOutcome
 from vslam.trajectory import Trajectory
@@ -28,55 +39,15 @@ from vslam.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-BLUE, GREEN, AMBER, RED, GREY = "#3b82f6", "#10b981", "#f59e0b", "#ef4444", "#94a3b8"
-_STAGE_COLORS = [BLUE, AMBER, GREEN, "#8b5cf6", "#ec4899", "#06b6d4", "#84cc16", "#f97316", GREY]
-_STATE_COLORS = {TrackingState.WEAK: AMBER, TrackingState.LOST: RED}
-
-# Hex colour in the drawing -> CSS variable in the HTML report.
-_THEME = {"#1f2430": "ink", "#5b6472": "muted", "#e3e7ed": "line"}
-_INK, _MUTED, _LINE = _THEME
-_STYLE = {
-    "axes.axisbelow": True,
-    "axes.edgecolor": _LINE,
-    "axes.grid": True,
-    "axes.labelcolor": _MUTED,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "figure.titlesize": 11.0,
-    "figure.titleweight": "bold",
-    "font.family": "DejaVu Sans",
-    "font.size": 9.5,
-    "grid.color": _LINE,
-    "grid.linewidth": 0.8,
-    "legend.borderaxespad": 0.2,
-    "legend.fontsize": 9.0,
-    "legend.frameon": False,
-    "legend.handlelength": 1.4,
-    "legend.labelcolor": _INK,
-    "lines.linewidth": 1.6,
-    "svg.fonttype": "none",  # text stays text and takes the font of the page
-    "xtick.color": _LINE,
-    "xtick.labelcolor": _MUTED,
-    "ytick.color": _LINE,
-    "ytick.labelcolor": _MUTED,
-}
-# Inches, small enough for the text to stay readable on a phone.
-_WIDTH, _LOW, _SQUARE = 5.6, 3.0, 6.6
+_STAGE_COLORS = [BLUE, AMBER, GREEN, VIOLET, "#ec4899", "#06b6d4", "#84cc16", "#f97316", GREY]
 _MAX_BINS = 240  # of the stacked times: one bin is a pixel or two wide
 
 
-@dataclass(frozen=True)
-class ReportFigure:
-    """One figure: ``svg`` begins at its ``<svg`` tag and takes its neutrals from CSS variables."""
-
-    name: str
-    caption: str
-    png: bytes
-    svg: str
-
-
 def draw_figures(
-    outcome: RunOutcome, evaluation: Evaluation | None, ground_truth: Trajectory | None
+    outcome: RunOutcome,
+    evaluation: Evaluation | None,
+    ground_truth: Trajectory | None,
+    verdict: LoopEvaluation | None,
 ) -> list[ReportFigure]:
     """Draw all figures that this run has data for, in the order of the report.
 
@@ -84,23 +55,34 @@ def draw_figures(
         outcome: the run.
         evaluation: of ``outcome.trajectory``, frame by frame, or None.
         ground_truth: of the same frames, or None.
+        verdict: of ``outcome.loops``, or None.
     """
     # after_reset shuts out a matplotlibrc of the user: equal runs give equal figures.
-    with style.context(_STYLE, after_reset=True):
+    with style.context(STYLE, after_reset=True):
         return [
-            _save(name, caption, figure)
-            for name, caption, figure in _draw(outcome, evaluation, ground_truth)
+            save(name, caption, figure)
+            for name, caption, figure in _draw(outcome, evaluation, ground_truth, verdict)
         ]
 
 
 def _draw(
-    outcome: RunOutcome, evaluation: Evaluation | None, ground_truth: Trajectory | None
+    outcome: RunOutcome,
+    evaluation: Evaluation | None,
+    ground_truth: Trajectory | None,
+    verdict: LoopEvaluation | None,
 ) -> Iterator[tuple[str, str, Figure]]:
     if len(outcome.trajectory):
         caption = "Seen from above, at equal scale; z points ahead of the first camera."
         if evaluation is not None and evaluation.alignment != "none":
             caption += f" Estimate after {evaluation.alignment.upper()} alignment."
-        yield "top_view", caption, _top_view(outcome, evaluation, ground_truth)
+        yield "top_view", caption, top_view(outcome, evaluation, ground_truth, verdict)
+    if outcome.closures:
+        caption = (
+            "Keyframes just before the first loop was closed and at the end. Dashed: each loop, "
+            "from where its keyframes stood before its own correction: what they lie apart is the "
+            "drift that it took away."
+        )
+        yield "loop_closing", caption, loop_closing(outcome, evaluation, ground_truth)
     if evaluation is not None:
         yield (
             "error_along_path",
@@ -127,37 +109,8 @@ def _draw(
         )
 
 
-def _top_view(
-    outcome: RunOutcome, evaluation: Evaluation | None, ground_truth: Trajectory | None
-) -> Figure:
-    figure, axes = _new_figure("Top view", "x (m)", "z (m)", _SQUARE)
-    T_wc = outcome.trajectory.T_wc if evaluation is None else evaluation.T_wc_aligned
-    x, z = T_wc[:, 0, 3], T_wc[:, 2, 3]
-    if evaluation is not None and ground_truth is not None:
-        truth = ground_truth.T_wc[:, :3, 3]
-        axes.plot(truth[:, 0], truth[:, 2], color=GREY, linewidth=3.4, alpha=0.65, label="truth")
-    axes.plot(x, z, color=BLUE, label="estimate")
-    axes.plot(x[:1], z[:1], "o", color=_INK, markersize=5, zorder=4, label="start")
-    for state, color in _STATE_COLORS.items():
-        times = [track.timestamp for track in outcome.tracks if track.state == state]
-        at = np.isin(outcome.trajectory.timestamps, times)
-        if at.any():
-            axes.plot(
-                x[at],
-                z[at],
-                "o",
-                color=color,
-                markersize=3.5,
-                label=f"{state.lower()} ({at.sum()})",
-            )
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.06)
-    _legend(figure, axes)
-    return figure
-
-
 def _error_along_path(outcome: RunOutcome, evaluation: Evaluation) -> Figure:
-    figure, axes = _new_figure("Error along the path", "distance travelled (m)", "error (m)", _LOW)
+    figure, axes = new_figure("Error along the path", "distance travelled (m)", "error (m)", LOW)
     distances, errors = evaluation.distances_m, evaluation.errors_m
     lost = [track.timestamp for track in outcome.tracks if track.state == TrackingState.LOST]
     at = np.isin(outcome.trajectory.timestamps, lost)
@@ -165,7 +118,7 @@ def _error_along_path(outcome: RunOutcome, evaluation: Evaluation) -> Figure:
     axes.plot(distances, errors, color=BLUE)
     axes.axhline(
         evaluation.ate_rmse_m,
-        color=_INK,
+        color=INK,
         linewidth=1.0,
         linestyle=(0, (4, 3)),
         label=f"RMSE {evaluation.ate_rmse_m:.3g} m",
@@ -174,28 +127,28 @@ def _error_along_path(outcome: RunOutcome, evaluation: Evaluation) -> Figure:
         axes.plot(
             distances[at], errors[at], "o", color=RED, markersize=3.5, label=f"lost ({at.sum()})"
         )
-    _legend(figure, axes)
+    add_legend(figure, axes)
     axes.set_ylim(0.0, 1.12 * max(float(errors.max()), 1e-9))
     axes.margins(x=0.0)
     return figure
 
 
 def _error_histogram(evaluation: Evaluation) -> Figure:
-    figure, axes = _new_figure("Error histogram", "error (m)", "frames", _LOW)
+    figure, axes = new_figure("Error histogram", "error (m)", "frames", LOW)
     errors = evaluation.errors_m
     bins = np.linspace(0.0, max(float(errors.max()), 1e-9), 41).tolist()
     axes.hist(errors, bins=bins, color=BLUE, alpha=0.85, rwidth=0.88)
-    marks = [("median", float(np.median(errors)), GREEN), ("RMSE", evaluation.ate_rmse_m, _INK)]
+    marks = [("median", float(np.median(errors)), GREEN), ("RMSE", evaluation.ate_rmse_m, INK)]
     for label, value, color in marks:
         axes.axvline(value, color=color, linewidth=1.4, label=f"{label} {value:.3g} m")
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.grid(visible=False, axis="x")
-    _legend(figure, axes)
+    add_legend(figure, axes)
     return figure
 
 
 def _tracked_points(outcome: RunOutcome) -> Figure:
-    figure, axes = _new_figure("Tracked points", "frame", "points", _LOW)
+    figure, axes = new_figure("Tracked points", "frame", "points", LOW)
     tracks = outcome.tracks
     frame = np.array([track.index for track in tracks])
     series = [
@@ -206,7 +159,7 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
     for label, values, color, width in series:
         marker = "o" if len(tracks) == 1 else ""
         axes.plot(frame, values, color=color, linewidth=width, marker=marker, label=label)
-    for state, color in _STATE_COLORS.items():
+    for state, color in STATE_COLORS.items():
         at = np.array([track.state == state for track in tracks])
         for first, last in _intervals(at):
             # A legend passes over labels that begin with "_": one entry for each state.
@@ -216,12 +169,12 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
             )
     axes.set_ylim(bottom=0)
     _frame_axis(axes, frame)
-    _legend(figure, axes)
+    add_legend(figure, axes)
     return figure
 
 
 def _stage_times(outcome: RunOutcome) -> Figure:
-    figure, axes = _new_figure("Time per frame", "frame", "ms", _LOW)
+    figure, axes = new_figure("Time per frame", "frame", "ms", LOW)
     tracks, names = outcome.tracks, stage_names(outcome.tracks)
     frame = np.array([track.index for track in tracks])
     ms = np.array([[track.stage_ms.get(name, 0.0) for name in names] for track in tracks])
@@ -238,44 +191,27 @@ def _stage_times(outcome: RunOutcome) -> Figure:
     )
     axes.set_ylim(bottom=0)
     _frame_axis(axes, frame)
-    _legend(figure, axes)
+    add_legend(figure, axes)
     return figure
 
 
 def _stage_distribution(outcome: RunOutcome) -> Figure:
     names = stage_names(outcome.tracks)
-    figure, axes = _new_figure("Time per stage", "ms", "", max(_LOW, 0.9 + 0.3 * len(names)))
+    figure, axes = new_figure("Time per stage", "ms", "", max(LOW, 0.9 + 0.3 * len(names)))
     ms = [[t.stage_ms[name] for t in outcome.tracks if name in t.stage_ms] for name in names]
     low, q1, median, q3, high = np.array(
         [np.percentile(times, (5, 25, 50, 75, 95)) for times in ms]
     ).T
     rows = np.arange(len(names))
-    axes.hlines(rows, low, high, color=_MUTED, linewidth=1.2)
+    axes.hlines(rows, low, high, color=MUTED, linewidth=1.2)
     axes.barh(rows, q3 - q1, left=q1, height=0.56, color=_stage_colors(names))
-    axes.vlines(median, rows - 0.28, rows + 0.28, color=_INK, linewidth=2.0)
+    axes.vlines(median, rows - 0.28, rows + 0.28, color=INK, linewidth=2.0)
     axes.set_yticks(rows, names)
     axes.invert_yaxis()
     axes.set_xlim(left=0)
     axes.grid(visible=False, axis="y")
     axes.tick_params(axis="y", length=0)
     return figure
-
-
-def _new_figure(title: str, x_label: str, y_label: str, height: float) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    figure.suptitle(title, x=0.01, ha="left", color=_INK)
-    axes.set(xlabel=x_label, ylabel=y_label)
-    axes.tick_params(length=3)
-    return figure, axes
-
-
-def _legend(figure: Figure, axes: Axes) -> None:
-    # Below the axes a legend never covers data.
-    count = len(axes.get_legend_handles_labels()[0])
-    columns = count if count <= 5 else min(-(-count // 2), 4)
-    figure.legend(loc="outside lower center", ncols=columns, columnspacing=1.2)
 
 
 def _frame_axis(axes: Axes, frame: NDArray[np.int64]) -> None:
@@ -291,17 +227,3 @@ def _intervals(at: NDArray[np.bool_]) -> NDArray[np.int64]:
     """``(M, 2)`` first and last index of each run of True in ``(N,)``."""
     steps = np.diff(np.concatenate([[False], at, [False]]).astype(np.int8))
     return np.stack([np.flatnonzero(steps == 1), np.flatnonzero(steps == -1) - 1], axis=1)
-
-
-def _save(name: str, caption: str, figure: Figure) -> ReportFigure:
-    png, svg = io.BytesIO(), io.StringIO()
-    figure.savefig(png, format="png", dpi=160)
-    figure.set_layout_engine("none")  # the layout is done and holds for the SVG
-    # The salt keeps element ids apart between figures of one page, and equal between runs.
-    with mpl.rc_context({"svg.hashsalt": name}):
-        figure.savefig(svg, format="svg", metadata={"Date": None}, transparent=True)
-    text = svg.getvalue()
-    text = text[text.index("<svg") :]
-    for color, variable in _THEME.items():
-        text = text.replace(color, f"var(--{variable})")
-    return ReportFigure(name, caption, png.getvalue(), text)

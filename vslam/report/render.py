@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from vslam.report.loop_tables import loop_tables
 from vslam.report.schema import ReportJson
 
 if TYPE_CHECKING:
@@ -52,8 +53,29 @@ def headlines(report: ReportJson) -> list[Headline]:
             f"a frame, of all threads; start-up {report.startup_s:.1f} s",
         ),
         Headline("Memory", f"{report.peak_memory_mb:.0f} MB", "at its peak"),
-        Headline("Map", f"{report.landmarks:,}", f"landmarks, {report.keyframes:,} keyframes"),
+        Headline("Map", f"{report.landmarks:,}", _map_note(report)),
+        _loops(report),
     ]
+
+
+def _map_note(report: ReportJson) -> str:
+    submaps = f", {report.submaps} sub-maps" if report.submaps > 1 else ""
+    return f"landmarks, {report.keyframes:,} keyframes{submaps}"
+
+
+def _loops(report: ReportJson) -> Headline:
+    notes = []
+    if report.revisit_stretches is not None:
+        notes += [
+            f"{report.loops_found} of {report.revisit_stretches} revisits found",
+            f"{report.loops_missed} missed",
+            f"{report.loops_wrong} wrong",
+        ]
+    if report.detector == "none":
+        return Headline("Loops", "off", "no detector; " + ", ".join(notes[:1]) if notes else "")
+    notes.append(f"{report.loops_rejected} candidates rejected")
+    tone = "bad" if report.loops_wrong else ""
+    return Headline("Loops", f"{report.loops_closed} closed", ", ".join(notes), tone)
 
 
 def render_markdown(report: ReportJson) -> str:
@@ -69,11 +91,9 @@ def render_markdown(report: ReportJson) -> str:
     if report.stage_ms:
         lines += ["", "## Time per stage (ms)", ""]
         lines += _table(("stage", "mean", "median", "p95"), stage_rows(report))
-    if report.loops:
-        lines += ["", "## Loops", ""]
-        lines += _table(
-            ("query", "match", "score", "inliers", "accepted", "reason"), loop_rows(report)
-        )
+    for table in loop_tables(report):
+        lines += ["", f"## {table.title}", "", *_table(table.head, table.rows)]
+        lines += ["", table.note] if table.note else []
     lines += ["", "## Run", "", *_table(("", ""), option_rows(report))]
     lines += ["", "## Machine", "", *_table(("", ""), machine_rows(report))]
     lines += ["", "## Recording", "", "    rerun recording.rrd", ""]
@@ -101,7 +121,7 @@ def render_html(report: ReportJson, config: str, figures: Sequence[ReportFigure]
         report=report,
         headlines=headlines(report),
         stages=stage_rows(report),
-        loops=loop_rows(report),
+        loop_tables=loop_tables(report),
         options=option_rows(report),
         machine=machine_rows(report),
         config=config,
@@ -114,21 +134,6 @@ def stage_rows(report: ReportJson) -> list[tuple[str, ...]]:
     return [
         (name, f"{ms.mean:.2f}", f"{ms.median:.2f}", f"{ms.p95:.2f}")
         for name, ms in report.stage_ms.items()
-    ]
-
-
-def loop_rows(report: ReportJson) -> list[tuple[str, ...]]:
-    """Query, match, score, inliers, accepted and reason of each loop candidate."""
-    return [
-        (
-            str(loop.query),
-            str(loop.match),
-            f"{loop.score:.3f}",
-            str(loop.inliers),
-            "yes" if loop.accepted else "no",
-            loop.reason,
-        )
-        for loop in report.loops
     ]
 
 

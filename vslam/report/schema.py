@@ -20,14 +20,47 @@ class StageTime(_Model):
 
 
 class LoopEntry(_Model):
-    """One loop candidate; a rejected one has the reason."""
+    """One loop candidate, accepted or not, in frames of this run.
 
-    query: int
-    match: int
+    ``query_frame`` is None for a frame that was not in the map. ``right`` says whether the relative
+    pose found is the ground truth's, None where that cannot be said. ``moved_m`` is the farthest
+    way that the correction moved a keyframe, ``correction_s`` its time; None if rejected.
+    """
+
+    query_frame: int | None
+    match_frame: int
     score: float
+    matches: int
     inliers: int
     accepted: bool
+    right: bool | None
     reason: str
+    moved_m: float | None
+    correction_s: float | None
+
+
+class RevisitEntry(_Model):
+    """A stretch of frames that leads along an earlier one, by the ground truth.
+
+    ``loop_frame`` is the first frame with a right loop that was closed on it, None if missed.
+    """
+
+    first_frame: int
+    last_frame: int
+    first_match_frame: int
+    last_match_frame: int
+    length_m: float
+    loop_frame: int | None
+
+
+class WithoutLoops(_Model):
+    """The same run with the detector ``none`` (``--compare-loops``)."""
+
+    ate_rmse_m: float | None
+    rpe_m: float | None
+    t_rel_percent: float | None
+    lost_frames: int
+    loops_closed: int
 
 
 class Machine(_Model):
@@ -44,9 +77,12 @@ class ReportJson(_Model):
 
     Errors are None without ground truth, and KITTI's drift also on paths shorter than 100 m.
     ``frames`` counts the frames done; ``skipped_frames`` those with an unreadable image.
+    ``loops_closed`` and ``loops_rejected`` count candidates, ``loops_wrong`` the closed ones that
+    are wrong; ``loops_found`` and ``loops_missed`` count the ``revisit_stretches``. The last four
+    are None without ground truth. See :mod:`vslam.loop_evaluation`.
     """
 
-    schema_version: int = 1
+    schema_version: int = 2
 
     lost_frames: int
     weak_frames: int
@@ -71,7 +107,16 @@ class ReportJson(_Model):
 
     keyframes: int
     landmarks: int
+    submaps: int
+    loops_closed: int
+    loops_rejected: int
+    loops_found: int | None
+    loops_missed: int | None
+    loops_wrong: int | None
+    revisit_stretches: int | None
+    revisits: list[RevisitEntry]
     loops: list[LoopEntry]
+    without_loops: WithoutLoops | None
 
     dataset: str
     sequence: str

@@ -10,21 +10,41 @@ from pathlib import Path
 
 import numpy as np
 
+from vslam.comparison import figures_without_loops
 from vslam.evaluate import Evaluation
 from vslam.features import TrackingState, TrackResult
+from vslam.geometry import inverses
 from vslam.info import available_cores, versions
-from vslam.report.schema import LoopEntry, Machine, ReportJson, StageTime
+from vslam.loop_evaluation import LoopEvaluation
+from vslam.loops import Closure
+from vslam.report.schema import (
+    LoopEntry,
+    Machine,
+    ReportJson,
+    RevisitEntry,
+    StageTime,
+    WithoutLoops,
+)
 from vslam.run import RunOutcome
 
 
 def summarize(
-    outcome: RunOutcome, evaluation: Evaluation | None, evo_command: str | None
+    outcome: RunOutcome,
+    evaluation: Evaluation | None,
+    verdict: LoopEvaluation | None,
+    evo_command: str | None,
 ) -> ReportJson:
-    """Reduce a run to what ``report.json`` holds; the errors are None without an evaluation."""
+    """Reduce a run to what ``report.json`` holds.
+
+    The errors are None without an evaluation, the judgement of loops is without a verdict.
+    """
     frames = len(outcome.tracks)
     states = Counter(track.state for track in outcome.tracks)
     options = asdict(outcome.settings)
     del options["config"]
+    loops = _loops(outcome, verdict)
+    closed = sum(loop.accepted for loop in loops)
+    without = figures_without_loops(outcome)
     return ReportJson(
         lost_frames=states[TrackingState.LOST],
         weak_frames=states[TrackingState.WEAK],
@@ -46,7 +66,16 @@ def summarize(
         stage_ms=_stage_times(outcome.tracks),
         keyframes=outcome.n_keyframes,
         landmarks=outcome.n_landmarks,
-        loops=[LoopEntry(**asdict(row)) for row in outcome.loops],
+        submaps=outcome.n_submaps,
+        loops_closed=closed,
+        loops_rejected=len(loops) - closed,
+        loops_found=verdict.n_found if verdict else None,
+        loops_missed=verdict.n_missed if verdict else None,
+        loops_wrong=verdict.n_wrong if verdict else None,
+        revisit_stretches=len(verdict.revisits) if verdict else None,
+        revisits=_revisits(verdict) if verdict else [],
+        loops=loops,
+        without_loops=WithoutLoops(**asdict(without)) if without else None,
         machine=_machine(),
         versions=versions(),
         created=datetime.now(UTC).replace(microsecond=0),
@@ -57,6 +86,50 @@ def summarize(
 def stage_names(tracks: list[TrackResult]) -> list[str]:
     """Stages in the order in which the run first went through them."""
     return list(dict.fromkeys(name for track in tracks for name in track.stage_ms))
+
+
+def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntry]:
+    frames = outcome.keyframe_frames
+    closures = {(c.edge.query, c.edge.match): c for c in outcome.closures}
+    right = verdict.right if verdict else (None,) * len(outcome.loops)
+    entries = []
+    for edge, is_right in zip(outcome.loops, right, strict=True):
+        closure = closures.get((edge.query, edge.match)) if edge.accepted else None
+        entries.append(
+            LoopEntry(
+                query_frame=int(frames[edge.query]) if edge.query >= 0 else None,
+                match_frame=int(frames[edge.match]),
+                score=edge.score,
+                matches=edge.n_matches,
+                inliers=edge.n_inliers,
+                accepted=edge.accepted,
+                right=is_right,
+                reason=edge.reason,
+                moved_m=_moved(closure) if closure else None,
+                correction_s=closure.seconds if closure else None,
+            )
+        )
+    return entries
+
+
+def _moved(closure: Closure) -> float:
+    before, after = inverses(closure.T_cw_before), inverses(closure.T_cw_after)
+    return float(np.linalg.norm((after - before)[:, :3, 3], axis=1).max())
+
+
+def _revisits(verdict: LoopEvaluation) -> list[RevisitEntry]:
+    found = verdict.revisits
+    return [
+        RevisitEntry(
+            first_frame=int(found.first[k]),
+            last_frame=int(found.last[k]),
+            first_match_frame=int(found.first_match[k]),
+            last_match_frame=int(found.last_match[k]),
+            length_m=float(found.length_m[k]),
+            loop_frame=int(verdict.loop_frame[k]) if verdict.loop_frame[k] >= 0 else None,
+        )
+        for k in range(len(found))
+    ]
 
 
 def _stage_times(tracks: list[TrackResult]) -> dict[str, StageTime]:

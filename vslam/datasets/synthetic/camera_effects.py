@@ -12,7 +12,7 @@ SHUTTER = 0.004  # s
 _BLUR = 0.55  # px, deviation of the lens
 _VIGNETTE = 0.22  # light lost in the corners
 _READ_NOISE, _SHOT_NOISE = 0.9, 0.022  # grey levels; grey levels squared for each grey level
-_KNEE = 190.0  # grey where the response bends towards saturation
+_KNEE, _ROLL = 170.0, 0.5  # grey where the response bends, and its slope from there to saturation
 
 
 def sensor_image(
@@ -40,9 +40,8 @@ def sensor_image(
         image = np.asarray(blurred, np.float32)
     image = np.asarray(cv2.GaussianBlur(image, (0, 0), _BLUR), np.float32)
     image = image * _vignette(camera)
-    over = np.maximum(image - _KNEE, 0)
-    room = 255.0 - _KNEE
-    image = np.minimum(image, _KNEE) + room * over / (over + room)
+    image = np.minimum(image, _KNEE + _ROLL * (image - _KNEE))
+    image = np.minimum(image, 255.0)
     rng = np.random.default_rng(key)
     gain = 1.0 + 5.0 * night
     deviation = np.sqrt(_READ_NOISE**2 + _SHOT_NOISE * np.maximum(image, 0)) * np.float32(gain)

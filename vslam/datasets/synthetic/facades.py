@@ -38,14 +38,14 @@ class FacadeStyle:
 def random_style(rng: Rng, *, town: bool) -> FacadeStyle:
     """A style; a town has shops, a suburb shutters."""
     brick = bool(rng.random() < 0.22)
-    low, high = (75, 125) if brick else (165, 225) if rng.random() < 0.6 else (110, 170)
+    low, high = (70, 125) if brick else (185, 238) if rng.random() < 0.6 else (120, 180)
     return FacadeStyle(
         wall=float(rng.uniform(low, high)),
-        frame=float(rng.choice([215.0, 225.0, 60.0, 130.0])),
-        glass=float(rng.uniform(22, 60)),
+        frame=float(rng.choice([235.0, 240.0, 50.0, 120.0], p=[0.4, 0.25, 0.25, 0.1])),
+        glass=float(rng.uniform(10, 32)),
         brick=brick,
         storey=float(rng.uniform(2.6, 3.3)),
-        pitch=float(rng.uniform(1.9, 3.6)),
+        pitch=float(rng.uniform(1.9, 3.2)),
         window=(float(rng.uniform(0.8, 1.7)), float(rng.uniform(1.1, 1.7))),
         shutters=bool(rng.random() < (0.2 if town else 0.4)),
         balconies=bool(rng.random() < 0.25),
@@ -75,7 +75,7 @@ def facade(
     image[:] = style.wall
     if style.brick:
         _lay_bricks(rng, image, columns / width, rows / height)
-    image *= 1.0 + 0.055 * noise(rng, rows, columns, 0.4 * columns, 7)
+    image *= 1.0 + 0.035 * noise(rng, rows, columns, 0.4 * columns, 7)
     streaks = cv2.resize(noise(rng, 4, columns, 14.0, 3), (columns, rows))
     image *= 1.0 - 0.035 * np.clip(streaks, 0, 3)
     lights = np.zeros_like(image)
@@ -108,7 +108,7 @@ def facade(
         x = float(rng.choice([0.15, width - 0.25]))
         painter.box(x, 0, x + 0.1, height, style.wall * float(rng.uniform(0.5, 0.8)))
         painter.box(x + 0.1, 0, x + 0.15, height, style.wall * 0.45)
-    image *= 1.0 + 0.03 * noise(rng, rows, columns, 3.0, 2)
+    image *= 1.0 + 0.035 * noise(rng, rows, columns, 2.0, 1)
     return np.clip(image, 6, 250), lights
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.spatial import cKDTree
 from vslam.datasets.synthetic.scene import AtlasBuilder, Surfaces, join, patches
 from vslam.datasets.synthetic.terrain import Roads, Terrain
 from vslam.datasets.synthetic.textures import Rng, detail, noise
+from vslam.info import available_cores
 from vslam.kernels import kernel
 
 TILE = 12.8  # m
@@ -53,12 +55,13 @@ def make_ground(
     far = tree.query(corner + TILE / 2)[0]
     grain = np.stack([noise(rng, 1024, 1024, cell, 5) for cell in (300.0, 40.0)])
     marks = _road_marks(rng, roads, style)
-    asphalt = atlas.add(detail(rng, 0.16, 5.0))
-    meadow = atlas.add(detail(rng, 0.28, 7.0))
+    asphalt = atlas.add(detail(rng, 0.20, 2.5))
+    meadow = atlas.add(detail(rng, 0.38, 5.0))
     section = np.array([style.lane, style.parking, style.walk, style.dash, style.dash + style.gap,
                         float(style.edge_line)])  # fmt: skip
-    parts = []
-    for (x, z), distance in zip(corner[far < _REACH], far[far < _REACH], strict=True):
+
+    def paint(at_corner: NDArray[np.float64], distance: float) -> NDArray[np.float32]:
+        x, z = at_corner
         # Half the diagonal of a tile is 0.71 of its side.
         side = _COARSE
         if distance < style.walk + 0.71 * TILE:
@@ -69,8 +72,14 @@ def make_ground(
         image = np.empty((side, side), np.float32)
         _paint(image, x, z, TILE / side, nearest, 0.4, roads.xz, roads.heading, roads.along,
                roads.junction, marks, section, grain)  # fmt: skip
-        texture = atlas.add(image)
-        parts.append(_tile(x, z, terrain, texture, asphalt if distance < 9.0 else meadow))
+        return image
+
+    parts = []
+    corner, far = corner[far < _REACH], far[far < _REACH]
+    with ThreadPoolExecutor(available_cores()) as pool:
+        for (x, z), distance, image in zip(corner, far, pool.map(paint, corner, far), strict=True):
+            fine = asphalt if distance < style.parking + 2.7 else meadow
+            parts.append(_tile(x, z, terrain, atlas.add(image), fine))
     return join(parts)
 
 
@@ -177,7 +186,7 @@ def _paint(
             fine = grain[1, int(z / texel) & 1023, (int(x / texel) + 331) & 1023]
             edge = off + 0.02 * fine
             if edge < lane:
-                grey = 70.0 * marks[i, 8] * (1.0 + 0.07 * wide + 0.075 * fine)
+                grey = 66.0 * marks[i, 8] * (1.0 + 0.05 * wide + 0.06 * fine)
                 # Tyres polish their tracks.
                 track = abs(abs(lateral) - 0.45 * lane) - 0.75
                 grey *= 1.0 - 0.06 * math.exp(-8.0 * track * track)
@@ -187,7 +196,7 @@ def _paint(
                         grey *= 0.6
                 for k in range(2):
                     if abs(lateral - marks[i, k]) < 0.03 + 0.014 * fine:
-                        grey *= 0.5
+                        grey *= 0.4
                 if marks[i, 2] > 0.0 and abs(ahead) < 0.03 + 0.02 * fine:
                     grey *= 0.55
                 if marks[i, 6] > 0.0:
@@ -209,7 +218,7 @@ def _paint(
                 if edge < lane + 0.12:
                     grey = 118.0 + 9.0 * fine
             elif edge < parking + 0.16:
-                grey = (145.0 + 9.0 * fine) * (0.7 if (s % 1.0) < 0.03 else 1.0)
+                grey = (150.0 + 9.0 * fine) * (0.7 if (s % 1.0) < 0.03 else 1.0)
                 grey *= 0.55 if edge < parking + 0.035 else 1.0
             elif edge < walk:
                 size = 0.5
@@ -222,7 +231,7 @@ def _paint(
                 # Gardens, drives and paths alternate behind the pavement.
                 lot = math.floor(s / 5.0)
                 kind = _hash(lot, 7 if side > 0.0 else 8)
-                grey = 62.0 * (1.0 + 0.25 * wide + 0.2 * fine)
+                grey = 58.0 * (1.0 + 0.25 * wide + 0.3 * fine)
                 if kind < 0.22:
                     grey = 105.0 * (1.0 + 0.1 * wide + 0.12 * fine)
                 elif kind > 0.8:

@@ -53,30 +53,31 @@ def _try_house(
 def _size(site: Site, rng: Rng) -> tuple[float, float, float]:
     if site.variation.aliased:
         rng = np.random.default_rng([site.variation.seed, 6, site.next_thing % ALIASES])
-    tall = 3.0 * int(rng.integers(2, 6 if site.route.land == "town" else 4))
-    return (
-        float(rng.uniform(8, 17)),
-        tall + float(rng.uniform(0.3, 1.2)),
-        float(rng.uniform(8, 12)),
-    )
+    if site.route.land == "town":
+        tall, width = 3.0 * int(rng.integers(2, 6)), float(rng.uniform(8, 17))
+    else:
+        tall, width = 2.8 * int(rng.integers(1, 3)), float(rng.uniform(8, 13))
+    return (width, tall + float(rng.uniform(0.3, 1.2)), float(rng.uniform(8, 12)))
 
 
 def line_with_houses(site: Site) -> None:
     """Fronts along both sides of every road."""
     roads, rng, town = site.roads, site.rng, site.route.land == "town"
     for side in (-1.0, 1.0):
-        at, setback = 0, site.style.walk + 2.0
+        at, setback = 0, site.style.walk + (2.0 if town else 6.0)
         while at < len(roads.xz) - 20:
             size = _size(site, rng)
             middle = min(at + int(2 * size[0]), len(roads.xz) - 1)
             if rng.random() < 0.45:
-                low, high = (0.3, 4.0) if town else (3.5, 9.0)
+                low, high = (0.3, 4.0) if town else (4.0, 11.0)
                 setback = site.style.walk + float(rng.uniform(low, high))
             out = roads.right[middle] * side
             front = roads.xz[middle] + setback * out
             heading = float(np.arctan2(out[0], out[1])) + float(rng.normal(0, 0.015))
             if _try_house(site, front, heading, size, site.style.walk + 0.2):
-                gap = 0.0 if town and rng.random() < 0.45 else float(rng.uniform(2.5, 9.0))
+                gap = 0.0
+                if not (town and rng.random() < 0.45):
+                    gap = float(rng.uniform(2.5, 9.0) if town else rng.uniform(5.0, 16.0))
                 at += int(4 * (size[0] + gap)) + 1
             else:
                 at += 8

@@ -4,22 +4,36 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from vslam.camera import StereoCamera
 from vslam.datasets.synthetic import solids
 from vslam.datasets.synthetic.camera_effects import sensor_image
+from vslam.datasets.synthetic.files import check_disk, write_png, writing
 from vslam.datasets.synthetic.passes import Passes
 from vslam.datasets.synthetic.render import Renderer
 from vslam.datasets.synthetic.routes import Route
 from vslam.datasets.synthetic.site import Variation
-from vslam.datasets.synthetic.store import OnFrame, check_disk, write_png, writing
-from vslam.datasets.synthetic.town import build_town
+from vslam.datasets.synthetic.store import OnFrame
+from vslam.datasets.synthetic.town import Town, build_town
 
 _LATERAL, _HEADING, _HEIGHT = 1.4, 14.0, 0.25  # largest changes: m, degrees, m
-_APART = 40.0  # m between different places
+_EXPOSURE = 0.25  # deviation of the logarithm of the second view's exposure by the first's
+_APART = 40.0  # m between different places,
+_SIGHT, _STREET = 160.0, 25.0  # and where one lies so far ahead of the other in the same street
+_TOGETHER, _LATER, _ALIGNED = 4.0, 60, 30.0  # m, frames, degrees: another pass through a place
+_ALIKE = 5  # a look-alike is drawn from so many of the most similar places
+_PLACES, _SMALL = 160, 8  # places that are compared, in views so many times smaller
+_COLUMNS = ("a", "b", "same", "kind", "frame_a", "frame_b", "when_a", "when_b", "distance_m",
+            "lateral_m", "heading_deg", "height_m", "exposure_ratio")  # fmt: skip
+
+Float = NDArray[np.float64]
 
 
 def render_pairs(
@@ -31,10 +45,17 @@ def render_pairs(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> None:
-    """Render ``count`` pairs, half of one place and half of two places that look alike.
+    """Render ``count`` pairs, half of one place and half of two places.
 
-    ``folder/pairs.csv`` has a row for each: both images, ``same`` (1 or 0) and how the second
-    view differs (metres to the side, degrees, metres up, the moment of each view as a frame).
+    ``folder/pairs.csv`` has a row for each: both images, ``same`` (1 or 0), the kind, the frame of
+    the drive that each view was taken from, the moment of each as a frame (what stands there and
+    how it is lit), and how the second view differs: metres between the frames' places, metres to
+    the side, degrees and metres up that were added, and the ratio of the exposures. The kinds:
+
+    - ``shift``: the same frame, moved to the side, turned, raised;
+    - ``pass``: another pass through the place, where the drive has one, shifted likewise;
+    - ``alike``: another place, one of those that look most like the first in a small blurred view;
+    - ``random``: any other place.
 
     Args:
         route: drive to take places from.
@@ -50,45 +71,124 @@ def render_pairs(
     """
     check_disk(folder, count, depth=False)
     rng = np.random.default_rng([variation.seed, 20])
-    town = build_town(route, variation)
+    town = build_town(route, variation, sway=_LATERAL)
     passes = Passes(route, town, variation)
-    renderer = Renderer(route.camera, town.atlas, town.sky, threads)
+    alike = _look_alikes(route, town, passes, threads)
+    again = _other_passes(route.T_wc)
+    returns = np.flatnonzero([len(others) > 0 for others in again])
     places = route.T_wc[:, [0, 2], 3]
     last = len(places) - 1
+    renderer = Renderer(route.camera, town.atlas, town.sky, threads)
     table = io.StringIO()
     rows = csv.writer(table)
-    rows.writerow(["a", "b", "same", "lateral_m", "heading_deg", "height_m", "when_a", "when_b"])
+    rows.writerow(_COLUMNS)
     with writing(folder):
         (folder / "images").mkdir(parents=True, exist_ok=True)
         for k in range(count):
-            same = k % 2 == 0
-            first = int(rng.integers(len(places)))
+            kind = ("shift", "alike", "pass", "random")[k % 4]
+            if kind == "pass" and not returns.size:
+                kind = "shift"
+            first = int(rng.choice(returns) if kind == "pass" else rng.integers(len(places)))
             second = first
-            if not same:
-                apart = np.flatnonzero(np.linalg.norm(places - places[first], axis=1) > _APART)
+            if kind == "pass":
+                second = int(rng.choice(again[first]))
+            elif kind == "alike":
+                first, second = (int(x) for x in alike[int(rng.integers(len(alike)))])
+            elif kind == "random":
+                apart = np.flatnonzero(_different(route.T_wc[first], route.T_wc))
                 second = int(rng.choice(apart)) if apart.size else last - first
-            shift = rng.uniform(-1, 1, 3) * [_LATERAL, _HEADING, _HEIGHT]
-            whens = (first, last if same and variation.change > 0 else second)
+            whens = (first, last if kind == "shift" and variation.change > 0 else second)
+            shift = (rng.uniform(-1, 1, 3) * [_LATERAL, _HEADING, _HEIGHT]).tolist()
+            ratio = float(np.exp(rng.normal(0.0, _EXPOSURE)))
             names = []
             for eye, (frame, when) in enumerate(zip((first, second), whens, strict=True)):
-                T = route.T_wc[frame]
-                T = T if eye == 0 else _shifted(T, *shift.tolist())
-                moment = passes.at(when)
-                view, _ = renderer.stereo(moment.surfaces, moment.shadows, moment.light, T)
-                image = sensor_image(view.image, route.camera, yaw_rate=0.0, night=moment.night,
-                                     key=(variation.seed, k, eye))  # fmt: skip
+                T = route.T_wc[frame] if eye == 0 else _shifted(route.T_wc[frame], *shift)
+                image = _view(renderer, route, passes, T, when, 1.0 if eye == 0 else ratio,
+                              key=(variation.seed, k, eye))  # fmt: skip
                 names.append(f"images/{k:06d}_{'ab'[eye]}.png")
                 write_png(folder / names[-1], image, 1)
-            rows.writerow([*names, int(same), *(f"{x:.3f}" for x in shift), *whens])
+            distance = float(np.linalg.norm(places[second] - places[first]))
+            rows.writerow([
+                *names, int(kind in ("shift", "pass")), kind, first, second, *whens,
+                *(f"{x:.3f}" for x in (distance, *shift, ratio)),
+            ])  # fmt: skip
             if on_frame:
                 on_frame(k + 1, count)
         (folder / "pairs.csv").write_text(table.getvalue())
     renderer.close()
 
 
-def _shifted(
-    T_wc: NDArray[np.float64], lateral: float, heading: float, height: float
-) -> NDArray[np.float64]:
+def _view(
+    renderer: Renderer, route: Route, passes: Passes, T_wc: Float, when: int, ratio: float,
+    *, key: tuple[int, int, int],
+) -> NDArray[np.uint8]:  # fmt: skip
+    moment = passes.at(when)
+    light = replace(moment.light, exposure=moment.light.exposure * ratio)
+    view, _ = renderer.stereo(moment.surfaces, moment.shadows, light, T_wc, moment.pools)
+    return sensor_image(view.image, route.camera, yaw_rate=0.0, night=moment.night, key=key)
+
+
+def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
+    """For each frame the frames of other passes that stand and look about alike."""
+    xz, ahead = T_wc[:, [0, 2], 3], T_wc[:, :3, 2]
+    again = []
+    for k, near in enumerate(cKDTree(xz).query_ball_point(xz, _TOGETHER)):
+        others = np.array(near, np.int64)
+        others = others[np.abs(others - k) > _LATER]
+        again.append(others[ahead[others] @ ahead[k] > np.cos(np.radians(_ALIGNED))])
+    return again
+
+
+def _different(T_wc: Float, others: Float) -> NDArray[np.bool_]:
+    """Which of ``others`` ``(N, 4, 4)`` stand elsewhere and do not look along the same street."""
+    away = (others[:, :3, 3] - T_wc[:3, 3])[:, [0, 2]]
+    ahead = T_wc[[0, 2], 2] / np.linalg.norm(T_wc[[0, 2], 2])
+    aside = np.abs(away @ np.array([ahead[1], -ahead[0]]))
+    distance = np.linalg.norm(away, axis=1)
+    alike = np.abs(others[:, [0, 2], 2] @ ahead) > 0.7
+    different: NDArray[np.bool_] = (distance > _APART) & ~(
+        alike & (aside < _STREET) & (distance < _SIGHT)
+    )
+    return different
+
+
+def _look_alikes(route: Route, town: Town, passes: Passes, threads: int) -> NDArray[np.int64]:
+    """``(P, 2)`` frames of different places that look alike, several for each of many places.
+
+    Alike are small, blurred views, brightness and contrast set aside, with a high correlation.
+    """
+    chosen = np.unique(np.linspace(0, len(route.T_wc) - 1, _PLACES).astype(int))
+    camera = route.camera
+    small = StereoCamera(
+        camera.fx / _SMALL,
+        camera.fy / _SMALL,
+        camera.cx / _SMALL,
+        camera.cy / _SMALL,
+        camera.baseline,
+        camera.width // _SMALL,
+        camera.height // _SMALL,
+    )
+    renderer = Renderer(small, town.atlas, town.sky, threads)
+    moment = passes.at(0)
+    seen = []
+    for k in chosen:
+        view, _ = renderer.stereo(moment.surfaces, moment.shadows, moment.light, route.T_wc[k])
+        blurred = cv2.GaussianBlur(np.minimum(view.image, 255.0), (0, 0), 1.5).ravel()
+        seen.append((blurred - blurred.mean()) / (blurred.std() + 1e-6))
+    renderer.close()
+    score = np.array(seen) @ np.array(seen).T / seen[0].size
+    for k, T in enumerate(route.T_wc[chosen]):
+        score[k, ~_different(T, route.T_wc[chosen])] = -np.inf
+    pairs = [
+        (int(chosen[k]), int(chosen[other]))
+        for k, row in enumerate(score)
+        for other in np.argsort(-row)[:_ALIKE]
+        if np.isfinite(row[other])
+    ]
+    return np.array(pairs or [(int(chosen[0]), int(chosen[-1]))], np.int64)
+
+
+def _shifted(T_wc: Float, lateral: float, heading: float, height: float) -> Float:
     moved = T_wc.copy()
     moved[:3, :3] = solids.turn(np.radians(heading)) @ T_wc[:3, :3]
     moved[:3, 3] += lateral * T_wc[:3, 0] + [0.0, -height, 0.0]

@@ -28,6 +28,7 @@ class Palette:
     posters: list[int]
     metal: int
     lamp: int
+    kerb: int
     tiles: list[int]
     plaster: int
     render: int
@@ -50,8 +51,9 @@ def make_palette(rng: Rng, atlas: AtlasBuilder, pool: int) -> Palette:
         posters=[add(textures.poster(rng)) for _ in range(2 * pool)],
         metal=add(np.full((16, 16), 92.0) + rng.normal(0, 9, (16, 16))),
         lamp=add(np.full((8, 8), 215.0)),
+        kerb=add(_kerb(rng)),
         tiles=[add(_roof_tiles(rng)) for _ in range(6)],
-        plaster=add(textures.detail(rng, 0.05, 9.0)),
+        plaster=add(textures.detail(rng, 0.07, 3.0)),
         render=add(np.clip(165 + 9 * textures.noise(rng, 256, 256, 90.0, 6), 0, 255)),
     )
 
@@ -62,8 +64,18 @@ def _sign(rng: Rng, atlas: AtlasBuilder) -> tuple[int, int]:
     return atlas.add(face, alpha), atlas.add(back, alpha)
 
 
+def _kerb(rng: Rng) -> textures.Grey:
+    """Kerb stones, 4 m of them, each a metre long."""
+    tone = np.repeat(rng.uniform(135, 175, 4), 128)[None, :]
+    grey = tone * (1.0 + 0.09 * textures.noise(rng, 32, 512, 8.0, 3))
+    grey[:, ::128] = grey[:, 1::128] = 60.0
+    return np.clip(grey, 10, 240)
+
+
 def _roof_tiles(rng: Rng) -> textures.Grey:
     y, x = np.mgrid[0:256, 0:256]
     course = 60 + 40 * rng.random() + 13 * np.sin(2 * np.pi * x / 12.8)
-    course = course - 24 * ((y % 16) < 3)
+    course = (
+        course * np.where(y % 16 < 4, 0.55, 1.0) * rng.uniform(0.8, 1.2, (16, 20))[y // 16, x // 13]
+    )
     return np.clip(course * (1 + 0.13 * textures.noise(rng, 256, 256, 60.0, 6)), 5, 240)

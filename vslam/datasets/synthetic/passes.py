@@ -7,18 +7,27 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from vslam.datasets.synthetic.plan import CLEARANCE
 from vslam.datasets.synthetic.render import Light
 from vslam.datasets.synthetic.routes import CAMERA_HEIGHT, Route
 from vslam.datasets.synthetic.scene import Surfaces, join
-from vslam.datasets.synthetic.shadows import ShadowMap, cast_shadows
+from vslam.datasets.synthetic.shadows import (
+    NO_LAMPS,
+    LampPools,
+    ShadowMap,
+    cast_shadows,
+    lamp_pools,
+)
 from vslam.datasets.synthetic.site import AFTER, BEFORE, Variation
 from vslam.datasets.synthetic.town import Town
 
 _NEAR, _LEFT = 60.0, 75.0  # m: a place was passed, and has been left again
-_SUN_STEP = 40  # frames between two positions of the sun
-_CAR_REACH = np.array([1.0, 2.4])  # half width and length of the largest car, m
+_AGAIN, _STRETCH = 60, 15  # frames: a place is passed again after so many, for so many
+_CASTS = 3  # shadow maps kept
+_CLOUD = 12.0  # frames that a cloud hides the sun while it moves between two passes
+_CAR_REACH = np.array([1.1, 2.7])  # half width and length of the largest car, m
 
 
 @dataclass(frozen=True)
@@ -29,6 +38,7 @@ class Moment:
     shadows: ShadowMap
     light: Light
     night: float
+    pools: LampPools = NO_LAMPS
 
 
 class Passes:
@@ -38,24 +48,27 @@ class Passes:
         self._route, self._town, self._variation = route, town, variation
         self._switch = _switch_frames(town.place, route.T_wc[:, [0, 2], 3])
         self._lock = threading.Lock()
-        self._casts: dict[int, tuple[ShadowMap, Surfaces]] = {}
+        self._casts: dict[int, ShadowMap] = {}
+        self._starts = pass_starts(route.T_wc) if variation.change > 0 else [0]
+        self._pools = lamp_pools(town.lamps)
 
     def at(self, frame: int) -> Moment:
         """The town at frame number ``frame`` of the route."""
-        changing = self._variation.change > 0
-        epoch = frame // _SUN_STEP if changing else 0
-        light, night = self._light(epoch * _SUN_STEP)
+        number = int(np.searchsorted(self._starts, frame, side="right")) - 1
+        light, night = self._light(frame, number)
+        standing = self._standing(frame)
         with self._lock:
-            if epoch not in self._casts:
-                standing = self._standing(epoch * _SUN_STEP)
-                shadows = cast_shadows(standing, self._town.atlas, light.sun)
-                self._casts = {k: v for k, v in self._casts.items() if k >= epoch - 1}
-                self._casts[epoch] = shadows, standing
-            shadows, standing = self._casts[epoch]
-        if changing:
-            standing = self._standing(frame)
+            if number not in self._casts:
+                middle = (*self._starts, len(self._route.T_wc))[number : number + 2]
+                there = self._standing(sum(middle) // 2)
+                shadows = cast_shadows(there, self._town.atlas, light.sun)
+                self._casts[number] = shadows
+                while len(self._casts) > _CASTS:
+                    del self._casts[next(iter(self._casts))]
+            shadows = self._casts[number]
         cars = self._cars(frame)
-        return Moment(join([standing, *cars]) if cars else standing, shadows, light, night)
+        surfaces = join([standing, *cars]) if cars else standing
+        return Moment(surfaces, shadows, light, night, self._pools if night > 0 else NO_LAMPS)
 
     def _standing(self, frame: int) -> Surfaces:
         surfaces, when = self._town.surfaces, self._town.when
@@ -65,26 +78,31 @@ class Passes:
         present = (when == 0) | ((when == BEFORE) & ~later) | ((when == AFTER) & later)
         return surfaces.select((surfaces.thing < 0) | present[surfaces.thing])
 
-    def _light(self, frame: int) -> tuple[Light, float]:
+    def _light(self, frame: int, number: int) -> tuple[Light, float]:
+        """The sun stands still during a pass and moves to the next behind a cloud; night falls
+        slowly over the whole drive."""
         seed, change = self._variation.seed, self._variation.change
         rng = np.random.default_rng([seed, 11])
-        azimuth, rise = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(36, 50))
+        azimuth, rise = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(33, 46))
+        moved = change * number / max(len(self._starts) - 1, 1)
+        azimuth += np.radians(110) * moved
+        rise *= 1.0 - 0.35 * moved
         progress = min(frame / max(len(self._route.T_wc) - 1, 1), 1.0)
         progress = progress * progress * (3 - 2 * progress)
-        azimuth += np.radians(110) * change * progress
         night = max(0.0, change - 0.7) / 0.3 * progress
-        rise *= 1.0 - 0.35 * change * progress
+        away = min((abs(frame - start) for start in self._starts[1:]), default=1000)
+        clear = 1.0 - float(np.exp(-((away / _CLOUD) ** 2)))
         sun = np.array(
             [np.sin(azimuth) * np.cos(rise), -np.sin(rise), np.cos(azimuth) * np.cos(rise)]
         )
         light = Light(
             sun,
-            direct=1.0 - night,
-            ambient=0.36 * (1 - 0.7 * night),
+            direct=clear * (1.0 - night),
+            ambient=0.29 * (2 - clear) * (1 - 0.7 * night),
             glow=0.9 * night,
             haze=125.0 * (1 - 0.93 * night),
             headlight=0.5 * night,
-            exposure=1.5 * (1 + 1.7 * night),
+            exposure=1.95 * (1 + 1.4 * night),
         )
         return light, night
 
@@ -121,3 +139,14 @@ def _switch_frames(place: NDArray[np.float64], cameras: NDArray[np.float64]) -> 
             if left.size:
                 switch[k] = near[0] + left[0]
     return switch
+
+
+def pass_starts(T_wc: NDArray[np.float64]) -> list[int]:
+    """Frames at which the drive ``(N, 4, 4)`` comes to streets that it knows, after frame 0."""
+    xz = T_wc[:, [0, 2], 3]
+    tree = cKDTree(xz)
+    known = np.array([
+        min(near) < k - _AGAIN for k, near in enumerate(tree.query_ball_point(xz, 6.0))
+    ])  # fmt: skip
+    edges = np.flatnonzero(np.diff(np.r_[0, known, 0]))
+    return [0, *(int(a) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= _STRETCH)]

@@ -33,6 +33,7 @@ class Plan:
         columns, rows = np.ceil((roads.xz.max(axis=0) + _BORDER - self._low) / _CELL).astype(int)
         self._taken = np.zeros((rows, columns), np.uint8)
         self._tall = np.zeros((rows, columns), np.uint8)
+        self._limit = np.array([columns - 1, rows - 1])
         self._road = self._distance(roads.xz)
         self._cameras = cKDTree(cameras)
 
@@ -43,8 +44,8 @@ class Plan:
         return np.asarray(cv2.distanceTransform(clear, cv2.DIST_L2, 5) * _CELL, np.float32)
 
     def _cell(self, xz: Float) -> NDArray[np.int64]:
-        limit = np.array(self._taken.shape[::-1]) - 1
-        return np.clip(((xz - self._low) / _CELL).astype(np.int64), 0, limit)
+        cells = ((xz - self._low) / _CELL).astype(np.int64)
+        return np.minimum(np.maximum(cells, 0, out=cells), self._limit, out=cells)
 
     def claim(self, corners: Float, *, road: float, tall: bool = False) -> bool:
         """Take the ground of a convex polygon ``(K, 2)`` if it is free, ``road`` metres from the

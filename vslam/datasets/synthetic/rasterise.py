@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from vslam.kernels import inline, kernel
+from vslam.kernels import borrowed, inline, kernel
 
 NEAR = 0.2  # m
 FAR = 400.0  # m
@@ -54,6 +54,8 @@ def find_visible(
     Returns:
         ``(V, COLUMNS)`` float64; the columns are named above.
     """
+    origin, edge_s, edge_t, T_wc = (
+        borrowed(origin), borrowed(edge_s), borrowed(edge_t), borrowed(T_wc))  # fmt: skip
     fx, fy, cx, cy = intrinsics
     found = np.empty((1024, COLUMNS))
     n = 0
@@ -201,10 +203,13 @@ def rasterise(visible, first_row, samples, alpha, alpha_offset, log_size, invers
         inverse_depth: ``(h, w)`` float32, updated: 1/z of the nearest surface, 0 without one.
         seen: ``(h, w)`` int32, updated: its row in ``visible``.
     """
+    visible, alpha, alpha_offset = borrowed(visible), borrowed(alpha), borrowed(alpha_offset)
+    log_size, inverse_depth, seen = borrowed(log_size), borrowed(inverse_depth), borrowed(seen)
     height, width = inverse_depth.shape
     step = 1.0 / samples
     shift = 0.5 * step - 0.5  # pixel coordinate of sample 0
-    bound = np.empty((6, 3))
+    held = np.empty((6, 3))
+    bound = borrowed(held)
     for k in range(len(visible)):
         q = visible[k]
         first = max(int(q[FIRST_ROW]) * samples - first_row, 0)
@@ -256,6 +261,7 @@ def rasterise(visible, first_row, samples, alpha, alpha_offset, log_size, invers
                     inverse_depth[j, begin:end],
                     seen[j, begin:end],
                 )
+    held[0, 0] = 0.0  # it must live until here
 
 
 @kernel

@@ -20,7 +20,7 @@ from vslam.camera import StereoCamera
 from vslam.datasets.synthetic.rasterise import find_visible, rasterise
 from vslam.datasets.synthetic.scene import Atlas, Surfaces
 from vslam.datasets.synthetic.shade import shade
-from vslam.datasets.synthetic.shadows import ShadowMap
+from vslam.datasets.synthetic.shadows import NO_LAMPS, LampPools, ShadowMap
 
 SAMPLES = 2  # visibility samples a pixel, in each direction
 _BANDS = 2  # bands of rows of an eye, the unit of work of a thread
@@ -45,11 +45,11 @@ class Light:
 
     sun: NDArray[np.float64]
     direct: float = 1.0
-    ambient: float = 0.36
+    ambient: float = 0.29
     glow: float = 0.0
     haze: float = 125.0
     visibility: float = 900.0
-    exposure: float = 1.5
+    exposure: float = 1.95
     headlight: float = 0.0
 
     def as_array(self) -> NDArray[np.float64]:
@@ -81,13 +81,19 @@ class Renderer:
         self._pool.shutdown()
 
     def stereo(
-        self, surfaces: Surfaces, shadows: ShadowMap, light: Light, T_wc: NDArray[np.float64]
+        self,
+        surfaces: Surfaces,
+        shadows: ShadowMap,
+        light: Light,
+        T_wc: NDArray[np.float64],
+        pools: LampPools = NO_LAMPS,
     ) -> tuple[View, View]:
         """Left and right view of a rig whose left camera stands at ``T_wc`` ``(4, 4)``."""
         right = T_wc.copy()
         right[:3, 3] += T_wc[:3, 0] * self._camera.baseline
         eyes = [
-            self._pool.submit(self._prepare, surfaces, shadows, light, T) for T in (T_wc, right)
+            self._pool.submit(self._prepare, surfaces, shadows, light, T, pools)
+            for T in (T_wc, right)
         ]
         views, jobs = [], []
         for eye in eyes:
@@ -99,7 +105,12 @@ class Renderer:
         return views[0], views[1]
 
     def _prepare(
-        self, surfaces: Surfaces, shadows: ShadowMap, light: Light, T_wc: NDArray[np.float64]
+        self,
+        surfaces: Surfaces,
+        shadows: ShadowMap,
+        light: Light,
+        T_wc: NDArray[np.float64],
+        pools: LampPools,
     ) -> tuple[View, list[Callable[[], None]]]:
         camera, atlas = self._camera, self._atlas
         height, width = camera.height, camera.width
@@ -152,6 +163,8 @@ class Renderer:
                 self._sky,
                 shadows.height_cm,
                 shadows.frame,
+                pools.light,
+                pools.frame,
                 T_wc,
                 intrinsics,
                 lamp,

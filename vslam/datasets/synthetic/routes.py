@@ -24,6 +24,8 @@ _CAMERAS = {  # as in KITTI's three recording periods: 00-02, 03, 04-12
     "04-12": StereoCamera(707.0912, 707.0912, 601.8873, 183.1104, 0.53715, 1226, 370),
 }
 
+CALIBRATIONS = tuple(_CAMERAS)
+
 
 @dataclass(frozen=True)
 class Route:
@@ -146,7 +148,7 @@ def built_in_route(name: str) -> Route:
     return Route(name, plan.about, plan.land, camera, _poses(xz, terrain), roads, terrain)
 
 
-def route_of_poses(T_wc: Float, name: str, camera: str = "00-02") -> Route:
+def route_of_poses(T_wc: Float, name: str, calibration: str = "00-02") -> Route:
     """A route along given poses, KITTI's for example.
 
     The heights of all passes over a place are averaged, so that each road has one height; heading,
@@ -155,11 +157,17 @@ def route_of_poses(T_wc: Float, name: str, camera: str = "00-02") -> Route:
     Args:
         T_wc: ``(N, 4, 4)`` float64, y down.
         name: of the route.
-        camera: recording period whose calibration to use.
+        calibration: one of `CALIBRATIONS`: the KITTI sequences whose camera to use; poses do not
+            tell.
 
     Raises:
-        InputError: NaN, fewer than 20 poses, less than 20 m, or a jump of more than 5 m.
+        InputError: unknown calibration, NaN, fewer than 20 poses, less than 20 m, or a jump of
+            more than 5 m.
     """
+    if calibration not in CALIBRATIONS:
+        raise InputError(
+            f"--calibration {calibration}: unknown; choose one of {', '.join(CALIBRATIONS)}."
+        )
     if not np.isfinite(T_wc).all():
         raise InputError(f"{name}: a pose holds NaN or infinity; repair the trajectory.")
     if len(T_wc) < 20:
@@ -185,7 +193,9 @@ def route_of_poses(T_wc: Float, name: str, camera: str = "00-02") -> Route:
     terrain = _terrain(roads.xz, _heights_of(xz, -T_wc[:, 1, 3] - CAMERA_HEIGHT))
     poses = T_wc.copy()
     poses[:, 1, 3] = -terrain.height(xz) - CAMERA_HEIGHT
-    return Route(name, f"{len(T_wc)} given poses", "town", _CAMERAS[camera], poses, roads, terrain)
+    return Route(
+        name, f"{len(T_wc)} given poses", "town", _CAMERAS[calibration], poses, roads, terrain
+    )
 
 
 def _round_corners(leg: _Leg) -> tuple[Float, Float]:

@@ -56,7 +56,7 @@ class Surfaces:
 
     def moved(self, R: Float, t: Float) -> Surfaces:
         """The surfaces turned by ``R`` ``(3, 3)`` and then shifted by ``t`` ``(3,)``."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values = dict(vars(self))
         values["origin"] = self.origin @ R.T + t
         values["edge_s"] = self.edge_s @ R.T
         values["edge_t"] = self.edge_t @ R.T
@@ -65,9 +65,10 @@ class Surfaces:
 
 def join(parts: Sequence[Surfaces]) -> Surfaces:
     """All surfaces of ``parts`` (at least one) in their order."""
-    return Surfaces(
-        *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Surfaces))
-    )
+    if len(parts) == 1:
+        return parts[0]
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return Surfaces(*(np.concatenate(column) for column in columns))
 
 
 def patches(
@@ -86,23 +87,30 @@ def patches(
     thing: int = -1,
 ) -> Surfaces:
     """Surfaces that share all but place and texture coordinates; arrays as in `Surfaces`."""
-    o, s, t = (np.atleast_2d(np.asarray(x, np.float64)) for x in (origin, edge_s, edge_t))
-    n = max(len(o), len(s), len(t))
-    o, s, t = (np.broadcast_to(x, (n, 3)).copy() for x in (o, s, t))
+    arrays = [np.asarray(x, np.float64) for x in (origin, edge_s, edge_t)]
+    n = max(len(x) if x.ndim == 2 else 1 for x in arrays)
+    o, s, t = (_rows(x, n) for x in arrays)
     return Surfaces(
         o,
         s,
         t,
-        np.broadcast_to(np.asarray(uv, np.float64), (n, 6)).copy(),
+        _rows(np.asarray(uv, np.float64), n),
         np.full(n, texture, np.int32),
         np.full(n, detail, np.int32),
-        np.full(n, detail_size),
-        np.full(n, gain),
-        np.full(n, triangle),
+        np.full(n, detail_size, np.float64),
+        np.full(n, gain, np.float64),
+        np.full(n, triangle, np.bool_),
         np.full(n, layer, np.uint8),
         np.full(n, material, np.uint8),
         np.full(n, thing, np.int32),
     )
+
+
+def _rows(values: Float, n: int) -> Float:
+    """``(n, K)`` from ``(K,)`` or as many rows: faster than NumPy's own broadcasting."""
+    rows = np.empty((n, values.shape[-1]))
+    rows[:] = values
+    return rows
 
 
 @dataclass(frozen=True)

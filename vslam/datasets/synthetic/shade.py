@@ -16,14 +16,16 @@ from vslam.datasets.synthetic.rasterise import (
     SUN,
     TEXTURE,
 )
-from vslam.kernels import inline, kernel
+from vslam.kernels import borrowed, inline, kernel
 
 _SCALE = 0.5 ** np.arange(24)  # of the levels of a mipmap
-MAX_TAPS = 2  # trilinear samples along the long side of a pixel's footprint
+_TWO_TAPS = 1.25  # ratio of the sides of a pixel's footprint from which it is sampled twice
 _DETAIL_ENDS = 12.0  # texels of the fine texture in a pixel that leave nothing of its contrast
 _SKY_HAZE = 185.0  # haze under which the panorama shows its own grey
 SKY_RISE = 1.0  # tangent of the elevation at the upper edge of the sky's panorama
 SKY_FALL = 0.1  # and of the depression at its lower edge
+_GLARE, _GLARE_WIDTH = 120.0, 0.10  # grey that the sky gains towards the sun; 1 - cos of its half
+_POOL_GAIN = 2.5  # brightness under a street lamp by that of a lit window
 _SHADE_BIAS = 0.35  # m that an occluder must rise above a point to shade it
 
 
@@ -31,8 +33,8 @@ _SHADE_BIAS = 0.35  # m that an occluder must rise above a point to shade it
 def _bilinear(texels, at, log_w, log_h, level, u, v):
     """Texture at ``(u, v)``, given in texels of level 0; it repeats endlessly."""
     scale = _SCALE[level]
-    x = u * scale - np.float32(0.5)
-    y = v * scale - np.float32(0.5)
+    x = u * scale - 0.5
+    y = v * scale - 0.5
     x0, y0 = math.floor(x), math.floor(y)
     fx, fy = np.float32(x - x0), np.float32(y - y0)
     row_log = max(log_w - level, 0)
@@ -49,62 +51,92 @@ def _bilinear(texels, at, log_w, log_h, level, u, v):
 
 
 @inline
-def _log2(size):
-    """Integer part and, linear between powers of two, the fraction of a logarithm; size >= 1."""
-    bits = np.float32(size).view(np.int32)
+def _log2(bits):
+    """Integer part and, linear between powers of two, the fraction of the logarithm of a float32
+    given by its bits."""
     return (int(bits) >> 23) - 127, np.float32(int(bits) & 0x7FFFFF) * np.float32(1.0 / 0x800000)
 
 
-@kernel
-def _trilinear(texels, offset, number, log_w, log_h, size, u, v):
-    """Texture ``number`` at ``(u, v)`` averaged over about ``size`` texels of level 0."""
-    if size <= 1.0:
-        return _bilinear(texels, offset[number, 0], log_w, log_h, 0, u, v)
-    low, part = _log2(size)
+@inline
+def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
+    """Texture ``number`` at ``(u, v)`` averaged over about as many texels of level 0 as the float32
+    of these ``bits`` says. Levels blend over the middle half of an octave."""
+    low, part = _log2(bits)
     top = max(log_w, log_h)
+    part = (part - np.float32(0.25)) * np.float32(2.0)
+    if low < 0:
+        low, part = 0, np.float32(0.0)
     if low >= top:
-        return np.float32(texels[np.uintp(offset[number, top])])
-    near = _bilinear(texels, offset[number, low], log_w, log_h, low, u, v)
-    far = _bilinear(texels, offset[number, low + 1], log_w, log_h, low + 1, u, v)
-    return near + (far - near) * part
+        low, part = top, np.float32(0.0)
+    # One way out: else Numba counts the references of the arrays at each call.
+    row = np.uintp(number)
+    high = low
+    if part >= 1.0:
+        low = high = low + 1
+    elif part > 0.0:
+        high = low + 1
+    grey = _bilinear(texels, offset[row, np.uintp(low)], log_w, log_h, low, u, v)
+    if high > low:
+        far = _bilinear(texels, offset[row, np.uintp(high)], log_w, log_h, high, u, v)
+        grey += (far - grey) * part
+    return grey
 
 
-@kernel
-def _sky(texels, offset, log_size, number, x, y, z, pixel):
-    """Panorama in the world direction ``(x, y, z)``; ``pixel``: angle of a pixel in radians."""
+@inline
+def _sky(texels, offset, log_size, number, lamp, x, y, z, bits):
+    """Panorama in the world direction ``(x, y, z)`` with the glow of the sky about the sun;
+    ``bits``: texels that a pixel covers, as a float32's bits."""
     log_w, log_h = log_size[number, 0], log_size[number, 1]
-    flat = math.sqrt(x * x + z * z)
+    square = x * x + z * z
+    flat = math.sqrt(square)
     rise = (SKY_RISE + y / flat) / (SKY_RISE + SKY_FALL)
     u = (math.atan2(x, z) / (2.0 * math.pi) + 0.5) * (1 << log_w)
     v = min(max(rise, 0.0), 0.9999) * ((1 << log_h) - 1) + 0.5
-    size = pixel * max((1 << log_w) / (2.0 * math.pi), (1 << log_h) / (SKY_RISE + SKY_FALL))
-    return _trilinear(texels, offset, number, log_w, log_h, size, u, v)
+    away = 1.0 - (x * lamp[0] + y * lamp[1] + z * lamp[2]) / math.sqrt(square + y * y)
+    glow = lamp[3] * (_GLARE / (1.0 + away / _GLARE_WIDTH) ** 2)
+    return _trilinear(texels, offset, number, log_w, log_h, bits, u, v) + glow
 
 
-@kernel
-def _lit(shadow, frame, lamp, x, y, z):
+@inline
+def _lit(shadow, frame, lamp, slope, x, y, z):
     """Part of the sun that reaches a world point: 0 in shadow to 1, soft at the edge."""
     up = -y
-    slope = 1.0 / max(-lamp[1], 0.05)
     a = (x - lamp[0] * slope * up - frame[0]) / frame[2] - 0.5
     b = (z - lamp[2] * slope * up - frame[1]) / frame[2] - 0.5
     a0, b0 = math.floor(a), math.floor(b)
     c, r = int(a0), int(b0)
-    if c < 0 or r < 0 or c >= shadow.shape[1] - 1 or r >= shadow.shape[0] - 1:
-        return 1.0
-    level = (up + _SHADE_BIAS - frame[3]) * 100.0
-    fa, fb = a - a0, b - b0
+    light = 1.0
+    if c >= 0 and r >= 0 and c < shadow.shape[1] - 1 and r < shadow.shape[0] - 1:
+        level = (up + _SHADE_BIAS - frame[3]) * 100.0
+        fa, fb = a - a0, b - b0
+        light = 0.0
+        r, c = np.uintp(r), np.uintp(c)
+        one = np.uintp(1)
+        if shadow[r, c] <= level:
+            light += (1.0 - fa) * (1.0 - fb)
+        if shadow[r, c + one] <= level:
+            light += fa * (1.0 - fb)
+        if shadow[r + one, c] <= level:
+            light += (1.0 - fa) * fb
+        if shadow[r + one, c + one] <= level:
+            light += fa * fb
+    return light
+
+
+@inline
+def _pool(pools, pool_frame, x, y, z):
+    """Light of the street lamps at a world point, 1 under a lamp."""
+    a = (x - pool_frame[0]) / pool_frame[2]
+    b = (z - pool_frame[1]) / pool_frame[2]
+    c, r = math.floor(a), math.floor(b)
     light = 0.0
-    r, c = np.uintp(r), np.uintp(c)
-    one = np.uintp(1)
-    if shadow[r, c] <= level:
-        light += (1.0 - fa) * (1.0 - fb)
-    if shadow[r, c + one] <= level:
-        light += fa * (1.0 - fb)
-    if shadow[r + one, c] <= level:
-        light += (1.0 - fa) * fb
-    if shadow[r + one, c + one] <= level:
-        light += fa * fb
+    if c >= 0 and r >= 0 and c < pools.shape[1] - 1 and r < pools.shape[0] - 1:
+        fa, fb = a - c, b - r
+        r, c = np.uintp(r), np.uintp(c)
+        one = np.uintp(1)
+        upper = pools[r, c] * (1.0 - fa) + pools[r, c + one] * fa
+        lower = pools[r + one, c] * (1.0 - fa) + pools[r + one, c + one] * fa
+        light = upper * (1.0 - fb) + lower * fb
     return light
 
 
@@ -120,6 +152,8 @@ def shade(
     sky,
     shadow,
     frame,
+    pools,
+    pool_frame,
     T_wc,
     intrinsics,
     lamp,
@@ -127,6 +161,8 @@ def shade(
     depth,
 ):
     """Fill the rows of ``image`` and ``depth`` that belong to a band of samples.
+
+    Pixels whose samples all see one surface are shaded in runs, the others once for each surface.
 
     Args:
         visible: from `rasterise.find_visible`.
@@ -136,130 +172,199 @@ def shade(
         texels, offset, log_size: see `scene.Atlas`.
         sky: number of the sky's panorama.
         shadow, frame: see `shadows.ShadowMap`.
+        pools, pool_frame: see `shadows.LampPools`.
         T_wc, intrinsics, lamp: pose, ``fx fy cx cy``, `render.Light.as_array`.
         image, depth: ``(H, W)`` float32, written; see `render.View`.
     """
-    fx, fy, cx, cy = intrinsics
+    visible, seen, texels, offset = (
+        borrowed(visible), borrowed(seen), borrowed(texels), borrowed(offset))  # fmt: skip
+    log_size, shadow, frame = borrowed(log_size), borrowed(shadow), borrowed(frame)
+    pools, pool_frame, lamp = borrowed(pools), borrowed(pool_frame), borrowed(lamp)
+    T_wc, intrinsics = borrowed(T_wc), borrowed(intrinsics)
     width = image.shape[1]
-    step = 1.0 / samples
-    number = np.empty(samples * samples, np.int64)
-    weight = np.empty(samples * samples)
-    shift_u = np.empty(samples * samples)
-    shift_v = np.empty(samples * samples)
-    rate = 1.0 / lamp[7]
+    room = samples * samples
+    held_number, held = np.empty(room, np.int64), np.empty((3, room))
+    number = borrowed(held_number)
+    weight, shift_u, shift_v = borrowed(held[0]), borrowed(held[1]), borrowed(held[2])
+    held_rows, held_size = np.empty((8, width)), np.empty(width, np.float32)
+    texel, total, nearest = borrowed(held_rows[2:]), borrowed(held_rows[0]), borrowed(held_rows[1])
+    size, bits = borrowed(held_size), borrowed(held_size.view(np.int32))
     for j in range(seen.shape[0] // samples):
         v = first_row + j
-        for u in range(width):
-            kinds = 1
-            first = seen[j * samples, u * samples]
-            number[0], weight[0], shift_u[0], shift_v[0] = first, samples * samples, 0.0, 0.0
-            alike = True
-            for a in range(samples):
-                for b in range(samples):
-                    alike &= seen[j * samples + a, u * samples + b] == first
-            if not alike:
-                kinds = 0
-                for a in range(samples):
-                    for b in range(samples):
-                        s = seen[j * samples + a, u * samples + b]
-                        k = 0
-                        while k < kinds and number[k] != s:
-                            k += 1
-                        if k == kinds:
-                            number[k] = s
-                            weight[k] = shift_u[k] = shift_v[k] = 0.0
-                            kinds += 1
-                        weight[k] += 1.0
-                        shift_u[k] += (b + 0.5) * step - 0.5
-                        shift_v[k] += (a + 0.5) * step - 0.5
-            total = 0.0
-            nearest = 0.0
+        total[:] = 0.0
+        nearest[:] = 0.0
+        start = 0
+        while start < width:
+            first = seen[j * samples, start * samples]
+            end = start
+            while end < width and _alike(seen, j * samples, end * samples, samples, first):
+                end += 1
+            if end > start:
+                number[0], weight[0], shift_u[0], shift_v[0] = first, room, 0.0, 0.0
+                kinds = 1
+            else:
+                end = start + 1
+                kinds = _kinds(
+                    seen, j * samples, start * samples, samples, number, weight, shift_u, shift_v
+                )
             for k in range(kinds):
-                x = u + shift_u[k] / weight[k]
-                y = v + shift_v[k] / weight[k]
-                rx, ry = (x - cx) / fx, (y - cy) / fy
-                wx = T_wc[0, 0] * rx + T_wc[0, 1] * ry + T_wc[0, 2]
-                wy = T_wc[1, 0] * rx + T_wc[1, 1] * ry + T_wc[1, 2]
-                wz = T_wc[2, 0] * rx + T_wc[2, 1] * ry + T_wc[2, 2]
+                x, y = start + shift_u[k] / weight[k], v + shift_v[k] / weight[k]
+                part = weight[k] / room
                 if number[k] < 0:
-                    grey = _sky(texels, offset, log_size, sky, wx, wy, wz, 1.0 / fx)
-                    total += weight[k] * grey * lamp[6] / _SKY_HAZE
-                    continue
-                # No row view here: counting its references costs more than the arithmetic.
-                n = np.uintp(number[k])
-                inverse = visible[n, 6] * x + visible[n, 7] * y + visible[n, 8]
-                z = 1.0 / inverse
-                s = (
-                    visible[n, TEXTURE] * x + visible[n, TEXTURE + 1] * y + visible[n, TEXTURE + 2]
-                ) * z
-                t = (
-                    visible[n, TEXTURE + 3] * x
-                    + visible[n, TEXTURE + 4] * y
-                    + visible[n, TEXTURE + 5]
-                ) * z
-                s_u, t_u = (
-                    (visible[n, TEXTURE] - s * visible[n, 6]) * z,
-                    (visible[n, TEXTURE + 3] - t * visible[n, 6]) * z,
-                )
-                s_v, t_v = (
-                    (visible[n, TEXTURE + 1] - s * visible[n, 7]) * z,
-                    (visible[n, TEXTURE + 4] - t * visible[n, 7]) * z,
-                )
-                along_u, along_v = (
-                    math.sqrt(s_u * s_u + t_u * t_u),
-                    math.sqrt(s_v * s_v + t_v * t_v),
-                )
-                if along_u > along_v:
-                    long, short, ds, dt = along_u, along_v, s_u, t_u
+                    _sky_run(
+                        start, end, x, y, part, texels, offset, log_size, sky, T_wc, intrinsics,
+                        lamp, size, bits, total,
+                    )  # fmt: skip
                 else:
-                    long, short, ds, dt = along_v, along_u, s_v, t_v
-                taps = 1
-                if long > 1.0:
-                    taps = min(math.ceil(long / max(short, 1.0) - 0.25), MAX_TAPS)
-                size = max(long / taps, short)
-                texture = int(visible[n, NUMBER])
-                log_w, log_h = log_size[texture, 0], log_size[texture, 1]
-                albedo = 0.0
-                for tap in range(taps):
-                    f = (tap + 0.5) / taps - 0.5
-                    albedo += _trilinear(
-                        texels, offset, texture, log_w, log_h, size, s + f * ds, t + f * dt
+                    _shade_run(
+                        visible, number[k], start, end, x, y, part, texels, offset, log_size,
+                        shadow, frame, pools, pool_frame, T_wc, intrinsics, lamp, texel, size,
+                        bits, total, nearest,
+                    )  # fmt: skip
+            start = end
+        for u in range(width):
+            image[v, u] = total[u] * lamp[8]
+            depth[v, u] = 1.0 / nearest[u] if nearest[u] > 0.0 else 0.0
+    # What is borrowed above must live until here.
+    held[0, 0] = held_number[0] + held_rows[0, 0] + held_size[0]
+
+
+@inline
+def _kinds(seen, row, column, samples, number, weight, shift_u, shift_v):
+    """The different surfaces that the samples of a pixel see, how many samples see each, and the
+    sum of their shifts from the pixel's centre."""
+    kinds = 0
+    step = 1.0 / samples
+    for a in range(samples):
+        for b in range(samples):
+            s = seen[np.uintp(row + a), np.uintp(column + b)]
+            k = 0
+            while k < kinds and number[k] != s:
+                k += 1
+            if k == kinds:
+                number[k] = s
+                weight[k] = shift_u[k] = shift_v[k] = 0.0
+                kinds += 1
+            weight[k] += 1.0
+            shift_u[k] += (b + 0.5) * step - 0.5
+            shift_v[k] += (a + 0.5) * step - 0.5
+    return kinds
+
+
+@inline
+def _alike(seen, row, column, samples, first):
+    alike = True
+    for a in range(samples):
+        for b in range(samples):
+            alike &= seen[np.uintp(row + a), np.uintp(column + b)] == first
+    return alike
+
+
+@inline
+def _sky_run(
+    start, end, x0, y, weight, texels, offset, log_size, sky, T_wc, intrinsics, lamp, size, bits,
+    total,
+):  # fmt: skip
+    """As `_shade_run`, for the sky."""
+    fx, fy, cx, cy = intrinsics
+    scale_u = (1 << log_size[sky, 0]) / (2.0 * math.pi)
+    scale_v = (1 << log_size[sky, 1]) / (SKY_RISE + SKY_FALL)
+    size[0] = max(scale_u, scale_v) / fx
+    ry = (y - cy) / fy
+    for u in range(start, end):
+        rx = (x0 + (u - start) - cx) / fx
+        grey = _sky(
+            texels, offset, log_size, sky, lamp, T_wc[0, 0] * rx + T_wc[0, 1] * ry + T_wc[0, 2],
+            T_wc[1, 0] * rx + T_wc[1, 1] * ry + T_wc[1, 2],
+            T_wc[2, 0] * rx + T_wc[2, 1] * ry + T_wc[2, 2], bits[0],
+        )  # fmt: skip
+        total[u] += weight * grey * lamp[6] / _SKY_HAZE
+
+
+@inline
+def _shade_run(
+    visible, number, start, end, x0, y, weight, texels, offset, log_size, shadow, frame,
+    pools, pool_frame, T_wc, intrinsics, lamp, texel, size, bits, total, nearest,
+):  # fmt: skip
+    """Add one surface on the pixels ``start`` to ``end`` of a row, the first of which is sampled at
+    ``(x0, y)``, to ``total`` and ``nearest``. ``texel``, ``size``: room for one row;
+    ``bits``: ``size`` seen as integers."""
+    fx, fy, cx, cy = intrinsics
+    ry = (y - cy) / fy
+    count = end - start
+    # Direction of the ray: base + x step.
+    step_x, step_y, step_z = T_wc[0, 0] / fx, T_wc[1, 0] / fx, T_wc[2, 0] / fx
+    base_x = T_wc[0, 1] * ry + T_wc[0, 2] + (x0 - cx) * step_x
+    base_y = T_wc[1, 1] * ry + T_wc[1, 2] + (x0 - cx) * step_y
+    base_z = T_wc[2, 1] * ry + T_wc[2, 2] + (x0 - cx) * step_z
+    n = np.uintp(number)  # no row view: counting its references costs more than the arithmetic
+    au, av = visible[n, TEXTURE], visible[n, TEXTURE + 3]
+    bu, bv = visible[n, TEXTURE + 1], visible[n, TEXTURE + 4]
+    inverse_0 = visible[n, 6] * x0 + visible[n, 7] * y + visible[n, 8]
+    u_0 = au * x0 + bu * y + visible[n, TEXTURE + 2]
+    v_0 = av * x0 + bv * y + visible[n, TEXTURE + 5]
+    p6, p7 = visible[n, 6], visible[n, 7]
+    for i in range(np.uintp(count)):
+        at = np.float64(np.int64(i))
+        z = 1.0 / (inverse_0 + at * p6)
+        s, t = (u_0 + at * au) * z, (v_0 + at * av) * z
+        s_u, t_u = (au - s * p6) * z, (av - t * p6) * z
+        s_v, t_v = (bu - s * p7) * z, (bv - t * p7) * z
+        along_u, along_v = s_u * s_u + t_u * t_u, s_v * s_v + t_v * t_v
+        wide = along_u > along_v
+        long, short = math.sqrt(max(along_u, along_v)), math.sqrt(min(along_u, along_v))
+        twice = long > _TWO_TAPS * max(short, 1.0)
+        texel[0, i], texel[1, i], texel[2, i] = z, s, t
+        texel[3, i] = (0.25 * (s_u if wide else s_v)) if twice else 0.0
+        texel[4, i] = (0.25 * (t_u if wide else t_v)) if twice else 0.0
+        size[i] = max(0.5 * long if twice else long, short)
+    texture, fine = int(visible[n, NUMBER]), int(visible[n, DETAIL])
+    log_w, log_h = log_size[texture, 0], log_size[texture, 1]
+    for i in range(count):
+        s, t = texel[1, i], texel[2, i]
+        ds, dt = texel[3, i], texel[4, i]
+        taps = 2 if ds != 0.0 or dt != 0.0 else 1
+        albedo = np.float32(0.0)
+        for tap in range(taps):
+            f = taps - 1 - 2 * tap  # 0, or 1 and -1
+            albedo += _trilinear(
+                texels, offset, texture, log_w, log_h, bits[i], s + f * ds, t + f * dt
+            )
+        texel[5, i] = albedo / np.float32(taps)
+    if fine >= 0:
+        detail_u, detail_v = visible[n, DETAIL_U], visible[n, DETAIL_V]
+        finer = max(detail_u, detail_v)
+        log_d = log_size[fine, 0]
+        for i in range(count):
+            size[i] = min(size[i] * finer, 2.0 * _DETAIL_ENDS)
+            if size[i] < _DETAIL_ENDS:
+                texel[5, i] *= (
+                    _trilinear(
+                        texels, offset, fine, log_d, log_d, bits[i], texel[1, i] * detail_u,
+                        texel[2, i] * detail_v,
                     )
-                albedo /= taps
-                fine = int(visible[n, DETAIL])
-                if fine >= 0:
-                    detail_size = size * max(visible[n, DETAIL_U], visible[n, DETAIL_V])
-                    log_d = log_size[fine, 0]
-                    if detail_size < _DETAIL_ENDS:
-                        albedo *= (
-                            _trilinear(
-                                texels,
-                                offset,
-                                fine,
-                                log_d,
-                                log_d,
-                                detail_size,
-                                s * visible[n, DETAIL_U],
-                                t * visible[n, DETAIL_V],
-                            )
-                            / 128.0
-                        )
-                light = visible[n, AMBIENT]
-                if visible[n, SUN] > 0.0:
-                    light += visible[n, SUN] * _lit(
-                        shadow,
-                        frame,
-                        lamp,
-                        T_wc[0, 3] + z * wx,
-                        T_wc[1, 3] + z * wy,
-                        T_wc[2, 3] + z * wz,
-                    )
-                if lamp[9] > 0.0:
-                    beam = math.exp(-3.0 * rx * rx - 30.0 * (ry - 0.08) * (ry - 0.08))
-                    light += lamp[9] * beam * 200.0 / (100.0 + z * z)
-                grey = albedo * (light + visible[n, GLOW])
-                clear = 1.0 / (1.0 + z * rate * (1.0 + 0.5 * z * rate))
-                total += weight[k] * (grey * clear + lamp[6] * (1.0 - clear))
-                nearest = max(nearest, inverse)
-            image[v, u] = total * lamp[8] / (samples * samples)
-            depth[v, u] = 1.0 / nearest if nearest > 0.0 else 0.0
+                    / 128.0
+                )  # fmt: skip
+    ambient, sun = visible[n, AMBIENT] + visible[n, GLOW], visible[n, SUN]
+    slope = 1.0 / max(-lamp[1], 0.05)
+    rate = 1.0 / lamp[7]
+    lamps, beams = lamp[5] > 0.0, lamp[9] > 0.0
+    gain = visible[n, AMBIENT] / max(lamp[4], 1e-6)
+    for i in range(count):
+        z = texel[0, i]
+        light = ambient
+        if sun > 0.0 or lamps:
+            x = T_wc[0, 3] + z * (base_x + i * step_x)
+            up = T_wc[1, 3] + z * (base_y + i * step_y)
+            far = T_wc[2, 3] + z * (base_z + i * step_z)
+            if sun > 0.0:
+                light += sun * _lit(shadow, frame, lamp, slope, x, up, far)
+            if lamps:
+                light += _POOL_GAIN * gain * lamp[5] * _pool(pools, pool_frame, x, up, far)
+        if beams:
+            rx = (x0 + i - cx) / fx
+            beam = math.exp(-3.0 * rx * rx - 30.0 * (ry - 0.08) * (ry - 0.08))
+            light += lamp[9] * beam * 200.0 / (100.0 + z * z)
+        clear = 1.0 / (1.0 + z * rate * (1.0 + 0.5 * z * rate))
+        total[start + i] += weight * (texel[5, i] * light * clear + lamp[6] * (1.0 - clear))
+        nearest[start + i] = max(nearest[start + i], 1.0 / z)

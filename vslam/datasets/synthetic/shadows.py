@@ -13,6 +13,7 @@ from vslam.kernels import kernel
 
 _MAX_CELLS = 30e6
 _FINEST = 0.08  # m
+_POOL_CELL, _POOL_REACH = 0.5, 16.0  # m
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,41 @@ class ShadowMap:
 
     height_cm: NDArray[np.uint16]
     frame: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LampPools:
+    """Light that street lamps cast, whatever the height: a lamp's cone is taken as a cylinder.
+
+    Attributes:
+        light: ``(R, C)`` float32, 1 under a lamp; rows along z, columns along x.
+        frame: ``(3,)`` float64 x and z of node (0, 0) and the distance of nodes, metres.
+    """
+
+    light: NDArray[np.float32]
+    frame: NDArray[np.float64]
+
+
+NO_LAMPS = LampPools(np.zeros((1, 1), np.float32), np.array([0.0, 0.0, 1.0]))
+
+
+def lamp_pools(lamps: NDArray[np.float64]) -> LampPools:
+    """Pools of light about the lamps ``(L, 2)`` (x, z)."""
+    if len(lamps) == 0:
+        return NO_LAMPS
+    low = np.floor(lamps.min(axis=0) - _POOL_REACH)
+    columns, rows = np.ceil((lamps.max(axis=0) + _POOL_REACH - low) / _POOL_CELL).astype(int) + 1
+    light = np.zeros((rows, columns), np.float32)
+    reach = int(_POOL_REACH / _POOL_CELL)
+    for xz in lamps:
+        c, r = np.rint((xz - low) / _POOL_CELL).astype(int)
+        window = slice(max(r - reach, 0), r + reach + 1), slice(max(c - reach, 0), c + reach + 1)
+        y, x = np.mgrid[window]
+        away = (x * _POOL_CELL + low[0] - xz[0]) ** 2 + (y * _POOL_CELL + low[1] - xz[1]) ** 2
+        # A lamp six metres up, by the law of the inverse square and two cosines; 0 at the border.
+        fall = (1.0 + away / 36.0) ** -2 - (1.0 + _POOL_REACH**2 / 36.0) ** -2
+        light[window] += np.maximum(fall, 0.0).astype(np.float32)
+    return LampPools(light, np.array([low[0], low[1], _POOL_CELL]))
 
 
 def cast_shadows(surfaces: Surfaces, atlas: Atlas, sun: NDArray[np.float64]) -> ShadowMap:

@@ -53,6 +53,8 @@ class Site:
         rng: for what need not be the same in another variation.
         parts: surfaces of each thing, in the route's world.
         place, when: of each thing; see `town.Town`.
+        cameras: ``(N, 2)`` x and z of all places where a camera may stand.
+        lamps: x and z of street lamps.
     """
 
     route: Route
@@ -63,14 +65,11 @@ class Site:
     atlas: AtlasBuilder
     palette: Palette
     rng: Rng
+    cameras: Float
+    lamps: list[Float] = field(default_factory=list)
     parts: list[Surfaces] = field(default_factory=list)
     place: list[Float] = field(default_factory=list)
     when: list[int] = field(default_factory=list)
-
-    @property
-    def cameras(self) -> Float:
-        """``(N, 2)`` x and z of all camera positions."""
-        return self.route.T_wc[:, [0, 2], 3]
 
     @property
     def next_thing(self) -> int:

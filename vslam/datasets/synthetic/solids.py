@@ -82,7 +82,7 @@ def roof(
     w, h, d = size
     tone = float(rng.uniform(0.6, 1.4))
     over = 0.45
-    if rng.random() < 0.15:
+    if h > 7.0 and rng.random() < 0.15:
         rim = box((-w / 2 - 0.2, -h - 0.5, -0.2), (w / 2 + 0.2, -h, d + 0.2), wall, thing=thing,
                   repeat=3.0, gain=0.7)  # fmt: skip
         return rim
@@ -133,17 +133,18 @@ def tree(
             rng.normal(0, 0.25, cards) * spread])  # fmt: skip
         size = np.clip(2.1 * spread, 0.8, None)
     else:
-        cards = int(rng.integers(16, 24))
+        cards = int(rng.integers(18, 26))
         wide, tall = 0.30 * height * float(rng.uniform(0.85, 1.15)), 0.5 * (height - clear)
         direction = rng.normal(0, 1, (cards, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         reach = rng.uniform(0.25, 0.8, (cards, 1))
         middle = direction * reach * [wide, tall, wide] + [0, -(clear + tall), 0]
         size = rng.uniform(0.32, 0.5, cards) * height * 0.62
-    parts += [
-        _card(rng, at, float(a), int(rng.choice(twigs)), thing, 0.8 if conifer else 1.0)
-        for at, a in zip(middle, size, strict=True)
-    ]
+    if not conifer:
+        for at in middle[: int(rng.integers(4, 8))]:
+            parts.append(_branch(rng, np.array([0.0, -0.9 * clear, 0.0]), 0.8 * at,
+                                 radius, bark, thing))  # fmt: skip
+    parts.append(_cards(rng, middle, size, twigs, thing, 0.8 if conifer else 1.0))
     return join(parts)
 
 
@@ -153,10 +154,7 @@ def bush(rng: Rng, twigs: Sequence[int], *, height: float, thing: int) -> Surfac
     middle = np.column_stack([
         rng.normal(0, 0.3 * height, cards), rng.uniform(-0.75, -0.4, cards) * height,
         rng.normal(0, 0.3 * height, cards)])  # fmt: skip
-    return join([
-        _card(rng, at, float(rng.uniform(0.7, 1.1)) * height, int(rng.choice(twigs)), thing, 0.9)
-        for at in middle
-    ])  # fmt: skip
+    return _cards(rng, middle, rng.uniform(0.7, 1.1, cards) * height, twigs, thing, 0.9)
 
 
 def _trunk(radius: float, height: float, bark: int, thing: int) -> Surfaces:
@@ -172,16 +170,34 @@ def _trunk(radius: float, height: float, bark: int, thing: int) -> Surfaces:
     )
 
 
-def _card(rng: Rng, middle: Vector, size: float, twig: int, thing: int, gain: float) -> Surfaces:
-    heading, tilt, roll = rng.uniform(0, 2 * np.pi), rng.uniform(-0.6, 0.6), rng.uniform(0, 6.3)
-    across = np.array([np.cos(heading), 0.0, -np.sin(heading)])
-    normal = np.array([np.sin(heading), np.sin(tilt), np.cos(heading)])
-    up = np.cross(normal / np.linalg.norm(normal), across)
-    s = np.cos(roll) * across + np.sin(roll) * up
-    t = np.cos(roll) * up - np.sin(roll) * across
-    corner = np.asarray(middle) - 0.5 * size * (s + t)
-    return patches(corner, size * s, size * t, twig, material=FOLIAGE, thing=thing,
-                   gain=gain * float(rng.uniform(0.8, 1.25)))  # fmt: skip
+def _branch(rng: Rng, start: Vector, end: Vector, radius: float, bark: int, thing: int) -> Surfaces:
+    """Two crossed strips from ``start`` to ``end``."""
+    way = np.asarray(end) - np.asarray(start)
+    side = np.cross(way, rng.normal(0, 1, 3))
+    side /= np.linalg.norm(side)
+    other = np.cross(side, way / np.linalg.norm(way))
+    across = 1.1 * radius * np.stack([side, other])
+    return patches(start - 0.5 * across, across, np.tile(way, (2, 1)), bark,
+                   uv=(0, 0.3, 0, 0, 0, 2.0), thing=thing)  # fmt: skip
+
+
+def _cards(
+    rng: Rng, middle: NDArray[np.float64], size: NDArray[np.float64], twigs: Sequence[int],
+    thing: int, gain: float,
+) -> Surfaces:  # fmt: skip
+    """Square twigs at ``middle`` ``(N, 3)`` with sides ``size`` ``(N,)``, turned at random."""
+    n = len(middle)
+    heading, tilt, roll = rng.uniform((0, -0.6, 0), (2 * np.pi, 0.6, 6.3), (n, 3)).T[:, :, None]
+    zero = np.zeros_like(heading)
+    across = np.hstack([np.cos(heading), zero, -np.sin(heading)])
+    normal = np.hstack([np.sin(heading), np.sin(tilt), np.cos(heading)])
+    up = np.cross(normal / np.linalg.norm(normal, axis=1, keepdims=True), across)
+    s = size[:, None] * (np.cos(roll) * across + np.sin(roll) * up)
+    t = size[:, None] * (np.cos(roll) * up - np.sin(roll) * across)
+    cards = patches(middle - 0.5 * (s + t), s, t, 0, material=FOLIAGE, thing=thing)
+    cards.texture[:] = rng.choice(twigs, n)
+    cards.gain[:] = gain * rng.uniform(0.8, 1.25, n)
+    return cards
 
 
 def hedge(rng: Rng, length: float, height: float, texture: int, top: int, thing: int) -> Surfaces:

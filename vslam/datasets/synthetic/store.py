@@ -4,35 +4,43 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import shutil
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from vslam.camera import StereoCamera
 from vslam.datasets.synthetic.camera_effects import sensor_image
+from vslam.datasets.synthetic.files import (
+    check_disk,
+    checksum,
+    damaged_frames,
+    frame_files,
+    locked,
+    size,
+    write,
+    write_png,
+    writing,
+)
 from vslam.datasets.synthetic.passes import Passes
 from vslam.datasets.synthetic.render import Renderer
 from vslam.datasets.synthetic.routes import RATE, Route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.town import build_town
-from vslam.errors import InputError
 from vslam.trajectory import write_kitti
 
-VERSION = 1  # raise it whenever the same seed gives other bytes
-_IMAGE_BYTES, _DEPTH_BYTES = 380_000, 330_000  # of one file, generous
-_RESERVE = 200_000_000  # bytes left free
+VERSION = 2  # raise it whenever the same seed gives other bytes
 _DEPTH_SCALE = 100.0  # 16-bit depth counts centimetres
 _RECORD = "manifest.json"
+
+_log = logging.getLogger(__name__)
 
 OnFrame = Callable[[int, int], None]
 
@@ -100,6 +108,7 @@ def render_sequence(
     *,
     depth: bool = False,
     until: int | None = None,
+    verify: bool = False,
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> Path:
@@ -111,39 +120,70 @@ def render_sequence(
         cache: folder for the trees; see `cache_folder`.
         depth: write ``depth_0``, 16-bit PNG in centimetres of the left eye, too.
         until: render the frames before this one only; a later call goes on from there.
+        verify: compare the checksum of every frame. Without it the sizes of all files and the
+            checksums of a few frames are compared. Damaged frames are rendered again, with a
+            warning in the log.
         threads: frames in work at a time; the bytes do not depend on it.
         on_frame: called with frames done and in all.
 
     Raises:
-        InputError: the folder cannot be written or the disk is too small.
+        InputError: the folder cannot be written, the disk is too small or another process is
+            rendering the sequence.
     """
     root = cache / folder_name(variation)
     folder = root / "sequences" / route.name
     wanted = _record_of(route, variation, depth)
-    found = _read_record(folder)
-    if found is not None and {**found, "checksums": None} == {**wanted, "checksums": None}:
-        if "checksums" in found:
+    frames = len(route.T_wc)
+    n = min(until or frames, frames)
+    found = _matching_record(folder, wanted, route.camera)
+    if found is not None and "checksums" in found:
+        if not (damaged := damaged_frames(folder, found, thorough=verify)):
             return root
-    elif folder.exists():
-        shutil.rmtree(folder)
-    n = min(until or len(route.T_wc), len(route.T_wc))
-    missing = [k for k in range(n) if not all(p.exists() for p in _files(folder, k, depth))]
+        numbers = ", ".join(map(str, damaged[:5])) + (", ..." if len(damaged) > 5 else "")
+        _log.warning("%s: %d damaged, rendered again: %s", folder, len(damaged), numbers)
+        missing, n = damaged, frames
+    else:
+        missing = list(range(n)) if found is None else _missing(folder, n, depth)
     check_disk(cache, len(missing), depth)
-    with writing(cache):
+    with writing(cache), locked(folder):
+        if found is None and folder.exists():
+            shutil.rmtree(folder)
         for name in ("image_0", "image_1", *(("depth_0",) if depth else ())):
             (folder / name).mkdir(parents=True, exist_ok=True)
-        _write(folder / _RECORD, json.dumps(wanted).encode())
-        _write(folder / "times.txt", "".join(f"{t:.6e}\n" for t in route.timestamps).encode())
-        _write(folder / "calib.txt", _calibration(route.camera).encode())
+        write(folder / _RECORD, json.dumps(wanted).encode())
+        write(folder / "times.txt", "".join(f"{t:.6e}\n" for t in route.timestamps).encode())
+        write(folder / "calib.txt", _calibration(route.camera).encode())
         (root / "poses").mkdir(exist_ok=True)
         write_kitti(root / "poses" / f"{route.name}.txt", route.ground_truth)
+        for k in missing:
+            for path in frame_files(folder, k, depth):
+                path.unlink(missing_ok=True)
         if missing:
             _render(route, variation, folder, missing, depth, threads, on_frame)
-        if n < len(route.T_wc):
+        if n < frames:
             return root
-        sums = [_checksum(_files(folder, k, depth)) for k in range(n)]
-        _write(folder / _RECORD, json.dumps({**wanted, "checksums": sums}).encode())
+        files = [frame_files(folder, k, depth) for k in range(n)]
+        sums = {"checksums": [checksum(f) for f in files], "sizes": [size(f) for f in files]}
+        write(folder / _RECORD, json.dumps({**wanted, **sums}).encode())
     return root
+
+
+def _matching_record(
+    folder: Path, wanted: dict[str, Any], camera: StereoCamera
+) -> dict[str, Any] | None:
+    """The manifest of a folder, if it is one of what is wanted."""
+    found = _read_record(folder)
+    if found is None or any(found.get(key) != value for key, value in wanted.items()):
+        return None
+    try:
+        same = (folder / "calib.txt").read_text() == _calibration(camera)
+    except FileNotFoundError:
+        same = True
+    return found if same else None
+
+
+def _missing(folder: Path, n: int, depth: bool) -> list[int]:
+    return [k for k in range(n) if not all(p.exists() for p in frame_files(folder, k, depth))]
 
 
 def _render(
@@ -163,8 +203,10 @@ def _render(
 
     def frame(k: int) -> None:
         moment = passes.at(k)
-        views = renderer.stereo(moment.surfaces, moment.shadows, moment.light, route.T_wc[k])
-        paths = _files(folder, k, depth)
+        views = renderer.stereo(
+            moment.surfaces, moment.shadows, moment.light, route.T_wc[k], moment.pools
+        )
+        paths = frame_files(folder, k, depth)
         for eye, (view, path) in enumerate(zip(views, paths, strict=False)):
             image = sensor_image(
                 view.image,
@@ -219,31 +261,6 @@ def _read_record(folder: Path) -> dict[str, Any] | None:
         return None
 
 
-def _files(folder: Path, frame: int, depth: bool) -> list[Path]:
-    names = ("image_0", "image_1", *(("depth_0",) if depth else ()))
-    return [folder / name / f"{frame:06d}.png" for name in names]
-
-
-def _checksum(paths: list[Path]) -> str:
-    digest = hashlib.sha256()
-    for path in paths:
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def _write(path: Path, data: bytes) -> None:
-    """Whole or not at all."""
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    part.write_bytes(data)
-    os.replace(part, path)
-
-
-def write_png(path: Path, image: NDArray[Any], level: int) -> None:
-    """Write a PNG whole or not at all."""
-    data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, level])[1]
-    _write(path, data.tobytes())
-
-
 def _calibration(camera: StereoCamera) -> str:
     lines = []
     for eye in range(4):
@@ -251,29 +268,3 @@ def _calibration(camera: StereoCamera) -> str:
         numbers = [camera.fx, 0, camera.cx, shift, 0, camera.fy, camera.cy, 0, 0, 0, 1, 0]
         lines.append(f"P{eye}: " + " ".join(f"{x:.12e}" for x in numbers) + "\n")
     return "".join(lines)
-
-
-def check_disk(cache: Path, frames: int, depth: bool) -> None:
-    """Refuse, with what it needs, to render ``frames`` pairs of images onto a disk too small."""
-    needed = frames * (2 * _IMAGE_BYTES + (_DEPTH_BYTES if depth else 0))
-    there = cache
-    while not there.exists() and there != there.parent:
-        there = there.parent
-    free = shutil.disk_usage(there).free
-    if frames and needed + _RESERVE > free:
-        raise InputError(
-            f"{cache}: rendering {frames} frames needs {needed / 1e9:.1f} GB and "
-            f"{_RESERVE / 1e9:.1f} GB to spare but {free / 1e9:.1f} GB are free; "
-            "free some space or set $VSLAM_CACHE to another disk."
-        )
-
-
-@contextmanager
-def writing(cache: Path) -> Iterator[None]:
-    """Turn what the file system refuses into one sentence."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(
-            f"{cache}: cannot be written ({error.strerror}); set $VSLAM_CACHE to another folder."
-        ) from error

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from vslam.datasets.synthetic import solids
 from vslam.datasets.synthetic.ground import RoadStyle
 from vslam.datasets.synthetic.plan import CLEARANCE, rectangle
-from vslam.datasets.synthetic.scene import Surfaces, join
+from vslam.datasets.synthetic.scene import Surfaces, join, patches
 from vslam.datasets.synthetic.site import AFTER, ALIASES, ALWAYS, BEFORE, Float, Site
 from vslam.datasets.synthetic.vehicles import make_car
+
+_KERB = (0.15, 0.12)  # width and height of kerb stones, m
 
 
 def plant(site: Site, xz: Float, height: float) -> None:
@@ -45,6 +48,31 @@ def _pruned(site: Site, model: Surfaces, xz: Float) -> Surfaces | None:
     return model.select(~hangs) if hangs.mean() < 0.3 else None
 
 
+def lay_kerbs(site: Site) -> None:
+    """Raised kerb stones between carriageway and pavement, broken where a road joins and where the
+    drive cuts a corner."""
+    roads, edge, step = site.roads, site.style.parking, 8
+    tree, cameras = cKDTree(roads.xz), cKDTree(site.cameras)
+    first = np.arange(0, len(roads.xz) - step, step)
+    first = first[np.abs(roads.along[first + step] - roads.along[first]) < 0.25 * step + 0.5]
+    right = roads.right
+    for side in (-1.0, 1.0):
+        ends = [roads.xz[k] + side * edge * right[k] for k in (first, first + step)]
+        back = [roads.xz[k] + side * (edge + _KERB[0]) * right[k] for k in (first, first + step)]
+        free = np.ones(len(first), bool)
+        for at in (ends[0], 0.5 * (ends[0] + ends[1]), ends[1]):
+            free &= (tree.query(at)[0] > edge - 0.1) & (cameras.query(at)[0] > CLEARANCE + 1.2)
+        a, b, c = (_on_ground(site, xz[free], _KERB[1]) for xz in (*ends, back[0]))
+        along = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 1.0])
+        for across in (np.array([0.0, _KERB[1] + 0.1, 0.0]), c - a):
+            site.parts.append(patches(a, b - a, across, site.palette.kerb, uv=along))
+
+
+def _on_ground(site: Site, xz: Float, height: float) -> Float:
+    up = site.route.terrain.height(xz) + height
+    return np.stack([xz[:, 0], -up, xz[:, 1]], axis=1)
+
+
 def fill_behind(site: Site) -> None:
     """Big trees between and behind the houses."""
     rng, roads = site.rng, site.roads
@@ -58,13 +86,14 @@ def fill_behind(site: Site) -> None:
 def furnish(site: Site) -> None:
     """Cars, hedges, trees, posts and shrubs along the streets."""
     roads, style, rng = site.roads, site.style, site.rng
+    town = site.route.land == "town"
     for side in (-1.0, 1.0):
         for step, rate, action in (
-            (21, 0.62, _park),
-            (26, 0.55, _screen),
-            (38, 0.55, _kerb_tree),
+            (21, 0.62 if town else 0.3, _park),
+            (26, 0.45 if town else 0.95, _screen),
+            (38, 0.5 if town else 0.6, _kerb_tree),
             (62, 0.7, _post),
-            (17, 0.45, _shrub),
+            (17, 0.3 if town else 0.75, _shrub),
         ):
             for at in range(int(rng.integers(0, step)), len(roads.xz), step):
                 if rng.random() < rate and not roads.junction[at]:
@@ -98,12 +127,12 @@ def _screen(site: Site, xz: Float, out: Float, style: RoadStyle) -> None:
     if not site.plan.claim(rectangle(at + 0.4 * out, heading, length, 0.8), road=style.walk - 0.2):
         return
     kind = rng.random()
-    if kind < 0.5:
+    if kind < (0.45 if site.route.land == "town" else 0.6):
         model = solids.hedge(
             rng, length, float(rng.uniform(0.9, 2.2)),
             int(rng.choice(site.palette.hedges)), site.palette.leaves, thing,
         )  # fmt: skip
-    elif kind < 0.7:
+    elif kind < 0.75:
         model = solids.panel(
             length, float(rng.uniform(0.8, 1.4)), int(rng.choice(site.palette.fences)), thing
         )
@@ -136,7 +165,8 @@ def _kerb_tree(site: Site, xz: Float, out: Float, style: RoadStyle) -> None:
 
 def _shrub(site: Site, xz: Float, out: Float, style: RoadStyle) -> None:
     rng, height = site.rng, float(site.rng.uniform(0.7, 2.4))
-    at = xz + out * (style.walk + float(rng.uniform(0.7, 3.0)))
+    deep = 3.0 if site.route.land == "town" else 7.0
+    at = xz + out * (style.walk + float(rng.uniform(0.7, deep)))
     if site.plan.claim(rectangle(at, 0.0, height, height), road=style.walk - 0.3):
         site.stand(
             solids.bush(rng, site.palette.twigs, height=height, thing=site.next_thing), at, 0.0
@@ -150,6 +180,7 @@ def _post(site: Site, xz: Float, out: Float, style: RoadStyle) -> None:
         return
     heading = float(np.arctan2(out[0], out[1]))
     if rng.random() < 0.5:
+        site.lamps.append(at - 0.9 * out)
         model = solids.lamp_post(
             float(rng.uniform(4.8, 7.5)), 0.9, site.palette.metal, site.palette.lamp, thing
         )

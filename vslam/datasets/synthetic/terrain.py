@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,11 +53,11 @@ class Roads:
     along: Float
     junction: NDArray[np.bool_]
 
-    @property
+    @cached_property
     def forward(self) -> Float:
         return np.stack([np.sin(self.heading), np.cos(self.heading)], axis=1)
 
-    @property
+    @cached_property
     def right(self) -> Float:
         return np.stack([np.cos(self.heading), -np.sin(self.heading)], axis=1)
 

@@ -113,7 +113,7 @@ def foliage(rng: Rng, size: int = 256, density: float = 1.0) -> tuple[Grey, Grey
         )
         for image, value in ((alpha, 255.0), (grey, 24.0)):
             cv2.line(image, (size // 2, size // 2), end, value, 2)
-    _leaves(rng, grey, alpha, int(620 * density), radial=True)
+    _leaves(rng, grey, alpha, int(1700 * density), radial=True)
     return grey, alpha
 
 
@@ -123,7 +123,7 @@ def hedge(rng: Rng, width: int = 512, height: int = 128) -> tuple[Grey, Grey]:
     alpha = np.zeros((height, width), np.float32)
     edge = (0.07 + 0.02 * noise(rng, 1, width, 24.0, 4)[0]) * height
     alpha[np.arange(height)[:, None] > edge] = 255.0
-    _leaves(rng, grey, alpha, width * height // 70, radial=False)
+    _leaves(rng, grey, alpha, width * height // 30, radial=False)
     alpha[-2:] = 255.0
     shade = np.linspace(1.12, 0.7, height, dtype=np.float32)[:, None]
     return grey * shade, alpha
@@ -141,12 +141,12 @@ def _leaves(rng: Rng, grey: Grey, alpha: Grey, count: int, *, radial: bool) -> N
         x, y = rng.uniform(0, width, count), rng.uniform(height * 0.06, height, count)
     light = rng.uniform(0, 1, count)
     order = np.argsort(light)  # bright leaves lie on top
-    radius = np.clip(rng.gamma(6.0, width / 256 * 0.62 if radial else 0.55, count), 1.0, 14.0)
+    radius = np.clip(rng.gamma(6.0, width / 256 * 0.37 if radial else 0.30, count), 1.0, 14.0)
     turn = rng.uniform(0, 180, count)
     for k in order:
         at = (int(x[k]), int(y[k]))
         axes = (max(1, int(radius[k] * 1.4)), max(1, int(radius[k] * 0.8)))
-        value = 26.0 + 100.0 * float(light[k]) ** 1.5
+        value = 20.0 + 105.0 * float(light[k]) ** 1.7
         cv2.ellipse(grey, at, axes, float(turn[k]), 0, 360, value, -1)
         cv2.ellipse(alpha, at, axes, float(turn[k]), 0, 360, 255.0, -1)
 
@@ -213,13 +213,18 @@ def sky(rng: Rng, *, treeline: bool = True) -> Grey:
     """Panorama of clouds over a far treeline; u is the heading, v falls with elevation."""
     height, width = 512, 2048
     rise = np.linspace(SKY_RISE, -SKY_FALL, height, dtype=np.float32)[:, None]
-    image = 178.0 + 52.0 * np.exp(-rise / 0.22) * np.ones((1, width), np.float32)
+    zenith = float(rng.uniform(70, 125))  # a clear sky is dark to a camera without colour
+    image = zenith + 75.0 * np.exp(-rise / 0.25) * np.ones((1, width), np.float32)
     clouds = noise(rng, height, width, 300.0, 6)
     clouds = clouds + 0.5 * noise(rng, height, width, 90.0, 5)
-    image += np.clip(clouds - 0.2, 0, 1.6) * 30.0 * np.clip(rise * 4 + 0.4, 0, 1)
+    image += (
+        np.clip(clouds - float(rng.uniform(0.0, 0.6)), 0, 1.6)
+        * 45.0
+        * np.clip(rise * 4 + 0.4, 0, 1)
+    )
     image = np.minimum(image, 250.0)
     if treeline:
-        for far, tone in ((0.050, 150.0), (0.032, 118.0)):
+        for far, tone in ((0.050, 120.0), (0.032, 90.0)):
             top = far + 0.25 * far * noise(rng, 1, width, 240.0, 7)[0]
             rough = noise(rng, height, width, 10.0, 3)
             trees = rise < top + 0.002 * rough

@@ -20,7 +20,7 @@ from vslam.datasets.synthetic.vehicles import make_car
 
 _ROADS = {
     "town": RoadStyle(4.2, 6.3, 8.3, 3.0, 4.5, False, 0.8),
-    "suburb": RoadStyle(4.2, 5.0, 6.6, 2.0, 5.0, True, 0.6),
+    "suburb": RoadStyle(4.2, 6.2, 7.6, 2.0, 5.0, False, 0.6),
     "motorway": RoadStyle(8.5, 9.6, 11.0, 6.0, 9.0, True, 0.25),
 }
 
@@ -36,6 +36,7 @@ class Town:
         place: ``(T, 2)`` float64 x and z of each thing.
         when: ``(T,)`` int8 ``ALWAYS``, ``BEFORE`` or ``AFTER``.
         moving: cars in their own frames; see `solids`.
+        lamps: ``(L, 2)`` float64 x and z of street lamps.
     """
 
     surfaces: Surfaces
@@ -44,23 +45,28 @@ class Town:
     place: Float
     when: NDArray[np.int8]
     moving: tuple[Surfaces, ...]
+    lamps: Float
 
 
-def build_town(route: Route, variation: Variation) -> Town:
-    """The town of a route."""
+def build_town(route: Route, variation: Variation, sway: float = 0.0) -> Town:
+    """The town of a route, with room for cameras up to ``sway`` metres to either side of it."""
     rng = np.random.default_rng([variation.seed, 1])
     atlas = AtlasBuilder()
     motorway = route.land == "motorway"
     roads = route.roads if motorway else _with_side_streets(route.roads, variation.seed)
+    aside = np.array([-sway, 0.0, sway] if sway else [0.0])
+    places = route.T_wc[:, None, :3, 3] + aside[:, None] * route.T_wc[:, None, :3, 0]
+    cameras = places.reshape(-1, 3)[:, [0, 2]]
     site = Site(
         route,
         variation,
         roads,
         _ROADS[route.land],
-        Plan(roads, route.T_wc[:, [0, 2], 3]),
+        Plan(roads, cameras),
         atlas,
         make_palette(rng, atlas, 3 if variation.aliased else 18),
         rng,
+        cameras,
     )
     ground = make_ground(rng, atlas, roads, route.terrain, site.style)
     if motorway:
@@ -70,6 +76,7 @@ def build_town(route: Route, variation: Variation) -> Town:
         houses.close_sight_lines(site)
         streetside.fill_behind(site)
         streetside.furnish(site)
+        streetside.lay_kerbs(site)
     rng = np.random.default_rng([variation.seed, 9])
     moving = tuple(make_car(rng, atlas, 0).surfaces for _ in range(variation.moving))
     return Town(
@@ -79,6 +86,7 @@ def build_town(route: Route, variation: Variation) -> Town:
         np.array(site.place).reshape(-1, 2),
         np.array(site.when, np.int8),
         moving,
+        np.array(site.lamps).reshape(-1, 2),
     )
 
 

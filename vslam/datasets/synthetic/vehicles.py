@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.datasets.synthetic.scene import AtlasBuilder, Surfaces, join, patches
 from vslam.datasets.synthetic.textures import Grey, Rng, letters, noise, write
@@ -30,6 +31,11 @@ _SIZES = {  # length, width, height in metres
     "van": (4.9, 1.92, 1.95),
 }
 
+_BELT, _ROOF = 0.6, 0.78  # height of the belt line; width of the roof, in parts of the whole
+_TAPER_AT, _TAPER = (0.0, 0.12, 0.9, 1.0), (0.84, 1.0, 1.0, 0.9)  # of the width along the length
+
+Float = NDArray[np.float64]
+
 
 @dataclass(frozen=True)
 class Car:
@@ -46,47 +52,83 @@ def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Car:
     outline = np.array([(x, y) for x, y, _ in _OUTLINES[kind]])
     outline[1:-1] += rng.normal(0, 0.008, outline[1:-1].shape)
     glass = [bool(g) for *_, g in _OUTLINES[kind]]
-    paint = float(rng.choice([18, 28, 45, 75, 110, 150, 190, 225]) * rng.uniform(0.9, 1.1))
+    paint = float(rng.choice([14, 20, 28, 40, 60, 95, 140, 205]) * rng.uniform(0.9, 1.1))
     side, alpha = _paint_side(rng, outline, glass, paint)
     side_id = atlas.add(side, alpha)
     end_ids = [atlas.add(_paint_end(rng, paint, front=front)) for front in (True, False)]
-    strip_ids = [atlas.add(_paint_strip(rng, paint)), atlas.add(_paint_strip(rng, 30.0))]
+    strip_ids = [atlas.add(_paint_strip(rng, paint)), atlas.add(_paint_glass(rng))]
 
     points = np.stack(
         [np.zeros(len(outline)), -height * outline[:, 1], length * (0.5 - outline[:, 0])], axis=1
     )
-    parts = []
-    across = np.array([width, 0.0, 0.0])
-    corner = np.array([-width / 2, 0.0, 0.0])
-    for x in (-width / 2, width / 2):
+    parts = _sides((length, width, height), side_id, thing)
+    # The ends are narrower than the middle, the roof narrower than the belt.
+    half = 0.5 * width * np.where(
+        outline[:, 1] > _BELT,
+        1.0 - (1.0 - _ROOF) * (outline[:, 1] - _BELT) / (1.0 - _BELT),
+        np.interp(outline[:, 0], _TAPER_AT, _TAPER),
+    )  # fmt: skip
+    reach = half[:, None] * np.array([1.0, 0.0, 0.0])
+    for k in range(len(points) - 1):
+        low = min(outline[k, 1], outline[k + 1, 1])
+        texture = strip_ids[1 if glass[k] and low > 0.4 else 0]
+        top, bottom = k, k + 1
+        if k == 0:
+            texture, top, bottom = end_ids[0], 1, 0
+        elif k == len(points) - 2:
+            texture = end_ids[1]
         parts.append(
-            patches(
-                np.array([x, -height, length / 2]),
-                np.array([0.0, 0.0, -length]),
-                np.array([0.0, height, 0.0]),
-                side_id,
-                thing=thing,
+            _trapezium(
+                points[top] - reach[top],
+                points[top] + reach[top],
+                points[bottom] - reach[bottom],
+                points[bottom] + reach[bottom],
+                texture,
+                thing,
             )
         )
-    for k in range(len(points) - 1):
-        a, b = points[k], points[k + 1]
-        low = min(outline[k, 1], outline[k + 1, 1])
-        if k == 0 or k == len(points) - 2:
-            end = end_ids[0 if k == 0 else 1]
-            top, bottom = (b, a) if k == 0 else (a, b)
-            parts.append(patches(top + corner, across, bottom - top, end, thing=thing))
-        else:
-            texture = strip_ids[1 if glass[k] and low > 0.4 else 0]
-            parts.append(patches(a + corner, across, b - a, texture, thing=thing))
     shade = patches(
         np.array([-width / 2, -0.14, length / 2]),
-        across,
+        np.array([width, 0.0, 0.0]),
         np.array([0.0, 0.0, -length]),
         strip_ids[1],
         gain=0.2,
         thing=thing,
     )
     return Car(join([*parts, shade]), (length / 2, width / 2))
+
+
+def _trapezium(
+    top_left: Float, top_right: Float, low_left: Float, low_right: Float, texture: int, thing: int
+) -> Surfaces:
+    """Two triangles that share a texture; corners ``(3,)``."""
+    return join([
+        patches(top_left, top_right - top_left, low_left - top_left, texture, triangle=True,
+                thing=thing),
+        patches(low_right, low_left - low_right, top_right - low_right, texture, triangle=True,
+                uv=(1, -1, 0, 1, 0, -1), thing=thing),
+    ])  # fmt: skip
+
+
+def _sides(size: tuple[float, float, float], texture: int, thing: int) -> list[Surfaces]:
+    """Both sides of ``(length, width, height)``: a lower part that bends in at both ends, and a
+    cabin that leans in."""
+    length, width, height = size
+    parts = []
+    for sign in (-1.0, 1.0):
+        belt = np.array([sign * width / 2, -height * _BELT, length / 2])
+        lean = np.array([sign * width / 2 * _ROOF, -height, length / 2])
+        back = np.array([0.0, 0.0, -length])
+        parts.append(patches(lean, back, belt - lean, texture, uv=(0, 1, 0, 0, 0, 1 - _BELT),
+                             thing=thing))  # fmt: skip
+        for k in range(len(_TAPER_AT) - 1):
+            from_, to = _TAPER_AT[k], _TAPER_AT[k + 1]
+            start = belt * [_TAPER[k], 1, 1] + from_ * back
+            end = belt * [_TAPER[k + 1], 1, 1] + to * back
+            parts.append(patches(start, end - start, np.array([0.0, height * _BELT, 0.0]), texture,
+                                 uv=(from_, to - from_, 0, 1 - _BELT, 0, _BELT),
+                                 thing=thing))  # fmt: skip
+    return parts
 
 
 def _paint_side(
@@ -96,6 +138,10 @@ def _paint_side(
     at = (outline * [width - 1, -(height - 1)] + [0, height - 1]).round().astype(np.int32)
     grey = np.full((height, width), paint, np.float32)
     grey *= np.linspace(1.15, 0.75, height, dtype=np.float32)[:, None]
+    # The bulge under the belt mirrors the sky, the sill the street.
+    at_row = np.linspace(0, 1, height, dtype=np.float32)[:, None]
+    grey += 35.0 * np.exp(-(((at_row - 0.5) / 0.06) ** 2)) - 12.0 * (at_row > 0.68)
+    grey = np.clip(grey, 6, 250)
     alpha = np.zeros((height, width), np.float32)
     cv2.fillPoly(alpha, [at], 255.0)
     # Side windows: the outline above the belt line, shrunk.
@@ -165,4 +211,15 @@ def _paint_strip(rng: Rng, paint: float) -> Grey:
     grey[:, :2] *= 0.6
     grey[:, -2:] *= 0.6
     grey[:2] *= 0.6
+    return np.clip(grey, 5, 250)
+
+
+def _paint_glass(rng: Rng) -> Grey:
+    """A pane that mirrors a bright sky above and dark houses below."""
+    slope = np.linspace(1, 0, 64, dtype=np.float32)[:, None]
+    edge = float(rng.uniform(0.3, 0.7)) + 0.12 * noise(rng, 1, 64, 24.0, 3)
+    grey = 18.0 + 14.0 * slope + 70.0 * slope * (slope > edge)
+    grey = grey + 4.0 * noise(rng, 64, 64, 30.0, 2)
+    grey[:3] = grey[-3:] = 15.0
+    grey[:, :3] = grey[:, -3:] = 15.0
     return np.clip(grey, 5, 250)

@@ -1,0 +1,267 @@
+"""Bundle adjustment of hundreds of keyframes, loops included.
+
+The problem, the loss and the steps are those of ``bundle_adjustment``; what differs is the reduced
+camera system. Keyframes that share no landmark do not couple, so that it is kept in 6x6 blocks
+where they do and factored sparsely (``block_cholesky``; Triggs et al., "Bundle adjustment - a
+modern synthesis", section 6.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.backend.block_cholesky import analyse, factor_solve, panel
+from vslam.backend.bundle_adjustment import (
+    BundleProblem,
+    BundleSolution,
+    evaluate,
+    invert_damped,
+    linearise,
+    step_cameras,
+    step_points,
+)
+from vslam.kernels import inner_kernel, kernel
+
+
+def adjust_globally(
+    problem: BundleProblem,
+    *,
+    iterations: int,
+    tolerance: float = 1e-6,
+    use: NDArray[np.bool_] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> BundleSolution:
+    """Minimise the robust reprojection error: ``bundle_adjustment.adjust`` for many keyframes.
+
+    A keyframe may observe a landmark once. Nearly all the time is spent without the GIL.
+
+    Args:
+        iterations: of Levenberg-Marquardt, at most.
+        tolerance: stops when the cost falls by less than this (relative).
+        use: ``(O,)`` bool, observations that count; all by default.
+        stop: asked before each iteration; once it says so, the estimate so far is returned.
+    """
+    n_free, n_observations = problem.n_free, len(problem.camera)
+    used = np.ones(n_observations, np.bool_) if use is None else use
+    pairs = coupled_cameras(problem.first, problem.camera, used, n_free)
+    structure = analyse(n_free, pairs)
+    # Free cameras come as they are eliminated, and held ones after them.
+    cameras = np.concatenate([structure.order, np.arange(n_free, len(problem.T_cw))])
+    rank = np.argsort(cameras)
+    points_order, order = working_order(problem.first, rank[problem.camera], len(cameras))
+    observations = (
+        np.concatenate([[0], np.cumsum(np.diff(problem.first)[points_order])]),
+        rank[problem.camera[order]],
+        problem.uvr[order],
+        problem.inverse_sigma2[order],
+        used[order],
+        problem.intrinsics,
+    )
+    first, camera, used = observations[0], observations[1], observations[4]
+    slots = pair_slots(structure, first, camera, used, n_free)
+    T_cw, points = problem.T_cw[cameras], problem.points[points_order]
+    T_trial, points_trial = T_cw.copy(), points.copy()
+    inlier = np.ones(n_observations, np.bool_)
+    cost = _evaluate(T_cw, points, *observations, inlier)
+    # Blocks of the normal equations, named as in ``bundle_adjustment``.
+    n_points = len(points)
+    W = np.zeros((n_observations, 3, 6))
+    V, g = np.empty((n_points, 3, 3)), np.empty((n_points, 3))
+    U, b = np.empty((n_free, 6, 6)), np.empty((n_free, 6))
+    S, x = np.empty(36 * len(structure.row)), np.empty((n_free, 6))
+    V_inverse = np.empty((n_points, 3, 3))
+    damping, growth, done = 1e-5, 2.0, 0
+    for _ in range(iterations):
+        if stop is not None and stop():
+            break
+        _linearise(T_cw, n_free, points, *observations, W, V, g, U, b)
+        improved, small = False, False
+        for _ in range(8):
+            reduce_points_sparsely(
+                structure, slots, n_free, first, camera, used, W, V, g, U, b, damping, S, x,
+                V_inverse,
+            )  # fmt: skip
+            if factor_solve(structure, S, x):
+                _step(
+                    n_free, first, camera, used, W, g, x, V_inverse, T_cw, points, T_trial,
+                    points_trial,
+                )  # fmt: skip
+                trial = _evaluate(T_trial, points_trial, *observations, inlier)
+                if trial < cost:
+                    small = cost - trial < tolerance * cost
+                    cost = trial
+                    T_cw, T_trial = T_trial, T_cw
+                    points, points_trial = points_trial, points
+                    damping, growth, improved = max(damping * 0.1, 1e-9), 2.0, True
+                    break
+            damping *= growth * 5.0
+            growth *= 2.0
+        done += 1
+        if not improved or small:
+            break
+    cost = _evaluate(T_cw, points, *observations, inlier)
+    points_trial[points_order] = points
+    inlier_as_given = np.empty_like(inlier)
+    inlier_as_given[order] = inlier
+    return BundleSolution(T_cw[rank], points_trial, cost, inlier_as_given, done)
+
+
+@kernel
+def working_order(first, rank, n_cameras):
+    """Points ``(P,)`` and observations ``(O,)`` in the order in which they are worked on.
+
+    Observations of a point come as their cameras, of which ``rank`` ``(O,)`` is the place in the
+    elimination: of any two the first names the column and the second the row. Points come by their
+    first camera: blocks that are written one after the other lie side by side.
+    """
+    n_points = len(first) - 1
+    start = np.zeros(n_cameras + 2, np.int64)
+    earliest = np.full(n_points, n_cameras)
+    for p in range(n_points):
+        for o in range(first[p], first[p + 1]):
+            earliest[p] = min(earliest[p], rank[o])
+        start[earliest[p] + 1] += 1
+    for k in range(n_cameras + 1):
+        start[k + 1] += start[k]
+    points = np.empty(n_points, np.int64)
+    for p in range(n_points):
+        points[start[earliest[p]]] = p
+        start[earliest[p]] += 1
+    observations = np.empty(len(rank), np.int64)
+    n = 0
+    for p in points:
+        begin = n
+        for o in range(first[p], first[p + 1]):
+            k = n
+            while k > begin and rank[observations[k - 1]] > rank[o]:
+                observations[k] = observations[k - 1]
+                k -= 1
+            observations[k] = o
+            n += 1
+    return points, observations
+
+
+@kernel
+def coupled_cameras(first, camera, used, n_free):
+    """Pairs of free cameras that observe a common point, ``(M, 2)`` int64, each once."""
+    coupled = np.zeros((n_free, n_free), np.bool_)
+    for p in range(len(first) - 1):
+        for o in range(first[p], first[p + 1]):
+            if camera[o] >= n_free or not used[o]:
+                continue
+            for other in range(o + 1, first[p + 1]):
+                if camera[other] < n_free and used[other]:
+                    i, j = camera[o], camera[other]
+                    coupled[min(i, j), max(i, j)] = True
+    count = 0
+    for i in range(n_free):
+        for j in range(i + 1, n_free):
+            count += coupled[i, j]
+    pairs = np.empty((count, 2), np.int64)
+    count = 0
+    for i in range(n_free):
+        for j in range(i + 1, n_free):
+            if coupled[i, j]:
+                pairs[count, 0], pairs[count, 1] = i, j
+                count += 1
+    return pairs
+
+
+@kernel
+def pair_slots(structure, first, camera, used, n_free):
+    """Slot of each pair of used observations of a point, ``(N,)`` int32, in the order in which
+    ``reduce_points_sparsely`` meets them. Cameras are in elimination order."""
+    count = 0
+    for p in range(len(first) - 1):
+        seen = 0
+        for o in range(first[p], first[p + 1]):
+            if used[o] and camera[o] < n_free:
+                count += seen
+                seen += 1
+    slots = np.empty(count, np.int32)
+    count = 0
+    for p in range(len(first) - 1):
+        for o in range(first[p], first[p + 1]):
+            if not used[o] or camera[o] >= n_free:
+                continue
+            slot = structure.first[camera[o]]
+            for other in range(o + 1, first[p + 1]):
+                if used[other] and camera[other] < n_free:
+                    while structure.row[slot] < camera[other]:
+                        slot += 1
+                    slots[count] = slot
+                    count += 1
+    return slots
+
+
+@kernel
+def _evaluate(T_cw, points, first, camera, uvr, inverse_sigma2, used, intrinsics, inlier):
+    return evaluate(T_cw, points, first, camera, uvr, inverse_sigma2, used, intrinsics, inlier)
+
+
+@kernel
+def _linearise(
+    T_cw, n_free, points, first, camera, uvr, inverse_sigma2, used, intrinsics, W, V, g, U, b
+):
+    linearise(
+        T_cw, n_free, points, first, camera, uvr, inverse_sigma2, used, intrinsics, W, V, g, U, b
+    )
+
+
+@kernel
+def reduce_points_sparsely(
+    structure, slots, n_free, first, camera, used, W, V, g, U, b, damping, S, x, V_inverse
+):
+    """Reduced camera system ``S x = rhs``, in panels, after eliminating the points."""
+    for i in range(len(S)):
+        S[i] = 0.0
+    for k in range(n_free):
+        begin, width = panel(structure, k)
+        for i in range(6):
+            x[k, i] = b[k, i]
+            for j in range(6):
+                S[begin + i * width + j] = U[k, i, j]
+            S[begin + i * width + i] *= 1.0 + damping
+    Y = np.empty((3, 6))
+    pair = 0
+    for p in range(len(V)):
+        N = V_inverse[p]
+        invert_damped(V[p], damping, N)
+        for o in range(first[p], first[p + 1]):
+            k = camera[o]
+            if k >= n_free or not used[o]:
+                continue
+            for i in range(6):
+                w0, w1, w2 = W[o, 0, i], W[o, 1, i], W[o, 2, i]
+                Y[0, i] = N[0, 0] * w0 + N[0, 1] * w1 + N[0, 2] * w2
+                Y[1, i] = N[1, 0] * w0 + N[1, 1] * w1 + N[1, 2] * w2
+                Y[2, i] = N[2, 0] * w0 + N[2, 1] * w1 + N[2, 2] * w2
+                x[k, i] -= Y[0, i] * g[p, 0] + Y[1, i] * g[p, 1] + Y[2, i] * g[p, 2]
+            begin, width = panel(structure, k)
+            subtract_coupling(Y, W, o, S, begin, width)
+            for other in range(o + 1, first[p + 1]):
+                if used[other] and camera[other] < n_free:
+                    offset = begin + 6 * (slots[pair] - structure.first[k])
+                    subtract_coupling(Y, W, other, S, offset, width)
+                    pair += 1
+
+
+@inner_kernel
+def subtract_coupling(Y, W, o, S, offset, width):
+    """Take ``Y' W[o]`` off the block of ``S`` that begins at ``offset``."""
+    start, step = np.uintp(offset), np.uintp(width)
+    for i in range(np.uintp(6)):
+        y0, y1, y2 = Y[0, i], Y[1, i], Y[2, i]
+        for j in range(np.uintp(6)):
+            S[start + j] -= y0 * W[o, 0, j] + y1 * W[o, 1, j] + y2 * W[o, 2, j]
+        start += step
+
+
+@kernel
+def _step(n_free, first, camera, used, W, g, x, V_inverse, T_cw, points, T_trial, points_trial):
+    twists = x.reshape(-1)
+    step_points(n_free, first, camera, used, W, g, twists, V_inverse, points, points_trial)
+    step_cameras(n_free, twists, T_cw, T_trial)

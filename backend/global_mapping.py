@@ -1,0 +1,118 @@
+"""The whole map as a bundle problem, and its solution merged into a map that has gone on since.
+
+Global bundle adjustment takes seconds: it works on a snapshot while tracking and local mapping go
+on (Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017, section III-D).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.backend.bundle_adjustment import BundleProblem, BundleSolution
+from vslam.backend.local_mapping import assemble
+from vslam.backend.loop_correction import carry_landmarks
+from vslam.camera import StereoCamera
+from vslam.geometry import compose, inverse, orthonormalised
+from vslam.kernels import kernel
+from vslam.map import Map
+from vslam.observations import refresh_landmarks, unlink
+
+
+@dataclass(frozen=True)
+class GlobalSnapshot:
+    """A copy of the map as a bundle problem, and what its numbers stand for.
+
+    Attributes:
+        problem: keyframes that move first, held ones last.
+        keyframes: ``(K,)`` int64, id of each camera of the problem.
+        landmarks: ``(P,)`` int32, id of each of its points.
+        rows: ``(O,)`` int64, row of the map of each of its observations.
+        n_keyframes, n_landmarks: how many the map had; greater ids are newer.
+    """
+
+    problem: BundleProblem
+    keyframes: NDArray[np.int64]
+    landmarks: NDArray[np.int32]
+    rows: NDArray[np.int64]
+    n_keyframes: int
+    n_landmarks: int
+
+
+def take_snapshot(map_: Map, camera: StereoCamera) -> GlobalSnapshot:
+    """Copy all living keyframes and landmarks into a bundle problem.
+
+    The first keyframe is held. So is the first of every part of the map that no landmark connects
+    to it: nothing else says where that part is.
+    """
+    living = map_.living_keyframes()
+    landmarks = map_.living_landmarks().astype(np.int32)
+    part = connected_parts(map_.arrays, landmarks, map_.n_keyframes)
+    held = part[living] == living
+    keyframes = np.concatenate([living[~held], living[held]])
+    problem, rows = assemble(map_, living[~held], living[held], landmarks, camera)
+    return GlobalSnapshot(problem, keyframes, landmarks, rows, map_.n_keyframes, map_.n_landmarks)
+
+
+@kernel
+def connected_parts(a, landmarks, n_keyframes):
+    """First keyframe of the part of the map that each keyframe belongs to, ``(K,)`` int64.
+
+    Keyframes that observe a common landmark are in one part (union-find).
+    """
+    part = np.arange(n_keyframes)
+    for landmark in landmarks:
+        first = -1
+        row = a.head[landmark]
+        while row >= 0:
+            k = np.int64(a.keyframe[row])
+            while part[k] != k:
+                part[k] = part[part[k]]
+                k = part[k]
+            if first < 0:
+                first = k
+            elif k < first:
+                part[first] = k
+                first = k
+            else:
+                part[k] = first
+            row = a.next_row[row]
+    for k in range(n_keyframes):
+        part[k] = part[part[k]]
+    return part
+
+
+def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution) -> None:
+    """Bring the solution of a snapshot into the map, which has gone on since.
+
+    Keyframes and landmarks of the snapshot take their new places, as far as they live. Newer
+    keyframes keep their pose relative to their spanning-tree parent (Mur-Artal and Tardós,
+    ORB-SLAM2, III-D), newer landmarks move with the keyframe they are anchored in. Observations
+    that failed the chi-square test are removed if the row still observes the same landmark.
+    """
+    a = map_.arrays
+    T_cw_old = a.T_cw[: map_.n_keyframes].copy()
+    living = a.keyframe_alive[snapshot.keyframes]
+    a.T_cw[snapshot.keyframes[living]] = solution.T_cw[living]
+    # A parent is older than its children: it has moved when they ask for it.
+    for k in range(snapshot.n_keyframes, map_.n_keyframes):
+        parent = map_.parents[k]
+        if a.keyframe_alive[k] and parent >= 0:
+            T_k_parent = compose(T_cw_old[k], inverse(T_cw_old[parent]))
+            a.T_cw[k] = orthonormalised(compose(T_k_parent, a.T_cw[parent]))
+    carry_landmarks(map_, np.arange(snapshot.n_landmarks, map_.n_landmarks), T_cw_old)
+    lives = a.landmark_alive[snapshot.landmarks]
+    a.xyz[snapshot.landmarks[lives]] = solution.points[lives]
+    observed = np.repeat(snapshot.landmarks, np.diff(snapshot.problem.first))
+    remove_unchanged(a, snapshot.rows[~solution.inlier], observed[~solution.inlier])
+    refresh_landmarks(a, map_.living_landmarks().astype(np.int32), map_.scales)
+
+
+@kernel
+def remove_unchanged(a, rows, landmarks):
+    """Unlink each of ``(N,)`` rows that still observes its landmark."""
+    for i in range(len(rows)):
+        if a.landmark[rows[i]] == landmarks[i]:
+            unlink(a, rows[i])

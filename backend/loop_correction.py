@@ -1,0 +1,93 @@
+"""Moving keyframes, and the landmarks with them, when a loop closure has corrected their poses."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.geometry import compose, inverse
+from vslam.kernels import inner_kernel, kernel
+from vslam.map import Map
+
+
+def move_keyframes(
+    map_: Map, keyframes: NDArray[np.integer], T_cw_new: NDArray[np.float64]
+) -> None:
+    """Set poses and take each landmark along, rigidly, with the keyframe it is anchored in.
+
+    The anchor is the keyframe that saw the landmark first (ORB-SLAM, VII-C), or if that was
+    culled, the first of those that see it; landmarks anchored in keyframes that are not named
+    stay. Seen from its anchor nothing changes, so that the reach is as before and the normal turns
+    with the anchor: it is exact where all observers move as one. Culled keyframes follow the
+    living ones they are placed by.
+
+    Args:
+        keyframes: ``(N,)`` ids of living keyframes.
+        T_cw_new: ``(N, 4, 4)`` their new poses.
+
+    Raises:
+        ValueError: a keyframe was culled: it has no pose of its own.
+    """
+    a = map_.arrays
+    if not a.keyframe_alive[keyframes].all():
+        raise ValueError("move_keyframes: some of the keyframes were culled.")
+    T_cw_old = a.T_cw[: map_.n_keyframes].copy()
+    a.T_cw[keyframes] = T_cw_new
+    carry_landmarks(map_, np.arange(map_.n_landmarks), T_cw_old)
+
+
+def carry_landmarks(map_: Map, landmarks: NDArray[np.int64], T_cw_old: NDArray[np.float64]) -> None:
+    """Move landmarks rigidly with their anchors, whose poses were ``T_cw_old`` and are the map's.
+
+    Args:
+        landmarks: ``(N,)`` int64 ids; dead ones are passed over.
+        T_cw_old: ``(K, 4, 4)`` poses of all keyframes before.
+    """
+    a, n = map_.arrays, map_.n_keyframes
+    moved = np.any(T_cw_old != a.T_cw[:n], axis=(1, 2)) & a.keyframe_alive[:n]
+    _carry(a, landmarks, _motions(T_cw_old, a.T_cw, moved), moved)
+
+
+@kernel
+def _motions(T_cw_old, T_cw_new, moved):
+    """World motion of each keyframe: what is fixed to it goes from p to ``motion p``."""
+    motion = np.zeros((len(moved), 4, 4))
+    for k in range(len(moved)):
+        if moved[k]:
+            T = compose(inverse(T_cw_new[k]), T_cw_old[k])
+            for i in range(4):
+                for j in range(4):
+                    motion[k, i, j] = T[i, j]
+    return motion
+
+
+@kernel
+def _carry(a, landmarks, motion, moved):
+    p, n = np.empty(3), np.empty(3)
+    for landmark in landmarks:
+        if not a.landmark_alive[landmark]:
+            continue
+        anchor = anchor_of(a, landmark)
+        if anchor < 0 or not moved[anchor]:
+            continue
+        for i in range(3):
+            p[i], n[i] = a.xyz[landmark, i], a.normal[landmark, i]
+        T = motion[anchor]
+        for i in range(3):
+            a.xyz[landmark, i] = T[i, 0] * p[0] + T[i, 1] * p[1] + T[i, 2] * p[2] + T[i, 3]
+            a.normal[landmark, i] = T[i, 0] * n[0] + T[i, 1] * n[1] + T[i, 2] * n[2]
+
+
+@inner_kernel
+def anchor_of(a, landmark):
+    """The keyframe that a landmark moves with, or -1 if nothing living sees it."""
+    first = a.first_keyframe[landmark]
+    if a.keyframe_alive[first]:
+        return first
+    first = -1
+    row = a.head[landmark]
+    while row >= 0:
+        if first < 0 or a.keyframe[row] < first:
+            first = a.keyframe[row]
+        row = a.next_row[row]
+    return first

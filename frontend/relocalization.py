@@ -1,0 +1,77 @@
+"""Finding a lost camera in the map (ORB-SLAM, T-RO 2015, V-C)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vslam.frontend.matching import count_elsewhere, search_all
+from vslam.frontend.pnp import ransac_pose
+from vslam.frontend.tracking import Frame, Tracker, observations, refine, track_local_map
+from vslam.map import LocalMap
+
+
+def relocalise(
+    frame: Frame, place: LocalMap, surroundings: LocalMap, tracker: Tracker, seed: int
+) -> int:
+    """Find the pose of a frame of which nothing is known, at a place that it resembles.
+
+    Descriptors are matched with the landmarks of the place; P3P inside RANSAC, which needs no
+    stereo, finds a pose; then all landmarks around are searched for near their projections, in a
+    wide and in the usual window.
+
+    Args:
+        frame: untracked; on success it has its pose and its landmarks, else it is left untracked.
+        place: the landmarks of a candidate keyframe.
+        surroundings: those of the candidate and its covisible keyframes.
+        seed: of the draws; the same seed gives the same result.
+
+    Returns:
+        Inliers, at least ``relocalization.min_inliers`` and not all on one object; 0 without
+        success.
+    """
+    inliers = _locate(frame, place, surroundings, tracker, seed)
+    config = tracker.config.relocalization
+    elsewhere = count_elsewhere(frame.features.xy[frame.landmark >= 0, 0], tracker.camera.width)
+    if inliers >= config.min_inliers and elsewhere >= config.min_elsewhere:
+        return inliers
+    frame.T_cw = np.eye(4)
+    frame.landmark[:] = -1
+    frame.xyz[:] = np.nan
+    return 0
+
+
+def _locate(
+    frame: Frame, place: LocalMap, surroundings: LocalMap, tracker: Tracker, seed: int
+) -> int:
+    config = tracker.config.relocalization
+    found = search_all(
+        place.descriptor,
+        frame.features.descriptors.view(np.uint64),
+        config.match_distance,
+        config.match_ratio,
+    )
+    hit = np.flatnonzero(found >= 0)
+    if len(hit) < config.min_matches:
+        return 0
+    feature = found[hit]
+    T_cw, inlier = ransac_pose(
+        place.xyz[hit],
+        *observations(frame, feature, tracker),
+        tracker.camera.intrinsics,
+        np.uint64(seed),
+        config.min_consensus,
+        config.max_draws,
+        config.confidence,
+    )
+    if np.count_nonzero(inlier) < config.min_consensus:
+        return 0
+    frame.landmark[:] = -1
+    frame.xyz[:] = np.nan
+    frame.landmark[feature[inlier]] = place.ids[hit[inlier]]
+    frame.xyz[feature[inlier]] = place.xyz[hit[inlier]]
+    inliers = refine(frame, T_cw, tracker)
+    for window in (config.first_window, tracker.config.tracking.local_window):
+        if inliers < config.min_consensus:
+            return 0
+        _, inliers, _ = track_local_map(frame, surroundings, tracker, window)
+    return inliers

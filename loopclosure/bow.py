@@ -1,0 +1,227 @@
+"""Loop detection by bag of words.
+
+Candidates are chosen as in ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-E and VII-A): by
+shared words, by likeness compared with the query's own neighbours, and by groups of covisible
+keyframes. The index gives the score of every keyframe at once, the neighbours' included.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.config import BowConfig
+from vslam.features import Features
+from vslam.kernels import inner_kernel, kernel
+from vslam.loopclosure.bow_index import InvertedIndex, Likeness, NodeIndex, grown
+from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
+from vslam.loops import LoopCandidate
+from vslam.map import Map
+from vslam.observations import count_shared
+
+
+class BowDetector:
+    """Remembers the words of keyframes. See ``LoopDetector``; ids must come in ascending order."""
+
+    name = "bow"
+
+    def __init__(self, vocabulary: Vocabulary, config: BowConfig | None = None) -> None:
+        self.vocabulary = vocabulary
+        self.config = config or BowConfig()
+        self._node_of_word = vocabulary.ancestors(self.config.direct_level)
+        self._index = InvertedIndex(vocabulary.n_words)
+        # Features of all keyframes, sorted by node within each: those of keyframe k are entries
+        # start[k] to start[k + 1]. Keyframes that were never added have none.
+        self._start = np.zeros(65, np.int64)
+        self._feature = np.empty(65536, np.int32)
+        self._word = np.empty(65536, np.int32)
+        self._n_keyframes = 0  # one more than the newest id
+
+    def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
+        """Remember the words of a keyframe; the image is not looked at.
+
+        Raises:
+            ValueError: the id is not greater than those before.
+        """
+        if keyframe < self._n_keyframes:
+            raise ValueError(f"keyframe {keyframe} comes after {self._n_keyframes - 1}")
+        words = self.vocabulary.words(features.descriptors)
+        self._index_features(keyframe, words)
+        self._index.add(keyframe, bow_vector(self.vocabulary, words))
+
+    def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
+        """Living keyframes, not recent and not covisible, that look like a keyframe added before.
+
+        Without a covisible neighbour that sets the least score, every score will do.
+        """
+        config = self.config
+        entries = self._entries(keyframe)
+        likeness = self._index.compare(bow_vector(self.vocabulary, self._word[entries]))
+        n = len(likeness.score)
+        eligible = map_.arrays.keyframe_alive[:n].copy()
+        eligible[max(0, keyframe + 1 - config.exclude_recent) :] = False
+        covisible, _ = map_.covisible(keyframe, config.min_shared)
+        covisible = covisible[(covisible < n) & (covisible != keyframe)]
+        eligible[covisible] = False
+        known = covisible[np.diff(self._start[: n + 1])[covisible] > 0]
+        least = float(likeness.score[known].min()) if len(known) else 0.0
+        return self._candidates(keyframe, likeness, eligible, least, map_)
+
+    def locate(
+        self, image: NDArray[np.uint8] | None, features: Features, map_: Map
+    ) -> list[LoopCandidate]:
+        """Living keyframes that look like a frame outside the map, best first."""
+        words = self.vocabulary.words(features.descriptors)
+        likeness = self._index.compare(bow_vector(self.vocabulary, words))
+        eligible = map_.arrays.keyframe_alive[: len(likeness.score)].copy()
+        return self._candidates(-1, likeness, eligible, 0.0, map_)
+
+    def node_index(self, keyframe: int) -> NodeIndex:
+        """Direct index of a keyframe added before."""
+        entries = self._entries(keyframe)
+        return NodeIndex(self._node_of_word[self._word[entries]], self._feature[entries])
+
+    def node_index_of(self, features: Features) -> NodeIndex:
+        """Direct index of a frame outside the map."""
+        node = self._node_of_word[self.vocabulary.words(features.descriptors)]
+        order = np.argsort(node, kind="stable").astype(np.int32)
+        return NodeIndex(node[order], order)
+
+    def _index_features(self, keyframe: int, words: NDArray[np.int32]) -> None:
+        first = int(self._start[self._n_keyframes])
+        last = first + len(words)
+        self._start = grown(self._start, keyframe + 2)
+        self._word, self._feature = grown(self._word, last), grown(self._feature, last)
+        order = np.argsort(self._node_of_word[words], kind="stable")
+        self._feature[first:last], self._word[first:last] = order, words[order]
+        self._start[self._n_keyframes : keyframe + 1] = first
+        self._start[keyframe + 1] = last
+        self._n_keyframes = keyframe + 1
+
+    def _entries(self, keyframe: int) -> slice:
+        if not 0 <= keyframe < self._n_keyframes:
+            raise ValueError(f"keyframe {keyframe} has not been added")
+        return slice(int(self._start[keyframe]), int(self._start[keyframe + 1]))
+
+    def _candidates(
+        self,
+        query: int,
+        likeness: Likeness,
+        eligible: NDArray[np.bool_],
+        least_score: float,
+        map_: Map,
+    ) -> list[LoopCandidate]:
+        config = self.config
+        chosen = choose_candidates(
+            map_.arrays,
+            map_.n_keyframes,
+            likeness.shared,
+            likeness.score,
+            eligible,
+            least_score,
+            config.common_words_ratio,
+            config.group_size,
+            config.min_shared,
+            config.group_score_ratio,
+            config.max_groups,
+        )
+        return [LoopCandidate(query, k, float(likeness.score[k])) for k in chosen.tolist()]
+
+
+@inner_kernel
+def most_covisible(counts, minimum, keyframes, strength):
+    """Fill ``keyframes`` and ``strength``, ``(G,)`` int64, with those of the greatest counts.
+
+    Greatest first, the lower id first of equals, none below ``minimum``. Returns how many.
+    """
+    n = 0
+    for k in range(len(counts)):
+        count = counts[k]
+        if count < minimum or (n == len(keyframes) and (n == 0 or count <= strength[n - 1])):
+            continue
+        i = n if n < len(keyframes) else n - 1
+        while i > 0 and strength[i - 1] < count:
+            keyframes[i], strength[i] = keyframes[i - 1], strength[i - 1]
+            i -= 1
+        keyframes[i], strength[i] = k, count
+        n = min(n + 1, len(keyframes))
+    return n
+
+
+@kernel
+def choose_candidates(
+    a,
+    n_keyframes,
+    shared,
+    score,
+    eligible,
+    least_score,
+    common_words_ratio,
+    group_size,
+    min_shared,
+    group_score_ratio,
+    max_groups,
+):
+    """Candidates by shared words, score and groups, each once, best group first.
+
+    1. Those that share more than ``common_words_ratio`` of the most words that any shares, with
+       at least ``least_score``; of these the ``max_groups`` best.
+    2. Each gathers those of its ``group_size`` best covisible keyframes that also pass the first
+       test of 1; the group has the sum of their scores and stands for its best keyframe.
+    3. Groups with ``group_score_ratio`` of the best group's score.
+
+    Args:
+        a, n_keyframes: of the map.
+        shared, score, eligible: ``(K,)``, K at most ``n_keyframes``.
+
+    Returns:
+        ``(n,)`` int64 keyframes.
+    """
+    n = len(shared)
+    most = 0
+    for k in range(n):
+        if eligible[k]:
+            most = max(most, shared[k])
+    passed = np.zeros(n, np.bool_)
+    rank = np.full(n, -1.0)
+    for k in range(n):
+        if eligible[k] and shared[k] > 0 and shared[k] >= common_words_ratio * most:
+            passed[k] = True
+            if score[k] >= least_score:
+                rank[k] = score[k]
+    representative = np.empty(max_groups, np.int64)
+    group_score = np.empty(max_groups)
+    covisible, strength = np.empty(group_size, np.int64), np.empty(group_size, np.int64)
+    groups, best_group = 0, 0.0
+    while groups < max_groups and n > 0:
+        member = int(np.argmax(rank))
+        if rank[member] < 0.0:
+            break
+        rank[member] = -1.0
+        n_covisible = most_covisible(
+            count_shared(a, member, n_keyframes), min_shared, covisible, strength
+        )
+        total, best = score[member], member
+        for i in range(n_covisible):
+            neighbour = covisible[i]
+            if neighbour < n and passed[neighbour]:
+                total += score[neighbour]
+                if score[neighbour] > score[best]:
+                    best = neighbour
+        representative[groups] = best
+        group_score[groups] = total
+        groups += 1
+        best_group = max(best_group, total)
+    chosen = np.empty(groups, np.int64)
+    taken = np.zeros(n, np.bool_)
+    m = 0
+    for _ in range(groups):
+        g = int(np.argmax(group_score[:groups]))
+        if group_score[g] < group_score_ratio * best_group:
+            break
+        group_score[g] = -1.0
+        if not taken[representative[g]]:
+            taken[representative[g]] = True
+            chosen[m] = representative[g]
+            m += 1
+    return chosen[:m].copy()

@@ -1,0 +1,140 @@
+"""One look-alike keyframe is no loop: candidates must persist, and verified loops must agree.
+
+ORB-SLAM (T-RO 2015, VII-A) asks that the places which resemble consecutive keyframes overlap.
+That is evidence by looks. Two verified loops of neighbouring keyframes give a stronger one: both
+say by how much the map has drifted, and must say the same (ORB-SLAM3, T-RO 2021, section VI, has
+the same idea: verify first, then ask other keyframes to confirm).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.config import ConsistencyConfig
+from vslam.geometry import inverse, se3_log
+from vslam.loops import LoopCandidate, LoopEdge
+from vslam.map import Map
+
+
+@dataclass(frozen=True)
+class _Group:
+    """A place that resembled recent keyframes: a candidate with its covisible keyframes.
+
+    ``length`` keyframes in a row resembled it, ``age`` keyframes ago the last of them.
+    """
+
+    keyframes: frozenset[int]
+    length: int
+    age: int = 0
+
+
+class LoopConsistency:
+    """Memory of what recent keyframes resembled, and of the loops verified for them.
+
+    Call ``update`` once for every keyframe, with or without candidates, ``confirm`` for every
+    verified edge, and ``reset`` once a loop was closed.
+    """
+
+    def __init__(self, config: ConsistencyConfig) -> None:
+        self.config = config
+        self._groups: list[_Group] = []
+        self._verified: list[tuple[int, LoopEdge]] = []  # turn, edge
+        self._turn = 0
+
+    @property
+    def n_groups(self) -> int:
+        """Groups remembered: never more than the candidates of ``max_gap + 1`` keyframes."""
+        return len(self._groups)
+
+    def update(
+        self, keyframe: int, candidates: list[LoopCandidate], map_: Map
+    ) -> tuple[list[LoopCandidate], list[LoopEdge]]:
+        """Candidates whose place resembled enough keyframes in a row, and edges for the others.
+
+        Each candidate continues the longest group that it overlaps and leaves exactly one group:
+        the number of groups is the number of candidates, however often they overlap. Candidates
+        with one and the same group count once.
+        """
+        self._turn += 1
+        groups: dict[frozenset[int], _Group] = {}
+        consistent, rejected = [], []
+        continued: set[int] = set()
+        for candidate in candidates:
+            around = map_.covisible(candidate.match, self.config.min_shared)[0].tolist()
+            place = frozenset({candidate.match, *around})
+            before = [i for i, g in enumerate(self._groups) if not place.isdisjoint(g.keyframes)]
+            continued.update(before)
+            length = 1 + max((self._groups[i].length for i in before), default=0)
+            groups[place] = _Group(place, length)
+            if length >= self.config.min_keyframes:
+                consistent.append(candidate)
+            else:
+                reason = f"resembled {length} of {self.config.min_keyframes} keyframes in a row"
+                rejected.append(LoopEdge(keyframe, candidate.match, candidate.score, False, reason))
+        waiting = [
+            replace(g, age=g.age + 1)
+            for i, g in enumerate(self._groups)
+            if i not in continued and g.age < self.config.max_gap
+        ]
+        self._groups = [*groups.values(), *waiting]
+        return consistent, rejected
+
+    def confirm(self, edge: LoopEdge, map_: Map) -> LoopEdge:
+        """A verified edge, once enough recent keyframes were verified with the same drift.
+
+        The drift that an edge implies is the motion of the world that would bring the query to
+        where the edge puts it. Odometry between neighbouring keyframes is exact compared with the
+        tolerances, so that true loops imply one drift and chance ones do not.
+
+        Returns:
+            The edge as it was, or not accepted, waiting for others. The best edge that agrees
+            counts once for each keyframe.
+        """
+        if not edge.accepted:
+            return edge
+        oldest = self._turn - self.config.verified_memory
+        self._verified = [(turn, e) for turn, e in self._verified if turn >= oldest]
+        drift = implied_drift(edge, map_)
+        where = inverse(map_.keyframe_pose(edge.query))[:3, 3]
+        agreeing = {
+            other.query
+            for _, other in self._verified
+            if other.query != edge.query and self._agree(drift, implied_drift(other, map_), where)
+        }
+        self._verified.append((self._turn, edge))
+        votes = 1 + len(agreeing)
+        if votes >= self.config.min_verified:
+            return edge
+        reason = f"verified by {votes} of {self.config.min_verified} keyframes"
+        return replace(edge, accepted=False, reason=reason)
+
+    def reset(self) -> None:
+        """Forget everything: closing a loop has moved the map."""
+        self._groups.clear()
+        self._verified.clear()
+
+    def _agree(
+        self, a: NDArray[np.float64], b: NDArray[np.float64], where: NDArray[np.float64]
+    ) -> bool:
+        """Whether two drifts move a camera at ``where`` ((3,), world) to the same pose."""
+        twist = se3_log(inverse(a) @ b)
+        apart = (a[:3, :3] - b[:3, :3]) @ where + a[:3, 3] - b[:3, 3]
+        return bool(
+            np.linalg.norm(apart) <= self.config.max_apart
+            and np.degrees(np.linalg.norm(twist[3:])) <= self.config.max_turn
+        )
+
+
+def implied_drift(edge: LoopEdge, map_: Map) -> NDArray[np.float64]:
+    """``(4, 4)`` motion of the world that takes the query to where an edge puts it.
+
+    Raises:
+        ValueError: the edge has no pose.
+    """
+    if edge.T_query_match is None:
+        raise ValueError(f"the edge from {edge.query} to {edge.match} has no pose")
+    T_wq = inverse(map_.keyframe_pose(edge.match)) @ inverse(edge.T_query_match)
+    return T_wq @ map_.keyframe_pose(edge.query)

@@ -1,0 +1,284 @@
+"""Geometric verification: is a loop candidate the same place, and where is the camera in it?
+
+ORB-SLAM's steps (T-RO 2015, VII-B; for stereo T-RO 2017, III-D): descriptors matched between two
+keyframes, a motion by RANSAC, guided matching with all that the place knows, refinement. ORB-SLAM
+then counts inliers. A facade or a car that looks like another brings inliers too, so that we ask
+for the opposite evidence as well: whether the rest of the scene fits, and how much each side
+should see of the other's landmarks and does not.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import StereoCamera
+from vslam.config import VerificationConfig
+from vslam.features import FeatureGrid
+from vslam.frontend.matching import (
+    consistent_orientation,
+    count_elsewhere,
+    predict_view,
+    search_all,
+    search_windows,
+)
+from vslam.frontend.pose import optimise_pose
+from vslam.geometry import inverse, orthonormalised, transform
+from vslam.loopclosure.alignment import Sightings, align
+from vslam.loops import LoopCandidate, LoopEdge
+from vslam.map import Map
+from vslam.observations import collect_landmarks
+
+Matrix = NDArray[np.float64]
+GRID_COLUMNS, GRID_ROWS = 8, 4
+
+
+class View(NamedTuple):
+    """What a camera should see of M landmarks, and does see.
+
+    Attributes:
+        landmarks: ``(M,)`` int32, those that should be visible.
+        feature: ``(M,)`` int32, inlier feature of each (index within the keyframe), or -1.
+        uv: ``(M, 2)`` float64, where they should appear.
+        n_matches: features found near the predictions, outliers included.
+        T_cw: ``(4, 4)`` pose of the camera in the world of the landmarks.
+    """
+
+    landmarks: NDArray[np.int32]
+    feature: NDArray[np.int32]
+    uv: Matrix
+    n_matches: int
+    T_cw: Matrix
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """``(M,)``: those with an inlier."""
+        return self.feature >= 0
+
+
+def verify(
+    map_: Map,
+    candidate: LoopCandidate,
+    camera: StereoCamera,
+    config: VerificationConfig,
+) -> LoopEdge:
+    """Decide whether the query keyframe shows the place of the match. Reads the map only.
+
+    Returns:
+        An edge that is accepted with reason "verified", or not, with what spoke against it.
+        Its pose and its matches are set as soon as there are any; features and landmarks are the
+        inliers: features of the query, and living landmarks of the place, neither of them twice.
+    """
+    query, match = candidate.query, candidate.match
+    edge = LoopEdge(query, match, candidate.score, accepted=False, reason="")
+    rows_q, rows_m = match_keyframes(map_, query, match, config)
+    edge = _with(edge, n_matches=len(rows_q))
+    if len(rows_q) < config.min_matches:
+        return _with(edge, reason=f"only {len(rows_q)} descriptors match")
+
+    T_query_match, n_inliers = _consensus(map_, query, match, rows_q, rows_m, camera, config)
+    if T_query_match is None:
+        return _with(edge, reason=f"no motion that {config.min_consensus} of the matches agree on")
+    edge = _with(edge, n_inliers=n_inliers, T_query_match=T_query_match)
+
+    place = place_of(map_, match, query, config)
+    T_mw = map_.keyframe_pose(match)
+    landmarks = collect_landmarks(map_.arrays, place, map_.n_landmarks)
+    view = look(map_, query, landmarks, T_query_match @ T_mw, camera, config)
+    T_query_match = orthonormalised(view.T_cw @ inverse(T_mw))
+    edge = _with(
+        edge,
+        n_matches=view.n_matches,
+        n_inliers=int(np.count_nonzero(view.seen)),
+        T_query_match=T_query_match,
+        features=view.feature[view.seen],
+        landmarks=view.landmarks[view.seen],
+    )
+    reason = _objection(map_, edge, view, T_query_match, camera, config)
+    return _with(edge, accepted=not reason, reason=reason or "verified")
+
+
+def _with(edge: LoopEdge, **changes: object) -> LoopEdge:
+    return LoopEdge(**(vars(edge) | changes))
+
+
+def match_keyframes(
+    map_: Map, query: int, match: int, config: VerificationConfig
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of two keyframes, ``(N,)`` each, whose features observe landmarks and look alike."""
+    a = map_.arrays
+    rows_q, rows_m = (
+        np.flatnonzero(a.landmark[map_.rows(k)] >= 0) + a.first_row[k] for k in (query, match)
+    )
+    found = search_all(
+        a.descriptor[rows_q], a.descriptor[rows_m], config.match_distance, config.match_ratio
+    )
+    hit = np.flatnonzero(found >= 0)
+    rows_q, rows_m = rows_q[hit], rows_m[found[hit]]
+    if len(hit):
+        keep = consistent_orientation(a.angle[rows_q], a.angle[rows_m])
+        rows_q, rows_m = rows_q[keep], rows_m[keep]
+    return rows_q, rows_m
+
+
+def _consensus(
+    map_: Map,
+    query: int,
+    match: int,
+    rows_q: NDArray[np.int64],
+    rows_m: NDArray[np.int64],
+    camera: StereoCamera,
+    config: VerificationConfig,
+) -> tuple[Matrix | None, int]:
+    """``T_query_match`` of most of the matches, and how many; None if too few agree."""
+    found = align(
+        _sightings(map_, query, rows_q),
+        _sightings(map_, match, rows_m),
+        camera.intrinsics,
+        seed=query << 32 | match,
+        min_inliers=config.min_consensus,
+        max_draws=config.max_draws,
+        confidence=config.confidence,
+    )
+    if found is None:
+        return None, 0
+    return found.T_a_b, int(np.count_nonzero(found.inlier))
+
+
+def _sightings(map_: Map, keyframe: int, rows: NDArray[np.int64]) -> Sightings:
+    a = map_.arrays
+    points = transform(a.T_cw[keyframe], a.xyz[a.landmark[rows]])
+    return Sightings(points, *_observations(map_, rows))
+
+
+def _observations(map_: Map, rows: NDArray[np.int64]) -> tuple[Matrix, Matrix]:
+    """``(N, 3)`` u, v, u_right of rows, and ``(N,)`` their inverse variances."""
+    a = map_.arrays
+    uvr = np.column_stack([a.xy[rows], a.u_right[rows]]).astype(np.float64)
+    return uvr, map_.scales[a.octave[rows]] ** -2.0
+
+
+def place_of(map_: Map, match: int, query: int, config: VerificationConfig) -> NDArray[np.int64]:
+    """The match and its best covisible keyframes, none of which sees what the query sees."""
+    near_query = {query, *map_.covisible(query)[0].tolist()}
+    around = [k for k in map_.covisible(match)[0].tolist() if k not in near_query]
+    return np.array([match, *around[: config.place_keyframes]], np.int64)
+
+
+def look(
+    map_: Map,
+    keyframe: int,
+    landmarks: NDArray[np.int32],
+    T_cw: Matrix,
+    camera: StereoCamera,
+    config: VerificationConfig,
+) -> View:
+    """Guided matching: find ``(N,)`` landmarks near where a pose of a keyframe puts them, refine
+    the pose with all that was found, and once more in narrower windows.
+
+    Args:
+        T_cw: estimate of the keyframe's pose in the world of the landmarks, which is not the
+            world of its own landmarks where the map has drifted.
+    """
+    a, rows = map_.arrays, map_.rows(keyframe)
+    grid = FeatureGrid.of_positions(a.xy[rows], camera.width, camera.height)
+    free = np.ones(rows.stop - rows.start, np.bool_)
+    for window in (config.first_window, config.second_window):
+        uvr, radius, octave = predict_view(
+            T_cw,
+            a.xyz[landmarks],
+            a.normal[landmarks],
+            a.reach[landmarks],
+            camera.intrinsics,
+            camera.width,
+            camera.height,
+            map_.scales,
+            window,
+        )
+        found, _ = search_windows(
+            uvr,
+            radius,
+            octave - 1,
+            octave + 1,
+            a.landmark_descriptor[landmarks],
+            a.xy[rows],
+            a.octave[rows],
+            a.u_right[rows],
+            a.descriptor[rows],
+            free,
+            grid.start,
+            grid.items,
+            grid.columns,
+            config.guided_distance,
+            1.0,
+        )
+        hit = np.flatnonzero(found >= 0)
+        T_cw, inlier = optimise_pose(
+            T_cw,
+            a.xyz[landmarks[hit]],
+            *_observations(map_, found[hit].astype(np.int64) + rows.start),
+            camera.intrinsics,
+        )
+    visible = np.flatnonzero(radius > 0)
+    feature = np.full(len(landmarks), -1, np.int32)
+    feature[hit[inlier]] = found[hit[inlier]]
+    return View(landmarks[visible], feature[visible], uvr[visible, :2], len(hit), T_cw)
+
+
+def _objection(
+    map_: Map,
+    edge: LoopEdge,
+    view: View,
+    T_query_match: Matrix,
+    camera: StereoCamera,
+    config: VerificationConfig,
+) -> str:
+    """What speaks against a refined loop, "" if nothing does."""
+    if edge.n_inliers < config.min_inliers:
+        return f"only {edge.n_inliers} landmarks of the place fit"
+    if edge.n_inliers < config.min_inlier_ratio * edge.n_matches:
+        return f"only {edge.n_inliers} of {edge.n_matches} matches fit"
+    distance = float(np.linalg.norm(inverse(T_query_match)[:3, 3]))
+    if distance > config.max_distance:
+        return f"{distance:.0f} m from the place"
+    expected, occupied = occupied_cells(view, camera)
+    if occupied < max(config.min_cells, config.min_cell_ratio * expected):
+        return f"inliers in {occupied} of {expected} cells of the image only"
+    elsewhere = count_elsewhere(view.uv[view.seen, 0], camera.width)
+    if elsewhere < config.min_elsewhere:
+        return f"only {elsewhere} inliers outside one third of the image"
+    seen, total = seen_of(map_, edge.match, view)
+    if seen < config.min_seen_ratio * total:
+        return f"only {seen} of {total} landmarks of the place are seen"
+    seen, total = seen_of(map_, edge.query, look_back(map_, edge, T_query_match, camera, config))
+    if seen < config.min_seen_ratio * total:
+        return f"the place saw only {seen} of {total} landmarks of the query"
+    return ""
+
+
+def look_back(
+    map_: Map,
+    edge: LoopEdge,
+    T_query_match: Matrix,
+    camera: StereoCamera,
+    config: VerificationConfig,
+) -> View:
+    """What the match sees of the landmarks of the query."""
+    T_mw = inverse(T_query_match) @ map_.keyframe_pose(edge.query)
+    return look(map_, edge.match, map_.landmarks_of(edge.query), T_mw, camera, config)
+
+
+def seen_of(map_: Map, keyframe: int, view: View) -> tuple[int, int]:
+    """How many of the landmarks of a keyframe a view has, and how many it should have."""
+    own = np.isin(view.landmarks, map_.landmarks_of(keyframe))
+    return int(np.count_nonzero(view.seen & own)), int(np.count_nonzero(own))
+
+
+def occupied_cells(view: View, camera: StereoCamera) -> tuple[int, int]:
+    """Cells of the image where landmarks should be, and cells where they are."""
+    column = (view.uv[:, 0] * GRID_COLUMNS / camera.width).astype(np.int64)
+    row = (view.uv[:, 1] * GRID_ROWS / camera.height).astype(np.int64)
+    cell = row * GRID_COLUMNS + column
+    return len(np.unique(cell)), len(np.unique(cell[view.seen]))

@@ -1,0 +1,236 @@
+"""Visual words: a tree of binary descriptors, and the bag of words of an image.
+
+The tree is the hierarchical vocabulary of Nister and Stewenius (CVPR 2006) over binary
+descriptors (Galvez-Lopez and Tardos, T-RO 2012, section III): each node splits its descriptors
+into k clusters by Hamming distance, the centre of a cluster is the majority of each bit, and the
+leaves are the words. Nodes are numbered breadth first, so that the children of a node are
+neighbours in memory: going down a level reads one piece of 32 k bytes.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError, ResultsError
+from vslam.kernels import hamming, kernel
+
+SCHEMA = 1
+SHIPPED = Path(__file__).with_name("vocabulary.npz")
+MAX_BRANCHING, MAX_LEVELS = 20, 10  # what DBoW2's text format admits, too
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """A tree of N nodes with W leaves, the words. Node 0 is the root and has no descriptor.
+
+    Attributes:
+        branching: children that a node has at most, the k of the field.
+        levels: edges from the root to a leaf at most, the L of the field.
+        descriptors: ``(N, 4)`` uint64, centre of each node; zero for the root.
+        first_child: ``(N,)`` int32, children are ``first_child ... + n_children - 1``.
+        n_children: ``(N,)`` uint8, 0 for a leaf.
+        parent: ``(N,)`` int32, -1 for the root.
+        level: ``(N,)`` uint8, edges from the root.
+        word: ``(N,)`` int32, the word that a leaf is, in order of the nodes; -1 for others.
+        weight: ``(W,)`` float32, inverse document frequency ln(images / images with the word).
+    """
+
+    branching: int
+    levels: int
+    descriptors: NDArray[np.uint64]
+    first_child: NDArray[np.int32]
+    n_children: NDArray[np.uint8]
+    parent: NDArray[np.int32]
+    level: NDArray[np.uint8]
+    word: NDArray[np.int32]
+    weight: NDArray[np.float32]
+
+    @property
+    def n_words(self) -> int:
+        return len(self.weight)
+
+    def words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
+        """Word of each of ``(M, 32)`` uint8 descriptors, ``(M,)`` int32."""
+        return descend(
+            np.ascontiguousarray(descriptors).view(np.uint64),
+            self.descriptors,
+            self.first_child,
+            self.n_children,
+            self.word,
+        )
+
+    def ancestors(self, level: int) -> NDArray[np.int32]:
+        """Node of each word at a level counted from the root, ``(W,)`` int32.
+
+        A word that lies above that level is its own ancestor.
+        """
+        nodes = np.flatnonzero(self.word >= 0).astype(np.int32)
+        while (deep := self.level[nodes] > level).any():
+            nodes[deep] = self.parent[nodes[deep]]
+        return nodes
+
+
+class BowVector(NamedTuple):
+    """Bag of words of an image: ``words`` (N,) i4 ascending; ``weights`` (N,) f4 of sum 1."""
+
+    words: NDArray[np.int32]
+    weights: NDArray[np.float32]
+
+
+def bow_vector(vocabulary: Vocabulary, words: NDArray[np.int32]) -> BowVector:
+    """tf-idf weights of an image's ``(M,)`` words, scaled to an L1 norm of 1 (Nister, section 4).
+
+    Words of weight 0, those seen in every training image, say nothing and are left out.
+    """
+    unique, count = np.unique(words, return_counts=True)
+    weights = count * vocabulary.weight[unique].astype(np.float64)
+    telling = weights > 0
+    weights = weights[telling]
+    return BowVector(unique[telling], (weights / max(weights.sum(), 1e-300)).astype(np.float32))
+
+
+def score(a: BowVector, b: BowVector) -> float:
+    """Likeness of two images in [0, 1]: 1 - |a - b| / 2 (T-RO 2012, equation 2).
+
+    With weights that are positive and sum to 1, that is the sum of the lesser weight of each
+    word that both have (Nister and Stewenius, section 4, equation 5, rearranged).
+    """
+    _, in_a, in_b = np.intersect1d(a.words, b.words, assume_unique=True, return_indices=True)
+    return float(np.minimum(a.weights[in_a], b.weights[in_b]).sum(dtype=np.float64))
+
+
+@kernel
+def descend(queries, descriptors, first_child, n_children, word):
+    """Follow the nearest child, the first of equals, from the root to a leaf.
+
+    Args:
+        queries: ``(M, 4)`` uint64; the others as in ``Vocabulary``.
+
+    Returns:
+        ``(M,)`` int32 words.
+    """
+    out = np.empty(len(queries), np.int32)
+    for i in range(len(queries)):
+        query = queries[i]
+        node = 0
+        while n_children[node] > 0:
+            first = first_child[node]
+            nearest, least = first, hamming(query, descriptors[first])
+            for child in range(first + 1, first + np.int64(n_children[node])):
+                distance = hamming(query, descriptors[child])
+                if distance < least:
+                    nearest, least = child, distance
+            node = nearest
+        out[i] = word[node]
+    return out
+
+
+# -- from its parts -------------------------------------------------------------------------------
+
+
+def from_children(
+    branching: int,
+    levels: int,
+    descriptors: NDArray[np.uint64],
+    n_children: NDArray[np.uint8],
+    weight: NDArray[np.float32],
+) -> Vocabulary:
+    """The vocabulary that the nodes in breadth-first order make.
+
+    Raises:
+        ValueError: what of the parts does not fit together.
+    """
+    n = len(n_children)
+    if not 2 <= branching <= MAX_BRANCHING:
+        raise ValueError(f"branching {branching} is not in 2 to {MAX_BRANCHING}")
+    if not 1 <= levels <= MAX_LEVELS:
+        raise ValueError(f"{levels} levels are not 1 to {MAX_LEVELS}")
+    if n < 2 or descriptors.shape != (n, 4):
+        raise ValueError(f"there are {n} nodes and descriptors of shape {descriptors.shape}")
+    if n_children.max() > branching:
+        raise ValueError(f"a node has {n_children.max()} children, more than {branching}")
+    children = n_children.astype(np.int64)
+    first_child = 1 + np.cumsum(children) - children
+    inner = np.flatnonzero(children)
+    if children.sum() != n - 1 or (first_child[inner] <= inner).any():
+        raise ValueError("the numbers of children do not make a tree")
+    parent = np.concatenate([[-1], np.repeat(np.arange(n), children)]).astype(np.int32)
+    level = np.zeros(n, np.uint8)
+    start, stop, depth = 1, 1 + int(children[0]), 1
+    while start < stop:  # the next level: the children of this one
+        if depth > levels:
+            raise ValueError(f"the tree is deeper than {levels} levels")
+        level[start:stop] = depth
+        start, stop, depth = stop, stop + int(children[start:stop].sum()), depth + 1
+    leaf = children == 0
+    if weight.shape != (np.count_nonzero(leaf),):
+        raise ValueError(f"{np.count_nonzero(leaf)} leaves have {len(weight)} weights")
+    if not (np.isfinite(weight).all() and (weight >= 0).all()):
+        raise ValueError("a weight is negative or not finite")
+    word = np.full(n, -1, np.int32)
+    word[leaf] = np.arange(len(weight), dtype=np.int32)
+    return Vocabulary(
+        branching=branching,
+        levels=levels,
+        descriptors=descriptors,
+        first_child=first_child.astype(np.int32),
+        n_children=n_children,
+        parent=parent,
+        level=level,
+        word=word,
+        weight=weight,
+    )
+
+
+def save(vocabulary: Vocabulary, path: Path) -> None:
+    """Write as npz, not compressed: random bits would not shrink, and it loads at once.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
+    try:
+        with path.open("wb") as file:
+            np.savez(
+                file,
+                schema=np.int64(SCHEMA),
+                branching=np.int64(vocabulary.branching),
+                levels=np.int64(vocabulary.levels),
+                descriptors=vocabulary.descriptors,
+                n_children=vocabulary.n_children,
+                weight=vocabulary.weight,
+            )
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error
+
+
+def load(path: Path = SHIPPED) -> Vocabulary:
+    """Read what ``save`` wrote; without a path, the vocabulary that comes with vslam.
+
+    Raises:
+        InputError: no such file, damaged, of another schema, or not a vocabulary.
+    """
+    again = "make it again with vslam vocabulary train or convert"
+    try:
+        with np.load(path, allow_pickle=False) as parts:
+            if "schema" not in parts or "n_children" not in parts:
+                raise InputError(f"{path}: holds no vocabulary; {again}.")
+            if (schema := int(parts["schema"])) != SCHEMA:
+                raise InputError(f"{path}: schema {schema}, this version reads {SCHEMA}; {again}.")
+            return from_children(
+                int(parts["branching"]),
+                int(parts["levels"]),
+                parts["descriptors"].astype(np.uint64, copy=False),
+                parts["n_children"].astype(np.uint8, copy=False),
+                parts["weight"].astype(np.float32, copy=False),
+            )
+    except OSError as error:
+        why = error.strerror or "not an npz file"
+        raise InputError(f"{path}: cannot read the vocabulary ({why}); {again}.") from error
+    except (ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: damaged vocabulary ({error}); {again}.") from error

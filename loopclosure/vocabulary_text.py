@@ -1,0 +1,284 @@
+"""DBoW2's text format for vocabularies, which ORB-SLAM's ``ORBvoc.txt`` is in.
+
+The first line is ``k L scoring weighting``. Each further line is a node: the number of its parent,
+whether it is a leaf (0 or 1), 32 bytes of descriptor, and its weight (of a leaf, the idf). Nodes
+are numbered from 1 in the order of their lines; 0 is the root, which has no line. Any order in
+which parents come before their children is read; we write breadth first.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError, ResultsError
+from vslam.kernels import inner_kernel, kernel
+from vslam.loopclosure.vocabulary import (
+    MAX_BRANCHING,
+    MAX_LEVELS,
+    Vocabulary,
+    from_children,
+    load,
+    save,
+)
+
+NUMBERS = 35  # in the line of a node: parent, leaf, 32 bytes, weight
+L1_NORM, TF_IDF = 0, 0  # DBoW2's numbers for the scoring and weighting that we have
+
+_TOO_FEW, _TOO_MANY, _NO_NUMBER, _NO_BYTE, _NO_FLAG, _NO_PARENT, _NO_WEIGHT = range(1, 8)
+_FAULTS = {
+    _TOO_FEW: f"has fewer than {NUMBERS} numbers",
+    _TOO_MANY: f"has more than {NUMBERS} numbers",
+    _NO_NUMBER: "holds something that is not a number",
+    _NO_BYTE: "has a descriptor byte that is not a whole number from 0 to 255",
+    _NO_FLAG: "has a leaf flag that is neither 0 nor 1",
+    _NO_PARENT: "names a parent that does not come before it",
+    _NO_WEIGHT: "has a weight that is negative or too large",
+}
+
+
+def read_vocabulary(path: Path) -> Vocabulary:
+    """Read an npz file, or DBoW2's text if the name ends in .txt.
+
+    Raises:
+        InputError: another ending, or as ``load`` and ``read_text``.
+    """
+    return read_text(path) if is_text(path) else load(path)
+
+
+def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
+    """Write an npz file, or DBoW2's text if the name ends in .txt.
+
+    Raises:
+        InputError: another ending.
+        ResultsError: the file cannot be written.
+    """
+    (write_text if is_text(path) else save)(vocabulary, path)
+
+
+def is_text(path: Path) -> bool:
+    """Whether the name says DBoW2's text rather than npz.
+
+    Raises:
+        InputError: it says neither.
+    """
+    if path.suffix not in (".txt", ".npz"):
+        raise InputError(f"{path}: a vocabulary's name ends in .npz or in .txt (DBoW2's format).")
+    return path.suffix == ".txt"
+
+
+def read_text(path: Path) -> Vocabulary:
+    """Read a vocabulary in DBoW2's text format.
+
+    Raises:
+        InputError: missing or damaged; the sentence names the line and what is wrong with it.
+    """
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the vocabulary ({error.strerror}).") from error
+    text = text.rstrip()
+    if not text:
+        raise InputError(f"{path}: the file is empty; fetch or export the vocabulary again.")
+    header, _, body = text.partition(b"\n")
+    branching, levels = _read_header(path, header)
+    body_bytes = np.frombuffer(body, np.uint8)
+    n = body.count(b"\n") + 1
+    parent, leaf = np.zeros(n + 1, np.int64), np.zeros(n + 1, np.bool_)
+    descriptors = np.zeros((n + 1, 32), np.uint8)
+    weight = np.zeros(n + 1)
+    node, fault = parse_nodes(body_bytes, parent, leaf, descriptors, weight)
+    if fault:
+        raise InputError(f"{path}: line {node + 1} {_FAULTS[fault]}; fetch or export it again.")
+    parent[0] = -1
+    _check_family(path, parent, leaf, branching)
+    order, level = _breadth_first(parent)
+    if level[-1] > levels:
+        deep = int(order[np.argmax(level > levels)])
+        raise InputError(
+            f"{path}: line {deep + 1} is at level {level.max()}, but line 1 says {levels} levels."
+        )
+    n_children = np.bincount(parent[1:], minlength=n + 1)[order]
+    return from_children(
+        branching,
+        levels,
+        np.ascontiguousarray(descriptors[order]).view(np.uint64),
+        n_children.astype(np.uint8),
+        weight[order][leaf[order]].astype(np.float32),
+    )
+
+
+def write_text(vocabulary: Vocabulary, path: Path) -> None:
+    """Write a vocabulary so that DBoW2 and ORB-SLAM read it.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
+    v = vocabulary
+    weight = np.zeros(len(v.word), np.float32)
+    weight[v.word >= 0] = v.weight
+    byte = [f" {value}" for value in range(256)]
+    # No line break at the end: ORB-SLAM's reader takes what follows one for a node.
+    lines = [f"{v.branching} {v.levels} {L1_NORM} {TF_IDF}"]
+    rows = zip(
+        v.parent[1:].tolist(),
+        (v.word[1:] >= 0).tolist(),
+        v.descriptors[1:].view(np.uint8).tolist(),
+        weight[1:].tolist(),
+        strict=True,
+    )
+    for parent, leaf, values, idf in rows:
+        lines.append(f"{parent} {leaf:d}{''.join([byte[value] for value in values])} {idf:.9g}")
+    try:
+        path.write_text("\n".join(lines), encoding="ascii")
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error
+
+
+def _read_header(path: Path, header: bytes) -> tuple[int, int]:
+    try:
+        branching, levels, scoring, weighting = map(int, header.split())
+    except ValueError:
+        raise InputError(
+            f"{path}: line 1 is not 'k L scoring weighting' in whole numbers; "
+            "is this a vocabulary in DBoW2's text format?"
+        ) from None
+    if not (2 <= branching <= MAX_BRANCHING and 1 <= levels <= MAX_LEVELS):
+        raise InputError(
+            f"{path}: line 1 says k {branching} and L {levels}, which are not "
+            f"in 2 to {MAX_BRANCHING} and 1 to {MAX_LEVELS}."
+        )
+    if (scoring, weighting) != (L1_NORM, TF_IDF):
+        raise InputError(
+            f"{path}: line 1 says scoring {scoring} and weighting {weighting}; "
+            "only 0 and 0 (L1 norm, tf-idf) can be read."
+        )
+    return branching, levels
+
+
+def _check_family(
+    path: Path, parent: NDArray[np.int64], leaf: NDArray[np.bool_], branching: int
+) -> None:
+    """Leaves have no children, other nodes have one at least and ``branching`` at most."""
+    n_children = np.bincount(parent[1:], minlength=len(parent))
+    for wrong, what in (
+        (leaf & (n_children > 0), "is a leaf and has children"),
+        (~leaf & (n_children == 0), "is no leaf and has no children: the file was cut short"),
+        (n_children > branching, f"has more children than the {branching} that line 1 says"),
+    ):
+        if wrong.any():
+            node = int(np.argmax(wrong))
+            where = f"line {node + 1}" if node else "the root"
+            raise InputError(f"{path}: {where} {what}; fetch or export it again.")
+
+
+def _breadth_first(parent: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Nodes level by level, siblings together and in the order of their lines, and the levels."""
+    by_parent = np.argsort(parent, kind="stable")
+    n_children = np.bincount(parent[1:], minlength=len(parent))
+    first = 1 + np.cumsum(n_children) - n_children  # in by_parent, behind the root
+    generations = [np.zeros(1, np.int64)]
+    while True:
+        parents = generations[-1][n_children[generations[-1]] > 0]
+        if len(parents) == 0:
+            break
+        counts = n_children[parents]
+        within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        generations.append(by_parent[np.repeat(first[parents], counts) + within])
+    levels = np.repeat(np.arange(len(generations)), [len(nodes) for nodes in generations])
+    return np.concatenate(generations), levels
+
+
+@inner_kernel
+def read_number(text, position):
+    """Decimal number at ``position``: (value, position behind it), or (nan, ...) if it is none."""
+    end = len(text)
+    negative = False
+    if position < end and (text[position] == ord("-") or text[position] == ord("+")):
+        negative = text[position] == ord("-")
+        position += 1
+    value, exponent, digits = 0.0, 0, 0
+    while position < end and ord("0") <= text[position] <= ord("9"):
+        value = 10.0 * value + (text[position] - ord("0"))
+        digits += 1
+        position += 1
+    if position < end and text[position] == ord("."):
+        position += 1
+        while position < end and ord("0") <= text[position] <= ord("9"):
+            value = 10.0 * value + (text[position] - ord("0"))
+            digits += 1
+            exponent -= 1
+            position += 1
+    if digits == 0:
+        return np.nan, position
+    if position < end and (text[position] == ord("e") or text[position] == ord("E")):
+        position += 1
+        down = position < end and text[position] == ord("-")
+        if position < end and (down or text[position] == ord("+")):
+            position += 1
+        power, digits = 0, 0
+        while position < end and ord("0") <= text[position] <= ord("9"):
+            power = min(10 * power + (text[position] - ord("0")), 9999)
+            digits += 1
+            position += 1
+        if digits == 0:
+            return np.nan, position
+        exponent += -power if down else power
+    # A division by a power of ten rounds once, a product with its inverse twice.
+    value = value / 10.0**-exponent if exponent < 0 else value * 10.0**exponent
+    return (-value if negative else value), position
+
+
+@kernel
+def parse_nodes(text, parent, leaf, descriptors, weight):
+    """Read the lines of the nodes 1 ... n of ``(n + 1,)`` arrays, which are written.
+
+    Returns:
+        node at fault, and the fault (one of ``_FAULTS``), or 0, 0.
+    """
+    position, end = 0, len(text)
+    for node in range(1, len(parent)):
+        column = 0
+        while True:
+            while position < end and (
+                text[position] == ord(" ")
+                or text[position] == ord("\t")
+                or text[position] == ord("\r")
+            ):
+                position += 1
+            if position == end or text[position] == ord("\n"):
+                position += 1
+                break
+            if column == NUMBERS:
+                return node, _TOO_MANY
+            value, position = read_number(text, position)
+            if np.isnan(value) or (
+                position < end
+                and text[position] != ord(" ")
+                and text[position] != ord("\t")
+                and text[position] != ord("\r")
+                and text[position] != ord("\n")
+            ):
+                return node, _NO_NUMBER
+            if column == 0:
+                if not (0 <= value < node and value == np.floor(value)):
+                    return node, _NO_PARENT
+                parent[node] = np.int64(value)
+            elif column == 1:
+                if value != 0.0 and value != 1.0:
+                    return node, _NO_FLAG
+                leaf[node] = value == 1.0
+            elif column < NUMBERS - 1:
+                if not (0 <= value <= 255 and value == np.floor(value)):
+                    return node, _NO_BYTE
+                descriptors[node, column - 2] = np.uint8(value)
+            else:
+                if not (0.0 <= value <= 3e38):
+                    return node, _NO_WEIGHT
+                weight[node] = value
+            column += 1
+        if column < NUMBERS:
+            return node, _TOO_FEW
+    return 0, 0

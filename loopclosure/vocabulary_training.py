@@ -1,0 +1,243 @@
+"""Training of a vocabulary: k-majority clustering, level by level.
+
+Galvez-Lopez and Tardos (T-RO 2012, section III) on binary descriptors, after Nister and Stewenius
+(CVPR 2006): in each node, descriptors go to the nearest of k centres and each centre becomes the
+majority of its descriptors, bit by bit, until nothing changes. All arithmetic is on whole numbers
+and the random numbers are our own, so that a seed means the same tree everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.kernels import hamming, inner_kernel, kernel
+from vslam.loopclosure.vocabulary import MAX_BRANCHING, MAX_LEVELS, Vocabulary, from_children
+
+TRIALS = 4  # about 2 + ln k, of greedy k-means++
+ITERATIONS = 12  # of the majority vote in a node; most nodes settle earlier
+
+
+def train(
+    descriptors_of_images: Sequence[NDArray[np.uint8]],
+    branching: int = 10,
+    levels: int = 5,
+    seed: int = 0,
+    on_level: Callable[[int, int], None] | None = None,
+) -> Vocabulary:
+    """Grow a tree on the ``(n, 32)`` uint8 descriptors of each image; the same for the same seed.
+
+    Args:
+        on_level: told the levels done and the nodes so far.
+
+    Raises:
+        ValueError: branching or levels out of range, or fewer than two different descriptors.
+    """
+    if not (2 <= branching <= MAX_BRANCHING and 1 <= levels <= MAX_LEVELS):
+        raise ValueError(
+            f"branching is 2 to {MAX_BRANCHING} and levels 1 to {MAX_LEVELS}, "
+            f"not {branching} and {levels}"
+        )
+    counts = [len(one) for one in descriptors_of_images]
+    if sum(counts) == 0:
+        raise ValueError("there are no descriptors to train on")
+    data = np.ascontiguousarray(np.concatenate(descriptors_of_images)).view(np.uint64)
+    order = np.arange(len(data), dtype=np.int64)
+    centres, n_children = [np.zeros((1, 4), np.uint64)], []
+    starts = np.array([0, len(data)], np.int64)  # of the nodes of a level within `order`
+    for level in range(levels):
+        stream = np.uint64((seed * MAX_LEVELS + level) % 2**64)
+        new, split, starts = split_level(data, order, starts, branching, stream, ITERATIONS)
+        centres.append(new)
+        n_children.append(split)
+        if on_level is not None:
+            on_level(level + 1, sum(map(len, centres)))
+    if len(centres[1]) < 2:
+        raise ValueError("all descriptors are the same")
+    n_children.append(np.zeros(len(centres[-1]), np.uint8))
+    nodes, children = np.concatenate(centres), np.concatenate(n_children)
+    n_leaves = int(np.count_nonzero(children == 0))
+    tree = from_children(branching, levels, nodes, children, np.ones(n_leaves, np.float32))
+    seen_in = np.zeros(n_leaves, np.int64)
+    for one in descriptors_of_images:
+        seen_in[np.unique(tree.words(one))] += 1
+    # Every leaf is the nearest of some training descriptor: none is seen nowhere.
+    weight = np.log(len(counts) / np.maximum(seen_in, 1)).astype(np.float32)
+    return from_children(branching, levels, nodes, children, weight)
+
+
+@inner_kernel
+def uniform(state):
+    """Next number of [0, 1) and the state after it: splitmix64 (Steele et al., OOPSLA 2014)."""
+    state = state + np.uint64(0x9E3779B97F4A7C15)
+    z = state
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z = z ^ (z >> np.uint64(31))
+    return np.float64(z >> np.uint64(11)) / 9007199254740992.0, state
+
+
+@inner_kernel
+def seed_centres(data, members, branching, state, nearest, centres):
+    """Choose up to ``branching`` different members, far from each other.
+
+    k-means++ (Arthur and Vassilvitskii, SODA 2007) draws a member by its squared distance to the
+    nearest centre so far; of bit vectors, that is the Hamming distance itself. Of ``TRIALS``
+    drawn, the one that brings all members nearest is taken (their section 7).
+
+    Args:
+        members: ``(n,)`` indices into data; nearest: ``(n,)`` int64 workspace.
+        centres: ``(branching, 4)`` uint64, written.
+
+    Returns:
+        How many there are; fewer only if there are no more different descriptors.
+    """
+    n = len(members)
+    draw, state = uniform(state)
+    chosen = members[min(int(draw * n), n - 1)]
+    for i in range(n):
+        nearest[i] = 257
+    for k in range(branching):
+        for w in range(4):
+            centres[k, w] = data[chosen, w]
+        total = 0
+        for i in range(n):
+            distance = hamming(data[members[i]], centres[k])
+            if distance < nearest[i]:
+                nearest[i] = distance
+            total += nearest[i]
+        if total == 0 or k == branching - 1:
+            return k + 1
+        least_left = total + 1
+        for _ in range(TRIALS):
+            draw, state = uniform(state)
+            target, drawn = int(draw * total), 0
+            while target >= nearest[drawn] and drawn < n - 1:
+                target -= nearest[drawn]
+                drawn += 1
+            left = 0
+            for i in range(n):
+                left += min(nearest[i], hamming(data[members[i]], data[members[drawn]]))
+            if left < least_left:
+                least_left = left
+                chosen = members[drawn]
+    return branching
+
+
+@inner_kernel
+def assign(data, members, centres, n_centres, label):
+    """Give each member the nearest centre, the first of equals; returns how many changed."""
+    changed = 0
+    for i in range(len(members)):
+        nearest, least = 0, 257
+        for k in range(n_centres):
+            distance = hamming(data[members[i]], centres[k])
+            if distance < least:
+                nearest, least = k, distance
+        if label[i] != nearest:
+            label[i] = nearest
+            changed += 1
+    return changed
+
+
+@inner_kernel
+def vote(data, members, label, n_centres, ones, size, centres):
+    """Set each bit of a centre that more than half of its members have; the others keep theirs.
+
+    Args:
+        ones: ``(branching, 256)`` int64, and size: ``(branching,)`` int64, workspace.
+    """
+    for k in range(n_centres):
+        size[k] = 0
+        for bit in range(256):
+            ones[k, bit] = 0
+    for i in range(len(members)):
+        k = label[i]
+        size[k] += 1
+        for w in range(4):
+            value = data[members[i], w]
+            for bit in range(64):
+                ones[k, 64 * w + bit] += np.int64((value >> np.uint64(bit)) & np.uint64(1))
+    for k in range(n_centres):
+        if size[k] == 0:
+            continue
+        for w in range(4):
+            value = np.uint64(0)
+            for bit in range(64):
+                if 2 * ones[k, 64 * w + bit] > size[k]:
+                    value |= np.uint64(1) << np.uint64(bit)
+            centres[k, w] = value
+
+
+@kernel
+def split_level(data, order, starts, branching, stream, iterations):
+    """Split each node of a level into clusters, and sort ``order`` by them.
+
+    Args:
+        data: ``(M, 4)`` uint64; order: ``(M,)`` int64 indices into it, grouped by node, written.
+        starts: ``(n + 1,)`` int64, where the group of each of the n nodes starts; groups of
+            nodes that are leaves already have been left out of ``order``'s range.
+        stream: uint64 that the random numbers of this level follow from.
+
+    Returns:
+        centres: ``(c, 4)`` uint64 of the children, node by node.
+        n_children: ``(n,)`` uint8; a node with one descriptor only, many times, has none.
+        child_starts: ``(c + 1,)`` int64.
+    """
+    n_nodes = len(starts) - 1
+    centres = np.zeros((n_nodes * branching, 4), np.uint64)
+    n_children = np.zeros(n_nodes, np.uint8)
+    child_starts = np.zeros(n_nodes * branching + 1, np.int64)
+    largest = 0
+    for node in range(n_nodes):
+        largest = max(largest, starts[node + 1] - starts[node])
+    label, nearest = np.empty(largest, np.int64), np.empty(largest, np.int64)
+    sorted_members = np.empty(largest, np.int64)
+    own = np.empty((branching, 4), np.uint64)
+    ones = np.empty((branching, 256), np.int64)
+    size, cursor = np.empty(branching, np.int64), np.empty(branching, np.int64)
+    total, filled = 0, 0
+    for node in range(n_nodes):
+        members = order[starts[node] : starts[node + 1]]
+        n = len(members)
+        # Far apart for each node, so that no two read the same stretch of the sequence.
+        state = stream * np.uint64(0xD1342543DE82EF95) + np.uint64(node) * np.uint64(1 << 40)
+        n_centres = seed_centres(data, members, branching, state, nearest, own)
+        if n_centres == 1:
+            continue  # one descriptor: a leaf
+        for i in range(n):
+            label[i] = -1
+        changed = assign(data, members, own, n_centres, label)
+        iteration = 0
+        # The last step is an assignment: members are where a descent will find them.
+        while changed > 0 and iteration < iterations:
+            vote(data, members, label, n_centres, ones, size, own)
+            changed = assign(data, members, own, n_centres, label)
+            iteration += 1
+        for k in range(n_centres):
+            size[k] = 0
+        for i in range(n):
+            size[label[i]] += 1
+        position = 0
+        for k in range(n_centres):
+            cursor[k] = position
+            position += size[k]
+        for i in range(n):
+            sorted_members[cursor[label[i]]] = members[i]
+            cursor[label[i]] += 1
+        # Leaves of upper levels leave holes: what is split moves together.
+        for i in range(n):
+            order[filled + i] = sorted_members[i]
+        for k in range(n_centres):
+            if size[k] == 0:
+                continue
+            for w in range(4):
+                centres[total, w] = own[k, w]
+            child_starts[total] = filled
+            filled += size[k]
+            total += 1
+            n_children[node] += 1
+        child_starts[total] = filled
+    return centres[:total].copy(), n_children, child_starts[: total + 1].copy()

@@ -1,0 +1,140 @@
+"""Loops closed, lost cameras found and sub-maps joined, on a ring of points (tests/ring.py)."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from ring import CAMERA, LAP, Oracle, Ring
+
+from vslam.features import Features, TrackingState
+from vslam.geometry import inverse
+from vslam.loopclosure.detector import NoDetector
+from vslam.loops import LoopCandidate
+from vslam.slam import Slam
+
+ROUND = [float(k) for k in range(LAP + 40)]
+DRIFTING = Ring.create(focal_error=0.01)
+EXACT = Ring.create()
+
+
+class Deceived(Oracle):
+    """Takes the opposite side of the ring for the place."""
+
+    def query(self, keyframe, map_):
+        opposite = int(np.argmin(np.abs(np.array(map_.frames) - map_.frames[keyframe] + LAP // 2)))
+        if keyframe < 20 or not map_.arrays.keyframe_alive[opposite]:
+            return []
+        return [LoopCandidate(keyframe, opposite, 1.0)]
+
+
+def run(ring, frames, detector=None, *, threads=1, dark=(), finish=True):
+    """Drive along ``frames`` of the ring, ten a second; ``dark`` ones show nothing."""
+    slam = Slam(CAMERA, None, detector, threads=threads)
+    results = []
+    for i, k in enumerate(frames):
+        image = np.array([[i & 255, i >> 8]], np.uint8)  # tells the oracle which frame it is
+        features = Features.none() if i in dark else ring.see(k, 1)
+        results.append(slam.step_features(features, 0.1 * i, image))
+    if finish:
+        slam.finish()
+    return slam, results
+
+
+def errors(slam, ring, frames):
+    """``(N,)`` metres between estimated and true positions, in the world of the first frame."""
+    T_0 = inverse(ring.pose(frames[0]))
+    truth = np.array([(T_0 @ ring.pose(k))[:3, 3] for k in frames])
+    return np.linalg.norm(slam.trajectory().T_wc[:, :3, 3] - truth, axis=1)
+
+
+@cache
+def closed():
+    return run(DRIFTING, ROUND, Oracle(DRIFTING, ROUND))[0]
+
+
+def test_a_closed_loop_takes_the_drift_out(check_map):
+    without, _ = run(DRIFTING, ROUND)
+    slam = closed()
+    before, after = errors(without, DRIFTING, ROUND), errors(slam, DRIFTING, ROUND)
+    assert before[-1] > 3.0
+    assert after[-1] < 0.8
+    assert np.sqrt((after**2).mean()) < 0.5 * np.sqrt((before**2).mean())
+    accepted = [edge for edge in slam.loops if edge.accepted]
+    assert [edge.reason for edge in accepted] == ["closed"] * len(slam.closures)
+    assert slam.closures
+    check_map(slam.map)
+
+
+def test_both_ends_of_a_loop_see_the_same_landmarks_afterwards():
+    slam = closed()
+    edge = slam.closures[0].edge
+    shared = dict(zip(*(x.tolist() for x in slam.map.covisible(edge.query)), strict=True))
+    assert shared[edge.match] >= 40
+
+
+def test_a_closure_says_where_the_keyframes_were():
+    closure = closed().closures[0]
+    query = int(np.flatnonzero(closure.keyframes == closure.edge.query)[0])
+    match = int(np.flatnonzero(closure.keyframes == closure.edge.match)[0])
+    gap = [
+        np.linalg.norm((T[query] @ inverse(T[match]))[:3, 3] - closure.edge.T_query_match[:3, 3])
+        for T in (closure.T_cw_before, closure.T_cw_after)
+    ]
+    assert gap[0] > 2.0
+    assert gap[1] < 0.1
+
+
+def test_same_bytes_with_one_thread_and_two():
+    again = run(DRIFTING, ROUND, Oracle(DRIFTING, ROUND), threads=2)[0]
+    assert again.trajectory().T_wc.tobytes() == closed().trajectory().T_wc.tobytes()
+
+
+def test_a_detector_that_is_wrong_changes_nothing():
+    deceived = run(DRIFTING, ROUND, Deceived(DRIFTING, ROUND))[0]
+    without = run(DRIFTING, ROUND, NoDetector())[0]
+    assert deceived.loops
+    assert not any(edge.accepted for edge in deceived.loops)
+    assert deceived.trajectory().T_wc.tobytes() == without.trajectory().T_wc.tobytes()
+
+
+def test_a_camera_carried_back_is_found_in_the_map():
+    frames = [*ROUND[:90], *(k + 0.4 for k in ROUND[30:60])]
+    slam, results = run(EXACT, frames, Oracle(EXACT, frames))
+    lost = [r.index for r in results if r.state is TrackingState.LOST]
+    assert len(lost) <= 3
+    assert not slam.map.restarts
+    assert errors(slam, EXACT, frames)[[i for i in range(len(frames)) if i not in lost]].max() < 0.5
+
+
+def test_a_camera_carried_back_is_lost_without_a_detector():
+    frames = [*ROUND[:90], *(k + 0.4 for k in ROUND[30:60])]
+    slam, results = run(EXACT, frames)
+    assert errors(slam, EXACT, frames)[-1] > 50.0
+    assert sum(r.state is TrackingState.LOST for r in results) >= 10
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_parts_of_the_map_are_joined_by_a_loop(check_map, threads):
+    frames = [*ROUND[:80], *ROUND[140:]]  # 60 frames, 90 m, cut out
+    slam, results = run(EXACT, frames, Oracle(EXACT, frames), threads=threads)
+    assert len(slam.map.restarts) == 1
+    assert slam.closures
+    tracked = [r.index for r in results if r.state is not TrackingState.LOST]
+    found = errors(slam, EXACT, frames)
+    assert found[tracked].max() < 0.7  # the part after the cut lay some 70 m off
+    assert len(slam.trajectory()) == len(frames)
+    check_map(slam.map)
+
+
+def test_two_seconds_of_darkness_lose_no_pose(check_map):
+    slam, results = run(EXACT, ROUND, Oracle(EXACT, ROUND), dark=range(60, 80))
+    assert len(slam.trajectory()) == len(ROUND)
+    assert np.isfinite(slam.trajectory().T_wc).all()
+    lost = [r.index for r in results if r.state is TrackingState.LOST]
+    assert set(range(60, 80)) <= set(lost)
+    assert len(lost) <= 22
+    found = errors(slam, EXACT, ROUND)
+    assert found.max() < 1.5  # the dark frames too: their motion is interpolated
+    check_map(slam.map)

@@ -1,0 +1,195 @@
+"""When candidates persist, and when verified loops agree."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vslam.config import ConsistencyConfig
+from vslam.geometry import compose, inverse, se3_exp, se3_log
+from vslam.loopclosure.consistency import LoopConsistency, implied_drift
+from vslam.loops import LoopCandidate, LoopEdge
+
+STRICT = ConsistencyConfig(min_keyframes=3, max_gap=0)  # ORB-SLAM's rule
+DRIFT = se3_exp(np.array([2.0, 0.3, -4.0, 0.01, 0.12, 0.0]))
+
+
+class Street:
+    """A map as consistency asks it: keyframes 2 m apart, driven twice, covisible up to 6 m.
+
+    The second pass starts with keyframe 100 and has drifted.
+    """
+
+    def covisible(self, keyframe: int, minimum: int = 1):
+        near = [keyframe + d for d in (1, -1, 2, -2, 3, -3)]
+        return np.array(near), np.full(len(near), 50)
+
+    def keyframe_pose(self, keyframe: int) -> np.ndarray:
+        truth = inverse(se3_exp(np.array([0.0, 0.0, 2.0 * (keyframe % 100), 0.0, 0.0, 0.0])))
+        return compose(truth, inverse(DRIFT)) if keyframe >= 100 else truth
+
+
+STREET = Street()
+
+
+def candidates(query: int, *matches: int) -> list[LoopCandidate]:
+    return [LoopCandidate(query, match, 0.5) for match in matches]
+
+
+def verified(query: int, match: int, error=(0.0, 0.0, 0.0), turn: float = 0.0) -> LoopEdge:
+    """An edge with the true relative pose, wrong by ``error`` (m) and ``turn`` (degrees)."""
+    true = compose(
+        inverse(se3_exp(np.array([0.0, 0.0, 2.0 * (query - 100), 0.0, 0.0, 0.0]))),
+        inverse(STREET.keyframe_pose(match)),
+    )
+    wrong = se3_exp(np.array([*error, 0.0, np.radians(turn), 0.0]))
+    return LoopEdge(query, match, 0.5, True, "verified", 100, 90, compose(wrong, true))
+
+
+# -- by looks -------------------------------------------------------------------------------------
+
+
+def test_a_place_must_resemble_three_keyframes_in_a_row():
+    consistency = LoopConsistency(STRICT)
+    for turn, query in enumerate((110, 111, 112, 113)):
+        consistent, rejected = consistency.update(query, candidates(query, 10 + turn), STREET)
+        assert len(consistent) == (turn >= 2)
+        assert [edge.reason for edge in rejected] == (
+            [] if turn >= 2 else [f"resembled {turn + 1} of 3 keyframes in a row"]
+        )
+        assert all((e.query, e.accepted) == (query, False) for e in rejected)
+
+
+def test_places_that_jump_are_not_consistent():
+    consistency = LoopConsistency(STRICT)
+    for query, match in ((110, 10), (111, 40), (112, 70), (113, 10), (114, 40)):
+        consistent, rejected = consistency.update(query, candidates(query, match), STREET)
+        assert consistent == []
+        assert rejected[0].match == match
+
+
+@pytest.mark.parametrize(("gap", "still"), [(0, False), (1, True)])
+def test_a_keyframe_without_candidates_in_between(gap, still):
+    consistency = LoopConsistency(STRICT.model_copy(update={"max_gap": gap}))
+    consistency.update(110, candidates(110, 10), STREET)
+    consistency.update(111, candidates(111, 11), STREET)
+    consistency.update(112, [], STREET)
+    consistent, _ = consistency.update(113, candidates(113, 13), STREET)
+    assert bool(consistent) == still
+    consistency.update(114, [], STREET)
+    consistency.update(115, [], STREET)
+    assert consistency.update(116, candidates(116, 16), STREET)[0] == []
+
+
+def test_only_the_consistent_one_of_several_candidates_passes():
+    consistency = LoopConsistency(STRICT)
+    for query, other in ((110, 50), (111, 70), (112, 90)):
+        consistent, rejected = consistency.update(
+            query, candidates(query, other, query - 100), STREET
+        )
+    assert [c.match for c in consistent] == [12]
+    assert [e.match for e in rejected] == [90]
+
+
+def test_overlapping_groups_do_not_multiply():
+    # Each of ten candidates overlaps all the groups before: pairs of them would be 10^30.
+    consistency = LoopConsistency(ConsistencyConfig(min_keyframes=3, max_gap=2))
+    for query in range(110, 140):
+        matches = [20 + (query + i) % 10 for i in range(10)]
+        consistency.update(query, candidates(query, *matches), STREET)
+        assert consistency.n_groups <= 10
+    for query in range(140, 170):  # and those that nothing continues are forgotten
+        apart = [1000 * query + 20 * i for i in range(10)]
+        consistency.update(query, candidates(query, *apart), STREET)
+        assert consistency.n_groups <= 30
+
+
+def test_the_same_group_twice_counts_once():
+    consistency = LoopConsistency(STRICT)
+    consistent, rejected = consistency.update(110, candidates(110, 10, 10, 10, 11), STREET)
+    assert consistent == []
+    assert len(rejected) == 4
+    assert consistency.n_groups == 2
+
+
+# -- verified ones --------------------------------------------------------------------------------
+
+
+def test_the_drift_of_a_true_edge_is_undone():
+    np.testing.assert_allclose(
+        se3_log(compose(implied_drift(verified(110, 10), STREET), DRIFT)), 0, atol=1e-12
+    )
+
+
+def test_two_true_edges_confirm_each_other():
+    consistency = LoopConsistency(ConsistencyConfig())
+    consistency.update(110, [], STREET)
+    first = consistency.confirm(verified(110, 10, (0.05, 0.02, 0.1), 0.05), STREET)
+    assert not first.accepted
+    assert first.reason == "verified by 1 of 2 keyframes"
+    assert first.T_query_match is not None
+    consistency.update(111, [], STREET)
+    second = consistency.confirm(verified(111, 12, (-0.05, 0.0, 0.05), -0.05), STREET)
+    assert second.accepted
+    assert second.reason == "verified"
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"error": (1.0, 0.0, 0.0)}, {"error": (0.0, 0.0, 8.0)}, {"turn": 3.0}]
+)
+def test_edges_that_disagree_do_not(wrong):
+    consistency = LoopConsistency(ConsistencyConfig())
+    consistency.update(110, [], STREET)
+    consistency.confirm(verified(110, 10, **wrong), STREET)
+    consistency.update(111, [], STREET)
+    assert not consistency.confirm(verified(111, 11), STREET).accepted
+    consistency.update(112, [], STREET)
+    assert consistency.confirm(verified(112, 12), STREET).accepted  # the true ones outlive it
+
+
+def test_one_keyframe_cannot_confirm_itself():
+    consistency = LoopConsistency(ConsistencyConfig())
+    consistency.update(110, [], STREET)
+    for match in (9, 10, 11):
+        assert not consistency.confirm(verified(110, match), STREET).accepted
+
+
+def test_verified_edges_are_forgotten_in_time_and_at_a_reset():
+    config = ConsistencyConfig(verified_memory=3)
+    for forgets in ("time", "reset"):
+        consistency = LoopConsistency(config)
+        consistency.update(110, [], STREET)
+        consistency.confirm(verified(110, 10), STREET)
+        if forgets == "time":
+            for query in range(111, 115):
+                consistency.update(query, [], STREET)
+        else:
+            consistency.reset()
+            consistency.update(111, [], STREET)
+        assert not consistency.confirm(verified(114, 14), STREET).accepted
+
+
+def test_a_rejected_edge_stays_rejected_and_counts_for_nothing():
+    consistency = LoopConsistency(ConsistencyConfig())
+    consistency.update(110, [], STREET)
+    rejected = LoopEdge(110, 10, 0.5, False, "only 3 descriptors match")
+    assert consistency.confirm(rejected, STREET) is rejected
+    consistency.update(111, [], STREET)
+    assert not consistency.confirm(verified(111, 11), STREET).accepted
+
+
+def test_a_revisit_of_twenty_metres_is_closed_within_it():
+    # Keyframes every 3 m and a detector that misses every other one.
+    consistency = LoopConsistency(ConsistencyConfig())
+    closed_at = None
+    for turn in range(7):
+        query = 110 + turn
+        found = candidates(query, 10 + turn) if turn % 2 == 0 else []
+        consistent, _ = consistency.update(query, found, STREET)
+        for candidate in consistent:
+            if consistency.confirm(verified(query, candidate.match), STREET).accepted:
+                closed_at = 3 * turn
+                break
+        if closed_at:
+            break
+    assert closed_at == 12

@@ -1,0 +1,155 @@
+"""Global bundle adjustment against the dense one and GTSAM, and its merging into a map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from test_bundle_adjustment import CAMERA, gtsam_graph, make_problem, pose_differences
+
+from vslam.backend.bundle_adjustment import BundleProblem, adjust
+from vslam.backend.global_bundle_adjustment import adjust_globally, coupled_cameras
+from vslam.geometry import inverses, se3_exp, transform
+
+
+def loop_problem(
+    *, n: int = 36, noise: float = 0.5, mono: float = 0.3, seed: int = 0
+) -> tuple[BundleProblem, np.ndarray]:
+    """Cameras on a circle looking outwards at a ring of points: each couples to its neighbours
+    and the last to the first. A drifting start; true ``T_cw``, the held one last."""
+    rng = np.random.default_rng(seed)
+    angle = 2 * np.pi * np.arange(n) / n
+    T_wc = np.array([se3_exp(np.array([0, 0, 0, 0, a, 0.0])) for a in angle])
+    T_wc[:, :3, 3] = 4.0 * T_wc[:, :3, 2]
+    around = rng.uniform(0, 2 * np.pi, 15 * n)
+    ring = rng.uniform(12, 25, 15 * n)
+    points = np.stack([ring * np.sin(around), rng.uniform(-2, 2, 15 * n), ring * np.cos(around)], 1)
+    truth = inverses(T_wc)
+    start = truth.copy()
+    drift = np.eye(4)
+    for k in range(1, n):
+        drift = se3_exp(rng.normal(size=6) * [0.04, 0.04, 0.04, 0.006, 0.006, 0.006]) @ drift
+        start[k] = drift @ truth[k]
+    roll = np.roll(np.arange(n), -1)
+    truth, start = truth[roll], start[roll]
+    first, camera, uvr = [0], [], []
+    for p in points:
+        for k in range(n):
+            q = transform(truth[k], p[None])
+            seen = CAMERA.project(q)[0]
+            if q[0, 2] > 1 and (np.abs(seen[:2] - [320, 120]) < [250, 120]).all():
+                seen += noise * rng.normal(size=3)
+                if rng.random() < mono:
+                    seen[2] = np.nan
+                camera.append(k)
+                uvr.append(seen)
+        first.append(len(camera))
+    problem = BundleProblem(
+        T_cw=start,
+        n_free=n - 1,
+        points=points + 0.2 * rng.normal(size=points.shape),
+        first=np.array(first),
+        camera=np.array(camera),
+        uvr=np.array(uvr),
+        inverse_sigma2=np.ones(len(camera)),
+        intrinsics=CAMERA.intrinsics,
+    )
+    return problem, truth
+
+
+def test_the_ring_is_sparse_and_closed():
+    problem, _ = loop_problem()
+    used = np.ones(len(problem.camera), bool)
+    pairs = coupled_cameras(problem.first, problem.camera, used, problem.n_free)
+    n = problem.n_free
+    assert (pairs[:, 0] < pairs[:, 1]).all()
+    assert len(np.unique(pairs, axis=0)) == len(pairs) < 0.45 * n * (n - 1) / 2
+    assert (pairs[:, 1] - pairs[:, 0] > n - 4).any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_same_optimum_as_the_dense_one(seed):
+    problem, truth = loop_problem(seed=seed)
+    dense = adjust(problem, iterations=40, tolerance=1e-13)
+    ours = adjust_globally(problem, iterations=40, tolerance=1e-13)
+    assert ours.cost == pytest.approx(dense.cost, rel=1e-9)
+    assert pose_differences(ours.T_cw, dense.T_cw).max() < 1e-6
+    np.testing.assert_array_equal(ours.inlier, dense.inlier)
+    # Half a pixel of noise leaves a few centimetres; what is exact without it is tested below.
+    before, after = pose_differences(problem.T_cw, truth), pose_differences(ours.T_cw, truth)
+    assert after.max() < 0.06 < 0.3 * before.max()
+    assert ours.T_cw[-1].tobytes() == problem.T_cw[-1].tobytes()
+
+
+def test_each_step_is_the_dense_one():
+    problem, _, _ = make_problem(noise=0.6, outliers=30)
+    for iterations in (0, 1, 3):
+        dense = adjust(problem, iterations=iterations, tolerance=0.0)
+        ours = adjust_globally(problem, iterations=iterations, tolerance=0.0)
+        assert ours.iterations == dense.iterations
+        assert ours.cost == pytest.approx(dense.cost, rel=1e-9)
+        assert np.abs(ours.T_cw - dense.T_cw).max() < 1e-7
+        assert np.abs(ours.points - dense.points).max() < 1e-5
+        np.testing.assert_array_equal(ours.inlier, dense.inlier)
+
+
+def test_same_optimum_as_gtsam_round_the_loop():
+    problem, _ = loop_problem(n=30)
+    ours = adjust_globally(problem, iterations=100, tolerance=1e-13)
+    graph, values = gtsam_graph(problem)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(100)
+    parameters.setRelativeErrorTol(1e-13)
+    parameters.setAbsoluteErrorTol(1e-13)
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    theirs = inverses(np.array([result.atPose3(k).matrix() for k in range(30)]))
+    assert ours.cost == pytest.approx(graph.error(result), rel=1e-6)
+    assert ours.cost < 0.5 * graph.error(values)
+    assert pose_differences(ours.T_cw, theirs).max() < 1e-5
+
+
+def test_observations_out_of_use_have_no_influence():
+    problem, truth = loop_problem(noise=0.0)
+    use = np.random.default_rng(0).random(len(problem.camera)) > 0.1
+    uvr = problem.uvr.copy()
+    uvr[~use, :2] += 300.0
+    spoilt = replace(problem, uvr=uvr)
+    solution = adjust_globally(spoilt, iterations=50, use=use, tolerance=1e-14)
+    assert solution.cost < 1e-10
+    assert pose_differences(solution.T_cw, truth).max() < 1e-6
+    np.testing.assert_array_equal(solution.inlier, use)
+
+
+def test_stops_when_told_with_what_it_has():
+    problem, _ = loop_problem()
+    answers = iter([False, False, True])
+    solution = adjust_globally(problem, iterations=50, tolerance=0.0, stop=lambda: next(answers))
+    assert solution.iterations == 2
+    two = adjust_globally(problem, iterations=2, tolerance=0.0)
+    assert solution.T_cw.tobytes() == two.T_cw.tobytes()
+    assert solution.points.tobytes() == two.points.tobytes()
+
+
+def test_nothing_to_do():
+    problem, _ = loop_problem()
+    empty = replace(
+        problem,
+        points=np.empty((0, 3)),
+        first=np.zeros(1, np.int64),
+        camera=np.empty(0, np.int64),
+        uvr=np.empty((0, 3)),
+        inverse_sigma2=np.empty(0),
+    )
+    solution = adjust_globally(empty, iterations=5)
+    assert (solution.cost, len(solution.inlier)) == (0.0, 0)
+    assert np.array_equal(solution.T_cw, problem.T_cw)
+
+
+def test_all_cameras_held_moves_points_only():
+    problem, truth = loop_problem(noise=0.0)
+    held = replace(problem, T_cw=truth, n_free=0)
+    solution = adjust_globally(held, iterations=30, tolerance=1e-14)
+    assert solution.T_cw.tobytes() == truth.tobytes()
+    assert solution.cost < 1e-10

@@ -1,0 +1,120 @@
+"""A lost frame of a simulated street is found, or left as it was."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_mapping import CAMERA, World, make_world
+from test_verification import forward, in_strip, link_pass
+
+from vslam.config import Config, RelocalizationConfig
+from vslam.features import FeatureGrid, Features
+from vslam.frontend.relocalization import relocalise
+from vslam.frontend.tracking import Frame, Tracker
+from vslam.geometry import inverse, se3_exp, se3_log
+from vslam.map import local_map
+
+TRACKER = Tracker.create(CAMERA, Config())
+KEYFRAMES = 4
+
+
+def mapped_street() -> World:
+    world = make_world(700)
+    for i in range(KEYFRAMES):
+        world.add_keyframe(forward(0.8 * i), noise=0.4)
+    link_pass(world, range(KEYFRAMES))
+    return world
+
+
+def lost_frame(world: World, T_cw: np.ndarray, *, mono: bool = False, among=None) -> Frame:
+    """What a camera sees of the street; its points but ``among`` look different now."""
+    if among is not None:
+        changed = ~np.isin(np.arange(len(world.points)), among)
+        world.descriptors[changed] = world.rng.integers(
+            0, 256, (np.count_nonzero(changed), 32), dtype=np.uint8
+        )
+    k = world.add_keyframe(T_cw, noise=0.4, mono=mono)
+    a, rows = world.map.arrays, world.map.rows(k)
+    features = Features(
+        a.xy[rows].copy(),
+        a.octave[rows].copy(),
+        a.angle[rows].copy(),
+        a.descriptor[rows].copy().view(np.uint8),
+        a.u_right[rows].copy(),
+    )
+    grid = FeatureGrid.of_positions(features.xy, CAMERA.width, CAMERA.height)
+    return Frame.untracked(features, grid)
+
+
+def find(world: World, frame: Frame, seed: int = 0) -> int:
+    place, surroundings = local_map(world.map, 1, 1), local_map(world.map, 1, 80)
+    return relocalise(frame, place, surroundings, TRACKER, seed)
+
+
+@pytest.mark.parametrize("mono", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_lost_frame_is_found(mono, seed):
+    world = mapped_street()
+    T_cw = forward(1.7, 0.6 - 0.5 * seed, 0.1 * seed)
+    frame = lost_frame(world, T_cw, mono=mono)
+    inliers = find(world, frame, seed)
+    assert inliers >= 50
+    assert inliers == np.count_nonzero(frame.landmark >= 0)
+    twist = se3_log(frame.T_cw @ inverse(T_cw))
+    assert np.linalg.norm(twist[:3]) < 0.03
+    assert np.degrees(np.linalg.norm(twist[3:])) < 0.1
+    tracked = np.flatnonzero(frame.landmark >= 0)
+    a = world.map.arrays
+    np.testing.assert_array_equal(frame.xyz[tracked], a.xyz[frame.landmark[tracked]])
+    assert np.isnan(frame.xyz[frame.landmark < 0]).all()
+    shown = world.point_of_row[a.first_row[KEYFRAMES] + tracked]
+    meant = world.point_of_row[a.head[frame.landmark[tracked]]]
+    assert np.mean(shown == meant) > 0.99
+
+
+def test_a_frame_is_found_among_things_that_have_changed():
+    world = mapped_street()
+    frame = lost_frame(world, T_cw := forward(1.2, 0.3), among=np.arange(0, 700, 4))
+    assert find(world, frame) >= 50
+    assert np.abs(se3_log(frame.T_cw @ inverse(T_cw))).max() < 0.03
+
+
+def test_the_same_seed_gives_the_same_pose():
+    poses = []
+    for _ in range(2):
+        frame = lost_frame(world := mapped_street(), forward(1.2, 0.3))
+        find(world, frame, seed=3)
+        poses.append(frame.T_cw.tobytes())
+    assert poses[0] == poses[1]
+
+
+@pytest.mark.parametrize("case", ["elsewhere", "too few", "no features", "no landmarks"])
+def test_a_frame_that_is_not_found_is_left_untracked(case):
+    world = mapped_street()
+    among = {"elsewhere": [], "too few": in_strip(world, 250, 290)}.get(case)
+    frame = lost_frame(world, forward(1.2, 0.3), among=among)
+    if case == "no features":
+        grid = FeatureGrid.of_positions(np.empty((0, 2), np.float32), CAMERA.width, CAMERA.height)
+        frame = Frame.untracked(Features.none(), grid)
+    if case == "no landmarks":
+        world = mapped_street()
+        nothing = local_map(world.map, 1, 1)
+        nothing = type(nothing)(*(array[:0] for array in nothing))
+        inliers = relocalise(frame, nothing, nothing, TRACKER, 0)
+    else:
+        frame.T_cw = se3_exp(np.ones(6))
+        inliers = find(world, frame)
+    assert inliers == 0
+    np.testing.assert_array_equal(frame.T_cw, np.eye(4))
+    assert (frame.landmark == -1).all()
+    assert np.isnan(frame.xyz).all()
+
+
+def test_one_object_that_looks_the_same_brings_inliers_but_is_no_place():
+    world = mapped_street()
+    frame = lost_frame(world, forward(1.2, 0.3), among=in_strip(world, 200, 390))
+    assert find(world, frame) == 0
+    config = Config(relocalization=RelocalizationConfig(min_elsewhere=0))
+    tracker = Tracker.create(CAMERA, config)
+    place, surroundings = local_map(world.map, 1, 1), local_map(world.map, 1, 80)
+    assert relocalise(frame, place, surroundings, tracker, 0) >= 50

@@ -1,0 +1,172 @@
+"""Loop closing: from a keyframe that looks familiar to a corrected map (ORB-SLAM, section VII).
+
+Everything here happens in the mapping job of a keyframe, which owns the map. Only the global
+bundle adjustment after a loop works beside it, on a snapshot; it is merged a number of keyframes
+later that depends on the size of the problem alone, so that a run has one result.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.backend.bundle_adjustment import BundleSolution
+from vslam.backend.fusion import fuse_loop
+from vslam.backend.global_bundle_adjustment import adjust_globally
+from vslam.backend.global_mapping import GlobalSnapshot, merge_solution, take_snapshot
+from vslam.backend.local_mapping import adjust_locally, strong_neighbours
+from vslam.backend.loop_correction import move_keyframes
+from vslam.backend.pose_graph import consistency, essential_graph, optimise
+from vslam.camera import StereoCamera
+from vslam.config import Config
+from vslam.features import Features
+from vslam.geometry import compose, inverse, orthonormalised
+from vslam.loopclosure.consistency import LoopConsistency
+from vslam.loopclosure.detector import LoopDetector
+from vslam.loopclosure.verification import verify
+from vslam.loops import Closure, LoopCandidate, LoopEdge
+from vslam.map import Map
+
+Matrix = NDArray[np.float64]
+
+
+class LoopClosing:
+    """Finds, verifies and closes loops.
+
+    Attributes:
+        detector: what finds candidates.
+        edges: every candidate and what became of it, in order.
+        closures: the loops that were closed.
+    """
+
+    def __init__(
+        self, detector: LoopDetector, camera: StereoCamera, config: Config, *, threads: int
+    ) -> None:
+        self.detector = detector
+        self.edges: list[LoopEdge] = []
+        self.closures: list[Closure] = []
+        self._camera = camera
+        self._config = config
+        self._consistency = LoopConsistency(config.consistency)
+        self._executor = ThreadPoolExecutor(1, "global-adjustment") if threads > 1 else None
+        self._global: _PendingAdjustment | None = None
+
+    def process(
+        self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
+    ) -> None:
+        """Look for loops at a keyframe whose local mapping is done; close the first real one."""
+        if self._global is not None and keyframe >= self._global.due:
+            self.finish(map_)
+        self.detector.add(keyframe, image, features)
+        candidates = self.detector.query(keyframe, map_)
+        consistent, rejected = self._consistency.update(keyframe, candidates, map_)
+        self.edges += rejected
+        for number, candidate in enumerate(consistent):
+            edge = verify(map_, candidate, self._camera, self._config.verification)
+            edge = self._consistency.confirm(edge, map_)
+            if edge.accepted:
+                edge = self._close(map_, edge)
+            self.edges.append(edge)
+            if edge.accepted:
+                self._consistency.reset()
+                self.edges += [_superseded(other) for other in consistent[number + 1 :]]
+                break
+
+    def finish(self, map_: Map) -> None:
+        """Merge the global bundle adjustment that is under way, if there is one."""
+        if self._global is not None:
+            merge_solution(map_, self._global.snapshot, self._global.solution())
+            self._global = None
+
+    def _close(self, map_: Map, edge: LoopEdge) -> LoopEdge:
+        """Correct the map by a verified loop; if it contradicts the rest, leave the map alone."""
+        start = time.perf_counter()
+        config = self._config
+        accepted = [closure.edge for closure in self.closures]
+        graph = essential_graph(map_, [*accepted, edge], config.pose_graph, weak=map_.restarts)
+        graph = replace(graph, T_cw=self._aligned(map_, edge)[graph.keyframes])
+        T_cw = optimise(graph, config.pose_graph)
+        verdict = consistency(graph, T_cw, config.pose_graph)
+        if not verdict.consistent:
+            return replace(edge, accepted=False, reason=verdict.reason)
+        if self._global is not None:  # it knows nothing of this loop
+            self._global.cancel()
+            self._global = None
+        keyframes = graph.keyframes
+        before = map_.arrays.T_cw[keyframes]
+        query_side = [edge.query, *strong_neighbours(map_, edge.query, config)]
+        match_side = [edge.match, *strong_neighbours(map_, edge.match, config)]
+        move_keyframes(map_, keyframes, T_cw)
+        fuse_loop(map_, edge, query_side, match_side, self._camera, config)
+        adjust_locally(map_, edge.query, self._camera, config)
+        edge = replace(edge, reason="closed")
+        closure = Closure(edge, keyframes, before, T_cw, time.perf_counter() - start)
+        self.closures.append(closure)
+        self._global = self._start_global(map_, edge.query)
+        return edge
+
+    def _aligned(self, map_: Map, edge: LoopEdge) -> Matrix:
+        """Poses ``T_cw`` to start from: a sub-map that the loop joins is moved to where the loop
+        puts it as a whole, since its own place was only a prediction."""
+        T_cw = map_.arrays.T_cw[: map_.n_keyframes].copy()
+        submap = self.joined_submaps(map_)
+        if submap[edge.query] == submap[edge.match]:
+            return T_cw
+        assert edge.T_query_match is not None
+        T_query = compose(edge.T_query_match, T_cw[edge.match])
+        T_match = compose(inverse(edge.T_query_match), T_cw[edge.query])
+        # The part that holds the first keyframe is the world; of two others the query's moves.
+        moving, T_new = (
+            (edge.match, T_match) if submap[edge.query] == submap[0] else (edge.query, T_query)
+        )
+        T_old_new = compose(inverse(T_cw[moving]), T_new)  # new world to old world
+        for keyframe in np.flatnonzero(submap == submap[moving]):
+            T_cw[keyframe] = orthonormalised(compose(T_cw[keyframe], T_old_new))
+        return T_cw
+
+    def joined_submaps(self, map_: Map) -> NDArray[np.int64]:
+        """``(n_keyframes,)`` sub-map of each keyframe; those joined by loops count as one."""
+        submap = map_.submaps()
+        for closure in self.closures:
+            one, other = submap[closure.edge.query], submap[closure.edge.match]
+            submap[submap == max(one, other)] = min(one, other)
+        return submap
+
+    def _start_global(self, map_: Map, keyframe: int) -> _PendingAdjustment:
+        config = self._config.loops
+        snapshot = take_snapshot(map_, self._camera)
+        wait = 1 + len(snapshot.problem.camera) // config.observations_per_keyframe
+        stop = threading.Event()
+
+        def work() -> BundleSolution:
+            return adjust_globally(
+                snapshot.problem,
+                iterations=config.global_iterations,
+                tolerance=1e-4,
+                stop=stop.is_set,
+            )
+
+        solution = work if self._executor is None else self._executor.submit(work).result
+        return _PendingAdjustment(snapshot, solution, keyframe + wait, stop)
+
+
+def _superseded(candidate: LoopCandidate) -> LoopEdge:
+    reason = "another loop was closed at this keyframe"
+    return LoopEdge(candidate.query, candidate.match, candidate.score, False, reason)
+
+
+@dataclass(frozen=True)
+class _PendingAdjustment:
+    snapshot: GlobalSnapshot
+    solution: Callable[[], BundleSolution]
+    due: int
+    stop: threading.Event
+
+    def cancel(self) -> None:
+        self.stop.set()

@@ -1,0 +1,148 @@
+"""Files of a rendered sequence: written whole or not at all, by one process at a time, checked."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import psutil
+from numpy.typing import NDArray
+
+from vslam.errors import InputError
+
+_IMAGE_BYTES, _DEPTH_BYTES = 450_000, 330_000  # of one file, generous
+_RESERVE = 200_000_000  # bytes left free
+_SAMPLED = 5  # frames whose checksum a quick look compares
+
+
+def frame_files(folder: Path, frame: int, depth: bool) -> list[Path]:
+    """Left, right and, with ``depth``, depth image of a frame."""
+    names = ("image_0", "image_1", *(("depth_0",) if depth else ()))
+    return [folder / name / f"{frame:06d}.png" for name in names]
+
+
+def checksum(paths: Sequence[Path]) -> str:
+    """64 bits of the SHA-256 of the files' contents, one after the other."""
+    digest = hashlib.sha256()
+    for path in paths:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def size(paths: Sequence[Path]) -> int:
+    """Bytes of all the files; -1 if one is missing."""
+    try:
+        return sum(path.stat().st_size for path in paths)
+    except FileNotFoundError:
+        return -1
+
+
+def damaged_frames(folder: Path, manifest: dict[str, Any], *, thorough: bool) -> list[int]:
+    """Frames whose files differ from the manifest of a complete sequence.
+
+    Args:
+        folder: of the sequence.
+        manifest: its ``checksums`` and ``sizes``, one a frame.
+        thorough: compare every checksum, not only all sizes and a few checksums.
+    """
+    sums, depth = manifest["checksums"], bool(manifest["depth"])
+    sizes = manifest.get("sizes") or [None] * len(sums)
+    close = range(len(sums))
+    looked_at = set(close if thorough else np.linspace(0, len(sums) - 1, _SAMPLED).astype(int))
+    damaged = []
+    for k in close:
+        paths = frame_files(folder, k, depth)
+        found = size(paths)
+        wrong = found < 0 or (sizes[k] is not None and found != sizes[k])
+        if wrong or (k in looked_at and checksum(paths) != sums[k]):
+            damaged.append(k)
+    return damaged
+
+
+def write(path: Path, data: bytes) -> None:
+    """Whole or not at all."""
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    part.write_bytes(data)
+    os.replace(part, path)
+
+
+def write_png(path: Path, image: NDArray[Any], level: int) -> None:
+    """Write a PNG whole or not at all."""
+    data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, level])[1]
+    write(path, data.tobytes())
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other processes from writing to a sequence's folder.
+
+    Raises:
+        InputError: another living process writes to it.
+    """
+    lock = folder.with_name(f".{folder.name}.lock")
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    mine = lock.with_name(f"{lock.name}.{os.getpid()}")
+    mine.write_text(str(os.getpid()))
+    while True:
+        try:
+            os.link(mine, lock)  # with its contents from the first moment
+            break
+        except FileExistsError:
+            owner = _owner(lock)
+            if owner is None:
+                continue
+            if owner and psutil.pid_exists(owner):
+                mine.unlink()
+                raise InputError(
+                    f"{folder}: process {owner} is rendering it; wait until it is done, or delete "
+                    f"{lock} if that process is not vslam."
+                ) from None
+            lock.unlink(missing_ok=True)  # left by a process that was killed
+    mine.unlink()
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+
+
+def _owner(lock: Path) -> int | None:
+    """Process that holds a lock; 0 if the file does not say, None if it is gone by now."""
+    try:
+        return int(lock.read_text() or 0)
+    except FileNotFoundError:
+        return None
+    except ValueError:
+        return 0
+
+
+def check_disk(cache: Path, frames: int, depth: bool) -> None:
+    """Refuse, with what it needs, to render ``frames`` pairs of images onto a disk too small."""
+    needed = frames * (2 * _IMAGE_BYTES + (_DEPTH_BYTES if depth else 0))
+    there = cache
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    free = shutil.disk_usage(there).free
+    if frames and needed + _RESERVE > free:
+        raise InputError(
+            f"{cache}: rendering {frames} frames needs {needed / 1e9:.1f} GB and "
+            f"{_RESERVE / 1e9:.1f} GB to spare but {free / 1e9:.1f} GB are free; "
+            "free some space or set $VSLAM_CACHE to another disk."
+        )
+
+
+@contextmanager
+def writing(cache: Path) -> Iterator[None]:
+    """Turn what the file system refuses into one sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{cache}: cannot be written ({error.strerror}); set $VSLAM_CACHE to another folder."
+        ) from error

@@ -1,0 +1,98 @@
+"""How a figure of the report looks: colours, style, and its two files.
+
+Every figure is drawn once in light colours and saved twice: as PNG, and as SVG whose neutral
+colours are CSS variables, so that the HTML report follows the reader's light or dark theme.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import matplotlib as mpl
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from vslam.features import TrackingState
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+BLUE, GREEN, AMBER, RED, GREY = "#3b82f6", "#10b981", "#f59e0b", "#ef4444", "#94a3b8"
+VIOLET = "#8b5cf6"
+STATE_COLORS = {TrackingState.WEAK: AMBER, TrackingState.LOST: RED}
+
+# Hex colour in the drawing -> CSS variable in the HTML report.
+_THEME = {"#1f2430": "ink", "#5b6472": "muted", "#e3e7ed": "line"}
+INK, MUTED, LINE = _THEME
+STYLE = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": LINE,
+    "axes.grid": True,
+    "axes.labelcolor": MUTED,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "figure.titlesize": 11.0,
+    "figure.titleweight": "bold",
+    "font.family": "DejaVu Sans",
+    "font.size": 9.5,
+    "grid.color": LINE,
+    "grid.linewidth": 0.8,
+    "legend.borderaxespad": 0.2,
+    "legend.fontsize": 9.0,
+    "legend.frameon": False,
+    "legend.handlelength": 1.4,
+    "legend.labelcolor": INK,
+    "lines.linewidth": 1.6,
+    "svg.fonttype": "none",  # text stays text and takes the font of the page
+    "xtick.color": LINE,
+    "xtick.labelcolor": MUTED,
+    "ytick.color": LINE,
+    "ytick.labelcolor": MUTED,
+}
+# Inches, small enough for the text to stay readable on a phone.
+WIDTH, LOW, SQUARE = 5.6, 3.0, 6.6
+
+
+@dataclass(frozen=True)
+class ReportFigure:
+    """One figure: ``svg`` begins at its ``<svg`` tag and takes its neutrals from CSS variables."""
+
+    name: str
+    caption: str
+    png: bytes
+    svg: str
+
+
+def new_figure(title: str, x_label: str, y_label: str, height: float) -> tuple[Figure, Axes]:
+    """A figure of one plot with a title at the left; ``height`` in inches."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    figure.suptitle(title, x=0.01, ha="left", color=INK)
+    axes.set(xlabel=x_label, ylabel=y_label)
+    axes.tick_params(length=3)
+    return figure, axes
+
+
+def add_legend(figure: Figure, axes: Axes) -> None:
+    """List all labelled artists below the axes, where a legend never covers data."""
+    count = len(axes.get_legend_handles_labels()[0])
+    columns = count if count <= 5 else min(-(-count // 2), 4)
+    figure.legend(loc="outside lower center", ncols=columns, columnspacing=1.2)
+
+
+def save(name: str, caption: str, figure: Figure) -> ReportFigure:
+    """Save as PNG and SVG; equal figures give equal bytes."""
+    png, svg = io.BytesIO(), io.StringIO()
+    figure.savefig(png, format="png", dpi=160)
+    figure.set_layout_engine("none")  # the layout is done and holds for the SVG
+    # The salt keeps element ids apart between figures of one page, and equal between runs.
+    with mpl.rc_context({"svg.hashsalt": name}):
+        figure.savefig(svg, format="svg", metadata={"Date": None}, transparent=True)
+    text = svg.getvalue()
+    text = text[text.index("<svg") :]
+    for color, variable in _THEME.items():
+        text = text.replace(color, f"var(--{variable})")
+    return ReportFigure(name, caption, png.getvalue(), text)

@@ -1,0 +1,135 @@
+"""The tables of a report that tell of loops, short even where hundreds were rejected."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from dataclasses import dataclass
+
+from vslam.comparison import LoopFigures, comparison_rows
+from vslam.report.schema import LoopEntry, ReportJson
+
+_MAX_CLOSED = 60
+_MAX_REJECTED = 12
+
+Row = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Table:
+    """``texts``: the columns that hold words, aligned to the left; ``note`` goes below."""
+
+    title: str
+    head: Row
+    rows: list[Row]
+    texts: Row = ()
+    note: str = ""
+    folded: bool = False
+
+
+def loop_tables(report: ReportJson) -> list[Table]:
+    """With and without loops, revisits, closed loops, why others were rejected, which came near."""
+    return [
+        table
+        for table in (
+            _comparison(report),
+            _revisits(report),
+            _closed(report),
+            _reasons(report),
+            _nearly(report),
+        )
+        if table.rows
+    ]
+
+
+def _comparison(report: ReportJson) -> Table:
+    rows: list[Row] = []
+    if report.without_loops:
+        names = ("ate_rmse_m", "rpe_m", "t_rel_percent", "lost_frames", "loops_closed")
+        with_ = LoopFigures(**{name: getattr(report, name) for name in names})
+        without = LoopFigures(**report.without_loops.model_dump())
+        rows += comparison_rows(with_, without)
+    return Table("With and without loop closing", ("", report.detector, "without"), rows, ("",))
+
+
+def _revisits(report: ReportJson) -> Table:
+    rows: list[Row] = [
+        (
+            f"{r.first_frame}-{r.last_frame}",
+            f"{r.first_match_frame}-{r.last_match_frame}",
+            f"{r.length_m:.0f} m",
+            "missed" if r.loop_frame is None else f"found at {r.loop_frame}",
+        )
+        for r in report.revisits
+    ]
+    note = "By the ground truth: frames on which the camera drives along an earlier stretch again."
+    return Table("Revisits", ("frames", "again", "length", "loop"), rows, ("loop",), note)
+
+
+def _closed(report: ReportJson) -> Table:
+    closed = [loop for loop in report.loops if loop.accepted]
+    closed.sort(key=lambda loop: loop.right is not False)  # wrong ones first, else as they came
+    rows: list[Row] = [
+        (*_evidence(loop), _right(loop), _metres(loop.moved_m), _seconds(loop.correction_s))
+        for loop in closed[:_MAX_CLOSED]
+    ]
+    head = (*_EVIDENCE, "pose", "moved", "time")
+    note = "Moved: the farthest way of a keyframe. Pose: against the ground truth's."
+    if len(closed) > _MAX_CLOSED:
+        note += f" {len(closed) - _MAX_CLOSED} more are in report.json."
+    return Table("Loops closed", head, rows, ("pose",), note)
+
+
+def _reasons(report: ReportJson) -> Table:
+    groups: dict[str, list[LoopEntry]] = defaultdict(list)
+    for loop in report.loops:
+        if not loop.accepted:
+            groups[_without_numbers(loop.reason)].append(loop)
+    ordered = sorted(groups.items(), key=lambda group: -len(group[1]))
+    rows: list[Row] = [
+        (reason, str(len(loops)), str(max(loop.inliers for loop in loops)), _share_right(loops))
+        for reason, loops in ordered
+    ]
+    head = ("reason", "candidates", "most inliers", "pose right")
+    note = f"{report.loops_rejected} candidates; each of them is in report.json."
+    return Table("Loops rejected", head, rows, ("reason",), note)
+
+
+def _nearly(report: ReportJson) -> Table:
+    rejected = [loop for loop in report.loops if not loop.accepted]
+    rejected.sort(key=lambda loop: (-loop.inliers, -loop.matches, -loop.score))
+    rows: list[Row] = [
+        (*_evidence(loop), _right(loop), loop.reason) for loop in rejected[:_MAX_REJECTED]
+    ]
+    head = (*_EVIDENCE, "pose", "reason")
+    return Table("Rejected with the most inliers", head, rows, ("pose", "reason"), folded=True)
+
+
+_EVIDENCE = ("frame", "earlier", "score", "matches", "inliers")
+
+
+def _evidence(loop: LoopEntry) -> Row:
+    query = "lost" if loop.query_frame is None else str(loop.query_frame)
+    return query, str(loop.match_frame), f"{loop.score:.3f}", str(loop.matches), str(loop.inliers)
+
+
+def _without_numbers(reason: str) -> str:
+    """Reasons that differ in their figures only are one reason."""
+    return re.sub(r"\d+(\.\d+)?", "N", reason)
+
+
+def _right(loop: LoopEntry) -> str:
+    return {True: "right", False: "wrong", None: "n/a"}[loop.right]
+
+
+def _share_right(loops: list[LoopEntry]) -> str:
+    judged = [loop.right for loop in loops if loop.right is not None]
+    return f"{sum(judged)} of {len(judged)}" if judged else "n/a"
+
+
+def _metres(value: float | None) -> str:
+    return "n/a" if value is None else f"{value:.2f} m"
+
+
+def _seconds(value: float | None) -> str:
+    return "n/a" if value is None else f"{value:.2f} s"

@@ -1,0 +1,152 @@
+"""The maps of a report, seen from above: the whole path, and what loop closing did to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from vslam.evaluate import Evaluation
+from vslam.geometry import inverses
+from vslam.loop_evaluation import LoopEvaluation
+from vslam.report.drawing import (
+    AMBER,
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    RED,
+    SQUARE,
+    STATE_COLORS,
+    VIOLET,
+    add_legend,
+    new_figure,
+)
+from vslam.run import RunOutcome
+from vslam.trajectory import Trajectory
+
+Points = NDArray[np.float64]
+
+
+def top_view(
+    outcome: RunOutcome,
+    evaluation: Evaluation | None,
+    ground_truth: Trajectory | None,
+    verdict: LoopEvaluation | None,
+) -> Figure:
+    """Estimate and truth, doubtful frames, closed loops, and revisits that were missed."""
+    figure, axes = new_figure("Top view", "x (m)", "z (m)", SQUARE)
+    T_wc = outcome.trajectory.T_wc if evaluation is None else evaluation.T_wc_aligned
+    x, z = T_wc[:, 0, 3], T_wc[:, 2, 3]
+    if evaluation is not None and ground_truth is not None:
+        truth = ground_truth.T_wc[:, :3, 3]
+        axes.plot(truth[:, 0], truth[:, 2], color=GREY, linewidth=3.4, alpha=0.65, label="truth")
+    axes.plot(x, z, color=BLUE, label="estimate")
+    axes.plot(x[:1], z[:1], "o", color=INK, markersize=5, zorder=4, label="start")
+    for state, color in STATE_COLORS.items():
+        times = [track.timestamp for track in outcome.tracks if track.state == state]
+        at = np.isin(outcome.trajectory.timestamps, times)
+        if at.any():
+            label = f"{state.lower()} ({at.sum()})"
+            axes.plot(x[at], z[at], "o", color=color, markersize=3.5, label=label)
+    if verdict is not None and verdict.n_missed:
+        missed = verdict.loop_frame < 0
+        stretches = [
+            np.append(_at_frames(outcome, T_wc, np.arange(first, last + 1)), [[np.nan] * 3], axis=0)
+            for first, last in zip(
+                verdict.revisits.first[missed], verdict.revisits.last[missed], strict=True
+            )
+        ]
+        path = np.concatenate(stretches)
+        label = f"revisit missed ({missed.sum()})"
+        axes.plot(path[:, 0], path[:, 2], color=VIOLET, linewidth=6, alpha=0.45, label=label)
+    right = verdict.right if verdict else (None,) * len(outcome.loops)
+    for wrong, color, name in ((False, GREEN, "loop"), (True, RED, "wrong loop")):
+        chosen = [
+            (edge.query, edge.match)
+            for edge, is_right in zip(outcome.loops, right, strict=True)
+            if edge.accepted and edge.query >= 0 and (is_right is False) == wrong
+        ]
+        if chosen:
+            frames = outcome.keyframe_frames[np.array(chosen)]
+            lines = _lines(_at_frames(outcome, T_wc, frames.ravel()).reshape(-1, 2, 3))
+            label = f"{name} ({len(chosen)})"
+            axes.plot(*lines, "o-", color=color, linewidth=1.2, markersize=4, label=label, zorder=5)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+    add_legend(figure, axes)
+    return figure
+
+
+def loop_closing(
+    outcome: RunOutcome, evaluation: Evaluation | None, ground_truth: Trajectory | None
+) -> Figure:
+    """Keyframes before the first correction and at the end, in the frame of the ground truth.
+
+    Both go through the alignment of the final trajectory: before and after are drawn where the map
+    had them, so that what moved is what loop closing moved.
+    """
+    figure, axes = new_figure("Map before and after loop closing", "x (m)", "z (m)", SQUARE)
+    if evaluation is not None and ground_truth is not None:
+        truth = ground_truth.T_wc[:, :3, 3]
+        axes.plot(truth[:, 0], truth[:, 2], color=GREY, linewidth=3.4, alpha=0.65, label="truth")
+    before = _aligned(outcome, evaluation, _centres(outcome.closures[0].T_cw_before))
+    after = _aligned(outcome, evaluation, outcome.keyframes.T_wc[:, :3, 3])
+    for points, color, label in ((before, AMBER, "before"), (after, BLUE, "after")):
+        axes.plot(
+            points[:, 0],
+            points[:, 2],
+            ".-",
+            color=color,
+            linewidth=1.2,
+            markersize=3.5,
+            label=label,
+        )
+    ends = []
+    for closure in outcome.closures:
+        at = [
+            np.flatnonzero(closure.keyframes == k) for k in (closure.edge.query, closure.edge.match)
+        ]
+        if all(map(len, at)):
+            ends.append(_centres(closure.T_cw_before[np.concatenate(at)]))
+    if ends:
+        lines = _lines(_aligned(outcome, evaluation, np.concatenate(ends)).reshape(-1, 2, 3))
+        label = f"loop, before ({len(ends)})"
+        axes.plot(*lines, "o--", color=GREEN, linewidth=1.2, markersize=4, label=label, zorder=5)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+    add_legend(figure, axes)
+    return figure
+
+
+def _centres(T_cw: NDArray[np.float64]) -> Points:
+    return inverses(T_cw)[:, :3, 3]
+
+
+def _lines(ends: Points) -> Sequence[Points]:
+    """x and z of ``(M, 2, 3)`` lines as one polyline each, with gaps."""
+    gaps = np.full((len(ends), 1, 3), np.nan)
+    points = np.concatenate([ends, gaps], axis=1).reshape(-1, 3)
+    return points[:, 0], points[:, 2]
+
+
+def _at_frames(outcome: RunOutcome, T_wc: NDArray[np.float64], frames: NDArray[np.int64]) -> Points:
+    """``(F, 3)`` positions of frames of the run, from the poses of all frames done."""
+    times = outcome.sequence.timestamps[frames]
+    index = np.searchsorted(outcome.trajectory.timestamps, times)
+    return T_wc[np.minimum(index, len(T_wc) - 1), :3, 3]
+
+
+def _aligned(outcome: RunOutcome, evaluation: Evaluation | None, points: Points) -> Points:
+    """Take ``(N, 3)`` points of the estimate's world to where the evaluation has put it."""
+    if evaluation is None:
+        return points
+    estimate, aligned = outcome.trajectory.T_wc, evaluation.T_wc_aligned
+    R = aligned[0, :3, :3] @ estimate[0, :3, :3].T
+    p, q = estimate[:, :3, 3], aligned[:, :3, 3]
+    scale = 1.0
+    if evaluation.alignment == "sim3":
+        scale = float(np.linalg.norm(q - q.mean(axis=0)) / np.linalg.norm(p - p.mean(axis=0)))
+    return scale * (points - p.mean(axis=0)) @ R.T + q.mean(axis=0)

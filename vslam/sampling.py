@@ -1,0 +1,59 @@
+"""What the RANSAC kernels share: a random generator of their own, and how often to draw.
+
+A kernel that owns its generator gives the same answer for the same seed, whatever other threads
+draw (Fischler and Bolles, CACM 1981, for the method).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vslam.kernels import kernel
+
+_STEP = np.uint64(0x9E3779B97F4A7C15)
+_MIX_A = np.uint64(0xBF58476D1CE4E5B9)
+_MIX_B = np.uint64(0x94D049BB133111EB)
+_S27, _S30, _S31, _S33 = np.uint64(27), np.uint64(30), np.uint64(31), np.uint64(33)
+
+
+@kernel
+def random_index(state, n):
+    """A number below ``n``; advances ``state`` ``(1,)`` uint64 (SplitMix64, Steele et al. 2014)."""
+    state[0] += _STEP
+    z = state[0]
+    z = (z ^ (z >> _S30)) * _MIX_A
+    z = (z ^ (z >> _S27)) * _MIX_B
+    z = z ^ (z >> _S31)
+    # 31 bits times n: the bias is below n / 2^31, and int64 cannot overflow.
+    return (np.int64(z >> _S33) * n) >> 31
+
+
+@kernel
+def draw_three(state, n):
+    """Three different numbers below ``n`` (at least 3)."""
+    i = random_index(state, n)
+    j = random_index(state, n - 1)
+    k = random_index(state, n - 2)
+    if j >= i:
+        j += 1
+    low, high = min(i, j), max(i, j)
+    if k >= low:
+        k += 1
+    if k >= high:
+        k += 1
+    return i, j, k
+
+
+@kernel
+def draws_needed(inlier_share, confidence, limit):
+    """Draws of three until, with ``confidence``, one of them holds inliers only; ``limit`` at most.
+
+    Fischler and Bolles 1981, section II-B.
+    """
+    good = inlier_share**3
+    if good >= 1.0:
+        return 1
+    miss = np.log1p(-good)
+    if miss == 0.0:
+        return limit
+    return int(min(float(limit), np.ceil(np.log1p(-confidence) / miss)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 
@@ -12,12 +13,12 @@ from siamese_worlds import small_network, small_settings, views
 from typer.testing import CliRunner
 
 from vslam.cli import app
-from vslam.config import SiameseConfig
+from vslam.config import Config, SiameseConfig
 from vslam.errors import InputError
 from vslam.features import Features
 from vslam.loopclosure.siamese.detector import SiameseDetector, open_detector
 from vslam.loopclosure.siamese.onnx import export_onnx
-from vslam.loopclosure.siamese.siamese import save_network
+from vslam.loopclosure.siamese.siamese import build_network, save_network
 from vslam.map import Map
 from vslam.observations import link
 
@@ -123,6 +124,21 @@ def test_detectors_are_opened_by_name(tmp_path):
         open_detector("bow", SiameseConfig())
     with pytest.raises(InputError, match="ships no weights"):
         open_detector("vgg16", SiameseConfig())
+
+
+def test_a_run_closes_with_a_learned_detector(kitti_tree, tmp_path):
+    """Random weights: places are found by similarity alone, and geometry has the last word."""
+    path = tmp_path / "capsule.safetensors"
+    save_network(build_network("capsule"), path, {})
+    settings = tmp_path / "config.json"
+    settings.write_text(Config(siamese=SiameseConfig(threshold=0.0)).model_dump_json())
+    words = ["run", "--data", str(kitti_tree), "--detector", "capsule", "--weights", str(path)]
+    words += ["--config", str(settings), "--no-record", "--quiet", "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    report = json.loads((tmp_path / "latest" / "report.json").read_text())
+    assert (report["detector"], report["weights"]) == ("capsule", str(path))
+    assert report["lost_frames"] == report["loops_wrong"] == 0
 
 
 def test_onnx_says_what_torch_says(tmp_path):

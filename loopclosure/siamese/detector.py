@@ -13,11 +13,10 @@ from vslam.errors import InputError
 from vslam.features import Features
 from vslam.loopclosure.siamese.images import to_square, to_tensor
 from vslam.loopclosure.siamese.runtime import one_thread
-from vslam.loopclosure.siamese.siamese import NETWORKS, SiameseNetwork, for_inference, load_network
+from vslam.loopclosure.siamese.siamese import SiameseNetwork, for_inference, load_network
+from vslam.loopclosure.siamese.weights import find_weights
 from vslam.loops import LoopCandidate
 from vslam.map import Map
-
-SHIPPED = Path(__file__).parent / "weights"
 
 
 class SiameseDetector:
@@ -114,14 +113,7 @@ def open_detector(name: str, config: SiameseConfig, weights: Path | None = None)
     Raises:
         InputError: unknown name, no weights, or weights of another network.
     """
-    if name not in NETWORKS:
-        raise InputError(f"--detector {name}: unknown; choose one of {', '.join(NETWORKS)}.")
-    path = weights or SHIPPED / f"{name}.safetensors"
-    if weights is None and not path.exists():
-        raise InputError(
-            f"--detector {name}: vslam ships no weights for it; train it with 'vslam train {name}' "
-            "and name the file with --weights."
-        )
+    path = find_weights(name, weights)
     network, _ = load_network(path)
     if network.name != name:
         raise InputError(f"{path}: weights of {network.name}, not of {name}; name another file.")

@@ -23,8 +23,7 @@ from vslam.loopclosure.siamese.branches import (
 )
 from vslam.loopclosure.siamese.capsules import length
 from vslam.loopclosure.siamese.extractors import fold_batch_norms
-
-NETWORKS = ("capsule", "capsule-pruned", "alexnet", "vgg16")
+from vslam.loopclosure.siamese.weights import NETWORKS
 
 
 class DistanceHead(nn.Module):

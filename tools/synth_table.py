@@ -71,9 +71,11 @@ def main() -> None:
     options = parser.parse_args()
     again = options.again.split(",")
     kept = {key: row for key, row in _read(options.out).items() if row["system"] not in again}
-    systems = [*OURS, *([PEER] if options.peer_python else [])]
     for drive in _drives(options):
         for light in options.lights.split(";"):
+            # What loop closing is worth is asked once for each drive.
+            systems = [*OURS] if light == "clean" and "aliased" not in drive.title else ["vslam"]
+            systems += [PEER] if options.peer_python else []
             wanted = {f"{drive.title}, {light}, {system}": system for system in systems}
             missing = {key: system for key, system in wanted.items() if key not in kept}
             if not missing:

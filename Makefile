@@ -50,5 +50,8 @@ $(INSTALLED): pyproject.toml constraints.txt
 	  $$python -m venv $(VENV) || { \
 	    echo "$$python has no venv module: install it (Debian, Ubuntu: python3-venv)" >&2; exit 1; }; \
 	fi
+	@# PyPI's torch for Linux brings gigabytes of CUDA; the CPU's build has an index of its own.
+	-$(BIN)/python -m pip install --quiet --no-deps --retries 0 --timeout 20 \
+	  torch -c constraints.txt --index-url https://download.pytorch.org/whl/cpu
 	$(BIN)/python -m pip install --quiet -e '.[dev]' -c constraints.txt
 	@touch $@

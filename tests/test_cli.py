@@ -102,7 +102,9 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        ("--detector capsule", ["--detector capsule", "not built yet", "'none', 'bow'"]),
+        ("--detector vgg16", ["--detector vgg16", "ships no weights", "vslam train vgg16"]),
+        ("--detector capsule --weights no.safetensors", ["no.safetensors", "not there"]),
+        ("--detector bow --weights no.safetensors", ["--weights", "bow has none"]),
         ("--detector orb", ["--detector orb", "unknown"]),
         ("--sensor mono", ["--sensor mono", "not built yet", "'stereo'"]),
         ("--sensor rgbd", ["--sensor rgbd", "not built yet"]),

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from vslam import __version__, synth_cli, vocabulary_cli
+from vslam import __version__, synth_cli, train_cli, vocabulary_cli
 from vslam.console import evaluation_rows, print_rows, print_summary
 from vslam.errors import InputError, ResultsError
 
@@ -19,8 +19,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-_DETECTORS = {"none": True, "bow": True, "capsule": False, "capsule-pruned": False}
-_DETECTORS |= {"alexnet": False, "vgg16": False}
 _SENSORS = {"stereo": True, "mono": False, "rgbd": False}
 
 Data = Annotated[
@@ -73,8 +71,15 @@ def run(
         ),
     ] = None,
     detector: Annotated[
-        str, typer.Option(help="Loop detector: [b]bow[/b], or [b]none[/b] for odometry only.")
+        str,
+        typer.Option(
+            help="Loop detector: [b]bow[/b], [b]none[/b] for odometry only; with [b]--weights[/b] "
+            "also capsule, capsule-pruned, alexnet, vgg16."
+        ),
     ] = "bow",
+    weights: Annotated[
+        Path | None, typer.Option(help="Safetensors file of a learned detector (vslam train).")
+    ] = None,
     sensor: Annotated[str, typer.Option(help="In this version: stereo.")] = "stereo",
     out: Annotated[Path, typer.Option(help="Where the folders of the runs go.")] = Path("runs"),
     config: Annotated[
@@ -89,7 +94,9 @@ def run(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
 ) -> None:
     """Run SLAM on a sequence and write trajectory, map, recording and report to a folder."""
-    _require_built("--detector", detector, _DETECTORS)
+    from vslam.detectors import require_detector
+
+    require_detector(detector, weights)
     _require_built("--sensor", sensor, _SENSORS)
     if compare_loops and detector == "none":
         raise InputError("--compare-loops: nothing to compare with --detector none; name another.")
@@ -122,6 +129,7 @@ def run(
         every=every,
         max_frames=max_frames,
         config=thresholds,
+        weights=weights,
     )
     from vslam.comparison import with_comparison
     from vslam.pipeline import run_sequence
@@ -238,6 +246,7 @@ def info(data: Data = _DATA) -> None:
 
 
 synth_cli.register(app)
+train_cli.register(app)
 vocabulary_cli.register(app)
 
 

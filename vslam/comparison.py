@@ -38,7 +38,7 @@ def with_comparison(
     from vslam.pipeline import run_sequence
     from vslam.recorder import NullRecorder
 
-    settings = replace(outcome.settings, detector="none")
+    settings = replace(outcome.settings, detector="none", weights=None)
     without = run_sequence(
         outcome.sequence, perturbation, settings, NullRecorder(), on_frame=on_frame
     )

@@ -7,6 +7,7 @@ Sources: [ORB] Rublee et al., ICCV 2011; [OS1] Mur-Artal et al., ORB-SLAM, T-RO 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -97,6 +98,20 @@ class MappingConfig(_Section):
     min_shared: int = Field(15, ge=1, description="Landmarks that make a covisibility edge. [OS1]")
     max_ba_keyframes: int = Field(60, ge=2, description="Free keyframes in local BA. [own]")
     ba_iterations: int = Field(10, ge=1, description="Levenberg-Marquardt iterations at most.")
+
+
+class SiameseConfig(_Section):
+    """Learned loop detectors. [ZS]: Zhou and Sun, Sci Rep 15, 7644 (2025)."""
+
+    threshold: float = Field(0.9, ge=0, le=1, description="Similarity of a loop. [ZS]")
+    max_candidates: int = Field(5, ge=1, description="Candidates of a query, best first. [own]")
+    recent_keyframes: int = Field(10, ge=0, description="Newest keyframes never asked. [own]")
+    min_shared: int = Field(
+        15, ge=1, description="Landmarks shared with a better candidate: the same place. [OS1]"
+    )
+    fit: Literal["squash", "crop"] = Field(
+        "squash", description="Whole view squashed into the network's square, or its centre. [own]"
+    )
 
 
 class VerificationConfig(_Section):
@@ -254,6 +269,7 @@ class Config(_Section):
     loops: LoopConfig = LoopConfig()
     bow: BowConfig = BowConfig()
     pose_graph: PoseGraphConfig = PoseGraphConfig()
+    siamese: SiameseConfig = SiameseConfig()
 
 
 def load_config(path: Path) -> Config:

@@ -2,12 +2,35 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from vslam.config import Config
+from vslam.errors import InputError
 from vslam.loopclosure.detector import LoopDetector, NoDetector
+from vslam.loopclosure.siamese.weights import NETWORKS, find_weights
+
+DETECTORS = ("none", "bow", *NETWORKS)
 
 
-def create_detector(name: str, config: Config) -> LoopDetector:
+def require_detector(name: str, weights: Path | None) -> None:
+    """Refuse what cannot be created, before anything heavy is imported or compiled.
+
+    Raises:
+        InputError: no such detector, or no weights for it.
+    """
+    if name not in DETECTORS:
+        raise InputError(f"--detector {name}: unknown; choose one of {', '.join(DETECTORS)}.")
+    if name in NETWORKS:
+        find_weights(name, weights)
+    elif weights is not None:
+        raise InputError(f"--weights: the detector {name} has none; leave the option out.")
+
+
+def create_detector(name: str, config: Config, weights: Path | None = None) -> LoopDetector:
     """A detector that remembers nothing yet. What it needs is imported here, not before.
+
+    Args:
+        weights: of a learned detector; None for those that vslam ships.
 
     Raises:
         InputError: its vocabulary or weights cannot be read.
@@ -20,4 +43,8 @@ def create_detector(name: str, config: Config) -> LoopDetector:
         from vslam.loopclosure.vocabulary import load
 
         return BowDetector(load(), config.bow)
+    if name in NETWORKS:
+        from vslam.loopclosure.siamese.detector import open_detector
+
+        return open_detector(name, config.siamese, weights)
     raise ValueError(f"no loop detector {name!r}")

@@ -62,7 +62,7 @@ def run_sequence(
     in the outcome. Ctrl-C ends the run after the current frame; all done so far is kept.
     """
     cv2.setNumThreads(1)  # the pool uses the cores
-    detector = create_detector(settings.detector, settings.config)
+    detector = create_detector(settings.detector, settings.config, settings.weights)
     slam = Slam(sequence.camera, settings.config, detector, threads=settings.threads)
     tracks: list[TrackResult] = []
     skipped: list[str] = []

@@ -75,6 +75,27 @@ def render_bar(*, shown: bool) -> Iterator[Callable[[int, int], None]]:
 
 
 @contextmanager
+def training_bar(*, shown: bool) -> Iterator[Callable[[int, int, int, float], None]]:
+    """Yield the callable that takes epoch, step, steps of the epoch and loss of a training."""
+    columns = (
+        TextColumn("epoch {task.fields[epoch]}"),
+        MofNCompleteColumn(),
+        BarColumn(),
+        TextColumn("loss {task.fields[loss]:.3f}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
+        task = progress.add_task("", total=None, epoch=0, loss=float("nan"))
+
+        def on_step(epoch: int, step: int, steps: int, loss: float) -> None:
+            if step == 1:
+                progress.reset(task)
+            progress.update(task, total=steps, completed=step, epoch=epoch, loss=loss)
+
+        yield on_step
+
+
+@contextmanager
 def count_bar(what: str, total: int, *, shown: bool) -> Iterator[Callable[[], None]]:
     """Yield the callable to call after each of ``total`` things."""
     columns = (TextColumn(what), MofNCompleteColumn(), BarColumn(), TimeRemainingColumn())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ class RunSettings:
     every: int
     max_frames: int | None
     config: Config
+    weights: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -142,7 +142,8 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
     names = ("dataset", "sequence", "perturb", "detector", "sensor", "seed", "threads", "start")
     options = [(name, str(getattr(report, name))) for name in (*names, "every")]
     limit = "all" if report.max_frames is None else str(report.max_frames)
-    return [*options, ("max-frames", limit)]
+    weights = [("weights", str(report.weights))] if report.weights else []
+    return [*options, ("max-frames", limit), *weights]
 
 
 def machine_rows(report: ReportJson) -> list[tuple[str, str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
+from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
@@ -128,6 +129,7 @@ class ReportJson(_Model):
     start: int
     every: int
     max_frames: int | None
+    weights: Path | None = None
 
     machine: Machine
     versions: dict[str, str]

@@ -1,0 +1,78 @@
+"""Random changes of an image that do not change its place: viewpoint, light, occlusion, sensor."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Augmentation(BaseModel):
+    """Strengths; 0 leaves a change out. The paper has projective changes, luminance and masks."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    homography: float = Field(0.10, ge=0, le=0.4, description="Largest move of a corner, of side.")
+    shift: float = Field(0.10, ge=0, le=0.5, description="Largest horizontal shift, of side.")
+    log_gain: float = Field(0.35, ge=0, description="Deviation of the logarithm of the gain.")
+    bias: float = Field(20.0, ge=0, description="Deviation, grey levels.")
+    log_gamma: float = Field(0.25, ge=0, description="Deviation of the logarithm of gamma.")
+    masks: int = Field(3, ge=0, description="Largest number of masks.")
+    mask_area: float = Field(0.10, ge=0, le=0.5, description="Largest area of a mask, of image.")
+    noise: float = Field(6.0, ge=0, description="Largest deviation, grey levels.")
+    blur: float = Field(1.0, ge=0, description="Largest deviation of a Gaussian blur, pixels.")
+    mirror: bool = Field(True, description="Mirror both images of every second pair.")
+
+
+STRONG = Augmentation(
+    homography=0.16, shift=0.22, log_gain=0.5, bias=30.0, log_gamma=0.4, masks=4, mask_area=0.15,
+    noise=12.0, blur=2.0,
+)  # fmt: skip
+
+
+def augment(
+    image: NDArray[np.uint8], strength: Augmentation, rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Change a square ``(S, S)`` image at random.
+
+    The order is that of the world: viewpoint, then what stands in the way, then light, lens and
+    sensor, then 8 bits.
+    """
+    import cv2
+
+    side = image.shape[0]
+    corners = np.array([[0, 0], [side, 0], [side, side], [0, side]], np.float32)
+    moved = corners + rng.uniform(-1, 1, (4, 2)).astype(np.float32) * strength.homography * side
+    moved[:, 0] += rng.uniform(-1, 1) * strength.shift * side
+    H = cv2.getPerspectiveTransform(corners, moved)
+    warped = cv2.warpPerspective(
+        image, H, (side, side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
+    )
+    out = np.asarray(warped, np.uint8)
+    for _ in range(int(rng.integers(strength.masks + 1))):
+        _cover(out, strength.mask_area, rng)
+    grey = np.arange(256) / 255.0
+    curve = 255.0 * grey ** np.exp(strength.log_gamma * rng.standard_normal())
+    curve = np.exp(strength.log_gain * rng.standard_normal()) * curve
+    curve += strength.bias * rng.standard_normal()
+    out = np.asarray(cv2.LUT(out, np.clip(np.rint(curve), 0, 255).astype(np.uint8)), np.uint8)
+    # Every second image stays sharp and clean: most real ones are.
+    blur, noise = rng.uniform(-1, 1, 2) * (strength.blur, strength.noise)
+    if blur > 0.2:
+        out = np.asarray(cv2.GaussianBlur(out, (0, 0), float(blur)), np.uint8)
+    if noise > 0.5:
+        grain = rng.standard_normal(out.shape, dtype=np.float32)
+        out = np.clip(np.rint(out + np.float32(noise) * grain), 0, 255).astype(np.uint8)
+    return out
+
+
+def _cover(image: NDArray[np.uint8], largest: float, rng: np.random.Generator) -> None:
+    side = image.shape[0]
+    area = rng.uniform(0.0, largest)
+    if area == 0.0:
+        return
+    stretch = np.exp(rng.uniform(-0.7, 0.7))
+    width = min(side, max(1, round(side * float(np.sqrt(area) * stretch))))
+    height = min(side, max(1, round(side * float(np.sqrt(area) / stretch))))
+    x, y = rng.integers(side - width + 1), rng.integers(side - height + 1)
+    image[y : y + height, x : x + width] = rng.integers(256)

@@ -1,0 +1,214 @@
+"""Capsules: prediction vectors and dynamic routing, an equation of the paper for each function.
+
+Zhou and Sun, Sci Rep 15, 7644 (2025), equations 4 to 9, after Sabour et al., NIPS 2017.
+N images, I primary capsules of A numbers, J output capsules of D numbers. Primary capsules come in
+T types (learned by the extractor) at P places of a grid: i = t P + p.
+
+``route`` is the paper, letter by letter: the reference. ``route_factored`` computes the same from
+the sums that matrices shared by the places of a type allow, without ever forming the prediction
+vectors; it is what the network runs.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+Over = Literal["primary", "output"]
+_DEVIATION = 0.12  # of a prediction vector at the start, over the root of the capsules
+_TINY = 1e-12  # keeps the square root differentiable at 0
+
+
+def squash(s: Tensor) -> Tensor:
+    """Eq. 8: ``|s|² / (1 + |s|²) · s / |s|`` along the last axis; the length is below 1."""
+    squared = (s * s).sum(-1, keepdim=True)
+    return s * (torch.sqrt(squared + _TINY) / (1.0 + squared))
+
+
+def length(v: Tensor) -> Tensor:
+    """Eq. 9: L2 norm along the last axis, with a finite gradient at 0."""
+    return torch.sqrt((v * v).sum(-1) + _TINY)
+
+
+def predict(u: Tensor, W: Tensor) -> Tensor:
+    """Eq. 4: prediction vectors ``û_j|i = W_ij u_i``.
+
+    Args:
+        u: ``(N, T, P, A)`` primary capsules.
+        W: ``(J, T, A, D)``, shared by the places of a type.
+
+    Returns:
+        ``(N, J, I, D)``.
+    """
+    u_hat = torch.einsum("ntpa,jtad->njtpd", u, W)
+    return u_hat.flatten(2, 3)
+
+
+def couple(b: Tensor, over: Over = "primary") -> Tensor:
+    """Eq. 6: coupling coefficients, softmax of the logits ``b`` ``(N, J, I)``.
+
+    ``primary``: the sum over i is 1, as the paper writes; ``output``: the sum over j is 1, as in
+    Sabour et al.
+    """
+    return torch.softmax(b, dim=2 if over == "primary" else 1)
+
+
+def combine(c: Tensor, u_hat: Tensor) -> Tensor:
+    """Eq. 5: ``s_j = Σ_i c_ij û_j|i``, from ``(N, J, I)`` and ``(N, J, I, D)`` to ``(N, J, D)``."""
+    return torch.einsum("nji,njid->njd", c, u_hat)
+
+
+def agree(u_hat: Tensor, v: Tensor) -> Tensor:
+    """Eq. 7: ``û_j|i · v_j``, what a logit grows by, ``(N, J, I)``."""
+    return torch.einsum("njid,njd->nji", u_hat, v)
+
+
+def route(
+    u_hat: Tensor, iterations: int = 3, over: Over = "primary", alive: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Dynamic routing as the paper writes it; gradients flow through the last iteration only.
+
+    Args:
+        u_hat: ``(N, J, I, D)`` prediction vectors.
+        iterations: at least 1.
+        over: what the coupling coefficients are normalised over.
+        alive: ``(I,)`` bool; a capsule that is not takes no part, as if it were removed.
+
+    Returns:
+        Output capsules ``v`` ``(N, J, D)`` and the coupling coefficients ``(N, J, I)`` behind them.
+    """
+    n, outputs, primaries, _ = u_hat.shape
+    with torch.no_grad():
+        b = u_hat.new_zeros((n, outputs, primaries))
+        for _ in range(iterations - 1):
+            b = b + agree(u_hat, squash(combine(_masked_couple(b, over, alive), u_hat)))
+        c = _masked_couple(b, over, alive)
+    return squash(combine(c, u_hat)), c
+
+
+def route_factored(
+    u: Tensor, W: Tensor, iterations: int = 3, over: Over = "primary", alive: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """``route(predict(u, W), ...)`` without the prediction vectors.
+
+    ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and ``û_j|i · v_j = u_tp · (W_tjᵀ v_j)``: sums over places
+    of A numbers take the place of ``I J D`` numbers written once and read five times.
+
+    Args:
+        u: ``(N, T, P, A)`` primary capsules.
+        W: ``(J, T, A, D)``.
+        iterations, over, alive: as in :func:`route`.
+
+    Returns:
+        As :func:`route`.
+    """
+    n, types, places, size = u.shape
+    outputs, _, _, depth = W.shape
+    W_j = W.reshape(outputs, types * size, depth)
+    rows = u.reshape(n * types, places, size)
+    present = None if alive is None else alive.view(types, 1, places)
+
+    def sums(pooled: Tensor) -> Tensor:
+        """``Σ_p c u`` of each type and output ``(N, T, J, A)`` to ``s`` ``(N, J, D)``."""
+        s = torch.bmm(pooled.permute(2, 0, 1, 3).reshape(outputs, n, types * size), W_j)
+        return s.transpose(0, 1)
+
+    def combined(c: Tensor) -> Tensor:
+        """Couplings ``(N, T, J, P)`` to ``s`` ``(N, J, D)``."""
+        pooled = torch.bmm(c.view(n * types, outputs, places), rows)
+        return sums(pooled.view(n, types, outputs, size))
+
+    def agreements(v: Tensor) -> Tensor:
+        """Outputs ``(N, J, D)`` to agreements ``(N, T, J, P)``."""
+        back = torch.bmm(v.transpose(0, 1), W_j.transpose(1, 2)).view(outputs, n, types, size)
+        back = back.permute(1, 2, 0, 3).reshape(n * types, outputs, size)
+        return torch.bmm(back, rows.transpose(1, 2)).view(n, types, outputs, places)
+
+    def couplings(b: Tensor) -> Tensor:
+        """Eq. 6 for logits ``(N, T, J, P)``."""
+        if over == "output":
+            c = torch.softmax(b, dim=2)
+            return c if present is None else c * present
+        if present is not None:
+            b = b.masked_fill(~present, -torch.inf)
+        e = (b - b.amax((1, 3), keepdim=True)).exp_()
+        return e.div_(e.sum((1, 3), keepdim=True))
+
+    with torch.no_grad():
+        # With b = 0 all capsules count alike: the first sums are means, without a softmax.
+        here = rows if present is None else rows * present.view(types, places, 1).repeat(n, 1, 1)
+        count = places * types if alive is None else alive.sum()
+        share = 1.0 / (count if over == "primary" else outputs)
+        means = here.sum(1).view(n, types, 1, size).expand(-1, -1, outputs, -1) * share
+        if iterations == 1:
+            c = couplings(u.new_zeros((n, types, outputs, places)))
+        else:
+            b = agreements(squash(sums(means)))
+            for _ in range(iterations - 2):
+                b += agreements(squash(combined(couplings(b))))
+            c = couplings(b)
+    return squash(combined(c)), c.transpose(1, 2).flatten(2)
+
+
+def _masked_couple(b: Tensor, over: Over, alive: Tensor | None) -> Tensor:
+    if alive is None:
+        return couple(b, over)
+    # Over outputs, a capsule that takes no part has the softmax of -inf throughout: NaN.
+    return torch.nan_to_num(couple(b.masked_fill(~alive, -torch.inf), over), nan=0.0)
+
+
+class CapsuleLayer(nn.Module):
+    """From primary to output capsules.
+
+    ``W_ij = W_t(i)j diag(g_i)``: a matrix for each type and output, and a gain of A numbers for
+    each primary capsule, which tells its place apart. (A matrix for each i and j would be tens of
+    millions of parameters.) A pruned capsule has no row in ``gains`` and ``place``: it takes part
+    in no product and no softmax.
+
+    Attributes:
+        W: ``(J, T, A, D)``.
+        gains: ``(T, K, A)``, K places kept of each type, all of them before pruning.
+        place: ``(T, K)`` int64 buffer, the places that are kept.
+        alive: ``(T K,)`` bool buffer, capsules that are not masked: the reference that physical
+            removal is tested against.
+    """
+
+    place: Tensor
+    alive: Tensor
+
+    def __init__(
+        self,
+        types: int,
+        places: int,
+        size: int,
+        outputs: int,
+        depth: int,
+        iterations: int = 3,
+        over: Over = "primary",
+        kept: int | None = None,
+    ) -> None:
+        super().__init__()
+        kept = places if kept is None else kept
+        self.iterations, self.over, self.places = iterations, over, places
+        # A mean over thousands of capsules is short, and short outputs agree with nobody: with
+        # half of this the couplings stay equal, with twice as much a few capsules take all.
+        deviation = _DEVIATION * (types * places / size) ** 0.5 if over == "primary" else 1.0
+        self.W = nn.Parameter(torch.randn(outputs, types, size, depth) * deviation)
+        self.gains = nn.Parameter(torch.ones(types, kept, size))
+        self.register_buffer("place", torch.arange(kept).repeat(types, 1))
+        self.register_buffer("alive", torch.ones(types * kept, dtype=torch.bool))
+        self.masked = False
+
+    def forward(self, u: Tensor) -> Tensor:
+        """``(N, T, P, A)`` primary capsules to ``(N, J, D)`` output capsules."""
+        return self.routed(u)[0]
+
+    def routed(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Output capsules and the couplings ``(N, J, T K)`` that led to them."""
+        if self.place.shape[1] < self.places:
+            index = self.place[None, :, :, None].expand(u.shape[0], -1, -1, u.shape[3])
+            u = torch.gather(u, 2, index)
+        alive = self.alive if self.masked else None
+        return route_factored(u * self.gains, self.W, self.iterations, self.over, alive)

@@ -1,0 +1,211 @@
+"""Sources put together: images in memory, division into training and validation, pairs."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError, ResultsError
+from vslam.loopclosure.siamese.images import Fit
+from vslam.loopclosure.siamese.places import DIFFERENT, SAME, UNKNOWN, Places
+
+# Frames of each sequence that training may use; the others are what loop detectors are tested on.
+TRAINING_FRAMES = {"kitti00": (250, 1500)}
+# Training uses one of them, the test the other.
+_EITHER = ({"citycentre", "newcollege"},)
+
+
+@dataclass(frozen=True)
+class Collection:
+    """All images of all sources.
+
+    Attributes:
+        names: ``source/folder/file`` of each of N images.
+        squares: ``(N, S, S)`` uint8.
+        relation: ``(N, N)`` int8, 1 same place, -1 another, 0 not known.
+        unit: ``(N,)`` int64; images of one unit stay together in a division.
+        sources: name of each source and how many images it has.
+    """
+
+    names: tuple[str, ...]
+    squares: NDArray[np.uint8]
+    relation: NDArray[np.int8]
+    unit: NDArray[np.int64]
+    sources: tuple[tuple[str, int], ...]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """``a``, ``b`` ``(M,)`` int64 images and ``same`` ``(M,)`` bool."""
+
+    a: NDArray[np.int64]
+    b: NDArray[np.int64]
+    same: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.a)
+
+
+def refuse_test_data(sources: Sequence[Places]) -> None:
+    """No trajectory is both learned from and tested on.
+
+    Raises:
+        InputError: test frames of KITTI, or both FAB-MAP collections, among the sources.
+    """
+    for source in sources:
+        first, last = TRAINING_FRAMES.get(source.name, (0, 1_000_000_000))
+        frames = [int(Path(name).stem) for name in source.names if source.name in TRAINING_FRAMES]
+        if frames and not (first <= min(frames) and max(frames) <= last):
+            raise InputError(
+                f"{source.name}: frames {min(frames)} to {max(frames)} hold test data; "
+                f"train on [first={first},last={last}]."
+            )
+    names = {source.name.lower().replace("_", "") for source in sources}
+    for either in _EITHER:
+        if len(found := either & names) > 1:
+            raise InputError(
+                f"--data: {' and '.join(sorted(found))} together leave none to test on; "
+                "train on one of them."
+            )
+
+
+def load(sources: Sequence[Places], pixels: int, fit: Fit, threads: int = 2) -> Collection:
+    """Decode all images of all sources into memory (51 kB an image at 227 pixels).
+
+    Raises:
+        InputError: nothing to load, or two sources of one name.
+        UnreadableImageError: an image is missing or damaged.
+    """
+    names = [source.name for source in sources]
+    if not sources:
+        raise InputError("--data: name at least one source of images.")
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"--data: two sources are called {twice}; rename a folder.")
+    work = [(source, i) for source in sources for i in range(len(source))]
+    with ThreadPoolExecutor(threads) as pool:
+        squares = np.stack(list(pool.map(lambda job: job[0].read(job[1], pixels, fit), work)))
+    relation = np.full((len(work), len(work)), DIFFERENT, np.int8)
+    starts = np.cumsum([0, *map(len, sources)])
+    spans = [slice(a, b) for a, b in pairwise(starts.tolist())]
+    for source, span in zip(sources, spans, strict=True):
+        for other, beside in zip(sources, spans, strict=True):
+            if other.family == source.family:
+                relation[span, beside] = UNKNOWN
+        relation[span, span] = source.relation
+    unit = np.concatenate([s.unit + k * 10_000_000 for k, s in enumerate(sources)])
+    return Collection(
+        tuple(f"{source.name}/{source.names[i]}" for source, i in work),
+        squares,
+        relation,
+        unit.astype(np.int64),
+        tuple((source.name, len(source)) for source in sources),
+    )
+
+
+def divide(
+    collection: Collection, seed: int, share: float = 0.15
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Images to train on and to validate on, whole units each.
+
+    Training images that show a place of a validation image (the ends of a stretch of road) are
+    left out of both.
+
+    Raises:
+        InputError: too few images for both.
+    """
+    rng = np.random.default_rng([seed, 1])
+    units = np.unique(collection.unit)
+    chosen = rng.permutation(len(units))[: max(1, round(share * len(units)))]
+    validating = np.isin(collection.unit, units[chosen])
+    seen = (collection.relation[validating] == SAME).any(0) & ~validating
+    train, validation = np.flatnonzero(~validating & ~seen), np.flatnonzero(validating)
+    for part in (train, validation):
+        relation = collection.relation[np.ix_(part, part)]
+        if not len(part) or not (relation == DIFFERENT).any():
+            raise InputError("--data: too few places to divide; add a source of images.")
+    return train, validation
+
+
+def draw_pairs(
+    collection: Collection,
+    chosen: NDArray[np.int64],
+    count: int,
+    rng: np.random.Generator,
+    hard: NDArray[np.int64] | None = None,
+    hard_share: float = 0.5,
+) -> Pairs:
+    """Pairs to train on, as many of one place as of two.
+
+    Args:
+        chosen: ``(M,)`` images to draw from.
+        count: number of pairs, even.
+        hard: ``(M, K)`` images of other places that look alike, -1 for none: :func:`mine`.
+        hard_share: of the pairs of two places, how many are drawn from ``hard``.
+    """
+    relation = collection.relation[np.ix_(chosen, chosen)]
+    a = rng.integers(len(chosen), size=count)
+    b = np.empty(count, np.int64)
+    same = np.arange(count) % 2 == 0
+    for k in range(count):
+        wanted = np.flatnonzero(relation[a[k]] == (SAME if same[k] else DIFFERENT))
+        use_hard = rng.random() < hard_share
+        if not same[k] and hard is not None and use_hard:
+            offered = hard[a[k]][hard[a[k]] >= 0]
+            if offered.size:
+                b[k] = np.searchsorted(chosen, rng.choice(offered))
+                continue
+        if not wanted.size:  # an image of which no other place is known
+            wanted, same[k] = np.array([a[k]]), True
+        b[k] = rng.choice(wanted)
+    return Pairs(chosen[a], chosen[b], same)
+
+
+def mine(
+    collection: Collection, chosen: NDArray[np.int64], descriptors: NDArray[np.float32], k: int = 10
+) -> NDArray[np.int64]:
+    """The ``k`` images of other places that look most alike, ``(M, k)``, -1 where there are less.
+
+    Args:
+        chosen: ``(M,)`` images.
+        descriptors: ``(M, D)`` of these.
+    """
+    out = np.full((len(chosen), k), -1, np.int64)
+    for start in range(0, len(chosen), 512):
+        rows = chosen[start : start + 512]
+        alike = descriptors[start : start + 512] @ descriptors.T
+        alike[collection.relation[np.ix_(rows, chosen)] != DIFFERENT] = -np.inf
+        best = np.argsort(-alike, axis=1, kind="stable")[:, :k]
+        found = np.take_along_axis(alike, best, 1) > -np.inf
+        out[start : start + 512, : best.shape[1]] = np.where(found, chosen[best], -1)
+    return out
+
+
+def write_pairs(path: Path, collection: Collection, pairs: Pairs, seed: int) -> None:
+    """Write a list of pairs as CSV: a, b, same; the first line says the seed.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
+    table = io.StringIO()
+    table.write(f"# seed {seed}\n")
+    rows = csv.writer(table, lineterminator="\n")
+    rows.writerow(["a", "b", "same"])
+    for a, b, same in zip(pairs.a, pairs.b, pairs.same, strict=True):
+        rows.writerow([collection.names[a], collection.names[b], int(same)])
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(table.getvalue())
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error

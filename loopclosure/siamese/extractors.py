@@ -1,0 +1,143 @@
+"""From an image to primary capsules: the light extractor of the paper and the one it replaces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from vslam.loopclosure.siamese.capsules import squash
+
+Block = tuple[int, int, int]
+"""Channels, stride and dilation of a separable convolution; the first is the stem."""
+
+LIGHT_BLOCKS: tuple[Block, ...] = (
+    (32, 4, 1),  # 57 places a side for 227 pixels
+    (64, 2, 1),  # 29
+    (128, 1, 2),
+    (192, 2, 3),  # 15
+    (256, 1, 2),
+)
+
+
+class Separable(nn.Module):
+    """Depthwise and pointwise convolution, then batch normalisation (Eq. 1) and ReLU."""
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        kernel: int = 3,
+        stride: int = 1,
+        dilation: int = 1,
+        *,
+        active: bool = True,
+    ) -> None:
+        super().__init__()
+        self.depthwise = nn.Conv2d(
+            inputs, inputs, kernel, stride, dilation * (kernel // 2), dilation,
+            groups=inputs, bias=False,
+        )  # fmt: skip
+        self.pointwise = nn.Conv2d(inputs, outputs, 1, bias=False)
+        self.norm: nn.Module = nn.BatchNorm2d(outputs)
+        self.active = active
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.norm(self.pointwise(self.depthwise(x)))
+        return torch.relu(x) if self.active else x
+
+    def fold(self) -> None:
+        """Work the normalisation into the convolution before it: same result, less time."""
+        if isinstance(self.norm, nn.BatchNorm2d):
+            self.pointwise = fuse_conv_bn_eval(self.pointwise, self.norm)
+            self.norm = nn.Identity()
+
+
+class Stem(nn.Module):
+    """The one ordinary convolution, 7x7; three channels are too few to separate."""
+
+    def __init__(self, outputs: int, stride: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(3, outputs, 7, stride, 3, bias=False)
+        self.norm: nn.Module = nn.BatchNorm2d(outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.relu(self.norm(self.conv(x)))
+
+    def fold(self) -> None:
+        if isinstance(self.norm, nn.BatchNorm2d):
+            self.conv = fuse_conv_bn_eval(self.conv, self.norm)
+            self.norm = nn.Identity()
+
+
+class PrimaryCapsules(nn.Module):
+    """A 7x7 stride-1 separable convolution whose channels are read as capsules, and squashed."""
+
+    def __init__(self, inputs: int, types: int, size: int) -> None:
+        super().__init__()
+        self.types, self.size = types, size
+        self.conv = Separable(inputs, types * size, kernel=7, active=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(N, C, h, w)`` to ``(N, types, h w, size)``."""
+        x = self.conv(x)
+        n, _, h, w = x.shape
+        return squash(x.reshape(n, self.types, self.size, h * w).transpose(2, 3))
+
+
+class LightExtractor(nn.Sequential):
+    """Strided separable convolutions with dilations 1, 2, 3: 227 pixels become a grid of 15x15.
+
+    Attributes:
+        out_channels: of the grid.
+    """
+
+    def __init__(self, blocks: Sequence[Block] = LIGHT_BLOCKS) -> None:
+        stem, *rest = blocks
+        layers: list[nn.Module] = [Stem(stem[0], stem[1])]
+        inputs = stem[0]
+        for outputs, stride, dilation in rest:
+            layers.append(Separable(inputs, outputs, stride=stride, dilation=dilation))
+            inputs = outputs
+        super().__init__(*layers)
+        self.out_channels = inputs
+
+
+def grid_side(pixels: int, blocks: Sequence[Block] = LIGHT_BLOCKS) -> int:
+    """Places along one side of the grid for a square image of so many pixels."""
+    for _, stride, _ in blocks:
+        pixels = (pixels - 1) // stride + 1
+    return pixels
+
+
+class OriginalExtractor(nn.Module):
+    """The extractor of CapsNet: two dense 9x9 convolutions (Sabour et al., NIPS 2017, section 4).
+
+    The reference of the paper's saving. CapsNet's images have 28 pixels: ours are reduced to
+    ``reduced`` first, so that stride 2 ends at the grid of the light extractor.
+    """
+
+    reduced = 31  # (31 - 8 - 8) // 2 + 1 = 8
+
+    def __init__(self, types: int, size: int) -> None:
+        super().__init__()
+        self.types, self.size = types, size
+        self.conv = nn.Conv2d(3, 256, 9)
+        self.primary = nn.Conv2d(256, types * size, 9, stride=2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(N, 3, H, W)`` to primary capsules ``(N, types, 64, size)``."""
+        x = nn.functional.interpolate(x, size=(self.reduced, self.reduced), mode="area")
+        x = self.primary(torch.relu(self.conv(x)))
+        n = x.shape[0]
+        return squash(x.reshape(n, self.types, self.size, -1).transpose(2, 3))
+
+
+def fold_batch_norms(network: nn.Module) -> None:
+    """Fold every normalisation of an extractor, in place; the network must be in eval mode."""
+    for module in network.modules():
+        if isinstance(module, Separable | Stem):
+            cast(Separable, module).fold()

@@ -1,0 +1,136 @@
+"""What training minimises, and how a network is judged and calibrated."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from torch import Tensor
+from torch.nn import functional
+
+from vslam.loopclosure.benchmark import balanced_accuracy, summary
+from vslam.loopclosure.siamese.augmentation import Augmentation, augment
+from vslam.loopclosure.siamese.data import Collection
+from vslam.loopclosure.siamese.images import to_tensor
+from vslam.loopclosure.siamese.places import DIFFERENT, SAME, UNKNOWN
+from vslam.loopclosure.siamese.siamese import DistanceHead, SiameseNetwork
+
+_MOST_SAME = 5  # images of its place that a validation image asks for
+
+
+def cross_entropy(logits: Tensor, same: Tensor) -> Tensor:
+    """Eq. 3: ``-(y log p + (1 - y) log(1 - p))``, mean over pairs, from logits of p."""
+    return functional.binary_cross_entropy_with_logits(logits, same.to(logits.dtype))
+
+
+def contrast(a: Tensor, b: Tensor, same: Tensor, relation: Tensor, temperature: float) -> Tensor:
+    """Each pair of one place against all images of other places in the batch (InfoNCE).
+
+    Van den Oord et al. 2018, symmetric as in CLIP. Not in the paper.
+
+    Args:
+        a, b: ``(N, D)`` unit descriptors of pairs.
+        same: ``(N,)`` bool.
+        relation: ``(2 N, 2 N)`` int8 of the images of ``a`` and ``b`` together.
+    """
+    if not bool(same.any()):
+        return a.sum() * 0.0
+    both = torch.cat([a, b])
+    n = len(a)
+    partner = torch.arange(2 * n, device=a.device).roll(n)
+    alike = both @ both.T / temperature
+    positive = alike.gather(1, partner[:, None])
+    others = alike.masked_fill(relation != DIFFERENT, -torch.inf)
+    losses = torch.logsumexp(torch.cat([positive, others], 1), 1) - positive[:, 0]
+    return losses[same.repeat(2)].mean()
+
+
+@torch.no_grad()
+def embed_all(
+    network: SiameseNetwork, squares: NDArray[np.uint8], device: torch.device, batch: int = 64
+) -> NDArray[np.float32]:
+    """Descriptors ``(N, D)`` of ``(N, S, S)`` images, in eval mode."""
+    network.eval()
+    parts = [
+        network.embed(to_tensor(squares[k : k + batch]).to(device)).cpu()
+        for k in range(0, len(squares), batch)
+    ]
+    return torch.cat(parts).numpy()
+
+
+@torch.no_grad()
+def score_matrix(
+    network: SiameseNetwork,
+    queries: NDArray[np.float32],
+    gallery: NDArray[np.float32],
+    device: torch.device,
+) -> NDArray[np.float32]:
+    """Similarity ``(Q, M)`` of each query with each image of the gallery."""
+    network.eval()
+    stored = torch.from_numpy(gallery).to(device)
+    rows = [network.compare(q, stored).cpu() for q in torch.from_numpy(queries).to(device)]
+    return torch.stack(rows).numpy()
+
+
+def validate(
+    network: SiameseNetwork,
+    collection: Collection,
+    chosen: NDArray[np.int64],
+    strength: Augmentation,
+    device: torch.device,
+) -> tuple[dict[str, float], NDArray[np.float32], NDArray[np.bool_]]:
+    """Retrieval among the validation images: each, augmented, asks for its place.
+
+    All pairs whose relation is known count, not a balanced choice: many more of two places than
+    of one, as in a SLAM run; of its own place at most five. The augmentations and this choice are
+    the same at every call.
+
+    Returns:
+        Figures of :func:`vslam.loopclosure.benchmark.summary`, and the scores and labels of the
+        pairs behind them.
+    """
+    squares = collection.squares[chosen]
+    changed = np.stack(
+        [augment(s, strength, np.random.default_rng([7, k])) for k, s in enumerate(squares)]
+    )
+    gallery = embed_all(network, squares, device)
+    scores = score_matrix(network, embed_all(network, changed, device), gallery, device)
+    relation = collection.relation[np.ix_(chosen, chosen)].copy()
+    for k, row in enumerate(relation):
+        # Fifty pictures of one webcam would outweigh all streets.
+        others = np.flatnonzero(row == SAME)
+        dropped = np.random.default_rng([8, k]).permutation(others)[_MOST_SAME:]
+        row[dropped] = UNKNOWN
+    known = relation != UNKNOWN
+    same, score = relation[known] == SAME, scores[known]
+    figures = summary(same, score)
+    for threshold in (0.5, 0.9):
+        name = f"balanced_accuracy_at_{threshold}"
+        figures[name] = balanced_accuracy(same, score, threshold)
+    return figures, score, same
+
+
+def calibrate(network: SiameseNetwork, score: NDArray, same: NDArray) -> None:
+    """Fit a and b of ``p = sigmoid(a - b d)`` to scores, true and false pairs weighing the same.
+
+    In place. The order of scores and so AP stay; what 0.9 means is set. Heads without a and b are
+    left as they are.
+    """
+    head = network.head
+    if not isinstance(head, DistanceHead):
+        return
+    a, b = head.log_a.exp().item(), head.log_b.exp().item()
+    p = np.clip(np.asarray(score, np.float64), 1e-12, 1 - 1e-12)
+    d = (a - np.log(p / (1 - p))) / b
+    same = np.asarray(same, bool)
+    weight = np.where(same, 0.5 / same.sum(), 0.5 / (~same).sum())
+    sign = np.where(same, 1.0, -1.0)
+
+    def cost(x: NDArray) -> float:
+        return float(weight @ np.logaddexp(0.0, -sign * (np.exp(x[0]) - np.exp(x[1]) * d)))
+
+    best = minimize(cost, np.log([a, b]), method="Nelder-Mead").x
+    with torch.no_grad():
+        head.log_a.fill_(float(best[0]))
+        head.log_b.fill_(float(best[1]))

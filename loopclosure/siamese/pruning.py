@@ -1,0 +1,88 @@
+"""Pruning: primary capsules that no output listens to are taken out of the network.
+
+The paper ranks primary capsules by their coupling coefficients, drops the lowest 20 % and sets
+their W_ij to 0. A zero costs as much time as any number: here they are removed.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from vslam.errors import InputError
+from vslam.loopclosure.siamese.branches import CapsuleBranch
+from vslam.loopclosure.siamese.siamese import SiameseNetwork
+
+
+@torch.no_grad()
+def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor:
+    """Activity of each primary capsule, ``(T, K)``: mean of c_ij over images and outputs j.
+
+    Args:
+        network: of a capsule branch, in eval mode.
+        batches: images of the training set, ``(N, 3, S, S)`` each.
+
+    Raises:
+        InputError: no images, or a network without capsules.
+    """
+    branch = _capsules_of(network)
+    total, count = None, 0
+    for images in batches:
+        c = branch.routed(images)[1]
+        summed = c.mean(1).sum(0)
+        total = summed if total is None else total + summed
+        count += len(images)
+    if total is None:
+        raise InputError("pruning: no images to rank the capsules with; name training data.")
+    return (total / count).view(branch.shape.types, -1)
+
+
+def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
+    """``(T, K)`` bool, the least active ``fraction`` of the capsules of each type.
+
+    The same number of each type (the paper does not say): what is left is still one dense product
+    for all types. Ties go to the lower index.
+    """
+    dropped = round(fraction * activity.shape[1])
+    order = torch.argsort(activity, dim=1, stable=True)
+    out = torch.zeros_like(activity, dtype=torch.bool)
+    return out.scatter_(1, order[:, :dropped], True)
+
+
+def masked(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
+    """A copy in which the capsules of ``drop`` ``(T, K)`` are silenced but still computed."""
+    copied = copy.deepcopy(network)
+    layer = _capsules_of(copied).capsules
+    layer.alive.copy_(~drop.flatten())
+    layer.masked = True
+    return copied
+
+
+def pruned(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
+    """A copy without the capsules of ``drop`` ``(T, K)``, as many of each type.
+
+    Raises:
+        InputError: a network without capsules.
+    """
+    branch = _capsules_of(network)
+    layer = branch.capsules
+    kept = (~drop).nonzero()[:, 1].view(len(drop), -1)
+    shape = branch.shape.model_copy(update={"kept": kept.shape[1]})
+    smaller = SiameseNetwork("capsule-pruned", CapsuleBranch(shape), copy.deepcopy(network.head))
+    state = network.state_dict()
+    prefix = "branch.capsules."
+    rows = kept[:, :, None].expand(-1, -1, layer.gains.shape[2])
+    state[prefix + "gains"] = torch.gather(layer.gains.detach(), 1, rows)
+    state[prefix + "place"] = torch.gather(layer.place, 1, kept)
+    state[prefix + "alive"] = layer.alive.view(len(drop), -1).gather(1, kept).flatten()
+    smaller.load_state_dict(state)
+    return smaller.to(layer.W.device).train(network.training)
+
+
+def _capsules_of(network: SiameseNetwork) -> CapsuleBranch:
+    if not isinstance(network.branch, CapsuleBranch):
+        raise InputError(f"{network.name}: has no capsules to prune; choose capsule.")
+    return network.branch

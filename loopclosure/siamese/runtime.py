@@ -1,0 +1,45 @@
+"""Threads of torch, and how long an image takes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from vslam.loopclosure.siamese.siamese import SiameseNetwork
+
+
+def set_threads(threads: int) -> None:
+    """Threads that torch computes with from now on."""
+    torch.set_num_threads(threads)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Compute on one thread within: the sums, and so the bits, do not depend on the machine's."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@torch.no_grad()
+def milliseconds_per_image(*networks: SiameseNetwork, repeats: int = 50) -> list[float]:
+    """Least time to embed one image on one core for each network.
+
+    In turn, so that all of them meet the same load of the machine; the least of the repeats,
+    because other processes can only add to it.
+    """
+    best = [float("inf")] * len(networks)
+    with one_thread():
+        for _ in range(repeats):
+            for k, network in enumerate(networks):
+                image = torch.rand(1, 3, network.pixels, network.pixels)
+                began = time.perf_counter()
+                network.embed(image)
+                best[k] = min(best[k], time.perf_counter() - began)
+    return [1e3 * seconds for seconds in best]

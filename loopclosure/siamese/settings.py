@@ -1,0 +1,60 @@
+"""What a training depends on beside its data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from vslam.errors import InputError
+from vslam.loopclosure.siamese.augmentation import STRONG, Augmentation
+from vslam.loopclosure.siamese.branches import CapsuleShape
+
+
+class TrainSettings(BaseModel):
+    """Written to ``settings.json`` of a training, read by ``--settings``."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    network: str = Field("capsule", description="Network to train.")
+    shape: CapsuleShape = Field(CapsuleShape(), description="Of a capsule branch.")
+    fit: Literal["squash", "crop"] = Field("squash", description="Whole view, or central square.")
+    seed: int = Field(0, ge=0, description="Of weights, division, pairs and augmentation.")
+    loss: Literal["bce", "bce+contrast"] = Field("bce", description="Eq. 3, or with contrast.")
+    temperature: float = Field(0.07, gt=0, description="Of the contrast.")
+    learning_rate: float = Field(3e-4, gt=0, description="Of Adam. [paper]")
+    schedule: Literal["constant", "cosine"] = "constant"
+    batch: int = Field(64, ge=2, description="Pairs. [paper]")
+    epochs: int = Field(40, ge=1, description="At most.")
+    pairs: int = Field(4096, ge=2, description="Pairs of an epoch.")
+    patience: int = Field(6, ge=1, description="Epochs without a better validation AP.")
+    hard_share: float = Field(0.5, ge=0, le=1, description="Of the pairs of two places: mined.")
+    mined_images: int = Field(4000, ge=2, description="Images embedded for mining, at most.")
+    validation_share: float = Field(0.15, gt=0, lt=1, description="Of the units of each source.")
+    validation_images: int = Field(800, ge=2, description="At most.")
+    augmentation: Augmentation = Augmentation()
+
+
+PRESETS = {
+    # What the paper writes; augmentation strengths and mining are ours, it gives none.
+    "paper": TrainSettings(),
+    # Every image of a batch is compared with every other, under stronger changes.
+    "best": TrainSettings(loss="bce+contrast", schedule="cosine", augmentation=STRONG, patience=10),
+}
+
+
+def load_settings(path: Path) -> TrainSettings:
+    """Read settings in JSON; keys left out keep their defaults.
+
+    Raises:
+        InputError: missing file, no JSON, unknown key or value out of range.
+    """
+    try:
+        return TrainSettings.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the settings ({error.strerror}).") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "file"
+        raise InputError(f"{path}: {where}: {first['msg']}.") from error

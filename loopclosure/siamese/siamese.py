@@ -1,0 +1,197 @@
+"""A Siamese network: one branch for both images, and what compares their descriptors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import ValidationError
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from torch.nn import functional
+
+from vslam.errors import InputError, ResultsError
+from vslam.loopclosure.siamese.branches import (
+    CapsuleBranch,
+    CapsuleShape,
+    ConvolutionalBranch,
+    alexnet,
+    vgg16,
+)
+from vslam.loopclosure.siamese.capsules import length
+from vslam.loopclosure.siamese.extractors import fold_batch_norms
+from vslam.loopclosure.siamese.weights import NETWORKS
+
+
+class DistanceHead(nn.Module):
+    """``p = sigmoid(a - b d)`` (Eq. 2) of the distance d of two descriptors (Eq. 10), a, b > 0."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        # p = 0.5 at d = 1.1, between pairs of one and of two places under random weights.
+        self.log_a = nn.Parameter(torch.tensor(1.5))
+        self.log_b = nn.Parameter(torch.tensor(1.4))
+
+    def forward(self, a: Tensor, b: Tensor) -> Tensor:
+        """Logits ``(N,)`` of pairs of ``(N, D)`` unit descriptors."""
+        return self.of_distance(length(a - b))
+
+    def of_distance(self, d: Tensor) -> Tensor:
+        """Logit of a distance."""
+        return self.log_a.exp() - self.log_b.exp() * d
+
+    def compare(self, query: Tensor, gallery: Tensor) -> Tensor:
+        """Logits ``(M,)`` of one ``(D,)`` descriptor with each of ``(M, D)``, one product."""
+        return self.of_distance(torch.sqrt((2.0 - 2.0 * (gallery @ query)).clamp_min(0.0)))
+
+
+class ConcatenationHead(nn.Module):
+    """Both vectors concatenated, fully connected layers with batch normalisation (Eq. 1).
+
+    The mean over both orders of the pair, so that the answer does not depend on it.
+    """
+
+    def __init__(self, dimensions: int, hidden: int = 256) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Linear(2 * dimensions, hidden, bias=False),
+            nn.BatchNorm1d(hidden),
+            nn.ReLU(inplace=True),
+            nn.Linear(hidden, 1),
+        )
+
+    def forward(self, a: Tensor, b: Tensor) -> Tensor:
+        """Logits ``(N,)`` of pairs of ``(N, D)`` descriptors."""
+        both = torch.cat([torch.cat([a, b], 1), torch.cat([b, a], 1)])
+        return self.layers(both).view(2, -1).mean(0)
+
+    def compare(self, query: Tensor, gallery: Tensor) -> Tensor:
+        """Logits ``(M,)`` of one ``(D,)`` descriptor with each of ``(M, D)``."""
+        return self.forward(query.expand_as(gallery), gallery)
+
+
+class SiameseNetwork(nn.Module):
+    """One contract for all branches: ``embed`` and ``similarity``.
+
+    Attributes:
+        name: one of ``NETWORKS``.
+        pixels: side of the square images it takes.
+        dimensions: D of its descriptors.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        branch: CapsuleBranch | ConvolutionalBranch,
+        head: DistanceHead | ConcatenationHead,
+    ) -> None:
+        super().__init__()
+        self.name, self.branch, self.head = name, branch, head
+        self.pixels, self.dimensions = branch.pixels, branch.dimensions
+
+    def embed(self, images: Tensor) -> Tensor:
+        """``(N, 3, S, S)`` float32 in [0, 1] to ``(N, D)`` float32 descriptors of L2 norm 1."""
+        return functional.normalize(self.branch(images).float(), dim=1)
+
+    def logits(self, a: Tensor, b: Tensor) -> Tensor:
+        """Logit of ``similarity``, what training works on."""
+        return self.head(a, b)
+
+    def similarity(self, a: Tensor, b: Tensor) -> Tensor:
+        """Probability ``(N,)`` in (0, 1) that pairs of ``(N, D)`` descriptors show one place."""
+        return torch.sigmoid(self.head(a, b))
+
+    def compare(self, query: Tensor, gallery: Tensor) -> Tensor:
+        """Similarity ``(M,)`` of one ``(D,)`` descriptor with each of a ``(M, D)`` gallery."""
+        return torch.sigmoid(self.head.compare(query, gallery))
+
+    def forward(self, images: Tensor) -> Tensor:
+        """As :meth:`embed`."""
+        return self.embed(images)
+
+    def n_parameters(self) -> int:
+        """Learned numbers."""
+        return sum(p.numel() for p in self.parameters())
+
+
+def build_network(name: str, shape: CapsuleShape | None = None) -> SiameseNetwork:
+    """A network with random weights, drawn from torch's global generator.
+
+    Args:
+        name: one of ``NETWORKS``.
+        shape: of a capsule branch.
+
+    Raises:
+        InputError: unknown name.
+    """
+    if name in ("capsule", "capsule-pruned"):
+        return SiameseNetwork(name, CapsuleBranch(shape or CapsuleShape()), DistanceHead())
+    if name not in NETWORKS:
+        raise InputError(f"{name}: no such network; choose one of {', '.join(NETWORKS)}.")
+    branch = alexnet() if name == "alexnet" else vgg16()
+    return SiameseNetwork(name, branch, ConcatenationHead(branch.dimensions))
+
+
+def save_network(
+    network: SiameseNetwork, path: Path, about: dict[str, Any], *, half: bool = False
+) -> None:
+    """Write weights as safetensors, with what rebuilds the network and ``about`` as metadata.
+
+    Args:
+        half: store in half precision, for shipping.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
+    tensors = {
+        key: value.detach().half() if half and value.is_floating_point() else value.detach()
+        for key, value in network.state_dict().items()
+    }
+    shape = network.branch.shape if isinstance(network.branch, CapsuleBranch) else None
+    metadata = {
+        "name": network.name,
+        "shape": shape.model_dump_json() if shape else "",
+        "about": json.dumps(about),
+    }
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_suffix(".part")
+        save_file({k: v.cpu().contiguous() for k, v in tensors.items()}, temporary, metadata)
+        temporary.replace(path)
+    except (OSError, SafetensorError) as error:
+        raise ResultsError(f"{path}: the weights cannot be written ({error}).") from error
+
+
+def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
+    """Read what :func:`save_network` wrote; returns the network in eval mode and ``about``.
+
+    Raises:
+        InputError: missing or damaged file, or not one of ours.
+    """
+    fix = "train it with 'vslam train', or name another file"
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        shape = metadata["shape"]
+        network = build_network(
+            metadata["name"], CapsuleShape.model_validate_json(shape) if shape else None
+        )
+        wanted = network.state_dict()
+        network.load_state_dict({k: v.to(wanted[k].dtype) for k, v in tensors.items()})
+        about: dict[str, Any] = json.loads(metadata["about"])
+    except OSError as error:
+        raise InputError(f"{path}: the weights cannot be read; {fix}.") from error
+    except (SafetensorError, KeyError, ValueError, RuntimeError, ValidationError) as error:
+        raise InputError(f"{path}: not weights of this version of vslam; {fix}.") from error
+    return network.eval(), about
+
+
+def for_inference(network: SiameseNetwork) -> SiameseNetwork:
+    """Eval mode, no gradients, normalisations folded into convolutions; in place."""
+    network.eval().requires_grad_(False)
+    fold_batch_norms(network)
+    return network

@@ -1,0 +1,83 @@
+"""What a training starts from: random weights, another training's, torchvision's, or a pruning."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from vslam.errors import InputError
+from vslam.loopclosure.siamese.branches import CapsuleBranch, ConvolutionalBranch
+from vslam.loopclosure.siamese.data import Collection, divide
+from vslam.loopclosure.siamese.images import to_tensor
+from vslam.loopclosure.siamese.objective import validate
+from vslam.loopclosure.siamese.pruning import lowest, mean_couplings, pruned
+from vslam.loopclosure.siamese.runtime import milliseconds_per_image
+from vslam.loopclosure.siamese.settings import TrainSettings
+from vslam.loopclosure.siamese.siamese import (
+    SiameseNetwork,
+    build_network,
+    for_inference,
+    load_network,
+)
+
+PRUNED_SHARE = 0.2
+_RANKED_IMAGES = 1000
+
+
+def starting_network(
+    settings: TrainSettings, collection: Collection, weights: Path | None, device: str
+) -> tuple[SiameseNetwork | None, TrainSettings, dict[str, Any]]:
+    """The network to start from, the settings that fit it, and what the model card adds.
+
+    Args:
+        weights: safetensors of ours; for alexnet and vgg16 also torchvision's file; None for
+            random weights.
+
+    Raises:
+        InputError: weights that are missing, damaged or of another network.
+    """
+    if settings.network == "capsule-pruned":
+        if weights is None:
+            raise InputError("vslam train capsule-pruned: name the network to prune, --weights.")
+        return _prune(settings, collection, weights, torch.device(device))
+    if weights is None:
+        return None, settings, {}
+    about = {"started_from": str(weights)}
+    if weights.suffix != ".safetensors":
+        torch.manual_seed(settings.seed)
+        network = build_network(settings.network, settings.shape)
+        if not isinstance(network.branch, ConvolutionalBranch):
+            raise InputError(f"{weights}: {settings.network} starts from .safetensors only.")
+        network.branch.load_torchvision(weights)
+        return network, settings, about
+    network, _ = load_network(weights)
+    if network.name != settings.network:
+        raise InputError(f"{weights}: weights of {network.name}, not of {settings.network}.")
+    if isinstance(network.branch, CapsuleBranch):
+        settings = settings.model_copy(update={"shape": network.branch.shape})
+    return network, settings, about
+
+
+def _prune(
+    settings: TrainSettings, collection: Collection, weights: Path, device: torch.device
+) -> tuple[SiameseNetwork, TrainSettings, dict[str, Any]]:
+    full, _ = load_network(weights)
+    train, validation = divide(collection, settings.seed, settings.validation_share)
+    validation = validation[: settings.validation_images]
+    step = max(1, len(train) // _RANKED_IMAGES)
+    squares = collection.squares[train[::step]]
+    full.to(device)
+    batches = (to_tensor(squares[k : k + 32]).to(device) for k in range(0, len(squares), 32))
+    smaller = pruned(full, lowest(mean_couplings(full, batches), PRUNED_SHARE))
+    report: dict[str, Any] = {"pruned_from": str(weights), "pruned_share": PRUNED_SHARE}
+    for name, network in (("before", full), ("removed", smaller)):
+        figures = validate(network, collection, validation, settings.augmentation, device)[0]
+        report[f"average_precision_{name}"] = figures["average_precision"]
+    copies = [for_inference(copy.deepcopy(network).cpu()) for network in (full, smaller)]
+    report["ms_before"], report["ms_removed"] = milliseconds_per_image(*copies)
+    assert isinstance(smaller.branch, CapsuleBranch)
+    settings = settings.model_copy(update={"shape": smaller.branch.shape})
+    return smaller, settings, report

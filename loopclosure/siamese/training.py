@@ -1,0 +1,365 @@
+"""Training: an epoch of pairs after the other, checkpoints that a killed run goes on from.
+
+Everything random is drawn from the seed, the epoch and the number of the step or pair: a
+checkpoint needs no state of a generator beside them, and a resumed training has the bits of one
+that was never interrupted (same machine, same number of threads).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vslam.errors import InputError, ResultsError
+from vslam.loopclosure.siamese.augmentation import augment
+from vslam.loopclosure.siamese.data import Collection, Pairs, divide, draw_pairs, mine, write_pairs
+from vslam.loopclosure.siamese.images import to_tensor
+from vslam.loopclosure.siamese.objective import (
+    calibrate,
+    contrast,
+    cross_entropy,
+    embed_all,
+    validate,
+)
+from vslam.loopclosure.siamese.settings import TrainSettings
+from vslam.loopclosure.siamese.siamese import (
+    SiameseNetwork,
+    build_network,
+    load_network,
+    save_network,
+)
+
+OnStep = Callable[[int, int, int, float], None]
+"""``(epoch, step, steps of the epoch, loss)``"""
+
+CHECKPOINT = "checkpoint.pt"
+_CHECKPOINT_EVERY_S = 300.0
+_HEAD_RATE = 30.0  # a and b are logarithms of single numbers: Adam's steps are small for them
+
+
+@dataclass
+class Progress:
+    """Where a training stands: what a checkpoint holds beside weights and moments."""
+
+    epoch: int = 0
+    step: int = 0
+    best: float = -1.0
+    stale: int = 0
+    loss_sum: float = 0.0
+    seconds: float = 0.0
+    images: int = 0
+    history: list[dict[str, float]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a training came to.
+
+    Attributes:
+        finished: False if it was asked to stop before its end; a call with ``resume`` goes on.
+        figures: validation figures of the best epoch, calibrated.
+        progress: with the figures of every epoch.
+        weights: file of the best network.
+        train, validation: images of the division.
+    """
+
+    finished: bool
+    figures: dict[str, float]
+    progress: Progress
+    weights: Path
+    train: NDArray[np.int64]
+    validation: NDArray[np.int64]
+
+
+def train(
+    collection: Collection,
+    settings: TrainSettings,
+    folder: Path,
+    *,
+    device: str = "cpu",
+    threads: int = 2,
+    resume: bool = False,
+    start: SiameseNetwork | None = None,
+    on_step: OnStep | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Outcome:
+    """Train a network and write it, its log, its lists of pairs and checkpoints to a folder.
+
+    Args:
+        collection: images and their relations.
+        settings: see there.
+        folder: to write to; ``settings.network`` names the file of the weights.
+        device: ``cpu`` or ``cuda``, which computes in bfloat16 where it can.
+        threads: that augment images.
+        resume: go on from the folder's checkpoint, if there is one.
+        start: network to start from instead of random weights (fine-tuning).
+        on_step: called after each step.
+        should_stop: asked after each step; a checkpoint is written before stopping.
+
+    Raises:
+        InputError: too little data, an unknown device, or a checkpoint of other settings.
+        ResultsError: the loss is not finite (the last good checkpoint stays), or a full disk.
+    """
+    where = _open_device(device)
+    train_images, validation = divide(collection, settings.seed, settings.validation_share)
+    rng = np.random.default_rng([settings.seed, 2])
+    if len(validation) > settings.validation_images:
+        picked = rng.choice(len(validation), settings.validation_images, replace=False)
+        validation = validation[np.sort(picked)]
+    torch.manual_seed(settings.seed)
+    network = (start or build_network(settings.network, settings.shape)).to(where)
+    optimiser = _optimiser(network, settings)
+    progress, pairs = Progress(), None
+    steps = max(1, settings.pairs // settings.batch)
+    weights = folder / f"{settings.network}.safetensors"
+    if resume and (folder / CHECKPOINT).exists():
+        progress, pairs = _load_checkpoint(folder / CHECKPOINT, settings, network, optimiser)
+    else:  # so that there is one to keep, whatever the first steps do
+        _save_checkpoint(folder / CHECKPOINT, settings, network, optimiser, progress, None)
+    saved = time.monotonic()
+    with ThreadPoolExecutor(threads) as pool:
+        while progress.epoch < settings.epochs and progress.stale < settings.patience:
+            began = time.monotonic()
+            if pairs is None:
+                pairs = _pairs_of_epoch(
+                    collection, train_images, settings, network, progress, where
+                )
+                write_pairs(
+                    folder / "pairs" / f"epoch_{progress.epoch:03d}.csv",
+                    collection, pairs, settings.seed,
+                )  # fmt: skip
+            while progress.step < steps:
+                batch = slice(progress.step * settings.batch, (progress.step + 1) * settings.batch)
+                loss = _step(
+                    network, optimiser, collection, pairs, batch, settings, progress, steps, pool,
+                    where,
+                )  # fmt: skip
+                if not math.isfinite(loss):
+                    raise ResultsError(
+                        f"{folder}: the loss is {loss} in epoch {progress.epoch}, step "
+                        f"{progress.step}; the last good checkpoint is kept, resume it with a "
+                        "lower learning rate."
+                    )
+                progress.step += 1
+                progress.loss_sum += loss
+                progress.images += 2 * (min(batch.stop, len(pairs)) - batch.start)
+                if on_step:
+                    on_step(progress.epoch, progress.step, steps, loss)
+                stop = should_stop is not None and should_stop()
+                if stop or time.monotonic() - saved > _CHECKPOINT_EVERY_S:
+                    progress.seconds += time.monotonic() - began
+                    began = saved = time.monotonic()
+                    _save_checkpoint(
+                        folder / CHECKPOINT, settings, network, optimiser, progress, pairs
+                    )
+                if stop:
+                    return Outcome(False, {}, progress, weights, train_images, validation)
+            _end_epoch(network, collection, validation, settings, progress, weights, steps, where)
+            progress.seconds += time.monotonic() - began
+            progress.history[-1]["seconds"] = progress.seconds
+            pairs = None
+            _save_checkpoint(folder / CHECKPOINT, settings, network, optimiser, progress, None)
+            saved = time.monotonic()
+            _write_log(folder / "log.csv", progress.history)
+    best, about = load_network(weights)
+    figures, score, same = validate(
+        best.to(where), collection, validation, settings.augmentation, where
+    )
+    calibrate(best, score, same)
+    figures = validate(best, collection, validation, settings.augmentation, where)[0]
+    save_network(best, weights, {**about, "validation": figures})
+    return Outcome(True, figures, progress, weights, train_images, validation)
+
+
+def _step(
+    network: SiameseNetwork,
+    optimiser: torch.optim.Optimizer,
+    collection: Collection,
+    pairs: Pairs,
+    batch: slice,
+    settings: TrainSettings,
+    progress: Progress,
+    steps: int,
+    pool: ThreadPoolExecutor,
+    device: torch.device,
+) -> float:
+    """One step of Adam; the weights are untouched where the loss is not finite."""
+    a, b = pairs.a[batch], pairs.b[batch]
+    same = torch.from_numpy(pairs.same[batch]).to(device)
+    images = _augmented(collection, a, b, batch.start, settings, progress.epoch, pool).to(device)
+    # Dropout of AlexNet and VGG16 draws from torch's generator.
+    torch.manual_seed((settings.seed * 1_009 + progress.epoch) * 1_000_003 + progress.step)
+    rate = _learning_rate(settings, progress.epoch * steps + progress.step, settings.epochs * steps)
+    for group in optimiser.param_groups:
+        group["lr"] = rate * group["factor"]
+    network.train()
+    half = device.type == "cuda" and torch.cuda.is_bf16_supported()
+    with torch.autocast(device.type, torch.bfloat16, enabled=half):
+        descriptors = network.embed(images)
+    first, second = descriptors[: len(a)], descriptors[len(a) :]
+    loss = cross_entropy(network.logits(first, second), same)
+    if settings.loss == "bce+contrast":
+        both = np.concatenate([a, b])
+        relation = torch.from_numpy(collection.relation[np.ix_(both, both)]).to(device)
+        loss = loss + contrast(first, second, same, relation, settings.temperature)
+    value = loss.item()
+    if math.isfinite(value):
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+    return value
+
+
+def _augmented(
+    collection: Collection,
+    a: NDArray[np.int64],
+    b: NDArray[np.int64],
+    first: int,
+    settings: TrainSettings,
+    epoch: int,
+    pool: ThreadPoolExecutor,
+) -> torch.Tensor:
+    def one(job: tuple[int, int, int]) -> NDArray[np.uint8]:
+        image, pair, side = job
+        square = collection.squares[image]
+        if settings.augmentation.mirror and (pair + epoch) // 2 % 2:
+            square = np.ascontiguousarray(square[:, ::-1])
+        rng = np.random.default_rng([settings.seed, 3, epoch, pair, side])
+        return augment(square, settings.augmentation, rng)
+
+    jobs = [(int(image), first + k, 0) for k, image in enumerate(a)]
+    jobs += [(int(image), first + k, 1) for k, image in enumerate(b)]
+    return to_tensor(np.stack(list(pool.map(one, jobs))))
+
+
+def _pairs_of_epoch(
+    collection: Collection,
+    images: NDArray[np.int64],
+    settings: TrainSettings,
+    network: SiameseNetwork,
+    progress: Progress,
+    device: torch.device,
+) -> Pairs:
+    rng = np.random.default_rng([settings.seed, 4, progress.epoch])
+    hard = None
+    if progress.epoch > 0 and settings.hard_share > 0:  # random weights find nothing hard
+        if len(images) > settings.mined_images:
+            images = np.sort(rng.choice(images, settings.mined_images, replace=False))
+        descriptors = embed_all(network, collection.squares[images], device)
+        hard = mine(collection, images, descriptors)
+    return draw_pairs(collection, images, settings.pairs, rng, hard, settings.hard_share)
+
+
+def _end_epoch(
+    network: SiameseNetwork,
+    collection: Collection,
+    validation: NDArray[np.int64],
+    settings: TrainSettings,
+    progress: Progress,
+    weights: Path,
+    steps: int,
+    device: torch.device,
+) -> None:
+    figures = validate(network, collection, validation, settings.augmentation, device)[0]
+    row = {"epoch": float(progress.epoch), "loss": progress.loss_sum / steps, **figures}
+    progress.history.append(row)
+    if figures["average_precision"] > progress.best:
+        progress.best, progress.stale = figures["average_precision"], 0
+        save_network(network, weights, {"epoch": progress.epoch, "validation": figures})
+    else:
+        progress.stale += 1
+    progress.epoch, progress.step, progress.loss_sum = progress.epoch + 1, 0, 0.0
+
+
+def _learning_rate(settings: TrainSettings, step: int, steps: int) -> float:
+    if settings.schedule == "constant":
+        return settings.learning_rate
+    return settings.learning_rate * 0.5 * (1.0 + math.cos(math.pi * step / steps))
+
+
+def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.Optimizer:
+    single = [p for p in network.head.parameters() if p.ndim == 0]
+    others = [p for p in network.parameters() if not any(p is q for q in single)]
+    groups: list[dict[str, Any]] = [{"params": others, "factor": 1.0}]
+    if single:
+        groups.append({"params": single, "factor": _HEAD_RATE})
+    return torch.optim.Adam(groups, lr=settings.learning_rate)
+
+
+def _open_device(name: str) -> torch.device:
+    if name not in ("cpu", "cuda"):
+        raise InputError(f"--device {name}: must be cpu or cuda.")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device cuda: torch finds no CUDA device; train with --device cpu.")
+    return torch.device(name)
+
+
+def _save_checkpoint(
+    path: Path,
+    settings: TrainSettings,
+    network: SiameseNetwork,
+    optimiser: torch.optim.Optimizer,
+    progress: Progress,
+    pairs: Pairs | None,
+) -> None:
+    content = {
+        "settings": settings.model_dump_json(),
+        "network": network.state_dict(),
+        "optimiser": optimiser.state_dict(),
+        "progress": vars(progress),
+        "pairs": None if pairs is None else [torch.from_numpy(x) for x in vars(pairs).values()],
+    }
+    temporary = path.with_suffix(".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        torch.save(content, temporary)
+        temporary.replace(path)
+    except (OSError, RuntimeError) as error:
+        raise ResultsError(f"{path}: the checkpoint cannot be written ({error}).") from error
+
+
+def _load_checkpoint(
+    path: Path,
+    settings: TrainSettings,
+    network: SiameseNetwork,
+    optimiser: torch.optim.Optimizer,
+) -> tuple[Progress, Pairs | None]:
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        written = TrainSettings.model_validate_json(content["settings"])
+    except Exception as error:  # torch raises half a dozen kinds
+        raise InputError(f"{path}: not a readable checkpoint; remove it to start anew.") from error
+    # A lower learning rate is what a diverged training is resumed with.
+    free = {"learning_rate": settings.learning_rate, "patience": settings.patience}
+    if written.model_copy(update=free) != settings:
+        raise InputError(
+            f"{path}: written with other settings; use those of settings.json beside it, or "
+            "another --out."
+        )
+    network.load_state_dict(content["network"])
+    optimiser.load_state_dict(content["optimiser"])
+    stored = content["pairs"]
+    pairs = None if stored is None else Pairs(*(x.numpy() for x in stored))
+    return Progress(**content["progress"]), pairs
+
+
+def _write_log(path: Path, history: list[dict[str, float]]) -> None:
+    table = io.StringIO()
+    rows = csv.DictWriter(table, list(history[0]), lineterminator="\n")
+    rows.writeheader()
+    rows.writerows(history)
+    try:
+        path.write_text(table.getvalue())
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error

@@ -1,0 +1,33 @@
+"""Where the weights of the networks are; imports no torch, so that a mistake is told at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from vslam.errors import InputError
+
+NETWORKS = ("capsule", "capsule-pruned", "alexnet", "vgg16")
+SHIPPED = Path(__file__).parent / "weights"
+
+
+def find_weights(name: str, weights: Path | None = None) -> Path:
+    """The safetensors file of a detector.
+
+    Args:
+        name: one of ``NETWORKS``.
+        weights: the file that the user names; None for the one that vslam ships.
+
+    Raises:
+        InputError: unknown name, or no such file.
+    """
+    if name not in NETWORKS:
+        raise InputError(f"--detector {name}: unknown; choose one of {', '.join(NETWORKS)}.")
+    path = weights or SHIPPED / f"{name}.safetensors"
+    if path.exists():
+        return path
+    if weights is None:
+        raise InputError(
+            f"--detector {name}: vslam ships no weights for it; train it with 'vslam train {name}' "
+            "and name the file with --weights."
+        )
+    raise InputError(f"--weights {path}: not there; name the .safetensors file of a training.")

@@ -1,0 +1,267 @@
+"""Capsules, routing, pruning and the contract of the Siamese networks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from siamese_worlds import SMALL, small_network
+
+from vslam.errors import InputError
+from vslam.loopclosure.siamese import capsules
+from vslam.loopclosure.siamese.branches import CapsuleBranch, CapsuleShape, alexnet, standardised
+from vslam.loopclosure.siamese.extractors import LIGHT_BLOCKS, grid_side
+from vslam.loopclosure.siamese.images import to_square, to_tensor
+from vslam.loopclosure.siamese.pruning import lowest, masked, mean_couplings, pruned
+from vslam.loopclosure.siamese.siamese import (
+    build_network,
+    for_inference,
+    load_network,
+    save_network,
+)
+
+
+def images(n: int = 3, pixels: int = 64, seed: int = 0) -> torch.Tensor:
+    return torch.rand(n, 3, pixels, pixels, generator=torch.Generator().manual_seed(seed))
+
+
+def test_squash_keeps_the_direction_and_bends_the_length():
+    s = torch.tensor([[3.0, 4.0], [0.3, -0.4], [0.0, 0.0]])
+    v = capsules.squash(s)
+    assert v[0].tolist() == pytest.approx([25 / 26 * 0.6, 25 / 26 * 0.8], abs=1e-6)
+    assert v[1].tolist() == pytest.approx([0.2 * 0.6, -0.2 * 0.8], abs=1e-6)
+    assert v[2].tolist() == [0.0, 0.0]
+    assert capsules.length(v).tolist() == pytest.approx([25 / 26, 0.2, 1e-6], abs=1e-6)
+
+
+def test_squash_has_a_finite_gradient_at_zero():
+    s = torch.zeros(1, 4, requires_grad=True)
+    (capsules.squash(s).sum() + capsules.length(s).sum()).backward()
+    assert torch.isfinite(s.grad).all()
+
+
+@pytest.mark.parametrize(("over", "axis"), [("primary", 2), ("output", 1)])
+def test_couplings_sum_to_one(over, axis):
+    u_hat = torch.randn(2, 5, 30, 4, generator=torch.Generator().manual_seed(1))
+    for iterations in (1, 2, 3):
+        _, c = capsules.route(u_hat, iterations, over)
+        assert torch.allclose(c.sum(axis), torch.ones(()), atol=1e-6)
+        assert (c > 0).all()
+
+
+def test_routing_stays_at_a_fixed_point_where_all_capsules_agree():
+    one = torch.tensor([2.0, -1.0, 0.5])
+    u_hat = one.expand(1, 1, 6, 3)
+    for iterations in (1, 2, 3, 10):
+        v, c = capsules.route(u_hat, iterations)
+        assert torch.allclose(c, torch.full((1, 1, 6), 1 / 6), atol=1e-6)
+        assert torch.allclose(v[0, 0], capsules.squash(one), atol=1e-6)
+
+
+def test_routing_turns_to_the_majority():
+    many, one = torch.tensor([2.0, 0.0]), torch.tensor([0.0, 2.0])
+    u_hat = torch.stack([many, many, many, one])[None, None]
+    first = capsules.route(u_hat, 1)[1][0, 0]
+    later = capsules.route(u_hat, 5)[1][0, 0]
+    assert first.tolist() == pytest.approx([0.25] * 4)
+    assert later[3] < 0.1
+    assert later[0] > 0.3
+
+
+def test_one_iteration_by_hand():
+    u = torch.tensor([[[[1.0, 0.0], [0.0, 1.0]]]])  # one image, one type, two places
+    W = torch.tensor([[[[2.0, 0.0], [0.0, 4.0]]]])  # (J, T, A, D) = (1, 1, 2, 2)
+    v, c = capsules.route_factored(u, W, iterations=2)
+    # s = (1, 2), |s|² = 5; agreement of (2, 0) and (0, 4) with v = s sqrt(5) / 6
+    b = torch.tensor([2.0, 8.0]) * 5**0.5 / 6
+    expected = torch.softmax(b, 0)
+    assert torch.allclose(c[0, 0], expected, atol=1e-6)
+    s = expected[0] * torch.tensor([2.0, 0.0]) + expected[1] * torch.tensor([0.0, 4.0])
+    assert torch.allclose(v[0, 0], capsules.squash(s), atol=1e-6)
+
+
+@pytest.mark.parametrize("over", ["primary", "output"])
+@pytest.mark.parametrize("iterations", [1, 2, 3])
+@pytest.mark.parametrize("some_dead", [False, True])
+def test_factored_routing_is_the_paper_s_routing(over, iterations, some_dead):
+    torch.manual_seed(2)
+    u, W = capsules.squash(torch.randn(3, 5, 9, 4) * 2), torch.randn(6, 5, 4, 7)
+    alive = torch.rand(45) > 0.3 if some_dead else None
+    wanted = capsules.route(capsules.predict(u, W), iterations, over, alive)
+    for mine, reference in zip(
+        capsules.route_factored(u, W, iterations, over, alive), wanted, strict=True
+    ):
+        assert torch.allclose(mine, reference, atol=1e-5)
+
+
+def test_gradients_are_finite_and_pass_through_the_last_iteration_only():
+    torch.manual_seed(3)
+    u = capsules.squash(torch.randn(2, 3, 4, 5)).requires_grad_()
+    W = torch.randn(2, 3, 5, 6, requires_grad=True)
+    v, c = capsules.route_factored(u, W, 3)
+    assert not c.requires_grad
+    by_hand = capsules.squash(capsules.combine(c, capsules.predict(u, W)))
+    weight = torch.randn_like(v)
+    mine = torch.autograd.grad((v * weight).sum(), [u, W])
+    wanted = torch.autograd.grad((by_hand * weight).sum(), [u, W])
+    for gradient, reference in zip(mine, wanted, strict=True):
+        assert torch.isfinite(gradient).all()
+        assert torch.allclose(gradient, reference, atol=1e-5)
+
+
+def test_every_parameter_learns():
+    network = small_network().train()
+    descriptors = network.embed(images(4))
+    network.similarity(descriptors[:2], descriptors[2:]).sum().backward()
+    for name, parameter in network.named_parameters():
+        assert torch.isfinite(parameter.grad).all(), name
+        assert parameter.grad.abs().max() > 0, name
+
+
+def test_the_contract():
+    network = small_network().eval()
+    with torch.no_grad():
+        descriptors = network.embed(images(5))
+        p = network.similarity(descriptors, descriptors.roll(1, 0))
+        compared = network.compare(descriptors[0], descriptors)
+    assert descriptors.shape == (5, network.dimensions)
+    assert descriptors.dtype == torch.float32
+    assert torch.allclose(descriptors.norm(dim=1), torch.ones(5), atol=1e-5)
+    assert ((p > 0) & (p < 1)).all()
+    assert torch.allclose(compared[4], p[0], atol=1e-5)
+    assert compared.argmax() == 0
+
+
+def test_similarity_falls_with_distance():
+    network = small_network()
+    e = torch.eye(3)
+    near = torch.nn.functional.normalize(torch.tensor([[1.0, 0.1, 0.0]]))
+    assert network.similarity(e[:1], near) > network.similarity(e[:1], e[1:2])
+
+
+def test_the_default_network_is_within_the_budget():
+    network = build_network("capsule")
+    assert network.n_parameters() <= 3_000_000
+    assert grid_side(227, LIGHT_BLOCKS) ** 2 == CapsuleShape().places
+    with torch.no_grad():
+        assert network.eval().embed(images(1, 227)).shape == (1, 1024)
+
+
+def test_the_original_extractor_is_the_larger_one():
+    original = CapsuleBranch(CapsuleShape(extractor="original", outputs=2)).eval()
+    with torch.no_grad():
+        assert original(images(1, 227)).shape == (1, 32)
+    light = CapsuleBranch(CapsuleShape(outputs=2))
+    count = [sum(p.numel() for p in branch.parameters()) for branch in (original, light)]
+    assert count[0] > 20 * count[1]
+
+
+def test_gain_and_bias_of_the_camera_drop_out():
+    x = images(1)
+    assert torch.allclose(standardised(0.5 * x + 0.2), standardised(x), atol=0.02)
+
+
+def test_a_pruned_network_is_the_masked_network():
+    network = small_network().eval()
+    branch = network.branch
+    torch.nn.init.uniform_(branch.capsules.gains, 0.5, 1.5)
+    activity = mean_couplings(network, [images(4, seed=5), images(3, seed=6)])
+    assert activity.shape == (8, branch.shape.places)
+    assert activity.sum().item() == pytest.approx(1.0, abs=1e-4)  # the mean over j of sums of 1
+    drop = lowest(activity, 0.2)
+    dropped = round(0.2 * branch.shape.places)
+    assert drop.sum(1).tolist() == [dropped] * 8
+    assert (
+        activity[drop].view(8, -1).max(1).values.le(activity[~drop].view(8, -1).min(1).values).all()
+    )
+    smaller, silenced = pruned(network, drop), masked(network, drop)
+    with torch.no_grad():
+        x = images(6, seed=7)
+        mine, wanted, before = smaller.embed(x), silenced.embed(x), network.embed(x)
+    assert torch.allclose(mine, wanted, atol=1e-5)
+    assert not torch.allclose(before, wanted, atol=1e-3)
+    assert smaller.branch.capsules.gains.numel() == 8 * (branch.shape.places - dropped) * 8
+
+
+def test_a_pruned_network_can_be_pruned_again():
+    network = small_network().eval()
+    once = pruned(network, lowest(mean_couplings(network, [images()]), 0.2))
+    drop = lowest(mean_couplings(once, [images()]), 0.2)
+    with torch.no_grad():
+        x = images(2, seed=9)
+        assert torch.allclose(pruned(once, drop).embed(x), masked(once, drop).embed(x), atol=1e-5)
+
+
+def test_folding_changes_nothing_but_the_time():
+    network = small_network().train()
+    with torch.no_grad():
+        for seed in range(5):
+            network.embed(images(8, seed=seed))  # running means away from 0
+        network.eval()
+        before = network.embed(images(2, seed=11))
+        after = for_inference(network).embed(images(2, seed=11))
+    assert torch.allclose(before, after, atol=1e-5)
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_weights_survive_a_file(tmp_path, half):
+    network = small_network().eval()
+    drop = lowest(mean_couplings(network, [images()]), 0.2)
+    network = pruned(network, drop)
+    path = tmp_path / "weights" / "w.safetensors"
+    save_network(network, path, {"seed": 3}, half=half)
+    read, about = load_network(path)
+    assert about == {"seed": 3}
+    assert (read.name, read.branch.shape) == ("capsule-pruned", network.branch.shape)
+    with torch.no_grad():
+        x = images(2)
+        assert torch.allclose(read.embed(x), network.embed(x), atol=1e-2 if half else 0)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no weights at all, but long enough to parse"])
+def test_bad_weights_are_named(tmp_path, content):
+    path = tmp_path / "w.safetensors"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=r"w\.safetensors: .*vslam train"):
+        load_network(path)
+
+
+def test_a_torchvision_file_of_another_network_is_refused(tmp_path):
+    torch.save({"features.0.weight": torch.zeros(1)}, tmp_path / "x.pth")
+    with pytest.raises(InputError, match="another network"):
+        alexnet().load_torchvision(tmp_path / "x.pth")
+    with pytest.raises(InputError, match="not a readable weight file"):
+        alexnet().load_torchvision(tmp_path / "none.pth")
+
+
+def test_alexnet_takes_a_torchvision_file(tmp_path):
+    torch.manual_seed(0)
+    network = build_network("alexnet").eval()
+    state = {k: v for k, v in network.branch.state_dict().items() if "descriptor" not in k}
+    assert state["features.10.weight"].shape == (256, 256, 3, 3)  # torchvision's names and shapes
+    assert state["classifier.4.weight"].shape == (4096, 4096)
+    changed = {k: v * 0 + 0.001 for k, v in state.items()}
+    torch.save({**changed, "classifier.6.weight": torch.zeros(1000, 4096)}, tmp_path / "a.pth")
+    network.branch.load_torchvision(tmp_path / "a.pth")
+    assert (network.branch.features[0].weight == 0.001).all()
+    with torch.no_grad():
+        d = network.embed(images(2, 227))
+        assert torch.allclose(
+            network.similarity(d[:1], d[1:]), network.similarity(d[1:], d[:1]), atol=1e-6
+        )
+
+
+def test_an_unknown_network_is_refused():
+    with pytest.raises(InputError, match="resnet"):
+        build_network("resnet", SMALL)
+
+
+def test_squash_and_crop():
+    image = np.zeros((40, 100), np.uint8)
+    image[:, 30:70] = 200
+    assert to_square(image, 20, "crop").min() == 200
+    assert to_square(image, 20, "squash")[:, 0].max() == 0
+    tensor = to_tensor(to_square(image, 20, "crop")[None])
+    assert tensor.shape == (1, 3, 20, 20)
+    assert tensor.max().item() == pytest.approx(200 / 255)

@@ -1,0 +1,183 @@
+"""The plug-in that makes a Siamese network a loop detector, its commands and its export."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from siamese_worlds import small_network, small_settings, views
+from typer.testing import CliRunner
+
+from vslam.cli import app
+from vslam.config import Config, SiameseConfig
+from vslam.errors import InputError
+from vslam.features import Features
+from vslam.loopclosure.siamese.detector import SiameseDetector, open_detector
+from vslam.loopclosure.siamese.onnx import export_onnx
+from vslam.loopclosure.siamese.siamese import build_network, save_network
+from vslam.map import Map
+from vslam.observations import link
+
+
+def features(n: int) -> Features:
+    return Features(
+        xy=np.zeros((n, 2), np.float32),
+        octave=np.zeros(n, np.uint8),
+        angle=np.zeros(n, np.float32),
+        descriptors=np.zeros((n, 32), np.uint8),
+        u_right=np.full(n, np.nan, np.float32),
+    )
+
+
+def a_map(keyframes: int, covisible: tuple[tuple[int, int], ...] = ()) -> Map:
+    """Keyframes of 20 features; those of a pair share 16 landmarks."""
+    map_ = Map(np.ones(8))
+    for k in range(keyframes):
+        map_.add_keyframe(features(100), np.eye(4), float(k), k)
+    used = [0] * keyframes
+    for pair in covisible:
+        ids = map_.add_landmarks(np.zeros((16, 3)), np.zeros((16, 4), np.uint64), pair[0])
+        for k in pair:
+            for landmark in ids:
+                link(map_.arrays, map_.rows(k).start + used[k], landmark)
+                used[k] += 1
+    return map_
+
+
+SCENES = views(100).squares[::2]
+
+
+def detector(config: SiameseConfig | None = None, places: list[int] | None = None):
+    """A detector that was given one image for each keyframe, by the number of its scene."""
+    config = config or SiameseConfig(recent_keyframes=3, threshold=0.0)
+    found = SiameseDetector(small_network(), config)
+    for keyframe, place in enumerate(places or []):
+        found.add(keyframe, SCENES[place], Features.none())
+    return found
+
+
+def test_the_same_image_is_the_best_match():
+    places = list(range(90))
+    places[80] = 12
+    found = detector(places=places).query(80, a_map(90))
+    assert (found[0].query, found[0].match) == (80, 12)
+    assert len(found) == 5
+    scores = [candidate.score for candidate in found]
+    assert scores == sorted(scores, reverse=True)
+    assert min(scores) > 0
+    assert max(scores) < 1
+
+
+def test_recent_covisible_dead_and_unseen_keyframes_are_not_asked():
+    places = [0] * 12
+    one = detector(places=places)
+    one.add(12, None, Features.none())
+    one.add(13, SCENES[0], Features.none())
+    map_ = a_map(14, covisible=((13, 2),))
+    map_.arrays.keyframe_alive[5] = False
+    matches = {candidate.match for candidate in one.query(13, map_)}
+    assert matches <= {0, 1, 3, 4, 6, 7, 8, 9}
+    assert one.query(12, map_) == []
+    assert one.query(1, map_) == []
+
+
+def test_neighbours_of_a_candidate_do_not_crowd_out_other_places():
+    places = [7, 7, 7, 7, 20, 21, 22, 23, 7]
+    config = SiameseConfig(recent_keyframes=1, threshold=0.0, max_candidates=2)
+    map_ = a_map(9, covisible=((0, 1), (0, 2), (0, 3)))
+    matches = [c.match for c in detector(config, places).query(8, map_)]
+    assert matches[0] == 0
+    assert matches[1] in (4, 5, 6)
+
+
+def test_the_threshold_holds_for_loops_and_not_for_relocalisation():
+    one = detector(SiameseConfig(recent_keyframes=0, threshold=1.0), list(range(6)))
+    map_ = a_map(6)
+    assert one.query(5, map_) == []
+    found = one.locate(SCENES[3], Features.none(), map_)
+    assert (found[0].query, found[0].match) == (-1, 3)
+    assert one.locate(None, Features.none(), map_) == []
+
+
+def test_answers_do_not_depend_on_the_number_of_threads():
+    before = torch.get_num_threads()
+    answers = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        answers.append(detector(places=list(range(20))).query(19, a_map(20)))
+        assert torch.get_num_threads() == threads
+    torch.set_num_threads(before)
+    assert answers[0] == answers[1]
+
+
+def test_detectors_are_opened_by_name(tmp_path):
+    path = tmp_path / "capsule.safetensors"
+    save_network(small_network(), path, {})
+    assert open_detector("capsule", SiameseConfig(), path).name == "capsule"
+    with pytest.raises(InputError, match="weights of capsule, not of capsule-pruned"):
+        open_detector("capsule-pruned", SiameseConfig(), path)
+    with pytest.raises(InputError, match="unknown; choose one of"):
+        open_detector("bow", SiameseConfig())
+    with pytest.raises(InputError, match="ships no weights"):
+        open_detector("vgg16", SiameseConfig())
+
+
+def test_a_run_closes_with_a_learned_detector(kitti_tree, tmp_path):
+    """Random weights: places are found by similarity alone, and geometry has the last word."""
+    path = tmp_path / "capsule.safetensors"
+    save_network(build_network("capsule"), path, {})
+    settings = tmp_path / "config.json"
+    settings.write_text(Config(siamese=SiameseConfig(threshold=0.0)).model_dump_json())
+    words = ["run", "--data", str(kitti_tree), "--detector", "capsule", "--weights", str(path)]
+    words += ["--config", str(settings), "--no-record", "--quiet", "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    report = json.loads((tmp_path / "latest" / "report.json").read_text())
+    assert (report["detector"], report["weights"]) == ("capsule", str(path))
+    assert report["lost_frames"] == report["loops_wrong"] == 0
+
+
+def test_onnx_says_what_torch_says(tmp_path):
+    pytest.importorskip("onnxscript")
+    path = tmp_path / "capsule.onnx"
+    assert export_onnx(small_network(), path) < 1e-4
+    assert path.stat().st_size > 10_000
+
+
+def test_train_writes_weights_and_card(tmp_path):
+    import cv2
+
+    data = tmp_path / "pairs"
+    (data / "images").mkdir(parents=True)
+    rows = ["a,b,same"]
+    squares = views(40).squares
+    for k in range(40):
+        same = k % 2 == 0
+        names = [f"images/{k}a.png", f"images/{k}b.png"]
+        cv2.imwrite(str(data / names[0]), squares[2 * k])
+        cv2.imwrite(str(data / names[1]), squares[2 * k + 1 if same else 2 * k - 1])
+        rows.append(f"{names[0]},{names[1]},{int(same)}")
+    (data / "pairs.csv").write_text("\n".join(rows) + "\n")
+    settings = tmp_path / "settings.json"
+    settings.write_text(small_settings(epochs=1).model_dump_json())
+    out = tmp_path / "out"
+    command = ["train", "capsule", "--data", f"pairs:{data}", "--settings", str(settings)]
+    done = CliRunner().invoke(app, [*command, "--out", str(out), "--threads", "1"])
+    assert done.exit_code == 0, done.output
+    assert "average_precision" in done.stdout
+    files = {path.name for path in out.iterdir()}
+    assert files >= {"capsule.safetensors", "capsule.json", "capsule.md", "log.csv",
+                     "checkpoint.pt", "settings.json", "pairs"}  # fmt: skip
+
+
+def test_neither_help_nor_a_run_without_it_loads_torch():
+    script = (
+        "import sys\nfrom vslam import cli\nimport vslam.pipeline, vslam.loopclosure.detector\n"
+        "sys.stdout.write(' '.join({'torch', 'onnx', 'safetensors'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd="/")
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr

@@ -1,0 +1,221 @@
+"""Training: it learns, it resumes bit for bit, and it stops where it must."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import torch
+from siamese_worlds import SMALL, small_network, small_settings, views
+
+from vslam.errors import InputError, ResultsError
+from vslam.loopclosure.benchmark import average_precision, precision_recall
+from vslam.loopclosure.siamese import training
+from vslam.loopclosure.siamese.augmentation import STRONG, Augmentation, augment
+from vslam.loopclosure.siamese.card import describe, write_card
+from vslam.loopclosure.siamese.data import draw_pairs
+from vslam.loopclosure.siamese.objective import (
+    calibrate,
+    contrast,
+    cross_entropy,
+    embed_all,
+    score_matrix,
+)
+from vslam.loopclosure.siamese.settings import PRESETS, load_settings
+from vslam.loopclosure.siamese.siamese import load_network
+from vslam.loopclosure.siamese.start import starting_network
+from vslam.loopclosure.siamese.training import CHECKPOINT, train
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(("loss", "epochs"), [("bce", 14), ("bce+contrast", 12)])
+def test_64_pairs_are_learned_by_heart(tmp_path, loss, epochs):
+    collection = views(46)
+    settings = small_settings(
+        epochs=epochs, pairs=64, batch=32, loss=loss, patience=99, learning_rate=5e-3
+    )
+    outcome = train(collection, settings, tmp_path, threads=1)
+    assert len(outcome.train) == 64
+    network, _ = load_network(outcome.weights)
+    cpu = torch.device("cpu")
+    d = embed_all(network, collection.squares, cpu)
+    score = score_matrix(network, d, d, cpu)
+    pairs = draw_pairs(collection, outcome.train, 64, np.random.default_rng(0))
+    assert pairs.same.sum() == 32
+    learned = precision_recall(pairs.same, score[pairs.a, pairs.b])
+    assert average_precision(learned) == 1.0
+    assert outcome.figures["average_precision"] > 0.9  # of places it never saw
+
+
+def test_a_resumed_training_has_the_bits_of_an_uninterrupted_one(tmp_path):
+    collection, settings = views(20), small_settings()
+    whole = train(collection, settings, tmp_path / "whole", threads=1)
+    steps = []
+
+    def killed_in_the_middle() -> bool:
+        steps.append(1)
+        return len(steps) in (1, 3)  # in the first epoch and, resumed, in the second
+
+    parts = tmp_path / "parts"
+    for finished in (False, False, True):
+        part = train(
+            collection, settings, parts, threads=2, resume=True, should_stop=killed_in_the_middle
+        )
+        assert part.finished is finished
+    one, other = (
+        torch.load(folder / CHECKPOINT, weights_only=True) for folder in (tmp_path / "whole", parts)
+    )
+    for name, tensor in one["network"].items():
+        assert torch.equal(tensor, other["network"][name]), name
+    timeless = [
+        [{k: v for k, v in row.items() if k != "seconds"} for row in outcome.progress.history]
+        for outcome in (whole, part)
+    ]
+    assert timeless[0] == timeless[1]
+    assert whole.figures == part.figures
+    lists = [sorted((tmp_path / name / "pairs").iterdir()) for name in ("whole", "parts")]
+    assert [p.read_bytes() for p in lists[0]] == [p.read_bytes() for p in lists[1]]
+    assert lists[0][0].read_text().startswith("# seed 0\na,b,same\n")
+
+
+def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_good_checkpoint(tmp_path, monkeypatch):
+    collection, settings = views(20), small_settings(epochs=3)
+    calls = []
+
+    def sometimes_nan(logits: torch.Tensor, same: torch.Tensor) -> torch.Tensor:
+        calls.append(1)
+        loss = cross_entropy(logits, same)
+        return loss * float("nan") if len(calls) == 4 else loss
+
+    monkeypatch.setattr(training, "cross_entropy", sometimes_nan)
+    with pytest.raises(ResultsError, match=r"the loss is nan in epoch 1, step 1; the last good"):
+        train(collection, settings, tmp_path, threads=1)
+    kept = torch.load(tmp_path / CHECKPOINT, weights_only=True)
+    assert kept["progress"]["epoch"] == 1
+    assert all(torch.isfinite(t).all() for t in kept["network"].values())
+    gentler = settings.model_copy(update={"learning_rate": 1e-4})
+    assert train(collection, gentler, tmp_path, threads=1, resume=True).finished
+
+
+def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
+    collection = views(20)
+    train(collection, small_settings(epochs=1), tmp_path, threads=1)
+    with pytest.raises(InputError, match="other settings"):
+        train(collection, small_settings(seed=1), tmp_path, threads=1, resume=True)
+    (tmp_path / CHECKPOINT).write_bytes(b"cut off")
+    with pytest.raises(InputError, match="not a readable checkpoint"):
+        train(collection, small_settings(), tmp_path, threads=1, resume=True)
+
+
+def test_no_better_epoch_for_long_ends_the_training(tmp_path):
+    settings = small_settings(epochs=50, patience=2, learning_rate=1e-12)
+    outcome = train(views(20), settings, tmp_path, threads=1)
+    assert outcome.finished
+    assert outcome.progress.epoch < 50
+    assert outcome.progress.stale == 2
+    with (tmp_path / "log.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == outcome.progress.epoch
+
+
+def test_the_card_tells_where_the_weights_come_from(tmp_path):
+    collection, settings = views(20), small_settings(epochs=1)
+    outcome = train(collection, settings, tmp_path, threads=1)
+    network, _ = load_network(outcome.weights)
+    card = describe(
+        network, collection, settings, outcome, preset="paper", data=["pairs:x"], device="cpu"
+    )
+    paths = write_card(card, outcome.weights)
+    written = json.loads(paths[0].read_text())
+    assert written["sources"] == {"blobs": 40}
+    assert written["validation"]["average_precision"] == outcome.figures["average_precision"]
+    assert written["commit"]
+    assert written["settings"]["seed"] == 0
+    assert "--data pairs:x" in paths[1].read_text()
+
+
+def test_pruning_and_fine_tuning(tmp_path):
+    collection, settings = views(20), small_settings(epochs=1)
+    full = train(collection, settings, tmp_path / "full", threads=1)
+    wanted = settings.model_copy(update={"network": "capsule-pruned"})
+    start, fitted, report = starting_network(wanted, collection, full.weights, "cpu")
+    assert fitted.shape.kept == round(0.8 * SMALL.places)
+    assert {"average_precision_before", "average_precision_removed"} <= set(report)
+    tuned = train(collection, fitted, tmp_path / "pruned", threads=1, start=start)
+    assert load_network(tuned.weights)[0].name == "capsule-pruned"
+    with pytest.raises(InputError, match="--weights"):
+        starting_network(wanted, collection, None, "cpu")
+    with pytest.raises(InputError, match="weights of capsule, not of alexnet"):
+        starting_network(
+            settings.model_copy(update={"network": "alexnet"}), collection, full.weights, "cpu"
+        )
+
+
+def test_cross_entropy_is_equation_3():
+    p, y = torch.tensor([0.9, 0.2]), torch.tensor([1, 0])
+    wanted = -(np.log(0.9) + np.log(0.8)) / 2
+    assert cross_entropy(torch.logit(p), y).item() == pytest.approx(wanted, abs=1e-6)
+
+
+def test_contrast_leaves_out_what_is_not_known():
+    e = torch.eye(4)
+    a, b, same = e[:2], torch.stack([e[0], e[3]]), torch.tensor([True, False])
+    known = -torch.ones(4, 4, dtype=torch.int8)
+    unknown = torch.zeros(4, 4, dtype=torch.int8)
+    # Three others at cosine 0, the partner at cosine 1, temperature 0.5.
+    wanted = np.log(np.exp(2) + 3 * np.exp(0)) - 2
+    known[0, 2] = known[2, 0] = 1
+    known.fill_diagonal_(1)
+    wanted = np.log(np.exp(2) + 2) - 2
+    assert contrast(a, b, same, known, 0.5).item() == pytest.approx(wanted, abs=1e-5)
+    assert contrast(a, b, same, unknown, 0.5).item() == pytest.approx(0.0, abs=1e-6)
+
+
+def test_calibration_finds_the_law_behind_the_labels():
+    network = small_network()
+    rng = np.random.default_rng(0)
+    d = rng.uniform(0, 2, 20000)
+    same = rng.random(20000) < 1 / (1 + np.exp(-(6 - 8 * d)))
+    with torch.no_grad():
+        score = torch.sigmoid(network.head.of_distance(torch.from_numpy(d))).numpy()
+    calibrate(network, score, same)
+    a, b = network.head.log_a.exp().item(), network.head.log_b.exp().item()
+    prior = np.log((~same).sum() / same.sum())  # balanced weights shift a by the prior
+    assert b == pytest.approx(8.0, rel=0.1)
+    assert a == pytest.approx(6.0 + prior, rel=0.1)
+
+
+def test_augmentation_repeats_and_its_strengths_can_be_nothing():
+    image = views(1).squares[0]
+    changed = [augment(image, STRONG, np.random.default_rng(k)) for k in (1, 1, 2)]
+    assert np.array_equal(changed[0], changed[1])
+    assert not np.array_equal(changed[0], changed[2])
+    assert changed[0].shape == image.shape
+    nothing = Augmentation(**dict.fromkeys(
+        ("homography", "shift", "log_gain", "bias", "log_gamma", "masks", "noise", "blur"), 0
+    ))  # fmt: skip
+    assert np.array_equal(augment(image, nothing, np.random.default_rng(0)), image)
+
+
+def test_settings_are_read_and_checked(tmp_path):
+    path = tmp_path / "settings.json"
+    path.write_text(PRESETS["best"].model_dump_json())
+    assert load_settings(path) == PRESETS["best"]
+    path.write_text('{"batch": 0}')
+    with pytest.raises(InputError, match=r"settings\.json: batch"):
+        load_settings(path)
+
+
+def test_cuda_is_refused_where_there_is_none(tmp_path):
+    if torch.cuda.is_available():
+        pytest.skip("there is one")
+    with pytest.raises(InputError, match="--device cpu"):
+        train(views(20), small_settings(), tmp_path, device="cuda")

@@ -1,0 +1,197 @@
+"""The commands ``vslam train`` and ``vslam export``. torch is imported inside them."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vslam.errors import InputError
+
+if TYPE_CHECKING:
+    from vslam.loopclosure.siamese.data import Collection
+    from vslam.loopclosure.siamese.settings import TrainSettings
+    from vslam.loopclosure.siamese.training import Outcome
+
+_TRAIN_EXAMPLES = """
+[b]Examples[/b]
+
+  vslam train capsule --data "kitti:~/kitti\\[seq=00,first=250,last=1500]" --data photos:~/places
+
+  vslam train capsule --data pairs:town1 --data pairs:town2 --preset best --device cuda
+
+  vslam train capsule --data pairs:town1 --out training/capsule --resume
+
+  vslam train capsule-pruned --weights training/capsule/capsule.safetensors --data pairs:town1
+"""
+_EXPORT_EXAMPLES = """
+[b]Example[/b]
+
+  vslam export onnx --weights training/capsule/capsule.safetensors --out capsule.onnx
+"""
+_PLACES_EXAMPLES = """
+[b]Example[/b]
+
+  vslam export places --data "kitti:~/kitti\\[first=250,last=1500]" --data photos:~/places
+"""
+
+export = typer.Typer(help="Export a trained network, or images to train on.", no_args_is_help=True)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the application."""
+    app.command(epilog=_TRAIN_EXAMPLES)(train)
+    app.add_typer(export, name="export")
+
+
+DataSources = Annotated[
+    list[str],
+    typer.Option(
+        "--data", help="Source of images, [b]KIND:PATH\\[options][/b]; again for more. Kinds: "
+        "kitti, fabmap, pairs, photos, pack (docs/training.md).",
+    ),
+]  # fmt: skip
+
+
+def train(
+    network: Annotated[str, typer.Argument(help="capsule, capsule-pruned, alexnet or vgg16.")],
+    data: DataSources,
+    preset: Annotated[str, typer.Option(help="paper or best.")] = "paper",
+    settings: Annotated[
+        Path | None, typer.Option(help="JSON with settings, instead of the preset's.")
+    ] = None,
+    epochs: Annotated[int | None, typer.Option(min=1, help="At most so many.")] = None,
+    pairs: Annotated[int | None, typer.Option(min=2, help="Pairs of an epoch.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="Threads.", show_default="cores")
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(
+            help="Network to start from; for capsule-pruned the one to prune; for alexnet and "
+            "vgg16 a weight file of torchvision."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder to write to.", show_default="training/NETWORK-PRESET"),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")
+    ] = False,
+    max_minutes: Annotated[
+        float | None, typer.Option(min=0, help="Stop after so long, with a checkpoint.")
+    ] = None,
+    allow_test_data: Annotated[
+        bool, typer.Option("--allow-test-data", help="Train on the frames kept for testing.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
+) -> None:
+    """Train a loop detector; writes weights, log, pairs, checkpoints and a model card."""
+    from vslam.info import available_cores
+    from vslam.loopclosure.siamese.data import load, refuse_test_data
+    from vslam.loopclosure.siamese.places import open_source
+    from vslam.loopclosure.siamese.runtime import set_threads
+    from vslam.loopclosure.siamese.settings import PRESETS, load_settings
+
+    if preset not in PRESETS:
+        raise InputError(f"--preset {preset}: unknown; choose one of {', '.join(PRESETS)}.")
+    began = time.monotonic()
+    sources = [source for spec in data for source in open_source(spec)]
+    if not allow_test_data:
+        refuse_test_data(sources)
+    chosen = load_settings(settings) if settings else PRESETS[preset]
+    given = {"epochs": epochs, "pairs": pairs, "seed": seed, "network": network}
+    chosen = chosen.model_copy(update={k: v for k, v in given.items() if v is not None})
+    folder = out or Path("training") / f"{network}-{preset}"
+    threads = threads or available_cores()
+    set_threads(threads)
+    collection = load(sources, chosen.shape.pixels, chosen.fit, threads)
+    outcome = _train(
+        collection, chosen, folder, preset, data, device, threads, resume, weights,
+        None if max_minutes is None else began + 60.0 * max_minutes, quiet,
+    )  # fmt: skip
+    if quiet:
+        return
+    if not outcome.finished:
+        typer.echo(f"{folder}: stopped in epoch {outcome.progress.epoch}; go on with --resume")
+        return
+    for name, value in outcome.figures.items():
+        typer.echo(f"{name:<28}{value:.4f}")
+    typer.echo(f"{'weights':<28}{outcome.weights}")
+
+
+def _train(
+    collection: Collection,
+    settings: TrainSettings,
+    folder: Path,
+    preset: str,
+    data: list[str],
+    device: str,
+    threads: int,
+    resume: bool,
+    weights: Path | None,
+    until: float | None,
+    quiet: bool,
+) -> Outcome:
+    from vslam.loopclosure.siamese.card import describe, write_card
+    from vslam.loopclosure.siamese.siamese import load_network
+    from vslam.loopclosure.siamese.start import starting_network
+    from vslam.loopclosure.siamese.training import train as run
+    from vslam.progress import training_bar
+
+    start, settings, report = starting_network(settings, collection, weights, device)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "settings.json").write_text(settings.model_dump_json(indent=1) + "\n")
+    with training_bar(shown=not quiet) as on_step:
+        outcome = run(
+            collection, settings, folder, device=device, threads=threads, resume=resume,
+            start=start, on_step=on_step,
+            should_stop=None if until is None else lambda: time.monotonic() > until,
+        )  # fmt: skip
+    if outcome.weights.exists():
+        network, _ = load_network(outcome.weights)
+        card = describe(
+            network, collection, settings, outcome, preset=preset, data=data, device=device
+        )
+        write_card({**card, **report}, outcome.weights)
+    return outcome
+
+
+@export.command("onnx", epilog=_EXPORT_EXAMPLES)
+def onnx(
+    weights: Annotated[Path, typer.Option(help="Weights, .safetensors.")],
+    out: Annotated[Path, typer.Option(help="ONNX file to write.")] = Path("capsule.onnx"),
+) -> None:
+    """Write the branch (image to descriptor) as ONNX, and check it against torch."""
+    from vslam.loopclosure.siamese.onnx import export_onnx
+    from vslam.loopclosure.siamese.siamese import load_network
+
+    network, _ = load_network(weights)
+    difference = export_onnx(network, out)
+    typer.echo(
+        f"{out}: {out.stat().st_size / 1e6:.1f} MB, images (1, 3, {network.pixels}, "
+        f"{network.pixels}) to descriptor (1, {network.dimensions}); differs from torch by at "
+        f"most {difference:.1e}"
+    )
+
+
+@export.command("places", epilog=_PLACES_EXAMPLES)
+def places(
+    data: DataSources,
+    fit: Annotated[str, typer.Option(help="squash or crop.")] = "squash",
+    pixels: Annotated[int, typer.Option(min=32, help="Side of the squares.")] = 227,
+    out: Annotated[Path, typer.Option(help="File to write.")] = Path("places.npz"),
+) -> None:
+    """Write sources of images as one small file, for training on another machine."""
+    from vslam.loopclosure.siamese.places import open_source, write_pack
+
+    if fit not in ("squash", "crop"):
+        raise InputError(f"--fit {fit}: must be squash or crop.")
+    sources = [source for spec in data for source in open_source(spec)]
+    write_pack(sources, out, pixels, "squash" if fit == "squash" else "crop")
+    typer.echo(f"{out}: {sum(map(len, sources))} images, {out.stat().st_size / 1e6:.1f} MB")

@@ -8,9 +8,10 @@ from typing import Annotated
 
 import typer
 
-from vslam import __version__, synth_cli, vocabulary_cli
+from vslam import __version__, bench_cli, synth_cli, vocabulary_cli
 from vslam.console import evaluation_rows, print_rows, print_summary
 from vslam.errors import InputError, ResultsError
+from vslam.options import DETECTORS, SENSORS, require_built
 
 app = typer.Typer(
     help="Visual SLAM in pure Python.",
@@ -19,9 +20,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-_DETECTORS = {"none": True, "bow": True, "capsule": False, "capsule-pruned": False}
-_DETECTORS |= {"alexnet": False, "vgg16": False}
-_SENSORS = {"stereo": True, "mono": False, "rgbd": False}
 
 Data = Annotated[
     Path,
@@ -89,8 +87,8 @@ def run(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
 ) -> None:
     """Run SLAM on a sequence and write trajectory, map, recording and report to a folder."""
-    _require_built("--detector", detector, _DETECTORS)
-    _require_built("--sensor", sensor, _SENSORS)
+    require_built("--detector", detector, DETECTORS)
+    require_built("--sensor", sensor, SENSORS)
     if compare_loops and detector == "none":
         raise InputError("--compare-loops: nothing to compare with --detector none; name another.")
 
@@ -237,6 +235,7 @@ def info(data: Data = _DATA) -> None:
     print_rows(rows)
 
 
+bench_cli.register(app)
 synth_cli.register(app)
 vocabulary_cli.register(app)
 
@@ -260,11 +259,3 @@ def main() -> None:
     except ResultsError as error:
         typer.echo(f"error: {error}", err=True)
         sys.exit(1)
-
-
-def _require_built(option: str, value: str, known: dict[str, bool]) -> None:
-    built = ", ".join(f"'{name}'" for name, is_built in known.items() if is_built)
-    if value not in known:
-        raise InputError(f"{option} {value}: unknown; this version has only {built}.")
-    if not known[value]:
-        raise InputError(f"{option} {value}: not built yet; this version has only {built}.")

@@ -49,9 +49,8 @@ def run_on_cluster(
         futures = client.map(_run_on_worker, cells, options=options, stop=stop.name, pure=False)
         cell_of = {future.key: cell for future, cell in zip(futures, cells, strict=True)}
         for future in as_completed(futures, loop=client.loop):
-            error = future.exception()
-            cell = cell_of[future.key]
-            outcome = future.result() if error is None else Failed(cell, _said(error))
+            cell, defect = cell_of[future.key], future.exception()
+            outcome = future.result() if defect is None else Failed(cell, _said(defect))
             publish(outcome, out)
             yield outcome
     finally:

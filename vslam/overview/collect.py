@@ -168,6 +168,11 @@ def _add_external(text: str, found: Found) -> None:
         raise InputError(f"--trajectory {text}: none of the runs of {sequence} has a ground truth.")
     path = Path(file)
     evaluation = evaluate(read_trajectory(path, truth.timestamps), truth)
+    if evaluation.frames < len(truth):
+        found.notes.append(
+            f"{system} has a pose for {evaluation.frames} of {len(truth)} frames of {drive.place}, "
+            f"{perturb}: its errors are of those, where vslam's are of all"
+        )
     measures: dict[str, float | None] = {
         measure: getattr(evaluation, measure, None) for measure, *_ in MEASURES
     }

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import style
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from vslam.errors import InputError
 from vslam.overview.collect import Found, read_aligned
@@ -40,6 +40,7 @@ _MIN_STRENGTHS = 2  # not counting none
 _DASHES = ["-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1))]  # where lines cover each other
 
 Drawing = tuple[str, str, Figure]
+Looks = Mapping[str, tuple[str, Any]]  # colour and dashes of each system
 
 
 def draw_overview(report: OverviewJson, found: Found) -> list[ReportFigure]:
@@ -60,7 +61,7 @@ def draw_overview(report: OverviewJson, found: Found) -> list[ReportFigure]:
         ]
 
 
-def _errors(rows: list[Row], looks: dict[str, tuple[str, object]]) -> Iterator[Drawing]:
+def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
     """ATE by sequence: one figure for each perturbation."""
     for perturb in dict.fromkeys(row.drive.perturb for row in rows):
         known = [r for r in rows if r.drive.perturb == perturb and r.measures["ate_rmse_m"]]
@@ -76,7 +77,7 @@ def _errors(rows: list[Row], looks: dict[str, tuple[str, object]]) -> Iterator[D
             median, least, greatest = _spreads(mine, "ate_rmse_m")
             axes.vlines(at, least, greatest, color=looks[name][0], linewidth=2.2, alpha=0.5)
             axes.plot(at, median, "o", color=looks[name][0], markersize=5, label=name)
-        axes.set_yscale("log")
+        _logarithmic(axes)
         axes.set_xticks(range(len(places)), [place for _, place in places])
         axes.set_xlim(-0.5, len(places) - 0.5)
         axes.grid(visible=False, axis="x")
@@ -88,7 +89,7 @@ def _errors(rows: list[Row], looks: dict[str, tuple[str, object]]) -> Iterator[D
         )
 
 
-def _curves(rows: list[Row], looks: dict[str, tuple[str, object]]) -> Iterator[Drawing]:
+def _curves(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
     """ATE and loops against the strength of a law, one figure for each law and sequence."""
     laws = {
         law.partition(":")[0]: None
@@ -120,7 +121,7 @@ def _curve(
     title: str,
     rows: list[Row],
     strength: dict[Drive, float],
-    looks: dict[str, tuple[str, object]],
+    looks: Looks,
 ) -> Figure:
     figure, axes = new_figure(title, "", "ATE RMSE (m)", 1.7 * LOW)
     axes.remove()
@@ -146,9 +147,7 @@ def _curve(
     return figure
 
 
-def _paths(
-    report: OverviewJson, found: Found, looks: dict[str, tuple[str, object]]
-) -> Iterator[Drawing]:
+def _paths(report: OverviewJson, found: Found, looks: Looks) -> Iterator[Drawing]:
     """The run with the median ATE of each system, one figure for each drive."""
     for drive in dict.fromkeys(row.drive for row in report.rows):
         figure, axes = new_figure(
@@ -167,9 +166,7 @@ def _paths(
         )
 
 
-def _draw_paths(
-    axes: Axes, rows: list[Row], found: Found, looks: dict[str, tuple[str, object]]
-) -> int:
+def _draw_paths(axes: Axes, rows: list[Row], found: Found, looks: Looks) -> int:
     drawn = 0
     for row in rows:
         runs = [r for r in found.runs if r.drive == row.drive and r.system == row.system]
@@ -201,6 +198,16 @@ def _median_run(runs: Iterable[RunEntry]) -> RunEntry:
 def _spreads(rows: list[Row], measure: str) -> np.ndarray:
     spreads = [s for row in rows if (s := row.measures[measure]) is not None]
     return np.array([(s.median, s.least, s.greatest) for s in spreads]).T
+
+
+def _logarithmic(axes: Axes) -> None:
+    """A logarithmic axis from at least a third to three times the data, in plain numbers."""
+    low, high = axes.dataLim.intervaly
+    axes.set_yscale("log")
+    axes.set_ylim(max(low, 1e-4) / 3.0, max(high, 1e-4) * 3.0)
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter("{x:g}")
 
 
 def _light(perturb: str) -> str:

@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from vslam.overview.schema import MEASURES, OverviewJson, Row, RunEntry, Spread
+from vslam.overview.schema import MEASURES, Measure, OverviewJson, RunEntry, Spread
 from vslam.overview.summary import ALPHA, systems
 from vslam.report.loop_tables import Table
 from vslam.report.render import markdown_table, render_page
@@ -15,9 +15,13 @@ from vslam.report.render import markdown_table, render_page
 if TYPE_CHECKING:
     from vslam.report.drawing import ReportFigure
 
-_ABOUT = (
+_OTHER = ("loops_found", "loops_missed", "loops_wrong", "fps")
+_ABOUT_ERRORS = (
     "Medians over runs, in brackets the least and the greatest. ATE after SE3 alignment, of every "
-    "frame, lost ones included; RPE a frame. Loops by the ground truth."
+    "frame, lost ones included; RPE from one frame to the next."
+)
+_ABOUT_OTHERS = (
+    "Loops by the ground truth. fps of the frame loop: runs made side by side have fewer."
 )
 _TESTED = (
     "Pairs are sequences, each with the median of its runs: runs of one sequence are not "
@@ -27,15 +31,17 @@ _TESTED = (
 
 def tables(report: OverviewJson) -> list[Table]:
     """Every table of the report."""
-    return [table for table in (_results(report), _compared(report), _runs(report)) if table.rows]
+    found = [_compared(report), *_results(report), _runs(report)]
+    return [table for table in found if table.rows]
 
 
 def title(report: OverviewJson) -> str:
     """What the report is of, in one line."""
-    names = ", ".join(systems(report.runs))
     places = len({(row.drive.dataset, row.drive.place) for row in report.rows})
-    sequences = f"{places} sequence{'s' if places > 1 else ''}"
-    return f"{names} on {sequences}, {len(report.runs)} runs"
+    return (
+        f"{', '.join(systems(report.runs))}: {len(report.runs)} runs on {places} "
+        f"sequence{'s' if places > 1 else ''}"
+    )
 
 
 def render_markdown(report: OverviewJson) -> str:
@@ -82,29 +88,35 @@ def render_csv(report: OverviewJson) -> str:
     return text.getvalue()
 
 
-def _results(report: OverviewJson) -> Table:
+def _results(report: OverviewJson) -> list[Table]:
+    """Two tables of the same rows: one would be too wide to read."""
     texts = ("sequence", "perturbation", "system")
-    head = (
-        *texts,
-        "runs",
-        *(f"{name} ({unit})" if unit else name for _, name, unit, *_ in MEASURES),
-    )
-    rows = [
-        (
-            row.drive.place,
-            row.drive.perturb,
-            row.system,
-            str(row.runs),
-            *(_cell(row, name, decimals) for name, _, _, decimals, _ in MEASURES),
-        )
-        for row in report.rows
+
+    def table(name: str, measures: Sequence[Measure], note: str) -> Table:
+        columns = [f"{title} ({unit})" if unit else title for _, title, unit, *_ in measures]
+        rows: list[tuple[str, ...]] = [
+            (
+                row.drive.place,
+                row.drive.perturb,
+                row.system,
+                str(row.runs),
+                *(_cell(row.measures[measure], decimals) for measure, _, _, decimals in measures),
+            )
+            for row in report.rows
+        ]
+        return Table(name, (*texts, "runs", *columns), rows, texts, note)
+
+    errors = [measure for measure in MEASURES if measure[0] not in _OTHER]
+    others = [measure for measure in MEASURES if measure[0] in _OTHER]
+    return [
+        table("Errors", errors, _ABOUT_ERRORS),
+        table("Loops and speed", others, _ABOUT_OTHERS),
     ]
-    return Table("Results", head, rows, texts, _ABOUT)
 
 
 def _compared(report: OverviewJson) -> Table:
     head = ("systems", "perturbation", "better", "worse", "same", "median (m)", "p")
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             f"{c.second} - {c.first}",
             c.perturb,
@@ -121,7 +133,7 @@ def _compared(report: OverviewJson) -> Table:
 
 def _runs(report: OverviewJson) -> Table:
     head = ("sequence", "perturbation", "system", "seed", "frames", "ATE (m)", "run")
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             run.drive.place,
             run.drive.perturb,
@@ -146,17 +158,12 @@ def _made(report: OverviewJson) -> list[tuple[str, str]]:
     ]
 
 
-def _cell(row: Row, name: str, decimals: int) -> str:
-    spread = row.measures[name]
-    return "n/a" if spread is None else _spread(spread, decimals)
-
-
-def _spread(spread: Spread, decimals: int) -> str:
-    median, least, greatest = (
-        f"{value:.{decimals}f}" for value in (spread.median, spread.least, spread.greatest)
-    )
-    if decimals == 0 and spread.median % 1:
-        median = f"{spread.median:.1f}"
+def _cell(spread: Spread | None, decimals: int) -> str:
+    if spread is None:
+        return "n/a"
+    half = 1 if decimals == 0 and spread.median % 1 else decimals  # of an even number of counts
+    least, greatest = f"{spread.least:.{decimals}f}", f"{spread.greatest:.{decimals}f}"
+    median = f"{spread.median:.{half}f}"
     return median if least == greatest else f"{median} ({least}-{greatest})"
 
 

@@ -7,18 +7,18 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
-Less, More, Neither = "less", "more", ""
-# Name in the JSON, title, unit, decimals, and which way is better.
-MEASURES = (
-    ("lost_frames", "lost frames", "", 0, Less),
-    ("ate_rmse_m", "ATE RMSE", "m", 3, Less),
-    ("rpe_m", "RPE", "m", 4, Less),
-    ("t_rel_percent", "t_rel", "%", 3, Less),
-    ("r_rel_deg_per_100m", "r_rel", "°/100 m", 3, Less),
-    ("loops_found", "loops found", "", 0, More),
-    ("loops_missed", "missed", "", 0, Less),
-    ("loops_wrong", "wrong", "", 0, Less),
-    ("fps", "fps", "", 1, More),
+Measure = tuple[str, str, str, int]
+# Name in the JSON, title, unit, decimals.
+MEASURES: tuple[Measure, ...] = (
+    ("lost_frames", "lost frames", "", 0),
+    ("ate_rmse_m", "ATE RMSE", "m", 3),
+    ("rpe_m", "RPE", "m", 4),
+    ("t_rel_percent", "t_rel", "%", 3),
+    ("r_rel_deg_per_100m", "r_rel", "°/100 m", 3),
+    ("loops_found", "loops found", "", 0),
+    ("loops_missed", "missed", "", 0),
+    ("loops_wrong", "wrong", "", 0),
+    ("fps", "fps", "", 1),
 )
 
 

@@ -40,11 +40,12 @@ def summarize(found: Found) -> OverviewJson:
         for perturb in dict.fromkeys(row.drive.perturb for row in rows)
         if (comparison := compare(rows, first, second, perturb, "ate_rmse_m")) is not None
     ]
+    order = {(row.drive, row.system): k for k, row in enumerate(rows)}
     return OverviewJson(
         notes=found.notes,
         rows=rows,
         comparisons=compared,
-        runs=found.runs,
+        runs=sorted(found.runs, key=lambda run: order[run.drive, run.system]),
         versions=versions(),
         created=datetime.now(UTC).replace(microsecond=0),
     )
@@ -173,11 +174,10 @@ def _words(
     untied = len(better) + len(worse)
     if p_value is None:
         return text + (
-            f"{untied} that differ {'are' if untied != 1 else 'is'} too few for a test: below "
-            f"{least_pairs()}, Wilcoxon's p cannot fall under {ALPHA}. This says nothing about "
-            "other sequences."
+            f"Too few sequences differ ({untied}) for Wilcoxon's test, which takes {least_pairs()} "
+            f"to reach p < {ALPHA:g}: no claim about others."
         )
-    verdict = "more than chance explains" if p_value < ALPHA else "chance explains it"
+    verdict = "unlikely by chance" if p_value < ALPHA else "chance alone may do this"
     return text + f"Wilcoxon's signed-rank test on {untied}: p = {p_value:.3g}, {verdict}."
 
 

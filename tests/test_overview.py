@@ -23,7 +23,7 @@ from vslam.evaluate import evaluate
 from vslam.overview import write_overview
 from vslam.overview.collect import collect
 from vslam.overview.schema import MEASURES, Drive, OverviewJson, RunEntry
-from vslam.overview.summary import compare, least_pairs, make_rows, systems
+from vslam.overview.summary import compare, least_pairs, make_rows, strengths, systems
 from vslam.trajectory import read_trajectory, write_kitti, write_tum
 
 LAWS = ("none", "brightness:0.5", "brightness:1")
@@ -232,6 +232,15 @@ def test_runs_of_different_thresholds_are_noted(run_folder: Path, tmp_path: Path
         (folder / "config.json").write_text(name)
     notes = collect([tmp_path], []).notes
     assert any("2 different sets of thresholds" in note for note in notes)
+
+
+def test_changes_of_a_rendered_town_are_perturbations(run_folder: Path, tmp_path: Path):
+    for name, perturb in (("05", "none"), ("05+change:0.5", "none"), ("05+change:1", "blur:1")):
+        copy_run(run_folder, tmp_path / name, dataset="synthetic", sequence=name, perturb=perturb)
+    drives = [run.drive for run in collect([tmp_path], []).runs]
+    assert {drive.sequence for drive in drives} == {"05"}
+    assert [drive.perturb for drive in drives] == ["none", "change:0.5", "change:1,blur:1"]
+    assert list(strengths(drives, "change").values()) == [0.0, 0.5]
 
 
 def test_csv_has_a_line_for_each_row(written):

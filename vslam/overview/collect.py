@@ -126,12 +126,17 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
     detector = (
         report.detector if report.sensor == "stereo" else f"{report.detector}, {report.sensor}"
     )
+    # What changes a rendered town is a perturbation, too: 05+change:0.5 is the route 05.
+    sequence, *town = (
+        report.sequence.split("+") if report.dataset == "synthetic" else [report.sequence]
+    )
+    laws = [*town, *([report.perturb] if report.perturb != "none" else [])]
     return RunEntry(
         drive=Drive(
             dataset=report.dataset,
-            sequence=report.sequence,
+            sequence=sequence,
             excerpt=", ".join(parts),
-            perturb=report.perturb,
+            perturb=",".join(laws) or "none",
         ),
         system=detector,
         seed=report.seed,

@@ -211,6 +211,18 @@ def test_table_counts_cells(stub: Path, tmp_path: Path):
         assert part in text
 
 
+def test_table_stays_on_a_terminal(monkeypatch, capsys, tmp_path: Path):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    progress = table.Progress(CELLS, [], {"00": 100, "05": 100}, tmp_path, 1)
+    with table.live(progress, shown=True) as say:
+        say("a line for logs")
+        progress.add(execute.Failed(CELLS[0], "no luck"))
+    text = capsys.readouterr().err
+    assert "a line for logs" not in text
+    assert "1 failed" in text
+    assert "brightness:1" in text
+
+
 @pytest.fixture
 def bench(stub: Path, kitti_tree: Path, tmp_path: Path, monkeypatch, capsys):
     """``vslam bench`` with the stub in place of runs: (exit code, stdout, stderr)."""

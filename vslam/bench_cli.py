@@ -82,7 +82,7 @@ def bench(
 ) -> None:
     """Run sequences under perturbations with loop detectors, and report on all of them."""
     chosen = list(dict.fromkeys(name.strip() for name in detectors.split(",") if name.strip()))
-    for name in chosen:
+    for name in chosen or [""]:
         require_built("--detectors", name, DETECTORS)
 
     from vslam.bench import execute
@@ -94,14 +94,19 @@ def bench(
     from vslam.progress import announce
 
     sequences, laws = parse_sequences(seqs), parse_perturbations(perturb)
-    thresholds = (Config() if config is None else load_config(config)).model_dump_json(indent=2)
-    cells = make_grid(dataset, sequences, laws, chosen, runs, max_frames)
-    out, root = out.absolute(), data.absolute()
-    frames, identity = _open_all(dataset, root, sequences, max_frames, shown=not quiet)
-    execute.prepare(out, identity)
-    progress = Progress(
-        cells, execute.finished_cells(cells, out, thresholds + "\n"), frames, out, jobs
+    thresholds = Config() if config is None else load_config(config)
+    options = execute.RunOptions(
+        data=data.absolute() if dataset == "kitti" else None,
+        config=thresholds.model_dump_json(indent=2) + "\n",  # as a run writes it
+        threads=threads or max(1, min(available_cores() // jobs, 4)),
+        scratch=None if scheduler else execute.scratch_folder(out.absolute()),
     )
+    cells = make_grid(dataset, sequences, laws, chosen, runs, max_frames)
+    out = out.absolute()
+    frames, identity = _open_all(dataset, data.absolute(), sequences, max_frames, shown=not quiet)
+    execute.prepare(out, identity)
+    finished = execute.finished_cells(cells, out, options.config)
+    progress = Progress(cells, finished, frames, out, jobs)
     missing = progress.missing
     needed = estimate(missing, progress.reports, frames, jobs)
     check_disk(needed, out)
@@ -110,12 +115,6 @@ def bench(
         f"{jobs} at a time ({needed.basis}), {size(needed.kept)} in {out} and "
         f"{size(needed.scratch)} while it runs",
         shown=not quiet,
-    )
-    options = execute.RunOptions(
-        data=root if dataset == "kitti" else None,
-        config=thresholds + "\n",
-        threads=threads or max(1, min(available_cores() // jobs, 4)),
-        scratch=None if scheduler else execute.scratch_folder(out),
     )
     stopped = False
     try:

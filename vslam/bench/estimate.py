@@ -42,7 +42,7 @@ def estimate(
     """
     spent: dict[str, list[float]] = {}  # seconds a frame
     start: list[float] = []
-    for cell, report in finished.items():
+    for cell, report in list(finished.items()):  # the table is drawn while cells end
         if report.fps > 0:
             spent.setdefault(cell.detector, []).append(1.0 / report.fps)
             start.append(report.startup_s)

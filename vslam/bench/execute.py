@@ -92,7 +92,7 @@ def run_cell(
         for folder in (path.parent for path in work.glob("runs/*/report.json")):
             if is_finished(cell, folder, options.config):
                 return Finished(cell, str(folder), _read(folder) | {"log.txt": log.encode()})
-        return Failed(cell, "ended well but left no report of this run", log)
+        return Failed(cell, "no report of this run (another version of vslam?)", log)
 
 
 def run_here(
@@ -175,23 +175,22 @@ def prepare(out: Path, data: str) -> None:
     """
     import psutil
 
+    note = out / "data.txt"
     try:
         out.mkdir(parents=True, exist_ok=True)
+        if not note.exists():
+            note.write_text(f"{data}\n")
+        if (known := note.read_text().strip()) != data:
+            raise InputError(
+                f"{out}: holds runs on {known}, not on {data}; name another folder with --out."
+            )
         for left in (out / _PARTS).glob("*"):
             if not (left.name.isdecimal() and psutil.pid_exists(int(left.name))):
                 shutil.rmtree(left, ignore_errors=True)
-        (scratch_folder(out)).mkdir(parents=True, exist_ok=True)
-        note = out / "data.txt"
-        known = note.read_text().strip() if note.exists() else data
-        note.write_text(f"{data}\n" if known == data else f"{known}\n")
     except OSError as error:
         raise InputError(
             f"{out}: cannot be written ({error.strerror}); name another folder with --out."
         ) from error
-    if known != data:
-        raise InputError(
-            f"{out}: holds runs on {known}, not on {data}; name another folder with --out."
-        )
 
 
 def scratch_folder(out: Path) -> Path:

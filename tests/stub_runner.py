@@ -24,7 +24,7 @@ def started(stub: Path) -> list[tuple[str, int]]:
     return [(name, int(parent)) for name, parent in lines]
 
 
-def wait_for(condition: Callable[[], object], seconds: float = 60.0) -> None:
+def wait_for(condition: Callable[[], object], seconds: float = 120.0) -> None:
     """Until it is true; fails the test if that takes too long."""
     end = time.monotonic() + seconds
     while not condition():

@@ -43,7 +43,7 @@ def cluster(stub: Path, tmp_path: Path) -> Iterator[tuple[str, list[psutil.Popen
     try:
         start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
         at = r"Scheduler at:\s+(tcp://127\.0\.0\.1:\d+)"
-        wait_for(lambda: re.search(at, log.read_text()), 60)
+        wait_for(lambda: re.search(at, log.read_text()), 200)
         found = re.search(at, log.read_text())
         assert found
         for name in ("one", "two"):
@@ -51,7 +51,7 @@ def cluster(stub: Path, tmp_path: Path) -> Iterator[tuple[str, list[psutil.Popen
             start(
                 *words, "--host", "127.0.0.1", "--no-dashboard", "--local-directory", str(tmp_path)
             )
-        wait_for(lambda: log.read_text().count("Registered to") == 2, 60)
+        wait_for(lambda: log.read_text().count("Registered to") == 2, 200)
         yield found[1], processes[1:]
     finally:
         for process in processes:

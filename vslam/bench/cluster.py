@@ -51,6 +51,7 @@ def run_on_cluster(
         for future in as_completed(futures, loop=client.loop):
             cell, defect = cell_of[future.key], future.exception()
             outcome = future.result() if defect is None else Failed(cell, _said(defect))
+            future.release()  # or the death of a worker would run again all that it ever ran
             publish(outcome, out)
             yield outcome
     finally:

@@ -93,7 +93,8 @@ def test_leaving_stops_the_workers_runs(cluster, stub: Path, tmp_path: Path):
     wait_for(lambda: not any(w.children() for w in workers))
 
 
-def test_no_scheduler_is_one_sentence(tmp_path: Path):
+def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("vslam.bench.cluster._CONNECT_S", 1)
     options = execute.RunOptions(None, CONFIG, 1)
     with (
         pytest.raises(InputError, match=r"--scheduler tcp://127\.0\.0\.1:9: nothing answers"),

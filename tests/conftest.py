@@ -140,6 +140,27 @@ def kitti_tree(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactor
 
 
 @pytest.fixture(scope="session")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder as vslam writes it: 150 frames, brightness:1, detector none, seed 3."""
+    from test_report import make_outcome, report_of
+
+    folder = tmp_path_factory.mktemp("run")
+    report_of(make_outcome(150, lost=slice(20, 22)), folder)
+    return folder
+
+
+@pytest.fixture
+def stub(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder that steers tests/stub_runner.py."""
+    folder = tmp_path / "stub"
+    folder.mkdir()
+    for name in ("report.json", "trajectory.tum", "ground_truth_kitti.txt"):
+        (folder / name).write_bytes((run_folder / name).read_bytes())
+    monkeypatch.setenv("STUB_FOLDER", str(folder))
+    return folder
+
+
+@pytest.fixture(scope="session")
 def check_map() -> Callable[[Map], None]:
     """Assert every invariant of a map, by walking it in plain Python."""
     return _check_map

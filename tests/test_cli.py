@@ -67,7 +67,8 @@ def call(monkeypatch, capsys, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["run"], ["eval"], ["perturb"], ["info"], ["vocabulary", "train"]]
+    "command",
+    [[], ["run"], ["eval"], ["perturb"], ["info"], ["vocabulary", "train"], ["bench"], ["report"]],
 )
 def test_help_loads_nothing_heavy(command):
     script = (
@@ -76,7 +77,7 @@ def test_help_loads_nothing_heavy(command):
         "from vslam.cli import main\n"
         "try:\n    main()\nexcept SystemExit as stop:\n    assert not stop.code\n"
         "heavy = ('numpy', 'numba', 'cv2', 'evo', 'rerun', 'matplotlib', 'scipy', 'torch',\n"
-        "         'gtsam', 'pandas')\n"
+        "         'gtsam', 'pandas', 'distributed')\n"
         "loaded = [name for name in heavy if name in sys.modules]\n"
         "assert not loaded, loaded\n"
     )

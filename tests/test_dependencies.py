@@ -28,7 +28,7 @@ VOCABULARY = {
 }
 MIDDLE = ("frontend", "loopclosure", "backend")
 APPLICATION = ("slam", "cli", "report", "recorder", "pipeline", "run", "runfolder", "evaluate")
-APPLICATION += ("comparison", "console", "loop_evaluation")
+APPLICATION += ("comparison", "console", "loop_evaluation", "bench", "overview")
 # Verification of loops uses the frontend's matching and pose.
 GRANTED = {
     ("vslam.loopclosure.verification", "vslam.frontend.matching"),
@@ -40,6 +40,7 @@ ONLY_IN = {
     "gtsam": "vslam.backend",
     "rerun": "vslam.recorder",
     "evo": "vslam.evaluate",
+    "distributed": "vslam.bench.cluster",
 }
 CONSOLE = {"vslam.cli", "vslam.console"}
 

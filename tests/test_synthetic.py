@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from vslam.camera import StereoCamera
 from vslam.datasets import open_sequence
 from vslam.datasets.kitti import open_kitti
-from vslam.datasets.synthetic import houses, store, textures, vehicles
+from vslam.datasets.synthetic import houses, parse_drive, store, textures, vehicles
 from vslam.datasets.synthetic import town as town_module
 from vslam.datasets.synthetic.camera_effects import sensor_image
 from vslam.datasets.synthetic.pairs import render_pairs
@@ -569,3 +569,16 @@ def test_unwritable_cache(route, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"cannot be written.*VSLAM_CACHE"):
         store.render_sequence(route, Variation(), tmp_path / "file" / "cache")
+
+
+def test_a_name_says_how_the_town_varies():
+    assert parse_drive("05") == ("05", Variation())
+    assert parse_drive("05+change:0.5+moving:6+aliased") == (
+        "05",
+        Variation(change=0.5, moving=6, aliased=True),
+    )
+    for name in ("05+fog", "05+change:2", "05+change", "05+moving:x", "05+"):
+        with pytest.raises(InputError, match=r"--seq 05\+.* is not understood"):
+            parse_drive(name)
+    with pytest.raises(InputError, match="route 77: unknown"):
+        open_sequence("synthetic", None, "77+change:0.5")

@@ -8,9 +8,10 @@ from typing import Annotated
 
 import typer
 
-from vslam import __version__, synth_cli, train_cli, vocabulary_cli
+from vslam import __version__, bench_cli, synth_cli, train_cli, vocabulary_cli
 from vslam.console import evaluation_rows, print_rows, print_summary
 from vslam.errors import InputError, ResultsError
+from vslam.options import SENSORS, require_built
 
 app = typer.Typer(
     help="Visual SLAM in pure Python.",
@@ -19,7 +20,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-_SENSORS = {"stereo": True, "mono": False, "rgbd": False}
 
 Data = Annotated[
     Path,
@@ -97,7 +97,7 @@ def run(
     from vslam.detectors import require_detector
 
     require_detector(detector, weights)
-    _require_built("--sensor", sensor, _SENSORS)
+    require_built("--sensor", sensor, SENSORS)
     if compare_loops and detector == "none":
         raise InputError("--compare-loops: nothing to compare with --detector none; name another.")
 
@@ -245,6 +245,7 @@ def info(data: Data = _DATA) -> None:
     print_rows(rows)
 
 
+bench_cli.register(app)
 synth_cli.register(app)
 train_cli.register(app)
 vocabulary_cli.register(app)
@@ -269,11 +270,3 @@ def main() -> None:
     except ResultsError as error:
         typer.echo(f"error: {error}", err=True)
         sys.exit(1)
-
-
-def _require_built(option: str, value: str, known: dict[str, bool]) -> None:
-    built = ", ".join(f"'{name}'" for name, is_built in known.items() if is_built)
-    if value not in known:
-        raise InputError(f"{option} {value}: unknown; this version has only {built}.")
-    if not known[value]:
-        raise InputError(f"{option} {value}: not built yet; this version has only {built}.")

@@ -12,14 +12,14 @@ from vslam.loopclosure.siamese.weights import NETWORKS, find_weights
 DETECTORS = ("none", "bow", *NETWORKS)
 
 
-def require_detector(name: str, weights: Path | None) -> None:
+def require_detector(name: str, weights: Path | None = None, option: str = "--detector") -> None:
     """Refuse what cannot be created, before anything heavy is imported or compiled.
 
     Raises:
         InputError: no such detector, or no weights for it.
     """
     if name not in DETECTORS:
-        raise InputError(f"--detector {name}: unknown; choose one of {', '.join(DETECTORS)}.")
+        raise InputError(f"{option} {name}: unknown; choose one of {', '.join(DETECTORS)}.")
     if name in NETWORKS:
         find_weights(name, weights)
     elif weights is not None:

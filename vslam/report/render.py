@@ -83,19 +83,19 @@ def render_markdown(report: ReportJson) -> str:
     lines = [f"# vslam: {report.dataset} {report.sequence}", ""]
     if report.interrupted:
         lines += [f"**Interrupted: {report.interrupted}.** Numbers are of the frames done.", ""]
-    lines += _table(("", "", ""), [(h.label, h.value, h.note) for h in headlines(report)])
+    lines += markdown_table(("", "", ""), [(h.label, h.value, h.note) for h in headlines(report)])
     if report.skipped_messages:
         lines += ["", "## Skipped frames", "", *(f"- {text}" for text in report.skipped_messages)]
     if report.evo_command:
         lines += ["", "## Reproduce the ATE", "", f"    {report.evo_command}"]
     if report.stage_ms:
         lines += ["", "## Time per stage (ms)", ""]
-        lines += _table(("stage", "mean", "median", "p95"), stage_rows(report))
+        lines += markdown_table(("stage", "mean", "median", "p95"), stage_rows(report))
     for table in loop_tables(report):
-        lines += ["", f"## {table.title}", "", *_table(table.head, table.rows)]
+        lines += ["", f"## {table.title}", "", *markdown_table(table.head, table.rows)]
         lines += ["", table.note] if table.note else []
-    lines += ["", "## Run", "", *_table(("", ""), option_rows(report))]
-    lines += ["", "## Machine", "", *_table(("", ""), machine_rows(report))]
+    lines += ["", "## Run", "", *markdown_table(("", ""), option_rows(report))]
+    lines += ["", "## Machine", "", *markdown_table(("", ""), machine_rows(report))]
     lines += ["", "## Recording", "", "    rerun recording.rrd", ""]
     return "\n".join(lines)
 
@@ -108,16 +108,8 @@ def render_html(report: ReportJson, config: str, figures: Sequence[ReportFigure]
         config: text of ``config.json``, shown as it is.
         figures: drawn by :func:`vslam.report.figures.draw_figures`.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("vslam.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("report.html.jinja").render(
+    return render_page(
+        "report.html.jinja",
         report=report,
         headlines=headlines(report),
         stages=stage_rows(report),
@@ -127,6 +119,20 @@ def render_html(report: ReportJson, config: str, figures: Sequence[ReportFigure]
         config=config,
         figures=figures,
     )
+
+
+def render_page(template: str, **values: object) -> str:
+    """Fill in one of the templates of this package; all text is escaped."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("vslam.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(**values)
 
 
 def stage_rows(report: ReportJson) -> list[tuple[str, ...]]:
@@ -166,7 +172,8 @@ def _number(value: float | None, unit: str) -> str:
     return f"{value:.{decimals}f}{unit if unit == '°' else ' ' + unit}"
 
 
-def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> list[str]:
+def markdown_table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> list[str]:
+    """Lines of a table whose columns are aligned in the text, too."""
     rows = [tuple(cell.replace("|", "\\|").replace("\n", " ") for cell in row) for row in rows]
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     rule = tuple("-" * max(width, 3) for width in widths)

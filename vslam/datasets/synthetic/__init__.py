@@ -8,6 +8,7 @@ from vslam.datasets.kitti import KittiSequence, open_kitti
 from vslam.datasets.synthetic.routes import ROUTES, Route, built_in_route, route_of_poses
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import OnFrame, cache_folder, render_sequence
+from vslam.errors import InputError
 
 __all__ = [
     "ROUTES",
@@ -17,6 +18,7 @@ __all__ = [
     "built_in_route",
     "cache_folder",
     "open_synthetic",
+    "parse_drive",
     "render_sequence",
     "route_of_poses",
 ]
@@ -28,6 +30,33 @@ class SyntheticSequence(KittiSequence):
     @property
     def dataset(self) -> str:
         return "synthetic"
+
+
+def parse_drive(name: str) -> tuple[str, Variation]:
+    """``05+change:0.5+moving:6+aliased`` -> the route's name and the town's variation.
+
+    Raises:
+        InputError: a part that is none of these.
+    """
+    route, *parts = name.split("+")
+    town = Variation()
+    try:
+        for part in parts:
+            what, _, value = part.partition(":")
+            if what == "change" and 0.0 <= float(value) <= 1.0:
+                town = replace(town, change=float(value))
+            elif what == "moving" and int(value) >= 0:
+                town = replace(town, moving=int(value))
+            elif part == "aliased":
+                town = replace(town, aliased=True)
+            else:
+                raise ValueError
+    except ValueError:
+        raise InputError(
+            f"--seq {name}: '{part}' is not understood; write ROUTE, +change:0 to 1, +moving:CARS "
+            "or +aliased behind it."
+        ) from None
+    return route, town
 
 
 def open_synthetic(
@@ -42,18 +71,23 @@ def open_synthetic(
 ) -> SyntheticSequence:
     """Open a built-in route, rendered first where the cache lacks it.
 
+    Args:
+        name: as `parse_drive` takes it.
+        variation: of the town, if not by the name.
+
     Raises:
-        InputError: unknown route, or as `render_sequence` and `open_kitti`.
+        InputError: unknown route or town, or as `render_sequence` and `open_kitti`.
     """
-    route = built_in_route(name)
+    route_name, town = parse_drive(name)
+    route = built_in_route(route_name)
     until = None if max_frames is None else start + every * max_frames
     root = render_sequence(
         route,
-        variation or Variation(),
+        variation or town,
         cache_folder(),
         until=until,
         threads=threads,
         on_frame=on_frame,
     )
-    found = open_kitti(root, name, start=start, every=every, max_frames=max_frames)
-    return SyntheticSequence(**vars(replace(found)))
+    found = open_kitti(root, route_name, start=start, every=every, max_frames=max_frames)
+    return SyntheticSequence(**vars(replace(found, name=name)))

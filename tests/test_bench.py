@@ -1,0 +1,354 @@
+"""The grid of runs: its cells, what becomes of them, and that none is lost."""
+
+from __future__ import annotations
+
+import functools
+import io
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import psutil
+import pytest
+from stub_runner import COMMAND, started, wait_for
+
+from vslam import cli
+from vslam.bench import estimate, execute, grid, table
+from vslam.bench.grid import Cell
+from vslam.config import Config
+from vslam.errors import InputError, ResultsError
+
+CONFIG = Config().model_dump_json(indent=2) + "\n"
+
+
+def options_for(out: Path) -> execute.RunOptions:
+    return execute.RunOptions(
+        data=None, config=CONFIG, threads=1, command=COMMAND, scratch=execute.scratch_folder(out)
+    )
+
+
+CELLS = grid.make_grid("kitti", ["00", "05"], ["none", "brightness:1"], ["none", "bow"], 2)
+
+
+def test_sequences():
+    assert grid.parse_sequences("00-02,05,demo,01") == ["00", "01", "02", "05", "demo"]
+    assert grid.parse_sequences("9-11") == ["9", "10", "11"]
+    for text, part in (("05-00", "write 00-05"), (" ,", "no sequence")):
+        with pytest.raises(InputError, match=part):
+            grid.parse_sequences(text)
+
+
+def test_perturbations():
+    text = "none,brightness:0.50,brightness:1.5+blur,none"
+    assert grid.parse_perturbations(text) == ["none", "brightness:0.5", "brightness:1.5,blur:1"]
+    with pytest.raises(InputError, match="unknown law 'fog'"):
+        grid.parse_perturbations("none,fog:2")
+
+
+def test_only_seeded_perturbations_are_repeated_and_seeds_come_last():
+    assert [(c.sequence, c.perturb, c.seed) for c in CELLS if c.detector == "bow"] == [
+        ("00", "none", 0),
+        ("00", "brightness:1", 0),
+        ("05", "none", 0),
+        ("05", "brightness:1", 0),
+        ("00", "brightness:1", 1),
+        ("05", "brightness:1", 1),
+    ]
+    assert not grid.draws("blur:2")
+    assert grid.draws("blur:2,noise:1")
+
+
+def test_names_of_cells_differ():
+    cells = [
+        *CELLS,
+        *(Cell("kitti", "00", law, "bow", 0) for law in ("blur:1", "blur:0.1", "blur:1,noise:1")),
+        Cell("kitti", "00", "none", "bow", 0, 50),
+        Cell("synthetic", "00", "none", "bow", 0),
+    ]
+    assert len({cell.name for cell in cells}) == len(cells)
+    assert CELLS[0].name == "kitti-00-none-none-seed0"
+    assert Cell("kitti", "a/b", "none", "bow", 1).name == "kitti-a_b-none-bow-seed1"
+
+
+def test_a_cell_is_finished_only_by_a_whole_run_of_the_same_settings(run_folder: Path):
+    cell = Cell("kitti", "00", "brightness:1", "none", 3, 150)
+    assert grid.is_finished(cell, run_folder, CONFIG)
+    assert not grid.is_finished(cell, run_folder, CONFIG.replace("2000", "1999"))
+    assert not grid.is_finished(Cell("kitti", "00", "brightness:1", "none", 3), run_folder, CONFIG)
+    assert not grid.is_finished(Cell("kitti", "00", "none", "none", 3, 150), run_folder, CONFIG)
+    assert not grid.is_finished(cell, run_folder.parent, CONFIG)
+
+
+@pytest.mark.parametrize("change", ['"schema_version": 2|"schema_version": 1', "{|", "0|"])
+def test_a_report_of_another_schema_or_damaged_is_none(run_folder, tmp_path, change):
+    old, new = change.split("|")
+    text = (run_folder / "report.json").read_text()
+    (tmp_path / "report.json").write_text(text.replace(old, new, 1) if old != "0" else text[:99])
+    assert grid.read_report(tmp_path) is None
+
+
+def test_cells_become_folders(stub: Path, tmp_path: Path):
+    out = tmp_path / "bench"
+    outcomes = list(execute.run_here(CELLS, options_for(out), 2, out))
+    assert {outcome.cell for outcome in outcomes} == set(CELLS)
+    assert len(started(stub)) == len(CELLS) == 12
+    assert execute.finished_cells(CELLS, out, CONFIG) == CELLS
+    folder = out / CELLS[0].name
+    assert {path.name for path in folder.iterdir()} == {
+        "config.json",
+        "ground_truth_kitti.txt",
+        "log.txt",
+        "report.json",
+        "trajectory.tum",
+    }
+    report = grid.read_report(folder)
+    assert report is not None
+    assert report.evo_command == f"evo_ape kitti {folder}/ground_truth_kitti.txt --align"
+    execute.tidy(out)
+    assert {path.name for path in out.iterdir()} == {cell.name for cell in CELLS}
+
+
+def test_failing_cells_are_told_and_done_again(stub: Path, tmp_path: Path):
+    out, cells = tmp_path / "bench", CELLS[:3]
+    (stub / "fail-00-none-bow-0").touch()
+    (stub / "interrupt-00-none-none-0").touch()
+    outcomes = {o.cell: o for o in execute.run_here(cells, options_for(out), 2, out)}
+    failed = outcomes[cells[1]]
+    assert isinstance(failed, execute.Failed)
+    assert failed.message == "images of the moon; point the camera down."
+    assert "some talk" in (out / "failed" / f"{cells[1].name}.txt").read_text()
+    interrupted = outcomes[cells[0]]
+    assert isinstance(interrupted, execute.Failed)
+    assert "no report" in interrupted.message
+    assert execute.finished_cells(cells, out, CONFIG) == cells[2:]
+
+    (stub / "fail-00-none-bow-0").unlink()
+    assert [type(o) for o in execute.run_here(cells[1:2], options_for(out), 1, out)] == [
+        execute.Finished
+    ]
+    assert not (out / "failed" / f"{cells[1].name}.txt").exists()
+
+
+def test_a_runner_that_does_not_start_is_a_failed_cell(tmp_path: Path):
+    options = execute.RunOptions(None, CONFIG, 1, command=("/no/such/program",))
+    (outcome,) = execute.run_here(CELLS[:1], options, 1, tmp_path)
+    assert isinstance(outcome, execute.Failed)
+    assert "No such file" in outcome.message
+
+
+def test_leaving_kills_what_runs_and_keeps_what_is_finished(stub: Path, tmp_path: Path):
+    out, cells = tmp_path / "bench", CELLS[:4]
+    held = stub / "hold-00-none-bow-0"
+    held.touch()
+    with closing(execute.run_here(cells, options_for(out), 2, out)) as outcomes:
+        first = next(outcomes)
+        assert first.cell != cells[1]
+        process = next(p for p in psutil.Process().children() if COMMAND[1] in p.cmdline())
+    assert not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
+    kept = execute.finished_cells(cells, out, CONFIG)
+    assert first.cell in kept
+    assert cells[1] not in kept
+    assert not (out / "failed").exists()
+
+
+def test_one_folder_is_for_one_data_set(tmp_path: Path):
+    dead = tmp_path / ".parts" / "999999999"
+    dead.mkdir(parents=True)
+    execute.prepare(tmp_path, "/data/kitti")
+    assert not dead.exists()
+    execute.prepare(tmp_path, "/data/kitti")
+    with pytest.raises(InputError, match=r"runs on /data/kitti, not on /other; .* --out"):
+        execute.prepare(tmp_path, "/other")
+    assert (tmp_path / "data.txt").read_text() == "/data/kitti\n"
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be written"):
+        execute.prepare(tmp_path / "file", "/other")
+
+
+def test_results_that_cannot_be_written_are_said(tmp_path: Path):
+    (tmp_path / "out").touch()
+    done = execute.Finished(CELLS[0], "/tmp/run", {"report.json": b"{}"})
+    with pytest.raises(ResultsError, match="finished cells are kept"):
+        execute.publish(done, tmp_path / "out")
+
+
+def test_estimate_learns_from_finished_cells(run_folder: Path, tmp_path: Path):
+    frames = {"00": 4541, "05": 2761}
+    guess = estimate.estimate(CELLS, {}, frames, 2)
+    assert "guess" in guess.basis
+    assert guess.kept > 12e6
+    report = grid.read_report(run_folder)
+    assert report is not None
+    slow = report.model_copy(update={"fps": 2.0, "startup_s": 10.0})
+    learned = estimate.estimate(CELLS[1:3], {CELLS[0]: slow}, frames, 2)
+    expected = (2 * 10.0 + 2 * 4541 / 2.0) / 2
+    assert learned.seconds == pytest.approx(expected)
+    assert "1 finished" in learned.basis
+    assert estimate.estimate([], {}, frames, 2).seconds == 0.0
+    huge = estimate.Estimate(1.0, 10**18, 0, "")
+    with pytest.raises(InputError, match=r"needs 1000000000\.0 GB"):
+        estimate.check_disk(huge, tmp_path)
+    assert [estimate.duration(s) for s in (40, 420, 7500)] == ["40 s", "7 min", "2 h 05 min"]
+
+
+def test_table_counts_cells(stub: Path, tmp_path: Path):
+    from rich.console import Console
+
+    (stub / "fail-00-none-bow-0").touch()
+    progress = table.Progress(CELLS, [], {"00": 100, "05": 100}, tmp_path, 1)
+    outcomes = execute.run_here(CELLS[:2], options_for(tmp_path), 1, tmp_path)
+    said = [progress.add(outcome) for outcome in outcomes]
+    assert said[0].startswith("1/12 kitti-00-none-none-seed0: ATE 1.")
+    assert said[1] == (
+        "2/12 kitti-00-none-bow-seed0: failed: images of the moon; point the camera down."
+    )
+    assert progress.missing == CELLS[2:]
+    console = Console(width=100, record=True, file=io.StringIO())
+    console.print(progress.table())
+    text = console.export_text()
+    for part in ("1/1  1.", "1 failed", "0/2", "1 of 12 cells finished, 1 failed, about", "left"):
+        assert part in text
+
+
+def test_table_stays_on_a_terminal(monkeypatch, capsys, tmp_path: Path):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    progress = table.Progress(CELLS, [], {"00": 100, "05": 100}, tmp_path, 1)
+    with table.live(progress, shown=True) as say:
+        say("a line for logs")
+        progress.add(execute.Failed(CELLS[0], "no luck"))
+    text = capsys.readouterr().err
+    assert "a line for logs" not in text
+    assert "1 failed" in text
+    assert "brightness:1" in text
+
+
+@pytest.fixture
+def bench(stub: Path, kitti_tree: Path, tmp_path: Path, monkeypatch, capsys):
+    """``vslam bench`` with the stub in place of runs: (exit code, stdout, stderr)."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        execute, "RunOptions", functools.partial(execute.RunOptions, command=COMMAND)
+    )
+    monkeypatch.setattr("vslam.warmup.is_cold", lambda: False)
+
+    def call(*words: object) -> tuple[int, str, str]:
+        line = ["vslam", "bench", "--data", kitti_tree, "--seqs", "00", "--runs", 2, *words]
+        monkeypatch.setattr(sys, "argv", list(map(str, line)))
+        code: object = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = stop.code or 0
+        output = capsys.readouterr()
+        assert isinstance(code, int)
+        return code, output.out, output.err
+
+    return call
+
+
+def test_bench_runs_the_grid_and_writes_the_report(bench, stub: Path):
+    code, out, err = bench("--jobs", 2)
+    assert code == 0, err
+    assert "6 cells, 6 to do: about" in err
+    assert "6 of 6 cells finished, 0 failed" in out
+    assert {p.name for p in Path("bench").iterdir() if p.is_file()} == {
+        "data.txt",
+        "report.html",
+        "report.json",
+        "report.md",
+        "table.csv",
+    }
+    code, out, err = bench("--jobs", 2)
+    assert (code, len(started(stub))) == (0, 6)
+    assert "0 to do" in err
+
+
+def test_bench_counts_failures_and_ends_with_1(bench, stub: Path):
+    (stub / "fail-00-brightness:1-bow-1").touch()
+    code, out, err = bench()
+    assert code == 1
+    assert "failed: kitti-00-brightness1-bow-seed1: images of the moon" in err
+    assert "5 of 6 cells finished, 1 failed; the same command goes on" in out
+    (stub / "fail-00-brightness:1-bow-1").unlink()
+    assert bench()[0] == 0
+    assert len(started(stub)) == 7
+
+
+def test_bench_loses_nothing_to_an_interrupt(bench, stub: Path, monkeypatch):
+    add = table.Progress.add
+
+    def interrupted(self, outcome):
+        if len(self.reports) == 2:
+            raise KeyboardInterrupt
+        return add(self, outcome)
+
+    monkeypatch.setattr(table.Progress, "add", interrupted)
+    code, out, _ = bench()
+    assert code == 1
+    assert "stopped: 2 of 6 cells finished" in out
+    kept = {path.name for path in Path("bench").glob("kitti-*")}
+    assert len(kept) >= 3  # the one at hand, too
+    monkeypatch.setattr(table.Progress, "add", add)
+    assert bench()[0] == 0
+    done = started(stub)
+    assert len(done) <= 7  # the one that was running is done again
+    assert len(set(done)) == 6
+    assert not Path("bench/.parts").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        ("--detectors bow,capsule", ["capsule", "ships no weights"]),
+        ("--detectors orb", ["--detectors orb", "unknown"]),
+        ("--seqs 00-02", ["no such sequence", "01"]),
+        ("--perturb fog", ["unknown law 'fog'"]),
+        ("--dataset euroc", ["--dataset euroc", "unknown"]),
+    ],
+)
+def test_bench_refuses_before_it_starts(bench, words, parts):
+    code, out, err = bench(*words.split())
+    assert (code, out) == (2, "")
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert all(part in err for part in parts)
+    assert not Path("bench").exists()
+
+
+def test_a_real_grid_killed_and_resumed(kitti_tree: Path, tmp_path: Path):
+    """SIGKILL in the second cell: its process ends, too, and the next start does that cell only."""
+    out = tmp_path / "bench"
+    command = [sys.executable, "-m", "vslam", "bench", "--data", str(kitti_tree), "--seqs", "00"]
+    command += ["--max-frames", "6", "--perturb", "none,brightness", "--detectors", "none"]
+    command += ["--runs", "1", "--threads", "1", "--out", str(out)]
+    first, second = (
+        out / f"kitti-00-{light}-none-seed0-6frames" for light in ("none", "brightness1")
+    )
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        wait_for(first.exists, 300)
+        wait_for(lambda: psutil.Process(process.pid).children())
+        (child,) = psutil.Process(process.pid).children()
+    finally:
+        process.kill()
+        process.wait()
+    wait_for(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
+    assert not second.exists()
+    before = (first / "report.json").stat().st_mtime_ns
+
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "2 cells, 1 to do" in done.stderr
+    assert (first / "report.json").stat().st_mtime_ns == before
+    report = grid.read_report(second)
+    assert report is not None
+    assert (report.frames, report.perturb, report.lost_frames) == (6, "brightness:1", 0)
+    assert not (out / ".parts").exists()
+    assert "brightness:1" in (out / "report.md").read_text()
+
+
+def test_a_run_ends_by_itself_though_its_standard_input_is_open():
+    command = [sys.executable, "-m", "vslam.bench.child", "--version"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.wait(60) == 0

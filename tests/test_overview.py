@@ -1,0 +1,377 @@
+"""The report of many runs: what it counts, what it claims, and how it looks in a browser."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import http.server
+import json
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vslam import cli
+from vslam.errors import InputError
+from vslam.evaluate import evaluate
+from vslam.overview import write_overview
+from vslam.overview.collect import collect
+from vslam.overview.schema import MEASURES, Drive, OverviewJson, RunEntry
+from vslam.overview.summary import compare, least_pairs, make_rows, strengths, systems
+from vslam.trajectory import read_trajectory, write_kitti, write_tum
+
+LAWS = ("none", "brightness:0.5", "brightness:1")
+
+
+def copy_run(source: Path, folder: Path, **changes: object) -> Path:
+    """Another run with the trajectory of ``source``."""
+    folder.mkdir(parents=True)
+    for name in ("trajectory.tum", "trajectory_kitti.txt", "ground_truth_kitti.txt", "config.json"):
+        shutil.copy(source / name, folder)
+    report = json.loads((source / "report.json").read_text())
+    (folder / "report.json").write_text(json.dumps(report | changes))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sequences, three strengths, two detectors, two seeds where seeds matter, and debris."""
+    root = tmp_path_factory.mktemp("runs")
+    for s, sequence in enumerate(("00", "05")):
+        for k, perturb in enumerate(LAWS):
+            for detector in ("none", "bow"):
+                for seed in range(2 if k else 1):
+                    copy_run(
+                        run_folder,
+                        root / f"{sequence}-{k}-{detector}-{seed}",
+                        sequence=sequence,
+                        perturb=perturb,
+                        detector=detector,
+                        seed=seed,
+                        max_frames=None,
+                        ate_rmse_m=1.0 + s + k + 0.1 * seed - 0.5 * (detector == "bow"),
+                        loops_found=3 - k if detector == "bow" else 0,
+                        loops_missed=k if detector == "bow" else 3,
+                    )
+    copy_run(run_folder, root / "stopped", interrupted="Ctrl-C")
+    copy_run(run_folder, root / "old", schema_version=1, unknown=3)
+    copy_run(run_folder, root / ".parts" / "1" / "half", sequence="99")
+    (root / "damaged").mkdir()
+    (root / "damaged" / "report.json").write_text("{")
+    return root
+
+
+@pytest.fixture(scope="module")
+def written(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[OverviewJson, Path]:
+    out = tmp_path_factory.mktemp("report")
+    estimate = runs / "00-0-bow-0" / "trajectory_kitti.txt"
+    return write_overview([runs], [f"ORB-SLAM3@00={estimate}"], out), out
+
+
+def entry(system: str, sequence: str, ate: float | None, seed: int = 0) -> RunEntry:
+    return RunEntry(
+        drive=Drive(dataset="kitti", sequence=sequence, excerpt="", perturb="brightness:1"),
+        system=system,
+        seed=seed,
+        frames=100,
+        measures={name: None for name, *_ in MEASURES} | {"ate_rmse_m": ate},
+        source=f"{system}-{sequence}-{seed}",
+        machine=None,
+    )
+
+
+def test_json_is_versioned_and_round_trips(written):
+    report, out = written
+    text = (out / "report.json").read_text()
+    found = json.loads(text)
+    assert (found["kind"], found["schema_version"]) == ("overview", 1)
+    assert OverviewJson.model_validate_json(text).model_dump_json(indent=2) + "\n" == text
+    assert OverviewJson.model_validate_json(text) == report
+
+
+def test_rows_are_medians_with_spread(written):
+    report, _ = written
+    assert len(report.runs) == 21
+    assert len(report.rows) == 13
+    row = next(r for r in report.rows if r.drive.perturb == "brightness:1" and r.system == "bow")
+    assert (row.drive.sequence, row.runs, row.frames) == ("00", 2, 150)
+    ate = row.measures["ate_rmse_m"]
+    assert ate is not None
+    assert (ate.n, ate.least, ate.greatest) == (2, 2.5, 2.6)
+    assert ate.median == pytest.approx(2.55)
+    lights = [r.drive.perturb for r in report.rows if r.drive.sequence == "00"]
+    assert list(dict.fromkeys(lights)) == list(LAWS)
+    assert systems(report.rows) == ["none", "bow", "ORB-SLAM3"]
+
+
+def test_what_is_left_out_is_noted(written, runs: Path):
+    notes = "\n".join(written[0].notes)
+    assert f"{runs / 'stopped'} was interrupted (Ctrl-C)" in notes
+    assert "old/report.json is of another version of vslam (schema 1)" in notes
+    assert "damaged/report.json is damaged" in notes
+    assert "half" not in notes
+    assert not any(row.drive.sequence == "99" for row in written[0].rows)
+
+
+def test_external_trajectory_is_evaluated_like_a_run(written, run_folder: Path):
+    report, _ = written
+    row = next(row for row in report.rows if row.system == "ORB-SLAM3")
+    truth, estimate = (
+        read_trajectory(run_folder / f"{name}_kitti.txt") for name in ("ground_truth", "trajectory")
+    )
+    ate = row.measures["ate_rmse_m"]
+    assert ate is not None
+    assert ate.median == pytest.approx(evaluate(estimate, truth).ate_rmse_m, abs=1e-9)
+    assert row.measures["lost_frames"] is row.measures["loops_found"] is row.measures["fps"] is None
+    assert (row.drive.perturb, row.drive.sequence) == ("none", "00")
+
+
+def test_external_trajectory_with_frames_missing(runs: Path, run_folder: Path, tmp_path: Path):
+    whole = read_trajectory(run_folder / "trajectory.tum")
+    write_tum(tmp_path / "peer.tum", whole.select(np.arange(10, 150)))
+    found = collect([runs], [f"peer@05@brightness:1={tmp_path / 'peer.tum'}"])
+    assert any("peer has a pose for 140 of 150 frames of 05" in note for note in found.notes)
+    write_kitti(tmp_path / "short.txt", whole.T_wc[:9])
+    with pytest.raises(InputError, match="9 poses but 150 timestamps"):
+        collect([runs], [f"peer@05={tmp_path / 'short.txt'}"])
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("peer=x.txt", "of which sequence.*one of 00, 05"),
+        ("peer@07=x.txt", "of which sequence"),
+        ("x.txt", "NAME=FILE"),
+        ("=x.txt", "NAME=FILE"),
+        ("peer@00=none.txt", "none.txt: cannot read"),
+    ],
+)
+def test_external_trajectories_refused(runs: Path, text: str, part: str):
+    with pytest.raises(InputError, match=part):
+        collect([runs], [text])
+
+
+def test_no_runs_are_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="no finished run here"):
+        write_overview([tmp_path], [], tmp_path / "out")
+    with pytest.raises(InputError, match="no such folder"):
+        write_overview([tmp_path / "nothing"], [], tmp_path / "out")
+
+
+def test_the_same_run_named_twice_counts_once(runs: Path):
+    assert len(collect([runs, runs / "00-0-bow-0", runs / "00-0-bow-0" / ".."], []).runs) == 20
+
+
+def test_too_few_sequences_for_a_test_are_said(written):
+    report, out = written
+    bow = next(c for c in report.comparisons if (c.first, c.second) == ("none", "bow"))
+    assert (bow.second_better, bow.first_better, bow.ties, bow.p_value) == (2, 0, 0, None)
+    assert bow.median_difference == pytest.approx(-0.5)
+    for name in ("report.md", "report.html"):
+        text = (out / name).read_text().replace("&#39;", "'").replace("&lt;", "<")
+        assert "bow has the smaller ATE on 2 (00, 05)" in text
+        assert "Too few sequences differ (2) for Wilcoxon's test, which takes 6" in text
+
+
+def test_wilcoxon_pairs_sequences_not_runs():
+    """Six sequences, three runs each: n is 6, and p the least that 6 pairs can give."""
+    assert least_pairs() == 6
+    runs = [
+        entry(
+            system, f"{k:02d}", 1.0 + k - (0.1 + 0.01 * k) * (system == "bow") + 0.001 * seed, seed
+        )
+        for k in range(6)
+        for system in ("none", "bow")
+        for seed in range(3)
+    ]
+    found = compare(make_rows(runs), "none", "bow", "brightness:1", "ate_rmse_m")
+    assert found is not None
+    assert len(found.pairs) == found.second_better == 6
+    assert found.p_value == pytest.approx(2 * 0.5**6)
+    assert "p = 0.0312, unlikely by chance" in found.words
+
+
+def test_equal_trajectories_are_ties_and_not_counted():
+    runs = [
+        entry(system, f"{k:02d}", 1.0 + (0.2 if k == 6 and system == "bow" else 0.0))
+        for k in range(8)
+        for system in ("none", "bow")
+    ]
+    runs.append(entry("none", "09", None))
+    found = compare(make_rows(runs), "none", "bow", "brightness:1", "ate_rmse_m")
+    assert found is not None
+    assert (found.first_better, found.second_better, found.ties, found.p_value) == (1, 0, 7, None)
+    assert "none has the smaller ATE on 1 (06)" in found.words
+    assert compare(make_rows(runs), "none", "capsule", "brightness:1", "ate_rmse_m") is None
+    assert compare(make_rows(runs), "none", "bow", "none", "ate_rmse_m") is None
+
+
+def test_noise_is_not_called_a_win():
+    rng = np.random.default_rng(0)
+    runs = [
+        entry(system, f"{k:02d}", 1.0 + float(rng.normal(0.0, 0.1)))
+        for k in range(10)
+        for system in ("none", "bow")
+    ]
+    found = compare(make_rows(runs), "none", "bow", "brightness:1", "ate_rmse_m")
+    assert found is not None
+    assert found.p_value is not None
+    assert found.p_value > 0.05
+    assert "chance alone may do this" in found.words
+
+
+def test_runs_of_different_thresholds_are_noted(run_folder: Path, tmp_path: Path):
+    for name in ("a", "b"):
+        folder = copy_run(run_folder, tmp_path / name)
+        (folder / "config.json").write_text(name)
+    notes = collect([tmp_path], []).notes
+    assert any("2 different sets of thresholds" in note for note in notes)
+
+
+def test_changes_of_a_rendered_town_are_perturbations(run_folder: Path, tmp_path: Path):
+    for name, perturb in (("05", "none"), ("05+change:0.5", "none"), ("05+change:1", "blur:1")):
+        copy_run(run_folder, tmp_path / name, dataset="synthetic", sequence=name, perturb=perturb)
+    drives = [run.drive for run in collect([tmp_path], []).runs]
+    assert {drive.sequence for drive in drives} == {"05"}
+    assert [drive.perturb for drive in drives] == ["none", "change:0.5", "change:1,blur:1"]
+    assert list(strengths(drives, "change").values()) == [0.0, 0.5]
+
+
+def test_csv_has_a_line_for_each_row(written):
+    report, out = written
+    lines = list(csv.DictReader((out / "table.csv").open()))
+    assert len(lines) == len(report.rows)
+    assert lines[0]["system"] == "none"
+    assert float(lines[0]["ate_rmse_m"]) == float(lines[0]["ate_rmse_m_greatest"]) == 1.0
+    assert {line["loops_found"] for line in lines if line["system"] == "ORB-SLAM3"} == {""}
+
+
+def test_markdown_tables_are_aligned(written):
+    blocks = (written[1] / "report.md").read_text().split("\n\n")
+    tables = [block for block in blocks if block.startswith("|")]
+    assert len(tables) == 5
+    for table in tables:
+        assert len({len(line) for line in table.splitlines()}) == 1
+
+
+class _Page(HTMLParser):
+    """What a page asks the network for, and its figures."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.figures: list[str] = []
+        self.tags: set[str] = set()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        if tag == "figure":
+            self.figures.append(dict(attrs)["class"])
+        for name, value in attrs:
+            if name.split(":")[-1] in ("src", "href", "srcset", "data", "action", "poster"):
+                self.links.append(value)
+
+
+FIGURES = {
+    *(f"ate-{law}" for law in ("none", "brightness-0-5", "brightness-1")),
+    *(f"strength-brightness-kitti-{name}" for name in ("00", "05")),
+    *(f"path-kitti-{name}-{law}" for name in ("00", "05")
+      for law in ("none", "brightness-0-5", "brightness-1")),
+}  # fmt: skip
+
+
+def test_html_is_self_contained(written):
+    html = (written[1] / "report.html").read_text()
+    page = _Page()
+    page.feed(html)
+    assert {name.removeprefix("card ") for name in page.figures} == FIGURES
+    assert all(link.startswith(("#", "data:")) for link in page.links), page.links
+    assert not page.tags & {"script", "iframe", "object", "embed", "img"}
+    assert not re.search(r"@import|url\((?!['\"]?#)", html)
+
+
+def test_svg_ids_do_not_clash_in_the_page(written):
+    clips = re.findall(r"<clipPath id=\"(\w+)\"", (written[1] / "report.html").read_text())
+    assert clips
+    assert len(clips) == len(set(clips))
+
+
+_PROBE = """<!doctype html><link rel="icon" href="data:,"><body>
+<iframe id="page" style="width:400px;height:900px;border:0"></iframe><pre id="found"></pre><script>
+const page = document.getElementById("page");
+page.onload = () => {
+  const inner = page.contentDocument;
+  const boxes = [...inner.querySelectorAll("figure svg")].map(x => x.getBoundingClientRect());
+  document.getElementById("found").textContent = "FOUND" + JSON.stringify({
+    shown: inner.documentElement.clientWidth,
+    needed: inner.documentElement.scrollWidth,
+    figures: boxes.map(box => [box.left, box.right, box.height]),
+    paths: [...inner.querySelectorAll("figure svg path")].length,
+    requests: page.contentWindow.performance.getEntriesByType("resource").map(x => x.name),
+    font: getComputedStyle(inner.querySelector("td")).fontSize,
+  }) + "END";
+};
+page.src = "report.html";
+</script>"""
+
+
+def test_report_in_a_browser_as_wide_as_a_phone(written, tmp_path: Path):
+    """Chromium, 400 px: all figures are drawn, nothing sticks out, nothing is asked for."""
+    browser = next(
+        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+    )
+    if browser is None:
+        pytest.skip("no Chromium here: apt-get install chromium")
+    served = tmp_path / "served"
+    served.mkdir()
+    shutil.copy(written[1] / "report.html", served)
+    (served / "probe.html").write_text(_PROBE)
+    asked: list[str] = []
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, format, *arguments):
+            asked.append(self.path)
+
+    handler = functools.partial(Handler, directory=str(served))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        flags = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run "
+        flags += "--disable-background-networking --disable-component-update --disable-sync "
+        flags += "--virtual-time-budget=8000 --dump-dom"
+        command = [browser, *flags.split(), f"--user-data-dir={tmp_path / 'profile'}"]
+        address = f"http://127.0.0.1:{server.server_port}/probe.html"
+        done = subprocess.run([*command, address], capture_output=True, text=True, timeout=120)
+        server.shutdown()
+    dumped = re.search("FOUND(.*)END</pre>", done.stdout)
+    assert dumped, done.stdout[-2000:] + done.stderr[-2000:]
+    found = json.loads(dumped[1].replace("&amp;", "&"))
+    assert len(found["figures"]) == len(FIGURES)
+    assert all(
+        0 <= left < right <= 400 and height > 100 for left, right, height in found["figures"]
+    )
+    assert found["paths"] > 10 * len(FIGURES)
+    assert found["needed"] <= found["shown"] <= 400
+    assert found["requests"] == []
+    assert sorted(set(asked)) == ["/probe.html", "/report.html"]
+    assert float(found["font"].removesuffix("px")) >= 12
+
+
+def test_command_line(runs: Path, tmp_path: Path, monkeypatch, capsys):
+    runs = runs / "05-0-bow-0", runs / "05-0-none-0", runs / "stopped"
+    words = ["vslam", "report", *runs, "--out", tmp_path / "made", "--trajectory"]
+    words.append(f"peer={runs[0] / 'trajectory.tum'}")
+    monkeypatch.setattr(sys, "argv", list(map(str, words)))
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert not stop.value.code
+    output = capsys.readouterr()
+    assert f"{tmp_path / 'made' / 'report.html'}: 3 runs" in output.out
+    assert "note: " in output.err
+    # A report of many runs is not a run.
+    assert len(collect([tmp_path / "made", *runs], []).runs) == 2

@@ -1,0 +1,149 @@
+"""The cells of a benchmark, and where the results of a finished one are."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from vslam.errors import InputError
+from vslam.perturb import parse_perturbation
+from vslam.report.schema import ReportJson
+
+_UNSEEDED = {"none", "blur"}
+
+
+@dataclass(frozen=True, order=True)
+class Cell:
+    """One run of the grid: all that its figures depend on, apart from thresholds and images.
+
+    Attributes:
+        perturb: in canonical spelling, ``none`` or ``brightness:1.5,blur:0.5`` for example.
+        max_frames: frames from the first one, None for all.
+    """
+
+    dataset: str
+    sequence: str
+    perturb: str
+    detector: str
+    seed: int
+    max_frames: int | None = None
+
+    @property
+    def name(self) -> str:
+        """Of its folder: what tells cells apart is in it, so that none overwrites another."""
+        light = self.perturb.replace(":", "").replace(",", "+")
+        parts = [self.dataset, self.sequence, light, self.detector, f"seed{self.seed}"]
+        parts += [f"{self.max_frames}frames"] if self.max_frames else []
+        return "-".join(re.sub(r"[^A-Za-z0-9.+-]+", "_", part) for part in parts)
+
+    def arguments(self) -> list[str]:
+        """Of ``vslam run``."""
+        words = ["--dataset", self.dataset, "--seq", self.sequence, "--perturb", self.perturb]
+        words += ["--detector", self.detector, "--seed", str(self.seed)]
+        return words + (["--max-frames", str(self.max_frames)] if self.max_frames else [])
+
+
+def parse_sequences(text: str) -> list[str]:
+    """``00-02,05,demo`` -> ``00 01 02 05 demo``: names and ranges of numbers, each once.
+
+    Raises:
+        InputError: a range that runs backwards, or no name at all.
+    """
+    names: dict[str, None] = {}
+    for item in filter(None, (part.strip() for part in text.split(","))):
+        if ends := re.fullmatch(r"(\d+)-(\d+)", item):
+            first, last = int(ends[1]), int(ends[2])
+            if last < first:
+                raise InputError(
+                    f"--seqs {text}: {item} runs backwards; write {ends[2]}-{ends[1]}."
+                )
+            width = len(ends[1])
+            names.update(dict.fromkeys(f"{k:0{width}d}" for k in range(first, last + 1)))
+        else:
+            names[item] = None
+    if not names:
+        raise InputError("--seqs: no sequence; name some, 00-05 or demo,00 for example.")
+    return list(names)
+
+
+def parse_perturbations(text: str) -> list[str]:
+    """``none,brightness:2+blur`` -> ``none`` and ``brightness:2,blur:1``, in canonical spelling.
+
+    A comma separates entries of the grid, so that laws that act together are joined by ``+``.
+
+    Raises:
+        InputError: an entry that ``vslam run --perturb`` would refuse.
+    """
+    specs = [part.strip().replace("+", ",") for part in text.split(",")]
+    return list(dict.fromkeys(parse_perturbation(spec, 0, np.zeros(1)).name for spec in specs))
+
+
+def make_grid(
+    dataset: str,
+    sequences: Iterable[str],
+    perturbations: Iterable[str],
+    detectors: Iterable[str],
+    runs: int,
+    max_frames: int | None = None,
+) -> list[Cell]:
+    """All cells, in the order in which they are worth most if the work is cut short: every
+    sequence with the first seed, then with the next.
+
+    A perturbation that draws nothing gets one run: the same input gives the same bytes, and
+    counting them again would make a test believe in more than it has seen.
+    """
+    return [
+        Cell(dataset, sequence, perturb, detector, seed, max_frames)
+        for seed, sequence, perturb, detector in product(
+            range(runs), sequences, perturbations, detectors
+        )
+        if seed == 0 or draws(perturb)
+    ]
+
+
+def draws(perturb: str) -> bool:
+    """Whether the images depend on the seed."""
+    return not {law.partition(":")[0] for law in perturb.split(",")} <= _UNSEEDED
+
+
+def read_report(folder: Path) -> ReportJson | None:
+    """The report of a run folder, None if there is none or it is of another schema."""
+    try:
+        report = ReportJson.model_validate_json((folder / "report.json").read_bytes())
+    except (OSError, ValueError):
+        return None
+    return (
+        report
+        if report.schema_version == ReportJson.model_fields["schema_version"].default
+        else None
+    )
+
+
+def is_finished(cell: Cell, folder: Path, config: str) -> bool:
+    """Whether ``folder`` holds a complete run of just this cell.
+
+    Args:
+        config: the thresholds, as in ``config.json`` of a run.
+    """
+    report = read_report(folder)
+    if report is None or report.interrupted is not None:
+        return False
+    try:
+        same_config = (folder / "config.json").read_text() == config
+    except OSError:
+        return False
+    found = Cell(
+        report.dataset,
+        report.sequence,
+        report.perturb,
+        report.detector,
+        report.seed,
+        report.max_frames,
+    )
+    whole = (report.sensor, report.start, report.every) == ("stereo", 0, 1)
+    return same_config and whole and found == cell

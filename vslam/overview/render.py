@@ -1,0 +1,172 @@
+"""The report of many runs as Markdown, HTML and CSV: the same rows in the same order."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from vslam.overview.schema import MEASURES, Measure, OverviewJson, RunEntry, Spread
+from vslam.overview.summary import ALPHA, systems
+from vslam.report.loop_tables import Table
+from vslam.report.render import markdown_table, render_page
+
+if TYPE_CHECKING:
+    from vslam.report.drawing import ReportFigure
+
+_OTHER = ("loops_found", "loops_missed", "loops_wrong", "fps")
+_ABOUT_ERRORS = (
+    "Medians over runs, in brackets the least and the greatest. ATE after SE3 alignment, of every "
+    "frame, lost ones included; RPE from one frame to the next."
+)
+_ABOUT_OTHERS = (
+    "Loops by the ground truth. fps of the frame loop: runs made side by side have fewer."
+)
+_TESTED = (
+    "Pairs are sequences, each with the median of its runs: runs of one sequence are not "
+    f"independent. Two-sided, level {ALPHA:g}, not corrected for the number of tests."
+)
+
+
+def tables(report: OverviewJson) -> list[Table]:
+    """Every table of the report."""
+    found = [_compared(report), *_results(report), _runs(report)]
+    return [table for table in found if table.rows]
+
+
+def title(report: OverviewJson) -> str:
+    """What the report is of, in one line."""
+    places = len({(row.drive.dataset, row.drive.place) for row in report.rows})
+    return (
+        f"{', '.join(systems(report.runs))}: {len(report.runs)} runs on {places} "
+        f"sequence{'s' if places > 1 else ''}"
+    )
+
+
+def render_markdown(report: OverviewJson) -> str:
+    """Markdown whose tables are aligned, to be read in a terminal."""
+    lines = [f"# {title(report)}", ""]
+    if report.comparisons:
+        lines += ["## Who wins where", "", *(f"- {c.words}" for c in report.comparisons), ""]
+    for table in tables(report):
+        lines += [f"## {table.title}", "", *markdown_table(table.head, table.rows), ""]
+        lines += [table.note, ""] if table.note else []
+    if report.notes:
+        lines += ["## Notes", "", *(f"- {note}" for note in report.notes), ""]
+    lines += ["## Made", "", *markdown_table(("", ""), _made(report)), ""]
+    return "\n".join(lines)
+
+
+def render_html(report: OverviewJson, figures: Sequence[ReportFigure]) -> str:
+    """One self-contained page: style, figures and numbers are inside, nothing is loaded."""
+    return render_page(
+        "overview.html.jinja",
+        report=report,
+        title=title(report),
+        words=[c.words for c in report.comparisons],
+        tables=tables(report),
+        made=_made(report),
+        figures=figures,
+    )
+
+
+def render_csv(report: OverviewJson) -> str:
+    """A line for each row; of each measure the median, the least and the greatest."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    names = [name for name, *_ in MEASURES]
+    head = ["dataset", "sequence", "excerpt", "perturb", "system", "runs", "frames"]
+    writer.writerow([*head, *(f"{n}{end}" for n in names for end in ("", "_least", "_greatest"))])
+    for row in report.rows:
+        cells: list[object] = [*row.drive.model_dump().values(), row.system, row.runs, row.frames]
+        for name in names:
+            spread = row.measures[name]
+            found = (spread.median, spread.least, spread.greatest) if spread else ("", "", "")
+            cells += found
+        writer.writerow(cells)
+    return text.getvalue()
+
+
+def _results(report: OverviewJson) -> list[Table]:
+    """Two tables of the same rows: one would be too wide to read."""
+    texts = ("sequence", "perturbation", "system")
+
+    def table(name: str, measures: Sequence[Measure], note: str) -> Table:
+        columns = [f"{title} ({unit})" if unit else title for _, title, unit, *_ in measures]
+        rows: list[tuple[str, ...]] = [
+            (
+                row.drive.place,
+                row.drive.perturb,
+                row.system,
+                str(row.runs),
+                *(_cell(row.measures[measure], decimals) for measure, _, _, decimals in measures),
+            )
+            for row in report.rows
+        ]
+        return Table(name, (*texts, "runs", *columns), rows, texts, note)
+
+    errors = [measure for measure in MEASURES if measure[0] not in _OTHER]
+    others = [measure for measure in MEASURES if measure[0] in _OTHER]
+    return [
+        table("Errors", errors, _ABOUT_ERRORS),
+        table("Loops and speed", others, _ABOUT_OTHERS),
+    ]
+
+
+def _compared(report: OverviewJson) -> Table:
+    head = ("systems", "perturbation", "better", "worse", "same", "median (m)", "p")
+    rows: list[tuple[str, ...]] = [
+        (
+            f"{c.second} - {c.first}",
+            c.perturb,
+            str(c.second_better),
+            str(c.first_better),
+            str(c.ties),
+            f"{c.median_difference:+.3f}",
+            "too few" if c.p_value is None else f"{c.p_value:.3g}",
+        )
+        for c in report.comparisons
+    ]
+    return Table("Difference in ATE", head, rows, ("systems", "perturbation"), _TESTED)
+
+
+def _runs(report: OverviewJson) -> Table:
+    head = ("sequence", "perturbation", "system", "seed", "frames", "ATE (m)", "run")
+    rows: list[tuple[str, ...]] = [
+        (
+            run.drive.place,
+            run.drive.perturb,
+            run.system,
+            "-" if run.seed is None else str(run.seed),
+            str(run.frames),
+            _figure(run, "ate_rmse_m", 3),
+            run.source,
+        )
+        for run in report.runs
+    ]
+    texts = ("sequence", "perturbation", "system", "run")
+    return Table("Runs", head, rows, texts, folded=True)
+
+
+def _made(report: OverviewJson) -> list[tuple[str, str]]:
+    machines = dict.fromkeys(run.machine for run in report.runs if run.machine)
+    return [
+        ("machines", "; ".join(machines)),
+        ("vslam", report.versions.get("vslam", "")),
+        ("created", f"{report.created:%Y-%m-%d %H:%M:%S %Z}"),
+    ]
+
+
+def _cell(spread: Spread | None, decimals: int) -> str:
+    if spread is None:
+        return "n/a"
+    half = 1 if decimals == 0 and spread.median % 1 else decimals  # of an even number of counts
+    least, greatest = f"{spread.least:.{decimals}f}", f"{spread.greatest:.{decimals}f}"
+    median = f"{spread.median:.{half}f}"
+    return median if least == greatest else f"{median} ({least}-{greatest})"
+
+
+def _figure(run: RunEntry, name: str, decimals: int) -> str:
+    value = run.measures[name]
+    return "n/a" if value is None else f"{value:.{decimals}f}"

@@ -1,0 +1,119 @@
+"""The schema of the ``report.json`` of many runs: what scripts may rely on."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+Measure = tuple[str, str, str, int]
+# Name in the JSON, title, unit, decimals.
+MEASURES: tuple[Measure, ...] = (
+    ("lost_frames", "lost frames", "", 0),
+    ("ate_rmse_m", "ATE RMSE", "m", 3),
+    ("rpe_m", "RPE", "m", 4),
+    ("t_rel_percent", "t_rel", "%", 3),
+    ("r_rel_deg_per_100m", "r_rel", "°/100 m", 3),
+    ("loops_found", "loops found", "", 0),
+    ("loops_missed", "missed", "", 0),
+    ("loops_wrong", "wrong", "", 0),
+    ("fps", "fps", "", 1),
+)
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Drive(_Model):
+    """Images that systems are compared on; ``excerpt`` is empty for a whole sequence."""
+
+    dataset: str
+    sequence: str
+    excerpt: str
+    perturb: str
+
+    @property
+    def place(self) -> str:
+        """The sequence, without what was done to its images."""
+        return f"{self.sequence}, {self.excerpt}" if self.excerpt else self.sequence
+
+
+class RunEntry(_Model):
+    """One run. ``measures`` has the names of ``MEASURES``; None where a run has no such figure.
+
+    ``system`` is the loop detector, or the name of another system; ``source`` the folder of the
+    run or the file of the trajectory; ``seed`` is None for other systems.
+    """
+
+    drive: Drive
+    system: str
+    seed: int | None
+    frames: int
+    measures: dict[str, float | None]
+    source: str
+    machine: str | None
+
+
+class Spread(_Model):
+    """Of the ``n`` runs that have the figure."""
+
+    n: int
+    median: float
+    least: float
+    greatest: float
+
+
+class Row(_Model):
+    """All runs of one system on one drive; None for a measure that no run has."""
+
+    drive: Drive
+    system: str
+    runs: int
+    frames: int
+    measures: dict[str, Spread | None]
+
+
+class Pair(_Model):
+    """Medians of two systems on one drive, and ``difference``, the second minus the first."""
+
+    drive: Drive
+    first: float
+    second: float
+    difference: float
+
+
+class Comparison(_Model):
+    """Two systems under one perturbation, paired by sequence.
+
+    ``p_value`` is two-sided, of Wilcoxon's signed-rank test on the differences that are not ties;
+    None where there are too few for it to say anything.
+    """
+
+    measure: str
+    perturb: str
+    first: str
+    second: str
+    pairs: list[Pair]
+    second_better: int
+    first_better: int
+    ties: int
+    median_difference: float
+    p_value: float | None
+    words: str
+
+
+class OverviewJson(_Model):
+    """``kind`` tells this file from the ``report.json`` of one run."""
+
+    kind: Literal["overview"] = "overview"
+    schema_version: int = 1
+
+    notes: list[str]
+    rows: list[Row]
+    comparisons: list[Comparison]
+    runs: list[RunEntry]
+
+    versions: dict[str, str]
+    created: datetime

@@ -136,7 +136,8 @@ def _curve(
             at = [strength[row.drive] for row in some]
             median, least, greatest = _spreads(some, measure)
             axes.fill_between(at, least, greatest, color=color, alpha=0.16, linewidth=0)
-            axes.plot(at, median, "o", linestyle=dashes, color=color, markersize=4, label=name)
+            label = name if axes is upper else "_again"  # one entry of the legend for both
+            axes.plot(at, median, "o", linestyle=dashes, color=color, markersize=4, label=label)
     upper.set_ylabel("ATE RMSE (m)")
     lower.set(xlabel="strength", ylabel="loops found")
     lower.yaxis.set_major_locator(MaxNLocator(4, integer=True))

@@ -21,7 +21,7 @@ app = typer.Typer(
 )
 _DETECTORS = {"none": True, "bow": True, "capsule": False, "capsule-pruned": False}
 _DETECTORS |= {"alexnet": False, "vgg16": False}
-_SENSORS = {"stereo": True, "mono": False, "rgbd": False}
+_SENSORS = {"stereo": True, "mono": True, "rgbd": False}
 
 Data = Annotated[
     Path,
@@ -75,7 +75,10 @@ def run(
     detector: Annotated[
         str, typer.Option(help="Loop detector: [b]bow[/b], or [b]none[/b] for odometry only.")
     ] = "bow",
-    sensor: Annotated[str, typer.Option(help="In this version: stereo.")] = "stereo",
+    sensor: Annotated[
+        str,
+        typer.Option(help="[b]stereo[/b], or [b]mono[/b]: the left eye alone, scale arbitrary."),
+    ] = "stereo",
     out: Annotated[Path, typer.Option(help="Where the folders of the runs go.")] = Path("runs"),
     config: Annotated[
         Path | None, typer.Option(help="JSON file with thresholds, as config.json of a run.")
@@ -106,7 +109,8 @@ def run(
     with render_bar(shown=not quiet) as on_render:
         sequence = open_sequence(
             dataset, data, seq,
-            start=start, every=every, max_frames=max_frames, on_render=on_render,
+            start=start, every=every, max_frames=max_frames, monocular=sensor == "mono",
+            on_render=on_render,
         )  # fmt: skip
     perturbation = parse_perturbation(perturb, seed, sequence.timestamps)
     folder = create_run_folder(out, dataset, seq, perturbation.name, detector)

@@ -31,6 +31,11 @@ class RunSettings:
     max_frames: int | None
     config: Config
 
+    @property
+    def alignment(self) -> str:
+        """What is fitted before a trajectory is compared: a monocular one has no scale."""
+        return "sim3" if self.sensor == "mono" else "se3"
+
 
 @dataclass(frozen=True)
 class RunOutcome:

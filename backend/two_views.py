@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.camera import StereoCamera
-from vslam.config import Config
 from vslam.features import Features
 from vslam.geometry import compose, inverse, transform
 from vslam.map import Map

@@ -89,9 +89,7 @@ class InitializationConfig(_Section):
     max_rival_share: float = Field(
         0.7, gt=0, le=1, description="Of the best motion's points, for the second best. [OS1]"
     )
-    min_landmarks: int = Field(
-        100, ge=8, description="After the first bundle adjustment. [OS1]"
-    )
+    min_landmarks: int = Field(100, ge=8, description="After the first bundle adjustment. [OS1]")
     median_depth: float = Field(
         15.0, gt=0, description="Of the first landmarks: makes the unit of the map. [own]"
     )

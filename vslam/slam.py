@@ -432,9 +432,7 @@ class Slam:
         reference = self._mapping.reference
         T_rw = self._mapping.keyframe_pose(reference) if self.map.n_keyframes else np.eye(4)
         relative = orthonormalised(T_cw @ inverse(T_rw))
-        self._placed.append(
-            _Placed(timestamp, reference, relative, tracked, self._mapping_unit())
-        )
+        self._placed.append(_Placed(timestamp, reference, relative, tracked, self._mapping_unit()))
 
     def _pose_of(self, placed: _Placed) -> Matrix:
         """``T_cw`` of a placed frame."""

@@ -14,7 +14,8 @@ Image = NDArray[np.uint8]
 
 
 class Sequence(Protocol):
-    """A rectified stereo sequence, or its left eye. Readers check everything but pixels before the first frame.
+    """A rectified stereo sequence, or its left eye. Readers check everything but pixels before the
+    first frame.
 
     Attributes:
         dataset: name of the data set, ``kitti`` for example.

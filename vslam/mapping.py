@@ -222,7 +222,11 @@ class DeferredMapping:
     def _copy_view(self) -> None:
         self.local = local_map(self.map, self.reference, self._config.tracking.local_keyframes)
         self.reference_view = local_map(self.map, self.reference, 1)
-        needed = min(3, len(self.map.living_keyframes()))
+        living = self.map.living_keyframes()
+        if self._camera.monocular and self.map.restarts:
+            # A sub-map is young once more: without stereo nothing but this tells when to go on.
+            living = living[living >= self.map.restarts[-1]]
+        needed = min(3, len(living))
         self.n_reference = count_seen_by(self.map.arrays, self.reference, needed)
         self._T_reference = self.map.keyframe_pose(self.reference)
         self._rescaled_reference = self.map.rescaled[self.reference]

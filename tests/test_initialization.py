@@ -22,10 +22,14 @@ AHEAD = se3_exp(np.array([0.05, 0.0, -1.5, 0.01, 0.04, -0.01]))
 
 
 def scene(kind: str, n: int = 300, seed: int = 0) -> np.ndarray:
-    """``(n, 3)`` points before the camera: in a volume, or on a slanted plane."""
+    """``(n, 3)`` points before the camera: in a volume, on a slanted wall, or on the floor."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform([-4.0, -3.0], [4.0, 3.0], (n, 2))
-    z = rng.uniform(6.0, 14.0, n) if kind == "volume" else 9.0 + 0.3 * xy[:, 0] - 0.2 * xy[:, 1]
+    if kind == "wall":
+        return np.column_stack([xy, 9.0 + 0.3 * xy[:, 0] - 0.2 * xy[:, 1]])
+    z = rng.uniform(6.0, 14.0, n)
+    if kind == "floor":
+        return np.column_stack([xy[:, 0], np.full(n, 1.5), rng.uniform(3.0, 12.0, n)])
     return np.column_stack([xy * (z / 9.0)[:, None], z])
 
 
@@ -49,7 +53,7 @@ def turn_deg(R_a, R_b):
 
 @pytest.mark.parametrize("outliers", [0.0, 0.4])
 @pytest.mark.parametrize("motion", [ASIDE, AHEAD])
-@pytest.mark.parametrize(("kind", "model"), [("plane", "homography"), ("volume", "fundamental")])
+@pytest.mark.parametrize(("kind", "model"), [("wall", "homography"), ("volume", "fundamental")])
 def test_the_model_that_explains_the_scene_is_selected(kind, model, motion, outliers):
     xy_1, xy_2, right = views(scene(kind), motion, outliers=outliers)
     found = select_model(xy_1, xy_2, np.ones(len(xy_1)), CONFIG, seed=1)
@@ -106,12 +110,24 @@ def test_motion_and_points_of_a_volume_with_wrong_matches(motion):
     assert np.median(error) < 0.06
 
 
-def test_motion_of_a_plane_seen_aside():
-    xy_1, xy_2, _ = views(scene("plane", 400), ASIDE, noise=0.3, outliers=0.2)
-    found = reconstruct(xy_1, xy_2, np.ones(len(xy_1)), CAMERA, CONFIG, seed=1)
-    if found is not None:  # a plane may leave two motions: then none is taken
-        assert turn_deg(found.T_2_1[:3, :3], ASIDE[:3, :3]) < 1.0
-        assert angle_deg(found.T_2_1[:3, 3], ASIDE[:3, 3]) < 5.0
+def test_a_wall_leaves_two_motions_and_none_is_taken():
+    far_aside = se3_exp(np.array([-2.5, 0.1, 0.5, 0.01, -0.2, 0.02]))
+    xy_1, xy_2, _ = views(scene("wall", 400), far_aside, noise=0.2, outliers=0.2)
+    assert select_model(xy_1, xy_2, np.ones(400), CONFIG, seed=1).kind == "homography"
+    assert reconstruct(xy_1, xy_2, np.ones(400), CAMERA, CONFIG, seed=1) is None
+
+
+def test_motion_along_a_floor():
+    """The second motion that a plane allows would put half of the floor behind the camera."""
+    aside = se3_exp(np.array([-1.0, 0.0, 0.1, 0.0, 0.1, 0.0]))
+    points = scene("floor", 400)
+    xy_1, xy_2, right = views(points, aside, noise=0.2, outliers=0.2)
+    assert select_model(xy_1, xy_2, np.ones(400), CONFIG, seed=1).kind == "homography"
+    found = reconstruct(xy_1, xy_2, np.ones(400), CAMERA, CONFIG, seed=1)
+    assert found is not None
+    assert turn_deg(found.T_2_1[:3, :3], aside[:3, :3]) < 0.2
+    assert angle_deg(found.T_2_1[:3, 3], aside[:3, 3]) < 1.0
+    assert len(found.match) > 0.95 * np.count_nonzero(right)
 
 
 def test_too_little_parallax_is_no_start():

@@ -117,5 +117,5 @@ def test_images_must_be_those_of_the_camera():
         Slam(EYE).step(image, image, 0.0)
     with pytest.raises(ValueError, match="right image"):
         Slam(CAMERA).step(image, None, 0.0)
-    with pytest.raises(ValueError, match="shape|images are"):
+    with pytest.raises(ValueError, match="images are"):
         Slam(EYE).step(image[:-1], None, 0.0)

@@ -51,7 +51,7 @@ def adjust_two_views(
         intrinsics=camera.intrinsics,
     )
     solution = adjust(problem, iterations=ITERATIONS)
-    kept = solution.inlier.reshape(n, 2).all(axis=1)
+    kept = np.logical_and(solution.inlier[0::2], solution.inlier[1::2])
     T_2_1, points = solution.T_cw[0].copy(), solution.points
     if kept.any():
         scale = depth / float(np.median(points[kept, 2]))

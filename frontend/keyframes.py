@@ -53,6 +53,7 @@ def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig)
     tracked, reference = evidence.n_inliers, evidence.n_reference
     if tracked >= config.monocular_ratio * reference:
         return False
-    urgent = tracked < config.monocular_urgent_ratio * reference
+    # In a sharp turn the view is new before it is mapped: there every frame counts.
+    urgent = tracked < max(config.monocular_urgent_ratio * reference, config.monocular_min_tracked)
     late = evidence.seconds_since_keyframe >= config.max_interval_s
     return evidence.mapping_idle or urgent or late

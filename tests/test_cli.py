@@ -104,8 +104,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
     [
         ("--detector capsule", ["--detector capsule", "not built yet", "'none', 'bow'"]),
         ("--detector orb", ["--detector orb", "unknown"]),
-        ("--sensor mono", ["--sensor mono", "not built yet", "'stereo'"]),
-        ("--sensor rgbd", ["--sensor rgbd", "not built yet"]),
+        ("--sensor rgbd", ["--sensor rgbd", "not built yet", "'stereo', 'mono'"]),
         ("--sensor lidar", ["--sensor lidar", "unknown"]),
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
         ("--dataset euroc", ["--dataset euroc", "unknown"]),

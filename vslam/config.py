@@ -64,6 +64,9 @@ class TrackingConfig(_Section):
     lost_frames_before_restart: int = Field(
         10, ge=1, description="Lost this long, mapping restarts at the predicted pose. [own]"
     )
+    monocular_lost_frames: int = Field(
+        4, ge=1, description="The same for a monocular camera, which needs a second frame. [own]"
+    )
 
 
 class InitializationConfig(_Section):
@@ -93,6 +96,11 @@ class InitializationConfig(_Section):
     median_depth: float = Field(
         15.0, gt=0, description="Of the first landmarks: makes the unit of the map. [own]"
     )
+    max_rescaling: float = Field(
+        10.0,
+        gt=1,
+        description="Of a sub-map, to go on at the speed before; beyond, speed tells nothing. [own]",
+    )
     max_seconds: float = Field(
         1.5, gt=0, description="Between the two keyframes; then begin with another frame. [own]"
     )
@@ -112,6 +120,9 @@ class KeyframeConfig(_Section):
     )
     monocular_ratio: float = Field(
         0.9, gt=0, le=1, description="max_tracked_ratio of a monocular camera. [OS1, V-E]"
+    )
+    monocular_min_tracked: int = Field(
+        100, ge=0, description="Points; below, a monocular camera does not wait either. [own]"
     )
     monocular_urgent_ratio: float = Field(
         0.5, gt=0, le=1, description="urgent_ratio of a monocular camera. [own]"

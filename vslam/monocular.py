@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,12 @@ class Start:
     T_2_1: Matrix
     features: tuple[NDArray[np.int64], NDArray[np.int64]]
     points: Matrix
+
+    def scaled(self, factor: float) -> Start:
+        """The same views in another unit."""
+        T_2_1 = self.T_2_1.copy()
+        T_2_1[:3, 3] *= factor
+        return replace(self, T_2_1=T_2_1, points=factor * self.points)
 
 
 class Initialiser:

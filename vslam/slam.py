@@ -32,7 +32,7 @@ from vslam.loopclosure.detector import LoopDetector, NoDetector
 from vslam.loops import Closure, LoopEdge
 from vslam.map import Map, local_map
 from vslam.mapping import DeferredMapping
-from vslam.monocular import FirstView, Initialiser
+from vslam.monocular import FirstView, Initialiser, Start
 from vslam.trajectory import Trajectory, bridge_gaps
 
 Matrix = NDArray[np.float64]
@@ -311,18 +311,23 @@ class Slam:
         frame.T_cw = T_cw
         self._place(timestamp, T_cw, tracked=False)
         self._lost_frames += 1
-        restart = self._lost_frames >= self.config.tracking.lost_frames_before_restart
-        if restart and self.camera.monocular:
-            restart = self._start_monocular(frame)
-        elif restart and self._can_start(frame):
-            frame.landmark[:] = -1
-            self._insert_keyframe(frame)
-            self._velocity = None
-            self._lost_frames = 0
-            self._keep(frame)
-        else:
-            restart = False
-        return self._result(frame, TrackingState.LOST, matches, inliers, restart, clock)
+        restarted = self._restart(frame)
+        return self._result(frame, TrackingState.LOST, matches, inliers, restarted, clock)
+
+    def _restart(self, frame: Frame) -> bool:
+        """Begin a sub-map at the frame placed last if the camera has been lost for long."""
+        config = self.config.tracking
+        if self.camera.monocular:
+            long = self._lost_frames >= config.monocular_lost_frames
+            return long and self._start_monocular(frame)
+        if self._lost_frames < config.lost_frames_before_restart or not self._can_start(frame):
+            return False
+        frame.landmark[:] = -1
+        self._insert_keyframe(frame)
+        self._velocity = None
+        self._lost_frames = 0
+        self._keep(frame)
+        return True
 
     # Mapping
 
@@ -349,6 +354,7 @@ class Slam:
         if start is None:
             return False
         self._merge()
+        start = self._with_speed(start, second.timestamp)
         frame.T_cw = start.T_2_1 @ start.first.frame.T_cw
         frame.landmark, frame.xyz = self._mapping.begin(start, second)
         reference = self._mapping.reference
@@ -362,6 +368,17 @@ class Slam:
         self._initialiser.reset()
         self._keep(frame)
         return True
+
+    def _with_speed(self, start: Start, timestamp: float) -> Start:
+        """A sub-map's start in the unit of the map before it, as far as anything tells: the camera
+        drives on as fast as it did."""
+        if self._velocity is None:
+            return start
+        elapsed = timestamp - start.first.timestamp
+        moved = np.linalg.norm(self._velocity[:3]) * elapsed
+        factor = float(moved / np.linalg.norm(start.T_2_1[:3, 3]))
+        limit = self.config.initialization.max_rescaling
+        return start.scaled(factor) if 1.0 / limit < factor < limit else start
 
     def _can_start(self, frame: Frame) -> bool:
         n_stereo = int(np.count_nonzero(np.isfinite(frame.features.u_right)))

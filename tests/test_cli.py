@@ -267,6 +267,19 @@ def test_compare_loops_interrupted(call, root, with_detector):
     assert len(with_detector.runs) == 1
 
 
+def test_a_monocular_run_says_that_its_scale_is_arbitrary(call, root, pipeline):
+    code, out, err = call("run", "--data", root, "--sensor", "mono")
+    assert code == 0, err
+    assert "scale" in out
+    assert "arbitrary" in out
+    assert pipeline.settings.sensor == "mono"
+    assert pipeline.evaluation.alignment == "sim3"
+    assert pipeline.outcome.sequence.camera.monocular
+    _, out, _ = call("run", "--data", root, "--max-frames", 10)
+    assert "arbitrary" not in out
+    assert pipeline.evaluation.alignment == "se3"
+
+
 def test_quiet_run_says_nothing(call, root, pipeline):
     assert call("run", "--data", root, "--max-frames", 10, "--no-record", "--quiet") == (0, "", "")
     assert pipeline.recorder == "null"

@@ -99,7 +99,7 @@ class InitializationConfig(_Section):
     max_rescaling: float = Field(
         10.0,
         gt=1,
-        description="Of a sub-map, to go on at the speed before; beyond, speed tells nothing. [own]",
+        description="Of a sub-map, to go on at the speed before; beyond, it tells nothing. [own]",
     )
     max_seconds: float = Field(
         1.5, gt=0, description="Between the two keyframes; then begin with another frame. [own]"

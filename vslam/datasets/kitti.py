@@ -236,9 +236,10 @@ def _check_frames(
 ) -> list[tuple[Path, ...]]:
     for eye, images in enumerate(eyes):
         if not images:
+            instead = ", or run on the left eye alone with --sensor mono" if eye else ""
             raise InputError(
                 f"{folder}/image_{eye}: no images of the {('left', 'right')[eye]} eye; stereo "
-                f"needs both, download the grayscale images (22 GB) from {_HOME}."
+                f"needs both, download the grayscale images (22 GB) from {_HOME}{instead}."
             )
     complete = [all(stem in eye for eye in eyes) for stem in stems]
     if not all(complete):

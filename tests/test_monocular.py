@@ -97,6 +97,17 @@ def test_a_lost_camera_begins_a_sub_map_that_a_loop_joins(check_map):
     check_map(slam.map)
 
 
+def test_a_sub_map_goes_on_at_the_speed_before():
+    frames = [*ROUND[:40], *ROUND[100:140]]
+    slam, results = run(frames)
+    assert len(slam.map.restarts) == 1
+    steps = np.linalg.norm(np.diff(slam.trajectory().T_wc[:, :3, 3], axis=0), axis=1)
+    tracked = np.array([r.state is not TrackingState.LOST for r in results])
+    assert np.median(steps[50:]) == pytest.approx(np.median(steps[30:39]), rel=0.1)
+    assert tracked[50:].all()
+    assert len(slam.trajectory()) == 80
+
+
 def test_darkness_at_the_beginning_only_delays_it():
     slam, results = run(ROUND[:40], dark=range(12))
     assert all(r.state is TrackingState.LOST for r in results[:12])

@@ -21,7 +21,7 @@ RECENT_KEYFRAMES = 3  # a landmark is on probation for this many keyframes (ORB-
 
 def map_keyframe(map_: Map, keyframe: int, camera: StereoCamera, config: Config) -> None:
     """Bring the map up to date with a keyframe that was just inserted and linked."""
-    cull_recent_landmarks(map_, keyframe, config)
+    cull_recent_landmarks(map_, keyframe, camera, config)
     triangulate_with_neighbours(map_, keyframe, camera, config)
     refresh_keyframe(map_, keyframe)
     fuse_neighbourhood(map_, keyframe, camera, config)
@@ -35,7 +35,7 @@ def refresh_keyframe(map_: Map, keyframe: int) -> None:
     refresh_landmarks(map_.arrays, map_.landmarks_of(keyframe), map_.scales)
 
 
-def cull_recent_landmarks(map_: Map, keyframe: int, config: Config) -> None:
+def cull_recent_landmarks(map_: Map, keyframe: int, camera: StereoCamera, config: Config) -> None:
     """Erase landmarks on probation that tracking rarely finds or too few keyframes see."""
     _cull_landmarks(
         map_.arrays,
@@ -47,18 +47,19 @@ def cull_recent_landmarks(map_: Map, keyframe: int, config: Config) -> None:
         map_.n_landmarks,
         keyframe,
         config.mapping.min_found_ratio,
+        # One stereo and one monocular observation are not enough, nor are two monocular ones.
+        2 if camera.monocular else 3,
     )
 
 
 @kernel
-def _cull_landmarks(a, first, last, keyframe, min_found_ratio):
+def _cull_landmarks(a, first, last, keyframe, min_found_ratio, too_few):
     for landmark in range(first, last):
         if not a.landmark_alive[landmark]:
             continue
         rarely_found = a.found[landmark] < min_found_ratio * a.visible[landmark]
         age = keyframe - a.first_keyframe[landmark]
-        # Three: one stereo and one monocular observation are not enough.
-        if rarely_found or (age >= 2 and a.n_observations[landmark] <= 3):
+        if rarely_found or (age >= 2 and a.n_observations[landmark] <= too_few):
             erase_landmark(a, landmark)
 
 
@@ -195,7 +196,7 @@ def remove_observations(a, rows):
 
 def cull_keyframes(map_: Map, keyframe: int, camera: StereoCamera, config: Config) -> None:
     """Remove covisible keyframes most of whose close landmarks at least three others see as well,
-    at the same or a finer scale (ORB-SLAM, VI-E)."""
+    at the same or a finer scale (ORB-SLAM, VI-E). Without stereo all landmarks count."""
     neighbours, shared = map_.covisible(keyframe)
     close = config.stereo.close_depth_baselines * camera.baseline
     for neighbour in neighbours[shared >= config.mapping.min_shared]:
@@ -208,12 +209,15 @@ def cull_keyframes(map_: Map, keyframe: int, camera: StereoCamera, config: Confi
 
 @kernel
 def count_redundant(a, keyframe, bf, close_depth):
-    """Close landmarks of a keyframe, and how many of them three others see as well."""
+    """Close landmarks of a keyframe, and how many of them three others see as well; for a
+    monocular camera, whose ``bf`` is 0, all landmarks."""
     seen, redundant = 0, 0
     for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
         landmark = a.landmark[row]
+        if landmark < 0:
+            continue
         # A comparison with NaN is false: monocular observations do not count.
-        if landmark < 0 or not bf < close_depth * (a.xy[row, 0] - a.u_right[row]):
+        if bf > 0.0 and not bf < close_depth * (a.xy[row, 0] - a.u_right[row]):
             continue
         seen += 1
         others = 0

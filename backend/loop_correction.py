@@ -48,6 +48,17 @@ def carry_landmarks(map_: Map, landmarks: NDArray[np.int64], T_cw_old: NDArray[n
     _carry(a, landmarks, _motions(T_cw_old, a.T_cw, moved), moved)
 
 
+def carry_landmarks_by(map_: Map, motion: NDArray[np.float64], moved: NDArray[np.bool_]) -> None:
+    """Move all landmarks by the motions of their anchors.
+
+    Args:
+        motion: ``(K, 4, 4)`` of each keyframe, world to world, similarities too: then normal and
+            reach are to be refreshed.
+        moved: ``(K,)`` bool, keyframes that have one.
+    """
+    _carry(map_.arrays, np.arange(map_.n_landmarks), motion, moved)
+
+
 @kernel
 def _motions(T_cw_old, T_cw_new, moved):
     """World motion of each keyframe: what is fixed to it goes from p to ``motion p``."""

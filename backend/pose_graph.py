@@ -36,6 +36,8 @@ class PoseGraph:
         kind: ``(E,)`` uint8, TREE, COVISIBLE, WEAK or LOOP.
         sigmas: ``(E, 2)`` standard deviations, translation (m) and rotation (rad), of each axis.
         fixed: ``(N,)`` bool, keyframes that are held: one in each connected part.
+        scale: ``(E,)`` units around i for one around j; ``T_i_j`` is in the unit of i. 1 except
+            for loops of monocular maps (``similarity_graph``).
     """
 
     keyframes: NDArray[np.int64]
@@ -45,6 +47,7 @@ class PoseGraph:
     kind: NDArray[np.uint8]
     sigmas: NDArray[np.float64]
     fixed: NDArray[np.bool_]
+    scale: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -109,20 +112,24 @@ def essential_graph(
             passed = np.searchsorted(restarts, pair, side="right")
             gap = passed[0] < passed[1] and pair not in seen
             kind[pair] = WEAK if gap else TREE
-    measured: dict[tuple[int, int], NDArray[np.float64]] = {}
+    measured: dict[tuple[int, int], tuple[NDArray[np.float64], float]] = {}
     for loop in loops:
         query, match, T = _loop_of_living(map_, loop)
+        scale = loop.scale
         if query != match:
             if query > match:
-                query, match, T = match, query, inverse(T)
-            kind[query, match], measured[query, match] = LOOP, T
+                query, match, T, scale = match, query, inverse(T), 1.0 / scale
+            elif scale != 1.0:
+                T[:3, 3] *= scale
+            kind[query, match], measured[query, match] = LOOP, (T, scale)
     edges = index[np.array(sorted(kind), np.int64).reshape(-1, 2)]
     kinds = np.array([kind[pair] for pair in sorted(kind)], np.uint8)
     T_i_j = T_cw[edges[:, 0]] @ inverses(T_cw)[edges[:, 1]]
+    scales = np.ones(len(edges))
     loop_edges = np.flatnonzero(kinds == LOOP)
     for e in loop_edges.tolist():
         i, j = living[edges[e]].tolist()
-        T_i_j[e] = measured[i, j]
+        T_i_j[e], scales[e] = measured[i, j]
     return PoseGraph(
         keyframes=living,
         T_cw=T_cw,
@@ -131,6 +138,7 @@ def essential_graph(
         kind=kinds,
         sigmas=edge_sigmas(edges, T_i_j, kinds, len(living), config),
         fixed=_first_of_parts(edges, len(living)),
+        scale=scales,
     )
 
 
@@ -140,7 +148,9 @@ def _loop_of_living(map_: Map, loop: LoopEdge) -> tuple[int, int, NDArray[np.flo
         raise ValueError(f"The loop from keyframe {loop.query} to {loop.match} has no pose.")
     query, match, T = loop.query, loop.match, loop.T_query_match
     if not map_.arrays.keyframe_alive[query]:
-        T = compose(inverse(map_.T_c_parent[query]), T)
+        T_parent_query = inverse(map_.T_c_parent[query])
+        T_parent_query[:3, 3] /= loop.scale  # to the unit of the match
+        T = compose(T_parent_query, T)
         query = map_.parents[query]
     if not map_.arrays.keyframe_alive[match]:
         T = compose(T, map_.T_c_parent[match])
@@ -239,6 +249,16 @@ def consistency(
     """
     before = edge_errors(graph.T_cw, graph.edges, graph.T_i_j, graph.sigmas)
     after = edge_errors(T_cw, graph.edges, graph.T_i_j, graph.sigmas)
+    return judge(graph, before, after, config)
+
+
+def judge(
+    graph: PoseGraph,
+    before: NDArray[np.float64],
+    after: NDArray[np.float64],
+    config: PoseGraphConfig,
+) -> Consistency:
+    """``consistency`` from the chi-square ``(E,)`` of each edge before and after optimisation."""
     loop = graph.kind == LOOP
     loop_error = np.where(loop, after, np.nan)
     strain = float(after[~loop & (graph.kind != WEAK)].sum())

@@ -46,15 +46,21 @@ def triangulate_with_neighbours(
     lines and triangulate them (ORB-SLAM, VI-C). Returns the ids of the new landmarks."""
     neighbours, _ = map_.covisible(keyframe)
     created = [np.empty(0, np.int32)]
-    for neighbour in neighbours[: config.mapping.neighbours]:
+    limit, min_baseline = config.mapping.neighbours, camera.baseline
+    if camera.monocular:
+        limit = config.mapping.monocular_neighbours
+    for neighbour in neighbours[:limit]:
         a = map_.arrays
+        if camera.monocular:
+            depth = median_depth(map_, int(neighbour))
+            min_baseline = config.mapping.min_baseline_ratio * depth
         xyz, rows_1, rows_2 = triangulate_pair(
             a,
             keyframe,
             int(neighbour),
             camera.intrinsics,
             map_.scales,
-            camera.baseline,
+            min_baseline,
             config.mapping.epipolar_distance,
             config.mapping.min_parallax_cosine,
         )
@@ -63,6 +69,12 @@ def triangulate_with_neighbours(
         link_many(map_.arrays, rows_2, ids)
         created.append(ids)
     return np.concatenate(created)
+
+
+def median_depth(map_: Map, keyframe: int) -> float:
+    """Median depth of the landmarks that a keyframe observes: the scale of its view."""
+    points, T_cw = map_.arrays.xyz[map_.landmarks_of(keyframe)], map_.arrays.T_cw[keyframe]
+    return float(np.median(points @ T_cw[2, :3] + T_cw[2, 3]))
 
 
 @inner_kernel

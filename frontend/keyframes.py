@@ -1,4 +1,4 @@
-"""When a frame becomes a keyframe (ORB-SLAM2, section III-E)."""
+"""When a frame becomes a keyframe (ORB-SLAM2, section III-E; monocular: ORB-SLAM, V-E)."""
 
 from __future__ import annotations
 
@@ -42,3 +42,18 @@ def needs_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig) -> bool:
         return False
     urgent = starved or evidence.n_inliers < config.urgent_ratio * evidence.n_reference
     return evidence.mapping_idle or urgent
+
+
+def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig) -> bool:
+    """Decide without stereo (ORB-SLAM, V-E): early, since a point is mapped only once two keyframes
+    have seen it from different places; keyframes that prove redundant are culled.
+
+    Not by time: while the camera stands still, nothing new can be triangulated.
+    """
+    tracked, reference = evidence.n_inliers, evidence.n_reference
+    if tracked >= config.monocular_ratio * reference:
+        return False
+    # In a sharp turn the view is new before it is mapped: there every frame counts.
+    urgent = tracked < max(config.monocular_urgent_ratio * reference, config.monocular_min_tracked)
+    late = evidence.seconds_since_keyframe >= config.max_interval_s
+    return evidence.mapping_idle or urgent or late

@@ -71,12 +71,19 @@ class Tracker:
 
 
 def extract_features(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], tracker: Tracker
+    left: NDArray[np.uint8], right: NDArray[np.uint8] | None, tracker: Tracker
 ) -> Features:
-    """ORB features of the left image with their stereo matches. A pure function."""
+    """ORB features of the left image with their stereo matches, none without a right image.
+
+    A pure function.
+    """
     config = tracker.config
-    in_left, in_right = extract(left, config.orb), extract(right, config.orb)
-    u_right = match_stereo(in_left, in_right, tracker.camera, config.stereo)
+    in_left = extract(left, config.orb)
+    if right is None:
+        u_right = np.full(len(in_left.xy), np.nan, np.float32)
+    else:
+        in_right = extract(right, config.orb)
+        u_right = match_stereo(in_left, in_right, tracker.camera, config.stereo)
     return Features(in_left.xy, in_left.octave, in_left.angle, in_left.descriptors, u_right)
 
 
@@ -105,11 +112,12 @@ def track_motion(
     ahead = in_camera[:, 2] > 0.1
     uvr = camera.project(np.where(ahead[:, None], in_camera, 1.0))
     advance = compose(previous.T_cw, inverse(T_cw))[2, 3]
-    # Moving on by more than the baseline, features can only grow (or shrink) in octave.
+    # Moving on by more than the baseline, features can only grow (or shrink) in octave. Without
+    # a baseline nobody knows how far that is.
     low, high = octave - 1, octave + 1
-    if advance > camera.baseline:
+    if advance > camera.baseline > 0.0:
         low, high = octave, np.full_like(octave, NEVER)
-    elif advance < -camera.baseline:
+    elif advance < -camera.baseline < 0.0:
         low, high = np.zeros_like(octave), octave
     matches, inliers = 0, 0
     for widening in (1.0, 2.0, 4.0):

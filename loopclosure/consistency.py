@@ -120,7 +120,7 @@ class LoopConsistency:
         self, a: NDArray[np.float64], b: NDArray[np.float64], where: NDArray[np.float64]
     ) -> bool:
         """Whether two drifts move a camera at ``where`` ((3,), world) to the same pose."""
-        twist = se3_log(inverse(a) @ b)
+        twist = se3_log(inverse(_rigid(a)) @ _rigid(b))
         apart = (a[:3, :3] - b[:3, :3]) @ where + a[:3, 3] - b[:3, 3]
         return bool(
             np.linalg.norm(apart) <= self.config.max_apart
@@ -129,12 +129,22 @@ class LoopConsistency:
 
 
 def implied_drift(edge: LoopEdge, map_: Map) -> NDArray[np.float64]:
-    """``(4, 4)`` motion of the world that takes the query to where an edge puts it.
+    """``(4, 4)`` motion of the world that takes the query to where an edge puts it: a similarity,
+    its scale in the upper left 3x3 block, where the edge has a scale.
 
     Raises:
         ValueError: the edge has no pose.
     """
     if edge.T_query_match is None:
         raise ValueError(f"the edge from {edge.query} to {edge.match} has no pose")
-    T_wq = inverse(map_.keyframe_pose(edge.match)) @ inverse(edge.T_query_match)
-    return T_wq @ map_.keyframe_pose(edge.query)
+    S_wq = inverse(map_.keyframe_pose(edge.match)) @ inverse(edge.T_query_match)
+    S_wq[:3, :3] /= edge.scale
+    return S_wq @ map_.keyframe_pose(edge.query)
+
+
+def _rigid(S: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A similarity without its scale; a motion as it is."""
+    T, cube = S.copy(), np.linalg.det(S[:3, :3])
+    if abs(cube - 1.0) > 1e-9:
+        T[:3, :3] /= np.cbrt(cube)
+    return T

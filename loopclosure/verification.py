@@ -33,6 +33,7 @@ from vslam.observations import collect_landmarks
 
 Matrix = NDArray[np.float64]
 GRID_COLUMNS, GRID_ROWS = 8, 4
+MIN_DEPTHS = 10  # depths on both sides that a median ratio takes
 
 
 class View(NamedTuple):
@@ -78,10 +79,10 @@ def verify(
     if len(rows_q) < config.min_matches:
         return _with(edge, reason=f"only {len(rows_q)} descriptors match")
 
-    T_query_match, n_inliers = _consensus(map_, query, match, rows_q, rows_m, camera, config)
+    T_query_match, scale, n_inliers = _consensus(map_, query, match, rows_q, rows_m, camera, config)
     if T_query_match is None:
         return _with(edge, reason=f"no motion that {config.min_consensus} of the matches agree on")
-    edge = _with(edge, n_inliers=n_inliers, T_query_match=T_query_match)
+    edge = _with(edge, n_inliers=n_inliers, T_query_match=T_query_match, scale=scale)
 
     place = place_of(map_, match, query, config)
     T_mw = map_.keyframe_pose(match)
@@ -96,6 +97,8 @@ def verify(
         features=view.feature[view.seen],
         landmarks=view.landmarks[view.seen],
     )
+    if camera.monocular:
+        edge = _with(edge, scale=scale_of_view(map_, query, view, default=scale))
     reason = _objection(map_, edge, view, T_query_match, camera, config)
     return _with(edge, accepted=not reason, reason=reason or "verified")
 
@@ -131,8 +134,8 @@ def _consensus(
     rows_m: NDArray[np.int64],
     camera: StereoCamera,
     config: VerificationConfig,
-) -> tuple[Matrix | None, int]:
-    """``T_query_match`` of most of the matches, and how many; None if too few agree."""
+) -> tuple[Matrix | None, float, int]:
+    """``T_query_match`` and scale of most of the matches, and how many; None if too few agree."""
     found = align(
         _sightings(map_, query, rows_q),
         _sightings(map_, match, rows_m),
@@ -141,10 +144,27 @@ def _consensus(
         min_inliers=config.min_consensus,
         max_draws=config.max_draws,
         confidence=config.confidence,
+        fix_scale=not camera.monocular,
     )
     if found is None:
-        return None, 0
-    return found.T_a_b, int(np.count_nonzero(found.inlier))
+        return None, 1.0, 0
+    T_query_match = found.T_a_b.copy()
+    T_query_match[:3, 3] /= found.scale  # the query's unit to the match's
+    return T_query_match, found.scale, int(np.count_nonzero(found.inlier))
+
+
+def scale_of_view(map_: Map, query: int, view: View, *, default: float) -> float:
+    """Units around the query for one around the match: the median ratio of the depths that the
+    query's own landmarks and those of the place give the same features."""
+    a = map_.arrays
+    feature, landmarks = view.feature[view.seen], view.landmarks[view.seen]
+    own = a.landmark[map_.rows(query)][feature]
+    both = own >= 0
+    if np.count_nonzero(both) < MIN_DEPTHS:
+        return default
+    depth = transform(a.T_cw[query], a.xyz[own[both]])[:, 2]
+    depth_of_place = transform(view.T_cw, a.xyz[landmarks[both]])[:, 2]
+    return float(np.median(depth / depth_of_place))
 
 
 def _sightings(map_: Map, keyframe: int, rows: NDArray[np.int64]) -> Sightings:
@@ -266,7 +286,9 @@ def look_back(
     config: VerificationConfig,
 ) -> View:
     """What the match sees of the landmarks of the query."""
-    T_mw = inverse(T_query_match) @ map_.keyframe_pose(edge.query)
+    T_match_query = inverse(T_query_match)
+    T_match_query[:3, 3] *= edge.scale  # to the query's unit, which its landmarks are in
+    T_mw = T_match_query @ map_.keyframe_pose(edge.query)
     return look(map_, edge.match, map_.landmarks_of(edge.query), T_mw, camera, config)
 
 

@@ -108,15 +108,15 @@ def test_seventy_percent_of_outliers():
     assert max(degrees) < 0.15
 
 
-def test_scale_is_found_from_monocular_maps():
+@pytest.mark.parametrize(("n", "outliers"), [(100, 0.5), (200, 0.7)])
+def test_scale_is_found_from_monocular_maps(n, outliers):
     for seed in range(20):
-        T, a, b, _ = scene(seed, 100, 0.5, scale=2.5, noise=0.3)
-        mono = [
-            s._replace(uvr=np.column_stack([s.uvr[:, :2], np.full(100, np.nan)])) for s in (a, b)
-        ]
+        T, a, b, wrong = scene(seed, n, outliers, scale=2.5, noise=0.3)
+        mono = [s._replace(uvr=np.column_stack([s.uvr[:, :2], np.full(n, np.nan)])) for s in (a, b)]
         found = align(*mono, CAMERA.intrinsics, seed=seed, fix_scale=False, **SETTINGS)
         assert found is not None, seed
-        assert found.scale == pytest.approx(2.5, rel=0.01)
+        assert found.scale == pytest.approx(2.5, rel=0.025)
+        assert np.count_nonzero(found.inlier[wrong]) == 0
         assert errors(found.T_a_b, T)[1] < 0.2
         assert align(a, b, CAMERA.intrinsics, seed=seed, **SETTINGS) is None  # not rigid
 

@@ -107,8 +107,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--detector capsule --weights no.safetensors", ["no.safetensors", "not there"]),
         ("--detector bow --weights no.safetensors", ["--weights", "bow has none"]),
         ("--detector orb", ["--detector orb", "unknown"]),
-        ("--sensor mono", ["--sensor mono", "not built yet", "'stereo'"]),
-        ("--sensor rgbd", ["--sensor rgbd", "not built yet"]),
+        ("--sensor rgbd", ["--sensor rgbd", "not built yet", "'stereo', 'mono'"]),
         ("--sensor lidar", ["--sensor lidar", "unknown"]),
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
         ("--dataset euroc", ["--dataset euroc", "unknown"]),
@@ -269,6 +268,19 @@ def test_compare_loops_interrupted(call, root, with_detector):
     with_detector.runs.clear()
     assert call(*words)[0] == 1
     assert len(with_detector.runs) == 1
+
+
+def test_a_monocular_run_says_that_its_scale_is_arbitrary(call, root, pipeline):
+    code, out, err = call("run", "--data", root, "--sensor", "mono")
+    assert code == 0, err
+    assert "scale" in out
+    assert "arbitrary" in out
+    assert pipeline.settings.sensor == "mono"
+    assert pipeline.evaluation.alignment == "sim3"
+    assert pipeline.outcome.sequence.camera.monocular
+    _, out, _ = call("run", "--data", root, "--max-frames", 10)
+    assert "arbitrary" not in out
+    assert pipeline.evaluation.alignment == "se3"
 
 
 def test_quiet_run_says_nothing(call, root, pipeline):

@@ -7,7 +7,11 @@ from dataclasses import replace
 import pytest
 
 from vslam.config import KeyframeConfig
-from vslam.frontend.keyframes import KeyframeEvidence, needs_keyframe
+from vslam.frontend.keyframes import (
+    KeyframeEvidence,
+    needs_keyframe,
+    needs_monocular_keyframe,
+)
 
 CONFIG = KeyframeConfig(
     max_interval_s=1.0,
@@ -66,3 +70,32 @@ def test_thresholds_come_from_the_configuration():
     evidence = replace(CONTENT, n_inliers=149)
     assert not needs_keyframe(evidence, CONFIG.model_copy(update={"max_tracked_ratio": 0.5}))
     assert needs_keyframe(CONTENT, CONFIG.model_copy(update={"max_interval_s": 0.2}))
+
+
+def decide_monocular(**changes) -> bool:
+    config = CONFIG.model_copy(
+        update={
+            "monocular_ratio": 0.9,
+            "monocular_urgent_ratio": 0.5,
+            "monocular_min_tracked": 80,
+        }
+    )
+    return needs_monocular_keyframe(replace(CONTENT, **changes), config)
+
+
+def test_one_eye_needs_a_keyframe_once_a_tenth_of_the_reference_is_gone():
+    assert not decide_monocular(n_inliers=180)
+    assert decide_monocular(n_inliers=179)
+    assert not decide_monocular(n_inliers=179, mapping_idle=False)
+
+
+def test_one_eye_does_not_wait_where_half_is_gone_or_little_is_left():
+    assert not decide_monocular(n_inliers=100, mapping_idle=False)
+    assert decide_monocular(n_inliers=99, mapping_idle=False)
+    assert not decide_monocular(n_inliers=80, n_reference=90, mapping_idle=False)
+    assert decide_monocular(n_inliers=79, n_reference=90, mapping_idle=False)
+
+
+def test_one_eye_needs_no_keyframe_by_time_alone():
+    assert not decide_monocular(seconds_since_keyframe=60.0)
+    assert decide_monocular(seconds_since_keyframe=1.0, n_inliers=179, mapping_idle=False)

@@ -164,6 +164,25 @@ def test_no_images_of_one_eye(root, eye, word):
     refused(root, f"image_{eye}", f"no images of the {word} eye", "22 GB")
 
 
+def test_the_left_eye_alone(root):
+    for path in (root / "sequences/00/image_1").iterdir():
+        path.unlink()
+    (root / "sequences/00/image_1").rmdir()
+    refused(root, "no images of the right eye", "--sensor mono")
+    sequence = open_kitti(root, "00", monocular=True, max_frames=3)
+    assert len(sequence) == 3
+    assert sequence.camera.monocular
+    assert sequence.camera.fx == 50
+    left, right = sequence.read(2)
+    assert left.shape == (HEIGHT, WIDTH)
+    assert right is None
+    (root / "sequences/00/image_0/000001.png").write_bytes(b"")
+    refused(root, "image_0/000001.png", "empty", monocular=True)
+    for path in (root / "sequences/00/image_0").iterdir():
+        path.unlink()
+    refused(root, "no images in image_0", monocular=True)
+
+
 def test_no_images(root):
     (root / "sequences/01").mkdir()
     refused(root, "sequences/01: no images", "22 GB", name="01")

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from vslam.loop_evaluation import judge, revisits
+from vslam.loop_evaluation import judge, metres_per_unit, revisits
 from vslam.loops import LoopEdge
 
 Poses = NDArray[np.float64]
@@ -254,3 +254,17 @@ def test_no_loops_and_no_revisits():
     T_wc = along((0, 0), (0, 100))
     verdict = judge(NO_EDGES, np.zeros(0, np.int64), T_wc, times(T_wc))
     assert (verdict.n_found, verdict.n_missed, verdict.n_wrong, verdict.right) == (0, 0, 0, ())
+
+
+def test_unit_of_a_monocular_map_is_told_from_the_steps_around_a_frame():
+    T_wc = along((0, 0), (0, 200))
+    drifted = T_wc.copy()
+    unit = np.where(np.arange(len(T_wc)) < 100, 2.0, 0.5)  # metres
+    steps = np.diff(T_wc[:, :3, 3], axis=0) / unit[1:, None]
+    drifted[1:, :3, 3] = np.cumsum(steps, axis=0)
+    metres = metres_per_unit(drifted, T_wc)
+    np.testing.assert_allclose(metres[:75], 2.0)
+    np.testing.assert_allclose(metres[125:], 0.5)
+    np.testing.assert_allclose(metres_per_unit(T_wc[:1], T_wc[:1]), 1.0)
+    standing = np.tile(np.eye(4), (5, 1, 1))
+    np.testing.assert_allclose(metres_per_unit(standing, standing), 1.0)

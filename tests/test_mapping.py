@@ -411,7 +411,7 @@ def test_landmarks_on_probation_are_culled_by_the_letter():
         link_many(map_.arrays, np.array(rows), np.full(observers, landmark))
         map_.arrays.visible[landmark], map_.arrays.found[landmark] = visible, found
         survivors += [landmark] if survives else []
-    cull_recent_landmarks(map_, 6, CONFIG)
+    cull_recent_landmarks(map_, 6, CAMERA, CONFIG)
     assert map_.living_landmarks().tolist() == survivors
 
 

@@ -204,6 +204,14 @@ def test_negative_seed():
         parse_perturbation("blur", -1, TIMES)
 
 
+def test_the_left_eye_alone_sees_what_it_sees_beside_the_right_one():
+    law = parse_perturbation("brightness,noise,occlusion", 3, TIMES)
+    for index in (0, 7):
+        both, (alone, nothing) = law.apply(index, RAMP, TEXTURE), law.apply(index, RAMP, None)
+        np.testing.assert_array_equal(both[0], alone)
+        assert nothing is None
+
+
 @dataclass(frozen=True)
 class _Sequence:
     timestamps = TIMES

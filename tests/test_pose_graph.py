@@ -54,7 +54,9 @@ def chain_graph(T_wc: np.ndarray, loops=(), measured=(), reach: int = 1, weak=()
     if len(loops):
         T_i_j[-len(loops) :] = measured
     sigmas = edge_sigmas(edges, T_i_j, kinds, n, CONFIG)
-    return PoseGraph(np.arange(n), T_cw, edges, T_i_j, kinds, sigmas, np.arange(n) == 0)
+    return PoseGraph(
+        np.arange(n), T_cw, edges, T_i_j, kinds, sigmas, np.arange(n) == 0, np.ones(len(edges))
+    )
 
 
 # ------------------------------------------------------------------------------ closed forms

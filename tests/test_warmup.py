@@ -50,6 +50,12 @@ _, results = run(EXACT, jump, create_detector("bow", Config()))
 assert results[-1].state.name == "OK", "not relocalised"
 for name, known in signatures().items():
     assert known <= warm.get(name, set()), f"a loop compiles {name}{known - warm.get(name, set())}"
+
+from test_monocular import closed as closed_with_one_eye
+
+assert closed_with_one_eye()[0].closures
+for name, known in signatures().items():
+    assert known <= warm.get(name, set()), f"one eye compiles {name}{known - warm.get(name, set())}"
 """
 
 

@@ -174,7 +174,16 @@ def simulated_graph(n: int, reach: int, config: PoseGraphConfig) -> tuple[PoseGr
     kind = np.repeat([TREE, COVISIBLE, LOOP], [n - 1, len(path) - n + 1, len(loops)])
     kind = kind.astype(np.uint8)
     sigmas = edge_sigmas(edges, T_i_j, kind, n, config)
-    graph = PoseGraph(np.arange(n), inverses(T_wc), edges, T_i_j, kind, sigmas, np.arange(n) == 0)
+    graph = PoseGraph(
+        np.arange(n),
+        inverses(T_wc),
+        edges,
+        T_i_j,
+        kind,
+        sigmas,
+        np.arange(n) == 0,
+        np.ones(len(edges)),
+    )
     return graph, truth
 
 

@@ -5,7 +5,7 @@ Camera frame: x right, y down, z forward. Units: metres and pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,8 @@ class StereoCamera:
     Attributes:
         fx, fy: focal lengths in pixels.
         cx, cy: principal point of the left eye in pixels.
-        baseline: distance from the left to the right eye in metres, positive.
+        baseline: distance from the left to the right eye in metres; 0 says that there is no
+            right eye, and a map has no metres but a unit of its own (``backend/two_views.py``).
         width, height: image size in pixels.
     """
 
@@ -34,6 +35,15 @@ class StereoCamera:
     baseline: float
     width: int
     height: int
+
+    @property
+    def monocular(self) -> bool:
+        """Whether there is a left eye only."""
+        return self.baseline == 0.0
+
+    def left_eye(self) -> StereoCamera:
+        """The left eye alone."""
+        return replace(self, baseline=0.0)
 
     @property
     def bf(self) -> float:

@@ -80,7 +80,10 @@ def run(
     weights: Annotated[
         Path | None, typer.Option(help="Safetensors file of a learned detector (vslam train).")
     ] = None,
-    sensor: Annotated[str, typer.Option(help="In this version: stereo.")] = "stereo",
+    sensor: Annotated[
+        str,
+        typer.Option(help="[b]stereo[/b], or [b]mono[/b]: the left eye alone, scale arbitrary."),
+    ] = "stereo",
     out: Annotated[Path, typer.Option(help="Where the folders of the runs go.")] = Path("runs"),
     config: Annotated[
         Path | None, typer.Option(help="JSON file with thresholds, as config.json of a run.")
@@ -113,7 +116,8 @@ def run(
     with render_bar(shown=not quiet) as on_render:
         sequence = open_sequence(
             dataset, data, seq,
-            start=start, every=every, max_frames=max_frames, on_render=on_render,
+            start=start, every=every, max_frames=max_frames, monocular=sensor == "mono",
+            on_render=on_render,
         )  # fmt: skip
     perturbation = parse_perturbation(perturb, seed, sequence.timestamps)
     folder = create_run_folder(out, dataset, seq, perturbation.name, detector)

@@ -23,10 +23,17 @@ from vslam.backend.global_mapping import GlobalSnapshot, merge_solution, take_sn
 from vslam.backend.local_mapping import adjust_locally, strong_neighbours
 from vslam.backend.loop_correction import move_keyframes
 from vslam.backend.pose_graph import consistency, essential_graph, optimise
+from vslam.backend.similarity_graph import (
+    move_keyframes_similarly,
+    optimise_similarities,
+    rescaled_loop,
+    rigid,
+    similarity_consistency,
+)
 from vslam.camera import StereoCamera
 from vslam.config import Config
 from vslam.features import Features
-from vslam.geometry import compose, inverse, orthonormalised
+from vslam.geometry import compose, inverse, inverses, orthonormalised
 from vslam.loopclosure.consistency import LoopConsistency
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.verification import verify
@@ -51,6 +58,7 @@ class LoopClosing:
         self.detector = detector
         self.edges: list[LoopEdge] = []
         self.closures: list[Closure] = []
+        self._closed: list[LoopEdge] = []  # closures' edges, in the units of today
         self._camera = camera
         self._config = config
         self._consistency = LoopConsistency(config.consistency)
@@ -88,11 +96,16 @@ class LoopClosing:
         """Correct the map by a verified loop; if it contradicts the rest, leave the map alone."""
         start = time.perf_counter()
         config = self._config
-        accepted = [closure.edge for closure in self.closures]
-        graph = essential_graph(map_, [*accepted, edge], config.pose_graph, weak=map_.restarts)
-        graph = replace(graph, T_cw=self._aligned(map_, edge)[graph.keyframes])
-        T_cw = optimise(graph, config.pose_graph)
-        verdict = consistency(graph, T_cw, config.pose_graph)
+        graph = essential_graph(map_, [*self._closed, edge], config.pose_graph, weak=map_.restarts)
+        if self._camera.monocular:
+            start_S_wc = self._similarly_aligned(map_, edge)[graph.keyframes]
+            S_wc = optimise_similarities(graph, start_S_wc, config.pose_graph)
+            verdict = similarity_consistency(graph, start_S_wc, S_wc, config.pose_graph)
+            T_cw = inverses(rigid(S_wc))
+        else:
+            graph = replace(graph, T_cw=self._aligned(map_, edge)[graph.keyframes])
+            T_cw = optimise(graph, config.pose_graph)
+            verdict = consistency(graph, T_cw, config.pose_graph)
         if not verdict.consistent:
             return replace(edge, accepted=False, reason=verdict.reason)
         if self._global is not None:  # it knows nothing of this loop
@@ -102,7 +115,12 @@ class LoopClosing:
         before = map_.arrays.T_cw[keyframes]
         query_side = [edge.query, *strong_neighbours(map_, edge.query, config)]
         match_side = [edge.match, *strong_neighbours(map_, edge.match, config)]
-        move_keyframes(map_, keyframes, T_cw)
+        self._closed.append(edge)
+        if self._camera.monocular:
+            growth = move_keyframes_similarly(map_, keyframes, S_wc)
+            self._closed = [rescaled_loop(closed, growth) for closed in self._closed]
+        else:
+            move_keyframes(map_, keyframes, T_cw)
         fuse_loop(map_, edge, query_side, match_side, self._camera, config)
         adjust_locally(map_, edge.query, self._camera, config)
         edge = replace(edge, reason="closed")
@@ -115,20 +133,42 @@ class LoopClosing:
         """Poses ``T_cw`` to start from: a sub-map that the loop joins is moved to where the loop
         puts it as a whole, since its own place was only a prediction."""
         T_cw = map_.arrays.T_cw[: map_.n_keyframes].copy()
-        submap = self.joined_submaps(map_)
-        if submap[edge.query] == submap[edge.match]:
-            return T_cw
+        moving, keyframes = self._moving(map_, edge)
         assert edge.T_query_match is not None
-        T_query = compose(edge.T_query_match, T_cw[edge.match])
-        T_match = compose(inverse(edge.T_query_match), T_cw[edge.query])
-        # The part that holds the first keyframe is the world; of two others the query's moves.
-        moving, T_new = (
-            (edge.match, T_match) if submap[edge.query] == submap[0] else (edge.query, T_query)
-        )
+        if moving == edge.query:
+            T_new = compose(edge.T_query_match, T_cw[edge.match])
+        else:
+            T_new = compose(inverse(edge.T_query_match), T_cw[edge.query])
         T_old_new = compose(inverse(T_cw[moving]), T_new)  # new world to old world
-        for keyframe in np.flatnonzero(submap == submap[moving]):
+        for keyframe in keyframes:
             T_cw[keyframe] = orthonormalised(compose(T_cw[keyframe], T_old_new))
         return T_cw
+
+    def _similarly_aligned(self, map_: Map, edge: LoopEdge) -> Matrix:
+        """``_aligned`` of a monocular map: similarities ``S_wc``, since a sub-map that is moved to
+        where the loop puts it takes on the other's unit."""
+        T_cw = map_.arrays.T_cw[: map_.n_keyframes]
+        S_wc = inverses(T_cw)
+        moving, keyframes = self._moving(map_, edge)
+        assert edge.T_query_match is not None
+        S_query_match = edge.T_query_match.copy()
+        S_query_match[:3] *= edge.scale
+        if moving == edge.query:
+            S_new = S_wc[edge.match] @ np.linalg.inv(S_query_match)
+        else:
+            S_new = S_wc[edge.query] @ S_query_match
+        S_wc[keyframes] = S_new @ T_cw[moving] @ S_wc[keyframes]
+        return S_wc
+
+    def _moving(self, map_: Map, edge: LoopEdge) -> tuple[int, NDArray[np.int64]]:
+        """The end of a loop between two sub-maps that moves, and all keyframes that move with it;
+        none for a loop within one."""
+        submap = self.joined_submaps(map_)
+        if submap[edge.query] == submap[edge.match]:
+            return edge.query, np.empty(0, np.int64)
+        # The part that holds the first keyframe is the world; of two others the query's moves.
+        moving = edge.match if submap[edge.query] == submap[0] else edge.query
+        return moving, np.flatnonzero(submap == submap[moving])
 
     def joined_submaps(self, map_: Map) -> NDArray[np.int64]:
         """``(n_keyframes,)`` sub-map of each keyframe; those joined by loops count as one."""

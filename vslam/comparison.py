@@ -67,7 +67,7 @@ def figures_without_loops(outcome: RunOutcome) -> LoopFigures | None:
     evaluation = None
     if ground_truth is not None:
         try:
-            evaluation = evaluate(without.trajectory, ground_truth)
+            evaluation = evaluate(without.trajectory, ground_truth, without.settings.alignment)
         except InputError:  # too short to align, as the run with loops
             evaluation = None
     return loop_figures(without, evaluation)

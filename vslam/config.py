@@ -65,6 +65,46 @@ class TrackingConfig(_Section):
     lost_frames_before_restart: int = Field(
         10, ge=1, description="Lost this long, mapping restarts at the predicted pose. [own]"
     )
+    monocular_lost_frames: int = Field(
+        4, ge=1, description="The same for a monocular camera, which needs a second frame. [own]"
+    )
+
+
+class InitializationConfig(_Section):
+    """The first two keyframes of a monocular map [OS1, IV]."""
+
+    min_features: int = Field(200, ge=20, description="Of a frame to begin with. [own]")
+    window: float = Field(100.0, gt=0, description="Search in the second frame, pixels. [OS1]")
+    match_distance: int = Field(50, ge=0, le=256, description="Descriptor search, bits. [OS1]")
+    match_ratio: float = Field(0.9, gt=0, le=1, description="Best over second best. [OS1]")
+    min_matches: int = Field(100, ge=8, description="Below, begin with another frame. [OS1]")
+    draws: int = Field(300, ge=1, description="RANSAC draws of each model; OS1 has 200. [own]")
+    homography_share: float = Field(
+        0.45, gt=0, lt=1, description="Of both scores; above, the homography is taken. [OS1, IV]"
+    )
+    max_error: float = Field(2.0, gt=0, description="Reprojection at octave 0, pixels. [OS1]")
+    min_parallax_deg: float = Field(
+        1.0, gt=0, description="That min_points must have; OS1: 1 degree. [OS1]"
+    )
+    min_points: int = Field(50, ge=8, description="Triangulated with that parallax. [OS1]")
+    min_point_share: float = Field(
+        0.7, gt=0, le=1, description="Of the model's inliers in front of both cameras. [own]"
+    )
+    max_rival_share: float = Field(
+        0.7, gt=0, le=1, description="Of the best motion's points, for the second best. [OS1]"
+    )
+    min_landmarks: int = Field(100, ge=8, description="After the first bundle adjustment. [OS1]")
+    median_depth: float = Field(
+        15.0, gt=0, description="Of the first landmarks: makes the unit of the map. [own]"
+    )
+    max_rescaling: float = Field(
+        10.0,
+        gt=1,
+        description="Of a sub-map, to go on at the speed before; beyond, it tells nothing. [own]",
+    )
+    max_seconds: float = Field(
+        1.5, gt=0, description="Between the two keyframes; then begin with another frame. [own]"
+    )
 
 
 class KeyframeConfig(_Section):
@@ -79,6 +119,15 @@ class KeyframeConfig(_Section):
     urgent_ratio: float = Field(
         0.25, gt=0, le=1, description="Below this ratio, do not wait for local mapping. [OS2]"
     )
+    monocular_ratio: float = Field(
+        0.9, gt=0, le=1, description="max_tracked_ratio of a monocular camera. [OS1, V-E]"
+    )
+    monocular_min_tracked: int = Field(
+        100, ge=0, description="Points; below, a monocular camera does not wait either. [own]"
+    )
+    monocular_urgent_ratio: float = Field(
+        0.5, gt=0, le=1, description="urgent_ratio of a monocular camera. [own]"
+    )
     merge_after_frames: int = Field(
         2, ge=1, description="Local mapping is merged this many frames later. [own]"
     )
@@ -89,6 +138,12 @@ class MappingConfig(_Section):
 
     neighbours: int = Field(10, ge=1, description="Covisible keyframes triangulated with. [OS2]")
     fuse_neighbours: int = Field(10, ge=1, description="Covisible keyframes fused with. [OS2]")
+    monocular_neighbours: int = Field(
+        20, ge=1, description="Covisible keyframes triangulated with, monocular. [OS1]"
+    )
+    min_baseline_ratio: float = Field(
+        0.01, ge=0, description="Monocular baseline over median depth, to triangulate. [OS1]"
+    )
     min_parallax_cosine: float = Field(0.9998, gt=0, le=1, description="Triangulation. [OS1]")
     epipolar_distance: int = Field(50, ge=0, le=256, description="Triangulation, bits. [OS1]")
     fuse_distance: int = Field(50, ge=0, le=256, description="Fusion, bits. [OS1]")
@@ -236,11 +291,16 @@ class PoseGraphConfig(_Section):
     )
     translation_drift: float = Field(0.03, gt=0, description="m per root of a metre. [own]")
     rotation_drift: float = Field(0.001, gt=0, description="rad per root of a metre. [own]")
+    scale_drift: float = Field(
+        0.01, gt=0, description="Of a monocular map, logarithm per root of a unit. [own]"
+    )
     min_length: float = Field(
         0.3, gt=0, description="No edge is trusted as if it were shorter than this, m. [own]"
     )
     loop_translation: float = Field(0.1, gt=0, description="Sigma of a verified loop, m. [own]")
     loop_rotation: float = Field(0.005, gt=0, description="Sigma of a verified loop, rad. [own]")
+    loop_scale: float = Field(0.02, gt=0, description="Sigma of a verified loop, log. [own]")
+    weak_scale: float = Field(3.0, gt=0, description="Sigma where tracking was lost, log. [own]")
     weak_translation: float = Field(
         100.0, gt=0, description="Sigma where tracking was lost, m. [own]"
     )
@@ -261,6 +321,7 @@ class Config(_Section):
     orb: OrbConfig = OrbConfig()
     stereo: StereoConfig = StereoConfig()
     tracking: TrackingConfig = TrackingConfig()
+    initialization: InitializationConfig = InitializationConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
     mapping: MappingConfig = MappingConfig()
     verification: VerificationConfig = VerificationConfig()

@@ -53,6 +53,7 @@ def print_summary(
     submaps = f" in {outcome.n_submaps} sub-maps" if outcome.n_submaps > 1 else ""
     size = f"{outcome.n_keyframes} keyframes, {outcome.n_landmarks} landmarks{submaps}"
     rows = [
+        *_scale(outcome),
         ("frames", f"{len(tracks)} done, {lost} lost, {len(outcome.skipped)} unreadable"),
         *(evaluation_rows(evaluation) if evaluation else [("evaluation", remark)]),
         ("loops", _loops(outcome)),
@@ -65,6 +66,12 @@ def print_summary(
         rows.insert(0, ("interrupted", outcome.interrupted))
     print_rows(rows)
     _print_comparison(outcome, evaluation)
+
+
+def _scale(outcome: RunOutcome) -> list[tuple[str, str]]:
+    if outcome.settings.alignment != "sim3":
+        return []
+    return [("scale", "arbitrary: one camera; errors are after Sim3 alignment")]
 
 
 def _loops(outcome: RunOutcome) -> str:

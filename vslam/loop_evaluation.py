@@ -7,7 +7,7 @@ bend the map where few frames are. Here each loop and each return is judged by i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from vslam.loops import LoopEdge
 from vslam.run import RunOutcome
 
 _SAMPLE_M = 1.0  # the path is looked at once a metre, so that standing still costs nothing
+_UNIT_FRAMES = 20  # each way, to tell the unit of a monocular map
 _MAX_STEP_M = 20.0  # between two frames farther apart nobody knows where the path went
 
 Indices = NDArray[np.int64]
@@ -106,7 +107,37 @@ def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
     if T_wc is None or not len(outcome.trajectory):
         return None
     done = int(np.searchsorted(times, outcome.trajectory.timestamps[-1], side="right"))
-    return judge(outcome.loops, outcome.keyframe_frames, T_wc[:done], times[:done])
+    loops = outcome.loops
+    if outcome.settings.alignment == "sim3":
+        metres = metres_per_unit(np.array([track.T_wc for track in outcome.tracks]), T_wc[:done])
+        frames = outcome.keyframe_frames
+        loops = [_in_metres(edge, float(metres[frames[edge.match]])) for edge in loops]
+    return judge(loops, outcome.keyframe_frames, T_wc[:done], times[:done])
+
+
+def metres_per_unit(T_wc: Poses, T_wc_true: Poses) -> NDArray[np.float64]:
+    """What a monocular map's unit was when each frame was tracked, ``(N,)``: the median ratio of
+    true and estimated steps from frame to frame, over the 41 frames around it; 1 where nothing
+    moved."""
+    true, estimated = (
+        np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) for T in (T_wc_true, T_wc)
+    )
+    n = len(T_wc)
+    metres = np.ones(n)
+    for k in range(n):
+        steps = slice(max(0, k - _UNIT_FRAMES), k + _UNIT_FRAMES)
+        moved = (estimated[steps] > 0) & (true[steps] > 0)
+        if moved.any():
+            metres[k] = np.median(true[steps][moved] / estimated[steps][moved])
+    return metres
+
+
+def _in_metres(edge: LoopEdge, metres: float) -> LoopEdge:
+    if edge.T_query_match is None:
+        return edge
+    T = edge.T_query_match.copy()
+    T[:3, 3] *= metres
+    return replace(edge, T_query_match=T)
 
 
 def revisits(

@@ -33,10 +33,12 @@ class LoopEdge:
         reason: "closed", or in a few words what spoke against it.
         n_matches: landmarks of the place matched to features of the query.
         n_inliers: of these, how many agree with ``T_query_match``.
-        T_query_match: ``(4, 4)`` float64, maps the match's camera to the query's; None if the
-            candidate fell before geometry was looked at.
+        T_query_match: ``(4, 4)`` float64, maps the match's camera to the query's, in the unit of
+            the map around the match; None if the candidate fell before geometry was looked at.
         features: ``(N,)`` int32, inlier features of the query (index within the keyframe).
         landmarks: ``(N,)`` int32, the landmark of the place that each of them observes.
+        scale: length around the query, in its unit, of what is 1 around the match: 1 in metric
+            maps, whatever drift made of it in monocular ones.
     """
 
     query: int
@@ -49,6 +51,7 @@ class LoopEdge:
     T_query_match: NDArray[np.float64] | None = None
     features: NDArray[np.int32] | None = None
     landmarks: NDArray[np.int32] | None = None
+    scale: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -77,6 +77,8 @@ class Map:
         n_keyframes, n_landmarks, n_rows: how much of the capacity is in use, dead ones included.
         timestamps, frames, parents: of each keyframe: seconds, frame index, spanning-tree parent.
         T_c_parent: pose relative to the parent, set when a keyframe is culled.
+        rescaled: of each keyframe: units of the map around it that were one when it was added. 1 in
+            metric maps; loops of monocular ones change it.
         restarts: keyframes at which mapping began anew after the camera was lost, in order; each
             is the root of a sub-map, its pose relative to its parent only a prediction.
     """
@@ -91,6 +93,7 @@ class Map:
         self.frames: list[int] = []
         self.parents: list[int] = []
         self.T_c_parent: dict[int, NDArray[np.float64]] = {}
+        self.rescaled: list[float] = []
         self.restarts: list[int] = []
         k, n, r = 64, 8192, 65536
         self.arrays = Arrays(
@@ -150,6 +153,7 @@ class Map:
         self.timestamps.append(timestamp)
         self.frames.append(frame)
         self.parents.append(NONE)
+        self.rescaled.append(1.0)
         self.n_rows += n
         self.n_keyframes += 1
         return k

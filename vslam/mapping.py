@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 
 from vslam.backend.local_mapping import map_keyframe, refresh_keyframe
 from vslam.backend.triangulation import map_stereo_points
+from vslam.backend.two_views import map_two_views
 from vslam.camera import StereoCamera
 from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.features import Features
 from vslam.map import LocalMap, Map, local_map
+from vslam.monocular import FirstView, Start
 from vslam.observations import count_seen_by, link_many, resolve
 
 Matrix = NDArray[np.float64]
@@ -61,6 +63,7 @@ class DeferredMapping:
         self._executor = ThreadPoolExecutor(1, "mapping") if threads > 1 else None
         self._pending: Callable[[], None] | None = None
         self._T_reference = np.eye(4)
+        self._rescaled_reference = 1.0
         self._visible: list[NDArray[np.int32]] = []
         self._found: list[NDArray[np.int32]] = []
 
@@ -109,6 +112,34 @@ class DeferredMapping:
             self._closing.process(map_, keyframe, features, image)
         return observed
 
+    def begin(self, start: Start, second: FirstView) -> tuple[NDArray[np.int32], Matrix]:
+        """Add the first two keyframes of a monocular map or sub-map. Merge first.
+
+        Returns:
+            The landmarks that the second view's features observe, and where they are.
+        """
+        self._write_counts()
+        map_, views = self.map, (start.first, second)
+        one, two = map_two_views(
+            map_,
+            (views[0].frame.features, views[1].frame.features),
+            start.features,
+            start.first.frame.T_cw,
+            start.T_2_1,
+            start.points,
+            (views[0].timestamp, views[1].timestamp),
+            (views[0].index, views[1].index),
+        )
+        if one > 0:
+            map_.parents[one] = self.reference
+            map_.restarts.append(one)
+        map_.parents[two] = one
+        for keyframe, view in zip((one, two), views, strict=True):
+            self._closing.process(map_, keyframe, view.frame.features, view.image)
+        self.reference = two
+        self._copy_view()
+        return self.current(map_.arrays.landmark[map_.rows(two)])
+
     def merge(self) -> bool:
         """Wait for the pending mapping and show its result; returns whether there was one."""
         if self._pending is None:
@@ -139,6 +170,14 @@ class DeferredMapping:
                 raise RuntimeError("a keyframe is being mapped: merge before reading other poses")
             return self._T_reference
         return self.map.keyframe_pose(keyframe)
+
+    def rescaled(self, keyframe: int) -> float:
+        """``Map.rescaled`` of a keyframe; while one is being mapped, of the reference only."""
+        if self.busy:
+            if keyframe != self.reference:
+                raise RuntimeError("a keyframe is being mapped: merge before reading its scale")
+            return self._rescaled_reference
+        return self.map.rescaled[keyframe]
 
     def current(self, landmark: NDArray[np.int32]) -> tuple[NDArray[np.int32], Matrix]:
         """What ``(N,)`` landmark ids stand for after a merge, and where that is: ``(N,)`` ids and
@@ -183,6 +222,11 @@ class DeferredMapping:
     def _copy_view(self) -> None:
         self.local = local_map(self.map, self.reference, self._config.tracking.local_keyframes)
         self.reference_view = local_map(self.map, self.reference, 1)
-        needed = min(3, len(self.map.living_keyframes()))
+        living = self.map.living_keyframes()
+        if self._camera.monocular and self.map.restarts:
+            # A sub-map is young once more: without stereo nothing but this tells when to go on.
+            living = living[living >= self.map.restarts[-1]]
+        needed = min(3, len(living))
         self.n_reference = count_seen_by(self.map.arrays, self.reference, needed)
         self._T_reference = self.map.keyframe_pose(self.reference)
+        self._rescaled_reference = self.map.rescaled[self.reference]

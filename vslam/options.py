@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from vslam.errors import InputError
 
-SENSORS = {"stereo": True, "mono": False, "rgbd": False}
+SENSORS = {"stereo": True, "mono": True, "rgbd": False}
 
 
 def require_built(option: str, value: str, known: dict[str, bool]) -> None:

@@ -59,10 +59,14 @@ class Perturbation:
     name: str
     laws: tuple[Law, ...] = ()
 
-    def apply(self, index: int, left: Image, right: Image) -> tuple[Image, Image]:
-        """Perturb both ``(H, W)`` uint8 images of frame ``index``; safe in several threads."""
+    def apply(self, index: int, left: Image, right: Image | None) -> tuple[Image, Image | None]:
+        """Perturb both ``(H, W)`` uint8 images of frame ``index``; safe in several threads.
+
+        The left one becomes the same with and without a right one.
+        """
         for law in self.laws:
-            left, right = law(index, 0, left), law(index, 1, right)
+            left = law(index, 0, left)
+            right = None if right is None else law(index, 1, right)
         return left, right
 
 
@@ -122,6 +126,7 @@ def contact_sheet(
             [
                 cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
                 for image in (left, *perturbation.apply(index, left, right))
+                if image is not None
             ]
         )
         label = f"frame {index}, {sequence.timestamps[index]:.1f} s"

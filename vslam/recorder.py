@@ -178,7 +178,7 @@ class RerunRecorder:
             principal_point=list(_half(np.array([camera.cx, camera.cy]))),
             resolution=[round(s * camera.width), round(s * camera.height)],
             camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=4.0 * camera.baseline,
+            image_plane_distance=4.0 * (camera.baseline or 0.5),
         )
         log("world/camera/image", pinhole)
         for name, color, radius in (("tracked", _GREEN, -2.0), ("untracked", _GREY, -1.0)):

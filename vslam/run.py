@@ -33,6 +33,11 @@ class RunSettings:
     config: Config
     weights: Path | None = None
 
+    @property
+    def alignment(self) -> str:
+        """What is fitted before a trajectory is compared: a monocular one has no scale."""
+        return "sim3" if self.sensor == "mono" else "se3"
+
 
 @dataclass(frozen=True)
 class RunOutcome:

@@ -92,7 +92,7 @@ def write_results(
         evaluation, remark = None, "no ground truth"
         if (ground_truth := matched_ground_truth(outcome)) is not None:
             try:
-                evaluation = evaluate(outcome.trajectory, ground_truth)
+                evaluation = evaluate(outcome.trajectory, ground_truth, outcome.settings.alignment)
             except InputError as error:  # a clip too short to align is no reason to lose the run
                 remark = str(error)
         write_report(outcome, evaluation, folder)

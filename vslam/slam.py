@@ -1,4 +1,4 @@
-"""SLAM on a stereo stream: ``Slam.step`` is the method section."""
+"""SLAM on a stereo or monocular stream: ``Slam.step`` is the method section."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ from vslam.camera import StereoCamera
 from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.features import FeatureGrid, Features, TrackingState, TrackResult
-from vslam.frontend.keyframes import KeyframeEvidence, needs_keyframe
+from vslam.frontend.keyframes import (
+    KeyframeEvidence,
+    needs_keyframe,
+    needs_monocular_keyframe,
+)
 from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracking import (
     Frame,
@@ -28,6 +32,7 @@ from vslam.loopclosure.detector import LoopDetector, NoDetector
 from vslam.loops import Closure, LoopEdge
 from vslam.map import Map, local_map
 from vslam.mapping import DeferredMapping
+from vslam.monocular import FirstView, Initialiser, Start
 from vslam.trajectory import Trajectory, bridge_gaps
 
 Matrix = NDArray[np.float64]
@@ -35,16 +40,20 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _Placed:
-    """Where a frame is: relative to a keyframe, so that it follows when that one moves."""
+    """Where a frame is: relative to a keyframe, so that it follows when that one moves.
+
+    ``rescaled`` is what ``Map.rescaled`` was for the keyframe: the unit of ``T_c_reference``.
+    """
 
     timestamp: float
     reference: int
     T_c_reference: Matrix
     tracked: bool
+    rescaled: float = 1.0
 
 
 class Slam:
-    """Stereo SLAM.
+    """Stereo SLAM; monocular SLAM, in a unit of its own, with a camera without a baseline.
 
     >>> slam = Slam(camera)
     >>> for left, right, timestamp in frames:
@@ -66,7 +75,7 @@ class Slam:
     ) -> None:
         """
         Args:
-            camera: the rectified pair that the images come from.
+            camera: the rectified pair that the images come from, or ``camera.left_eye()``.
             config: thresholds; the defaults are those of the papers.
             detector: finds loops and relocalises (``vslam.detectors``); without one there is
                 odometry only.
@@ -86,6 +95,7 @@ class Slam:
         self._tracked = 0  # index of ``frame`` in _placed
         self._velocity: Matrix | None = None  # twist per second, None if unknown
         self._lost_frames = 0
+        self._initialiser = Initialiser(self.tracker)  # of monocular maps
         self._image: NDArray[np.uint8] | None = None  # left image of the frame in work
 
     @property
@@ -109,23 +119,28 @@ class Slam:
         return self._closing.closures
 
     def step(
-        self, left: NDArray[np.uint8], right: NDArray[np.uint8], timestamp: float
+        self, left: NDArray[np.uint8], right: NDArray[np.uint8] | None, timestamp: float
     ) -> TrackResult:
-        """Track one rectified stereo pair and map it if it is new.
+        """Track one rectified stereo pair, or a monocular image, and map it if it is new.
 
         Args:
-            left, right: ``(H, W)`` uint8.
+            left, right: ``(H, W)`` uint8; right is None for a monocular camera, and only then.
             timestamp: seconds, later than that of the last call.
 
         Raises:
             ValueError: images of another size than the camera's, not of bytes, or a timestamp that
                 goes back.
         """
+        if (right is None) != self.camera.monocular:
+            raise ValueError("a right image belongs to a stereo camera, and to no monocular one")
         expected = (self.camera.height, self.camera.width)
-        if left.shape != expected or right.shape != expected:
-            raise ValueError(f"images are {left.shape} and {right.shape}, the camera's {expected}")
-        if left.dtype != np.uint8 or right.dtype != np.uint8:
-            raise ValueError(f"images are of {left.dtype} and {right.dtype}, not of uint8")
+        images = [left] if right is None else [left, right]
+        if any(image.shape != expected for image in images):
+            shapes = " and ".join(str(image.shape) for image in images)
+            raise ValueError(f"images are {shapes}, the camera's {expected}")
+        if any(image.dtype != np.uint8 for image in images):
+            types = " and ".join(str(image.dtype) for image in images)
+            raise ValueError(f"images are of {types}, not of uint8")
         start = time.perf_counter()
         features = extract_features(left, right, self.tracker)
         stage_ms = {"extract": 1e3 * (time.perf_counter() - start)}
@@ -276,6 +291,7 @@ class Slam:
         """Place the frame; the velocity is that since the last frame tracked."""
         before = self._placed[self._tracked]
         step = se3_log(orthonormalised(frame.T_cw @ inverse(self._pose_of(before))))
+        self._initialiser.reset()
         # A leap to where the camera was found again is no motion.
         self._velocity = None if relocalised else step / (timestamp - before.timestamp)
         self._lost_frames = 0
@@ -295,31 +311,74 @@ class Slam:
         frame.T_cw = T_cw
         self._place(timestamp, T_cw, tracked=False)
         self._lost_frames += 1
-        restart = (
-            self._lost_frames >= self.config.tracking.lost_frames_before_restart
-            and self._can_start(frame)
-        )
-        if restart:
-            frame.landmark[:] = -1
-            self._insert_keyframe(frame)
-            self._velocity = None
-            self._lost_frames = 0
-            self._keep(frame)
-        return self._result(frame, TrackingState.LOST, matches, inliers, restart, clock)
+        restarted = self._restart(frame)
+        return self._result(frame, TrackingState.LOST, matches, inliers, restarted, clock)
+
+    def _restart(self, frame: Frame) -> bool:
+        """Begin a sub-map at the frame placed last if the camera has been lost for long."""
+        config = self.config.tracking
+        if self.camera.monocular:
+            long = self._lost_frames >= config.monocular_lost_frames
+            return long and self._start_monocular(frame)
+        if self._lost_frames < config.lost_frames_before_restart or not self._can_start(frame):
+            return False
+        frame.landmark[:] = -1
+        self._insert_keyframe(frame)
+        self._velocity = None
+        self._lost_frames = 0
+        self._keep(frame)
+        return True
 
     # Mapping
 
     def _start(self, frame: Frame, timestamp: float, clock: _Clock) -> TrackResult:
-        """The first keyframe is the world, its stereo points the first landmarks."""
+        """The first keyframe is the world, its stereo points the first landmarks; a monocular
+        map begins with two keyframes."""
         self._place(timestamp, frame.T_cw, tracked=False)
-        started = self._can_start(frame)
-        if started:
+        if self.camera.monocular:
+            started = self._start_monocular(frame)
+        elif started := self._can_start(frame):
             self._insert_keyframe(frame)
             self._keep(frame)
         inliers = int(np.count_nonzero(frame.landmark >= 0))
         state = TrackingState.OK if started else TrackingState.LOST
         clock.lap("keyframe")
         return self._result(frame, state, inliers, inliers, started, clock)
+
+    def _start_monocular(self, frame: Frame) -> bool:
+        """Begin a map, or a sub-map where tracking was lost, if an earlier frame forms a pair with
+        this one, the frame placed last."""
+        placed, index = self._placed[-1], len(self._placed) - 1
+        second = FirstView(frame, placed.timestamp, index, self._image)
+        start = self._initialiser.offer(second)
+        if start is None:
+            return False
+        self._merge()
+        start = self._with_speed(start, second.timestamp)
+        frame.T_cw = start.T_2_1 @ start.first.frame.T_cw
+        frame.landmark, frame.xyz = self._mapping.begin(start, second)
+        reference = self._mapping.reference
+        for keyframe, view in ((reference - 1, start.first), (reference, second)):
+            self._placed[view.index] = _Placed(
+                view.timestamp, keyframe, np.eye(4), True, self._mapping.rescaled(keyframe)
+            )
+        frame.T_cw = self._pose_of(self._placed[-1])
+        self._velocity = se3_log(start.T_2_1) / (second.timestamp - start.first.timestamp)
+        self._lost_frames = 0
+        self._initialiser.reset()
+        self._keep(frame)
+        return True
+
+    def _with_speed(self, start: Start, timestamp: float) -> Start:
+        """A sub-map's start in the unit of the map before it, as far as anything tells: the camera
+        drives on as fast as it did."""
+        if self._velocity is None:
+            return start
+        elapsed = timestamp - start.first.timestamp
+        moved = np.linalg.norm(self._velocity[:3]) * elapsed
+        factor = float(moved / np.linalg.norm(start.T_2_1[:3, 3]))
+        limit = self.config.initialization.max_rescaling
+        return start.scaled(factor) if 1.0 / limit < factor < limit else start
 
     def _can_start(self, frame: Frame) -> bool:
         n_stereo = int(np.count_nonzero(np.isfinite(frame.features.u_right)))
@@ -336,6 +395,8 @@ class Slam:
             untracked_close=int(np.count_nonzero(close & ~tracked)),
             mapping_idle=not self._mapping.busy,
         )
+        if self.camera.monocular:
+            return needs_monocular_keyframe(evidence, self.config.keyframes)
         return needs_keyframe(evidence, self.config.keyframes)
 
     def _insert_keyframe(self, frame: Frame) -> None:
@@ -345,7 +406,10 @@ class Slam:
         frame.landmark, frame.xyz = self._mapping.insert(
             frame.features, frame.landmark, frame.T_cw, timestamp, index, self._image
         )
-        self._placed[-1] = _Placed(timestamp, self._mapping.reference, np.eye(4), True)
+        reference = self._mapping.reference
+        self._placed[-1] = _Placed(
+            timestamp, reference, np.eye(4), True, self._mapping.rescaled(reference)
+        )
 
     def _mapping_is_due(self) -> bool:
         if not self._mapping.busy:
@@ -358,12 +422,18 @@ class Slam:
 
         ``current`` is the frame placed last, if it is not ``self.frame`` yet.
         """
+        reference, unit = self._mapping.reference, self._mapping_unit()
         if not self._mapping.merge():
             return
+        if self._velocity is not None and self._mapping.rescaled(reference) != unit:
+            self._velocity[:3] *= self._mapping.rescaled(reference) / unit
         self._follow_map(self.frame)
         if current is not None and current is not self.frame:
             current.landmark, current.xyz = self._mapping.current(current.landmark)
             current.T_cw = self._pose_of(self._placed[-1])
+
+    def _mapping_unit(self) -> float:
+        return self._mapping.rescaled(self._mapping.reference) if self.map.n_keyframes else 1.0
 
     def _follow_map(self, frame: Frame | None) -> None:
         """Bring the frame tracked last to where the map has moved."""
@@ -379,13 +449,18 @@ class Slam:
         reference = self._mapping.reference
         T_rw = self._mapping.keyframe_pose(reference) if self.map.n_keyframes else np.eye(4)
         relative = orthonormalised(T_cw @ inverse(T_rw))
-        self._placed.append(_Placed(timestamp, reference, relative, tracked))
+        self._placed.append(_Placed(timestamp, reference, relative, tracked, self._mapping_unit()))
 
     def _pose_of(self, placed: _Placed) -> Matrix:
         """``T_cw`` of a placed frame."""
         if self.map.n_keyframes == 0:
             return placed.T_c_reference
-        return placed.T_c_reference @ self._mapping.keyframe_pose(placed.reference)
+        T_c_reference = placed.T_c_reference
+        unit = self._mapping.rescaled(placed.reference)
+        if unit != placed.rescaled:
+            T_c_reference = T_c_reference.copy()
+            T_c_reference[:3, 3] *= unit / placed.rescaled
+        return T_c_reference @ self._mapping.keyframe_pose(placed.reference)
 
     def _result(
         self,

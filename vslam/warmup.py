@@ -14,6 +14,8 @@ Which one is shorter:
         time NUMBA_CACHE_DIR=$(mktemp -d) python -m vslam.warmup $half
     done
 
+Monocular runs call no others: their two views and similarities are NumPy's work.
+
 A kernel that both need is compiled by whoever comes to it first. Both must call it with the same
 types: for one signature two writers of Numba's cache cannot harm each other, for two they can.
 """

@@ -32,7 +32,7 @@ class KittiSequence:
         timestamps: ``(N,)`` float64 seconds since the first frame of the whole sequence.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` or None; the world is the first left camera
             of the whole sequence.
-        left, right: N image files each, of equal stems.
+        left, right: N image files each, of equal stems; right is empty for the left eye alone.
     """
 
     name: str
@@ -49,13 +49,15 @@ class KittiSequence:
     def __len__(self) -> int:
         return len(self.left)
 
-    def read(self, index: int) -> tuple[Image, Image]:
-        """Left and right image ``(H, W)`` uint8 of one frame. Safe to call from several threads.
+    def read(self, index: int) -> tuple[Image, Image | None]:
+        """Left and right image ``(H, W)`` uint8 of one frame, None for the right one where the left
+        eye is read alone. Safe to call from several threads.
 
         Raises:
             UnreadableImageError: a file is missing, damaged or not of the calibrated size.
         """
-        return self._read(self.left[index]), self._read(self.right[index])
+        left = self._read(self.left[index])
+        return left, self._read(self.right[index]) if self.right else None
 
     def _read(self, path: Path) -> Image:
         image = _decode(path)
@@ -70,7 +72,13 @@ class KittiSequence:
 
 
 def open_kitti(
-    root: Path, name: str, *, start: int = 0, every: int = 1, max_frames: int | None = None
+    root: Path,
+    name: str,
+    *,
+    start: int = 0,
+    every: int = 1,
+    max_frames: int | None = None,
+    monocular: bool = False,
 ) -> KittiSequence:
     """Open a sequence; only the selected frames must be complete.
 
@@ -85,6 +93,7 @@ def open_kitti(
         start: first frame, counted over the images present.
         every: take every N-th frame.
         max_frames: at most so many, None for all.
+        monocular: read the left eye alone; the right one's images need not be there.
 
     Raises:
         InputError: data missing, images unequal or empty, calibration, times or poses unusable.
@@ -92,14 +101,14 @@ def open_kitti(
     """
     base = _find_root(root)
     folder = _find_sequence(base, name)
-    eyes = [_list_images(folder / "image_0"), _list_images(folder / "image_1")]
-    stems = sorted(eyes[0].keys() | eyes[1].keys(), key=_by_number)
+    eyes = [_list_images(folder / f"image_{eye}") for eye in range(1 if monocular else 2)]
+    stems = sorted(set().union(*eyes), key=_by_number)
     chosen = _select(folder, len(stems), start, every, max_frames)
-    rows = _check_pairs(folder, eyes, [stems[k] for k in chosen])
-    left, right = zip(*rows, strict=True)
+    rows = _check_frames(folder, eyes, [stems[k] for k in chosen])
+    left, *right = zip(*rows, strict=True)
 
     sizes = [_decode(path).shape for path in rows[0]]
-    if sizes[0] != sizes[1]:
+    if not monocular and sizes[0] != sizes[1]:
         raise UnreadableImageError(
             rows[0][1],
             f"{_size(sizes[1])} pixels but the left image has {_size(sizes[0])}; "
@@ -107,13 +116,14 @@ def open_kitti(
         )
     times = _read_times(folder / "times.txt")
     frames = _row_numbers(folder / "times.txt", stems, len(times))[chosen]
+    camera = read_calibration(folder / "calib.txt", width=sizes[0][1], height=sizes[0][0])
     return KittiSequence(
         name=name,
-        camera=read_calibration(folder / "calib.txt", width=sizes[0][1], height=sizes[0][0]),
+        camera=camera.left_eye() if monocular else camera,
         timestamps=times[frames],
         ground_truth=_read_ground_truth(base / "poses" / f"{name}.txt", stems, len(times), chosen),
         left=left,
-        right=right,
+        right=() if monocular else right[0],
     )
 
 
@@ -221,16 +231,17 @@ def _select(
     return np.arange(start, n, every)[:max_frames]
 
 
-def _check_pairs(
+def _check_frames(
     folder: Path, eyes: list[dict[str, Path]], stems: list[str]
-) -> list[tuple[Path, Path]]:
+) -> list[tuple[Path, ...]]:
     for eye, images in enumerate(eyes):
         if not images:
+            instead = ", or run on the left eye alone with --sensor mono" if eye else ""
             raise InputError(
                 f"{folder}/image_{eye}: no images of the {('left', 'right')[eye]} eye; stereo "
-                f"needs both, download the grayscale images (22 GB) from {_HOME}."
+                f"needs both, download the grayscale images (22 GB) from {_HOME}{instead}."
             )
-    complete = [stem in eyes[0] and stem in eyes[1] for stem in stems]
+    complete = [all(stem in eye for eye in eyes) for stem in stems]
     if not all(complete):
         first = complete.index(False)
         eye = 0 if stems[first] not in eyes[0] else 1
@@ -241,11 +252,11 @@ def _check_pairs(
             f"{folder}: unequal counts, {len(eyes[0])} left and {len(eyes[1])} right images of "
             f"which {len(eyes[0].keys() & eyes[1].keys())} frames have both; {fix}."
         )
-    pairs = [(eyes[0][stem], eyes[1][stem]) for stem in stems]
-    for path in (path for pair in pairs for path in pair):
+    frames = [tuple(eye[stem] for eye in eyes) for stem in stems]
+    for path in (path for frame in frames for path in frame):
         if _is_empty(path):
             raise UnreadableImageError(path, "the file is empty; download it again.")
-    return pairs
+    return frames
 
 
 def _is_empty(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""What the pipeline needs of a data set: calibrated, timed stereo pairs."""
+"""What the pipeline needs of a data set: calibrated, timed stereo pairs, or the left eye alone."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ Image = NDArray[np.uint8]
 
 
 class Sequence(Protocol):
-    """A rectified stereo sequence. Readers check everything but pixels before the first frame.
+    """A rectified stereo sequence, or its left eye. Readers check everything but pixels before the
+    first frame.
 
     Attributes:
         dataset: name of the data set, ``kitti`` for example.
         name: name of the sequence in it, ``00`` for example.
-        camera: calibration of this sequence.
+        camera: calibration of this sequence; ``camera.monocular`` where there is a left eye only.
         timestamps: ``(N,)`` float64 seconds, strictly increasing.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` or None.
     """
@@ -37,8 +38,9 @@ class Sequence(Protocol):
 
     def __len__(self) -> int: ...
 
-    def read(self, index: int) -> tuple[Image, Image]:
-        """Left and right image ``(H, W)`` uint8 of one frame. Safe to call from several threads.
+    def read(self, index: int) -> tuple[Image, Image | None]:
+        """Left and right image ``(H, W)`` uint8 of one frame, None for a monocular camera's right
+        one. Safe to call from several threads.
 
         Raises:
             UnreadableImageError: a file is damaged or of another size than the calibration.
@@ -77,5 +79,5 @@ class SequenceView:
     def __len__(self) -> int:
         return len(self.indices)
 
-    def read(self, index: int) -> tuple[Image, Image]:
+    def read(self, index: int) -> tuple[Image, Image | None]:
         return self.base.read(int(self.indices[index]))

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 _ALIGNMENTS = {
     "se3": "SE3 alignment, no scale",
-    "sim3": "Sim3 alignment, scale fitted",
+    "sim3": "Sim3 alignment, since the scale is arbitrary",
     "none": "not aligned",
 }
 

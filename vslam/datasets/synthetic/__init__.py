@@ -66,6 +66,7 @@ def open_synthetic(
     start: int = 0,
     every: int = 1,
     max_frames: int | None = None,
+    monocular: bool = False,
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> SyntheticSequence:
@@ -89,5 +90,7 @@ def open_synthetic(
         threads=threads,
         on_frame=on_frame,
     )
-    found = open_kitti(root, route_name, start=start, every=every, max_frames=max_frames)
+    found = open_kitti(
+        root, route_name, start=start, every=every, max_frames=max_frames, monocular=monocular
+    )
     return SyntheticSequence(**vars(replace(found, name=name)))

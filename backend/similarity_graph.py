@@ -1,0 +1,154 @@
+"""The pose graph of a monocular map: scale drifts too, and a loop says by how much (ORB-SLAM, T-RO
+2015, VII-C; Strasdat et al., "Scale drift-aware large scale monocular SLAM", RSS 2010).
+
+Each keyframe has a similarity ``S_wc``, ``(4, 4)`` with the scale in its upper left 3x3 block, so
+that similarities are composed by ``@``. It maps points of the camera, in the unit that the map has
+around it before the correction, to the world. At the start all scales are 1; a loop alone measures
+another one. GTSAM optimises, from its built-in Similarity3 factors.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.backend.loop_correction import carry_landmarks_by
+from vslam.backend.pose_graph import HOLD, LOOP, WEAK, Consistency, PoseGraph, judge
+from vslam.config import PoseGraphConfig
+from vslam.geometry import inverses, se3_log
+from vslam.loops import LoopEdge
+from vslam.map import Map
+from vslam.observations import refresh_landmarks
+
+Matrix = NDArray[np.float64]
+
+
+def similarity(T_a_b: Matrix, scale: NDArray[np.float64] | float) -> Matrix:
+    """``(..., 4, 4)`` similarities of rigid motions and their scales ``(...,)``."""
+    S = T_a_b.copy()
+    S[..., :3, :3] *= np.asarray(scale)[..., None, None]
+    return S
+
+
+def scale_of(S: Matrix) -> NDArray[np.float64]:
+    """Scales ``(...,)`` of similarities ``(..., 4, 4)``."""
+    return np.cbrt(np.linalg.det(S[..., :3, :3]))
+
+
+def rigid(S: Matrix) -> Matrix:
+    """Similarities ``(..., 4, 4)`` without their scale: where the cameras are."""
+    return similarity(S, 1.0 / scale_of(S))
+
+
+def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> Matrix:
+    """Similarities ``(N, 4, 4)`` that agree best with the edges, from ``S_wc``.
+
+    Losses and method are those of ``pose_graph.optimise``; keyframes held keep their scale too.
+    """
+    import gtsam
+
+    noise = gtsam.noiseModel
+
+    def as_gtsam(S: Matrix) -> gtsam.Similarity3:
+        s = float(scale_of(S))  # GTSAM: s (R p + t)
+        return gtsam.Similarity3(S[:3, :3] / s, S[:3, 3] / s, s)
+
+    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    hold = noise.Isotropic.Sigma(7, HOLD)
+    for i, S in enumerate(S_wc):
+        pose = as_gtsam(S)
+        start.insert(i, pose)
+        if graph.fixed[i]:
+            factors.add(gtsam.PriorFactorSimilarity3(i, pose, hold))
+    cauchy = noise.mEstimator.Cauchy.Create(config.robust_scale)
+    measured = similarity(graph.T_i_j, graph.scale)
+    for (i, j), S_i_j, kind, sigma in zip(
+        graph.edges.tolist(), measured, graph.kind.tolist(), sigmas(graph, config), strict=True
+    ):
+        plain = noise.Diagonal.Sigmas(sigma)
+        model = noise.Robust.Create(cauchy, plain) if kind == LOOP else plain
+        factors.add(gtsam.BetweenFactorSimilarity3(i, j, as_gtsam(S_i_j), model))
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(config.iterations)
+    parameters.setRelativeErrorTol(1e-5)
+    result = gtsam.LevenbergMarquardtOptimizer(factors, start, parameters).optimize()
+    found = [result.atSimilarity3(i) for i in range(len(S_wc))]
+    R = np.array([pose.rotation().matrix() for pose in found])
+    t = np.array([pose.translation() for pose in found])
+    s = np.array([pose.scale() for pose in found])
+    S_wc = S_wc.copy()
+    free = ~graph.fixed
+    S_wc[free, :3, :3] = (s[:, None, None] * R)[free]
+    S_wc[free, :3, 3] = (s[:, None] * t)[free]
+    return S_wc
+
+
+def sigmas(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
+    """Standard deviations ``(E, 7)``: rotation, translation and the logarithm of the scale.
+
+    Scale drifts as the rest does, by a random walk over the path.
+    """
+    scale = graph.sigmas[:, 1] * (config.scale_drift / config.rotation_drift)
+    scale[graph.kind == LOOP] = config.loop_scale
+    scale[graph.kind == WEAK] = config.weak_scale
+    return np.column_stack([np.repeat(graph.sigmas[:, ::-1], 3, axis=1), scale])
+
+
+def similarity_consistency(
+    graph: PoseGraph, S_wc_before: Matrix, S_wc: Matrix, config: PoseGraphConfig
+) -> Consistency:
+    """``pose_graph.consistency`` for similarities before and after optimisation."""
+    before, after = (edge_errors(graph, S, config) for S in (S_wc_before, S_wc))
+    return judge(graph, before, after, config)
+
+
+def edge_errors(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> NDArray[np.float64]:
+    """Chi-square of each edge, ``(E,)``: rotation, translation and scale of its residual."""
+    i, j = graph.edges.T
+    S_i_j = np.linalg.inv(S_wc[i]) @ S_wc[j]
+    residual = np.linalg.inv(similarity(graph.T_i_j, graph.scale)) @ S_i_j
+    twist = np.array([se3_log(T) for T in rigid(residual)]).reshape(-1, 6)
+    error = np.column_stack([twist[:, 3:], twist[:, :3], np.log(scale_of(residual))])
+    return ((error / sigmas(graph, config)) ** 2).sum(axis=1)
+
+
+def move_keyframes_similarly(
+    map_: Map, keyframes: NDArray[np.integer], S_wc: Matrix
+) -> NDArray[np.float64]:
+    """Move keyframes and take each landmark along with its anchor, growing or shrinking what is
+    around it (ORB-SLAM, VII-C).
+
+    Culled keyframes follow the living ones they are placed by; ``map_.rescaled`` keeps account.
+
+    Args:
+        keyframes: ``(N,)`` ids of living keyframes; S_wc: ``(N, 4, 4)`` their similarities.
+
+    Returns:
+        ``(n_keyframes,)`` by what the unit around each keyframe was multiplied.
+    """
+    a, n = map_.arrays, map_.n_keyframes
+    motion = np.zeros((n, 4, 4))
+    motion[keyframes] = S_wc @ a.T_cw[keyframes]  # what is fixed to a keyframe, world to world
+    moved = np.zeros(n, np.bool_)
+    moved[keyframes] = True
+    a.T_cw[keyframes] = inverses(rigid(S_wc))
+    carry_landmarks_by(map_, motion, moved)
+    growth = np.ones(n)
+    growth[keyframes] = scale_of(S_wc)
+    for k in np.flatnonzero(~a.keyframe_alive[:n]).tolist():
+        growth[k] = growth[map_.parents[k]]
+        map_.T_c_parent[k] = map_.T_c_parent[k].copy()
+        map_.T_c_parent[k][:3, 3] *= growth[k]
+    for k in range(n):
+        map_.rescaled[k] *= float(growth[k])
+    refresh_landmarks(a, map_.living_landmarks().astype(np.int32), map_.scales)
+    return growth
+
+
+def rescaled_loop(edge: LoopEdge, growth: NDArray[np.float64]) -> LoopEdge:
+    """A loop in the units after a correction that multiplied those of its ends by ``growth``."""
+    assert edge.T_query_match is not None
+    T = edge.T_query_match.copy()
+    T[:3, 3] *= growth[edge.match]
+    scale = edge.scale * float(growth[edge.query] / growth[edge.match])
+    return LoopEdge(**(vars(edge) | {"T_query_match": T, "scale": scale}))

@@ -1,0 +1,338 @@
+"""The first two views of a monocular map: their motion and their points (ORB-SLAM, section IV).
+
+A plane, or a camera that only turns, leaves the fundamental matrix undetermined; any other scene is
+not explained by a homography. Both are fitted to the same draws and the score says which one to
+believe. What follows is only accepted if one motion stands out: a map that began wrong cannot be
+mended.
+
+Draws are fitted and judged all at once, in batches: NumPy is as fast here as a kernel would be,
+and has nothing to compile.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import CHI2_MONO, StereoCamera
+from vslam.config import InitializationConfig
+from vslam.frontend.matching import consistent_orientation, search_windows
+from vslam.frontend.tracking import Frame, Tracker
+
+Matrix = NDArray[np.float64]
+CHI2_LINE = 3.841  # 95 % quantile with 1 degree of freedom: a point's distance from a line
+SAMPLE = 8  # matches of a draw: what the eight-point algorithm needs; the homography has four over
+# Points with less parallax than this (0.36 degrees) are counted, but not mapped (ORB-SLAM).
+MAX_COSINE = 0.99998
+
+
+@dataclass(frozen=True)
+class TwoViewModel:
+    """The model that explains N matches of two views.
+
+    Attributes:
+        kind: which one was selected.
+        matrix: ``(3, 3)``; a homography takes pixels of view 1 to view 2, a fundamental matrix
+            them to epipolar lines of view 2.
+        inlier: ``(N,)`` bool, matches that it explains.
+        homography_share: ``S_H / (S_H + S_F)``, what the selection goes by.
+    """
+
+    kind: Literal["homography", "fundamental"]
+    matrix: Matrix
+    inlier: NDArray[np.bool_]
+    homography_share: float
+
+
+@dataclass(frozen=True)
+class TwoViews:
+    """Two views and what both of them see.
+
+    Attributes:
+        T_2_1: ``(4, 4)`` motion from view 1 to view 2, its translation of length 1.
+        match: ``(M,)`` int64, the matches that were triangulated.
+        points: ``(M, 3)`` in the frame of camera 1.
+    """
+
+    T_2_1: Matrix
+    match: NDArray[np.int64]
+    points: Matrix
+
+
+def match_views(
+    one: Frame, two: Frame, tracker: Tracker
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Features of two frames ``(N,)`` each that look alike and lie not far apart."""
+    config, before, now = tracker.config.initialization, one.features, two.features
+    n = len(before)
+    octave = before.octave.astype(np.int64)
+    found, _ = search_windows(
+        np.column_stack([before.xy, np.zeros(n)]).astype(np.float64),
+        np.full(n, config.window),
+        octave,
+        octave,
+        before.descriptors.view(np.uint64),
+        now.xy,
+        now.octave,
+        now.u_right,
+        now.descriptors.view(np.uint64),
+        np.ones(len(now), np.bool_),
+        two.grid.start,
+        two.grid.items,
+        two.grid.columns,
+        config.match_distance,
+        config.match_ratio,
+    )
+    first = np.flatnonzero(found >= 0)
+    second = found[first].astype(np.int64)
+    if len(first):
+        keep = consistent_orientation(before.angle[first], now.angle[second])
+        first, second = first[keep], second[keep]
+    return first, second
+
+
+def reconstruct(
+    xy_1: Matrix,
+    xy_2: Matrix,
+    sigma: Matrix,
+    camera: StereoCamera,
+    config: InitializationConfig,
+    *,
+    seed: int,
+) -> TwoViews | None:
+    """Motion and points of two views, None where they do not tell one motion from another.
+
+    Args:
+        xy_1, xy_2: ``(N, 2)`` matched pixels.
+        sigma: ``(N,)`` their standard deviation, pixels.
+        seed: of the draws; the same seed gives the same result.
+    """
+    if len(xy_1) < SAMPLE:
+        return None
+    model = select_model(xy_1, xy_2, sigma, config, seed=seed)
+    K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    if model.kind == "homography":
+        motions = motions_of_homography(np.linalg.inv(K) @ model.matrix @ K)
+    else:
+        motions = motions_of_essential(K.T @ model.matrix @ K)
+    match = np.flatnonzero(model.inlier)
+    if not motions:
+        return None
+    views = [
+        _triangulate(T, xy_1[match], xy_2[match], sigma[match], camera, config) for T in motions
+    ]
+    counts = np.array([np.count_nonzero(good) for _, good, _ in views])
+    best = int(np.argmax(counts))
+    rival = int(np.sort(counts)[-2])
+    points, good, cosine = views[best]
+    # The angle that at least min_points have.
+    widest = np.sort(cosine[good])[: config.min_points]
+    if (
+        counts[best] < max(config.min_points, config.min_point_share * len(match))
+        or rival > config.max_rival_share * counts[best]
+        or widest[-1] > np.cos(np.radians(config.min_parallax_deg))
+    ):
+        return None
+    kept = good & (cosine < MAX_COSINE)
+    return TwoViews(motions[best], match[kept], points[kept])
+
+
+def select_model(
+    xy_1: Matrix, xy_2: Matrix, sigma: Matrix, config: InitializationConfig, *, seed: int
+) -> TwoViewModel:
+    """Homography or fundamental matrix, whichever the scores ask for (ORB-SLAM, IV, steps 2, 3).
+
+    Args:
+        xy_1, xy_2: ``(N, 2)`` matched pixels, N at least 8; sigma: ``(N,)`` pixels.
+    """
+    n = len(xy_1)
+    x_1, N_1 = normalised(xy_1)
+    x_2, N_2 = normalised(xy_2)
+    rng = np.random.default_rng(seed)
+    drawn = np.argpartition(rng.random((config.draws, n)), SAMPLE - 1, axis=1)[:, :SAMPLE]
+    N_2_inverse = np.linalg.inv(N_2)
+
+    def homographies(chosen: NDArray[np.integer]) -> Matrix:
+        return N_2_inverse @ fit_homographies(x_1[chosen], x_2[chosen]) @ N_1
+
+    def fundamentals(chosen: NDArray[np.integer]) -> Matrix:
+        return N_2.T @ fit_fundamentals(x_1[chosen], x_2[chosen]) @ N_1
+
+    found = []
+    for fit, judge in ((homographies, judge_homographies), (fundamentals, judge_fundamentals)):
+        models = fit(drawn)
+        scores, inlier = judge(models, xy_1, xy_2, sigma)
+        best = int(np.argmax(scores))
+        M, score, explained = models[best], float(scores[best]), inlier[best]
+        # Fitted to all that it explains, a model explains more.
+        while np.count_nonzero(explained) >= SAMPLE:
+            refit = fit(np.flatnonzero(explained)[None])
+            scores, inlier = judge(refit, xy_1, xy_2, sigma)
+            if scores[0] <= score:
+                break
+            M, score, explained = refit[0], float(scores[0]), inlier[0]
+        found.append((M, score, explained))
+    (H, score_H, inlier_H), (F, score_F, inlier_F) = found
+    total = score_H + score_F
+    share = score_H / total if total > 0.0 else 0.0
+    if share > config.homography_share:
+        return TwoViewModel("homography", H, inlier_H, share)
+    return TwoViewModel("fundamental", F, inlier_F, share)
+
+
+def normalised(xy: Matrix) -> tuple[Matrix, Matrix]:
+    """``(N, 2)`` points moved to their mean and scaled to a mean distance of root 2, and the
+    ``(3, 3)`` matrix that does it (Hartley, "In defense of the eight-point algorithm", PAMI 1997).
+    """
+    centre = xy.mean(axis=0)
+    spread = np.linalg.norm(xy - centre, axis=1).mean()
+    scale = np.sqrt(2.0) / max(float(spread), 1e-12)
+    N = np.array([[scale, 0, -scale * centre[0]], [0, scale, -scale * centre[1]], [0, 0, 1.0]])
+    return scale * (xy - centre), N
+
+
+def fit_homographies(x_1: Matrix, x_2: Matrix) -> Matrix:
+    """``(B, 3, 3)`` homographies of B draws ``(B, M, 2)`` by DLT (Hartley and Zisserman, 4.1)."""
+    x, y, u, v = x_1[..., 0], x_1[..., 1], x_2[..., 0], x_2[..., 1]
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    above = np.stack([zero, zero, zero, -x, -y, -one, v * x, v * y, v], axis=-1)
+    below = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=-1)
+    return _null_vectors(np.concatenate([above, below], axis=1))
+
+
+def fit_fundamentals(x_1: Matrix, x_2: Matrix) -> Matrix:
+    """``(B, 3, 3)`` fundamental matrices of B draws ``(B, M, 2)`` by the eight-point algorithm
+    (Hartley and Zisserman, 11.2): of rank 2, ``x_2' F x_1 = 0``."""
+    x, y, u, v = x_1[..., 0], x_1[..., 1], x_2[..., 0], x_2[..., 1]
+    A = np.stack([u * x, u * y, u, v * x, v * y, v, x, y, np.ones_like(x)], axis=-1)
+    U, d, Vt = np.linalg.svd(_null_vectors(A))
+    d[:, 2] = 0.0
+    return (U * d[:, None, :]) @ Vt
+
+
+def _null_vectors(A: Matrix) -> Matrix:
+    """The unit vectors h that make ``|A h|`` least, ``(B, 3, 3)``."""
+    _, vectors = np.linalg.eigh(A.swapaxes(1, 2) @ A)
+    return vectors[:, :, 0].reshape(-1, 3, 3)
+
+
+def judge_homographies(
+    H: Matrix, xy_1: Matrix, xy_2: Matrix, sigma: Matrix
+) -> tuple[Matrix, NDArray[np.bool_]]:
+    """Score ``(B,)`` and inliers ``(B, N)`` by the symmetric transfer error (ORB-SLAM, IV)."""
+    with np.errstate(all="ignore"):  # draws on a line: their scores are NaN, then 0
+        there = _squared(_transferred(H, xy_1) - xy_2) / sigma**2
+        back = _squared(_transferred(_adjugates(H), xy_2) - xy_1) / sigma**2
+    return _score(there, back, CHI2_MONO)
+
+
+def judge_fundamentals(
+    F: Matrix, xy_1: Matrix, xy_2: Matrix, sigma: Matrix
+) -> tuple[Matrix, NDArray[np.bool_]]:
+    """Score ``(B,)`` and inliers ``(B, N)`` by the distances from the epipolar lines of both views.
+
+    What a line leaves over is one dimension, but the score of a perfect match is that of a
+    homography, so that the two can be compared (ORB-SLAM, IV).
+    """
+    one = np.ones((len(xy_1), 1))
+    p_1, p_2 = np.hstack([xy_1, one]), np.hstack([xy_2, one])
+    lines_2 = p_1 @ F.swapaxes(1, 2)  # (B, N, 3)
+    lines_1 = p_2 @ F
+    product = np.einsum("bni,ni->bn", lines_2, p_2) ** 2 / sigma**2
+    with np.errstate(all="ignore"):
+        there = product / _squared(lines_2[..., :2])
+        back = product / _squared(lines_1[..., :2])
+    return _score(there, back, CHI2_LINE)
+
+
+def _score(there: Matrix, back: Matrix, limit: float) -> tuple[Matrix, NDArray[np.bool_]]:
+    score = np.zeros(len(there))
+    for error in (there, back):
+        score += np.where(error < limit, CHI2_MONO - error, 0.0).sum(axis=1)
+    return score, (there < limit) & (back < limit)
+
+
+def _transferred(H: Matrix, xy: Matrix) -> Matrix:
+    p = np.hstack([xy, np.ones((len(xy), 1))]) @ H.swapaxes(1, 2)
+    return p[..., :2] / p[..., 2:]
+
+
+def _adjugates(H: Matrix) -> Matrix:
+    """Inverses up to scale: exist for singular matrices too."""
+    a, b, c = H[:, 0], H[:, 1], H[:, 2]
+    return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
+
+
+def _squared(x: Matrix) -> Matrix:
+    return np.einsum("...i,...i->...", x, x)
+
+
+def motions_of_essential(E: Matrix) -> list[Matrix]:
+    """The four motions ``T_2_1`` of an essential matrix (Hartley and Zisserman, 9.6.2)."""
+    U, _, Vt = np.linalg.svd(E)
+    W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    s = np.linalg.det(U) * np.linalg.det(Vt)
+    turns = (s * U @ W @ Vt, s * U @ W.T @ Vt)
+    return [_motion(R, t) for R in turns for t in (U[:, 2], -U[:, 2])]
+
+
+def motions_of_homography(A: Matrix) -> list[Matrix]:
+    """The up to eight motions ``T_2_1`` of a calibrated homography (Faugeras and Lustman, "Motion
+    and structure from motion in a piecewise planar environment", 1988); none for a pure turn."""
+    U, (d1, d2, d3), Vt = np.linalg.svd(A)
+    if d1 / d2 < 1.00001 or d2 / d3 < 1.00001:
+        return []
+    s = np.linalg.det(U) * np.linalg.det(Vt)
+    x1 = np.sqrt((d1**2 - d2**2) / (d1**2 - d3**2))
+    x3 = np.sqrt((d2**2 - d3**2) / (d1**2 - d3**2))
+    root = np.sqrt((d1**2 - d2**2) * (d2**2 - d3**2))
+    motions = []
+    for e1 in (1.0, -1.0):
+        for e3 in (1.0, -1.0):
+            # d' = d2 (eq. 13) and d' = -d2 (eq. 15).
+            sin, cos = e1 * e3 * root / ((d1 + d3) * d2), (d2**2 + d1 * d3) / ((d1 + d3) * d2)
+            R = np.array([[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]])
+            motions.append(_motion(s * U @ R @ Vt, U @ [e1 * x1, 0.0, -e3 * x3]))
+            sin, cos = e1 * e3 * root / ((d1 - d3) * d2), (d1 * d3 - d2**2) / ((d1 - d3) * d2)
+            R = np.array([[cos, 0.0, sin], [0.0, -1.0, 0.0], [sin, 0.0, -cos]])
+            motions.append(_motion(s * U @ R @ Vt, U @ [e1 * x1, 0.0, e3 * x3]))
+    return motions
+
+
+def _motion(R: Matrix, t: Matrix) -> Matrix:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t / np.linalg.norm(t)
+    return T
+
+
+def _triangulate(
+    T_2_1: Matrix,
+    xy_1: Matrix,
+    xy_2: Matrix,
+    sigma: Matrix,
+    camera: StereoCamera,
+    config: InitializationConfig,
+) -> tuple[Matrix, NDArray[np.bool_], Matrix]:
+    """Points ``(N, 3)`` in camera 1; whether each lies in front of both cameras and reprojects
+    where it was seen; cosine of the angle between its rays."""
+    R, t = T_2_1[:3, :3], T_2_1[:3, 3]
+    ray_1 = camera.backproject(xy_1, np.ones(len(xy_1)))
+    ray_2 = camera.backproject(xy_2, np.ones(len(xy_2))) @ R  # in camera 1
+    centre_2 = -R.T @ t
+    # Midpoint of the shortest segment between the rays.
+    aa, bb, ab = _squared(ray_1), _squared(ray_2), np.einsum("ni,ni->n", ray_1, ray_2)
+    on_1, on_2 = ray_1 @ centre_2, ray_2 @ centre_2
+    with np.errstate(all="ignore"):  # parallel rays
+        determinant = aa * bb - ab * ab
+        depth_1 = (bb * on_1 - ab * on_2) / determinant
+        depth_2 = (ab * on_1 - aa * on_2) / determinant
+        points = 0.5 * (depth_1[:, None] * ray_1 + centre_2 + depth_2[:, None] * ray_2)
+        in_2 = points @ R.T + t
+        limit = (config.max_error * sigma) ** 2
+        good = (depth_1 > 0) & (depth_2 > 0) & (points[:, 2] > 0) & (in_2[:, 2] > 0)
+        good &= _squared(camera.project(points)[:, :2] - xy_1) < limit
+        good &= _squared(camera.project(in_2)[:, :2] - xy_2) < limit
+    return points, good, ab / np.sqrt(aa * bb)

@@ -1,0 +1,132 @@
+"""Monocular SLAM on a ring of points (tests/ring.py): the map has a unit of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from ring import CAMERA, LAP, Oracle, Ring
+
+from vslam.evaluate import evaluate
+from vslam.features import Features, TrackingState
+from vslam.slam import Slam
+from vslam.trajectory import Trajectory
+
+EYE = CAMERA.left_eye()
+RING = Ring.create()
+ROUND = [float(k) for k in range(LAP + 40)]
+
+
+def see(k):
+    """What the left eye sees at frame k; near points at coarse levels of the pyramid, as in an
+    image: what is mapped from two places must be found from a third."""
+    features = RING.see(k, 1)
+    depth = CAMERA.bf / (features.xy[:, 0] - features.u_right)
+    octave = np.clip(np.ceil(np.log(30.0 / np.clip(depth, 1.0, None)) / np.log(1.2)), 0, 7)
+    nothing = np.full(len(features), np.nan, np.float32)
+    return replace(features, octave=octave.astype(np.uint8), u_right=nothing)
+
+
+def run(frames, detector=None, *, threads=1, dark=()):
+    slam = Slam(EYE, None, detector, threads=threads)
+    results = []
+    for i, k in enumerate(frames):
+        image = np.array([[i & 255, i >> 8]], np.uint8)  # tells the oracle which frame it is
+        features = Features.none() if i in dark else see(k)
+        results.append(slam.step_features(features, 0.1 * i, image))
+    slam.finish()
+    return slam, results
+
+
+def error(slam, frames, chosen=slice(None)):
+    """ATE RMSE after Sim3 alignment, metres."""
+    found = slam.trajectory()
+    truth = Trajectory(found.timestamps, np.array([RING.pose(k) for k in frames]))
+    indices = np.arange(len(frames))[chosen]
+    return evaluate(found.select(indices), truth.select(indices), "sim3").ate_rmse_m
+
+
+@cache
+def closed():
+    return run(ROUND, Oracle(RING, ROUND))
+
+
+def test_a_map_begins_within_ten_frames_and_tracks_all_others(check_map):
+    slam, results = run(ROUND[:60])
+    lost = [r.index for r in results if r.state is TrackingState.LOST]
+    assert lost == list(range(len(lost)))
+    assert len(lost) < 10
+    assert error(slam, ROUND[:60], slice(len(lost), None)) < 0.2
+    check_map(slam.map)
+
+
+def test_the_first_landmarks_make_the_unit():
+    slam, results = run(ROUND[:6])
+    second = next(r.index for r in results if r.is_keyframe)
+    depth = slam.map.arrays.xyz[slam.map.landmarks_of(0), 2]
+    assert np.median(depth) == pytest.approx(slam.config.initialization.median_depth, rel=0.2)
+    assert second >= 1
+
+
+def test_a_loop_corrects_the_scale(check_map):
+    without, _ = run(ROUND)
+    slam, _ = closed()
+    assert slam.closures
+    assert all(edge.reason == "closed" for edge in slam.loops if edge.accepted)
+    assert error(slam, ROUND) < min(1.0, 0.5 * error(without, ROUND))
+    check_map(slam.map)
+
+
+def test_same_bytes_with_one_thread_and_two():
+    again, _ = run(ROUND, Oracle(RING, ROUND), threads=2)
+    assert again.trajectory().T_wc.tobytes() == closed()[0].trajectory().T_wc.tobytes()
+
+
+def test_a_lost_camera_begins_a_sub_map_that_a_loop_joins(check_map):
+    frames = [*ROUND[:80], *ROUND[140:], *(k + LAP for k in ROUND[40:70])]
+    slam, results = run(frames, Oracle(RING, frames))
+    assert len(slam.map.restarts) == 1
+    assert slam.closures
+    lost = sum(r.state is TrackingState.LOST for r in results)
+    assert lost < 25
+    tracked = [r.index for r in results if r.state is not TrackingState.LOST]
+    assert error(slam, frames, tracked) < 1.5
+    assert len(set(slam.map.rescaled)) > 1
+    check_map(slam.map)
+
+
+def test_a_sub_map_goes_on_at_the_speed_before():
+    frames = [*ROUND[:40], *ROUND[100:140]]
+    slam, results = run(frames)
+    assert len(slam.map.restarts) == 1
+    steps = np.linalg.norm(np.diff(slam.trajectory().T_wc[:, :3, 3], axis=0), axis=1)
+    tracked = np.array([r.state is not TrackingState.LOST for r in results])
+    assert np.median(steps[50:]) == pytest.approx(np.median(steps[30:39]), rel=0.1)
+    assert tracked[50:].all()
+    assert len(slam.trajectory()) == 80
+
+
+def test_darkness_at_the_beginning_only_delays_it():
+    slam, results = run(ROUND[:40], dark=range(12))
+    assert all(r.state is TrackingState.LOST for r in results[:12])
+    assert sum(r.state is TrackingState.LOST for r in results) < 20
+    assert len(slam.trajectory()) == 40
+
+
+def test_a_camera_that_stands_still_begins_no_map():
+    slam, results = run([3.0 + 1e-6 * k for k in range(30)])
+    assert slam.map.n_keyframes == 0
+    assert all(r.state is TrackingState.LOST for r in results)
+    assert np.isfinite(slam.trajectory().T_wc).all()
+
+
+def test_images_must_be_those_of_the_camera():
+    image = np.zeros((EYE.height, EYE.width), np.uint8)
+    with pytest.raises(ValueError, match="right image"):
+        Slam(EYE).step(image, image, 0.0)
+    with pytest.raises(ValueError, match="right image"):
+        Slam(CAMERA).step(image, None, 0.0)
+    with pytest.raises(ValueError, match="images are"):
+        Slam(EYE).step(image[:-1], None, 0.0)

@@ -9,6 +9,8 @@ another one. GTSAM optimises, from its built-in Similarity3 factors.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -151,4 +153,4 @@ def rescaled_loop(edge: LoopEdge, growth: NDArray[np.float64]) -> LoopEdge:
     T = edge.T_query_match.copy()
     T[:3, 3] *= growth[edge.match]
     scale = edge.scale * float(growth[edge.query] / growth[edge.match])
-    return LoopEdge(**(vars(edge) | {"T_query_match": T, "scale": scale}))
+    return replace(edge, T_query_match=T, scale=scale)

@@ -9,6 +9,7 @@ should see of the other's landmarks and does not.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -75,21 +76,23 @@ def verify(
     query, match = candidate.query, candidate.match
     edge = LoopEdge(query, match, candidate.score, accepted=False, reason="")
     rows_q, rows_m = match_keyframes(map_, query, match, config)
-    edge = _with(edge, n_matches=len(rows_q))
+    edge = replace(edge, n_matches=len(rows_q))
     if len(rows_q) < config.min_matches:
-        return _with(edge, reason=f"only {len(rows_q)} descriptors match")
+        return replace(edge, reason=f"only {len(rows_q)} descriptors match")
 
     T_query_match, scale, n_inliers = _consensus(map_, query, match, rows_q, rows_m, camera, config)
     if T_query_match is None:
-        return _with(edge, reason=f"no motion that {config.min_consensus} of the matches agree on")
-    edge = _with(edge, n_inliers=n_inliers, T_query_match=T_query_match, scale=scale)
+        return replace(
+            edge, reason=f"no motion that {config.min_consensus} of the matches agree on"
+        )
+    edge = replace(edge, n_inliers=n_inliers, T_query_match=T_query_match, scale=scale)
 
     place = place_of(map_, match, query, config)
     T_mw = map_.keyframe_pose(match)
     landmarks = collect_landmarks(map_.arrays, place, map_.n_landmarks)
     view = look(map_, query, landmarks, T_query_match @ T_mw, camera, config)
     T_query_match = orthonormalised(view.T_cw @ inverse(T_mw))
-    edge = _with(
+    edge = replace(
         edge,
         n_matches=view.n_matches,
         n_inliers=int(np.count_nonzero(view.seen)),
@@ -98,13 +101,9 @@ def verify(
         landmarks=view.landmarks[view.seen],
     )
     if camera.monocular:
-        edge = _with(edge, scale=scale_of_view(map_, query, view, default=scale))
+        edge = replace(edge, scale=scale_of_view(map_, query, view, default=scale))
     reason = _objection(map_, edge, view, T_query_match, camera, config)
-    return _with(edge, accepted=not reason, reason=reason or "verified")
-
-
-def _with(edge: LoopEdge, **changes: object) -> LoopEdge:
-    return LoopEdge(**(vars(edge) | changes))
+    return replace(edge, accepted=not reason, reason=reason or "verified")
 
 
 def match_keyframes(

@@ -8,7 +8,6 @@ compilation left out), and how well it did.
 
 from __future__ import annotations
 
-import resource
 import sys
 import time
 from collections.abc import Callable
@@ -31,6 +30,7 @@ from vslam.camera import StereoCamera
 from vslam.config import PoseGraphConfig
 from vslam.features import Features
 from vslam.geometry import inverse, inverses, se3_exp
+from vslam.info import peak_memory_mb
 from vslam.map import Map
 from vslam.observations import covisible_pairs, link_many
 
@@ -148,7 +148,7 @@ def bench_bundle() -> None:
             f"{solution.iterations} iterations, position error {before:.3f} -> {after:.3f} m, "
             f"cost per observation "
             f"{solution.cost / len(problem.camera):.3f}, peak memory of the process "
-            f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB"
+            f"{peak_memory_mb():.0f} MB"
         )
 
 

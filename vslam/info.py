@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import platform
+import sys
 import time
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -76,3 +78,16 @@ def process_age() -> float:
     import psutil
 
     return time.time() - psutil.Process().create_time()
+
+
+def peak_memory_mb() -> float:
+    """Most memory that this process has held so far."""
+    import resource
+
+    # Linux's getrusage counts what the parent had before this process was its own program.
+    with suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 2**10
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)

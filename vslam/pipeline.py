@@ -7,17 +7,14 @@ frames ahead. Their order is kept, so that the result does not depend on the num
 from __future__ import annotations
 
 import logging
-import resource
 import signal
-import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -28,7 +25,7 @@ from vslam.detectors import create_detector
 from vslam.errors import UnreadableImageError
 from vslam.features import Features, TrackResult
 from vslam.frontend.tracking import Tracker, extract_features
-from vslam.info import process_age
+from vslam.info import peak_memory_mb, process_age
 from vslam.perturb import Perturbation
 from vslam.recorder import Recorder
 from vslam.run import RunOutcome, RunSettings
@@ -105,7 +102,7 @@ def run_sequence(
         wall_s=wall,
         cpu_s=cpu,
         startup_s=startup,
-        peak_memory_mb=_peak_memory_mb(),
+        peak_memory_mb=peak_memory_mb(),
         n_keyframes=len(slam.map.living_keyframes()),
         n_landmarks=len(slam.map.living_landmarks()),
         map=slam.map,
@@ -186,13 +183,3 @@ def _stop_on_interrupt() -> Iterator[threading.Event]:
         yield interrupted
     finally:
         signal.signal(signal.SIGINT, previous)
-
-
-def _peak_memory_mb() -> float:
-    # Linux's getrusage counts what the parent had before this process was its own program.
-    with suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 2**10
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)

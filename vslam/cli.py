@@ -11,7 +11,6 @@ import typer
 from vslam import __version__, bench_cli, synth_cli, train_cli, vocabulary_cli
 from vslam.console import evaluation_rows, print_rows, print_summary
 from vslam.errors import InputError, ResultsError
-from vslam.options import SENSORS, require_built
 
 app = typer.Typer(
     help="Visual SLAM in pure Python.",
@@ -20,6 +19,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
+_SENSORS = {"stereo": True, "mono": True, "rgbd": False}
 
 Data = Annotated[
     Path,
@@ -100,7 +100,7 @@ def run(
     from vslam.detectors import require_detector
 
     require_detector(detector, weights)
-    require_built("--sensor", sensor, SENSORS)
+    _require_built("--sensor", sensor, _SENSORS)
     if compare_loops and detector == "none":
         raise InputError("--compare-loops: nothing to compare with --detector none; name another.")
 
@@ -274,3 +274,11 @@ def main() -> None:
     except ResultsError as error:
         typer.echo(f"error: {error}", err=True)
         sys.exit(1)
+
+
+def _require_built(option: str, value: str, known: dict[str, bool]) -> None:
+    built = ", ".join(f"'{name}'" for name, is_built in known.items() if is_built)
+    if value not in known:
+        raise InputError(f"{option} {value}: unknown; this version has only {built}.")
+    if not known[value]:
+        raise InputError(f"{option} {value}: not built yet; this version has only {built}.")

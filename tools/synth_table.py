@@ -157,11 +157,11 @@ def _in_light(drive: Drive, light: str) -> Iterator[Path]:
 def _row(drive: Drive, light: str, system: str, data: Path, options: argparse.Namespace) -> Row:
     import numpy as np
 
+    from vslam.datasets.kitti import read_kitti_poses
     from vslam.datasets.synthetic import store
-    from vslam.evaluate import path_length, read_pair
+    from vslam.evaluate import path_length
 
-    poses = data / "poses" / f"{drive.name}.txt"
-    truth = read_pair(poses, poses, None)[1].T_wc
+    truth = read_kitti_poses(data / "poses" / f"{drive.name}.txt")
     run_options = argparse.Namespace(
         data=data,
         seq=drive.name,

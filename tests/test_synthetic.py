@@ -231,7 +231,7 @@ def test_nothing_stands_near_a_camera_of_any_route(name, unpainted):
 
 
 def test_pairs_keep_clear_of_the_town_beside_the_route(route, unpainted):
-    town = build_town(route, Variation(), sway=1.4)
+    town = build_town(route, Variation(), aside=(-1.4, 1.4, 0.0))
     built = town.surfaces.select(np.arange(1, len(town.surfaces)))
     for aside in (-1.4, -0.7, 0.7, 1.4):
         cameras = route.T_wc[:, :3, 3] + aside * route.T_wc[:, :3, 0]

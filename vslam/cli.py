@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from vslam import __version__, bench_cli, synth_cli, train_cli, vocabulary_cli
+from vslam import __version__, bench_cli, loops_cli, synth_cli, train_cli, vocabulary_cli
 from vslam.console import evaluation_rows, print_rows, print_summary
 from vslam.errors import InputError, ResultsError
 
@@ -253,6 +253,7 @@ bench_cli.register(app)
 synth_cli.register(app)
 train_cli.register(app)
 vocabulary_cli.register(app)
+loops_cli.register(app)
 
 
 @app.callback(invoke_without_command=True)

@@ -19,6 +19,8 @@ _EXAMPLES = """
   vslam synth mine --trajectory poses/07.txt --calibration 04-12
 
   vslam synth demo --pairs 1000 --aliased --change 0.8 --out pairs
+
+  vslam synth 05 --pairs 500 --lateral=-3.2:1.4 --heading 0:30 --out pairs
 """
 
 
@@ -55,6 +57,20 @@ def synth(
     pairs: Annotated[
         int, typer.Option(min=0, help="Render so many labelled pairs for training instead.")
     ] = 0,
+    lateral: Annotated[
+        str,
+        typer.Option(
+            metavar="LOW:HIGH",
+            help="With --pairs: metres that second views are moved to the right; -3.2 is the "
+            "other lane.",
+        ),
+    ] = "-1.4:1.4",
+    heading: Annotated[
+        str,
+        typer.Option(
+            metavar="LOW:HIGH", help="With --pairs: degrees that they are turned, to either side."
+        ),
+    ] = "0:14",
     out: Annotated[
         Path | None, typer.Option(help="Folder to write to.", show_default="user's cache")
     ] = None,
@@ -104,10 +120,11 @@ def synth(
     threads = threads or min(available_cores(), 4)
     with render_bar(shown=not quiet) as on_frame:
         if pairs:
-            from vslam.datasets.synthetic.pairs import render_pairs
+            from vslam.datasets.synthetic.pairs import Moves, render_pairs
 
             root = out or Path("pairs")
-            render_pairs(drive, variation, root, pairs, threads=threads, on_frame=on_frame)
+            moves = Moves(_range("--lateral", lateral, -4.0), _range("--heading", heading, 0.0))
+            render_pairs(drive, variation, root, pairs, moves, threads=threads, on_frame=on_frame)
         else:
             root = store.render_sequence(
                 drive,
@@ -120,3 +137,14 @@ def synth(
                 on_frame=on_frame,
             )
     typer.echo(f"{root}: " + (f"{pairs} pairs" if pairs else f"sequence {route}"))
+
+
+def _range(option: str, given: str, least: float) -> tuple[float, float]:
+    low, _, high = given.partition(":")
+    try:
+        found = float(low), float(high)
+    except ValueError as error:
+        raise InputError(f"{option} {given}: must be LOW:HIGH, two numbers.") from error
+    if not least <= found[0] <= found[1] <= 45.0:
+        raise InputError(f"{option} {given}: must not fall, from {least:g} on.")
+    return found

@@ -25,8 +25,8 @@ class Augmentation(BaseModel):
 
 
 STRONG = Augmentation(
-    homography=0.16, shift=0.22, log_gain=0.5, bias=30.0, log_gamma=0.4, masks=4, mask_area=0.15,
-    noise=12.0, blur=2.0,
+    homography=0.16, shift=0.28, log_gain=0.6, bias=35.0, log_gamma=0.5, masks=4, mask_area=0.2,
+    noise=16.0, blur=2.0,
 )  # fmt: skip
 
 

@@ -113,8 +113,13 @@ def open_detector(name: str, config: SiameseConfig, weights: Path | None = None)
     Raises:
         InputError: unknown name, no weights, or weights of another network.
     """
+    return SiameseDetector(load_named(name, weights), config)
+
+
+def load_named(name: str, weights: Path | None = None) -> SiameseNetwork:
+    """The network of that name, arguments and errors as of :func:`open_detector`."""
     path = find_weights(name, weights)
     network, _ = load_network(path)
     if network.name != name:
         raise InputError(f"{path}: weights of {network.name}, not of {name}; name another file.")
-    return SiameseDetector(network, config)
+    return network

@@ -6,7 +6,8 @@ the sources are of one family (the same region photographed twice): then nothing
 
 Sources are named on the command line as ``kind:path``, with options in brackets:
 
-``kitti:DIR[seq=00,first=250,last=1500]``  a KITTI sequence with ground truth poses
+``kitti:DIR[seq=00,first=250,last=1500]``  a KITTI sequence with ground truth poses; in place of
+    first and last ``frames=0-249+1500-1699``, and ``truth=FILE.mat`` for a matrix of its loops
 ``fabmap:DIR[truth=FILE.mat]``             Oxford CityCentre or NewCollege (Cummins and Newman 2008)
 ``pairs:DIR``                              what ``vslam synth --pairs`` wrote
 ``photos:DIR``                             folders of photographs with a NOTES.txt, see below
@@ -32,6 +33,8 @@ from vslam.trajectory import read_kitti_poses, read_table
 SAME, UNKNOWN, DIFFERENT = 1, 0, -1
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".webp"}
 _UNDISTORT_COLUMNS = (8, 9)
+_VIEW = ("x_a", "z_a", "yaw_a", "x_b", "z_b", "yaw_b")
+_CELL = 80.0  # m, of a rendered town: stays together when training and validation are divided
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,8 @@ class Places:
         unit: ``(N,)`` int32; images of one unit (a folder, a stretch of road) stay together when
             training and validation are divided.
         calibration: ``(8,)`` or ``(9,)`` fx fy cx cy k1 k2 p1 p2 [k3], None if rectified.
+        asks: ``(N,)`` bool, images that ask for their place in a benchmark while the others are
+            asked for; None for a drive, where each asks for those long before it.
     """
 
     name: str
@@ -57,6 +62,7 @@ class Places:
     relation: NDArray[np.int8]
     unit: NDArray[np.int32]
     calibration: NDArray[np.float64] | None = None
+    asks: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -67,10 +73,16 @@ class Places:
         Raises:
             UnreadableImageError: missing or damaged.
         """
+        return to_square(self.grey(index), pixels, fit)
+
+    def grey(self, index: int) -> NDArray[np.uint8]:
+        """The image, undistorted, ``(H, W)``.
+
+        Raises:
+            UnreadableImageError: missing or damaged.
+        """
         image = read_grey(self.images[index], self.names[index])
-        if self.calibration is not None:
-            image = undistorted(image, self.calibration)
-        return to_square(image, pixels, fit)
+        return image if self.calibration is None else undistorted(image, self.calibration)
 
     def select(self, chosen: NDArray[np.int64]) -> Places:
         """The images ``chosen``, in their order."""
@@ -80,6 +92,7 @@ class Places:
             images=tuple(self.images[i] for i in chosen),
             relation=self.relation[np.ix_(chosen, chosen)],
             unit=self.unit[chosen],
+            asks=None if self.asks is None else self.asks[chosen],
         )
 
 
@@ -134,31 +147,83 @@ def relation_of_poses(
 
 
 def read_kitti(
-    root: Path, seq: str = "00", first: str = "0", last: str = "1000000", every: str = "1"
+    root: Path,
+    seq: str = "00",
+    first: str = "0",
+    last: str = "1000000",
+    every: str = "1",
+    frames: str = "",
+    truth: str = "",
 ) -> list[Places]:
     """Left grey images of a KITTI sequence; those numbered first to last, both included.
 
+    Args:
+        root: KITTI root.
+        seq, first, last, every: which images; every second one for 2.
+        frames: ranges instead of first and last, ``0-249+1500-1699``.
+        truth: ``.mat`` file with a matrix of the whole sequence that marks the same places; the
+            others are different beyond 25 m and not known below.
+
     Raises:
-        InputError: no images in that range, or no poses for them.
+        InputError: no images in that range, no poses for them, or no such matrix.
     """
     base = root if (root / "sequences").is_dir() else root / "dataset"
     folder = base / "sequences" / seq / "image_0"
+    spans = [span.split("-") for span in frames.split("+")] if frames else [[first, last]]
+    wanted = [range(int(low), int(high) + 1, int(every)) for low, high in spans]
     files = [f for f in _images(folder) if f.stem.isdecimal()]
-    files = [f for f in files if int(first) <= int(f.stem) <= int(last)][:: int(every)]
+    files = [f for f in files if any(int(f.stem) in span for span in wanted)]
     if len(files) < 2:
-        raise InputError(f"{folder}: no images numbered {first} to {last}; see datasets.md.")
+        asked = frames or f"{first} to {last}"
+        raise InputError(f"{folder}: no images numbered {asked}; see datasets.md.")
     poses = read_kitti_poses(base / "poses" / f"{seq}.txt")
-    frames = np.array([int(f.stem) for f in files])
-    if frames[-1] >= len(poses):
+    number = np.array([int(f.stem) for f in files])
+    if number[-1] >= len(poses):
         raise InputError(
             f"{base}/poses/{seq}.txt: {len(poses)} poses, none for image {files[-1].stem}; take "
             "the file of this sequence."
         )
-    T_wc = poses[frames]
+    T_wc = poses[number]
     steps = np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1)
     stretch = (np.concatenate([[0.0], np.cumsum(steps)]) // 100.0).astype(np.int32)  # of 100 m
+    relation = relation_of_poses(T_wc)
+    if truth:
+        path = Path(truth).expanduser()
+        loops = read_loop_matrix(path)
+        if len(loops) <= number[-1]:
+            raise InputError(
+                f"{path}: {len(loops)} rows, none for image {files[-1].stem}; take the matrix of "
+                "this sequence."
+            )
+        marked = loops[np.ix_(number, number)]
+        relation[relation == SAME] = UNKNOWN
+        relation[marked | marked.T] = SAME
+        np.fill_diagonal(relation, SAME)
     name = f"kitti{seq}"
-    return [Places(name, name, _names(files), tuple(files), relation_of_poses(T_wc), stretch)]
+    return [Places(name, name, _names(files), tuple(files), relation, stretch)]
+
+
+def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
+    """The first square matrix of a ``.mat`` file, ``(N, N)`` bool: which images close a loop.
+
+    Raises:
+        InputError: no such file, or no such matrix in it.
+    """
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        content = loadmat(path)
+    except (OSError, ValueError, TypeError, NotImplementedError, MatReadError) as error:
+        raise InputError(f"{path}: not a readable .mat file; download it again.") from error
+    matrices = [m for key, m in content.items() if not key.startswith("__")]
+    matrices = [m for m in matrices if m.ndim == 2 and m.shape[0] == m.shape[1] and m.size > 1]
+    if not matrices:
+        raise InputError(f"{path}: no ground truth in it (no square matrix with a match).")
+    found = matrices[0].toarray() if hasattr(matrices[0], "toarray") else matrices[0]
+    if not found.any():
+        raise InputError(f"{path}: no ground truth in it (no square matrix with a match).")
+    return np.asarray(found != 0)
 
 
 def read_fabmap(folder: Path, truth: str = "", eye: str = "left") -> list[Places]:
@@ -171,9 +236,6 @@ def read_fabmap(folder: Path, truth: str = "", eye: str = "left") -> list[Places
     Raises:
         InputError: no images, no matrix, or sizes that do not belong together.
     """
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
     files = _images(folder)
     if not files:
         raise InputError(f"{folder}: no images; see datasets.md.")
@@ -181,15 +243,7 @@ def read_fabmap(folder: Path, truth: str = "", eye: str = "left") -> list[Places
     path = named or next(iter(sorted(folder.glob("*.mat"))), None)
     if path is None:
         raise InputError(f"{folder}: no ground-truth matrix; name it: fabmap:DIR[truth=FILE.mat].")
-    try:
-        content = loadmat(path)
-    except (OSError, ValueError, TypeError, NotImplementedError, MatReadError) as error:
-        raise InputError(f"{path}: not a readable .mat file; download it again.") from error
-    matrices = [m for key, m in content.items() if not key.startswith("__")]
-    matrices = [m for m in matrices if m.ndim == 2 and m.shape[0] == m.shape[1] and m.size > 1]
-    if not matrices or not matrices[0].any():
-        raise InputError(f"{path}: no ground truth in it (no square matrix with a match).")
-    loops = np.asarray(matrices[0] != 0)
+    loops = read_loop_matrix(path)
     n = len(loops)
     if 2 * n == len(files):
         files = files[0 if eye == "left" else 1 :: 2]
@@ -218,13 +272,18 @@ def read_fabmap(folder: Path, truth: str = "", eye: str = "left") -> list[Places
 def read_pairs(folder: Path) -> list[Places]:
     """Rendered pairs: ``pairs.csv`` with columns a, b (files) and same (1 or 0), others allowed.
 
+    With the columns x_a, z_a, yaw_a and those of b (m, degrees), images of different pairs are
+    related, too: :func:`relation_of_views`. Without, nothing is known across pairs.
+
     Raises:
         InputError: no or malformed list, or no pair in it.
     """
     path = folder / "pairs.csv"
     try:
         with path.open(newline="") as file:
-            rows = [(row["a"], row["b"], int(row["same"])) for row in csv.DictReader(file)]
+            rows = [(row["a"], row["b"], int(row["same"]), row) for row in csv.DictReader(file)]
+        placed = bool(rows) and set(_VIEW) <= set(rows[0][3])
+        found = [[float(row[key]) for key in _VIEW] for *_, row in rows] if placed else []
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(
             f"{path}: no list of pairs (columns a, b, same); write it with 'vslam synth --pairs'."
@@ -232,18 +291,57 @@ def read_pairs(folder: Path) -> list[Places]:
     if not rows:
         raise InputError(f"{path}: no pair in it; write it again with 'vslam synth --pairs'.")
     number: dict[str, int] = {}
-    for a, b, _ in rows:
+    for a, b, *_ in rows:
         number.setdefault(a, len(number))
         number.setdefault(b, len(number))
     relation = np.zeros((len(number), len(number)), np.int8)
     unit = np.zeros(len(number), np.int32)
-    for k, (a, b, same) in enumerate(rows):
+    if placed:
+        views = np.zeros((len(number), 3))
+        for (a, b, *_), view in zip(rows, found, strict=True):
+            views[[number[a], number[b]]] = np.array(view).reshape(2, 3)
+        relation = relation_of_views(views)
+        cell = np.floor(views[:, :2] / _CELL).astype(np.int64)
+        unit = np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
+    for k, (a, b, same, _) in enumerate(rows):
         i, j = number[a], number[b]
         relation[i, j] = relation[j, i] = SAME if same else DIFFERENT
-        unit[i] = unit[j] = k
+        if not placed:
+            unit[i] = unit[j] = k
     np.fill_diagonal(relation, SAME)
     files = tuple(folder / name for name in number)
-    return [Places(folder.name, folder.name, _names(files), files, relation, unit)]
+    asks = np.isin([*number], [b for _, b, *_ in rows])
+    return [Places(folder.name, folder.name, _names(files), files, relation, unit, asks=asks)]
+
+
+def relation_of_views(
+    views: NDArray[np.float64],
+    *,
+    near: float = 5.0,
+    turned: float = 35.0,
+    far: float = 40.0,
+    sight: float = 160.0,
+    street: float = 25.0,
+) -> NDArray[np.int8]:
+    """Same place: nearer than ``near`` metres and ``turned`` degrees.
+
+    Different: beyond ``far`` metres, and not within ``sight`` in one street (``street`` metres to
+    the side) seen in one direction or against it.
+
+    Args:
+        views: ``(N, 3)`` x and z in metres, yaw in degrees from z towards x.
+    """
+    xz, yaw = views[:, :2], np.radians(views[:, 2])
+    ahead = np.stack([np.sin(yaw), np.cos(yaw)], 1)
+    away = xz[None] - xz[:, None]
+    distance = np.linalg.norm(away, axis=2)
+    aside = np.abs(away[..., 0] * ahead[:, None, 1] - away[..., 1] * ahead[:, None, 0])
+    cosine = ahead @ ahead.T
+    along = (np.abs(cosine) > 0.7) & (aside < street) & (distance < sight)
+    relation = np.zeros(distance.shape, np.int8)
+    relation[(distance < near) & (cosine > np.cos(np.radians(turned)))] = SAME
+    relation[(distance > far) & ~(along | along.T)] = DIFFERENT
+    return relation
 
 
 def read_photos(folder: Path) -> list[Places]:
@@ -401,7 +499,7 @@ def read_pack(path: Path) -> list[Places]:
 
 
 _READERS: dict[str, tuple[Callable[..., list[Places]], tuple[str, ...]]] = {
-    "kitti": (read_kitti, ("seq", "first", "last", "every")),
+    "kitti": (read_kitti, ("seq", "first", "last", "every", "frames", "truth")),
     "fabmap": (read_fabmap, ("truth", "eye")),
     "pairs": (read_pairs, ()),
     "photos": (read_photos, ()),

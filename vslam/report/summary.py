@@ -76,7 +76,7 @@ def summarize(
         revisits=_revisits(verdict) if verdict else [],
         loops=loops,
         without_loops=WithoutLoops(**asdict(without)) if without else None,
-        machine=_machine(),
+        machine=this_machine(),
         versions=versions(),
         created=datetime.now(UTC).replace(microsecond=0),
         **options,
@@ -144,7 +144,8 @@ def _stage_times(tracks: list[TrackResult]) -> dict[str, StageTime]:
     return times
 
 
-def _machine() -> Machine:
+def this_machine() -> Machine:
+    """Where this process runs."""
     return Machine(
         cpu=_cpu_name(),
         cores=available_cores(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -23,17 +23,32 @@ from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import OnFrame
 from vslam.datasets.synthetic.town import Town, build_town
 
-_LATERAL, _HEADING, _HEIGHT = 1.4, 14.0, 0.25  # largest changes: m, degrees, m
+_HEIGHT = 0.25  # largest change, m
 _EXPOSURE = 0.25  # deviation of the logarithm of the second view's exposure by the first's
 _APART = 40.0  # m between different places,
 _SIGHT, _STREET = 160.0, 25.0  # and where one lies so far ahead of the other in the same street
 _TOGETHER, _LATER, _ALIGNED = 4.0, 60, 30.0  # m, frames, degrees: another pass through a place
 _ALIKE = 5  # a look-alike is drawn from so many of the most similar places
 _PLACES, _SMALL = 160, 8  # places that are compared, in views so many times smaller
+KINDS = ("shift", "alike", "pass", "random")
 _COLUMNS = ("a", "b", "same", "kind", "frame_a", "frame_b", "when_a", "when_b", "distance_m",
-            "lateral_m", "heading_deg", "height_m", "exposure_ratio")  # fmt: skip
+            "lateral_m", "heading_deg", "height_m", "exposure_ratio",
+            "x_a", "z_a", "yaw_a", "x_b", "z_b", "yaw_b")  # fmt: skip
 
 Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Moves:
+    """How the second view of a pair is moved; ranges to draw from, lowest and highest.
+
+    Attributes:
+        lateral: metres to the right, negative to the left, where the other lane is (3.2 m).
+        heading: degrees of turn, to either side.
+    """
+
+    lateral: tuple[float, float] = (-1.4, 1.4)
+    heading: tuple[float, float] = (0.0, 14.0)
 
 
 def render_pairs(
@@ -41,16 +56,19 @@ def render_pairs(
     variation: Variation,
     folder: Path,
     count: int,
+    moves: Moves = Moves(),
     *,
+    kinds: tuple[str, ...] = KINDS,
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> None:
-    """Render ``count`` pairs, half of one place and half of two places.
+    """Render ``count`` pairs, with all kinds half of one place and half of two.
 
     ``folder/pairs.csv`` has a row for each: both images, ``same`` (1 or 0), the kind, the frame of
     the drive that each view was taken from, the moment of each as a frame (what stands there and
-    how it is lit), and how the second view differs: metres between the frames' places, metres to
-    the side, degrees and metres up that were added, and the ratio of the exposures. The kinds:
+    how it is lit), how the second view differs: metres between the frames' places, metres to the
+    side, degrees and metres up that were added, and the ratio of the exposures; and where both
+    cameras stand: x and z in metres, and degrees from z towards x. The kinds:
 
     - ``shift``: the same frame, moved to the side, turned, raised;
     - ``pass``: another pass through the place, where the drive has one, shifted likewise;
@@ -63,6 +81,8 @@ def render_pairs(
             puts days between the views of one place.
         folder: to write to.
         count: number of pairs.
+        moves: of the second views.
+        kinds: which are rendered, in turn.
         threads: of the renderer.
         on_frame: called with pairs done and in all.
 
@@ -71,9 +91,9 @@ def render_pairs(
     """
     check_disk(folder, count, depth=False)
     rng = np.random.default_rng([variation.seed, 20])
-    town = build_town(route, variation, sway=_LATERAL)
+    town = build_town(route, variation, (*moves.lateral, 0.0))
     passes = Passes(route, town, variation)
-    alike = _look_alikes(route, town, passes, threads)
+    alike = _look_alikes(route, town, passes, threads) if "alike" in kinds else None
     again = _other_passes(route.T_wc)
     returns = np.flatnonzero([len(others) > 0 for others in again])
     places = route.T_wc[:, [0, 2], 3]
@@ -85,32 +105,36 @@ def render_pairs(
     with writing(folder):
         (folder / "images").mkdir(parents=True, exist_ok=True)
         for k in range(count):
-            kind = ("shift", "alike", "pass", "random")[k % 4]
+            kind = kinds[k % len(kinds)]
             if kind == "pass" and not returns.size:
                 kind = "shift"
             first = int(rng.choice(returns) if kind == "pass" else rng.integers(len(places)))
             second = first
             if kind == "pass":
                 second = int(rng.choice(again[first]))
-            elif kind == "alike":
+            elif alike is not None and kind == "alike":
                 first, second = (int(x) for x in alike[int(rng.integers(len(alike)))])
             elif kind == "random":
                 apart = np.flatnonzero(_different(route.T_wc[first], route.T_wc))
                 second = int(rng.choice(apart)) if apart.size else last - first
             whens = (first, last if kind == "shift" and variation.change > 0 else second)
-            shift = (rng.uniform(-1, 1, 3) * [_LATERAL, _HEADING, _HEIGHT]).tolist()
+            turn = rng.uniform(*moves.heading) * rng.choice([-1.0, 1.0])
+            shift = (rng.uniform(*moves.lateral), turn, rng.uniform(-_HEIGHT, _HEIGHT))
             ratio = float(np.exp(rng.normal(0.0, _EXPOSURE)))
-            names = []
+            names: list[str] = []
+            cameras: list[float] = []
             for eye, (frame, when) in enumerate(zip((first, second), whens, strict=True)):
                 T = route.T_wc[frame] if eye == 0 else _shifted(route.T_wc[frame], *shift)
                 image = _view(renderer, route, passes, T, when, 1.0 if eye == 0 else ratio,
                               key=(variation.seed, k, eye))  # fmt: skip
                 names.append(f"images/{k:06d}_{'ab'[eye]}.png")
                 write_png(folder / names[-1], image, 1)
+                yaw = float(np.degrees(np.arctan2(T[0, 2], T[2, 2])))
+                cameras += [T[0, 3], T[2, 3], yaw]
             distance = float(np.linalg.norm(places[second] - places[first]))
             rows.writerow([
                 *names, int(kind in ("shift", "pass")), kind, first, second, *whens,
-                *(f"{x:.3f}" for x in (distance, *shift, ratio)),
+                *(f"{x:.3f}" for x in (distance, *shift, ratio, *cameras)),
             ])  # fmt: skip
             if on_frame:
                 on_frame(k + 1, count)
@@ -124,7 +148,7 @@ def _view(
 ) -> NDArray[np.uint8]:  # fmt: skip
     moment = passes.at(when)
     light = replace(moment.light, exposure=moment.light.exposure * ratio)
-    view, _ = renderer.stereo(moment.surfaces, moment.shadows, light, T_wc, moment.pools)
+    (view,) = renderer.views(moment.surfaces, moment.shadows, light, [T_wc], moment.pools)
     return sensor_image(view.image, route.camera, yaw_rate=0.0, night=moment.night, key=key)
 
 
@@ -172,7 +196,7 @@ def _look_alikes(route: Route, town: Town, passes: Passes, threads: int) -> NDAr
     moment = passes.at(0)
     seen = []
     for k in chosen:
-        view, _ = renderer.stereo(moment.surfaces, moment.shadows, moment.light, route.T_wc[k])
+        (view,) = renderer.views(moment.surfaces, moment.shadows, moment.light, [route.T_wc[k]])
         blurred = cv2.GaussianBlur(np.minimum(view.image, 255.0), (0, 0), 1.5).ravel()
         seen.append((blurred - blurred.mean()) / (blurred.std() + 1e-6))
     renderer.close()

@@ -25,7 +25,7 @@ from vslam.datasets.synthetic.town import Town
 
 _NEAR, _LEFT = 60.0, 75.0  # m: a place was passed, and has been left again
 _AGAIN, _STRETCH = 60, 15  # frames: a place is passed again after so many, for so many
-_CASTS = 3  # shadow maps kept
+_CASTS = 8  # shadow maps kept
 _CLOUD = 12.0  # frames that a cloud hides the sun while it moves between two passes
 _CAR_REACH = np.array([1.1, 2.7])  # half width and length of the largest car, m
 

@@ -9,7 +9,7 @@ the pixels, and a pixel is shaded once for each surface that its four samples se
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -91,10 +91,19 @@ class Renderer:
         """Left and right view of a rig whose left camera stands at ``T_wc`` ``(4, 4)``."""
         right = T_wc.copy()
         right[:3, 3] += T_wc[:3, 0] * self._camera.baseline
-        eyes = [
-            self._pool.submit(self._prepare, surfaces, shadows, light, T, pools)
-            for T in (T_wc, right)
-        ]
+        left_view, right_view = self.views(surfaces, shadows, light, (T_wc, right), pools)
+        return left_view, right_view
+
+    def views(
+        self,
+        surfaces: Surfaces,
+        shadows: ShadowMap,
+        light: Light,
+        T_wc: Iterable[NDArray[np.float64]],
+        pools: LampPools = NO_LAMPS,
+    ) -> list[View]:
+        """A view from each of the poses ``(4, 4)``."""
+        eyes = [self._pool.submit(self._prepare, surfaces, shadows, light, T, pools) for T in T_wc]
         views, jobs = [], []
         for eye in eyes:
             view, bands = eye.result()
@@ -102,7 +111,7 @@ class Renderer:
             jobs += [self._pool.submit(band) for band in bands]
         for job in jobs:
             job.result()
-        return views[0], views[1]
+        return views
 
     def _prepare(
         self,

@@ -48,14 +48,13 @@ class Town:
     lamps: Float
 
 
-def build_town(route: Route, variation: Variation, sway: float = 0.0) -> Town:
-    """The town of a route, with room for cameras up to ``sway`` metres to either side of it."""
+def build_town(route: Route, variation: Variation, aside: tuple[float, ...] = (0.0,)) -> Town:
+    """The town of a route, with room for cameras so many metres ``aside`` (right) of it."""
     rng = np.random.default_rng([variation.seed, 1])
     atlas = AtlasBuilder()
     motorway = route.land == "motorway"
     roads = route.roads if motorway else _with_side_streets(route.roads, variation.seed)
-    aside = np.array([-sway, 0.0, sway] if sway else [0.0])
-    places = route.T_wc[:, None, :3, 3] + aside[:, None] * route.T_wc[:, None, :3, 0]
+    places = route.T_wc[:, None, :3, 3] + np.array(aside)[:, None] * route.T_wc[:, None, :3, 0]
     cameras = places.reshape(-1, 3)[:, [0, 2]]
     site = Site(
         route,

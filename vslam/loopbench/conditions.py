@@ -1,0 +1,146 @@
+"""What is done to the images that ask for their place; the images asked for stay as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError
+from vslam.perturb import parse_perturbation
+
+Image = NDArray[np.uint8]
+
+KINDS = ("none", "light", "clipping", "viewpoint", "occlusion", "noise", "blur", "change", "all")
+# Of `vslam run --perturb`, at strength 1.
+_LAWS = {
+    "light": {"brightness": 2.0, "gamma": 2.0},
+    "occlusion": {"occlusion": 2.0},
+    "noise": {"noise": 2.5},
+    "blur": {"blur": 2.0},
+}
+_LAWS["all"] = {law: s / 2 for kind in _LAWS.values() for law, s in kind.items()}
+_OTHER_LANE, _TURN = 3.2, 30.0  # m and degrees, of viewpoint at strength 1
+_FIELD_OF_VIEW = 80.0  # degrees, taken for photographs that cannot be rendered again
+_CLIPPED = 0.6  # share of the pixels that become white, or black, at strength 1
+_APART_S = 10.0  # between images: the walks of light forget in 2 s
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A kind of change and its strength, 0 to 1."""
+
+    kind: str
+    strength: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """``none`` or ``viewpoint:0.5`` for example."""
+        return self.kind if self.kind == "none" else f"{self.kind}:{self.strength:g}"
+
+    @property
+    def view(self) -> float:
+        """Strength of the change of viewpoint."""
+        return {"viewpoint": self.strength, "all": self.strength / 2}.get(self.kind, 0.0)
+
+    @property
+    def lateral(self) -> tuple[float, float]:
+        """Metres to the right, drawn between; nobody drives twice on one line."""
+        side = -_OTHER_LANE * self.view
+        return (side, side) if self.view else (-0.3, 0.3)
+
+    @property
+    def heading(self) -> tuple[float, float]:
+        """Degrees to either side, drawn between."""
+        turn = _TURN * self.view
+        return (turn, turn) if self.view else (0.0, 3.0)
+
+    @property
+    def change(self) -> float:
+        """Of the town, as of ``vslam synth --change``: 0.5 and 0.9 for strengths 0.5 and 1."""
+        strength = {"change": self.strength, "all": self.strength / 2}.get(self.kind)
+        return 0.0 if strength is None else round(0.1 + 0.8 * strength, 3)
+
+
+def parse_conditions(kinds: str, strengths: str) -> list[Condition]:
+    """Conditions of every kind at every strength, ``none`` once and always first.
+
+    Args:
+        kinds: names with commas, of ``KINDS``.
+        strengths: numbers from 0 to 1 with commas.
+
+    Raises:
+        InputError: unknown kind, or a strength that is no number from 0 to 1.
+    """
+    names = [name.strip() for name in kinds.split(",") if name.strip()]
+    if wrong := [name for name in names if name not in KINDS]:
+        raise InputError(f"--perturb {wrong[0]}: unknown; choose from {', '.join(KINDS)}.")
+    try:
+        levels = [float(text) for text in strengths.split(",") if text.strip()]
+    except ValueError as error:
+        raise InputError(f"--strengths {strengths}: give numbers with commas.") from error
+    if not levels or not all(0.0 < level <= 1.0 for level in levels):
+        raise InputError(f"--strengths {strengths}: must be above 0 and at most 1.")
+    chosen = [Condition(name, level) for name in names if name != "none" for level in levels]
+    return [Condition("none"), *dict.fromkeys(chosen)]
+
+
+def apply(
+    condition: Condition, images: Sequence[Image], seed: int, *, rendered: bool
+) -> list[Image]:
+    """The images under a condition, each drawn anew.
+
+    Args:
+        condition: ``change`` leaves images as they are: a town is rendered changed.
+        images: ``(H, W)`` uint8 each.
+        seed: of all that is random.
+        rendered: the viewpoint was already changed when the images were rendered.
+    """
+    out = list(images)
+    if condition.view and not rendered:
+        out = [turned(image, _side(seed, k) * condition.heading[0]) for k, image in enumerate(out)]
+    if condition.kind == "clipping":
+        out = [clipped(image, _CLIPPED * condition.strength, _side(seed, k) > 0)
+               for k, image in enumerate(out)]  # fmt: skip
+    laws = _LAWS.get(condition.kind)
+    if laws:
+        spec = ",".join(
+            f"{law}:{strength * condition.strength:g}" for law, strength in laws.items()
+        )
+        law = parse_perturbation(spec, seed, _APART_S * np.arange(len(out) + 1.0))
+        out = [law.apply(k, image, None)[0] for k, image in enumerate(out)]
+    return out
+
+
+def turned(image: Image, degrees: float) -> Image:
+    """The image of a camera turned to the right: exact for a camera that stays where it is.
+
+    What was outside the view is black.
+    """
+    import cv2
+
+    height, width = image.shape
+    focal = width / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    R = np.array([[c, 0, -s], [0, 1.0, 0], [s, 0, c]])
+    H = K @ R @ np.linalg.inv(K)
+    return np.asarray(cv2.warpPerspective(image, H, (width, height)), np.uint8)
+
+
+def clipped(image: Image, share: float, bright: bool) -> Image:
+    """Exposed so that a share of the pixels becomes white, or black."""
+    grey = np.arange(256.0)
+    if bright:
+        white = max(float(np.quantile(image, 1.0 - share)), 1.0)
+        curve = grey * (255.0 / white)
+    else:
+        black = min(float(np.quantile(image, share)), 254.0)
+        curve = grey - black
+    return np.clip(np.rint(curve), 0, 255).astype(np.uint8)[image]
+
+
+def _side(seed: int, k: int) -> float:
+    return float(np.random.default_rng([seed, 30, k]).choice([-1.0, 1.0]))

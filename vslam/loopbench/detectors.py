@@ -1,0 +1,108 @@
+"""Loop detectors as functions of images: how alike each query and each image of a gallery are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.config import BowConfig, OrbConfig
+from vslam.frontend.orb import extract
+from vslam.loopbench.conditions import Image
+from vslam.loopclosure.bow_index import InvertedIndex, NodeIndex
+from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
+
+
+@dataclass(frozen=True)
+class View:
+    """An image with its ORB features.
+
+    Attributes:
+        image: ``(H, W)`` uint8.
+        xy: ``(N, 2)`` float32 pixels.
+        descriptors: ``(N, 32)`` uint8.
+        words: ``(N,)`` int32 of the vocabulary.
+        nodes: direct index.
+    """
+
+    image: Image
+    xy: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    words: NDArray[np.int32]
+    nodes: NodeIndex
+
+
+def look(images: Sequence[Image], vocabulary: Vocabulary, threads: int) -> list[View]:
+    """Extract the features of all images, as a run does."""
+    node_of_word = vocabulary.ancestors(BowConfig().direct_level)
+
+    def one(image: Image) -> View:
+        found = extract(image, OrbConfig())
+        words = vocabulary.words(found.descriptors)
+        node = node_of_word[words]
+        order = np.argsort(node, kind="stable").astype(np.int32)
+        return View(image, found.xy, found.descriptors, words, NodeIndex(node[order], order))
+
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(one, images))
+
+
+class Scorer(Protocol):
+    """A loop detector without a map."""
+
+    name: str
+    probability: bool
+    """Whether scores are probabilities, with thresholds at 0.5 and 0.9."""
+
+    def scores(self, queries: Sequence[View], gallery: Sequence[View]) -> NDArray[np.float64]:
+        """``(Q, G)``, greater is more alike."""
+
+
+class BowScorer:
+    """tf-idf and the L1 score, as :class:`vslam.loopclosure.bow.BowDetector` has them."""
+
+    name = "bow"
+    probability = False
+
+    def __init__(self, vocabulary: Vocabulary) -> None:
+        self._vocabulary = vocabulary
+
+    def scores(self, queries: Sequence[View], gallery: Sequence[View]) -> NDArray[np.float64]:
+        """See :class:`Scorer`."""
+        index = InvertedIndex(self._vocabulary.n_words)
+        for number, view in enumerate(gallery):
+            index.add(number, bow_vector(self._vocabulary, view.words))
+        return np.stack(
+            [index.compare(bow_vector(self._vocabulary, view.words)).score for view in queries]
+        ).astype(np.float64)
+
+
+def open_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scorer:
+    """``bow``, or one of the networks.
+
+    Raises:
+        InputError: no weights for it, or those of another network.
+    """
+    if name == "bow":
+        return BowScorer(vocabulary)
+    from vslam.config import SiameseConfig
+    from vslam.loopclosure.siamese.scoring import NetworkScorer
+
+    return _NetworkViews(NetworkScorer(name, weights, SiameseConfig().fit))
+
+
+class _NetworkViews:
+    probability = True
+
+    def __init__(self, network) -> None:  # type: ignore[no-untyped-def]
+        self.name = network.name
+        self._network = network
+
+    def scores(self, queries: Sequence[View], gallery: Sequence[View]) -> NDArray[np.float64]:
+        images = [view.image for view in gallery]
+        return self._network.scores([view.image for view in queries], images)

@@ -1,0 +1,161 @@
+"""Measure loop detectors on test sets: descriptors alone, and after geometric verification."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.config import VerificationConfig
+from vslam.loopbench.conditions import Condition
+from vslam.loopbench.detectors import Scorer, View, look
+from vslam.loopbench.schema import Cell, Curve, Gain
+from vslam.loopbench.sets import Questions, TestSet
+from vslam.loopclosure.benchmark import (
+    average_precision,
+    balanced_accuracy,
+    precision_recall,
+    summary,
+)
+from vslam.loopclosure.bow_index import match_by_node
+from vslam.loopclosure.siamese.places import DIFFERENT, SAME, UNKNOWN
+from vslam.loopclosure.vocabulary import Vocabulary
+
+MIN_MATCHES = 20  # that obey one epipolar geometry (ORB-SLAM, VII-B, asks for 20 in 3D)
+_EPIPOLAR_PIXELS = 2.0
+_CURVE_POINTS = 200
+_RESAMPLES = 200  # of the queries, for the interval of a difference
+
+Matrix = NDArray[np.float64]
+
+
+def measure(
+    test_set: TestSet,
+    condition: Condition,
+    scorers: Sequence[Scorer],
+    vocabulary: Vocabulary,
+    seed: int,
+    threads: int,
+) -> tuple[list[Cell], list[Gain]]:
+    """All detectors on one set under one condition; nothing where that is not to be had.
+
+    The first scorer is the baseline that the others are compared with.
+    """
+    questions = test_set.ask(condition, seed)
+    if questions is None:
+        return [], []
+    queries = look(questions.queries, vocabulary, threads)
+    gallery = look(questions.gallery, vocabulary, threads)
+    verify = _Verification(queries, gallery)
+    found = {scorer.name: scorer.scores(queries, gallery) for scorer in scorers}
+    cells = [
+        _cell(test_set.title, condition, scorer, found[scorer.name], questions, verify)
+        for scorer in scorers
+    ]
+    first, *others = found
+    gains = [
+        _gain(test_set.title, condition, first, other, found, questions.relation)
+        for other in others
+    ]
+    return cells, gains
+
+
+def _cell(
+    title: str,
+    condition: Condition,
+    scorer: Scorer,
+    scores: Matrix,
+    questions: Questions,
+    verify: _Verification,
+) -> Cell:
+    known = questions.relation != UNKNOWN
+    same, score = questions.relation[known] == SAME, scores[known]
+    accuracy: dict[str, float | None] = {
+        str(threshold): balanced_accuracy(same, score, threshold) if scorer.probability else None
+        for threshold in (0.5, 0.9)
+    }
+    answerable = (questions.relation == SAME).any(1)
+    best = np.where(known, scores, -np.inf).argmax(1)
+    truth = questions.relation[np.arange(len(best)), best]
+    accepted = np.array([verify.accepts(q, int(g)) for q, g in enumerate(best)])
+    curve = precision_recall(same, score)
+    points = np.unique(np.linspace(0, len(curve.recall) - 1, _CURVE_POINTS).astype(int))
+    return Cell(
+        data=title,
+        condition=condition.name,
+        detector=scorer.name,
+        figures=summary(same, score),
+        accuracy=accuracy,
+        queries=int(answerable.sum()),
+        first_right=float((truth[answerable] == SAME).mean()),
+        verified_right=float((accepted & (truth == SAME))[answerable].mean()),
+        verified_wrong=int((accepted & (truth == DIFFERENT)).sum()),
+        curve=Curve(
+            precision=curve.precision[points].round(5).tolist(),
+            recall=curve.recall[points].round(5).tolist(),
+        ),
+    )
+
+
+def _gain(
+    title: str,
+    condition: Condition,
+    first: str,
+    second: str,
+    found: dict[str, Matrix],
+    relation: NDArray[np.int8],
+) -> Gain:
+    """Difference in AP with a bootstrap interval: queries are drawn again, with their galleries."""
+    known, rng = relation != UNKNOWN, np.random.default_rng(0)
+
+    def gain(rows: NDArray[np.integer]) -> float:
+        mask = known[rows]
+        same = relation[rows][mask] == SAME
+        if not same.any():
+            return 0.0
+        ap = [average_precision(precision_recall(same, found[name][rows][mask]))
+              for name in (first, second)]  # fmt: skip
+        return ap[1] - ap[0]
+
+    n = len(relation)
+    drawn = [gain(rng.integers(n, size=n)) for _ in range(_RESAMPLES)]
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return Gain(
+        data=title, condition=condition.name, first=first, second=second,
+        difference=gain(np.arange(n)), low=float(low), high=float(high),
+    )  # fmt: skip
+
+
+class _Verification:
+    """Whether two images obey one epipolar geometry; each pair is asked for once."""
+
+    def __init__(self, queries: Sequence[View], gallery: Sequence[View]) -> None:
+        self._queries, self._gallery = queries, gallery
+        self._known: dict[tuple[int, int], bool] = {}
+
+    def accepts(self, query: int, image: int) -> bool:
+        key = query, image
+        if key not in self._known:
+            inliers = epipolar_inliers(self._queries[query], self._gallery[image])
+            self._known[key] = inliers >= MIN_MATCHES
+        return self._known[key]
+
+
+def epipolar_inliers(a: View, b: View, config: VerificationConfig | None = None) -> int:
+    """Matches of two images that obey the best fundamental matrix found."""
+    import cv2
+
+    config = config or VerificationConfig()
+    match = match_by_node(
+        *a.nodes, a.descriptors.view(np.uint64), np.ones(len(a.xy), np.bool_),
+        *b.nodes, b.descriptors.view(np.uint64), np.ones(len(b.xy), np.bool_),
+        config.match_distance, config.match_ratio,
+    )  # fmt: skip
+    rows = np.flatnonzero(match >= 0)
+    if len(rows) < MIN_MATCHES:
+        return 0
+    _, inlier = cv2.findFundamentalMat(
+        a.xy[rows], b.xy[match[rows]], cv2.USAC_DEFAULT, _EPIPOLAR_PIXELS, 0.999, 2000
+    )
+    return 0 if inlier is None else int(inlier.sum())

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +76,7 @@ def _network(name: str, weights: Path | None) -> Cost:
     one = network.embed([image])[0]
     for n in KEYFRAMES:
         gallery = np.random.default_rng(1).standard_normal((n, len(one))).astype(np.float32)
-        query[str(n)] = _median_ms(lambda gallery=gallery: network.compare(one, gallery))
+        query[str(n)] = _median_ms(partial(network.compare, one, gallery))
     return Cost(
         detector=name, load_s=loading, image_ms=embedding, query_ms=query,
         parameters=network.parameters, memory_mb=peak_memory_mb(),

@@ -93,8 +93,8 @@ def _images(source: Places) -> TestSet:
     def ask(condition: Condition, seed: int) -> Questions | None:
         if condition.kind == "change":
             return None
-        asked = [source.grey(i) for i in gallery]
-        asking = apply(condition, [source.grey(i) for i in queries], seed, rendered=False)
+        asked = [source.grey(int(i)) for i in gallery]
+        asking = apply(condition, [source.grey(int(i)) for i in queries], seed, rendered=False)
         return Questions(asking, asked, relation)
 
     return TestSet(source.name, ask)
@@ -124,8 +124,8 @@ def _town(
         (source,) = open_source(f"pairs:{folder}")
         assert source.asks is not None
         queries, gallery = np.flatnonzero(source.asks), np.flatnonzero(~source.asks)
-        asking = apply(condition, [source.grey(i) for i in queries], draw, rendered=True)
+        asking = apply(condition, [source.grey(int(i)) for i in queries], draw, rendered=True)
         relation = source.relation[np.ix_(queries, gallery)]
-        return Questions(asking, [source.grey(i) for i in gallery], relation)
+        return Questions(asking, [source.grey(int(i)) for i in gallery], relation)
 
     return TestSet(f"{name}, {'aliased ' if aliased else ''}town {seed}", ask)

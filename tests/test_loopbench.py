@@ -1,0 +1,245 @@
+"""Loop detectors compared on images: conditions, test sets, figures, report, command."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from datetime import UTC, datetime
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from vslam.cli import app
+from vslam.errors import InputError
+from vslam.loopbench import report as reporting
+from vslam.loopbench.conditions import Condition, apply, clipped, parse_conditions, turned
+from vslam.loopbench.cost import cost
+from vslam.loopbench.detectors import BowScorer, look
+from vslam.loopbench.measure import epipolar_inliers, measure
+from vslam.loopbench.schema import LoopsJson
+from vslam.loopbench.sets import Questions, TestSet, open_set
+from vslam.loopclosure.siamese.places import DIFFERENT, SAME, UNKNOWN
+from vslam.loopclosure.vocabulary import load
+
+
+def texture(seed: int, height: int = 188, width: int = 620) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 256, (height // 4, width // 4), np.uint8)
+    return cv2.resize(noise, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+@pytest.fixture(scope="module")
+def vocabulary():
+    return load()
+
+
+def test_conditions_are_kinds_times_strengths():
+    names = [c.name for c in parse_conditions("light,none,all,light", "0.5,1")]
+    assert names == ["none", "light:0.5", "light:1", "all:0.5", "all:1"]
+    strong, mild = Condition("viewpoint", 1.0), Condition("all", 1.0)
+    assert strong.lateral == (-3.2, -3.2)
+    assert strong.heading == (30.0, 30.0)
+    assert mild.heading == (15.0, 15.0)
+    assert Condition("change", 0.5).change == 0.5
+    assert Condition("change", 1.0).change == 0.9
+    assert Condition("light", 1.0).change == 0.0
+
+
+@pytest.mark.parametrize(
+    ("kinds", "strengths", "said"),
+    [
+        ("fog", "1", "--perturb fog: unknown"),
+        ("light", "2", "at most 1"),
+        ("light", "x", "numbers"),
+    ],
+)
+def test_conditions_that_are_refused(kinds, strengths, said):
+    with pytest.raises(InputError, match=said):
+        parse_conditions(kinds, strengths)
+
+
+def test_clipping_takes_a_share_of_the_pixels():
+    image = texture(0)
+    assert np.mean(clipped(image, 0.6, True) == 255) == pytest.approx(0.6, abs=0.02)
+    assert np.mean(clipped(image, 0.6, False) == 0) == pytest.approx(0.6, abs=0.02)
+
+
+def test_a_turned_camera_sees_in_its_middle_what_was_aside():
+    image = np.zeros((200, 800), np.uint8)
+    focal = 400 / np.tan(np.radians(40.0))
+    column = round(400 + focal * np.tan(np.radians(15.0)))
+    image[:, column - 2 : column + 3] = 255
+    bright = np.flatnonzero(turned(image, 15.0)[100] > 128)
+    assert bright.mean() == pytest.approx(400, abs=1)
+    assert (turned(np.full_like(image, 90), 30.0)[:, -200:] == 0).mean() > 0.9  # not seen before
+
+
+def test_conditions_repeat_with_their_seed_and_leave_the_rest_alone():
+    images = [texture(k) for k in range(3)]
+    for kind in ("light", "clipping", "viewpoint", "occlusion", "noise", "blur", "all"):
+        once = apply(Condition(kind, 1.0), images, 5, rendered=False)
+        again = apply(Condition(kind, 1.0), images, 5, rendered=False)
+        other = apply(Condition(kind, 1.0), images, 6, rendered=False)
+        assert all(np.array_equal(a, b) for a, b in zip(once, again, strict=True))
+        assert any((a != b).any() for a, b in zip(once, images, strict=True)), kind
+        assert kind == "blur" or any((a != b).any() for a, b in zip(once, other, strict=True)), kind
+    rendered = apply(Condition("viewpoint", 1.0), images, 5, rendered=True)
+    assert all(a is b for a, b in zip(rendered, images, strict=True))
+
+
+def test_a_drive_asks_for_what_lies_long_before(tmp_path):
+    folder = tmp_path / "sequences" / "00" / "image_0"
+    folder.mkdir(parents=True)
+    for k in range(60):
+        cv2.imwrite(str(folder / f"{k:06d}.png"), texture(k, 40, 80))
+    poses = np.tile(np.eye(3, 4), (60, 1, 1))
+    poses[:, 2, 3] = 10.0 * np.arange(60)
+    poses[55, 2, 3] = poses[2, 2, 3]
+    (tmp_path / "poses").mkdir()
+    np.savetxt(tmp_path / "poses" / "00.txt", poses.reshape(60, 12))
+    (found,) = open_set(f"kitti:{tmp_path}", tmp_path, threads=1, shown=False)
+    asked = found.ask(Condition("none"), 0)
+    assert asked.relation.shape == (10, 10)
+    same = np.argwhere(asked.relation == SAME)
+    assert same.tolist() == [[5, 2]]
+    assert (asked.relation[0, 1:] == UNKNOWN).all()  # image 50 does not ask for image 1 and later
+    assert asked.relation[9, 0] == DIFFERENT
+    assert found.ask(Condition("change", 1.0), 0) is None
+
+
+def test_of_pairs_the_second_images_ask(tmp_path):
+    rows = []
+    (tmp_path / "images").mkdir()
+    for k in range(3):
+        for eye in "ab":
+            cv2.imwrite(str(tmp_path / "images" / f"{k}{eye}.png"), texture(k, 40, 80))
+        place = {"x_a": 0.0, "z_a": 200.0 * k, "yaw_a": 0.0}
+        moved = {"x_b": 1.0, "z_b": 200.0 * k, "yaw_b": 20.0}
+        rows.append({"a": f"images/{k}a.png", "b": f"images/{k}b.png", "same": 1, **place, **moved})
+    with (tmp_path / "pairs.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, list(rows[0]))
+        table.writeheader()
+        table.writerows(rows)
+    (found,) = open_set(f"pairs:{tmp_path}", tmp_path, threads=1, shown=False)
+    asked = found.ask(Condition("none"), 0)
+    assert asked.relation.tolist() == (2 * np.eye(3) - 1).astype(int).tolist()
+
+
+@pytest.mark.parametrize(
+    "spec", ["town:nowhere", "town:demo[sed=1]", "town:demo[seed=x]", "town:", "pears:x"]
+)
+def test_sets_that_are_refused(spec, tmp_path):
+    with pytest.raises(InputError, match=re.escape(f"--data {spec}")):
+        open_set(spec, tmp_path, threads=1, shown=False)
+
+
+def test_one_epipolar_geometry_tells_a_place_from_another(vocabulary):
+    image = texture(1)
+    H = np.array([[1.02, 0.01, 6.0], [-0.01, 0.99, -3.0], [2e-5, 0.0, 1.0]])
+    moved = cv2.warpPerspective(image, H, image.shape[::-1])
+    one, two, other = look([image, moved, texture(2)], vocabulary, 1)
+    assert epipolar_inliers(one, two) > 100
+    assert epipolar_inliers(one, other) == 0
+
+
+class Told:
+    """Knows the truth, or its opposite."""
+
+    probability = True
+
+    def __init__(self, name: str, relation: np.ndarray, sign: float) -> None:
+        self.name, self._p = name, np.where(relation == SAME, 0.5 + 0.45 * sign, 0.5 - 0.45 * sign)
+
+    def scores(self, queries, gallery):
+        return self._p
+
+
+def test_figures_of_detectors_that_know_and_that_err(vocabulary):
+    images = [texture(k) for k in range(6)]
+    relation = (2 * np.eye(6) - 1).astype(np.int8)
+    relation[0, 1] = UNKNOWN
+    test_set = TestSet("walls", lambda condition, seed: Questions(images, images, relation))
+    scorers = [Told("liar", relation, -1.0), Told("sage", relation, 1.0)]
+    cells, gains = measure(test_set, Condition("none"), scorers, vocabulary, 0, 1)
+    liar, sage = cells
+    assert sage.figures["average_precision"] == 1.0
+    assert sage.figures["recall_at_100_precision"] == 1.0
+    assert sage.accuracy == {"0.5": 1.0, "0.9": 1.0}
+    found = sage.queries, sage.first_right, sage.verified_right, sage.verified_wrong
+    assert found == (6, 1.0, 1.0, 0)
+    assert liar.accuracy == {"0.5": 0.0, "0.9": 0.0}
+    # The liar's best images show other walls, whose matches obey no one geometry.
+    assert (liar.first_right, liar.verified_right, liar.verified_wrong) == (0.0, 0.0, 0)
+    (gain,) = gains
+    assert gain.low > 0.7
+    assert gain.difference == pytest.approx(1.0 - liar.figures["average_precision"])
+    assert test_set.ask(Condition("none"), 0).relation[0, 1] == UNKNOWN
+
+
+def test_report_says_who_wins_in_all_three_files(vocabulary, tmp_path):
+    images = [texture(k) for k in range(4)]
+    relation = (2 * np.eye(4) - 1).astype(np.int8)
+    test_set = TestSet("walls", lambda condition, seed: Questions(images, images, relation))
+    scorers = [BowScorer(vocabulary), Told("liar", relation, -1.0)]
+    cells, gains = measure(test_set, Condition("none"), scorers, vocabulary, 0, 1)
+    found = LoopsJson(
+        seed=0, cells=cells, gains=gains, costs=[], machine="a <b> machine", versions={},
+        created=datetime(2026, 1, 1, tzinfo=UTC),
+    )  # fmt: skip
+    reporting.write_report(found, tmp_path)
+    read = LoopsJson.model_validate_json((tmp_path / "loops.json").read_text())
+    assert read == found
+    text, page = (tmp_path / "loops.md").read_text(), (tmp_path / "loops.html").read_text()
+    for shown in (text, page):
+        assert "none: liar -0." in shown
+        assert "worse on walls" in shown
+        assert "1.000" in shown
+    assert page.count("<svg") == 1
+    assert "&lt;b&gt; machine" in page
+    assert not re.search(r"(src|href)=\"http", page)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--detectors", "none"], "--detectors none: finds nothing"),
+        (["--detectors", "magic"], "--detectors magic: unknown"),
+        (["--detectors", ""], "unknown"),
+        (["--detectors", "vgg16"], "vslam ships no weights"),
+        (["--detectors", "bow", "--weights", "capsule=x"], "must be NAME=FILE"),
+        (["--detectors", "bow", "--perturb", "fog"], "--perturb fog"),
+        (["--detectors", "bow", "--data", "kitti:/nowhere"], "/nowhere"),
+    ],
+)
+def test_command_refuses_in_one_sentence(arguments, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["loops", "bench", *arguments])
+    assert isinstance(result.exception, InputError)
+    assert said in str(result.exception)
+    assert not list(tmp_path.iterdir())
+
+
+def test_command_on_a_rendered_town(tmp_path, monkeypatch):
+    monkeypatch.setenv("VSLAM_CACHE", str(tmp_path / "cache"))
+    arguments = ["--detectors", "bow", "--perturb", "viewpoint", "--strengths", "1", "--quiet"]
+    arguments += ["--data", "town:demo[seed=7,places=4]", "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(app, ["loops", "bench", *arguments], catch_exceptions=False)
+    assert result.exit_code == 0
+    found = json.loads((tmp_path / "out" / "loops.json").read_text())
+    assert [cell["condition"] for cell in found["cells"]] == ["none", "viewpoint:1"]
+    plain, turned_away = (cell["figures"]["average_precision"] for cell in found["cells"])
+    assert plain == 1.0
+    assert turned_away <= plain
+    rendered = next((tmp_path / "cache").rglob("*view1*/pairs.csv"))
+    rows = list(csv.DictReader(rendered.open()))
+    assert {float(row["lateral_m"]) for row in rows} == {-3.2}
+    assert {abs(float(row["heading_deg"])) for row in rows} == {30.0}
+
+
+def test_cost_is_measured_in_a_process_of_its_own():
+    found = cost("bow", None)
+    assert set(found.query_ms) == {"1000", "5000"}
+    assert 0 < found.query_ms["1000"] < found.query_ms["5000"] < 50
+    assert 50 < found.memory_mb < 2000

@@ -573,11 +573,11 @@ def test_unwritable_cache(route, tmp_path):
 
 def test_a_name_says_how_the_town_varies():
     assert parse_drive("05") == ("05", Variation())
-    assert parse_drive("05+change:0.5+moving:6+aliased") == (
+    assert parse_drive("05+change:0.5+moving:6+aliased+seed:3") == (
         "05",
-        Variation(change=0.5, moving=6, aliased=True),
+        Variation(3, aliased=True, change=0.5, moving=6),
     )
-    for name in ("05+fog", "05+change:2", "05+change", "05+moving:x", "05+"):
+    for name in ("05+fog", "05+change:2", "05+change", "05+moving:x", "05+seed:", "05+"):
         with pytest.raises(InputError, match=r"--seq 05\+.* is not understood"):
             parse_drive(name)
     with pytest.raises(InputError, match="route 77: unknown"):

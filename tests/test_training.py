@@ -148,6 +148,9 @@ def test_pruning_and_fine_tuning(tmp_path):
     wanted = settings.model_copy(update={"network": "capsule-pruned"})
     start, fitted, report = starting_network(wanted, collection, full.weights, "cpu")
     assert fitted.shape.kept == round(0.8 * SMALL.places)
+    half = wanted.model_copy(update={"prune_share": 0.5})
+    fewer = starting_network(half, collection, full.weights, "cpu")[1]
+    assert fewer.shape.kept == SMALL.places - round(0.5 * SMALL.places)
     assert {"average_precision_before", "average_precision_removed"} <= set(report)
     tuned = train(collection, fitted, tmp_path / "pruned", threads=1, start=start)
     assert load_network(tuned.weights)[0].name == "capsule-pruned"

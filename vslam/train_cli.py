@@ -76,6 +76,10 @@ def train(
             "vgg16 a weight file of torchvision."
         ),
     ] = None,
+    prune_share: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=0.99, help="Share of the capsules that capsule-pruned lacks."),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder to write to.", show_default="training/NETWORK-PRESET"),
@@ -105,7 +109,8 @@ def train(
     if not allow_test_data:
         refuse_test_data(sources)
     chosen = load_settings(settings) if settings else PRESETS[preset]
-    given = {"epochs": epochs, "pairs": pairs, "seed": seed, "network": network}
+    given = {"epochs": epochs, "pairs": pairs, "seed": seed, "network": network,
+             "prune_share": prune_share}  # fmt: skip
     chosen = chosen.model_copy(update={k: v for k, v in given.items() if v is not None})
     folder = out or Path("training") / f"{network}-{preset}"
     threads = threads or available_cores()

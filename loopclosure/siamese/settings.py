@@ -34,6 +34,9 @@ class TrainSettings(BaseModel):
     validation_share: float = Field(0.15, gt=0, lt=1, description="Of the units of each source.")
     validation_images: int = Field(800, ge=2, description="At most.")
     augmentation: Augmentation = Augmentation()
+    prune_share: float = Field(
+        0.2, gt=0, lt=1, description="Of the capsules, taken out of capsule-pruned. [paper]"
+    )
 
 
 PRESETS = {

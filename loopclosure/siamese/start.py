@@ -23,7 +23,6 @@ from vslam.loopclosure.siamese.siamese import (
     load_network,
 )
 
-PRUNED_SHARE = 0.2
 _RANKED_IMAGES = 1000
 
 
@@ -71,8 +70,8 @@ def _prune(
     squares = collection.squares[train[::step]]
     full.to(device)
     batches = (to_tensor(squares[k : k + 32]).to(device) for k in range(0, len(squares), 32))
-    smaller = pruned(full, lowest(mean_couplings(full, batches), PRUNED_SHARE))
-    report: dict[str, Any] = {"pruned_from": str(weights), "pruned_share": PRUNED_SHARE}
+    smaller = pruned(full, lowest(mean_couplings(full, batches), settings.prune_share))
+    report: dict[str, Any] = {"pruned_from": str(weights), "pruned_share": settings.prune_share}
     for name, network in (("before", full), ("removed", smaller)):
         figures = validate(network, collection, validation, settings.augmentation, device)[0]
         report[f"average_precision_{name}"] = figures["average_precision"]

@@ -33,7 +33,7 @@ class SyntheticSequence(KittiSequence):
 
 
 def parse_drive(name: str) -> tuple[str, Variation]:
-    """``05+change:0.5+moving:6+aliased`` -> the route's name and the town's variation.
+    """``05+change:0.5+moving:6+aliased+seed:1`` -> the route's name and the town's variation.
 
     Raises:
         InputError: a part that is none of these.
@@ -47,14 +47,16 @@ def parse_drive(name: str) -> tuple[str, Variation]:
                 town = replace(town, change=float(value))
             elif what == "moving" and int(value) >= 0:
                 town = replace(town, moving=int(value))
+            elif what == "seed" and int(value) >= 0:
+                town = replace(town, seed=int(value))
             elif part == "aliased":
                 town = replace(town, aliased=True)
             else:
                 raise ValueError
     except ValueError:
         raise InputError(
-            f"--seq {name}: '{part}' is not understood; write ROUTE, +change:0 to 1, +moving:CARS "
-            "or +aliased behind it."
+            f"--seq {name}: '{part}' is not understood; write ROUTE, +change:0 to 1, +moving:CARS, "
+            "+seed:N or +aliased behind it."
         ) from None
     return route, town
 

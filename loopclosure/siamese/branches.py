@@ -77,7 +77,8 @@ class CapsuleBranch(nn.Module):
 
     def routed(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Output capsules ``(N, J, D)`` and couplings ``(N, J, I)``."""
-        x = standardised(images).contiguous(memory_format=torch.channels_last)
+        grey = images.mean(1, keepdim=True)
+        x = standardised(grey).contiguous(memory_format=torch.channels_last)
         x = self.primary(self.extractor(x))
         # Routing sums thousands of products: never in half precision.
         with torch.autocast(x.device.type, enabled=False):

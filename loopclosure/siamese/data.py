@@ -145,19 +145,30 @@ def draw_pairs(
     rng: np.random.Generator,
     hard: NDArray[np.int64] | None = None,
     hard_share: float = 0.5,
+    *,
+    same_share: float = 0.5,
+    together: int = 1,
 ) -> Pairs:
-    """Pairs to train on, as many of one place as of two.
+    """Pairs to train on.
 
     Args:
         chosen: ``(M,)`` images to draw from.
-        count: number of pairs, even.
+        count: number of pairs.
         hard: ``(M, K)`` images of other places that look alike, -1 for none: :func:`mine`.
         hard_share: of the pairs of two places, how many are drawn from ``hard``.
+        same_share: of the pairs, how many show one place, evenly spread.
+        together: so many pairs in a row begin in one source, drawn by its number of images.
     """
     relation = collection.relation[np.ix_(chosen, chosen)]
+    sizes = [size for _, size in collection.sources]
+    source = np.repeat(np.arange(len(sizes)), sizes)[chosen]
     a = rng.integers(len(chosen), size=count)
+    if together > 1:
+        for k in range(0, count, together):
+            members = np.flatnonzero(source == source[a[k]])
+            a[k : k + together] = rng.choice(members, len(a[k : k + together]))
     b = np.empty(count, np.int64)
-    same = np.arange(count) % 2 == 0
+    same = np.diff(np.ceil(same_share * np.arange(count + 1) - 1e-9)) > 0  # evenly, the first too
     for k in range(count):
         wanted = np.flatnonzero(relation[a[k]] == (SAME if same[k] else DIFFERENT))
         use_hard = rng.random() < hard_share

@@ -57,11 +57,11 @@ class Separable(nn.Module):
 
 
 class Stem(nn.Module):
-    """The one ordinary convolution, 7x7; three channels are too few to separate."""
+    """The one ordinary convolution, 7x7: one grey channel has nothing to separate."""
 
     def __init__(self, outputs: int, stride: int) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(3, outputs, 7, stride, 3, bias=False)
+        self.conv = nn.Conv2d(1, outputs, 7, stride, 3, bias=False)
         self.norm: nn.Module = nn.BatchNorm2d(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -125,11 +125,11 @@ class OriginalExtractor(nn.Module):
     def __init__(self, types: int, size: int) -> None:
         super().__init__()
         self.types, self.size = types, size
-        self.conv = nn.Conv2d(3, 256, 9)
+        self.conv = nn.Conv2d(1, 256, 9)
         self.primary = nn.Conv2d(256, types * size, 9, stride=2)
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(N, 3, H, W)`` to primary capsules ``(N, types, 64, size)``."""
+        """``(N, 1, H, W)`` to primary capsules ``(N, types, 64, size)``."""
         x = nn.functional.interpolate(x, size=(self.reduced, self.reduced), mode="area")
         x = self.primary(torch.relu(self.conv(x)))
         n = x.shape[0]

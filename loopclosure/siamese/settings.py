@@ -28,6 +28,8 @@ class TrainSettings(BaseModel):
     batch: int = Field(64, ge=2, description="Pairs. [paper]")
     epochs: int = Field(40, ge=1, description="At most.")
     pairs: int = Field(4096, ge=2, description="Pairs of an epoch.")
+    same_share: float = Field(0.5, gt=0, le=1, description="Of the pairs: of one place. [paper]")
+    together: int = Field(1, ge=1, description="Pairs in a row that are of one source.")
     patience: int = Field(6, ge=1, description="Epochs without a better validation AP.")
     hard_share: float = Field(0.5, ge=0, le=1, description="Of the pairs of two places: mined.")
     mined_images: int = Field(4000, ge=2, description="Images embedded for mining, at most.")
@@ -42,8 +44,10 @@ class TrainSettings(BaseModel):
 PRESETS = {
     # What the paper writes; augmentation strengths and mining are ours, it gives none.
     "paper": TrainSettings(),
-    # Every image of a batch is compared with every other, under stronger changes. Shorter epochs,
-    # with less mining and validation, suit the two cores that it was trained on.
+    # Every image of a batch is compared with every other, under stronger changes. Most pairs are
+    # of one place, since the contrast finds the other places in the batch; a quarter of a batch is
+    # of one source, where other places look most alike. Shorter epochs, with less mining and
+    # validation, suit the two cores that it was trained on.
     "best": TrainSettings(
         loss="bce+contrast",
         schedule="cosine",

@@ -258,7 +258,10 @@ def _pairs_of_epoch(
             images = np.sort(rng.choice(images, settings.mined_images, replace=False))
         descriptors = embed_all(network, collection.squares[images], device)
         hard = mine(collection, images, descriptors)
-    return draw_pairs(collection, images, settings.pairs, rng, hard, settings.hard_share)
+    return draw_pairs(
+        collection, images, settings.pairs, rng, hard, settings.hard_share,
+        same_share=settings.same_share, together=settings.together,
+    )  # fmt: skip
 
 
 def _end_epoch(

@@ -11,6 +11,7 @@ from siamese_worlds import views
 from vslam.errors import InputError, UnreadableImageError
 from vslam.geometry import se3_exp
 from vslam.loopclosure.siamese.data import (
+    Collection,
     divide,
     draw_pairs,
     load,
@@ -256,3 +257,23 @@ def test_lists_of_pairs_repeat_with_their_seed(tmp_path):
     assert texts[0] == texts[1]
     assert texts[0].splitlines()[0] == "# seed 5"
     assert len(texts[0].splitlines()) == 8
+
+
+def test_pairs_in_a_row_begin_in_one_source_and_most_are_of_one_place():
+    relation = np.where(np.arange(30)[:, None] // 2 == np.arange(30)[None] // 2, 1, -1)
+    collection = Collection(
+        tuple(f"s{k // 10}/f/{k}" for k in range(30)),
+        np.zeros((30, 8, 8), np.uint8),
+        relation.astype(np.int8),
+        np.arange(30) // 2,
+        (("s0", 10), ("s1", 10), ("s2", 10)),
+    )
+    chosen = np.arange(3, 30)
+    pairs = draw_pairs(collection, chosen, 80, np.random.default_rng(0), same_share=0.8, together=8)
+    begins = (pairs.a // 10).reshape(10, 8)
+    assert (begins == begins[:, :1]).all()
+    assert set(begins[:, 0]) == {0, 1, 2}
+    assert pairs.same.sum() == 64
+    assert pairs.same.reshape(16, 5).sum(1).tolist() == [4] * 16
+    assert np.isin(pairs.a, chosen).all()
+    assert np.array_equal(collection.relation[pairs.a, pairs.b] == 1, pairs.same)

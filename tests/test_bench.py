@@ -59,6 +59,22 @@ def test_only_seeded_perturbations_are_repeated_and_seeds_come_last():
     assert grid.draws("blur:2,noise:1")
 
 
+def test_cells_know_the_weights_of_their_detector(tmp_path: Path):
+    file = tmp_path / "mine.safetensors"
+    file.write_bytes(b"weights")
+    ours, plain = grid.make_grid(
+        "kitti", ["00"], ["none"], ["capsule", "bow"], 1, 9, {"capsule": file}
+    )
+    assert ours.arguments()[-4:] == ["--weights", str(file), "--max-frames", "9"]
+    assert "--weights" not in plain.arguments()
+    file.write_bytes(b"others")
+    (other,) = grid.make_grid("kitti", ["00"], ["none"], ["capsule"], 1, 9, {"capsule": file})
+    (shipped,) = grid.make_grid("kitti", ["00"], ["none"], ["capsule"], 1, 9)
+    assert len({ours.name, other.name, shipped.name, plain.name}) == 4
+    with pytest.raises(InputError, match=r"--weights .* cannot be read"):
+        grid.make_grid("kitti", ["00"], ["none"], ["capsule"], 1, 9, {"capsule": tmp_path / "no"})
+
+
 def test_names_of_cells_differ():
     cells = [
         *CELLS,

@@ -13,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from vslam.cli import app
+from vslam.datasets.synthetic import store
 from vslam.errors import InputError
 from vslam.loopbench import report as reporting
 from vslam.loopbench.conditions import Condition, apply, clipped, parse_conditions, turned
@@ -236,6 +237,8 @@ def test_command_on_a_rendered_town(tmp_path, monkeypatch):
     rows = list(csv.DictReader(rendered.open()))
     assert {float(row["lateral_m"]) for row in rows} == {-3.2}
     assert {abs(float(row["heading_deg"])) for row in rows} == {30.0}
+    assert store.clean(store.cache_folder()) > 0
+    assert not rendered.exists()
 
 
 def test_cost_is_measured_in_a_process_of_its_own():

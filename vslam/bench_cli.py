@@ -55,6 +55,10 @@ def bench(
         ),
     ] = "none,brightness",
     detectors: Annotated[str, typer.Option(help="Loop detectors, with commas.")] = "none,bow",
+    weights: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=FILE", help="Weights of a detector, not the shipped ones."),
+    ] = None,
     runs: Annotated[int, typer.Option(min=1, help="Seeds of each random perturbation.")] = 3,
     max_frames: Annotated[
         int | None, typer.Option(min=1, help="Stop each run after so many frames.")
@@ -85,12 +89,13 @@ def bench(
     from vslam.bench.grid import make_grid, parse_perturbations, parse_sequences
     from vslam.bench.table import Progress, live
     from vslam.config import Config, load_config
-    from vslam.detectors import require_detector
+    from vslam.detectors import parse_weights, require_detector
     from vslam.info import available_cores
     from vslam.progress import announce
 
+    files = parse_weights(weights or [], chosen)
     for name in chosen or [""]:
-        require_detector(name, option="--detectors")
+        require_detector(name, files.get(name), option="--detectors")
     sequences, laws = parse_sequences(seqs), parse_perturbations(perturb)
     thresholds = Config() if config is None else load_config(config)
     options = execute.RunOptions(
@@ -99,7 +104,7 @@ def bench(
         threads=threads or max(1, min(available_cores() // jobs, 4)),
         scratch=None if scheduler else execute.scratch_folder(out.absolute()),
     )
-    cells = make_grid(dataset, sequences, laws, chosen, runs, max_frames)
+    cells = make_grid(dataset, sequences, laws, chosen, runs, max_frames, files)
     out = out.absolute()
     frames, identity = _open_all(dataset, data.absolute(), sequences, max_frames, shown=not quiet)
     execute.prepare(out, identity)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from vslam.config import Config
@@ -48,3 +49,21 @@ def create_detector(name: str, config: Config, weights: Path | None = None) -> L
 
         return open_detector(name, config.siamese, weights)
     raise ValueError(f"no loop detector {name!r}")
+
+
+def parse_weights(given: Sequence[str], detectors: Sequence[str]) -> dict[str, Path]:
+    """``NAME=FILE`` each: the weights of some of these detectors.
+
+    Raises:
+        InputError: an item of another form, or of no detector asked for.
+    """
+    files = {}
+    for item in given:
+        name, equals, file = item.partition("=")
+        if not equals or name not in detectors:
+            raise InputError(
+                f"--weights {item}: must be NAME=FILE with a name of --detectors "
+                f"({', '.join(detectors)})."
+            )
+        files[name] = Path(file).expanduser().absolute()
+    return files

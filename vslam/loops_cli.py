@@ -66,11 +66,11 @@ def bench(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
     """Precision and recall of loop detectors under changes of light, view and town."""
-    from vslam.detectors import require_detector
+    from vslam.detectors import parse_weights, require_detector
     from vslam.loopbench.conditions import parse_conditions
 
     names = list(dict.fromkeys(n.strip() for n in detectors.split(",") if n.strip()))
-    files = _files(weights or [], names)
+    files = parse_weights(weights or [], names)
     for name in names or [""]:
         if name == "none":
             raise InputError("--detectors none: finds nothing; leave it out.")
@@ -117,16 +117,3 @@ def bench(
         write_report(report, out)
     if not quiet:
         typer.echo(f"{out / 'loops.html'}: {len(names)} detectors on {len(sets)} sets of images")
-
-
-def _files(given: list[str], names: list[str]) -> dict[str, Path]:
-    files = {}
-    for item in given:
-        name, equals, file = item.partition("=")
-        if not equals or name not in names:
-            raise InputError(
-                f"--weights {item}: must be NAME=FILE with a name of --detectors "
-                f"({', '.join(names)})."
-            )
-        files[name] = Path(file).expanduser()
-    return files

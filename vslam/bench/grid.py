@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -24,6 +25,9 @@ class Cell:
     Attributes:
         perturb: in canonical spelling, ``none`` or ``brightness:1.5,blur:0.5`` for example.
         max_frames: frames from the first one, None for all.
+        weights: of a learned detector, a file that every worker has under this path; None for the
+            shipped ones.
+        digest: of these weights.
     """
 
     dataset: str
@@ -32,6 +36,8 @@ class Cell:
     detector: str
     seed: int
     max_frames: int | None = None
+    weights: str | None = None
+    digest: str = ""
 
     @property
     def name(self) -> str:
@@ -39,12 +45,14 @@ class Cell:
         light = self.perturb.replace(":", "").replace(",", "+")
         parts = [self.dataset, self.sequence, light, self.detector, f"seed{self.seed}"]
         parts += [f"{self.max_frames}frames"] if self.max_frames else []
+        parts += [f"weights{self.digest}"] if self.digest else []
         return "-".join(re.sub(r"[^A-Za-z0-9.+-]+", "_", part) for part in parts)
 
     def arguments(self) -> list[str]:
         """Of ``vslam run``."""
         words = ["--dataset", self.dataset, "--seq", self.sequence, "--perturb", self.perturb]
         words += ["--detector", self.detector, "--seed", str(self.seed)]
+        words += ["--weights", self.weights] if self.weights else []
         return words + (["--max-frames", str(self.max_frames)] if self.max_frames else [])
 
 
@@ -90,20 +98,32 @@ def make_grid(
     detectors: Iterable[str],
     runs: int,
     max_frames: int | None = None,
+    weights: Mapping[str, Path] | None = None,
 ) -> list[Cell]:
     """All cells, in the order in which they are worth most if the work is cut short: every
     sequence with the first seed, then with the next.
 
     A perturbation that draws nothing gets one run: the same input gives the same bytes, and
     counting them again would make a test believe in more than it has seen.
+
+    Args:
+        weights: by detector, for those that do not use the shipped ones.
     """
+    files = {name: (str(path), _digest(path)) for name, path in (weights or {}).items()}
     return [
-        Cell(dataset, sequence, perturb, detector, seed, max_frames)
+        Cell(dataset, sequence, perturb, detector, seed, max_frames, *files.get(detector, ()))
         for seed, sequence, perturb, detector in product(
             range(runs), sequences, perturbations, detectors
         )
         if seed == 0 or draws(perturb)
     ]
+
+
+def _digest(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:8]
+    except OSError as error:
+        raise InputError(f"--weights {path}: cannot be read ({error.strerror}).") from error
 
 
 def draws(perturb: str) -> bool:
@@ -144,6 +164,8 @@ def is_finished(cell: Cell, folder: Path, config: str) -> bool:
         report.detector,
         report.seed,
         report.max_frames,
+        str(report.weights) if report.weights else None,
+        cell.digest,  # the folder is named after it
     )
     whole = (report.sensor, report.start, report.every) == ("stereo", 0, 1)
     return same_config and whole and found == cell

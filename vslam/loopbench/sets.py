@@ -109,10 +109,8 @@ def _town(
 
     def ask(condition: Condition, draw: int) -> Questions | None:
         change, view = condition.change, condition.view
-        folder = cache / f"v{store.VERSION}-places" / (
-            f"{name}-seed{seed}{'-aliased' if aliased else ''}-{places}-view{view:g}-"
-            f"change{change:g}"
-        )  # fmt: skip
+        town = f"{name}-seed{seed}{'-aliased' if aliased else ''}-{places}"
+        folder = store.place_folder(cache) / f"{town}-view{view:g}-change{change:g}"
         if not (folder / "pairs.csv").exists():
             variation = Variation(seed, aliased, change)
             moves = Moves(condition.lateral, condition.heading)

@@ -90,9 +90,22 @@ def list_stored(cache: Path) -> list[Stored]:
     return found
 
 
+def place_folder(cache: Path) -> Path:
+    """Where pairs of views lie that benchmarks of loop detectors rendered."""
+    return cache / f"v{VERSION}-places"
+
+
+def place_folders(cache: Path) -> list[Path]:
+    """Those of all versions."""
+    return sorted(cache.glob("v*-places"))
+
+
 def clean(cache: Path, name: str | None = None) -> int:
     """Remove one route's sequences of all variations, or everything; return the bytes freed."""
     freed = 0
+    for places in place_folders(cache) if name is None else []:
+        freed += sum(p.stat().st_size for p in places.rglob("*") if p.is_file())
+        shutil.rmtree(places)
     for stored in list_stored(cache):
         if name in (None, stored.name):
             freed += stored.size

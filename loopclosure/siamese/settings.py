@@ -45,9 +45,9 @@ PRESETS = {
     # What the paper writes; augmentation strengths and mining are ours, it gives none.
     "paper": TrainSettings(),
     # Every image of a batch is compared with every other, under stronger changes. Most pairs are
-    # of one place, since the contrast finds the other places in the batch; a quarter of a batch is
-    # of one source, where other places look most alike. Shorter epochs, with less mining and
-    # validation, suit the two cores that it was trained on.
+    # of one place, since the contrast finds the other places in the batch; half of a batch is
+    # of one source, where other places look most alike. Smaller batches and shorter epochs, with
+    # less mining and validation, suit the two cores that it was trained on.
     "best": TrainSettings(
         loss="bce+contrast",
         schedule="cosine",

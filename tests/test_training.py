@@ -16,6 +16,7 @@ from vslam.loopclosure.siamese import training
 from vslam.loopclosure.siamese.augmentation import STRONG, Augmentation, augment
 from vslam.loopclosure.siamese.card import describe, write_card
 from vslam.loopclosure.siamese.data import draw_pairs
+from vslam.loopclosure.siamese.images import to_tensor
 from vslam.loopclosure.siamese.objective import (
     calibrate,
     contrast,
@@ -23,9 +24,10 @@ from vslam.loopclosure.siamese.objective import (
     embed_all,
     score_matrix,
 )
+from vslam.loopclosure.siamese.pruning import lowest, pruned
 from vslam.loopclosure.siamese.settings import PRESETS, load_settings
 from vslam.loopclosure.siamese.siamese import load_network
-from vslam.loopclosure.siamese.start import starting_network
+from vslam.loopclosure.siamese.start import resized, starting_network
 from vslam.loopclosure.siamese.training import CHECKPOINT, train
 
 
@@ -140,6 +142,35 @@ def test_the_card_tells_where_the_weights_come_from(tmp_path):
     assert written["commit"]
     assert written["settings"]["seed"] == 0
     assert "--data pairs:x" in paths[1].read_text()
+
+
+def test_a_network_goes_on_with_larger_images(tmp_path):
+    collection, settings = views(20), small_settings(epochs=3)
+    small = train(collection, settings, tmp_path / "small", threads=1)
+    shape = settings.shape.model_copy(update={"pixels": 96})
+    wanted = settings.model_copy(update={"shape": shape})
+    start, fitted, report = starting_network(wanted, collection, small.weights, "cpu")
+    assert (start.pixels, fitted.shape.pixels, report["resized_to"]) == (96, 96, 96)
+    first, _ = load_network(small.weights)
+    same = resized(first, first.pixels).eval()
+    x = to_tensor(collection.squares[:4])
+    with torch.no_grad():
+        assert torch.equal(same.embed(x), first.eval().embed(x))
+    # Gains are interpolated: one that grows along the rows of the small grid does on the large one.
+    layer = first.branch.capsules
+    side = round(first.branch.shape.places**0.5)
+    with torch.no_grad():
+        layer.gains.copy_(
+            (torch.arange(side * side) // side).float()[None, :, None].expand_as(layer.gains)
+        )
+    grown = resized(first, 96).branch
+    rows = grown.capsules.gains[0, :, 0].reshape(round(grown.shape.places**0.5), -1)
+    assert (rows == rows[:, :1]).all()
+    assert (torch.diff(rows[:, 0]) >= 0).all()
+    assert rows[-1, 0] == side - 1
+    branch = pruned(first, lowest(torch.rand(8, SMALL.places), 0.2))
+    with pytest.raises(InputError, match="is pruned"):
+        resized(branch, 96)
 
 
 def test_pruning_and_fine_tuning(tmp_path):

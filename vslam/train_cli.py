@@ -76,6 +76,12 @@ def train(
             "vgg16 a weight file of torchvision."
         ),
     ] = None,
+    pixels: Annotated[
+        int | None,
+        typer.Option(
+            min=64, help="Side of the images of a capsule network; smaller ones train faster."
+        ),
+    ] = None,
     prune_share: Annotated[
         float | None,
         typer.Option(min=0.01, max=0.99, help="Share of the capsules that capsule-pruned lacks."),
@@ -112,6 +118,9 @@ def train(
     given = {"epochs": epochs, "pairs": pairs, "seed": seed, "network": network,
              "prune_share": prune_share}  # fmt: skip
     chosen = chosen.model_copy(update={k: v for k, v in given.items() if v is not None})
+    if pixels is not None:
+        shape = chosen.shape.model_copy(update={"pixels": pixels})
+        chosen = chosen.model_copy(update={"shape": shape})
     folder = out or Path("training") / f"{network}-{preset}"
     threads = threads or available_cores()
     set_threads(threads)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch.nn import functional
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.branches import CapsuleBranch, ConvolutionalBranch
@@ -56,8 +57,40 @@ def starting_network(
     if network.name != settings.network:
         raise InputError(f"{weights}: weights of {network.name}, not of {settings.network}.")
     if isinstance(network.branch, CapsuleBranch):
+        if settings.shape.pixels != network.pixels:
+            network = resized(network, settings.shape.pixels)
+            about["resized_to"] = settings.shape.pixels
         settings = settings.model_copy(update={"shape": network.branch.shape})
     return network, settings, about
+
+
+def resized(network: SiameseNetwork, pixels: int) -> SiameseNetwork:
+    """A network for images of another size that computes alike; training it further mends the rest.
+
+    Convolutions and transforms stay, the gains of the places are interpolated over the new grid.
+    So a network learns most at a small size, where an image costs a third (Howard's progressive
+    resizing, as in the DAWNBench entry of fast.ai, 2018).
+
+    Raises:
+        InputError: a network without capsules, one that is pruned, or CapsNet's fixed grid.
+    """
+    branch = network.branch
+    if not isinstance(branch, CapsuleBranch) or branch.shape.extractor != "light":
+        raise InputError(f"{network.name}: cannot take images of another size.")
+    if branch.shape.kept is not None:
+        raise InputError(f"{network.name}: is pruned to the places of its grid; resize before.")
+    shape = branch.shape.model_copy(update={"pixels": pixels})
+    larger = build_network(network.name, shape)
+    state = network.state_dict()
+    gains = state.pop("branch.capsules.gains")
+    for name in ("place", "alive"):
+        del state[f"branch.capsules.{name}"]
+    sides = [round(places**0.5) for places in (branch.shape.places, shape.places)]
+    grid = gains.transpose(1, 2).reshape(shape.types, shape.size, sides[0], sides[0])
+    grid = functional.interpolate(grid, size=(sides[1], sides[1]), mode="bilinear")
+    state["branch.capsules.gains"] = grid.flatten(2).transpose(1, 2).contiguous()
+    larger.load_state_dict(state, strict=False)
+    return larger
 
 
 def _prune(

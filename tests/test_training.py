@@ -167,7 +167,7 @@ def test_a_network_goes_on_with_larger_images(tmp_path):
     rows = grown.capsules.gains[0, :, 0].reshape(round(grown.shape.places**0.5), -1)
     assert torch.allclose(rows, rows[:, :1].expand_as(rows))
     assert (torch.diff(rows[:, 0]) >= 0).all()
-    assert rows[-1, 0] == pytest.approx(side - 1)
+    assert rows[-1, 0].item() == pytest.approx(side - 1)
     branch = pruned(first, lowest(torch.rand(8, SMALL.places), 0.2))
     with pytest.raises(InputError, match="is pruned"):
         resized(branch, 96)

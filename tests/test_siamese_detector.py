@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -18,7 +19,9 @@ from vslam.errors import InputError
 from vslam.features import Features
 from vslam.loopclosure.siamese.detector import SiameseDetector, open_detector
 from vslam.loopclosure.siamese.onnx import export_onnx
-from vslam.loopclosure.siamese.siamese import build_network, save_network
+from vslam.loopclosure.siamese.scoring import NetworkScorer
+from vslam.loopclosure.siamese.siamese import build_network, load_network, save_network
+from vslam.loopclosure.siamese.weights import SHIPPED, find_weights
 from vslam.map import Map
 from vslam.observations import link
 
@@ -149,8 +152,6 @@ def test_onnx_says_what_torch_says(tmp_path):
 
 
 def test_train_writes_weights_and_card(tmp_path):
-    import cv2
-
     data = tmp_path / "pairs"
     (data / "images").mkdir(parents=True)
     rows = ["a,b,same"]
@@ -172,6 +173,34 @@ def test_train_writes_weights_and_card(tmp_path):
     files = {path.name for path in out.iterdir()}
     assert files >= {"capsule.safetensors", "capsule.json", "capsule.md", "log.csv",
                      "checkpoint.pt", "settings.json", "pairs"}  # fmt: skip
+    full, shipped = out / "capsule.safetensors", tmp_path / "ship" / "capsule.safetensors"
+    done = CliRunner().invoke(
+        app, ["export", "weights", "--weights", str(full), "--out", str(shipped)]
+    )
+    assert done.exit_code == 0, done.output
+    assert shipped.stat().st_size < 0.6 * full.stat().st_size
+    assert {path.name for path in shipped.parent.iterdir()} == {
+        "capsule.safetensors", "capsule.json", "capsule.md"
+    }  # fmt: skip
+    x = torch.rand(2, 3, 64, 64)
+    with torch.no_grad():
+        a, b = (load_network(path)[0].eval().embed(x) for path in (full, shipped))
+    assert torch.allclose(a, b, atol=2e-2)
+
+
+@pytest.mark.parametrize("name", ["capsule", "capsule-pruned"])
+def test_shipped_weights_know_a_place_again(name):
+    """Textures, nothing like the training data: moved and darker they are still the same place."""
+    network, about = load_network(find_weights(name))
+    assert network.n_parameters() < 3e6
+    assert about["validation"]["average_precision"] > 0.4
+    rng = np.random.default_rng(0)
+    walls = [cv2.resize(rng.integers(0, 256, (9, 13), np.uint8), (620, 188)) for _ in range(12)]
+    again = [np.uint8(np.roll(wall, 12, 1) * 0.7) for wall in walls]
+    p = NetworkScorer(name, None, "squash").scores(again, walls)
+    assert (p.argmax(1) == np.arange(12)).mean() > 0.8
+    files = [path.stat().st_size for path in SHIPPED.glob("*.safetensors")]
+    assert sum(files) < 12e6
 
 
 def test_neither_help_nor_a_run_without_it_loads_torch():

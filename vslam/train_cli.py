@@ -194,6 +194,30 @@ def onnx(
     )
 
 
+@export.command("weights")
+def weights_(
+    weights: Annotated[Path, typer.Option(help="Weights of a training, .safetensors.")],
+    out: Annotated[Path, typer.Option(help="File to write, .safetensors.")],
+) -> None:
+    """Write weights in half precision, with their model card, as vslam ships them."""
+    import shutil
+
+    from vslam.errors import ResultsError
+    from vslam.loopclosure.siamese.siamese import load_network, save_network
+
+    network, about = load_network(weights)
+    save_network(network, out, about, half=True)
+    cards = [weights.with_suffix(end) for end in (".md", ".json")]
+    try:
+        for card in filter(Path.exists, cards):
+            shutil.copyfile(card, out.with_suffix(card.suffix))
+    except OSError as error:
+        raise ResultsError(
+            f"{out.parent}: the model card cannot be written ({error.strerror})."
+        ) from error
+    typer.echo(f"{out}: {network.name}, {out.stat().st_size / 1e6:.2f} MB")
+
+
 @export.command("places", epilog=_PLACES_EXAMPLES)
 def places(
     data: DataSources,

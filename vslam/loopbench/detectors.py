@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,9 @@ from vslam.frontend.orb import extract
 from vslam.loopbench.conditions import Image
 from vslam.loopclosure.bow_index import InvertedIndex, NodeIndex
 from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
+
+if TYPE_CHECKING:  # torch is loaded for those who ask for a network
+    from vslam.loopclosure.siamese.scoring import NetworkScorer
 
 
 @dataclass(frozen=True)
@@ -97,9 +100,11 @@ def open_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scor
 
 
 class _NetworkViews:
+    """Hands the images of views to a network."""
+
     probability = True
 
-    def __init__(self, network) -> None:  # type: ignore[no-untyped-def]
+    def __init__(self, network: NetworkScorer) -> None:
         self.name = network.name
         self._network = network
 

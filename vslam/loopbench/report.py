@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -171,7 +171,7 @@ def _ap_rows(report: LoopsJson) -> list[tuple[str, ...]]:
     return rows
 
 
-def _table(report: LoopsJson, name: str, shown, note: str) -> Table:  # type: ignore[no-untyped-def]
+def _table(report: LoopsJson, name: str, shown: Callable[[Cell], str], note: str) -> Table:
     names = _detectors(report)
     cells = {(c.data, c.condition, c.detector): shown(c) for c in report.cells}
     rows = [

@@ -45,7 +45,7 @@ def starting_network(
         return _prune(settings, collection, weights, torch.device(device))
     if weights is None:
         return None, settings, {}
-    about = {"started_from": str(weights)}
+    about: dict[str, Any] = {"started_from": str(weights)}
     if weights.suffix != ".safetensors":
         torch.manual_seed(settings.seed)
         network = build_network(settings.network, settings.shape)

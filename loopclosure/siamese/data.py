@@ -138,6 +138,14 @@ def divide(
     return train, validation
 
 
+def validation_images(validation: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:
+    """At most so many of them, the same for every training with this seed."""
+    if len(validation) <= most:
+        return validation
+    picked = np.random.default_rng([seed, 2]).choice(len(validation), most, replace=False)
+    return validation[np.sort(picked)]
+
+
 def draw_pairs(
     collection: Collection,
     chosen: NDArray[np.int64],

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.branches import CapsuleBranch, ConvolutionalBranch
-from vslam.loopclosure.siamese.data import Collection, divide
+from vslam.loopclosure.siamese.data import Collection, divide, validation_images
 from vslam.loopclosure.siamese.images import to_tensor
 from vslam.loopclosure.siamese.objective import validate
 from vslam.loopclosure.siamese.pruning import lowest, mean_couplings, pruned
@@ -98,7 +98,7 @@ def _prune(
 ) -> tuple[SiameseNetwork, TrainSettings, dict[str, Any]]:
     full, _ = load_network(weights)
     train, validation = divide(collection, settings.seed, settings.validation_share)
-    validation = validation[: settings.validation_images]
+    validation = validation_images(validation, settings.validation_images, settings.seed)
     step = max(1, len(train) // _RANKED_IMAGES)
     squares = collection.squares[train[::step]]
     full.to(device)

@@ -23,7 +23,15 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError, ResultsError
 from vslam.loopclosure.siamese.augmentation import augment
-from vslam.loopclosure.siamese.data import Collection, Pairs, divide, draw_pairs, mine, write_pairs
+from vslam.loopclosure.siamese.data import (
+    Collection,
+    Pairs,
+    divide,
+    draw_pairs,
+    mine,
+    validation_images,
+    write_pairs,
+)
 from vslam.loopclosure.siamese.images import to_tensor
 from vslam.loopclosure.siamese.objective import (
     calibrate,
@@ -113,10 +121,7 @@ def train(
     """
     where = _open_device(device)
     train_images, validation = divide(collection, settings.seed, settings.validation_share)
-    rng = np.random.default_rng([settings.seed, 2])
-    if len(validation) > settings.validation_images:
-        picked = rng.choice(len(validation), settings.validation_images, replace=False)
-        validation = validation[np.sort(picked)]
+    validation = validation_images(validation, settings.validation_images, settings.seed)
     torch.manual_seed(settings.seed)
     network = (start or build_network(settings.network, settings.shape)).to(where)
     optimiser = _optimiser(network, settings)

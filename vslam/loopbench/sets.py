@@ -126,4 +126,4 @@ def _town(
         relation = source.relation[np.ix_(queries, gallery)]
         return Questions(asking, [source.grey(int(i)) for i in gallery], relation)
 
-    return TestSet(f"{name}, {'aliased ' if aliased else ''}town {seed}", ask)
+    return TestSet(f"{name} {'aliased ' if aliased else ''}town {seed}", ask)

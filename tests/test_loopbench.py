@@ -224,15 +224,20 @@ def test_command_refuses_in_one_sentence(arguments, said, tmp_path, monkeypatch)
 
 def test_command_on_a_rendered_town(tmp_path, monkeypatch):
     monkeypatch.setenv("VSLAM_CACHE", str(tmp_path / "cache"))
-    arguments = ["--detectors", "bow", "--perturb", "viewpoint", "--strengths", "1", "--quiet"]
+    arguments = ["--detectors", "bow,capsule", "--perturb", "viewpoint", "--strengths", "1"]
+    arguments += ["--quiet"]
     arguments += ["--data", "town:demo[seed=7,places=4]", "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(app, ["loops", "bench", *arguments], catch_exceptions=False)
     assert result.exit_code == 0
     found = json.loads((tmp_path / "out" / "loops.json").read_text())
-    assert [cell["condition"] for cell in found["cells"]] == ["none", "viewpoint:1"]
-    plain, turned_away = (cell["figures"]["average_precision"] for cell in found["cells"])
-    assert plain == 1.0
-    assert turned_away <= plain
+    cells = {(cell["condition"], cell["detector"]): cell for cell in found["cells"]}
+    assert list(cells) == [(c, d) for c in ("none", "viewpoint:1") for d in ("bow", "capsule")]
+    plain, turned_away = (cells[c, "bow"]["figures"] for c in ("none", "viewpoint:1"))
+    assert plain["average_precision"] == 1.0
+    assert turned_away["average_precision"] <= 1.0
+    assert cells["none", "capsule"]["first_right"] > 0.5
+    assert [cost["detector"] for cost in found["costs"]] == ["bow", "capsule"]
+    assert [gain["second"] for gain in found["gains"]] == ["capsule", "capsule"]
     rendered = next((tmp_path / "cache").rglob("*view1*/pairs.csv"))
     rows = list(csv.DictReader(rendered.open()))
     assert {float(row["lateral_m"]) for row in rows} == {-3.2}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vslam.config import BowConfig
 from vslam.features import Features
 from vslam.kernels import inner_kernel, kernel
-from vslam.loopclosure.bow_index import InvertedIndex, Likeness, NodeIndex, grown
+from vslam.loopclosure.bow_index import InvertedIndex, Likeness, NodeIndex, grown, index_nodes
 from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
 from vslam.loops import LoopCandidate
 from vslam.map import Map
@@ -83,9 +83,7 @@ class BowDetector:
 
     def node_index_of(self, features: Features) -> NodeIndex:
         """Direct index of a frame outside the map."""
-        node = self._node_of_word[self.vocabulary.words(features.descriptors)]
-        order = np.argsort(node, kind="stable").astype(np.int32)
-        return NodeIndex(node[order], order)
+        return index_nodes(self._node_of_word[self.vocabulary.words(features.descriptors)])
 
     def _index_features(self, keyframe: int, words: NDArray[np.int32]) -> None:
         first = int(self._start[self._n_keyframes])

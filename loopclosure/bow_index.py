@@ -158,6 +158,12 @@ class NodeIndex(NamedTuple):
     feature: NDArray[np.int32]
 
 
+def index_nodes(node: NDArray[np.int32]) -> NodeIndex:
+    """Direct index of an image whose features lie under the nodes ``(N,)``."""
+    order = np.argsort(node, kind="stable").astype(np.int32)
+    return NodeIndex(node[order], order)
+
+
 @kernel
 def match_by_node(
     node_a,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vslam.config import BowConfig, OrbConfig
 from vslam.frontend.orb import extract
 from vslam.loopbench.conditions import Image
-from vslam.loopclosure.bow_index import InvertedIndex, NodeIndex
+from vslam.loopclosure.bow_index import InvertedIndex, NodeIndex, index_nodes
 from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
 
 if TYPE_CHECKING:  # torch is loaded for those who ask for a network
@@ -47,9 +47,7 @@ def look(images: Sequence[Image], vocabulary: Vocabulary, threads: int) -> list[
     def one(image: Image) -> View:
         found = extract(image, OrbConfig())
         words = vocabulary.words(found.descriptors)
-        node = node_of_word[words]
-        order = np.argsort(node, kind="stable").astype(np.int32)
-        return View(image, found.xy, found.descriptors, words, NodeIndex(node[order], order))
+        return View(image, found.xy, found.descriptors, words, index_nodes(node_of_word[words]))
 
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(one, images))

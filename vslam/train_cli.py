@@ -58,7 +58,7 @@ DataSources = Annotated[
 def train(
     network: Annotated[str, typer.Argument(help="capsule, capsule-pruned, alexnet or vgg16.")],
     data: DataSources,
-    preset: Annotated[str, typer.Option(help="paper or best.")] = "paper",
+    preset: Annotated[str, typer.Option(help="paper, best or pretrained.")] = "paper",
     settings: Annotated[
         Path | None, typer.Option(help="JSON with settings, instead of the preset's.")
     ] = None,

@@ -6,6 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+_TURNED = 0.5  # share of the images that turn, where any do
+_FIELD_OF_VIEW = 80.0  # degrees
+
 
 class Augmentation(BaseModel):
     """Strengths; 0 leaves a change out. The paper has projective changes, luminance and masks."""
@@ -14,6 +17,7 @@ class Augmentation(BaseModel):
 
     homography: float = Field(0.10, ge=0, le=0.4, description="Largest move of a corner, of side.")
     shift: float = Field(0.10, ge=0, le=0.5, description="Largest horizontal shift, of side.")
+    turn: float = Field(0.0, ge=0, le=45, description="Largest turn of the camera, degrees.")
     log_gain: float = Field(0.35, ge=0, description="Deviation of the logarithm of the gain.")
     bias: float = Field(20.0, ge=0, description="Deviation, grey levels.")
     log_gamma: float = Field(0.25, ge=0, description="Deviation of the logarithm of gamma.")
@@ -46,9 +50,11 @@ def augment(
     moved = corners + rng.uniform(-1, 1, (4, 2)).astype(np.float32) * strength.homography * side
     moved[:, 0] += rng.uniform(-1, 1) * strength.shift * side
     H = cv2.getPerspectiveTransform(corners, moved)
-    warped = cv2.warpPerspective(
-        image, H, (side, side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
-    )
+    edge = cv2.BORDER_REFLECT_101
+    if strength.turn > 0 and rng.random() < _TURNED:
+        H = H @ turn_homography(side, side, rng.uniform(-1, 1) * strength.turn)
+        edge = cv2.BORDER_CONSTANT if rng.random() < 0.5 else edge
+    warped = cv2.warpPerspective(image, H, (side, side), flags=cv2.INTER_LINEAR, borderMode=edge)
     out = np.asarray(warped, np.uint8)
     for _ in range(int(rng.integers(strength.masks + 1))):
         _cover(out, strength.mask_area, rng)
@@ -65,6 +71,19 @@ def augment(
         grain = rng.standard_normal(out.shape, dtype=np.float32)
         out = np.clip(np.rint(out + np.float32(noise) * grain), 0, 255).astype(np.uint8)
     return out
+
+
+def turn_homography(width: int, height: int, degrees: float) -> NDArray[np.float64]:
+    """Pixels before to pixels after a camera turned to the right where it stands, ``(3, 3)``.
+
+    Of a camera that sees 80 degrees across, as those on cars do. Heights only scale, so it holds
+    for images that were squashed, too.
+    """
+    focal = width / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    R = np.array([[c, 0, -s], [0, 1.0, 0], [s, 0, c]])
+    return np.asarray(K @ R @ np.linalg.inv(K))
 
 
 def _cover(image: NDArray[np.uint8], largest: float, rng: np.random.Generator) -> None:

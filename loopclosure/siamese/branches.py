@@ -18,6 +18,7 @@ from vslam.loopclosure.siamese.extractors import (
     PrimaryCapsules,
     grid_side,
 )
+from vslam.loopclosure.siamese.lite import LiteExtractor, lite_grid_side
 
 # ImageNet's statistics, which torchvision's weight files expect.
 _IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -29,7 +30,7 @@ class CapsuleShape(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    extractor: Literal["light", "original"] = "light"
+    extractor: Literal["light", "original", "lite0"] = "light"
     pixels: int = Field(227, ge=32, description="Side of the square input.")
     blocks: tuple[tuple[int, int, int], ...] = LIGHT_BLOCKS
     types: int = Field(32, ge=1, description="Types of primary capsules.")
@@ -45,6 +46,8 @@ class CapsuleShape(BaseModel):
         """Places of the grid."""
         if self.extractor == "original":
             return 64
+        if self.extractor == "lite0":
+            return lite_grid_side(self.pixels) ** 2
         return grid_side(self.pixels, self.blocks) ** 2
 
 
@@ -56,13 +59,16 @@ class CapsuleBranch(nn.Module):
         self.shape = shape
         self.pixels = shape.pixels
         self.dimensions = shape.outputs * shape.depth
-        if shape.extractor == "light":
-            light = LightExtractor(shape.blocks)
-            self.extractor: nn.Module = light
-            self.primary: nn.Module = PrimaryCapsules(light.out_channels, shape.types, shape.size)
-        else:
+        self.extractor: nn.Module
+        self.primary: nn.Module
+        if shape.extractor == "original":
             self.extractor = nn.Identity()
             self.primary = OriginalExtractor(shape.types, shape.size)
+        else:
+            lite = shape.extractor == "lite0"
+            grid = LiteExtractor() if lite else LightExtractor(shape.blocks)
+            self.extractor = grid
+            self.primary = PrimaryCapsules(grid.out_channels, shape.types, shape.size)
         # Depthwise convolutions are faster so, forward by a third and backward by a quarter.
         for module in (self.extractor, self.primary):
             module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

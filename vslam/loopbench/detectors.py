@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import OrderedDict
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,9 @@ from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
 
 if TYPE_CHECKING:  # torch is loaded for those who ask for a network
     from vslam.loopclosure.siamese.scoring import NetworkScorer
+
+
+_KEPT_GALLERIES = 3  # the unchanged one survives two strengths of a condition with its own
 
 
 @dataclass(frozen=True)
@@ -60,7 +65,10 @@ class Scorer(Protocol):
     probability: bool
     """Whether scores are probabilities, with thresholds at 0.5 and 0.9."""
 
-    def scores(self, queries: Sequence[View], gallery: Sequence[View]) -> NDArray[np.float64]:
+    def store(self, gallery: Sequence[View]) -> Any:
+        """What it keeps of the images asked for."""
+
+    def scores(self, queries: Sequence[View], stored: Any) -> NDArray[np.float64]:
         """``(Q, G)``, greater is more alike."""
 
 
@@ -73,13 +81,17 @@ class BowScorer:
     def __init__(self, vocabulary: Vocabulary) -> None:
         self._vocabulary = vocabulary
 
-    def scores(self, queries: Sequence[View], gallery: Sequence[View]) -> NDArray[np.float64]:
+    def store(self, gallery: Sequence[View]) -> InvertedIndex:
         """See :class:`Scorer`."""
         index = InvertedIndex(self._vocabulary.n_words)
         for number, view in enumerate(gallery):
             index.add(number, bow_vector(self._vocabulary, view.words))
+        return index
+
+    def scores(self, queries: Sequence[View], stored: InvertedIndex) -> NDArray[np.float64]:
+        """See :class:`Scorer`."""
         return np.stack(
-            [index.compare(bow_vector(self._vocabulary, view.words)).score for view in queries]
+            [stored.compare(bow_vector(self._vocabulary, view.words)).score for view in queries]
         ).astype(np.float64)
 
 
@@ -106,6 +118,35 @@ class _NetworkViews:
         self.name = network.name
         self._network = network
 
-    def scores(self, queries: Sequence[View], gallery: Sequence[View]) -> NDArray[np.float64]:
-        images = [view.image for view in gallery]
-        return self._network.scores([view.image for view in queries], images)
+    def store(self, gallery: Sequence[View]) -> NDArray[np.float32]:
+        return self._network.embed([view.image for view in gallery])
+
+    def scores(self, queries: Sequence[View], stored: NDArray[np.float32]) -> NDArray[np.float64]:
+        return self._network.scores(self.store(queries), stored)
+
+
+class Panel:
+    """The detectors of a benchmark, the first of which the others are compared with.
+
+    Most conditions ask for the same images: what was made of the last few galleries is kept.
+    """
+
+    def __init__(self, scorers: Sequence[Scorer], vocabulary: Vocabulary, threads: int) -> None:
+        self.scorers = tuple(scorers)
+        self._vocabulary, self._threads = vocabulary, threads
+        self._kept: OrderedDict[bytes, tuple[list[View], dict[str, Any]]] = OrderedDict()
+
+    def gallery(self, images: Sequence[Image]) -> tuple[list[View], dict[str, Any]]:
+        """Features of the images, and what each detector keeps of them."""
+        digest = hashlib.blake2b(b"".join(image.tobytes() for image in images)).digest()
+        if digest not in self._kept:
+            views = self.look(images)
+            self._kept[digest] = views, {one.name: one.store(views) for one in self.scorers}
+            while len(self._kept) > _KEPT_GALLERIES:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(digest)
+        return self._kept[digest]
+
+    def look(self, images: Sequence[Image]) -> list[View]:
+        """See :func:`look`."""
+        return look(images, self._vocabulary, self._threads)

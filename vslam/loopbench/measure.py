@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vslam.config import VerificationConfig
 from vslam.loopbench.conditions import Condition
-from vslam.loopbench.detectors import Scorer, View, look
+from vslam.loopbench.detectors import Panel, Scorer, View
 from vslam.loopbench.schema import Cell, Curve, Gain
 from vslam.loopbench.sets import Questions, TestSet
 from vslam.loopclosure.benchmark import (
@@ -20,7 +20,6 @@ from vslam.loopclosure.benchmark import (
 )
 from vslam.loopclosure.bow_index import match_by_node
 from vslam.loopclosure.siamese.places import DIFFERENT, SAME, UNKNOWN
-from vslam.loopclosure.vocabulary import Vocabulary
 
 MIN_MATCHES = 20  # that obey one epipolar geometry (ORB-SLAM, VII-B, asks for 20 in 3D)
 _EPIPOLAR_PIXELS = 2.0
@@ -33,25 +32,20 @@ Matrix = NDArray[np.float64]
 def measure(
     test_set: TestSet,
     condition: Condition,
-    scorers: Sequence[Scorer],
-    vocabulary: Vocabulary,
+    panel: Panel,
     seed: int,
-    threads: int,
 ) -> tuple[list[Cell], list[Gain]]:
-    """All detectors on one set under one condition; nothing where that is not to be had.
-
-    The first scorer is the baseline that the others are compared with.
-    """
+    """All detectors on one set under one condition; nothing where that is not to be had."""
     questions = test_set.ask(condition, seed)
     if questions is None:
         return [], []
-    queries = look(questions.queries, vocabulary, threads)
-    gallery = look(questions.gallery, vocabulary, threads)
+    queries = panel.look(questions.queries)
+    gallery, stored = panel.gallery(questions.gallery)
     verify = _Verification(queries, gallery)
-    found = {scorer.name: scorer.scores(queries, gallery) for scorer in scorers}
+    found = {one.name: one.scores(queries, stored[one.name]) for one in panel.scorers}
     cells = [
         _cell(test_set.title, condition, scorer, found[scorer.name], questions, verify)
-        for scorer in scorers
+        for scorer in panel.scorers
     ]
     first, *others = found
     gains = [

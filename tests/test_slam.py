@@ -204,8 +204,11 @@ def test_a_black_frame_soon_after_a_keyframe_does_not_move_the_frame_before(corr
     np.testing.assert_allclose(last.T_cw, expected, rtol=0, atol=1e-9)
 
 
-def test_after_a_long_blackout_mapping_restarts_at_the_predicted_pose(corridor, check_map):
-    config = Config(orb=ORB, tracking=TrackingConfig(lost_frames_before_restart=4))
+@pytest.mark.parametrize(("young", "lost"), [(0, 4), (20, 1)])
+def test_lost_for_long_mapping_restarts_at_the_predicted_pose(corridor, check_map, young, lost):
+    """For long: so many frames, or, where the map is hardly begun, one."""
+    tracking = TrackingConfig(lost_frames_before_restart=4, young_keyframes=young)
+    config = Config(orb=ORB, tracking=tracking)
     # From frame 10 on the camera is elsewhere: the images of the corridor run backwards, upside
     # down, so that nothing can be recognised.
     frames = list(range(20))
@@ -218,12 +221,11 @@ def test_after_a_long_blackout_mapping_restarts_at_the_predicted_pose(corridor, 
         results.append(slam.step(left, right, corridor.timestamps[k]))
     slam.finish()
     assert states(results[:10]) == "O" * 10
-    assert states(results[10:14]) == "LLLL"
-    assert states(results[14:]) == "O" * 6
-    assert [r.is_keyframe for r in results[10:14]] == [False, False, False, True]
+    assert states(results[10:]) == "L" * lost + "O" * (10 - lost)
+    assert [r.is_keyframe for r in results[10 : 10 + lost]] == [False] * (lost - 1) + [True]
     T_wc = slam.trajectory().T_wc
     # Still 0.35 m a frame, seen from the prediction.
-    steps = np.linalg.norm(np.diff(T_wc[13:, :3, 3], axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(T_wc[9 + lost :, :3, 3], axis=0), axis=1)
     np.testing.assert_allclose(steps, 0.35, rtol=0, atol=0.05)
     check_map(slam.map)
 

@@ -63,7 +63,10 @@ class TrackingConfig(_Section):
     min_inliers: int = Field(30, ge=3, description="Below, the frame is WEAK. [OS1]")
     min_inliers_lost: int = Field(15, ge=3, description="Below, the frame is LOST. [own]")
     lost_frames_before_restart: int = Field(
-        10, ge=1, description="Lost this long, mapping restarts at the predicted pose. [own]"
+        3, ge=1, description="Lost this long, mapping restarts at the predicted pose. [own]"
+    )
+    young_keyframes: int = Field(
+        5, ge=0, description="A map of no more is given up with the first frame lost. [own]"
     )
     monocular_lost_frames: int = Field(
         4, ge=1, description="The same for a monocular camera, which needs a second frame. [own]"

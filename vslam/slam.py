@@ -320,7 +320,9 @@ class Slam:
         if self.camera.monocular:
             long = self._lost_frames >= config.monocular_lost_frames
             return long and self._start_monocular(frame)
-        if self._lost_frames < config.lost_frames_before_restart or not self._can_start(frame):
+        young = self.map.n_keyframes <= config.young_keyframes
+        patience = 1 if young else config.lost_frames_before_restart
+        if self._lost_frames < patience or not self._can_start(frame):
             return False
         frame.landmark[:] = -1
         self._insert_keyframe(frame)

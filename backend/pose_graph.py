@@ -20,7 +20,7 @@ from vslam.loops import LoopEdge
 from vslam.map import Map
 from vslam.observations import covisible_pairs
 
-TREE, COVISIBLE, WEAK, LOOP = range(4)  # kinds of edges
+TREE, COVISIBLE, WEAK, LOOP, GAP = range(5)  # kinds of edges
 HOLD = 1e-6  # sigma, m and rad, of the prior that holds a keyframe
 
 
@@ -33,7 +33,7 @@ class PoseGraph:
         T_cw: ``(N, 4, 4)`` poses to start from.
         edges: ``(E, 2)`` int64, positions i, j in ``keyframes``.
         T_i_j: ``(E, 4, 4)`` measured pose of j in the camera frame of i.
-        kind: ``(E,)`` uint8, TREE, COVISIBLE, WEAK or LOOP.
+        kind: ``(E,)`` uint8, TREE, COVISIBLE, WEAK, LOOP or GAP.
         sigmas: ``(E, 2)`` standard deviations, translation (m) and rotation (rad), of each axis.
         fixed: ``(N,)`` bool, keyframes that are held: one in each connected part.
         scale: ``(E,)`` units around i for one around j; ``T_i_j`` is in the unit of i. 1 except
@@ -57,8 +57,8 @@ class Consistency:
     Attributes:
         consistent: whether the closure may stand.
         reason: "consistent", or in a few words what speaks against it.
-        strain: chi-square of the tree and covisibility edges: how much drift, in the units of the
-            drift model, the closure implies.
+        strain: chi-square of the tree, covisibility and gap edges: how much drift, in the units of
+            the drift model, the closure implies.
         closed: loop edges that were open before: what the strain is to be shared by.
         loop_error: ``(E,)`` chi-square of the loop edges, NaN for others.
     """
@@ -76,6 +76,7 @@ def essential_graph(
     config: PoseGraphConfig,
     *,
     weak: Collection[int] = (),
+    driven: bool = False,
 ) -> PoseGraph:
     """The essential graph of a map, *before* anything of the new loop has been written to it.
 
@@ -90,8 +91,9 @@ def essential_graph(
     Args:
         loops: that were closed, and last the new one; all with their pose.
         weak: keyframes that began anew after tracking was lost, culled ones too. Tree edges that
-            lead past one of them, and whose ends share hardly a landmark, come from a prediction
-            and are trusted accordingly.
+            lead past one of them, and whose ends share hardly a landmark, come from a prediction.
+        driven: trust such an edge as far as a car's motion can be predicted over that time (GAP);
+            otherwise the camera may have been carried anywhere (WEAK).
 
     Raises:
         ValueError: a loop has no pose.
@@ -111,7 +113,7 @@ def essential_graph(
             pair = (min(parent, child), max(parent, child))
             passed = np.searchsorted(restarts, pair, side="right")
             gap = passed[0] < passed[1] and pair not in seen
-            kind[pair] = WEAK if gap else TREE
+            kind[pair] = (GAP if driven else WEAK) if gap else TREE
     measured: dict[tuple[int, int], tuple[NDArray[np.float64], float]] = {}
     for loop in loops:
         query, match, T = _loop_of_living(map_, loop)
@@ -130,13 +132,14 @@ def essential_graph(
     for e in loop_edges.tolist():
         i, j = living[edges[e]].tolist()
         T_i_j[e], scales[e] = measured[i, j]
+    seconds = np.array([map_.timestamps[k] for k in living.tolist()], np.float64)
     return PoseGraph(
         keyframes=living,
         T_cw=T_cw,
         edges=edges,
         T_i_j=T_i_j,
         kind=kinds,
-        sigmas=edge_sigmas(edges, T_i_j, kinds, len(living), config),
+        sigmas=edge_sigmas(edges, T_i_j, kinds, seconds[edges], len(living), config),
         fixed=_first_of_parts(edges, len(living)),
         scale=scales,
     )
@@ -162,10 +165,11 @@ def edge_sigmas(
     edges: NDArray[np.int64],
     T_i_j: NDArray[np.float64],
     kind: NDArray[np.uint8],
+    seconds: NDArray[np.float64],
     n: int,
     config: PoseGraphConfig,
 ) -> NDArray[np.float64]:
-    """Standard deviations of edges, ``(E, 2)``, m and rad.
+    """Standard deviations of edges, ``(E, 2)``, m and rad; ``seconds`` ``(E, 2)`` of their ends.
 
     Drift is a random walk: the variance of a tree or covisibility edge grows with its length.
     These edges repeat what is one measurement, the path as it was estimated; were they independent
@@ -182,6 +186,10 @@ def edge_sigmas(
     root = np.sqrt(length * coverage[edges].mean(axis=1))
     drift = np.array([config.translation_drift, config.rotation_drift])
     sigmas = root[:, None] * drift
+    gap = kind == GAP
+    sigmas[gap, 0] = config.gap_translation * length[gap]
+    elapsed = np.abs(seconds[gap, 1] - seconds[gap, 0])
+    sigmas[gap, 1] = config.gap_rotation * np.maximum(elapsed, config.min_gap)
     sigmas[kind == WEAK] = config.weak_translation, config.weak_rotation
     sigmas[kind == LOOP] = config.loop_translation, config.loop_rotation
     return sigmas
@@ -241,8 +249,8 @@ def consistency(
     Two tests. A loop edge far from its measurement contradicts the others or more of the path than
     the loss would give up. The strain, chi-square of what tree and covisibility edges were bent by,
     has six degrees of freedom for each loop that was closed if drift is what the model says; beyond
-    several times that no plausible drift explains the loop. Nothing can be said against a single
-    loop across a weak edge: it strains nothing.
+    several times that no plausible drift explains the loop. What a GAP is bent by counts as well.
+    Nothing can be said against a single loop across a weak edge: it strains nothing.
 
     Args:
         T_cw: ``(N, 4, 4)`` result of ``optimise``.

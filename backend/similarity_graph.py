@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.loop_correction import carry_landmarks_by
-from vslam.backend.pose_graph import HOLD, LOOP, WEAK, Consistency, PoseGraph, judge
+from vslam.backend.pose_graph import GAP, HOLD, LOOP, WEAK, Consistency, PoseGraph, judge
 from vslam.config import PoseGraphConfig
 from vslam.geometry import inverses, se3_log
 from vslam.loops import LoopEdge
@@ -93,6 +93,7 @@ def sigmas(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     scale = graph.sigmas[:, 1] * (config.scale_drift / config.rotation_drift)
     scale[graph.kind == LOOP] = config.loop_scale
     scale[graph.kind == WEAK] = config.weak_scale
+    scale[graph.kind == GAP] = config.gap_scale
     return np.column_stack([np.repeat(graph.sigmas[:, ::-1], 3, axis=1), scale])
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from vslam.backend.pose_graph import (
     COVISIBLE,
+    GAP,
     LOOP,
     TREE,
     WEAK,
@@ -53,7 +54,7 @@ def chain_graph(T_wc: np.ndarray, loops=(), measured=(), reach: int = 1, weak=()
     T_i_j = T_cw[edges[:, 0]] @ T_wc[edges[:, 1]]
     if len(loops):
         T_i_j[-len(loops) :] = measured
-    sigmas = edge_sigmas(edges, T_i_j, kinds, n, CONFIG)
+    sigmas = edge_sigmas(edges, T_i_j, kinds, edges.astype(float), n, CONFIG)
     return PoseGraph(
         np.arange(n), T_cw, edges, T_i_j, kinds, sigmas, np.arange(n) == 0, np.ones(len(edges))
     )
@@ -287,6 +288,13 @@ def test_edges_past_a_restart_are_weak():
     assert list(edges.values()).count(WEAK) == 1
     e = list(edges).index((3, 5))
     assert graph.sigmas[e].tolist() == [CONFIG.weak_translation, CONFIG.weak_rotation]
+    # Driven on, 2 m in the time between: half of it, and so many rad a second.
+    graph = essential_graph(map_, [], CONFIG, weak={4}, driven=True)
+    assert named(graph)[3, 5] == GAP
+    assert WEAK not in named(graph).values()
+    elapsed = map_.timestamps[5] - map_.timestamps[3]
+    expected = [CONFIG.gap_translation * 2.0, CONFIG.gap_rotation * max(elapsed, CONFIG.min_gap)]
+    assert graph.sigmas[e].tolist() == pytest.approx(expected)
 
 
 def test_a_tree_edge_past_a_restart_with_landmarks_in_common_is_not_weak():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from ring import CAMERA
 
-from vslam.backend.pose_graph import LOOP, TREE, PoseGraph, edge_sigmas
+from vslam.backend.pose_graph import GAP, LOOP, TREE, WEAK, PoseGraph, edge_sigmas
 from vslam.backend.similarity_graph import (
     edge_errors,
     move_keyframes_similarly,
@@ -29,16 +29,19 @@ from vslam.observations import link_many
 CONFIG = PoseGraphConfig()
 
 
-def chain(T_wc: np.ndarray, T_first_last: np.ndarray, scale: float) -> PoseGraph:
-    """Odometry from each pose to the next, and one loop from the first to the last."""
+def chain(T_wc: np.ndarray, T_first_last: np.ndarray, scale: float, **lost: int) -> PoseGraph:
+    """Odometry from each pose to the next, and one loop from the first to the last; ``after=k,
+    kind=GAP``: tracking was lost after the k-th pose."""
     n = len(T_wc)
     edges = np.array([*((i, i + 1) for i in range(n - 1)), (0, n - 1)])
     kind = np.array([TREE] * (n - 1) + [LOOP], np.uint8)
+    if lost:
+        kind[lost["after"]] = lost["kind"]
     T_i_j = inverses(T_wc)[edges[:, 0]] @ T_wc[edges[:, 1]]
     T_i_j[-1] = T_first_last
     scales = np.ones(n)
     scales[-1] = scale
-    sigmas = edge_sigmas(edges, T_i_j, kind, n, CONFIG)
+    sigmas = edge_sigmas(edges, T_i_j, kind, edges.astype(float), n, CONFIG)
     return PoseGraph(
         np.arange(n), inverses(T_wc), edges, T_i_j, kind, sigmas, np.arange(n) == 0, scales
     )
@@ -98,6 +101,30 @@ def test_a_lap_whose_scale_drifted_closes():
     verdict = similarity_consistency(graph, start, found, CONFIG)
     assert verdict.consistent
     assert verdict.closed == 1
+
+
+def test_where_tracking_was_lost_the_error_of_a_lap_spreads_if_the_camera_drove_on():
+    """Lost half way: the unit jumps by a third, the gap is predicted too short and askew."""
+    growth, after = 1.004, 60
+    truth, estimate = drifted_lap(growth)
+    steps = inverses(estimate)[:-1] @ estimate[1:]
+    steps[after:, :3, 3] *= 1.3
+    steps[after] = steps[after] @ se3_exp(np.array([0, 0, -0.6, 0, 0.1, 0]))
+    for k in range(after, len(steps)):
+        estimate[k + 1] = estimate[k] @ steps[k]
+    loop = inverse(truth[0]) @ truth[-1], growth ** -(len(steps)) / 1.3
+    worst = {}
+    for kind in (GAP, WEAK):
+        graph = chain(estimate, *loop, after=after, kind=kind)
+        start = inverses(graph.T_cw)
+        found = optimise_similarities(graph, start, CONFIG)
+        assert similarity_consistency(graph, start, found, CONFIG).consistent
+        unit = np.linalg.norm(np.diff(found[:, :3, 3], axis=0), axis=1)
+        unit /= np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)
+        worst[kind] = np.abs(np.log(np.delete(unit, after))).max()
+    # Nothing spreads over a gap of which nothing is known: half a lap keeps its wrong unit.
+    assert worst[GAP] < 0.15
+    assert worst[WEAK] > 0.23
 
 
 def test_a_scale_that_no_drift_explains_is_refused():

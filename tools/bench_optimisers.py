@@ -173,7 +173,7 @@ def simulated_graph(n: int, reach: int, config: PoseGraphConfig) -> tuple[PoseGr
     )
     kind = np.repeat([TREE, COVISIBLE, LOOP], [n - 1, len(path) - n + 1, len(loops)])
     kind = kind.astype(np.uint8)
-    sigmas = edge_sigmas(edges, T_i_j, kind, n, config)
+    sigmas = edge_sigmas(edges, T_i_j, kind, edges.astype(float), n, config)
     graph = PoseGraph(
         np.arange(n),
         inverses(T_wc),

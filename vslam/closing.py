@@ -22,7 +22,14 @@ from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.global_mapping import GlobalSnapshot, merge_solution, take_snapshot
 from vslam.backend.local_mapping import adjust_locally, strong_neighbours
 from vslam.backend.loop_correction import move_keyframes
-from vslam.backend.pose_graph import consistency, essential_graph, optimise
+from vslam.backend.pose_graph import (
+    GAP,
+    Consistency,
+    PoseGraph,
+    consistency,
+    essential_graph,
+    optimise,
+)
 from vslam.backend.similarity_graph import (
     move_keyframes_similarly,
     optimise_similarities,
@@ -96,38 +103,48 @@ class LoopClosing:
         """Correct the map by a verified loop; if it contradicts the rest, leave the map alone."""
         start = time.perf_counter()
         config = self._config
-        graph = essential_graph(map_, [*self._closed, edge], config.pose_graph, weak=map_.restarts)
-        if self._camera.monocular:
-            start_S_wc = self._similarly_aligned(map_, edge)[graph.keyframes]
-            S_wc = optimise_similarities(graph, start_S_wc, config.pose_graph)
-            verdict = similarity_consistency(graph, start_S_wc, S_wc, config.pose_graph)
-            T_cw = inverses(rigid(S_wc))
-        else:
-            graph = replace(graph, T_cw=self._aligned(map_, edge)[graph.keyframes])
-            T_cw = optimise(graph, config.pose_graph)
-            verdict = consistency(graph, T_cw, config.pose_graph)
-        if not verdict.consistent:
-            return replace(edge, accepted=False, reason=verdict.reason)
+        solved = self._solve(map_, edge, driven=True)
+        if not solved.verdict.consistent and (solved.graph.kind == GAP).any():
+            solved = self._solve(map_, edge, driven=False)
+        if not solved.verdict.consistent:
+            return replace(edge, accepted=False, reason=solved.verdict.reason)
         if self._global is not None:  # it knows nothing of this loop
             self._global.cancel()
             self._global = None
-        keyframes = graph.keyframes
+        keyframes = solved.graph.keyframes
         before = map_.arrays.T_cw[keyframes]
         query_side = [edge.query, *strong_neighbours(map_, edge.query, config)]
         match_side = [edge.match, *strong_neighbours(map_, edge.match, config)]
         self._closed.append(edge)
         if self._camera.monocular:
-            growth = move_keyframes_similarly(map_, keyframes, S_wc)
+            growth = move_keyframes_similarly(map_, keyframes, solved.S_wc)
             self._closed = [rescaled_loop(closed, growth) for closed in self._closed]
         else:
-            move_keyframes(map_, keyframes, T_cw)
+            move_keyframes(map_, keyframes, solved.T_cw)
         fuse_loop(map_, edge, query_side, match_side, self._camera, config)
         adjust_locally(map_, edge.query, self._camera, config)
         edge = replace(edge, reason="closed")
-        closure = Closure(edge, keyframes, before, T_cw, time.perf_counter() - start)
+        closure = Closure(edge, keyframes, before, solved.T_cw, time.perf_counter() - start)
         self.closures.append(closure)
         self._global = self._start_global(map_, edge.query)
         return edge
+
+    def _solve(self, map_: Map, edge: LoopEdge, *, driven: bool) -> _Solution:
+        """The pose graph with a new loop, under one of two stories about where tracking was lost:
+        the camera drove on about as predicted, or it was carried to where the loop puts it."""
+        config, loops = self._config.pose_graph, [*self._closed, edge]
+        graph = essential_graph(map_, loops, config, weak=map_.restarts, driven=driven)
+        now = map_.arrays.T_cw[: map_.n_keyframes]
+        if self._camera.monocular:
+            start = inverses(now) if driven else self._similarly_aligned(map_, edge)
+            start = start[graph.keyframes]
+            S_wc = optimise_similarities(graph, start, config)
+            verdict = similarity_consistency(graph, start, S_wc, config)
+            return _Solution(graph, inverses(rigid(S_wc)), S_wc, verdict)
+        start = now if driven else self._aligned(map_, edge)
+        graph = replace(graph, T_cw=start[graph.keyframes])
+        T_cw = optimise(graph, config)
+        return _Solution(graph, T_cw, inverses(T_cw), consistency(graph, T_cw, config))
 
     def _aligned(self, map_: Map, edge: LoopEdge) -> Matrix:
         """Poses ``T_cw`` to start from: a sub-map that the loop joins is moved to where the loop
@@ -199,6 +216,16 @@ class LoopClosing:
 def _superseded(candidate: LoopCandidate) -> LoopEdge:
     reason = "another loop was closed at this keyframe"
     return LoopEdge(candidate.query, candidate.match, candidate.score, False, reason)
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """A pose graph, the poses found, with and without scale, and whether they make sense."""
+
+    graph: PoseGraph
+    T_cw: Matrix
+    S_wc: Matrix
+    verdict: Consistency
 
 
 @dataclass(frozen=True)

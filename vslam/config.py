@@ -308,6 +308,12 @@ class PoseGraphConfig(_Section):
         100.0, gt=0, description="Sigma where tracking was lost, m. [own]"
     )
     weak_rotation: float = Field(1.0, gt=0, description="Sigma where tracking was lost, rad. [own]")
+    gap_translation: float = Field(
+        0.5, gt=0, description="Where the camera drove on lost: of the way predicted. [own]"
+    )
+    gap_rotation: float = Field(0.3, gt=0, description="The same, rad per second. [own]")
+    gap_scale: float = Field(0.3, gt=0, description="The same, log: speeds change. [own]")
+    min_gap: float = Field(0.3, gt=0, description="No gap is taken for shorter, s. [own]")
     robust_scale: float = Field(3.0, gt=0, description="Of the Cauchy loss on loops, sigmas. [own]")
     iterations: int = Field(50, ge=1, description="Levenberg-Marquardt iterations at most.")
     max_loop_error: float = Field(

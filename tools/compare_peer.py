@@ -6,7 +6,9 @@ figures for the whole process: start, vocabulary, files written and all. Errors 
 vslam.evaluate for both, on the trajectory files that they wrote.
 
 The peer is a script that takes VOCABULARY SEQUENCE_FOLDER OUT --frames N, writes a pose a frame to
-OUT in KITTI's format and prints a JSON object with frames, fps, cpu_ms_per_frame and lost. Loops
+OUT in KITTI's format and prints a JSON object with frames, fps, cpu_ms_per_frame and lost. With
+``--sensor mono`` it is given ``--mono --rate 20`` (it loses its way when images come faster than
+its mapping) and writes its keyframes in TUM's format: its ATE is that of its keyframes alone. Loops
 are found, missed and wrong by the ground truth for vslam (vslam.loop_evaluation); of the peer only
 the closed ones are known: ``loops`` of that object, or the lines that ORB-SLAM3 prints for them.
 
@@ -41,7 +43,7 @@ MEASURES = (  # key, title with an arrow to the better side, format
     ("loops_closed", "loops closed", ".0f"),
     ("loops_missed", "revisits without a loop ↓", ".0f"),
     ("loops_wrong", "wrong loops ↓", ".0f"),
-    ("ate_m", "ATE, SE3-aligned, m ↓", ".3f"),
+    ("ate_m", "ATE, aligned, m ↓", ".3f"),
     ("rpe_m", "RPE per frame, m ↓", ".4f"),
     ("t_rel", "t_rel, % ↓", ".3f"),
 )
@@ -59,7 +61,7 @@ class Process(NamedTuple):
 class Run(NamedTuple):
     """One run: what the system reports of itself (``frames``, ``fps`` and ``cpu_ms_per_frame`` of
     the frame loop, and more), its lost frames, its loops closed, missed and wrong (None where it
-    does not say), and its trajectory in KITTI's format."""
+    does not say), and its trajectory, in KITTI's format or, with times, in TUM's."""
 
     process: Process
     report: dict[str, Any]
@@ -87,7 +89,7 @@ def measure(command: list[str], folder: Path) -> Process:
 def run_vslam(options: argparse.Namespace, folder: Path) -> Run:
     command = [options.vslam, "run", "--data", str(options.data), "--seq", options.seq]
     command += ["--max-frames", str(options.frames), "--no-record", "--quiet", "--out", "runs"]
-    command += ["--detector", options.detector]
+    command += ["--detector", options.detector, "--sensor", options.sensor]
     if options.threads:
         command += ["--threads", str(options.threads)]
     process = measure(command, folder)
@@ -101,22 +103,22 @@ def run_vslam(options: argparse.Namespace, folder: Path) -> Run:
 def run_peer(options: argparse.Namespace, folder: Path) -> Run:
     sequence = options.data / "sequences" / options.seq
     command = [str(options.peer_python), str(options.peer_script), str(options.vocabulary)]
-    command += [str(sequence), "out.kitti", "--frames", str(options.frames)]
+    command += [str(sequence), "out.txt", "--frames", str(options.frames)]
+    command += ["--mono", "--rate", "20"] if options.sensor == "mono" else []
     process = measure(command, folder)
     said = next(line for line in reversed(process.output.splitlines()) if line.startswith("{"))
     report = json.loads(said)
     loops = report.get("loops", process.output.count(PEER_LOOP))
-    trajectory = (folder / "out.kitti").read_text()
+    trajectory = (folder / "out.txt").read_text()
     return Run(process, report, report["lost"], (loops, None, None), trajectory)
 
 
 def figures(run: Run, options: argparse.Namespace) -> dict[str, float]:
     """Every measure of one run; NaN where it has no value, as t_rel on a path below 100 m."""
-    import numpy as np
-
     from vslam.datasets import open_sequence
+    from vslam.errors import InputError
     from vslam.evaluate import evaluate
-    from vslam.trajectory import Trajectory
+    from vslam.trajectory import Trajectory, read_trajectory
 
     process, frames = run.process, run.report["frames"]
     found = {
@@ -134,15 +136,19 @@ def figures(run: Run, options: argparse.Namespace) -> dict[str, float]:
         found[f"loops_{name}"] = nan if count is None else float(count)
     found |= dict.fromkeys(("ate_m", "rpe_m", "t_rel"), nan)
     sequence = open_sequence("kitti", options.data, options.seq, max_frames=options.frames)
-    rows = np.array([line.split() for line in run.trajectory.splitlines()], np.float64)
-    if sequence.ground_truth is None or len(rows) != len(sequence):
-        return found  # which pose belongs to which frame is not known
-    T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_wc[:, :3] = rows.reshape(-1, 3, 4)
-    errors = evaluate(
-        Trajectory(sequence.timestamps, T_wc),
-        Trajectory(sequence.timestamps, sequence.ground_truth),
-    )
+    if sequence.ground_truth is None:
+        return found
+    with tempfile.NamedTemporaryFile("w") as file:
+        file.write(run.trajectory)
+        file.flush()
+        try:
+            estimate = read_trajectory(Path(file.name), sequence.timestamps)
+        except InputError:  # too few poses: which belongs to which frame is not known
+            return found
+    truth = Trajectory(sequence.timestamps, sequence.ground_truth)
+    if options.sensor == "mono":  # without a unit, and of the peer keyframes alone
+        return found | {"ate_m": evaluate(estimate, truth, "sim3").ate_rmse_m}
+    errors = evaluate(estimate, truth)
     t_rel = errors.t_rel_percent
     found |= {"ate_m": errors.ate_rmse_m, "rpe_m": errors.rpe_m}
     return found | {"t_rel": nan if t_rel is None else t_rel}
@@ -189,6 +195,7 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--repeats", type=int, default=3, help="counted runs of each system")
     parser.add_argument("--threads", type=int, help="of vslam; its default unless given")
     parser.add_argument("--detector", default="none", help="loop detector of vslam")
+    parser.add_argument("--sensor", default="stereo", choices=("stereo", "mono"))
     parser.add_argument("--vslam", default=str(Path(sys.executable).with_name("vslam")))
     parser.add_argument("--peer-python", type=Path, required=True)
     parser.add_argument("--peer-script", type=Path, required=True)

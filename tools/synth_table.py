@@ -1,7 +1,7 @@
 """Write docs/results.md: vslam with and without loop closing, and a peer, on rendered drives.
 
     python tools/synth_table.py --routes demo,05 --lights clean,brightness:1.0 \
-        [--kitti KITTI --along 00,07] [--aliased demo:10] \
+        [--kitti KITTI --along 00,07] [--aliased demo:10] [--sensor mono] \
         [--peer-python PY --peer-script run_orbslam3.py --vocabulary voc.txt]
 
 A drive is a built-in route; with ``--along`` the poses of a KITTI sequence (KITTI/poses/NN.txt) in
@@ -39,9 +39,16 @@ Lost: frames. ATE: of every frame, after SE3 alignment. Loops: closed / missed /
 truth; a revisit counts where the camera passes a place again for 20 m in the same direction. Of
 ORB-SLAM3 only the loops it closes are known. fps: frames a second of the frame loop. Load: of the
 machine (mean of five minutes); above 2, on two cores, the fps are too low. Brightness: seed 0.
-
+"""
+COLUMNS = """
 | drive | frames | path m | light | system | lost | ATE m | ATE % | t_rel % | loops | fps | load |
 |---|---|---|---|---|---|---|---|---|---|---|---|
+"""
+MONOCULAR = """
+## Monocular: the left eye alone
+
+ATE after Sim3 alignment, of vslam for every frame, of ORB-SLAM3 for the keyframes that it keeps; it
+is given 20 images a second, vslam as many as it takes.
 """
 Row = dict[str, Any]
 
@@ -64,6 +71,7 @@ def main() -> None:
         "--lights", default="clean", help="clean, perturbations, kidnappings; with semicolons"
     )
     parser.add_argument("--out", type=Path, default=Path("docs/results.md"))
+    parser.add_argument("--sensor", default="stereo", choices=("stereo", "mono"))
     parser.add_argument("--again", default="", help="systems to measure again, with commas")
     parser.add_argument("--peer-python", type=Path)
     parser.add_argument("--peer-script", type=Path)
@@ -76,7 +84,8 @@ def main() -> None:
             # What loop closing is worth is asked once for each drive.
             systems = [*OURS] if light == "clean" and "aliased" not in drive.title else ["vslam"]
             systems += [PEER] if options.peer_python else []
-            wanted = {f"{drive.title}, {light}, {system}": system for system in systems}
+            eye = ", mono" if options.sensor == "mono" else ""
+            wanted = {f"{drive.title}, {light}, {system}{eye}": system for system in systems}
             missing = {key: system for key, system in wanted.items() if key not in kept}
             if not missing:
                 continue
@@ -168,6 +177,7 @@ def _row(drive: Drive, light: str, system: str, data: Path, options: argparse.Na
         frames=len(truth),
         threads=None,
         detector=OURS.get(system),
+        sensor=options.sensor,
         vslam=str(Path(sys.executable).with_name("vslam")),
         peer_python=options.peer_python and options.peer_python.absolute(),
         peer_script=options.peer_script and options.peer_script.absolute(),
@@ -180,6 +190,7 @@ def _row(drive: Drive, light: str, system: str, data: Path, options: argparse.Na
         "drive": drive.title,
         "light": light,
         "system": system,
+        "sensor": options.sensor,
         "frames": len(truth),
         "path_m": float(path_length(truth)[-1]),
         **{key: None if np.isnan(value) else value for key, value in found.items()},
@@ -218,7 +229,12 @@ def _write(out: Path, rows: dict[str, Row]) -> None:
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     out.with_suffix(".json").write_text(json.dumps(rows, indent=1) + "\n")
-    out.write_text(HEAD + "".join(map(_line, lines)))
+    parts = {
+        sensor: "".join(_line(row) for row in lines if row.get("sensor", "stereo") == sensor)
+        for sensor in ("stereo", "mono")
+    }
+    text = HEAD + COLUMNS + parts["stereo"]
+    out.write_text(text + (MONOCULAR + COLUMNS + parts["mono"] if parts["mono"] else ""))
 
 
 if __name__ == "__main__":

@@ -92,6 +92,10 @@ def run(
         bool,
         typer.Option("--compare-loops", help="Run again without loop closing; print both."),
     ] = False,
+    realtime: Annotated[
+        bool,
+        typer.Option("--realtime", help="Frames come at their times; late ones are dropped."),
+    ] = False,
     record: Annotated[bool, typer.Option(help="Write a Rerun recording.")] = True,
     ply: Annotated[bool, typer.Option("--ply", help="Write the landmarks as map.ply.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
@@ -103,6 +107,8 @@ def run(
     _require_built("--sensor", sensor, _SENSORS)
     if compare_loops and detector == "none":
         raise InputError("--compare-loops: nothing to compare with --detector none; name another.")
+    if compare_loops and realtime:
+        raise InputError("--compare-loops: two runs drop different frames; leave out --realtime.")
 
     from vslam.config import Config, load_config
     from vslam.datasets import open_sequence
@@ -134,6 +140,7 @@ def run(
         max_frames=max_frames,
         config=thresholds,
         weights=weights,
+        realtime=realtime,
     )
     from vslam.comparison import with_comparison
     from vslam.pipeline import run_sequence

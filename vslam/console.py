@@ -50,14 +50,16 @@ def print_summary(
 
     tracks = outcome.tracks
     lost = sum(track.state is TrackingState.LOST for track in tracks)
+    dropped = sum(track.state is TrackingState.DROPPED for track in tracks)
     submaps = f" in {outcome.n_submaps} sub-maps" if outcome.n_submaps > 1 else ""
     size = f"{outcome.n_keyframes} keyframes, {outcome.n_landmarks} landmarks{submaps}"
     rows = [
         *_scale(outcome),
         ("frames", f"{len(tracks)} done, {lost} lost, {len(outcome.skipped)} unreadable"),
+        *_latency(outcome, dropped),
         *(evaluation_rows(evaluation) if evaluation else [("evaluation", remark)]),
         ("loops", _loops(outcome)),
-        ("speed", f"{len(tracks) / outcome.wall_s:.1f} fps" if outcome.wall_s else "-"),
+        ("speed", f"{(len(tracks) - dropped) / outcome.wall_s:.1f} fps" if outcome.wall_s else "-"),
         ("map", size),
         ("folder", str(folder)),
         *((name, str(folder / file)) for name, file in _LOOK_AT if (folder / file).exists()),
@@ -66,6 +68,15 @@ def print_summary(
         rows.insert(0, ("interrupted", outcome.interrupted))
     print_rows(rows)
     _print_comparison(outcome, evaluation)
+
+
+def _latency(outcome: RunOutcome, dropped: int) -> list[tuple[str, str]]:
+    if not outcome.latency_ms:
+        return []
+    import numpy as np
+
+    median, p99 = np.percentile(outcome.latency_ms, [50, 99])
+    return [("real time", f"{dropped} frames dropped, latency {median:.0f} ms, p99 {p99:.0f} ms")]
 
 
 def _scale(outcome: RunOutcome) -> list[tuple[str, str]]:

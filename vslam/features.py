@@ -84,11 +84,13 @@ def build_grid(xy, columns, rows):
 
 
 class TrackingState(StrEnum):
-    """OK: enough inliers. WEAK: a pose, but on few inliers. LOST: the pose is predicted."""
+    """OK: enough inliers. WEAK: a pose, but on few inliers. LOST: the pose is predicted. DROPPED:
+    the images came while others were worked on (``--realtime``); the pose is interpolated."""
 
     OK = "OK"
     WEAK = "WEAK"
     LOST = "LOST"
+    DROPPED = "DROPPED"
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ class TrackResult:
         timestamp: seconds.
         T_wc: ``(4, 4)`` float64 pose at the time of tracking (camera to world); the final
             trajectory, after later bundle adjustments, comes from ``Slam.trajectory()``.
-        state: OK, WEAK or LOST.
+        state: OK, WEAK, LOST or DROPPED.
         n_features: features extracted from the left image.
         n_stereo: of these, features with a stereo match.
         n_matches: landmark matches before the last pose optimisation.

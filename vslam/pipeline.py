@@ -2,6 +2,8 @@
 
 Reading, perturbing and extracting are pure functions of a frame, done by a small pool a few
 frames ahead. Their order is kept, so that the result does not depend on the number of threads.
+In real time frames are prepared when they come and those that come too soon are dropped; then the
+result depends on the machine.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from vslam.errors import UnreadableImageError
 from vslam.features import Features, TrackResult
 from vslam.frontend.tracking import Tracker, extract_features
 from vslam.info import peak_memory_mb, process_age
+from vslam.live import live
 from vslam.perturb import Perturbation
 from vslam.recorder import Recorder
 from vslam.run import RunOutcome, RunSettings
@@ -56,20 +59,24 @@ def run_sequence(
     """Run SLAM over a whole sequence.
 
     A frame that cannot be read is skipped: it gets a predicted pose, counts as lost and is listed
-    in the outcome. Ctrl-C ends the run after the current frame; all done so far is kept.
+    in the outcome. One that is dropped in a real-time run gets an interpolated pose. Ctrl-C ends
+    the run after the current frame; all done so far is kept.
     """
     cv2.setNumThreads(1)  # the pool uses the cores
     detector = create_detector(settings.detector, settings.config, settings.weights)
     slam = Slam(sequence.camera, settings.config, detector, threads=settings.threads)
     tracks: list[TrackResult] = []
     skipped: list[str] = []
+    latency_ms: list[float] = []
     n_told = 0  # loops that the recorder knows of
     recorder.begin(sequence.camera, _ground_truth(sequence))
     startup = process_age()
     wall, cpu = time.perf_counter(), time.process_time()
     with _stop_on_interrupt() as interrupted:
-        frames = prepared_frames(sequence, perturbation, slam.tracker, settings.threads)
-        for index, frame in enumerate(frames):
+        for index, frame, came in _frames(sequence, perturbation, slam.tracker, settings):
+            for missed in sequence.timestamps[len(tracks) : index].tolist():
+                tracks.append(slam.skip(missed, dropped=True))
+                on_frame(tracks[-1])
             timestamp = float(sequence.timestamps[index])
             if frame.features is None or frame.left is None:
                 skipped.append(f"frame {index}: {frame.problem}")
@@ -78,6 +85,8 @@ def run_sequence(
             else:
                 result = slam.step_features(frame.features, timestamp, frame.left, frame.stage_ms)
             tracks.append(result)
+            if settings.realtime:
+                latency_ms.append(1e3 * (time.perf_counter() - came))
             recorder.frame(result, result.T_wc)
             if result.is_keyframe and slam.frame is not None and frame.left is not None:
                 recorder.keyframe(result, frame.left, slam.frame.features, slam.frame.landmark >= 0)
@@ -103,6 +112,7 @@ def run_sequence(
         cpu_s=cpu,
         startup_s=startup,
         peak_memory_mb=peak_memory_mb(),
+        latency_ms=latency_ms,
         n_keyframes=len(slam.map.living_keyframes()),
         n_landmarks=len(slam.map.living_landmarks()),
         map=slam.map,
@@ -112,6 +122,23 @@ def run_sequence(
         n_submaps=len({0, *slam.map.restarts}) if slam.map.n_keyframes else 0,
         interrupted="Ctrl-C" if interrupted.is_set() else None,
     )
+
+
+def _frames(
+    sequence: Sequence, perturbation: Perturbation, tracker: Tracker, settings: RunSettings
+) -> Iterator[tuple[int, PreparedFrame, float]]:
+    """Frames with their numbers and when they came: all of them now, or each in its time."""
+    if settings.realtime:
+        yield from live(
+            sequence.timestamps,
+            lambda index: prepare_frame(sequence, index, perturbation, tracker),
+            settings.threads,
+        )
+        return
+    frames = prepared_frames(sequence, perturbation, tracker, settings.threads)
+    now = time.perf_counter()
+    for index, frame in enumerate(frames):
+        yield index, frame, now
 
 
 def prepared_frames(

@@ -32,6 +32,7 @@ class RunSettings:
     max_frames: int | None
     config: Config
     weights: Path | None = None
+    realtime: bool = False
 
     @property
     def alignment(self) -> str:
@@ -48,6 +49,7 @@ class RunOutcome:
         keyframes: final keyframe poses.
         tracks: one result a frame.
         skipped: messages of the frames whose images could not be read.
+        latency_ms: of each frame tracked in a real-time run, from its time to its pose.
         wall_s, cpu_s: seconds from the first frame read to the last one tracked and mapped.
         startup_s: seconds from the start of the process to the first frame.
         peak_memory_mb: of the process.
@@ -74,6 +76,7 @@ class RunOutcome:
     peak_memory_mb: float
     n_keyframes: int
     n_landmarks: int
+    latency_ms: list[float] = field(default_factory=list)
     map: Map | None = None
     loops: list[LoopEdge] = field(default_factory=list)
     closures: list[Closure] = field(default_factory=list)

@@ -190,16 +190,18 @@ class Slam:
         clock.lap("keyframe")
         return self._result(frame, state, matches, inliers, is_keyframe, clock)
 
-    def skip(self, timestamp: float) -> TrackResult:
-        """Account for a frame without images: it is LOST at the predicted pose."""
+    def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
+        """Account for a frame without images, at the predicted pose: it is LOST, or DROPPED if
+        there was only no time for it."""
         self._check_time(timestamp)
         frame = self._prepare(Features.none())
         if self._placed:
             frame.T_cw = self._predict(timestamp)
-        if self.map.n_keyframes:
+        if self.map.n_keyframes and not dropped:
             self._lost_frames += 1
         self._place(timestamp, frame.T_cw, tracked=False)
-        return self._result(frame, TrackingState.LOST, 0, 0, False, _Clock())
+        state = TrackingState.DROPPED if dropped else TrackingState.LOST
+        return self._result(frame, state, 0, 0, False, _Clock())
 
     def finish(self) -> None:
         """Complete pending mapping. Call before reading the map or the final trajectory."""

@@ -47,6 +47,7 @@ def headlines(report: ReportJson) -> list[Headline]:
         Headline("t_rel", _number(report.t_rel_percent, "%"), "KITTI drift over 100-800 m"),
         Headline("r_rel", _number(report.r_rel_deg_per_100m, "°"), "every 100 m"),
         Headline("Speed", f"{report.fps:.1f} fps", f"{report.threads} threads"),
+        *_latency(report),
         Headline(
             "CPU",
             f"{report.cpu_ms_per_frame:.1f} ms",
@@ -56,6 +57,15 @@ def headlines(report: ReportJson) -> list[Headline]:
         Headline("Map", f"{report.landmarks:,}", _map_note(report)),
         _loops(report),
     ]
+
+
+def _latency(report: ReportJson) -> list[Headline]:
+    """In real time the machine decides what becomes of a frame: that is said with a tone."""
+    if report.latency_ms is None:
+        return []
+    ms, dropped = report.latency_ms, report.dropped_frames
+    note = f"median from image to pose; p95 {ms.p95:.0f}, p99 {ms.p99:.0f}; {dropped} dropped"
+    return [Headline("Latency", f"{ms.median:.0f} ms", note, "bad" if dropped else "good")]
 
 
 def _map_note(report: ReportJson) -> str:
@@ -90,7 +100,7 @@ def render_markdown(report: ReportJson) -> str:
         lines += ["", "## Reproduce the ATE", "", f"    {report.evo_command}"]
     if report.stage_ms:
         lines += ["", "## Time per stage (ms)", ""]
-        lines += markdown_table(("stage", "mean", "median", "p95"), stage_rows(report))
+        lines += markdown_table(("stage", "mean", "median", "p95", "p99"), stage_rows(report))
     for table in loop_tables(report):
         lines += ["", f"## {table.title}", "", *markdown_table(table.head, table.rows)]
         lines += ["", table.note] if table.note else []
@@ -136,9 +146,9 @@ def render_page(template: str, **values: object) -> str:
 
 
 def stage_rows(report: ReportJson) -> list[tuple[str, ...]]:
-    """Stage, mean, median and 95th percentile in milliseconds."""
+    """Stage, mean, median, 95th and 99th percentile in milliseconds."""
     return [
-        (name, f"{ms.mean:.2f}", f"{ms.median:.2f}", f"{ms.p95:.2f}")
+        (name, f"{ms.mean:.2f}", f"{ms.median:.2f}", f"{ms.p95:.2f}", f"{ms.p99:.2f}")
         for name, ms in report.stage_ms.items()
     ]
 
@@ -149,7 +159,8 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
     options = [(name, str(getattr(report, name))) for name in (*names, "every")]
     limit = "all" if report.max_frames is None else str(report.max_frames)
     weights = [("weights", str(report.weights))] if report.weights else []
-    return [*options, ("max-frames", limit), *weights]
+    realtime = [("realtime", "yes")] if report.realtime else []
+    return [*options, ("max-frames", limit), *weights, *realtime]
 
 
 def machine_rows(report: ReportJson) -> list[tuple[str, str]]:

@@ -18,6 +18,7 @@ class StageTime(_Model):
     mean: float
     median: float
     p95: float
+    p99: float = 0.0
 
 
 class LoopEntry(_Model):
@@ -77,7 +78,9 @@ class ReportJson(_Model):
     """One run in numbers.
 
     Errors are None without ground truth, and KITTI's drift also on paths shorter than 100 m.
-    ``frames`` counts the frames done; ``skipped_frames`` those with an unreadable image.
+    ``frames`` counts the frames done; ``skipped_frames`` those with an unreadable image, and
+    ``dropped_frames`` those that came too soon in a real-time run, whose ``latency_ms`` is from the
+    time of an image to its pose (None in any other run).
     ``loops_closed`` and ``loops_rejected`` count candidates, ``loops_wrong`` the closed ones that
     are wrong; ``loops_found`` and ``loops_missed`` count the ``revisit_stretches``. The last four
     are None without ground truth. See :mod:`vslam.loop_evaluation`.
@@ -89,6 +92,7 @@ class ReportJson(_Model):
     weak_frames: int
     skipped_frames: int
     skipped_messages: list[str]
+    dropped_frames: int = 0
     frames: int
     interrupted: str | None
 
@@ -105,6 +109,7 @@ class ReportJson(_Model):
     startup_s: float
     peak_memory_mb: float
     stage_ms: dict[str, StageTime]
+    latency_ms: StageTime | None = None
 
     keyframes: int
     landmarks: int
@@ -130,6 +135,7 @@ class ReportJson(_Model):
     every: int
     max_frames: int | None
     weights: Path | None = None
+    realtime: bool = False
 
     machine: Machine
     versions: dict[str, str]

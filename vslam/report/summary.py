@@ -40,6 +40,7 @@ def summarize(
     """
     frames = len(outcome.tracks)
     states = Counter(track.state for track in outcome.tracks)
+    done = frames - states[TrackingState.DROPPED]
     options = asdict(outcome.settings)
     del options["config"]
     loops = _loops(outcome, verdict)
@@ -50,6 +51,7 @@ def summarize(
         weak_frames=states[TrackingState.WEAK],
         skipped_frames=len(outcome.skipped),
         skipped_messages=outcome.skipped,
+        dropped_frames=states[TrackingState.DROPPED],
         frames=frames,
         interrupted=outcome.interrupted,
         alignment=evaluation.alignment if evaluation else None,
@@ -59,11 +61,12 @@ def summarize(
         t_rel_percent=evaluation.t_rel_percent if evaluation else None,
         r_rel_deg_per_100m=evaluation.r_rel_deg_per_100m if evaluation else None,
         evo_command=evo_command,
-        fps=frames / outcome.wall_s if outcome.wall_s > 0 else 0.0,
+        fps=done / outcome.wall_s if outcome.wall_s > 0 else 0.0,
         cpu_ms_per_frame=1000.0 * outcome.cpu_s / frames if frames else 0.0,
         startup_s=outcome.startup_s,
         peak_memory_mb=outcome.peak_memory_mb,
         stage_ms=_stage_times(outcome.tracks),
+        latency_ms=_stage_time(outcome.latency_ms) if outcome.latency_ms else None,
         keyframes=outcome.n_keyframes,
         landmarks=outcome.n_landmarks,
         submaps=outcome.n_submaps,
@@ -133,15 +136,15 @@ def _revisits(verdict: LoopEvaluation) -> list[RevisitEntry]:
 
 
 def _stage_times(tracks: list[TrackResult]) -> dict[str, StageTime]:
-    times = {}
-    for name in stage_names(tracks):
-        ms = np.array([track.stage_ms[name] for track in tracks if name in track.stage_ms])
-        times[name] = StageTime(
-            mean=float(ms.mean()),
-            median=float(np.median(ms)),
-            p95=float(np.percentile(ms, 95)),
-        )
-    return times
+    return {
+        name: _stage_time([track.stage_ms[name] for track in tracks if name in track.stage_ms])
+        for name in stage_names(tracks)
+    }
+
+
+def _stage_time(ms: list[float]) -> StageTime:
+    median, p95, p99 = np.percentile(ms, [50, 95, 99]).tolist()
+    return StageTime(mean=float(np.mean(ms)), median=median, p95=p95, p99=p99)
 
 
 def this_machine() -> Machine:

@@ -40,6 +40,9 @@ class CapsuleShape(BaseModel):
     iterations: int = Field(3, ge=1, description="Of the routing.")
     over: Literal["primary", "output"] = "primary"
     kept: int | None = Field(None, description="Places kept of each type; None before pruning.")
+    inner: tuple[int, ...] | None = Field(
+        None, description="Channels kept inside each block of a lite0 extractor; None: all."
+    )
 
     @property
     def places(self) -> int:
@@ -66,7 +69,7 @@ class CapsuleBranch(nn.Module):
             self.primary = OriginalExtractor(shape.types, shape.size)
         else:
             lite = shape.extractor == "lite0"
-            grid = LiteExtractor() if lite else LightExtractor(shape.blocks)
+            grid = LiteExtractor(shape.inner) if lite else LightExtractor(shape.blocks)
             self.extractor = grid
             self.primary = PrimaryCapsules(grid.out_channels, shape.types, shape.size)
         # Depthwise convolutions are faster so, forward by a third and backward by a quarter.

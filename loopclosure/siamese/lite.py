@@ -8,7 +8,9 @@ form: ReLU6, no squeeze and excitation.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -32,12 +34,15 @@ _DEVIATION = 0.5
 
 
 class InvertedResidual(nn.Module):
-    """Expansion, depthwise convolution and projection, with a shortcut where shapes allow."""
+    """Expansion to ``inner`` channels (None: no expansion), depthwise convolution and projection,
+    with a shortcut where shapes allow."""
 
-    def __init__(self, inputs: int, outputs: int, expansion: int, stride: int, kernel: int) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, inner: int | None, stride: int, kernel: int
+    ) -> None:
         super().__init__()
-        inner = inputs * expansion
-        self.expand = nn.Conv2d(inputs, inner, 1) if expansion > 1 else None
+        self.expand = None if inner is None else nn.Conv2d(inputs, inner, 1)
+        inner = inner or inputs
         self.depthwise = nn.Conv2d(inner, inner, kernel, stride, kernel // 2, groups=inner)
         self.project = nn.Conv2d(inner, outputs, 1)
         self.shortcut = stride == 1 and inputs == outputs
@@ -59,16 +64,18 @@ class LiteExtractor(nn.Module):
         out_channels: of the grid.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, inner: Sequence[int] | None = None) -> None:
+        """``inner``: channels inside each block that expands, where some were pruned."""
         super().__init__()
         self.stem = nn.Conv2d(1, _STEM, 3, 2, 1)
-        blocks: list[nn.Module] = []
-        inputs = _STEM
+        blocks: list[InvertedResidual] = []
+        inputs, widths = _STEM, None if inner is None else iter(inner)
         for expansion, outputs, stride, kernel, repeats in _STAGES:
             for k in range(repeats):
-                blocks.append(
-                    InvertedResidual(inputs, outputs, expansion, 1 if k else stride, kernel)
-                )
+                width = None
+                if expansion > 1:
+                    width = inputs * expansion if widths is None else next(widths)
+                blocks.append(InvertedResidual(inputs, outputs, width, 1 if k else stride, kernel))
                 inputs = outputs
         self.blocks = nn.Sequential(*blocks)
         self.out_channels = inputs
@@ -77,6 +84,11 @@ class LiteExtractor(nn.Module):
         """``(N, 1, S, S)`` of mean 0 and deviation 1 to ``(N, 112, g, g)``."""
         grid: Tensor = self.blocks(functional.relu6(self.stem(x)))
         return grid
+
+    @property
+    def residuals(self) -> list[InvertedResidual]:
+        """The blocks, with their type."""
+        return cast(list[InvertedResidual], list(self.blocks))
 
     def freeze(self, blocks: int) -> None:
         """Leave the stem and the first blocks out of the training; 0 trains everything."""
@@ -103,7 +115,7 @@ class LiteExtractor(nn.Module):
             weight, bias = _folded(state, "_conv_stem", "_bn0")
             self.stem.weight.copy_(weight.sum(1, keepdim=True) * _DEVIATION)
             self.stem.bias.copy_(bias)  # type: ignore[union-attr]
-            for number, block in enumerate(self.blocks):
+            for number, block in enumerate(self.residuals):
                 layers = {
                     "_depthwise_conv": ("depthwise", "_bn1"),
                     "_project_conv": ("project", "_bn2"),
@@ -117,6 +129,37 @@ class LiteExtractor(nn.Module):
                     getattr(block, ours).bias.copy_(bias)
         except (KeyError, TypeError, RuntimeError) as error:
             raise InputError(f"{path}: layers of another network; {fix}.") from error
+
+
+@torch.no_grad()
+def thinned(extractor: LiteExtractor, share: float) -> tuple[LiteExtractor, tuple[int, ...]]:
+    """A copy without the ``share`` of channels inside each block that matter least, and how many
+    are left in each.
+
+    A channel passes through one filter of each of the three convolutions: the product of their
+    norms says how much of it can arrive (the criterion of Li et al., "Pruning filters for efficient
+    ConvNets", ICLR 2017). Multiples of 8 are left, as many as a vector register holds.
+    """
+    kept = []
+    for block in extractor.residuals:
+        if block.expand is not None:
+            after = block.project.weight.transpose(0, 1)
+            filters = block.expand.weight, block.depthwise.weight, after
+            matter = torch.stack([w.flatten(1).norm(dim=1) for w in filters]).prod(0)
+            count = max(8, round((1.0 - share) * len(matter) / 8) * 8)
+            kept.append(matter.argsort(descending=True, stable=True)[:count].sort().values)
+    inner = tuple(map(len, kept))
+    smaller, rows = LiteExtractor(inner), iter(kept)
+    smaller.stem.load_state_dict(extractor.stem.state_dict())
+    for block, copy in zip(extractor.residuals, smaller.residuals, strict=True):
+        state = block.state_dict()
+        if block.expand is not None:
+            k = next(rows)
+            for name in ("expand.weight", "expand.bias", "depthwise.weight", "depthwise.bias"):
+                state[name] = state[name][k]
+            state["project.weight"] = state["project.weight"][:, k]
+        copy.load_state_dict(state)
+    return smaller, inner
 
 
 def lite_grid_side(pixels: int) -> int:

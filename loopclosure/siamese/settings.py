@@ -41,6 +41,9 @@ class TrainSettings(BaseModel):
     prune_share: float = Field(
         0.2, gt=0, lt=1, description="Of the capsules, taken out of capsule-pruned. [paper]"
     )
+    thin_share: float = Field(
+        0.0, ge=0, lt=1, description="Of the channels in blocks of lite0, taken out of it as well."
+    )
 
 
 _BEST = TrainSettings(

@@ -15,7 +15,12 @@ from vslam.loopclosure.siamese.data import Collection, divide, validation_images
 from vslam.loopclosure.siamese.images import to_tensor
 from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.objective import validate
-from vslam.loopclosure.siamese.pruning import lowest, mean_couplings, pruned
+from vslam.loopclosure.siamese.pruning import (
+    lowest,
+    mean_couplings,
+    pruned,
+    with_thinner_extractor,
+)
 from vslam.loopclosure.siamese.runtime import milliseconds_per_image
 from vslam.loopclosure.siamese.settings import TrainSettings
 from vslam.loopclosure.siamese.siamese import (
@@ -115,6 +120,9 @@ def _prune(
     batches = (to_tensor(squares[k : k + 32]).to(device) for k in range(0, len(squares), 32))
     smaller = pruned(full, lowest(mean_couplings(full, batches), settings.prune_share))
     report: dict[str, Any] = {"pruned_from": weights.name, "pruned_share": settings.prune_share}
+    if settings.thin_share:
+        smaller = with_thinner_extractor(smaller, settings.thin_share)
+        report["thinned_share"] = settings.thin_share
     for name, network in (("before", full), ("removed", smaller)):
         figures = validate(network, collection, validation, settings.augmentation, device)[0]
         report[f"average_precision_{name}"] = figures["average_precision"]

@@ -239,6 +239,20 @@ def test_augmentation_repeats_and_its_strengths_can_be_nothing():
     assert np.array_equal(augment(image, nothing, np.random.default_rng(0)), image)
 
 
+def test_a_zoom_is_what_driving_on_does():
+    """A dot beside the middle moves away from it, by at most the factor, in half of the images."""
+    image = np.zeros((65, 65), np.uint8)
+    image[32, 44:47] = 255
+    only = Augmentation(**dict.fromkeys(
+        ("homography", "shift", "log_gain", "bias", "log_gamma", "masks", "noise", "blur"), 0
+    ), zoom=0.4)  # fmt: skip
+    seen = [augment(image, only, np.random.default_rng(k)) for k in range(200)]
+    columns = np.array([one[32] @ np.arange(65.0) / max(one[32].sum(), 1) for one in seen])
+    factor = (columns - 32.5) / (45 - 32.5)
+    assert 0.35 < (factor < 1.001).mean() < 0.65
+    assert 1.3 < factor.max() < np.exp(0.4) + 0.05
+
+
 def test_settings_are_read_and_checked(tmp_path):
     path = tmp_path / "settings.json"
     path.write_text(PRESETS["best"].model_dump_json())

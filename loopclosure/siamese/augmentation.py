@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 _TURNED = 0.5  # share of the images that turn, where any do
+_ZOOMED = 0.5  # likewise
 _FIELD_OF_VIEW = 80.0  # degrees
 
 
@@ -18,6 +19,7 @@ class Augmentation(BaseModel):
     homography: float = Field(0.10, ge=0, le=0.4, description="Largest move of a corner, of side.")
     shift: float = Field(0.10, ge=0, le=0.5, description="Largest horizontal shift, of side.")
     turn: float = Field(0.0, ge=0, le=45, description="Largest turn of the camera, degrees.")
+    zoom: float = Field(0.0, ge=0, le=1, description="Largest logarithm of a zoom: driven on.")
     log_gain: float = Field(0.35, ge=0, description="Deviation of the logarithm of the gain.")
     bias: float = Field(20.0, ge=0, description="Deviation, grey levels.")
     log_gamma: float = Field(0.25, ge=0, description="Deviation of the logarithm of gamma.")
@@ -54,6 +56,11 @@ def augment(
     if strength.turn > 0 and rng.random() < _TURNED:
         H = H @ turn_homography(side, side, rng.uniform(-1, 1) * strength.turn)
         edge = cv2.BORDER_CONSTANT if rng.random() < 0.5 else edge
+    if strength.zoom > 0 and rng.random() < _ZOOMED:
+        # What is far ahead grows around the middle when the camera drives on, the rest likewise.
+        factor, middle = np.exp(rng.uniform(0, strength.zoom)), side / 2
+        shift = (1.0 - factor) * middle
+        H = H @ np.array([[factor, 0, shift], [0, factor, shift], [0, 0, 1.0]])
     warped = cv2.warpPerspective(image, H, (side, side), flags=cv2.INTER_LINEAR, borderMode=edge)
     out = np.asarray(warped, np.uint8)
     for _ in range(int(rng.integers(strength.masks + 1))):

@@ -1,0 +1,76 @@
+"""A guard against slow code that no other load on the machine can trip.
+
+Time is CPU time of this thread, the least of several, in units of a fixed kernel measured in
+turn with it: a slower machine, or a busy one, slows both. The limits are what was measured when
+they were written, times 1.6: a change that costs half as much again is noticed, noise is not.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from vslam.config import Config
+from vslam.frontend.tracking import Tracker, extract_features
+from vslam.kernels import kernel
+from vslam.slam import Slam
+
+REPEATS = 7
+
+
+@kernel
+def fixed_work(image, out):
+    """Two passes of a 1-2-4-2-1 blur: loads, integer sums and stores, as most kernels have them."""
+    height, width = image.shape
+    for _ in range(2):
+        for y in range(2, height - 2):
+            for x in range(2, width - 2):
+                across = image[y, x - 2] + 2 * image[y, x - 1] + 4 * image[y, x]
+                across += 2 * image[y, x + 1] + image[y, x + 2]
+                down = image[y - 2, x] + 2 * image[y - 1, x] + 2 * image[y + 1, x]
+                down += image[y + 2, x]
+                out[y, x] = (across + down) >> 4
+
+
+def least(*calls: Callable[[], object]) -> list[float]:
+    """Least CPU time of each call, in turn, s."""
+    best = [np.inf] * len(calls)
+    for _ in range(REPEATS):
+        for number, call in enumerate(calls):
+            start = time.thread_time()
+            call()
+            best[number] = min(best[number], time.thread_time() - start)
+    return best
+
+
+def units(call: Callable[[], object]) -> float:
+    """CPU time of a call in units of the fixed kernel on an image of KITTI's size, ten times."""
+    image = np.random.default_rng(0).integers(0, 256, (376, 1241)).astype(np.int32)
+    out = np.zeros_like(image)
+
+    def fixed() -> None:
+        for _ in range(10):
+            fixed_work(image, out)
+
+    fixed(), call()  # compile
+    one, other = least(fixed, call)
+    return other / one
+
+
+def test_extraction_of_a_pair(corridor):
+    tracker = Tracker.create(corridor.camera, Config())
+    ratio = units(lambda: extract_features(corridor.left[0], corridor.right[0], tracker))
+    assert ratio < 1.6 * 0.68
+
+
+def test_a_frame_tracked_and_mapped(corridor):
+    def drive() -> None:
+        slam = Slam(corridor.camera, Config(), threads=1)
+        for k in range(len(corridor.left)):
+            slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
+        slam.finish()
+
+    ratio = units(drive) / len(corridor.left)
+    assert ratio < 1.6 * 0.87

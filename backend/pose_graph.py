@@ -76,6 +76,7 @@ def essential_graph(
     config: PoseGraphConfig,
     *,
     weak: Collection[int] = (),
+    guessed: Collection[int] = (),
     driven: bool = False,
 ) -> PoseGraph:
     """The essential graph of a map, *before* anything of the new loop has been written to it.
@@ -92,6 +93,7 @@ def essential_graph(
         loops: that were closed, and last the new one; all with their pose.
         weak: keyframes that began anew after tracking was lost, culled ones too. Tree edges that
             lead past one of them, and whose ends share hardly a landmark, come from a prediction.
+        guessed: those of them that not even a prediction led to: always WEAK.
         driven: trust such an edge as far as a car's motion can be predicted over that time (GAP);
             otherwise the camera may have been carried anywhere (WEAK).
 
@@ -106,14 +108,15 @@ def essential_graph(
     seen = set(map(tuple, pairs.tolist()))
     # Edge by the pair of its ends: what is written later wins.
     kind = dict.fromkeys(map(tuple, pairs[shared >= config.min_shared].tolist()), COVISIBLE)
-    restarts = np.array(sorted(weak), np.int64)
+    restarts, guesses = (np.array(sorted(at), np.int64) for at in (weak, guessed))
     for child in living.tolist():
         parent = map_.parents[child]
         if parent >= 0:
             pair = (min(parent, child), max(parent, child))
-            passed = np.searchsorted(restarts, pair, side="right")
-            gap = passed[0] < passed[1] and pair not in seen
-            kind[pair] = (GAP if driven else WEAK) if gap else TREE
+            if not _passes(pair, restarts) or pair in seen:
+                kind[pair] = TREE
+            else:
+                kind[pair] = GAP if driven and not _passes(pair, guesses) else WEAK
     measured: dict[tuple[int, int], tuple[NDArray[np.float64], float]] = {}
     for loop in loops:
         query, match, T = _loop_of_living(map_, loop)
@@ -143,6 +146,12 @@ def essential_graph(
         fixed=_first_of_parts(edges, len(living)),
         scale=scales,
     )
+
+
+def _passes(pair: tuple[int, int], keyframes: NDArray[np.int64]) -> bool:
+    """Whether one of the sorted keyframes lies behind the first and not behind the second."""
+    low, high = np.searchsorted(keyframes, pair, side="right")
+    return bool(low < high)
 
 
 def _loop_of_living(map_: Map, loop: LoopEdge) -> tuple[int, int, NDArray[np.float64]]:
@@ -176,6 +185,9 @@ def edge_sigmas(
     the path would be the stiffer the more of them pass over it. Therefore each variance is
     multiplied by how many times the edges at its ends cover the path there: then all together
     resist to being stretched as the drift model says, however many they are.
+
+    A GAP may be wrong by a share of the way predicted, or by what a slow car gathers in that time;
+    of a WEAK edge nothing is known.
     """
     length = np.maximum(np.linalg.norm(T_i_j[:, :3, 3], axis=1), config.min_length)
     tree, path = kind == TREE, (kind == TREE) | (kind == COVISIBLE)
@@ -187,8 +199,9 @@ def edge_sigmas(
     drift = np.array([config.translation_drift, config.rotation_drift])
     sigmas = root[:, None] * drift
     gap = kind == GAP
-    sigmas[gap, 0] = config.gap_translation * length[gap]
     elapsed = np.abs(seconds[gap, 1] - seconds[gap, 0])
+    share = config.gap_translation * length[gap]
+    sigmas[gap, 0] = np.maximum(share, config.gap_speed * elapsed)
     sigmas[gap, 1] = config.gap_rotation * np.maximum(elapsed, config.min_gap)
     sigmas[kind == WEAK] = config.weak_translation, config.weak_rotation
     sigmas[kind == LOOP] = config.loop_translation, config.loop_rotation

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from ring import CAMERA, LAP, Oracle, Ring
 
+from vslam.closing import LoopClosing
 from vslam.features import Features, TrackingState
 from vslam.geometry import inverse
 from vslam.loopclosure.detector import NoDetector
@@ -139,3 +140,35 @@ def test_two_seconds_of_darkness_lose_no_pose(check_map):
     found = errors(slam, EXACT, ROUND)
     assert found.max() < 1.5  # the dark frames too: their motion is interpolated
     check_map(slam.map)
+
+
+@pytest.mark.parametrize(
+    ("ring", "frames", "dark", "stories"),
+    [
+        (DRIFTING, ROUND, range(60, 64), [True]),
+        (EXACT, [*ROUND[:80], *ROUND[140:]], (), [True, False]),  # 90 m between two frames
+    ],
+)
+def test_a_gap_is_driven_over_first_and_carried_over_if_that_cannot_be(
+    monkeypatch, ring, frames, dark, stories
+):
+    solve, asked = LoopClosing._solve, []
+
+    def noted(self, map_, edge, *, driven):
+        asked.append(driven)
+        return solve(self, map_, edge, driven=driven)
+
+    monkeypatch.setattr(LoopClosing, "_solve", noted)
+    slam, _ = run(ring, frames, Oracle(ring, frames), dark=dark)
+    assert len(slam.map.restarts) == 1
+    assert not slam.map.guesses
+    assert slam.closures
+    assert asked[: len(stories)] == stories
+
+
+def test_where_no_speed_was_known_a_restart_is_a_guess():
+    """Lost at once, the map has no velocity to predict the gap with."""
+    frames = [0.0, *ROUND[30:60]]
+    slam, results = run(EXACT, frames)
+    assert [r.state for r in results[:3]].count(TrackingState.LOST) == 1
+    assert slam.map.restarts == slam.map.guesses == [1]

@@ -293,8 +293,14 @@ def test_edges_past_a_restart_are_weak():
     assert named(graph)[3, 5] == GAP
     assert WEAK not in named(graph).values()
     elapsed = map_.timestamps[5] - map_.timestamps[3]
-    expected = [CONFIG.gap_translation * 2.0, CONFIG.gap_rotation * max(elapsed, CONFIG.min_gap)]
+    expected = [
+        max(CONFIG.gap_translation * 2.0, CONFIG.gap_speed * elapsed),
+        CONFIG.gap_rotation * max(elapsed, CONFIG.min_gap),
+    ]
     assert graph.sigmas[e].tolist() == pytest.approx(expected)
+    # Not where nobody knew how fast it went.
+    graph = essential_graph(map_, [], CONFIG, weak={4}, guessed={4}, driven=True)
+    assert named(graph)[3, 5] == WEAK
 
 
 def test_a_tree_edge_past_a_restart_with_landmarks_in_common_is_not_weak():

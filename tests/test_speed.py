@@ -1,8 +1,9 @@
-"""A guard against slow code that no other load on the machine can trip.
+"""A guard against slow code that other load on the machine does not trip.
 
-Time is CPU time of this thread, the least of several, in units of a fixed kernel measured in
-turn with it: a slower machine, or a busy one, slows both. The limits are what was measured when
-they were written, times 1.6: a change that costs half as much again is noticed, noise is not.
+CPU time of this thread, the least of several, in units of a fixed kernel measured in turn with it:
+a slower machine, or a busy one, slows both. Limits are 2.5 times the largest of three measurements
+on two busy Xeon cores with AVX-512 (November 2026): between kinds of processors the ratio moves,
+and what this is to notice is code that became several times as slow.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 
 from vslam.config import Config
@@ -22,7 +24,7 @@ REPEATS = 7
 
 @kernel
 def fixed_work(image, out):
-    """Two passes of a 1-2-4-2-1 blur: loads, integer sums and stores, as most kernels have them."""
+    """A star of nine pixels, summed, for every pixel, twice: loads, integer sums and stores."""
     height, width = image.shape
     for _ in range(2):
         for y in range(2, height - 2):
@@ -54,6 +56,7 @@ def units(call: Callable[[], object]) -> float:
         for _ in range(10):
             fixed_work(image, out)
 
+    cv2.setNumThreads(1)  # what other threads do is not counted
     fixed(), call()  # compile
     one, other = least(fixed, call)
     return other / one
@@ -62,7 +65,7 @@ def units(call: Callable[[], object]) -> float:
 def test_extraction_of_a_pair(corridor):
     tracker = Tracker.create(corridor.camera, Config())
     ratio = units(lambda: extract_features(corridor.left[0], corridor.right[0], tracker))
-    assert ratio < 1.6 * 0.68
+    assert ratio < 2.5 * 0.68
 
 
 def test_a_frame_tracked_and_mapped(corridor):
@@ -73,4 +76,4 @@ def test_a_frame_tracked_and_mapped(corridor):
         slam.finish()
 
     ratio = units(drive) / len(corridor.left)
-    assert ratio < 1.6 * 0.87
+    assert ratio < 2.5 * 0.87

@@ -94,7 +94,7 @@ def run(
     ] = False,
     realtime: Annotated[
         bool,
-        typer.Option("--realtime", help="Frames come at their times; late ones are dropped."),
+        typer.Option("--realtime", help="Frames come at their times; overtaken ones drop."),
     ] = False,
     record: Annotated[bool, typer.Option(help="Write a Rerun recording.")] = True,
     ply: Annotated[bool, typer.Option("--ply", help="Write the landmarks as map.ply.")] = False,

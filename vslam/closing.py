@@ -133,7 +133,9 @@ class LoopClosing:
         """The pose graph with a new loop, under one of two stories about where tracking was lost:
         the camera drove on about as predicted, or it was carried to where the loop puts it."""
         config, loops = self._config.pose_graph, [*self._closed, edge]
-        graph = essential_graph(map_, loops, config, weak=map_.restarts, driven=driven)
+        graph = essential_graph(
+            map_, loops, config, weak=map_.restarts, guessed=map_.guesses, driven=driven
+        )
         now = map_.arrays.T_cw[: map_.n_keyframes]
         if self._camera.monocular:
             start = inverses(now) if driven else self._similarly_aligned(map_, edge)

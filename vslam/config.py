@@ -66,10 +66,10 @@ class TrackingConfig(_Section):
         3, ge=1, description="Lost this long, mapping restarts at the predicted pose. [own]"
     )
     young_keyframes: int = Field(
-        5, ge=0, description="A map of no more is given up with the first frame lost. [own]"
+        5, ge=0, description="Stereo: with no more in all, one lost frame restarts. [own]"
     )
     monocular_lost_frames: int = Field(
-        4, ge=1, description="The same for a monocular camera, which needs a second frame. [own]"
+        4, ge=1, description="Monocular, whatever the age: after this, two views anew. [own]"
     )
 
 
@@ -311,6 +311,7 @@ class PoseGraphConfig(_Section):
     gap_translation: float = Field(
         0.5, gt=0, description="Where the camera drove on lost: of the way predicted. [own]"
     )
+    gap_speed: float = Field(2.0, gt=0, description="The same, at least, m per second. [own]")
     gap_rotation: float = Field(0.3, gt=0, description="The same, rad per second. [own]")
     gap_scale: float = Field(0.3, gt=0, description="The same, log: speeds change. [own]")
     min_gap: float = Field(0.3, gt=0, description="No gap is taken for shorter, s. [own]")

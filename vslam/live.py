@@ -1,4 +1,5 @@
-"""A recorded sequence played as a camera would send it: who is late misses frames."""
+"""A recorded sequence played as a camera would send it: frames that a newer one overtakes are lost
+to the listener."""
 
 from __future__ import annotations
 
@@ -38,16 +39,21 @@ def live(
     stop = threading.Event()
 
     def film(pool: ThreadPoolExecutor) -> None:
+        try:
+            shoot(pool)
+        finally:
+            coming.put(None)
+
+    def shoot(pool: ThreadPoolExecutor) -> None:
         following = 0
         while following < len(arrivals):
             free.acquire()
             newest = int(np.searchsorted(arrivals, time.perf_counter(), "right")) - 1
-            taken = max(following, newest)
+            taken = max(following, newest) if following else 0  # a run begins with the first one
             if stop.wait(max(0.0, arrivals[taken] - time.perf_counter())):
                 break
             coming.put((taken, pool.submit(prepare, taken)))
             following = taken + 1
-        coming.put(None)
 
     with ThreadPoolExecutor(min(threads, 2), "extraction") as pool:
         camera = threading.Thread(target=film, args=(pool,), name="camera", daemon=True)

@@ -94,7 +94,6 @@ def bench(
     machine = f"{here.cpu}, {here.cores} cores"
     vocabulary = load()
     scorers = [open_scorer(name, files.get(name), vocabulary) for name in names]
-    panel = Panel(scorers, vocabulary, threads)
     sets = [
         found
         for spec in data or DATA
@@ -105,6 +104,7 @@ def bench(
     cells: list[Cell] = []
     gains: list[Gain] = []
     for test_set in sets:
+        panel = Panel(scorers, vocabulary, threads)
         with count_bar(test_set.title, len(conditions), shown=not quiet) as advance:
             for condition in conditions:
                 more = measure(test_set, condition, panel, seed)

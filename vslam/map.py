@@ -81,6 +81,7 @@ class Map:
             metric maps; loops of monocular ones change it.
         restarts: keyframes at which mapping began anew after the camera was lost, in order; each
             is the root of a sub-map, its pose relative to its parent only a prediction.
+        guesses: those of them whose pose is not even that: how fast the camera went was not known.
     """
 
     def __init__(self, scales: NDArray[np.float64]) -> None:
@@ -95,6 +96,7 @@ class Map:
         self.T_c_parent: dict[int, NDArray[np.float64]] = {}
         self.rescaled: list[float] = []
         self.restarts: list[int] = []
+        self.guesses: list[int] = []
         k, n, r = 64, 8192, 65536
         self.arrays = Arrays(
             T_cw=np.zeros((k, 4, 4)),

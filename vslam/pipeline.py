@@ -84,9 +84,9 @@ def run_sequence(
                 result = slam.skip(timestamp)
             else:
                 result = slam.step_features(frame.features, timestamp, frame.left, frame.stage_ms)
+                if settings.realtime:
+                    latency_ms.append(1e3 * (time.perf_counter() - came))
             tracks.append(result)
-            if settings.realtime:
-                latency_ms.append(1e3 * (time.perf_counter() - came))
             recorder.frame(result, result.T_wc)
             if result.is_keyframe and slam.frame is not None and frame.left is not None:
                 recorder.keyframe(result, frame.left, slam.frame.features, slam.frame.landmark >= 0)

@@ -327,6 +327,9 @@ class Slam:
         if self._lost_frames < patience or not self._can_start(frame):
             return False
         frame.landmark[:] = -1
+        self._merge(frame)
+        if self._velocity is None:
+            self.map.guesses.append(self.map.n_keyframes)
         self._insert_keyframe(frame)
         self._velocity = None
         self._lost_frames = 0
@@ -358,7 +361,10 @@ class Slam:
         if start is None:
             return False
         self._merge()
-        start = self._with_speed(start, second.timestamp)
+        scaled = self._with_speed(start, second.timestamp)
+        if scaled is start:
+            self.map.guesses.append(self.map.n_keyframes)
+        start = scaled
         frame.T_cw = start.T_2_1 @ start.first.frame.T_cw
         frame.landmark, frame.xyz = self._mapping.begin(start, second)
         reference = self._mapping.reference

@@ -121,12 +121,15 @@ def train(
     if pixels is not None:
         shape = chosen.shape.model_copy(update={"pixels": pixels})
         chosen = chosen.model_copy(update={"shape": shape})
+    if network in ("alexnet", "vgg16") and chosen.shape.pixels != 227:
+        raise InputError(f"vslam train {network}: takes images of 227 pixels; add --pixels 227.")
     folder = out or Path("training") / f"{network}-{preset}"
     threads = threads or available_cores()
     set_threads(threads)
     collection = load(sources, chosen.shape.pixels, chosen.fit, threads)
     outcome = _train(
-        collection, chosen, folder, preset, data, device, threads, resume, weights,
+        collection, chosen, folder, settings.name if settings else preset, data, device, threads,
+        resume, weights,
         None if max_minutes is None else began + 60.0 * max_minutes, quiet,
     )  # fmt: skip
     if quiet:
@@ -155,10 +158,13 @@ def _train(
     from vslam.loopclosure.siamese.card import describe, write_card
     from vslam.loopclosure.siamese.siamese import load_network
     from vslam.loopclosure.siamese.start import starting_network
+    from vslam.loopclosure.siamese.training import CHECKPOINT
     from vslam.loopclosure.siamese.training import train as run
     from vslam.progress import training_bar
 
-    start, settings, report = starting_network(settings, collection, weights, device)
+    start, settings, report = starting_network(
+        settings, collection, weights, device, resuming=resume and (folder / CHECKPOINT).exists()
+    )
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "settings.json").write_text(settings.model_dump_json(indent=1) + "\n")
     with training_bar(shown=not quiet) as on_step:

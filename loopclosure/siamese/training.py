@@ -360,8 +360,13 @@ def _load_checkpoint(
             f"{path}: written with other settings; use those of settings.json beside it, or "
             "another --out."
         )
-    network.load_state_dict(content["network"])
-    optimiser.load_state_dict(content["optimiser"])
+    try:
+        network.load_state_dict(content["network"])
+        optimiser.load_state_dict(content["optimiser"])
+    except (RuntimeError, ValueError) as error:
+        raise InputError(
+            f"{path}: of another network, or of another version of vslam; use another --out."
+        ) from error
     stored = content["pairs"]
     pairs = None if stored is None else Pairs(*(x.numpy() for x in stored))
     return Progress(**content["progress"]), pairs

@@ -119,6 +119,7 @@ class _NetworkViews:
         self._network = network
 
     def store(self, gallery: Sequence[View]) -> NDArray[np.float32]:
+        """Descriptors ``(G, D)``."""
         return self._network.embed([view.image for view in gallery])
 
     def scores(self, queries: Sequence[View], stored: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -138,7 +139,11 @@ class Panel:
 
     def gallery(self, images: Sequence[Image]) -> tuple[list[View], dict[str, Any]]:
         """Features of the images, and what each detector keeps of them."""
-        digest = hashlib.blake2b(b"".join(image.tobytes() for image in images)).digest()
+        hashed = hashlib.blake2b()
+        for image in images:
+            hashed.update(f"{image.shape}".encode())
+            hashed.update(image.tobytes())
+        digest = hashed.digest()
         if digest not in self._kept:
             views = self.look(images)
             self._kept[digest] = views, {one.name: one.store(views) for one in self.scorers}

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 BLUE, GREEN, AMBER, RED, GREY = "#3b82f6", "#10b981", "#f59e0b", "#ef4444", "#94a3b8"
 VIOLET = "#8b5cf6"
-STATE_COLORS = {TrackingState.WEAK: AMBER, TrackingState.LOST: RED}
+STATE_COLORS = {
+    TrackingState.WEAK: AMBER, TrackingState.LOST: RED, TrackingState.DROPPED: VIOLET,
+}  # fmt: skip
 
 # Hex colour in the drawing -> CSS variable in the HTML report.
 _THEME = {"#1f2430": "ink", "#5b6472": "muted", "#e3e7ed": "line"}

@@ -78,9 +78,9 @@ class ReportJson(_Model):
     """One run in numbers.
 
     Errors are None without ground truth, and KITTI's drift also on paths shorter than 100 m.
-    ``frames`` counts the frames done; ``skipped_frames`` those with an unreadable image, and
-    ``dropped_frames`` those that came too soon in a real-time run, whose ``latency_ms`` is from the
-    time of an image to its pose (None in any other run).
+    ``frames`` counts the frames done; of them ``skipped_frames`` had an unreadable image and
+    ``dropped_frames`` were overtaken by a newer one in a real-time run, whose ``latency_ms`` is
+    from the time of an image to its pose (None in any other run).
     ``loops_closed`` and ``loops_rejected`` count candidates, ``loops_wrong`` the closed ones that
     are wrong; ``loops_found`` and ``loops_missed`` count the ``revisit_stretches``. The last four
     are None without ground truth. See :mod:`vslam.loop_evaluation`.

@@ -62,7 +62,7 @@ def summarize(
         r_rel_deg_per_100m=evaluation.r_rel_deg_per_100m if evaluation else None,
         evo_command=evo_command,
         fps=done / outcome.wall_s if outcome.wall_s > 0 else 0.0,
-        cpu_ms_per_frame=1000.0 * outcome.cpu_s / frames if frames else 0.0,
+        cpu_ms_per_frame=1000.0 * outcome.cpu_s / done if done else 0.0,
         startup_s=outcome.startup_s,
         peak_memory_mb=outcome.peak_memory_mb,
         stage_ms=_stage_times(outcome.tracks),

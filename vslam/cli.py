@@ -73,8 +73,8 @@ def run(
     detector: Annotated[
         str,
         typer.Option(
-            help="Loop detector: [b]bow[/b], [b]none[/b] for odometry only; with [b]--weights[/b] "
-            "also capsule, capsule-pruned, alexnet, vgg16."
+            help="Loop detector: [b]bow[/b], [b]capsule[/b], capsule-pruned, [b]none[/b] for "
+            "odometry only; with [b]--weights[/b] also alexnet, vgg16."
         ),
     ] = "bow",
     weights: Annotated[

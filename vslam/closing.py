@@ -24,6 +24,7 @@ from vslam.backend.local_mapping import adjust_locally, strong_neighbours
 from vslam.backend.loop_correction import move_keyframes
 from vslam.backend.pose_graph import (
     GAP,
+    WEAK,
     Consistency,
     PoseGraph,
     consistency,
@@ -104,7 +105,7 @@ class LoopClosing:
         start = time.perf_counter()
         config = self._config
         solved = self._solve(map_, edge, driven=True)
-        if not solved.verdict.consistent and (solved.graph.kind == GAP).any():
+        if not solved.verdict.consistent and np.isin(solved.graph.kind, (GAP, WEAK)).any():
             solved = self._solve(map_, edge, driven=False)
         if not solved.verdict.consistent:
             return replace(edge, accepted=False, reason=solved.verdict.reason)

@@ -90,7 +90,7 @@ class BowDetector:
         last = first + len(words)
         self._start = grown(self._start, keyframe + 2)
         self._word, self._feature = grown(self._word, last), grown(self._feature, last)
-        order = np.argsort(self._node_of_word[words], kind="stable")
+        order = index_nodes(self._node_of_word[words]).feature
         self._feature[first:last], self._word[first:last] = order, words[order]
         self._start[self._n_keyframes : keyframe + 1] = first
         self._start[keyframe + 1] = last

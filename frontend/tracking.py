@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import StereoCamera
 from vslam.config import Config
+from vslam.eyes import EachEye
 from vslam.features import FeatureGrid, Features
 from vslam.frontend.matching import (
     consistent_orientation,
@@ -71,19 +72,22 @@ class Tracker:
 
 
 def extract_features(
-    left: NDArray[np.uint8], right: NDArray[np.uint8] | None, tracker: Tracker
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8] | None,
+    tracker: Tracker,
+    each_eye: EachEye = map,
 ) -> Features:
     """ORB features of the left image with their stereo matches, none without a right image.
 
-    A pure function.
+    A pure function, whatever ``each_eye`` is.
     """
     config = tracker.config
-    in_left = extract(left, config.orb)
-    if right is None:
-        u_right = np.full(len(in_left.xy), np.nan, np.float32)
+    images = [left] if right is None else [left, right]
+    in_left, *in_right = each_eye(lambda image: extract(image, config.orb), images)
+    if in_right:
+        u_right = match_stereo(in_left, in_right[0], tracker.camera, config.stereo)
     else:
-        in_right = extract(right, config.orb)
-        u_right = match_stereo(in_left, in_right, tracker.camera, config.stereo)
+        u_right = np.full(len(in_left.xy), np.nan, np.float32)
     return Features(in_left.xy, in_left.octave, in_left.angle, in_left.descriptors, u_right)
 
 

@@ -19,6 +19,7 @@ VOCABULARY = {
         "map",
         "config",
         "errors",
+        "eyes",
         "kernels",
         "loops",
         "trajectory",

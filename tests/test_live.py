@@ -12,8 +12,13 @@ import numpy as np
 import pytest
 
 from vslam.config import Config, OrbConfig
+from vslam.datasets import open_sequence
 from vslam.features import TrackingState
 from vslam.live import live
+from vslam.perturb import Perturbation
+from vslam.pipeline import run_sequence
+from vslam.recorder import NullRecorder
+from vslam.run import RunSettings
 from vslam.slam import Slam
 
 
@@ -93,6 +98,17 @@ def test_frames_that_were_dropped_are_not_lost(corridor, check_map):
     steps = np.diff(slam.trajectory().T_wc[:, :3, 3], axis=0)
     np.testing.assert_allclose(np.linalg.norm(steps, axis=1), 0.35, atol=0.08)
     check_map(slam.map)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_one_eye_in_real_time(kitti_tree, threads):
+    sequence = open_sequence("kitti", kitti_tree, "00", max_frames=6, monocular=True)
+    settings = RunSettings(
+        "kitti", "00", "none", "none", "mono", 0, threads, 0, 1, 6, Config(), realtime=True
+    )
+    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    assert len(outcome.tracks) == 6
+    assert len(outcome.latency_ms) == sum(track.n_features > 0 for track in outcome.tracks) > 0
 
 
 def test_command_line_in_real_time(kitti_tree, tmp_path):

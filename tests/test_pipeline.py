@@ -10,6 +10,8 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,10 +23,11 @@ from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.evaluate import evaluate
 from vslam.features import TrackingState
+from vslam.frontend.tracking import Tracker
 from vslam.loops import LoopEdge
 from vslam.mapio import load_map, save_map
 from vslam.perturb import parse_perturbation
-from vslam.pipeline import _tell_loops, run_sequence
+from vslam.pipeline import _tell_loops, prepare_frame, run_sequence
 from vslam.recorder import NullRecorder
 from vslam.run import RunOutcome, RunSettings
 from vslam.trajectory import Trajectory, read_kitti_poses
@@ -59,6 +62,25 @@ def test_same_bytes_with_any_number_of_threads(kitti_tree):
     assert len({outcome.trajectory.T_wc.tobytes() for outcome in runs}) == 1
     assert len({outcome.map.arrays.xyz.tobytes() for outcome in runs}) == 1
     assert all(track.state == TrackingState.OK for track in runs[0].tracks)
+
+
+@pytest.mark.parametrize("monocular", [False, True])
+def test_both_eyes_at_once_are_prepared_to_the_same_bytes(kitti_tree, monocular):
+    sequence = open_sequence("kitti", kitti_tree, "00", monocular=monocular)
+    law = parse_perturbation("brightness:1", 0, sequence.timestamps)
+    tracker = Tracker.create(sequence.camera, Config())
+    met = threading.Barrier(1 if monocular else 2, timeout=60.0)
+
+    def at_once(function, eyes):
+        return pool.map(lambda eye: (met.wait(), function(eye))[1], eyes)
+
+    with ThreadPoolExecutor(2) as pool:
+        for index in range(3):
+            one = prepare_frame(sequence, index, law, tracker)
+            other = prepare_frame(sequence, index, law, tracker, at_once)
+            assert one.left.tobytes() == other.left.tobytes()
+            for name, value in vars(one.features).items():
+                assert value.tobytes() == getattr(other.features, name).tobytes(), name
 
 
 def test_corridor_is_tracked_to_centimetres(kitti_tree):

@@ -2,8 +2,8 @@
 
 Reading, perturbing and extracting are pure functions of a frame, done by a small pool a few
 frames ahead. Their order is kept, so that the result does not depend on the number of threads.
-In real time frames are prepared when they come and those that come too soon are dropped; then the
-result depends on the machine.
+In real time frames are prepared when they come, both eyes at once, and those that come too soon are
+dropped; then the result depends on the machine.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from vslam.datasets.sequence import Sequence
 from vslam.detectors import create_detector
 from vslam.errors import UnreadableImageError
+from vslam.eyes import EachEye
 from vslam.features import Features, TrackResult
 from vslam.frontend.tracking import Tracker, extract_features
 from vslam.info import peak_memory_mb, process_age
@@ -129,11 +130,13 @@ def _frames(
 ) -> Iterator[tuple[int, PreparedFrame, float]]:
     """Frames with their numbers and when they came: all of them now, or each in its time."""
     if settings.realtime:
-        yield from live(
-            sequence.timestamps,
-            lambda index: prepare_frame(sequence, index, perturbation, tracker),
-            settings.threads,
-        )
+        with ThreadPoolExecutor(2, "eye") as pool:
+            each_eye = map if settings.threads == 1 else pool.map
+            yield from live(
+                sequence.timestamps,
+                lambda index: prepare_frame(sequence, index, perturbation, tracker, each_eye),
+                settings.threads,
+            )
         return
     frames = prepared_frames(sequence, perturbation, tracker, settings.threads)
     now = time.perf_counter()
@@ -164,17 +167,21 @@ def prepared_frames(
 
 
 def prepare_frame(
-    sequence: Sequence, index: int, perturbation: Perturbation, tracker: Tracker
+    sequence: Sequence,
+    index: int,
+    perturbation: Perturbation,
+    tracker: Tracker,
+    each_eye: EachEye = map,
 ) -> PreparedFrame:
     """Read, perturb and extract one frame."""
     start = time.perf_counter()
     try:
-        left, right = sequence.read(index)
+        left, right = sequence.read(index, each_eye)
     except UnreadableImageError as error:
         return PreparedFrame(None, None, {}, str(error))
     left, right = perturbation.apply(index, left, right)
     read = time.perf_counter()
-    features = extract_features(left, right, tracker)
+    features = extract_features(left, right, tracker, each_eye)
     done = time.perf_counter()
     stage_ms = {"read": 1e3 * (read - start), "extract": 1e3 * (done - read)}
     return PreparedFrame(left, features, stage_ms)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from vslam.camera import StereoCamera
 from vslam.datasets.sequence import Image
 from vslam.errors import InputError, UnreadableImageError
+from vslam.eyes import EachEye
 from vslam.trajectory import read_kitti_poses, read_table
 
 _HOME = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php"
@@ -49,15 +50,16 @@ class KittiSequence:
     def __len__(self) -> int:
         return len(self.left)
 
-    def read(self, index: int) -> tuple[Image, Image | None]:
+    def read(self, index: int, each_eye: EachEye = map) -> tuple[Image, Image | None]:
         """Left and right image ``(H, W)`` uint8 of one frame, None for the right one where the left
         eye is read alone. Safe to call from several threads.
 
         Raises:
             UnreadableImageError: a file is missing, damaged or not of the calibrated size.
         """
-        left = self._read(self.left[index])
-        return left, self._read(self.right[index]) if self.right else None
+        files = [eye[index] for eye in (self.left, self.right) if eye]
+        left, *right = each_eye(self._read, files)
+        return left, right[0] if right else None
 
     def _read(self, path: Path) -> Image:
         image = _decode(path)

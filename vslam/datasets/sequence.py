@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import StereoCamera
+from vslam.eyes import EachEye
 
 Image = NDArray[np.uint8]
 
@@ -38,9 +39,13 @@ class Sequence(Protocol):
 
     def __len__(self) -> int: ...
 
-    def read(self, index: int) -> tuple[Image, Image | None]:
+    def read(self, index: int, each_eye: EachEye = map) -> tuple[Image, Image | None]:
         """Left and right image ``(H, W)`` uint8 of one frame, None for a monocular camera's right
         one. Safe to call from several threads.
+
+        Args:
+            index: of the frame.
+            each_eye: how the images are decoded, both at once for example.
 
         Raises:
             UnreadableImageError: a file is damaged or of another size than the calibration.
@@ -79,5 +84,5 @@ class SequenceView:
     def __len__(self) -> int:
         return len(self.indices)
 
-    def read(self, index: int) -> tuple[Image, Image | None]:
-        return self.base.read(int(self.indices[index]))
+    def read(self, index: int, each_eye: EachEye = map) -> tuple[Image, Image | None]:
+        return self.base.read(int(self.indices[index]), each_eye)

@@ -94,17 +94,24 @@ def _match(
     u_right = np.full(n, np.nan, np.float32)
     sad = np.full(n, -1.0, np.float32)
     start, items = rows_to_features(xy_r, octave_r, scales, shapes[0, 0])
+    candidates = np.empty(len(xy_r), np.int32)
     for i in range(n):
         u, v = xy_l[i, 0], xy_l[i, 1]
         row = int(v)
-        best, best_distance = -1, max_distance
+        # Few of a row come into question, nobody could foretell which: they are listed without a
+        # branch.
+        n_candidates = 0
         for k in range(start[row], start[row + 1]):
             j = items[k]
             disparity = u - xy_r[j, 0]
-            if disparity < -1.0 or disparity > max_disparity:
-                continue
-            if abs(int(octave_r[j]) - int(octave_l[i])) > 1:
-                continue
+            candidates[n_candidates] = j
+            n_candidates += (
+                (disparity >= -1.0)
+                & (disparity <= max_disparity)
+                & (abs(int(octave_r[j]) - int(octave_l[i])) <= 1)
+            )
+        best, best_distance = -1, max_distance
+        for j in candidates[:n_candidates]:
             distance = hamming(descriptors_l[i], descriptors_r[j])
             if distance < best_distance:
                 best, best_distance = j, distance

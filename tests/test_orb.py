@@ -9,19 +9,17 @@ import numpy as np
 import pytest
 
 from vslam.config import OrbConfig
+from vslam.frontend.corners import fast_scores, local_maxima, spread
 from vslam.frontend.orb import (
-    CIRCLE,
+    DISC,
     MARGIN,
     PATTERN,
     build_pyramid,
     describe,
     detect_corners,
     extract,
-    fast_scores,
     features_per_level,
-    local_maxima,
     orientations,
-    spread,
 )
 
 
@@ -183,16 +181,16 @@ def test_orientation_points_up_the_gradient(degrees):
     angle = np.deg2rad(degrees)
     y, x = np.mgrid[-30:31, -30:31]
     image = np.rint(128 + 4 * (np.cos(angle) * x + np.sin(angle) * y)).clip(0, 255).astype(np.uint8)
-    found = orientations(image, np.array([[30.0, 30.0]], np.float32), CIRCLE)[0]
+    found = orientations(image, np.array([[30.0, 30.0]], np.float32), DISC)[0]
     assert abs(np.rad2deg(np.angle(np.exp(1j * (found - angle))))) < 0.5
 
 
 def test_orientation_equals_the_moments_of_the_disc():
     image = noise()
     y, x = np.mgrid[-15:16, -15:16]
-    disc = np.abs(x) <= CIRCLE[:, None]
+    disc = DISC[:, : len(DISC)] > 0
     corners = grid_of_corners(image, 20)
-    for corner, angle in zip(corners, orientations(image, corners, CIRCLE), strict=True):
+    for corner, angle in zip(corners, orientations(image, corners, DISC), strict=True):
         u, v = corner.astype(int)
         patch = image[v - 15 : v + 16, u - 15 : u + 16] * disc.astype(float)
         assert angle == pytest.approx(np.arctan2((y * patch).sum(), (x * patch).sum()), abs=1e-6)
@@ -226,7 +224,7 @@ def test_descriptors_turn_with_the_image():
     described, angles = [], []
     for pixels, points in ((image, corners), (turned, moved)):
         smooth = cv2.GaussianBlur(pixels, (7, 7), 2)
-        angles.append(orientations(pixels, points, CIRCLE))
+        angles.append(orientations(pixels, points, DISC))
         described.append(describe(smooth, points, angles[-1], PATTERN))
     assert len(corners) == 300
     turn = np.angle(np.exp(1j * (angles[1] - angles[0])))

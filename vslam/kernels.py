@@ -53,6 +53,17 @@ def popcount(typing_context, value):
 
 
 @intrinsic
+def trailing_zeros(typing_context, value):
+    """Number of the lowest bit set in a uint64 other than 0: one instruction."""
+
+    def generate(context, builder, signature, arguments):
+        never_zero = context.get_constant(types.boolean, True)
+        return builder.cttz(arguments[0], never_zero)
+
+    return types.uint64(types.uint64), generate
+
+
+@intrinsic
 def borrowed(typing_context, array):
     """The same array without its count of references, valid while a caller holds the original.
 

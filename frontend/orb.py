@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vslam.config import OrbConfig
 from vslam.frontend.corners import fast_scores, local_maxima, spread
+from vslam.frontend.smoothing import smoothed
 from vslam.kernels import kernel
 
 PATCH_RADIUS = 15  # of the intensity centroid (Rublee et al., section 3.2)
@@ -75,9 +76,9 @@ def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
             config.cell_size,
         )
         angle = orientations(pixels, corners, DISC)
-        smooth = cv2.GaussianBlur(pixels, (7, 7), 2, sigmaY=2, borderType=cv2.BORDER_REFLECT_101)
         xys.append(corners * np.float32(pyramid.scales[level]))
         angles.append(angle)
+        smooth = smoothed(pixels) if len(corners) else pixels  # the smallest levels have none
         descriptors.append(describe(smooth, corners, angle, PATTERN))
         counts.append(len(corners))
     return Extraction(

@@ -21,6 +21,7 @@ from vslam.frontend.orb import (
     features_per_level,
     orientations,
 )
+from vslam.frontend.smoothing import smoothed
 
 
 def textured(height: int = 240, width: int = 320, seed: int = 0) -> np.ndarray:
@@ -54,6 +55,21 @@ def grid_of_corners(image: np.ndarray, margin: int, step: int = 9) -> np.ndarray
         np.arange(margin, width - margin, step), np.arange(margin, height - margin, step)
     )
     return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
+
+
+# -- smoothing ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [(4, 4), (5, 70), (64, 7), (39, 41), (120, 170), (376, 1241)])
+def test_smoothing_is_opencvs_bit_for_bit(size):
+    rng = np.random.default_rng(sum(size))
+    for image in (
+        rng.integers(0, 256, size, np.uint8),
+        rng.choice(np.array([0, 255], np.uint8), size),
+        np.full(size, 255, np.uint8),
+    ):
+        wanted = cv2.GaussianBlur(image, (7, 7), 2, sigmaY=2, borderType=cv2.BORDER_REFLECT_101)
+        assert np.array_equal(smoothed(image), wanted)
 
 
 # -- corners --------------------------------------------------------------------------------------

@@ -34,7 +34,7 @@ def wait_for(condition: Callable[[], object], seconds: float = 120.0) -> None:
 
 def main() -> None:
     assert sys.argv[1] == "run"
-    words = [word for word in sys.argv[2:] if word not in ("--no-record", "--quiet")]
+    words = [word for word in sys.argv[2:] if word not in ("--no-record", "--no-report", "--quiet")]
     options = dict(zip(words[::2], words[1::2], strict=True))
     keys = ("--seq", "--perturb", "--detector", "--seed")
     name = "-".join(options[key] for key in keys)

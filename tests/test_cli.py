@@ -177,7 +177,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
             n_submaps=2, interrupted=calls.interrupted if looped else calls.interrupted_without,
         )  # fmt: skip
 
-    def write_report(outcome, evaluation, folder):
+    def write_report(outcome, evaluation, folder, *, pages):
         calls.evaluation, calls.outcome = evaluation, outcome
         (folder / "report.html").write_text("report")
 

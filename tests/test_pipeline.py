@@ -165,6 +165,21 @@ def test_command_line_end_to_end(kitti_tree, tmp_path):
     assert float(rmse) == pytest.approx(report["ate_rmse_m"], abs=1e-6)
 
 
+def test_run_without_pages_is_enough_for_a_report_later(kitti_tree, tmp_path):
+    done = vslam("run", "--data", kitti_tree, "--no-record", "--no-report", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    folder = tmp_path / "runs" / "latest"
+    assert {path.name for path in folder.iterdir()} == {
+        "config.json", "ground_truth_kitti.txt", "keyframes.tum", "map.npz", "report.json",
+        "trajectory.tum", "trajectory_kitti.txt",
+    }  # fmt: skip
+    assert "report.html" not in done.stdout
+    later = vslam("report", folder, "--out", "later", cwd=tmp_path)
+    assert later.returncode == 0, later.stderr
+    assert "1 runs" in later.stdout
+    assert (tmp_path / "later" / "report.html").exists()
+
+
 def test_interrupt_finishes_the_report_of_the_frames_done(kitti_tree, tmp_path):
     root = tmp_path / "kitti"
     shutil.copytree(kitti_tree, root)

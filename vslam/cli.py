@@ -97,6 +97,14 @@ def run(
         typer.Option("--realtime", help="Frames come at their times; overtaken ones drop."),
     ] = False,
     record: Annotated[bool, typer.Option(help="Write a Rerun recording.")] = True,
+    pages: Annotated[
+        bool,
+        typer.Option(
+            "--report/--no-report",
+            help="Write report.html, report.md and figures; without, report.json alone, which is "
+            "all that [b]vslam report[/b] needs of a run.",
+        ),
+    ] = True,
     ply: Annotated[bool, typer.Option("--ply", help="Write the landmarks as map.ply.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
 ) -> None:
@@ -156,7 +164,7 @@ def run(
     if compare_loops and not outcome.interrupted:
         with progress_bar(len(sequence), shown=not quiet) as on_frame:
             outcome = with_comparison(outcome, perturbation, on_frame=on_frame)
-    evaluation, remark = write_results(folder, outcome, ply=ply)
+    evaluation, remark = write_results(folder, outcome, pages=pages, ply=ply)
     if not quiet:
         print_summary(outcome, evaluation, remark, folder)
     if outcome.interrupted:

@@ -70,11 +70,12 @@ def write_trajectories(folder: Path, outcome: RunOutcome) -> None:
 
 
 def write_results(
-    folder: Path, outcome: RunOutcome, *, ply: bool = False
+    folder: Path, outcome: RunOutcome, *, pages: bool = True, ply: bool = False
 ) -> tuple[Evaluation | None, str]:
     """Evaluate a run and write trajectories, report and map, what matters most first.
 
     Args:
+        pages: write the report as people read it, too, not only as ``report.json``.
         ply: write the landmarks as ``map.ply`` too.
 
     Returns:
@@ -95,7 +96,7 @@ def write_results(
                 evaluation = evaluate(outcome.trajectory, ground_truth, outcome.settings.alignment)
             except InputError as error:  # a clip too short to align is no reason to lose the run
                 remark = str(error)
-        write_report(outcome, evaluation, folder)
+        write_report(outcome, evaluation, folder, pages=pages)
         if outcome.map is not None:
             save_map(folder / "map.npz", outcome.map, outcome.sequence.camera)
             if ply:

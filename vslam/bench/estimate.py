@@ -14,7 +14,7 @@ from vslam.report.schema import ReportJson
 # Before any cell of the grid is finished: two threads of a Xeon, KITTI's images, loops closed.
 _FRAME_S, _START_S = 0.06, 5.0
 # Measured, rounded up: kept files of a cell, and the map that a run writes and the grid drops.
-_CELL_BYTES, _FRAME_BYTES, _SCRATCH_FRAME_BYTES = 1_000_000, 1_000, 45_000
+_CELL_BYTES, _FRAME_BYTES, _SCRATCH_FRAME_BYTES = 100_000, 1_000, 45_000
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ def run_cell(
         command = list(options.command or (sys.executable, "-m", "vslam.bench.child"))
         command += ["run", *cell.arguments(), "--threads", str(options.threads)]
         command += ["--data", str(options.data)] if options.data else []
-        command += ["--config", str(work / "config.json"), "--no-record", "--quiet"]
+        command += ["--config", str(work / "config.json"), "--no-record", "--no-report", "--quiet"]
         code = _call([*command, "--out", str(work / "runs")], work / "log.txt", stopped)
         log = (work / "log.txt").read_text(errors="replace")
         if code:

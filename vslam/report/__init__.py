@@ -12,7 +12,9 @@ if TYPE_CHECKING:
 __all__ = ["write_report"]
 
 
-def write_report(outcome: RunOutcome, evaluation: Evaluation | None, folder: Path) -> None:
+def write_report(
+    outcome: RunOutcome, evaluation: Evaluation | None, folder: Path, *, pages: bool = True
+) -> None:
     """Write everything that is known of a run, in any state of completion, into ``folder``.
 
     Files: ``report.json``, ``report.md``, ``report.html`` (one file, no network request),
@@ -23,14 +25,13 @@ def write_report(outcome: RunOutcome, evaluation: Evaluation | None, folder: Pat
         outcome: the run; it may be interrupted, all lost, or without a single frame.
         evaluation: of ``outcome.trajectory``, frame by frame; None without ground truth.
         folder: an existing folder; files of an earlier report are replaced.
+        pages: write what people read, too: Markdown, HTML and figures.
 
     Raises:
         OSError: a file cannot be written.
     """
     from vslam.evaluate import evo_command
     from vslam.loop_evaluation import evaluate_loops
-    from vslam.report.figures import draw_figures
-    from vslam.report.render import render_html, render_markdown
     from vslam.report.summary import summarize
     from vslam.runfolder import matched_ground_truth, write_trajectories
     from vslam.trajectory import write_tum
@@ -49,8 +50,13 @@ def write_report(outcome: RunOutcome, evaluation: Evaluation | None, folder: Pat
     verdict = evaluate_loops(outcome)
     report = summarize(outcome, evaluation, verdict, command)
     (folder / "report.json").write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
-    (folder / "report.md").write_text(render_markdown(report), encoding="utf-8")
+    if not pages:
+        return
 
+    from vslam.report.figures import draw_figures
+    from vslam.report.render import render_html, render_markdown
+
+    (folder / "report.md").write_text(render_markdown(report), encoding="utf-8")
     figures = draw_figures(outcome, evaluation, matched_ground_truth(outcome), verdict)
     (folder / "figures").mkdir(exist_ok=True)
     for figure in figures:

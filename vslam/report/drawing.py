@@ -55,6 +55,7 @@ STYLE = {
 }
 # Inches, small enough for the text to stay readable on a phone.
 WIDTH, LOW, SQUARE = 5.6, 3.0, 6.6
+DOTS_PER_INCH = 160
 
 
 @dataclass(frozen=True)
@@ -88,8 +89,12 @@ def add_legend(figure: Figure, axes: Axes) -> None:
 def save(name: str, caption: str, figure: Figure) -> ReportFigure:
     """Save as PNG and SVG; equal figures give equal bytes."""
     png, svg = io.BytesIO(), io.StringIO()
-    figure.savefig(png, format="png", dpi=160)
-    figure.set_layout_engine("none")  # the layout is done and holds for the SVG
+    figure.set_dpi(DOTS_PER_INCH)
+    if (layout := figure.get_layout_engine()) is not None:
+        layout.execute(figure)
+        # With an engine, even one that does nothing, each file would cost a drawing for nothing.
+        figure.set_layout_engine(None)
+    figure.savefig(png, format="png")
     # The salt keeps element ids apart between figures of one page, and equal between runs.
     with mpl.rc_context({"svg.hashsalt": name}):
         figure.savefig(svg, format="svg", metadata={"Date": None}, transparent=True)

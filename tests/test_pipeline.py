@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import json
 import os
@@ -170,9 +171,15 @@ def test_run_without_pages_is_enough_for_a_report_later(kitti_tree, tmp_path):
     assert done.returncode == 0, done.stderr
     folder = tmp_path / "runs" / "latest"
     assert {path.name for path in folder.iterdir()} == {
-        "config.json", "ground_truth_kitti.txt", "keyframes.tum", "map.npz", "report.json",
-        "trajectory.tum", "trajectory_kitti.txt",
+        "config.json", "frames.csv", "ground_truth_kitti.txt", "keyframes.tum", "map.npz",
+        "report.json", "trajectory.tum", "trajectory_kitti.txt",
     }  # fmt: skip
+    with (folder / "frames.csv").open(newline="") as file:
+        frames = list(csv.DictReader(file))
+    assert [int(frame["frame"]) for frame in frames] == list(range(28))
+    assert {frame["state"] for frame in frames} == {"OK"}
+    assert float(frames[0]["extract_ms"]) > 0.0
+    assert frames[0]["track_frame_ms"] == ""  # the first frame has nothing to be tracked against
     assert "report.html" not in done.stdout
     later = vslam("report", folder, "--out", "later", cwd=tmp_path)
     assert later.returncode == 0, later.stderr

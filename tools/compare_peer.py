@@ -25,7 +25,9 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,12 +52,14 @@ MEASURES = (  # key, title with an arrow to the better side, format
 
 
 class Process(NamedTuple):
-    """A process that has ended: its output and the kernel's account of it and its children."""
+    """A process that has ended: its output and the kernel's account of it and its children;
+    ``held`` is the memory it held at times since its start, as (s, MB)."""
 
     output: str
     wall_s: float
     cpu_s: float
     memory_mb: float
+    held: list[tuple[float, float]]
 
 
 class Run(NamedTuple):
@@ -77,22 +81,39 @@ def measure(command: list[str], folder: Path) -> Process:
     start = time.perf_counter()
     with log.open("wb") as output:
         child = subprocess.Popen(command, cwd=folder, stdout=output, stderr=subprocess.STDOUT)
+        ended, held = threading.Event(), []
+        watch = threading.Thread(target=sample_memory, args=(child.pid, ended, start, held))
+        watch.start()
         _, status, usage = os.wait4(child.pid, 0)
         wall = time.perf_counter() - start
+        ended.set()
+        watch.join()
         child.returncode = os.waitstatus_to_exitcode(status)
     text = log.read_text(errors="replace")
     if child.returncode:
         sys.exit(f"{text}\n{' '.join(command)}: exit code {child.returncode}")
-    return Process(text, wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
+    return Process(text, wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, held)
 
 
-def run_vslam(options: argparse.Namespace, folder: Path) -> Run:
+def sample_memory(
+    pid: int, ended: threading.Event, start: float, held: list[tuple[float, float]]
+) -> None:
+    """Note twice a second what a process holds."""
+    while not ended.wait(0.5):
+        with suppress(OSError):
+            status = Path(f"/proc/{pid}/status").read_text()
+            kilobytes = [line.split()[1] for line in status.splitlines() if "VmRSS" in line]
+            held += [(time.perf_counter() - start, int(kb) / 1024) for kb in kilobytes]
+
+
+def run_vslam(options: argparse.Namespace, folder: Path, *words: str) -> Run:
+    """Run vslam, with more ``words`` on its command line."""
     command = [options.vslam, "run", "--data", str(options.data), "--seq", options.seq]
     command += ["--max-frames", str(options.frames), "--no-record", "--quiet", "--out", "runs"]
     command += ["--detector", options.detector, "--sensor", options.sensor]
     if options.threads:
         command += ["--threads", str(options.threads)]
-    process = measure(command, folder)
+    process = measure([*command, *words], folder)
     results = folder / "runs" / "latest"
     report = json.loads((results / "report.json").read_text())
     trajectory = (results / "trajectory_kitti.txt").read_text()
@@ -172,16 +193,14 @@ def table(ours: list[dict[str, float]], peers: list[dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
-def setting(report: dict[str, Any], options: argparse.Namespace) -> str:
+def setting(report: dict[str, Any], peer_python: Path, repeats: int) -> str:
     """Machine, versions and the number of runs, as one paragraph, from a report of vslam."""
     ask = f"from importlib.metadata import version; print(version('{PEER_PACKAGE}'))"
-    peer = subprocess.run([options.peer_python, "-c", ask], capture_output=True, text=True)
+    peer = subprocess.run([peer_python, "-c", ask], capture_output=True, text=True)
     machine = report["machine"]
     ours = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
     return (
-        f"KITTI {options.seq}, frames 0-{options.frames - 1}, median (least - greatest) of "
-        f"{options.repeats} runs each, in turn, --detector {options.detector}, "
-        f"{time.strftime('%Y-%m-%d')}. "
+        f"median (least - greatest) of {repeats} runs each, in turn, {time.strftime('%Y-%m-%d')}. "
         f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. {ours}; "
         f"{PEER_PACKAGE} {peer.stdout.strip() or '(version unknown)'}."
     )
@@ -223,7 +242,9 @@ def main() -> None:
                 if repeat:
                     runs[name].append(run)
     ours, peers = ([figures(run, options) for run in done] for done in runs.values())
-    print(f"{table(ours, peers)}\n\n{setting(runs['vslam'][0].report, options)}")
+    frames = f"KITTI {options.seq}, frames 0-{options.frames - 1}, --detector {options.detector}"
+    about = setting(runs["vslam"][0].report, options.peer_python, options.repeats)
+    print(f"{table(ours, peers)}\n\n{frames}, {about}")
 
 
 if __name__ == "__main__":

@@ -18,8 +18,8 @@ def write_report(
     """Write everything that is known of a run, in any state of completion, into ``folder``.
 
     Files: ``report.json``, ``report.md``, ``report.html`` (one file, no network request),
-    ``figures/*.png``, ``config.json`` (read by ``--config``), ``keyframes.tum`` and the files of
-    :func:`vslam.runfolder.write_trajectories`.
+    ``figures/*.png``, ``frames.csv``, ``config.json`` (read by ``--config``), ``keyframes.tum`` and
+    the files of :func:`vslam.runfolder.write_trajectories`.
 
     Args:
         outcome: the run; it may be interrupted, all lost, or without a single frame.
@@ -32,6 +32,7 @@ def write_report(
     """
     from vslam.evaluate import evo_command
     from vslam.loop_evaluation import evaluate_loops
+    from vslam.report.frames import write_frames
     from vslam.report.summary import summarize
     from vslam.runfolder import matched_ground_truth, write_trajectories
     from vslam.trajectory import write_tum
@@ -40,6 +41,7 @@ def write_report(
     (folder / "config.json").write_text(config)
     write_trajectories(folder, outcome)
     write_tum(folder / "keyframes.tum", outcome.keyframes)
+    write_frames(folder / "frames.csv", outcome.tracks)
 
     command = None
     if evaluation is not None:

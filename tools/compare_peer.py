@@ -193,16 +193,18 @@ def table(ours: list[dict[str, float]], peers: list[dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
-def setting(report: dict[str, Any], peer_python: Path, repeats: int) -> str:
+def setting(report: dict[str, Any], peer_python: Path | None, repeats: int) -> str:
     """Machine, versions and the number of runs, as one paragraph, from a report of vslam."""
     ask = f"from importlib.metadata import version; print(version('{PEER_PACKAGE}'))"
-    peer = subprocess.run([peer_python, "-c", ask], capture_output=True, text=True)
+    peer = ""
+    if peer_python is not None:
+        said = subprocess.run([peer_python, "-c", ask], capture_output=True, text=True)
+        peer = f"; {PEER_PACKAGE} {said.stdout.strip() or '(version unknown)'}"
     machine = report["machine"]
     ours = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
     return (
         f"median (least - greatest) of {repeats} runs each, in turn, {time.strftime('%Y-%m-%d')}. "
-        f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. {ours}; "
-        f"{PEER_PACKAGE} {peer.stdout.strip() or '(version unknown)'}."
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. {ours}{peer}."
     )
 
 

@@ -1,0 +1,80 @@
+"""The arithmetic and the tables of tools/bench_speed.py, without a peer."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from pathlib import Path
+
+import pytest
+
+TOOLS = Path(__file__).parents[1] / "tools"
+
+
+@pytest.fixture
+def speed(monkeypatch):
+    monkeypatch.syspath_prepend(str(TOOLS))
+    yield importlib.import_module("bench_speed")
+    for name in ("bench_speed", "compare_peer"):
+        sys.modules.pop(name, None)
+
+
+def made_run(speed, report, held=(), memory_mb=300.0):
+    process = speed.compare_peer.Process("", 10.0, 15.0, memory_mb, list(held))
+    return speed.Run(process, report, 0, (0, 0, 0), "")
+
+
+def test_a_case_is_a_title_and_a_place(speed, kitti_tree):
+    case = speed.parse_case(f"a town={kitti_tree}:00:28")
+    assert case == ("a town", kitti_tree, "00", 28)
+    assert speed.rate(case) == pytest.approx(10.0)
+    for wrong in ("no place", f"t={kitti_tree}:00", f"t={kitti_tree}:00:all", "t=/nowhere:00:5"):
+        with pytest.raises(argparse.ArgumentTypeError):
+            speed.parse_case(wrong)
+
+
+def test_reading_is_measured(speed, kitti_tree):
+    assert 0.0 < speed.reading_ms(speed.Case("", kitti_tree, "00", 5)) < 1000.0
+
+
+def test_comparison_has_medians_and_ratios(speed):
+    names = [name for name, *_ in speed.MEASURES]
+    ours = [dict.fromkeys(names, value) for value in (10.0, 12.0, 20.0)]
+    peer = [dict.fromkeys(names, 6.0)]
+    table = speed.comparison({speed.FULL: ours, speed.PEER: peer})
+    head, _, first, *_ = table.splitlines()
+    assert head == "| | vslam | ORB-SLAM3 | vslam / ORB-SLAM3 |"
+    assert first == "| frames/s, whole process ↑ | 12.0 (10.0 - 20.0) | 6.0 | 2.00 |"
+    alone = speed.comparison({speed.FULL: ours[:1]})
+    assert alone.splitlines()[2] == "| frames/s, whole process ↑ | 10.0 |"
+
+
+def test_latency_of_the_peer_is_left_out_where_it_is_silent(speed, kitti_tree):
+    case = speed.Case("", kitti_tree, "00", 28)
+    report = {"latency_ms": {"median": 40.0, "p95": 50.0, "p99": 55.0}, "dropped_frames": 0}
+    ours = made_run(speed, report)
+    silent, talking = (
+        made_run(speed, {}),
+        made_run(speed, {"track_ms_median": 60.0, "track_ms_p95": 90.0}),
+    )
+    short = speed.latency({speed.LIVE: [ours], speed.PEER: [silent]}, case)
+    assert short.splitlines()[2] == "| vslam, image to pose, 10 Hz | 40 | 50 | 55 | 0 |"
+    assert "ORB-SLAM3" not in short
+    assert "| 60 | 90 | | |" in speed.latency({speed.LIVE: [ours], speed.PEER: [talking]}, case)
+
+
+def test_a_keyframe_costs_what_memory_grew_by(speed):
+    report = {"startup_s": 2.0, "keyframes": 50}
+    run = made_run(speed, report, [(0.5, 100.0), (1.5, 200.0), (2.5, 250.0)])
+    assert "200 MB before the first frame, 300 MB" in speed.memory(run)
+    assert "2.00 MB for each" in speed.memory(run)
+    assert "too short" in speed.memory(made_run(speed, report))
+
+
+def test_frames_are_averaged_by_blocks(speed):
+    table = [{"frame": str(k), "read_ms": "10", "track_frame_ms": "2"} for k in range(150)]
+    table[120]["track_frame_ms"] = ""  # a stage that the frame did not go through
+    everything, in_turn = speed.blocks(table)
+    assert everything == pytest.approx([12.0, 12.0 - 2 / 50])
+    assert in_turn == pytest.approx([2.0, 2.0 - 2 / 50])

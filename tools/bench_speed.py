@@ -1,0 +1,315 @@
+"""Measure the speed of vslam beside ORB-SLAM3 (pyorbslam3), and write it down as Markdown.
+
+    python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" \
+        [--flat "town 00=/data/towns:kitti00:4541"] [--ours-only] [--repeats 3] \
+        [--peer-python PY --peer-script run_orbslam3.py --vocabulary voc.txt] \
+        [--write docs/performance.md]
+
+A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run in
+turn, one at a time, after one round that is not counted; vslam with all its output, with
+``--no-report``, and once more per round with ``--realtime``. Of a ``--flat`` case vslam runs once,
+and the time of its frames is drawn along the drive. What a peer's script takes and prints is said
+in compare_peer.py; ``track_ms_median`` and ``track_ms_p95`` are taken where it prints them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import shlex
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import compare_peer
+from compare_peer import Run
+
+BLOCK = 100  # frames that one point of the drawing stands for
+AHEAD = {"read_ms", "extract_ms"}  # stages done by the pool, beside tracking
+FULL, LEAN, LIVE, PEER = "vslam", "vslam --no-report", "vslam --realtime", "ORB-SLAM3"
+MEASURES = (  # key, title with an arrow to the better side, format
+    ("process_fps", "frames/s, whole process ↑", ".1f"),
+    ("loop_fps", "frames/s, frame loop ↑", ".1f"),
+    ("process_cpu_ms", "CPU ms/frame, whole process ↓", ".1f"),
+    ("process_bare_ms", "the same without reading images ↓", ".1f"),
+    ("loop_cpu_ms", "CPU ms/frame, frame loop ↓", ".1f"),
+    ("loop_bare_ms", "the same without reading images ↓", ".1f"),
+    ("memory_mb", "peak memory, MB ↓", ".0f"),
+    ("lost", "lost frames ↓", ".0f"),
+    ("ate_m", "ATE, aligned, m ↓", ".3f"),
+)
+HEAD = """# Performance
+
+Written by the command at the end, one process at a time; the load says how idle the machine was
+when it began. Whole process: from the start of Python to its end, vocabulary, kernels from Numba's
+cache and all files written; frame loop: from the first image to the last pose. vslam runs with the
+detector `bow`, since ORB-SLAM3 always looks for loops. Reading images is the CPU time of
+`cv2.imread` on both eyes, measured in a process of its own and subtracted from both systems alike.
+"""
+READING = """
+import sys, time, cv2
+cv2.setNumThreads(1)
+files = sys.stdin.read().splitlines()
+start = time.process_time()
+for file in files:
+    cv2.imread(file, cv2.IMREAD_GRAYSCALE)
+print(time.process_time() - start)
+"""
+
+
+class Case(NamedTuple):
+    """Frames to run on: ``frames`` of a sequence, from the first one, under a title."""
+
+    title: str
+    data: Path
+    seq: str
+    frames: int
+
+
+def parse_case(text: str) -> Case:
+    """``TITLE=DATA:SEQ:FRAMES``."""
+    title, separator, place = text.partition("=")
+    parts = place.rsplit(":", 2)
+    if not separator or len(parts) != 3 or not parts[2].isdecimal():
+        raise argparse.ArgumentTypeError(f"{text}: write TITLE=DATA:SEQ:FRAMES")
+    data = Path(parts[0]).absolute()
+    if not (data / "sequences" / parts[1]).is_dir():
+        raise argparse.ArgumentTypeError(f"{data / 'sequences' / parts[1]}: not there")
+    return Case(title, data, parts[1], int(parts[2]))
+
+
+def reading_ms(case: Case) -> float:
+    """CPU milliseconds that decoding both images of a frame takes, in one thread."""
+    eyes = [case.data / "sequences" / case.seq / f"image_{eye}" for eye in (0, 1)]
+    files = [str(path) for eye in eyes for path in sorted(eye.iterdir())[: case.frames]]
+    command = [sys.executable, "-c", READING]
+    done = subprocess.run(
+        command, input="\n".join(files), capture_output=True, text=True, check=True
+    )
+    return 1e3 * float(done.stdout) / case.frames
+
+
+def all_options(case: Case, options: argparse.Namespace) -> argparse.Namespace:
+    """What compare_peer.py asks for."""
+    fixed = {"detector": "bow", "sensor": "stereo", "threads": None}
+    return argparse.Namespace(**vars(options) | case._asdict() | fixed)
+
+
+def run_vslam(case: Case, options: argparse.Namespace, scratch: str, *words: str) -> Run:
+    return compare_peer.run_vslam(all_options(case, options), Path(scratch), *words)
+
+
+def measure_case(case: Case, options: argparse.Namespace) -> dict[str, list[Run]]:
+    """All counted runs of each system."""
+    runs: dict[str, list[Run]] = {FULL: [], PEER: [], LEAN: [], LIVE: []}
+    words = {FULL: (), LEAN: ("--no-report",), LIVE: ("--no-report", "--realtime")}
+    if options.ours_only:
+        del runs[PEER]
+    for repeat in range(options.repeats + 1):
+        for system, done in runs.items():
+            with tempfile.TemporaryDirectory(prefix="vslam-speed-") as scratch:
+                if system == PEER:
+                    run = compare_peer.run_peer(all_options(case, options), Path(scratch))
+                else:
+                    run = run_vslam(case, options, scratch, *words[system])
+            counted = f"{repeat} of {options.repeats}" if repeat else "not counted"
+            print(f"{case.title}, {system}: {run.process.wall_s:.1f} s, {counted}", file=sys.stderr)
+            if repeat:
+                done.append(run)
+    return runs
+
+
+def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
+    """Every measure of one run."""
+    found = compare_peer.figures(run, argparse.Namespace(**case._asdict(), sensor="stereo"))
+    for name in ("process", "loop"):
+        found[f"{name}_bare_ms"] = found[f"{name}_cpu_ms"] - reading
+    return found
+
+
+def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
+    """A table of medians, with the ratios to the peer where there is one."""
+    systems = [system for system in (FULL, LEAN, PEER) if system in measured]
+    ours = [system for system in systems if system != PEER]
+    head = [*systems, *([f"{system} / {PEER}" for system in ours] if PEER in systems else [])]
+    lines = [f"| | {' | '.join(head)} |", "|---" * (len(head) + 1) + "|"]
+    for name, title, form in MEASURES:
+        medians = {s: statistics.median(run[name] for run in measured[s]) for s in systems}
+        cells = [spread([run[name] for run in measured[s]], form) for s in systems]
+        if PEER in systems:
+            peer = medians[PEER]
+            cells += [f"{medians[s] / peer:.2f}" if peer else "-" for s in ours]
+        lines.append(f"| {title} | {' | '.join(cells)} |".replace("nan", "-"))
+    return "\n".join(lines)
+
+
+def spread(values: list[float], form: str) -> str:
+    """Median (least - greatest), the median alone where they are the same as printed."""
+    low, high = format(min(values), form), format(max(values), form)
+    median = format(statistics.median(values), form)
+    return median if low == high else f"{median} ({low} - {high})"
+
+
+def latency(runs: dict[str, list[Run]], case: Case) -> str:
+    """Milliseconds from the time of an image to its pose, and what the peer says of its frames."""
+    ours = [run.report for run in runs[LIVE]]
+    values = [
+        spread([report["latency_ms"][key] for report in ours], ".0f")
+        for key in ("median", "p95", "p99")
+    ]
+    dropped = spread([report["dropped_frames"] for report in ours], ".0f")
+    lines = ["| ms per frame | p50 | p95 | p99 | dropped |", "|---|---|---|---|---|"]
+    row = f"| vslam, image to pose, {rate(case):.0f} Hz | {' | '.join(values)} | {dropped} |"
+    lines.append(row)
+    peers = [run.report for run in runs.get(PEER, [])]
+    if peers and "track_ms_median" in peers[0]:
+        cells = [
+            spread([peer[key] for peer in peers], ".0f")
+            for key in ("track_ms_median", "track_ms_p95")
+        ]
+        lines.append(f"| ORB-SLAM3, its call alone, images decoded | {' | '.join(cells)} | | |")
+    return "\n".join(lines)
+
+
+def rate(case: Case) -> float:
+    """Frames a second of the recording."""
+    times = (case.data / "sequences" / case.seq / "times.txt").read_text().split()[: case.frames]
+    return (len(times) - 1) / (float(times[-1]) - float(times[0]))
+
+
+def stages(report: dict[str, Any]) -> str:
+    """Milliseconds of each stage, wall time: stages of the pool overlap with the others."""
+    lines = ["| stage, ms | mean | p50 | p95 | p99 |", "|---|---|---|---|---|"]
+    for name, ms in report["stage_ms"].items():
+        cells = [f"{ms[key]:.1f}" for key in ("mean", "median", "p95", "p99")]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def memory(run: Run) -> str:
+    """How much a keyframe costs: from what is held at the first frame to the most ever held."""
+    before = [mb for seconds, mb in run.process.held if seconds <= run.report["startup_s"]]
+    if not before or not run.report["keyframes"]:
+        return "The run was too short to tell what a keyframe holds."
+    grown = run.process.memory_mb - before[-1]
+    kept = run.report["keyframes"]
+    return (
+        f"Memory: {before[-1]:.0f} MB before the first frame, {run.process.memory_mb:.0f} MB at "
+        f"its peak, with {kept} keyframes in the final map: {grown / kept:.2f} MB for each."
+    )
+
+
+def blocks(table: list[dict[str, str]]) -> tuple[list[float], list[float]]:
+    """Mean milliseconds of each ``BLOCK`` frames: of all stages, and of those in turn alone."""
+    everything, in_turn = [], []
+    for first in range(0, len(table), BLOCK):
+        rows = [
+            {k: float(v or 0.0) for k, v in row.items() if k.endswith("_ms")}
+            for row in table[first : first + BLOCK]
+        ]
+        everything.append(statistics.mean(sum(row.values()) for row in rows))
+        in_turn.append(
+            statistics.mean(sum(v for k, v in row.items() if k not in AHEAD) for row in rows)
+        )
+    return everything, in_turn
+
+
+def measure_flat(case: Case, options: argparse.Namespace) -> str:
+    """Run vslam once over a long case and draw the cost of a frame along it."""
+    with tempfile.TemporaryDirectory(prefix="vslam-speed-") as scratch:
+        run = run_vslam(case, options, scratch, "--no-report")
+        path = Path(scratch, "runs", "latest", "frames.csv")
+        with path.open(newline="", encoding="utf-8") as file:
+            everything, in_turn = blocks(list(csv.DictReader(file)))
+    draw(everything, in_turn, options.image)
+    fps, frames = run.report["fps"], run.report["frames"]
+    shown = options.image.name
+    if options.write:
+        shown = str(options.image.resolve().relative_to(options.write.resolve().parent))
+    return (
+        f"## Along the drive: {case.title}\n\n![Time per frame]({shown})\n\n"
+        f"{frames} frames at {fps:.1f} frames/s. First and last {BLOCK} frames, ms: all stages "
+        f"{everything[0]:.1f} and {everything[-1]:.1f}, tracking and waiting for mapping "
+        f"{in_turn[0]:.1f} and {in_turn[-1]:.1f}. {memory(run)}\n"
+    )
+
+
+def draw(everything: list[float], in_turn: list[float], path: Path) -> None:
+    """Both lines over the frame number, as PNG."""
+    from matplotlib import style
+
+    from vslam.report.drawing import BLUE, GREY, LOW, STYLE, add_legend, new_figure, save
+
+    with style.context(STYLE, after_reset=True):
+        figure, axes = new_figure("Time per frame along the drive", "frame", "ms", LOW)
+        middle = [BLOCK * (k + 0.5) for k in range(len(everything))]
+        axes.plot(middle, everything, color=GREY, label="all stages")
+        axes.plot(middle, in_turn, color=BLUE, label="without reading and extraction")
+        axes.set_ylim(bottom=0)
+        add_legend(figure, axes)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(save("along", "", figure).png)
+
+
+def section(case: Case, runs: dict[str, list[Run]]) -> str:
+    """All that is said of a case."""
+    reading = reading_ms(case)
+    measured = {s: [figures(run, case, reading) for run in runs[s]] for s in runs if s != LIVE}
+    return (
+        f"## {case.title}\n\n{case.frames} frames. Reading both images: {reading:.1f} ms CPU.\n\n"
+        f"{comparison(measured)}\n\n{latency(runs, case)}\n\n{stages(runs[FULL][-1].report)}\n\n"
+        f"{memory(runs[LEAN][-1])}\n"
+    )
+
+
+def parse_options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    shape = "TITLE=DATA:SEQ:FRAMES"
+    parser.add_argument("--case", type=parse_case, action="append", default=[], metavar=shape)
+    parser.add_argument("--flat", type=parse_case, metavar=shape, help="draw cost along it")
+    parser.add_argument("--repeats", type=int, default=3, help="counted runs of each system")
+    parser.add_argument("--ours-only", action="store_true", help="leave out the peer")
+    parser.add_argument("--vslam", default=str(Path(sys.executable).with_name("vslam")))
+    parser.add_argument("--peer-python", type=lambda text: Path(text).absolute())
+    parser.add_argument("--peer-script", type=lambda text: Path(text).absolute())
+    parser.add_argument("--vocabulary", type=lambda text: Path(text).absolute())
+    parser.add_argument("--write", type=Path, help="file to write; printed unless given")
+    parser.add_argument("--image", type=Path, default=Path("docs/images/cost-along-drive.png"))
+    options = parser.parse_args()
+    if not options.case and not options.flat:
+        parser.error("nothing to measure: give --case or --flat")
+    if options.repeats < 1:
+        parser.error("--repeats: at least 1")
+    peer = (options.peer_python, options.peer_script, options.vocabulary)
+    if options.case and not options.ours_only and not all(peer):
+        parser.error("--peer-python, --peer-script and --vocabulary, or --ours-only")
+    return options
+
+
+def main() -> None:
+    options = parse_options()
+    load = os.getloadavg()[0]
+    # Nothing heavy is imported before the last run: see compare_peer.measure.
+    measured = [(case, measure_case(case, options)) for case in options.case]
+    flat = [measure_flat(options.flat, options)] if options.flat else []
+    parts = [HEAD, *(section(case, runs) for case, runs in measured), *flat]
+    if measured:
+        report = measured[0][1][FULL][0].report
+        peer = None if options.ours_only else options.peer_python
+        setting = compare_peer.setting(report, peer, options.repeats)
+        setting = setting[0].upper() + setting[1:]
+        parts.append(f"## Setting\n\n{setting} Load when it began: {load:.1f}.\n")
+    parts.append(f"```sh\npython {shlex.join(sys.argv)}\n```\n")
+    text = "\n".join(parts)
+    if options.write:
+        options.write.write_text(text, encoding="utf-8")
+    else:
+        print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -7,7 +7,7 @@
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run in
 turn, one at a time, after one round that is not counted; vslam with all its output, with
-``--no-report``, and once more per round with ``--realtime``. Of a ``--flat`` case vslam runs once,
+``--no-report``, and in the last round with ``--realtime``, which takes as long as the drive. Of a ``--flat`` case vslam runs once,
 and the time of its frames is drawn along the drive. What a peer's script takes and prints is said
 in compare_peer.py; ``track_ms_median`` and ``track_ms_p95`` are taken where it prints them.
 """
@@ -111,6 +111,8 @@ def measure_case(case: Case, options: argparse.Namespace) -> dict[str, list[Run]
         del runs[PEER]
     for repeat in range(options.repeats + 1):
         for system, done in runs.items():
+            if system == LIVE and repeat < options.repeats:
+                continue
             with tempfile.TemporaryDirectory(prefix="vslam-speed-") as scratch:
                 if system == PEER:
                     run = compare_peer.run_peer(all_options(case, options), Path(scratch))

@@ -7,9 +7,10 @@
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run in
 turn, one at a time, after one round that is not counted; vslam with all its output, with
-``--no-report``, and in the last round with ``--realtime``, which takes as long as the drive. Of a ``--flat`` case vslam runs once,
-and the time of its frames is drawn along the drive. What a peer's script takes and prints is said
-in compare_peer.py; ``track_ms_median`` and ``track_ms_p95`` are taken where it prints them.
+``--no-report``, and in the last round with ``--realtime``, which takes as long as the drive. Of a
+``--flat`` case vslam runs once, and the time of its frames is drawn along the drive. What a peer's
+script takes and prints is said in compare_peer.py; ``track_ms_median`` and ``track_ms_p95`` are
+taken where it prints them.
 """
 
 from __future__ import annotations

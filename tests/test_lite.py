@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from siamese_worlds import small_network, small_settings, views
 from torch.nn import functional
 
@@ -14,7 +15,7 @@ from vslam.errors import InputError
 from vslam.loopclosure.siamese.augmentation import turn_homography
 from vslam.loopclosure.siamese.branches import CapsuleBranch, CapsuleShape
 from vslam.loopclosure.siamese.lite import LiteExtractor
-from vslam.loopclosure.siamese.pruning import with_thinner_extractor
+from vslam.loopclosure.siamese.pruning import with_shallower_extractor
 from vslam.loopclosure.siamese.siamese import load_network
 from vslam.loopclosure.siamese.start import resized, starting_network
 from vslam.loopclosure.siamese.training import train
@@ -170,28 +171,27 @@ def test_it_goes_on_at_another_size(imagenet):
 
 
 @torch.no_grad()
-def test_channels_that_carry_nothing_are_what_is_thinned(imagenet):
-    """With half of the channels of each block silenced, the half that is left computes the same."""
+def test_blocks_that_add_nothing_are_left_out_without_a_trace(imagenet):
     shape = CapsuleShape(extractor="lite0", pixels=65, types=4, outputs=4)
     network = starting_network(small_settings(shape=shape), views(8), imagenet, "cpu")[0]
     assert network is not None
-    g = torch.Generator().manual_seed(0)
-    for block in network.branch.extractor.blocks:
-        if block.expand is not None:
-            width = len(block.expand.weight)
-            silent = torch.randperm(width, generator=g)[: width // 2]
-            block.project.weight[:, silent] = 0.0
+    for number in (2, 10):
+        project = network.branch.extractor.residuals[number].project
+        project.weight.zero_()
+        project.bias.zero_()
     network.eval()
-    thin = with_thinner_extractor(network, 0.5)
-    assert thin.branch.shape.inner == (48, 72, 72, 120, 120, 240, 240, 240, 336, 336)
-    assert thin.n_parameters() < 0.6 * network.n_parameters()
-    x = torch.rand(2, 3, 65, 65, generator=g)
-    torch.testing.assert_close(thin.embed(x), network.embed(x), rtol=1e-4, atol=1e-5)
-    with pytest.raises(InputError, match="only a lite0 extractor"):
-        with_thinner_extractor(small_network(), 0.5)
+    shallow = with_shallower_extractor(network, (10, 2))
+    assert shallow.branch.shape.skipped == (2, 10)
+    assert list(shallow.branch.extractor.residuals) == [0, 1, 3, 4, 5, 6, 7, 8, 9]
+    x = torch.rand(2, 3, 65, 65, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(shallow.embed(x), network.embed(x), rtol=0, atol=0)
+    with pytest.raises(InputError, match="only blocks of a lite0 extractor"):
+        with_shallower_extractor(small_network(), (2,))
+    with pytest.raises(ValidationError, match="with a shortcut can be left out"):
+        CapsuleShape(extractor="lite0", skipped=(3,))
 
 
-def test_a_thinned_network_is_pruned_trained_and_read_again(tmp_path, imagenet):
+def test_a_shallower_network_is_pruned_trained_and_read_again(tmp_path, imagenet):
     settings = small_settings(
         shape=CapsuleShape(extractor="lite0", pixels=64, types=4, outputs=4), epochs=1, pairs=8
     )
@@ -199,11 +199,11 @@ def test_a_thinned_network_is_pruned_trained_and_read_again(tmp_path, imagenet):
     network = starting_network(settings, collection, imagenet, "cpu")[0]
     full = train(collection, settings, tmp_path / "full", start=network, threads=1)
     wanted = settings.model_copy(
-        update={"network": "capsule-pruned", "prune_share": 0.5, "thin_share": 0.25}
+        update={"network": "capsule-pruned", "prune_share": 0.5, "skipped_blocks": (4,)}
     )
     start, fitted, about = starting_network(wanted, collection, full.weights, "cpu")
-    assert (about["pruned_share"], about["thinned_share"]) == (0.5, 0.25)
-    assert (fitted.shape.kept, fitted.shape.inner[0]) == (8, 72)
+    assert (about["pruned_share"], about["skipped_blocks"]) == (0.5, (4,))
+    assert (fitted.shape.kept, fitted.shape.skipped) == (8, (4,))
     outcome = train(collection, fitted, tmp_path / "pruned", start=start, threads=1)
     assert load_network(outcome.weights)[0].branch.shape == fitted.shape
 

@@ -22,6 +22,7 @@ from vslam.loopclosure.siamese.objective import (
     contrast,
     cross_entropy,
     embed_all,
+    imitation,
     score_matrix,
 )
 from vslam.loopclosure.siamese.pruning import lowest, pruned
@@ -37,6 +38,25 @@ def _one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+def test_a_network_learns_to_describe_as_its_teacher_does(tmp_path):
+    collection, teacher = views(20), small_network(1)
+    cpu = torch.device("cpu")
+    wanted = embed_all(teacher, collection.squares, cpu)
+
+    def unlike(weight):
+        start = small_network(1)
+        with torch.no_grad():
+            for parameter in start.branch.extractor.parameters():
+                parameter.mul_(1.0 + 0.2 * torch.randn(parameter.shape))
+        settings = small_settings(epochs=2, pairs=64, imitation=weight)
+        folder = tmp_path / str(weight)
+        done = train(collection, settings, folder, start=start, teacher=teacher, threads=1)
+        found = embed_all(load_network(done.weights)[0], collection.squares, cpu)
+        return float(imitation(torch.from_numpy(found), torch.from_numpy(wanted)))
+
+    assert unlike(100.0) < 0.5 * unlike(0.0)
 
 
 @pytest.mark.parametrize(("loss", "epochs"), [("bce", 14), ("bce+contrast", 12)])

@@ -165,12 +165,15 @@ def _train(
     start, settings, report = starting_network(
         settings, collection, weights, device, resuming=resume and (folder / CHECKPOINT).exists()
     )
+    if settings.imitation and weights is None:
+        raise InputError("vslam train: imitation needs the network to stay near, --weights.")
+    teacher = load_network(weights)[0] if weights and settings.imitation else None
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "settings.json").write_text(settings.model_dump_json(indent=1) + "\n")
     with training_bar(shown=not quiet) as on_step:
         outcome = run(
             collection, settings, folder, device=device, threads=threads, resume=resume,
-            start=start, on_step=on_step,
+            start=start, teacher=teacher, on_step=on_step,
             should_stop=None if until is None else lambda: time.monotonic() > until,
         )  # fmt: skip
     if outcome.weights.exists():

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
 from vslam.errors import InputError
@@ -18,12 +18,21 @@ from vslam.loopclosure.siamese.extractors import (
     PrimaryCapsules,
     grid_side,
 )
-from vslam.loopclosure.siamese.lite import LiteExtractor, lite_grid_side
+from vslam.loopclosure.siamese.lite import SKIPPABLE, LiteExtractor, lite_grid_side
 from vslam.loopclosure.siamese.weights import read_pth
 
 # ImageNet's statistics, which torchvision's weight files expect.
 _IMAGENET_MEAN = (0.485, 0.456, 0.406)
 _IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
+
+
+def _have_shortcuts(blocks: tuple[int, ...]) -> tuple[int, ...]:
+    if not set(blocks) <= set(SKIPPABLE):
+        raise ValueError(f"only blocks with a shortcut can be left out, {SKIPPABLE}")
+    return blocks
+
+
+Skipped = Annotated[tuple[int, ...], AfterValidator(_have_shortcuts)]
 
 
 class CapsuleShape(BaseModel):
@@ -41,9 +50,7 @@ class CapsuleShape(BaseModel):
     iterations: int = Field(3, ge=1, description="Of the routing.")
     over: Literal["primary", "output"] = "primary"
     kept: int | None = Field(None, description="Places kept of each type; None before pruning.")
-    inner: tuple[int, ...] | None = Field(
-        None, description="Channels kept inside each block of a lite0 extractor; None: all."
-    )
+    skipped: Skipped = Field((), description="Blocks of a lite0 extractor left out.")
 
     @property
     def places(self) -> int:
@@ -70,7 +77,7 @@ class CapsuleBranch(nn.Module):
             self.primary = OriginalExtractor(shape.types, shape.size)
         else:
             lite = shape.extractor == "lite0"
-            grid = LiteExtractor(shape.inner) if lite else LightExtractor(shape.blocks)
+            grid = LiteExtractor(shape.skipped) if lite else LightExtractor(shape.blocks)
             self.extractor = grid
             self.primary = PrimaryCapsules(grid.out_channels, shape.types, shape.size)
         # Depthwise convolutions are faster so, forward by a third and backward by a quarter.

@@ -8,7 +8,8 @@ form: ReLU6, no squeeze and excitation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import OrderedDict
+from collections.abc import Collection
 from pathlib import Path
 from typing import cast
 
@@ -19,14 +20,22 @@ from torch.nn import functional
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.weights import read_pth
 
-# Expansion, channels, stride, kernel and repeats of the first five stages.
-_STAGES = (
-    (1, 16, 1, 3, 1),
-    (6, 24, 2, 3, 2),
-    (6, 40, 2, 5, 2),
-    (6, 80, 2, 3, 3),
-    (6, 112, 1, 5, 3),
+# Expansion, channels, stride and kernel of the blocks of the first five stages.
+_BLOCKS = (
+    (1, 16, 1, 3),
+    (6, 24, 2, 3),
+    (6, 24, 1, 3),
+    (6, 40, 2, 5),
+    (6, 40, 1, 5),
+    (6, 80, 2, 3),
+    (6, 80, 1, 3),
+    (6, 80, 1, 3),
+    (6, 112, 1, 5),
+    (6, 112, 1, 5),
+    (6, 112, 1, 5),
 )
+# Those with a shortcut, which passes on what a block leaves.
+SKIPPABLE = (2, 4, 6, 7, 9, 10)
 _STEM = 32
 _STRIDE = 16  # of stem and stages together
 _BATCH_NORM_EPSILON = 1e-3
@@ -35,15 +44,13 @@ _DEVIATION = 0.5
 
 
 class InvertedResidual(nn.Module):
-    """Expansion to ``inner`` channels (None: no expansion), depthwise convolution and projection,
-    with a shortcut where shapes allow."""
+    """Expansion of channels, depthwise convolution and projection, with a shortcut where shapes
+    allow."""
 
-    def __init__(
-        self, inputs: int, outputs: int, inner: int | None, stride: int, kernel: int
-    ) -> None:
+    def __init__(self, inputs: int, outputs: int, expansion: int, stride: int, kernel: int) -> None:
         super().__init__()
-        self.expand = None if inner is None else nn.Conv2d(inputs, inner, 1)
-        inner = inner or inputs
+        inner = inputs * expansion
+        self.expand = nn.Conv2d(inputs, inner, 1) if expansion > 1 else None
         self.depthwise = nn.Conv2d(inner, inner, kernel, stride, kernel // 2, groups=inner)
         self.project = nn.Conv2d(inner, outputs, 1)
         self.shortcut = stride == 1 and inputs == outputs
@@ -66,20 +73,17 @@ class LiteExtractor(nn.Module):
         out_channels: of the grid.
     """
 
-    def __init__(self, inner: Sequence[int] | None = None) -> None:
-        """``inner``: channels inside each block that expands, where some were pruned."""
+    def __init__(self, skipped: Collection[int] = ()) -> None:
+        """``skipped``: numbers of blocks that are left out, of ``SKIPPABLE``."""
         super().__init__()
         self.stem = nn.Conv2d(1, _STEM, 3, 2, 1)
-        blocks: list[InvertedResidual] = []
-        inputs, widths = _STEM, None if inner is None else iter(inner)
-        for expansion, outputs, stride, kernel, repeats in _STAGES:
-            for k in range(repeats):
-                width = None
-                if expansion > 1:
-                    width = inputs * expansion if widths is None else next(widths)
-                blocks.append(InvertedResidual(inputs, outputs, width, 1 if k else stride, kernel))
-                inputs = outputs
-        self.blocks = nn.Sequential(*blocks)
+        blocks: OrderedDict[str, nn.Module] = OrderedDict()
+        inputs = _STEM
+        for number, (expansion, outputs, stride, kernel) in enumerate(_BLOCKS):
+            if number not in skipped:
+                blocks[str(number)] = InvertedResidual(inputs, outputs, expansion, stride, kernel)
+            inputs = outputs
+        self.blocks = nn.Sequential(blocks)
         self.out_channels = inputs
 
     def forward(self, x: Tensor) -> Tensor:
@@ -88,15 +92,16 @@ class LiteExtractor(nn.Module):
         return grid
 
     @property
-    def residuals(self) -> list[InvertedResidual]:
-        """The blocks, with their type."""
-        return cast(list[InvertedResidual], list(self.blocks))
+    def residuals(self) -> dict[int, InvertedResidual]:
+        """The blocks by their numbers."""
+        return {int(k): cast(InvertedResidual, v) for k, v in self.blocks.named_children()}
 
     def freeze(self, blocks: int) -> None:
         """Leave the stem and the first blocks out of the training; 0 trains everything."""
-        fixed = [self.stem, *list(self.blocks)[:blocks]] if blocks else []
-        for module in fixed:
-            module.requires_grad_(False)
+        if blocks:
+            self.stem.requires_grad_(False)
+        for number, block in self.residuals.items():
+            block.requires_grad_(number >= blocks)
 
     @torch.no_grad()
     def load_imagenet(self, path: Path) -> None:
@@ -114,7 +119,7 @@ class LiteExtractor(nn.Module):
             weight, bias = _folded(state, "_conv_stem", "_bn0")
             self.stem.weight.copy_(weight.sum(1, keepdim=True) * _DEVIATION)
             self.stem.bias.copy_(bias)  # type: ignore[union-attr]
-            for number, block in enumerate(self.residuals):
+            for number, block in self.residuals.items():
                 layers = {
                     "_depthwise_conv": ("depthwise", "_bn1"),
                     "_project_conv": ("project", "_bn2"),
@@ -128,38 +133,6 @@ class LiteExtractor(nn.Module):
                     getattr(block, ours).bias.copy_(bias)
         except (KeyError, TypeError, RuntimeError) as error:
             raise InputError(f"{path}: layers of another network; {fix}.") from error
-
-
-@torch.no_grad()
-def thinned(extractor: LiteExtractor, share: float) -> tuple[LiteExtractor, tuple[int, ...]]:
-    """A copy without the ``share`` of channels inside each block that matter least, and how many
-    are left in each.
-
-    A channel passes through one filter of each of the three convolutions: the product of their
-    norms says how much of it can arrive (after Li et al., "Pruning filters for efficient ConvNets",
-    ICLR 2017, who rank single filters). What a channel passes on as a constant, from its bias, is
-    lost. Multiples of 8 are left, as many as a vector register holds.
-    """
-    kept = []
-    for block in extractor.residuals:
-        if block.expand is not None:
-            after = block.project.weight.transpose(0, 1)
-            filters = block.expand.weight, block.depthwise.weight, after
-            matter = torch.stack([w.flatten(1).norm(dim=1) for w in filters]).prod(0)
-            count = max(8, round((1.0 - share) * len(matter) / 8) * 8)
-            kept.append(matter.argsort(descending=True, stable=True)[:count].sort().values)
-    inner = tuple(map(len, kept))
-    smaller, rows = LiteExtractor(inner), iter(kept)
-    smaller.stem.load_state_dict(extractor.stem.state_dict())
-    for block, copy in zip(extractor.residuals, smaller.residuals, strict=True):
-        state = block.state_dict()
-        if block.expand is not None:
-            k = next(rows)
-            for name in ("expand.weight", "expand.bias", "depthwise.weight", "depthwise.bias"):
-                state[name] = state[name][k]
-            state["project.weight"] = state["project.weight"][:, k]
-        copy.load_state_dict(state)
-    return smaller, inner
 
 
 def lite_grid_side(pixels: int) -> int:

@@ -7,15 +7,17 @@ their W_ij to 0. A zero costs as much time as any number: here they are removed.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import torch
 from torch import Tensor
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.branches import CapsuleBranch
-from vslam.loopclosure.siamese.lite import LiteExtractor, thinned
+from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.siamese import SiameseNetwork
+
+_BLOCKS = "branch.extractor.blocks."
 
 
 @torch.no_grad()
@@ -83,24 +85,30 @@ def pruned(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
     return smaller.to(layer.W.device).train(network.training)
 
 
-def with_thinner_extractor(network: SiameseNetwork, share: float) -> SiameseNetwork:
-    """A copy without a ``share`` of the channels inside the blocks of its extractor.
+def with_shallower_extractor(network: SiameseNetwork, blocks: Collection[int]) -> SiameseNetwork:
+    """A copy without these blocks of its extractor; their shortcuts stay.
 
     Not in the paper: where the extractor takes most of the time, removing capsules saves little.
+    A residual network loses little with a block (Veit et al., NIPS 2016), and training mends that.
 
     Raises:
         InputError: a network without capsules, or with another extractor than lite0.
     """
     branch = _capsules_of(network)
     if not isinstance(branch.extractor, LiteExtractor):
-        raise InputError(f"{network.name}: only a lite0 extractor can be thinned.")
-    extractor, inner = thinned(branch.extractor, share)
-    shape = branch.shape.model_copy(update={"inner": inner})
+        raise InputError(f"{network.name}: only blocks of a lite0 extractor can be left out.")
+    left = set(branch.extractor.residuals) - set(blocks)
+    shape = branch.shape.model_copy(
+        update={"skipped": tuple(sorted({*branch.shape.skipped, *blocks}))}
+    )
     smaller = SiameseNetwork(network.name, CapsuleBranch(shape), copy.deepcopy(network.head))
-    state = network.state_dict()
-    prefix = "branch.extractor."
-    state |= {prefix + key: value for key, value in extractor.state_dict().items()}
-    smaller.load_state_dict(state)
+    smaller.load_state_dict(
+        {
+            key: value
+            for key, value in network.state_dict().items()
+            if not key.startswith(_BLOCKS) or int(key.removeprefix(_BLOCKS).split(".")[0]) in left
+        }
+    )
     return smaller.to(branch.capsules.W.device).train(network.training)
 
 

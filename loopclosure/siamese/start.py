@@ -19,7 +19,7 @@ from vslam.loopclosure.siamese.pruning import (
     lowest,
     mean_couplings,
     pruned,
-    with_thinner_extractor,
+    with_shallower_extractor,
 )
 from vslam.loopclosure.siamese.runtime import milliseconds_per_image
 from vslam.loopclosure.siamese.settings import TrainSettings
@@ -132,9 +132,9 @@ def _prune(
     batches = (to_tensor(squares[k : k + 32]).to(device) for k in range(0, len(squares), 32))
     smaller = pruned(full, lowest(mean_couplings(full, batches), settings.prune_share))
     report: dict[str, Any] = {"pruned_from": weights.name, "pruned_share": settings.prune_share}
-    if settings.thin_share:
-        smaller = with_thinner_extractor(smaller, settings.thin_share)
-        report["thinned_share"] = settings.thin_share
+    if settings.skipped_blocks:
+        smaller = with_shallower_extractor(smaller, settings.skipped_blocks)
+        report["skipped_blocks"] = settings.skipped_blocks
     for name, network in (("before", full), ("removed", smaller)):
         figures = validate(network, collection, validation, settings.augmentation, device)[0]
         report[f"average_precision_{name}"] = figures["average_precision"]

@@ -39,6 +39,7 @@ from vslam.loopclosure.siamese.objective import (
     contrast,
     cross_entropy,
     embed_all,
+    imitation,
     validate,
 )
 from vslam.loopclosure.siamese.settings import TrainSettings
@@ -100,6 +101,7 @@ def train(
     threads: int = 2,
     resume: bool = False,
     start: SiameseNetwork | None = None,
+    teacher: SiameseNetwork | None = None,
     on_step: OnStep | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Outcome:
@@ -113,6 +115,7 @@ def train(
         threads: that augment images.
         resume: go on from the folder's checkpoint, if there is one.
         start: network to start from instead of random weights (fine-tuning).
+        teacher: network whose descriptors it stays near, as ``settings.imitation`` says.
         on_step: called after each step.
         should_stop: asked after each step; a checkpoint is written before stopping.
 
@@ -125,6 +128,7 @@ def train(
     validation = validation_images(validation, settings.validation_images, settings.seed)
     torch.manual_seed(settings.seed)
     network = (start or build_network(settings.network, settings.shape)).to(where)
+    teacher = teacher.to(where).eval() if teacher is not None and settings.imitation else None
     optimiser = _optimiser(network, settings)
     progress, pairs = Progress(), None
     steps = max(1, settings.pairs // settings.batch)
@@ -148,8 +152,8 @@ def train(
             while progress.step < steps:
                 batch = slice(progress.step * settings.batch, (progress.step + 1) * settings.batch)
                 loss = _step(
-                    network, optimiser, collection, pairs, batch, settings, progress, steps, pool,
-                    where,
+                    network, teacher, optimiser, collection, pairs, batch, settings, progress,
+                    steps, pool, where,
                 )  # fmt: skip
                 if not math.isfinite(loss):
                     raise ResultsError(
@@ -190,6 +194,7 @@ def train(
 
 def _step(
     network: SiameseNetwork,
+    teacher: SiameseNetwork | None,
     optimiser: torch.optim.Optimizer,
     collection: Collection,
     pairs: Pairs,
@@ -219,6 +224,10 @@ def _step(
         both = np.concatenate([a, b])
         relation = torch.from_numpy(collection.relation[np.ix_(both, both)]).to(device)
         loss = loss + contrast(first, second, same, relation, settings.temperature)
+    if teacher is not None:
+        with torch.no_grad():
+            wanted = teacher.embed(images)
+        loss = loss + settings.imitation * imitation(descriptors, wanted)
     value = loss.item()
     if math.isfinite(value):
         optimiser.zero_grad(set_to_none=True)

@@ -154,8 +154,8 @@ def orientations(pixels, corners, inside):
     rows = len(inside)
     radius = rows // 2
     flat, weight = pixels.reshape(height * width), inside.reshape(rows * LANES)
-    # Of each column. 15 rows of 255 times at most 15 stay within 16 bits, so that a register takes
-    # many columns.
+    # Of each column. 255 (1 + 2 + ... + 15) stays within 16 bits, so that a register takes many
+    # columns.
     total, moment = np.empty(LANES, np.int16), np.empty(LANES, np.int16)
     for i in range(n):
         corner = (int(corners[i, 1]) - radius) * width + int(corners[i, 0]) - radius

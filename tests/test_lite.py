@@ -191,6 +191,12 @@ def test_blocks_that_add_nothing_are_left_out_without_a_trace(imagenet):
         CapsuleShape(extractor="lite0", skipped=(3,))
 
 
+def test_weights_that_speak_of_channels_inside_are_read_if_none_is_gone():
+    assert CapsuleShape.model_validate({"inner": None}) == CapsuleShape()
+    with pytest.raises(ValidationError, match="inner"):
+        CapsuleShape.model_validate({"inner": [8]})
+
+
 def test_a_shallower_network_is_pruned_trained_and_read_again(tmp_path, imagenet):
     settings = small_settings(
         shape=CapsuleShape(extractor="lite0", pixels=64, types=4, outputs=4), epochs=1, pairs=8

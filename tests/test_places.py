@@ -73,6 +73,8 @@ def test_kitti_takes_frames_by_number(tmp_path):
         ("kitti:{}[seq=00,first=900,last=990]", "no images numbered 900 to 990"),
         ("kitti:{}[seq=00,from=1]", "unknown option 'from'"),
         ("kitti:{}[first=x]", "not a number"),
+        ("kitti:{}[seq=00,first=0,last=5,near=25]", "near=25: must be above 0 and below 25 m"),
+        ("kitti:{}[seq=00,first=0,last=5,near=nan]", "near=nan: must be above 0"),
         ("films:{}", "one of the kinds"),
         ("pairs:{}", r"pairs\.csv: no list of pairs"),
         ("photos:{}", "no set of photographs"),

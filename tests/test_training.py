@@ -59,6 +59,18 @@ def test_a_network_learns_to_describe_as_its_teacher_does(tmp_path):
     assert unlike(100.0) < 0.5 * unlike(0.0)
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"imitation": 1.0}, "there is no network to stay near"),
+        ({"emphasis": {"bulbs": 3.0}}, "no source bulbs; there are blobs"),
+    ],
+)
+def test_settings_that_would_do_nothing_are_refused(tmp_path, changes, message):
+    with pytest.raises(InputError, match=message):
+        train(views(8), small_settings(**changes), tmp_path, threads=1)
+
+
 @pytest.mark.parametrize(("loss", "epochs"), [("bce", 14), ("bce+contrast", 12)])
 def test_64_pairs_are_learned_by_heart(tmp_path, loss, epochs):
     collection = views(46)

@@ -6,7 +6,7 @@
         [--write docs/performance.md]
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run in
-turn, one at a time, after one round that is not counted; vslam with all its output, with
+turn, one at a time, after one round that is not counted; vslam with its report, with
 ``--no-report``, and in the last round with ``--realtime``, which takes as long as the drive. Of a
 ``--flat`` case vslam runs once, and the time of its frames is drawn along the drive. What a peer's
 script takes and prints is said in compare_peer.py; ``track_ms_median`` and ``track_ms_p95`` are
@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import compare_peer
-from compare_peer import Run
+from compare_peer import Run, spread
 
 BLOCK = 100  # frames that one point of the drawing stands for
 AHEAD = {"read_ms", "extract_ms"}  # stages done by the pool, beside tracking
@@ -50,6 +50,7 @@ when it began. Whole process: from the start of Python to its end, vocabulary, k
 cache and all files written; frame loop: from the first image to the last pose. vslam runs with the
 detector `bow`, since ORB-SLAM3 always looks for loops. Reading images is the CPU time of
 `cv2.imread` on both eyes, measured in a process of its own and subtracted from both systems alike.
+In real time and along the drive vslam runs once a case.
 """
 READING = """
 import sys, time, cv2
@@ -80,13 +81,21 @@ def parse_case(text: str) -> Case:
     data = Path(parts[0]).absolute()
     if not (data / "sequences" / parts[1]).is_dir():
         raise argparse.ArgumentTypeError(f"{data / 'sequences' / parts[1]}: not there")
-    return Case(title, data, parts[1], int(parts[2]))
+    case = Case(title, data, parts[1], int(parts[2]))
+    here = min(len(list(eye.iterdir())) for eye in eyes(case))
+    if not 2 <= case.frames <= here:
+        raise argparse.ArgumentTypeError(f"{text}: FRAMES must be from 2 to {here}")
+    return case
+
+
+def eyes(case: Case) -> list[Path]:
+    """Folders of the left and right images."""
+    return [case.data / "sequences" / case.seq / f"image_{eye}" for eye in (0, 1)]
 
 
 def reading_ms(case: Case) -> float:
     """CPU milliseconds that decoding both images of a frame takes, in one thread."""
-    eyes = [case.data / "sequences" / case.seq / f"image_{eye}" for eye in (0, 1)]
-    files = [str(path) for eye in eyes for path in sorted(eye.iterdir())[: case.frames]]
+    files = [str(path) for eye in eyes(case) for path in sorted(eye.iterdir())[: case.frames]]
     command = [sys.executable, "-c", READING]
     done = subprocess.run(
         command, input="\n".join(files), capture_output=True, text=True, check=True
@@ -148,13 +157,6 @@ def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
             cells += [f"{medians[s] / peer:.2f}" if peer else "-" for s in ours]
         lines.append(f"| {title} | {' | '.join(cells)} |".replace("nan", "-"))
     return "\n".join(lines)
-
-
-def spread(values: list[float], form: str) -> str:
-    """Median (least - greatest), the median alone where they are the same as printed."""
-    low, high = format(min(values), form), format(max(values), form)
-    median = format(statistics.median(values), form)
-    return median if low == high else f"{median} ({low} - {high})"
 
 
 def latency(runs: dict[str, list[Run]], case: Case) -> str:
@@ -232,7 +234,7 @@ def measure_flat(case: Case, options: argparse.Namespace) -> str:
     fps, frames = run.report["fps"], run.report["frames"]
     shown = options.image.name
     if options.write:
-        shown = str(options.image.resolve().relative_to(options.write.resolve().parent))
+        shown = os.path.relpath(options.image, options.write.parent)
     return (
         f"## Along the drive: {case.title}\n\n![Time per frame]({shown})\n\n"
         f"{frames} frames at {fps:.1f} frames/s. First and last {BLOCK} frames, ms: all stages "

@@ -84,10 +84,12 @@ def measure(command: list[str], folder: Path) -> Process:
         ended, held = threading.Event(), []
         watch = threading.Thread(target=sample_memory, args=(child.pid, ended, start, held))
         watch.start()
-        _, status, usage = os.wait4(child.pid, 0)
-        wall = time.perf_counter() - start
-        ended.set()
-        watch.join()
+        try:
+            _, status, usage = os.wait4(child.pid, 0)
+            wall = time.perf_counter() - start
+        finally:  # Ctrl-C, too
+            ended.set()
+            watch.join()
         child.returncode = os.waitstatus_to_exitcode(status)
     text = log.read_text(errors="replace")
     if child.returncode:
@@ -175,17 +177,22 @@ def figures(run: Run, options: argparse.Namespace) -> dict[str, float]:
     return found | {"t_rel": nan if t_rel is None else t_rel}
 
 
+def spread(values: list[float], form: str) -> str:
+    """Median (least - greatest), the median alone where they are the same as printed."""
+    low, high = format(min(values), form), format(max(values), form)
+    median = format(statistics.median(values), form)
+    return median if low == high else f"{median} ({low} - {high})"
+
+
 def table(ours: list[dict[str, float]], peers: list[dict[str, float]]) -> str:
     """Markdown: median (least - greatest) of each, and the ratio of the medians."""
     lines = ["| | vslam | ORB-SLAM3 | ratio |", "|---|---|---|---|"]
     for name, title, form in MEASURES:
         cells, medians = [], []
         for runs in (ours, peers):
-            values = sorted(run[name] for run in runs)
+            values = [run[name] for run in runs]
             medians.append(statistics.median(values))
-            low, high = format(values[0], form), format(values[-1], form)
-            cell = format(medians[-1], form)
-            cells.append(cell if low == high else f"{cell} ({low} - {high})")
+            cells.append(spread(values, form))
         counted = name.startswith("loops_")  # a ratio of counts says nothing
         ratio = "-" if counted or not medians[1] else f"{medians[0] / medians[1]:.2f}"
         row = f"| {title} | {cells[0]} | {cells[1]} | {ratio} |"

@@ -103,8 +103,8 @@ def run(
         bool,
         typer.Option(
             "--report/--no-report",
-            help="Write report.html, report.md and figures; without, report.json alone, which is "
-            "all that [b]vslam report[/b] needs of a run.",
+            help="Write report.html, report.md and figures; without, of the report only its JSON, "
+            "which is all that [b]vslam report[/b] needs of a run.",
         ),
     ] = True,
     ply: Annotated[bool, typer.Option("--ply", help="Write the landmarks as map.ply.")] = False,
@@ -287,7 +287,7 @@ def main() -> None:
     # Imports and kernels from the cache make a million objects that stay: to look through them for
     # garbage again and again is a tenth of the start.
     gc.set_threshold(50_000, 20, 100)
-    # OpenBLAS's threads spin while they wait, and no product here is large enough to share.
+    # OpenBLAS's threads spin while they wait, and no product of a run is large enough to share.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         app()

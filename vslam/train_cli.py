@@ -162,12 +162,21 @@ def _train(
     from vslam.loopclosure.siamese.training import train as run
     from vslam.progress import training_bar
 
+    teacher = None
+    if settings.imitation:
+        if weights is None or weights.suffix != ".safetensors":
+            raise InputError(
+                "--settings: imitation needs a network of ours to stay near, --weights."
+            )
+        teacher, _ = load_network(weights)
+        if teacher.pixels != settings.shape.pixels:
+            raise InputError(
+                f"{weights}: takes images of {teacher.pixels} pixels, a network that is to stay "
+                f"near it cannot have {settings.shape.pixels}."
+            )
     start, settings, report = starting_network(
         settings, collection, weights, device, resuming=resume and (folder / CHECKPOINT).exists()
     )
-    if settings.imitation and weights is None:
-        raise InputError("vslam train: imitation needs the network to stay near, --weights.")
-    teacher = load_network(weights)[0] if weights and settings.imitation else None
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "settings.json").write_text(settings.model_dump_json(indent=1) + "\n")
     with training_bar(shown=not quiet) as on_step:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor, nn
 
 from vslam.errors import InputError
@@ -51,6 +51,14 @@ class CapsuleShape(BaseModel):
     over: Literal["primary", "output"] = "primary"
     kept: int | None = Field(None, description="Places kept of each type; None before pruning.")
     skipped: Skipped = Field((), description="Blocks of a lite0 extractor left out.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_what_is_gone(cls, given: Any) -> Any:
+        """Weights of 0.1.0 before blocks were left out say that no channel was."""
+        if isinstance(given, dict) and given.get("inner", 0) is None:
+            return {key: value for key, value in given.items() if key != "inner"}
+        return given
 
     @property
     def places(self) -> int:

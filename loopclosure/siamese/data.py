@@ -146,6 +146,17 @@ def validation_images(validation: NDArray[np.int64], most: int, seed: int) -> ND
     return validation[np.sort(picked)]
 
 
+def check_emphasis(collection: Collection, emphasis: Mapping[str, float]) -> None:
+    """Every source that is to be drawn more often is there.
+
+    Raises:
+        InputError: one is not.
+    """
+    known = [name for name, _ in collection.sources]
+    if wrong := [name for name in emphasis if name not in known]:
+        raise InputError(f"emphasis: no source {wrong[0]}; there are {', '.join(known)}.")
+
+
 def draw_pairs(
     collection: Collection,
     chosen: NDArray[np.int64],

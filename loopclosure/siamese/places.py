@@ -35,6 +35,7 @@ SAME, UNKNOWN, DIFFERENT = 1, 0, -1
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".webp"}
 _UNDISTORT_COLUMNS = (8, 9)
 _VIEW = ("x_a", "z_a", "yaw_a", "x_b", "z_b", "yaw_b")
+_FAR = 25.0  # m, beyond which two images of a drive show different places
 _CELL = 80.0  # m, of a rendered town: stays together when training and validation are divided
 
 
@@ -142,7 +143,7 @@ def relation_of_poses(
     *,
     near: float = 5.0,
     turned: float = 30.0,
-    far: float = 25.0,
+    far: float = _FAR,
 ) -> NDArray[np.int8]:
     """Same place: nearer than ``near`` metres and ``turned`` degrees; different: beyond ``far``."""
     centre, forward = T_wc[:, :3, 3], T_wc[:, :3, 2]
@@ -174,10 +175,11 @@ def read_kitti(
         truth: ``.mat`` file with a matrix of the whole sequence that marks the same places; the
             others are different beyond 25 m and not known below.
         near: metres within which two images show one place, below 25. The matrices of loop
-            detection count a place as the same up to 20 m and more along the road.
+            detection count places as the same up to 20 m apart and more.
 
     Raises:
-        InputError: no images in that range, no poses for them, or no such matrix.
+        InputError: no images in that range, no poses for them, no such matrix, or a ``near`` that
+            is out of range.
     """
     base = root if (root / "sequences").is_dir() else root / "dataset"
     folder = base / "sequences" / seq / "image_0"
@@ -198,6 +200,8 @@ def read_kitti(
     T_wc = poses[number]
     steps = np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1)
     stretch = (np.concatenate([[0.0], np.cumsum(steps)]) // 100.0).astype(np.int32)  # of 100 m
+    if not 0.0 < float(near) < _FAR:
+        raise InputError(f"near={near}: must be above 0 and below {_FAR:g} m.")
     relation = relation_of_poses(T_wc, near=float(near))
     if truth:
         path = Path(truth).expanduser()

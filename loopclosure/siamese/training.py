@@ -20,12 +20,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from vslam.errors import InputError, ResultsError
 from vslam.loopclosure.siamese.augmentation import augment
 from vslam.loopclosure.siamese.data import (
     Collection,
     Pairs,
+    check_emphasis,
     divide,
     draw_pairs,
     mine,
@@ -120,10 +122,14 @@ def train(
         should_stop: asked after each step; a checkpoint is written before stopping.
 
     Raises:
-        InputError: too little data, an unknown device, or a checkpoint of other settings.
+        InputError: too little data, an unknown device or source, a checkpoint of other settings, or
+            imitation without a teacher.
         ResultsError: the loss is not finite (the last good checkpoint stays), or a full disk.
     """
+    if settings.imitation and teacher is None:
+        raise InputError("imitation: there is no network to stay near; give it as the teacher.")
     where = _open_device(device)
+    check_emphasis(collection, settings.emphasis)
     train_images, validation = divide(collection, settings.seed, settings.validation_share)
     validation = validation_images(validation, settings.validation_images, settings.seed)
     torch.manual_seed(settings.seed)
@@ -360,6 +366,8 @@ def _load_checkpoint(
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         written = TrainSettings.model_validate_json(content["settings"])
+    except ValidationError as error:
+        raise InputError(f"{path}: of another version of vslam; use another --out.") from error
     except Exception as error:  # torch raises half a dozen kinds
         raise InputError(f"{path}: not a readable checkpoint; remove it to start anew.") from error
     # A lower learning rate is what a diverged training is resumed with.

@@ -24,7 +24,7 @@ def write_report(
     Args:
         outcome: the run; it may be interrupted, all lost, or without a single frame.
         evaluation: of ``outcome.trajectory``, frame by frame; None without ground truth.
-        folder: an existing folder; files of an earlier report are replaced.
+        folder: an existing folder; what is written replaces files of an earlier report.
         pages: write what people read, too: Markdown, HTML and figures.
 
     Raises:

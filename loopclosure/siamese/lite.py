@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Collection
+from itertools import pairwise
 from pathlib import Path
 from typing import cast
 
@@ -35,7 +36,11 @@ _BLOCKS = (
     (6, 112, 1, 5),
 )
 # Those with a shortcut, which passes on what a block leaves.
-SKIPPABLE = (2, 4, 6, 7, 9, 10)
+SKIPPABLE = tuple(
+    number
+    for number, (before, block) in enumerate(pairwise(_BLOCKS), 1)
+    if block[1] == before[1] and block[2] == 1
+)
 _STEM = 32
 _STRIDE = 16  # of stem and stages together
 _BATCH_NORM_EPSILON = 1e-3

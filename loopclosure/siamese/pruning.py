@@ -17,8 +17,6 @@ from vslam.loopclosure.siamese.branches import CapsuleBranch
 from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.siamese import SiameseNetwork
 
-_BLOCKS = "branch.extractor.blocks."
-
 
 @torch.no_grad()
 def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor:
@@ -97,18 +95,11 @@ def with_shallower_extractor(network: SiameseNetwork, blocks: Collection[int]) -
     branch = _capsules_of(network)
     if not isinstance(branch.extractor, LiteExtractor):
         raise InputError(f"{network.name}: only blocks of a lite0 extractor can be left out.")
-    left = set(branch.extractor.residuals) - set(blocks)
-    shape = branch.shape.model_copy(
-        update={"skipped": tuple(sorted({*branch.shape.skipped, *blocks}))}
-    )
+    skipped = tuple(sorted({*branch.shape.skipped, *blocks}))
+    shape = branch.shape.model_copy(update={"skipped": skipped})
     smaller = SiameseNetwork(network.name, CapsuleBranch(shape), copy.deepcopy(network.head))
-    smaller.load_state_dict(
-        {
-            key: value
-            for key, value in network.state_dict().items()
-            if not key.startswith(_BLOCKS) or int(key.removeprefix(_BLOCKS).split(".")[0]) in left
-        }
-    )
+    state = network.state_dict()
+    smaller.load_state_dict({key: state[key] for key in smaller.state_dict()})
     return smaller.to(branch.capsules.W.device).train(network.training)
 
 

@@ -11,7 +11,7 @@ from vslam.errors import InputError
 from vslam.loopclosure.siamese import capsules
 from vslam.loopclosure.siamese.branches import CapsuleBranch, CapsuleShape, alexnet, standardised
 from vslam.loopclosure.siamese.extractors import LIGHT_BLOCKS, grid_side
-from vslam.loopclosure.siamese.images import to_square, to_tensor
+from vslam.loopclosure.siamese.images import to_size, to_tensor
 from vslam.loopclosure.siamese.pruning import lowest, masked, mean_couplings, pruned
 from vslam.loopclosure.siamese.siamese import (
     build_network,
@@ -260,8 +260,8 @@ def test_an_unknown_network_is_refused():
 def test_squash_and_crop():
     image = np.zeros((40, 100), np.uint8)
     image[:, 30:70] = 200
-    assert to_square(image, 20, "crop").min() == 200
-    assert to_square(image, 20, "squash")[:, 0].max() == 0
-    tensor = to_tensor(to_square(image, 20, "crop")[None])
+    assert to_size(image, (20, 20), "crop").min() == 200
+    assert to_size(image, (20, 20), "squash")[:, 0].max() == 0
+    tensor = to_tensor(to_size(image, (20, 20), "crop")[None])
     assert tensor.shape == (1, 3, 20, 20)
     assert tensor.max().item() == pytest.approx(200 / 255)

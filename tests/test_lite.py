@@ -135,7 +135,7 @@ def test_fine_tuning_leaves_the_first_blocks_and_moves_the_rest_slowly(tmp_path,
     )  # fmt: skip
     collection = views(12)
     collection = type(collection)(**{
-        **vars(collection), "squares": np.pad(collection.squares, ((0, 0), (0, 1), (0, 1)), "edge")
+        **vars(collection), "images": np.pad(collection.images, ((0, 0), (0, 1), (0, 1)), "edge")
     })  # fmt: skip
     network, settings, about = starting_network(settings, collection, imagenet, "cpu")
     assert network is not None
@@ -163,7 +163,7 @@ def test_it_goes_on_at_another_size(imagenet):
     shape = CapsuleShape(extractor="lite0", pixels=65, types=4, outputs=4)
     network = starting_network(small_settings(shape=shape), views(8), imagenet, "cpu")[0]
     assert network is not None
-    larger = resized(network.eval(), 97).eval()
+    larger = resized(network.eval(), (97, 97)).eval()
     assert larger.branch.shape.places == 49
     theirs, ours = (dict(n.branch.extractor.named_parameters()) for n in (network, larger))
     for key in theirs:

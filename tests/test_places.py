@@ -187,7 +187,7 @@ def test_sources_together(tmp_path):
     photo_set(tmp_path / "zoo", "c", ["photos"])
     sources = open_source(f"photos:{tmp_path}")
     collection = load(sources, 20, "crop")
-    assert collection.squares.shape == (12, 20, 20)
+    assert collection.images.shape == (12, 20, 20)
     assert (collection.relation[:4, 4:8] == 0).all()  # landmarks of one family: not known
     assert (collection.relation[:8, 8:] == -1).all()
     with pytest.raises(InputError, match="two sources are called"):

@@ -51,7 +51,7 @@ def a_map(keyframes: int, covisible: tuple[tuple[int, int], ...] = ()) -> Map:
     return map_
 
 
-SCENES = views(100).squares[::2]
+SCENES = views(100).images[::2]
 
 
 def detector(config: SiameseConfig | None = None, places: list[int] | None = None):
@@ -155,7 +155,7 @@ def test_train_writes_weights_and_card(tmp_path):
     data = tmp_path / "pairs"
     (data / "images").mkdir(parents=True)
     rows = ["a,b,same"]
-    squares = views(40).squares
+    squares = views(40).images
     for k in range(40):
         same = k % 2 == 0
         names = [f"images/{k}a.png", f"images/{k}b.png"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -43,7 +44,7 @@ def _one_thread():
 def test_a_network_learns_to_describe_as_its_teacher_does(tmp_path):
     collection, teacher = views(20), small_network(1)
     cpu = torch.device("cpu")
-    wanted = embed_all(teacher, collection.squares, cpu)
+    wanted = embed_all(teacher, collection.images, cpu)
 
     def unlike(weight):
         start = small_network(1)
@@ -53,7 +54,7 @@ def test_a_network_learns_to_describe_as_its_teacher_does(tmp_path):
         settings = small_settings(epochs=2, pairs=64, imitation=weight)
         folder = tmp_path / str(weight)
         done = train(collection, settings, folder, start=start, teacher=teacher, threads=1)
-        found = embed_all(load_network(done.weights)[0], collection.squares, cpu)
+        found = embed_all(load_network(done.weights)[0], collection.images, cpu)
         return float(imitation(torch.from_numpy(found), torch.from_numpy(wanted)))
 
     assert unlike(100.0) < 0.5 * unlike(0.0)
@@ -81,7 +82,7 @@ def test_64_pairs_are_learned_by_heart(tmp_path, loss, epochs):
     assert len(outcome.train) == 64
     network, _ = load_network(outcome.weights)
     cpu = torch.device("cpu")
-    d = embed_all(network, collection.squares, cpu)
+    d = embed_all(network, collection.images, cpu)
     score = score_matrix(network, d, d, cpu)
     pairs = draw_pairs(collection, outcome.train, 64, np.random.default_rng(0))
     assert pairs.same.sum() == 32
@@ -179,30 +180,30 @@ def test_the_card_tells_where_the_weights_come_from(tmp_path):
 def test_a_network_goes_on_with_larger_images(tmp_path):
     collection, settings = views(20), small_settings(epochs=3)
     small = train(collection, settings, tmp_path / "small", threads=1)
-    shape = settings.shape.model_copy(update={"pixels": 96})
+    shape = settings.shape.for_images_of((96, 96))
     wanted = settings.model_copy(update={"shape": shape})
     start, fitted, report = starting_network(wanted, collection, small.weights, "cpu")
-    assert (start.pixels, fitted.shape.pixels, report["resized_to"]) == (96, 96, 96)
+    assert (start.size, fitted.shape.input, report["resized_to"]) == ((96, 96),) * 3
     first, _ = load_network(small.weights)
-    same = resized(first, first.pixels).eval()
-    x = to_tensor(collection.squares[:4])
+    same = resized(first, first.size).eval()
+    x = to_tensor(collection.images[:4])
     with torch.no_grad():
         assert torch.allclose(same.embed(x), first.eval().embed(x), atol=1e-6)
     # Gains are interpolated: one that grows along the rows of the small grid does on the large one.
     layer = first.branch.capsules
-    side = round(first.branch.shape.places**0.5)
+    side, columns = first.branch.shape.grid
     with torch.no_grad():
-        layer.gains.copy_(
-            (torch.arange(side * side) // side).float()[None, :, None].expand_as(layer.gains)
-        )
-    grown = resized(first, 96).branch
-    rows = grown.capsules.gains[0, :, 0].reshape(round(grown.shape.places**0.5), -1)
+        row = torch.arange(side * columns) // columns
+        layer.gains.copy_(row.float()[None, :, None].expand_as(layer.gains))
+    grown = resized(first, (96, 160)).branch
+    assert grown.shape.grid == (12, 20)
+    rows = grown.capsules.gains[0, :, 0].reshape(12, 20)
     assert torch.allclose(rows, rows[:, :1].expand_as(rows))
     assert (torch.diff(rows[:, 0]) >= 0).all()
     assert rows[-1, 0].item() == pytest.approx(side - 1)
     branch = pruned(first, lowest(torch.rand(8, SMALL.places), 0.2))
     with pytest.raises(InputError, match="is pruned"):
-        resized(branch, 96)
+        resized(branch, (96, 96))
 
 
 def test_pruning_and_fine_tuning(tmp_path):
@@ -217,6 +218,10 @@ def test_pruning_and_fine_tuning(tmp_path):
     assert {"average_precision_before", "average_precision_removed"} <= set(report)
     tuned = train(collection, fitted, tmp_path / "pruned", threads=1, start=start)
     assert load_network(tuned.weights)[0].name == "capsule-pruned"
+    smaller = wanted.model_copy(update={"shape": wanted.shape.for_images_of((48, 64))})
+    cut = replace(collection, images=collection.images[:, :48])
+    network, _, report = starting_network(smaller, cut, full.weights, "cpu")
+    assert network.size == report["resized_to"] == (48, 64)
     with pytest.raises(InputError, match="--weights"):
         starting_network(wanted, collection, None, "cpu")
     with pytest.raises(InputError, match="weights of capsule, not of alexnet"):
@@ -260,7 +265,7 @@ def test_calibration_finds_the_law_behind_the_labels():
 
 
 def test_augmentation_repeats_and_its_strengths_can_be_nothing():
-    image = views(1).squares[0]
+    image = views(1).images[0]
     changed = [augment(image, STRONG, np.random.default_rng(k)) for k in (1, 1, 2)]
     assert np.array_equal(changed[0], changed[1])
     assert not np.array_equal(changed[0], changed[2])

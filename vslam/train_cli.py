@@ -77,9 +77,10 @@ def train(
         ),
     ] = None,
     pixels: Annotated[
-        int | None,
+        str | None,
         typer.Option(
-            min=64, help="Side of the images of a capsule network; smaller ones train faster."
+            metavar="SIDE|HEIGHTxWIDTH",
+            help="Size of the images of a capsule network; smaller ones train faster.",
         ),
     ] = None,
     prune_share: Annotated[
@@ -119,14 +120,14 @@ def train(
              "prune_share": prune_share}  # fmt: skip
     chosen = chosen.model_copy(update={k: v for k, v in given.items() if v is not None})
     if pixels is not None:
-        shape = chosen.shape.model_copy(update={"pixels": pixels})
+        shape = chosen.shape.for_images_of(_parse_size(pixels))
         chosen = chosen.model_copy(update={"shape": shape})
-    if network in ("alexnet", "vgg16") and chosen.shape.pixels != 227:
+    if network in ("alexnet", "vgg16") and chosen.shape.input != (227, 227):
         raise InputError(f"vslam train {network}: takes images of 227 pixels; add --pixels 227.")
     folder = out or Path("training") / f"{network}-{preset}"
     threads = threads or available_cores()
     set_threads(threads)
-    collection = load(sources, chosen.shape.pixels, chosen.fit, threads)
+    collection = load(sources, chosen.shape.input, chosen.fit, threads)
     outcome = _train(
         collection, chosen, folder, settings.name if settings else preset, data, device, threads,
         resume, weights,
@@ -169,10 +170,10 @@ def _train(
                 "--settings: imitation needs a network of ours to stay near, --weights."
             )
         teacher, _ = load_network(weights)
-        if teacher.pixels != settings.shape.pixels:
+        if teacher.size != settings.shape.input:
             raise InputError(
-                f"{weights}: takes images of {teacher.pixels} pixels, a network that is to stay "
-                f"near it cannot have {settings.shape.pixels}."
+                f"{weights}: takes images of {_text(teacher.size)} pixels, a network that is to "
+                f"stay near it cannot have {_text(settings.shape.input)}."
             )
     start, settings, report = starting_network(
         settings, collection, weights, device, resuming=resume and (folder / CHECKPOINT).exists()
@@ -206,8 +207,8 @@ def onnx(
     network, _ = load_network(weights)
     difference = export_onnx(network, out)
     typer.echo(
-        f"{out}: {out.stat().st_size / 1e6:.1f} MB, images (1, 3, {network.pixels}, "
-        f"{network.pixels}) to descriptor (1, {network.dimensions}); differs from torch by at "
+        f"{out}: {out.stat().st_size / 1e6:.1f} MB, images (1, 3, {network.size[0]}, "
+        f"{network.size[1]}) to descriptor (1, {network.dimensions}); differs from torch by at "
         f"most {difference:.1e}"
     )
 
@@ -240,7 +241,9 @@ def weights_(
 def places(
     data: DataSources,
     fit: Annotated[str, typer.Option(help="squash or crop.")] = "squash",
-    pixels: Annotated[int, typer.Option(min=32, help="Side of the squares.")] = 227,
+    pixels: Annotated[
+        str, typer.Option(metavar="SIDE|HEIGHTxWIDTH", help="Size of the images.")
+    ] = "227",
     out: Annotated[Path, typer.Option(help="File to write.")] = Path("places.npz"),
 ) -> None:
     """Write sources of images as one small file, for training on another machine."""
@@ -249,5 +252,24 @@ def places(
     if fit not in ("squash", "crop"):
         raise InputError(f"--fit {fit}: must be squash or crop.")
     sources = [source for spec in data for source in open_source(spec)]
-    write_pack(sources, out, pixels, "squash" if fit == "squash" else "crop")
+    write_pack(sources, out, _parse_size(pixels), "squash" if fit == "squash" else "crop")
     typer.echo(f"{out}: {sum(map(len, sources))} images, {out.stat().st_size / 1e6:.1f} MB")
+
+
+def _parse_size(text: str) -> tuple[int, int]:
+    """``129`` or ``81x209`` to height and width.
+
+    Raises:
+        InputError: anything else, or fewer than 32 pixels.
+    """
+    height, _, width = text.lower().partition("x")
+    if not (height.isdecimal() and (width or height).isdecimal()):
+        raise InputError(f"--pixels {text}: write the side, 129, or height and width, 81x209.")
+    size = int(height), int(width or height)
+    if min(size) < 32:
+        raise InputError(f"--pixels {text}: a network needs 32 pixels each way at least.")
+    return size
+
+
+def _text(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"

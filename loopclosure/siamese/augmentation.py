@@ -40,29 +40,30 @@ STRONG = Augmentation(
 def augment(
     image: NDArray[np.uint8], strength: Augmentation, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Change a square ``(S, S)`` image at random.
+    """Change an image ``(H, W)`` at random.
 
     The order is that of the world: viewpoint, then what stands in the way, then light, lens and
     sensor, then 8 bits.
     """
     import cv2
 
-    side = image.shape[0]
-    corners = np.array([[0, 0], [side, 0], [side, side], [0, side]], np.float32)
-    moved = corners + rng.uniform(-1, 1, (4, 2)).astype(np.float32) * strength.homography * side
-    moved[:, 0] += rng.uniform(-1, 1) * strength.shift * side
+    height, width = image.shape
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    reach = np.array([width, height], np.float32) * np.float32(strength.homography)
+    moved = corners + rng.uniform(-1, 1, (4, 2)).astype(np.float32) * reach
+    moved[:, 0] += rng.uniform(-1, 1) * strength.shift * width
     H = cv2.getPerspectiveTransform(corners, moved)
     edge = cv2.BORDER_REFLECT_101
     if strength.turn > 0 and rng.random() < _TURNED:
-        H = H @ turn_homography(side, side, rng.uniform(-1, 1) * strength.turn)
+        H = H @ turn_homography(width, height, rng.uniform(-1, 1) * strength.turn)
         # Black, or a mirror image: nobody knows what was beside the view.
         edge = cv2.BORDER_CONSTANT if rng.random() < 0.5 else edge
     if strength.zoom > 0 and rng.random() < _ZOOMED:
         # What is far ahead grows around the middle when the camera drives on, the rest likewise.
-        factor, middle = np.exp(rng.uniform(0, strength.zoom)), side / 2
-        shift = (1.0 - factor) * middle
-        H = H @ np.array([[factor, 0, shift], [0, factor, shift], [0, 0, 1.0]])
-    warped = cv2.warpPerspective(image, H, (side, side), flags=cv2.INTER_LINEAR, borderMode=edge)
+        factor = np.exp(rng.uniform(0, strength.zoom))
+        x, y = (1.0 - factor) * width / 2, (1.0 - factor) * height / 2
+        H = H @ np.array([[factor, 0, x], [0, factor, y], [0, 0, 1.0]])
+    warped = cv2.warpPerspective(image, H, (width, height), flags=cv2.INTER_LINEAR, borderMode=edge)
     out = np.asarray(warped, np.uint8)
     for _ in range(int(rng.integers(strength.masks + 1))):
         _cover(out, strength.mask_area, rng)
@@ -95,12 +96,12 @@ def turn_homography(width: int, height: int, degrees: float) -> NDArray[np.float
 
 
 def _cover(image: NDArray[np.uint8], largest: float, rng: np.random.Generator) -> None:
-    side = image.shape[0]
+    rows, columns = image.shape
     area = rng.uniform(0.0, largest)
     if area == 0.0:
         return
     stretch = np.exp(rng.uniform(-0.7, 0.7))
-    width = min(side, max(1, round(side * float(np.sqrt(area) * stretch))))
-    height = min(side, max(1, round(side * float(np.sqrt(area) / stretch))))
-    x, y = rng.integers(side - width + 1), rng.integers(side - height + 1)
+    width = min(columns, max(1, round(columns * float(np.sqrt(area) * stretch))))
+    height = min(rows, max(1, round(rows * float(np.sqrt(area) / stretch))))
+    x, y = rng.integers(columns - width + 1), rng.integers(rows - height + 1)
     image[y : y + height, x : x + width] = rng.integers(256)

@@ -18,6 +18,7 @@ from vslam.loopclosure.siamese.extractors import (
     PrimaryCapsules,
     grid_side,
 )
+from vslam.loopclosure.siamese.images import Size
 from vslam.loopclosure.siamese.lite import SKIPPABLE, LiteExtractor, lite_grid_side
 from vslam.loopclosure.siamese.weights import read_pth
 
@@ -41,7 +42,8 @@ class CapsuleShape(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     extractor: Literal["light", "original", "lite0"] = "light"
-    pixels: int = Field(227, ge=32, description="Side of the square input.")
+    pixels: int = Field(227, ge=32, description="Height of the input.")
+    width: int | None = Field(None, ge=32, description="Of the input; None for a square.")
     blocks: tuple[tuple[int, int, int], ...] = LIGHT_BLOCKS
     types: int = Field(32, ge=1, description="Types of primary capsules.")
     size: int = Field(8, ge=1, description="Numbers of a primary capsule.")
@@ -61,13 +63,31 @@ class CapsuleShape(BaseModel):
         return given
 
     @property
+    def input(self) -> Size:
+        """Height and width of the images it takes."""
+        return self.pixels, self.width or self.pixels
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of places."""
+        if self.extractor == "original":
+            return 8, 8
+        height, width = self.input
+        if self.extractor == "lite0":
+            return lite_grid_side(height), lite_grid_side(width)
+        return grid_side(height, self.blocks), grid_side(width, self.blocks)
+
+    @property
     def places(self) -> int:
         """Places of the grid."""
-        if self.extractor == "original":
-            return 64
-        if self.extractor == "lite0":
-            return lite_grid_side(self.pixels) ** 2
-        return grid_side(self.pixels, self.blocks) ** 2
+        rows, columns = self.grid
+        return rows * columns
+
+    def for_images_of(self, size: Size) -> CapsuleShape:
+        """The same branch for images of another height and width."""
+        height, width = size
+        given = {"pixels": height, "width": None if width == height else width}
+        return self.model_copy(update=given)
 
 
 class CapsuleBranch(nn.Module):
@@ -76,7 +96,7 @@ class CapsuleBranch(nn.Module):
     def __init__(self, shape: CapsuleShape) -> None:
         super().__init__()
         self.shape = shape
-        self.pixels = shape.pixels
+        self.size = shape.input
         self.dimensions = shape.outputs * shape.depth
         self.extractor: nn.Module
         self.primary: nn.Module
@@ -97,7 +117,7 @@ class CapsuleBranch(nn.Module):
         )  # fmt: skip
 
     def forward(self, images: Tensor) -> Tensor:
-        """``(N, 3, S, S)`` float32 in [0, 1] to ``(N, D)``, not yet normalised."""
+        """``(N, 3, H, W)`` float32 in [0, 1] to ``(N, D)``, not yet normalised."""
         return self.routed(images)[0].flatten(1)
 
     def routed(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -133,7 +153,7 @@ class ConvolutionalBranch(nn.Module):
     ) -> None:
         super().__init__()
         self.name = name
-        self.pixels = 227
+        self.size = (227, 227)
         self.dimensions = 1024
         self.features = features
         self.pool = nn.AdaptiveAvgPool2d(side)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError, ResultsError
-from vslam.loopclosure.siamese.images import Fit
+from vslam.loopclosure.siamese.images import Fit, Size
 from vslam.loopclosure.siamese.places import DIFFERENT, SAME, UNKNOWN, Places
 
 # Frames of each sequence that training may use; the others are what loop detectors are tested on.
@@ -29,14 +29,14 @@ class Collection:
 
     Attributes:
         names: ``source/folder/file`` of each of N images.
-        squares: ``(N, S, S)`` uint8.
+        images: ``(N, H, W)`` uint8.
         relation: ``(N, N)`` int8, 1 same place, -1 another, 0 not known.
         unit: ``(N,)`` int64; images of one unit stay together in a division.
         sources: name of each source and how many images it has.
     """
 
     names: tuple[str, ...]
-    squares: NDArray[np.uint8]
+    images: NDArray[np.uint8]
     relation: NDArray[np.int8]
     unit: NDArray[np.int64]
     sources: tuple[tuple[str, int], ...]
@@ -80,7 +80,7 @@ def refuse_test_data(sources: Sequence[Places]) -> None:
             )
 
 
-def load(sources: Sequence[Places], pixels: int, fit: Fit, threads: int = 2) -> Collection:
+def load(sources: Sequence[Places], size: Size, fit: Fit, threads: int = 2) -> Collection:
     """Decode all images of all sources into memory (51 kB an image at 227 pixels).
 
     Raises:
@@ -95,7 +95,7 @@ def load(sources: Sequence[Places], pixels: int, fit: Fit, threads: int = 2) -> 
         raise InputError(f"--data: two sources are called {twice}; rename a folder.")
     work = [(source, i) for source in sources for i in range(len(source))]
     with ThreadPoolExecutor(threads) as pool:
-        squares = np.stack(list(pool.map(lambda job: job[0].read(job[1], pixels, fit), work)))
+        images = np.stack(list(pool.map(lambda job: job[0].read(job[1], size, fit), work)))
     relation = np.full((len(work), len(work)), DIFFERENT, np.int8)
     starts = np.cumsum([0, *map(len, sources)])
     spans = [slice(a, b) for a, b in pairwise(starts.tolist())]
@@ -107,7 +107,7 @@ def load(sources: Sequence[Places], pixels: int, fit: Fit, threads: int = 2) -> 
     unit = np.concatenate([s.unit + k * 10_000_000 for k, s in enumerate(sources)])
     return Collection(
         tuple(f"{source.name}/{source.names[i]}" for source, i in work),
-        squares,
+        images,
         relation,
         unit.astype(np.int64),
         tuple((source.name, len(source)) for source in sources),

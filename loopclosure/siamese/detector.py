@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vslam.config import SiameseConfig
 from vslam.errors import InputError
 from vslam.features import Features
-from vslam.loopclosure.siamese.images import to_square, to_tensor
+from vslam.loopclosure.siamese.images import to_size, to_tensor
 from vslam.loopclosure.siamese.runtime import one_thread
 from vslam.loopclosure.siamese.siamese import SiameseNetwork, for_inference, load_network
 from vslam.loopclosure.siamese.weights import find_weights
@@ -69,9 +69,9 @@ class SiameseDetector:
         return self._known[:n] & map_.arrays.keyframe_alive[:n]
 
     def _embed(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        square = to_square(image, self._network.pixels, self._config.fit)
+        small = to_size(image, self._network.size, self._config.fit)
         with one_thread(), torch.no_grad():
-            return np.asarray(self._network.embed(to_tensor(square[None]))[0].numpy())
+            return np.asarray(self._network.embed(to_tensor(small[None]))[0].numpy())
 
     def _best(
         self,

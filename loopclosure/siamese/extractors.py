@@ -107,7 +107,7 @@ class LightExtractor(nn.Sequential):
 
 
 def grid_side(pixels: int, blocks: Sequence[Block] = LIGHT_BLOCKS) -> int:
-    """Places along one side of the grid for a square image of so many pixels."""
+    """Places along a side of the grid for so many pixels of the image."""
     for _, stride, _ in blocks:
         pixels = (pixels - 1) // stride + 1
     return pixels

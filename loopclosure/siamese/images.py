@@ -15,29 +15,33 @@ from vslam.errors import UnreadableImageError
 Fit = Literal["squash", "crop"]
 
 
-def to_square(image: NDArray[np.uint8], pixels: int, fit: Fit = "squash") -> NDArray[np.uint8]:
-    """Resize ``(H, W)`` to ``(pixels, pixels)``.
+Size = tuple[int, int]
+"""Height and width, pixels."""
+
+
+def to_size(image: NDArray[np.uint8], size: Size, fit: Fit = "squash") -> NDArray[np.uint8]:
+    """Resize ``(H, W)`` to ``size``.
 
     ``squash`` keeps the whole view and loses the aspect; ``crop`` keeps the aspect and loses what
-    is beyond the central square.
+    is beyond the largest rectangle of the wanted aspect in the middle.
     """
     import cv2
 
     if fit == "crop":
-        height, width = image.shape
-        side = min(height, width)
-        y, x = (height - side) // 2, (width - side) // 2
-        image = image[y : y + side, x : x + side]
-    if image.shape == (pixels, pixels):
+        scale = min(image.shape[0] / size[0], image.shape[1] / size[1])
+        height, width = round(scale * size[0]), round(scale * size[1])
+        y, x = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
+        image = image[y : y + height, x : x + width]
+    if image.shape == size:
         return image
-    shrinking = image.shape[0] > pixels or image.shape[1] > pixels
+    shrinking = image.shape[0] > size[0] or image.shape[1] > size[1]
     way = cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, (pixels, pixels), interpolation=way), np.uint8)
+    return np.asarray(cv2.resize(image, size[::-1], interpolation=way), np.uint8)
 
 
-def to_tensor(squares: NDArray[np.uint8]) -> Tensor:
-    """``(N, S, S)`` grey images to ``(N, 3, S, S)`` float32 in [0, 1], the grey replicated."""
-    x = torch.from_numpy(np.ascontiguousarray(squares)).float().div_(255.0)
+def to_tensor(images: NDArray[np.uint8]) -> Tensor:
+    """``(N, H, W)`` grey images to ``(N, 3, H, W)`` float32 in [0, 1], the grey replicated."""
+    x = torch.from_numpy(np.ascontiguousarray(images)).float().div_(255.0)
     return x[:, None].expand(-1, 3, -1, -1)
 
 

@@ -92,7 +92,7 @@ class LiteExtractor(nn.Module):
         self.out_channels = inputs
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(N, 1, S, S)`` of mean 0 and deviation 1 to ``(N, 112, g, g)``."""
+        """``(N, 1, H, W)`` of mean 0 and deviation 1 to ``(N, 112, h, w)``."""
         grid: Tensor = self.blocks(functional.relu6(self.stem(x), inplace=True))
         return grid
 
@@ -141,7 +141,7 @@ class LiteExtractor(nn.Module):
 
 
 def lite_grid_side(pixels: int) -> int:
-    """Places along one side of the grid for a square image of so many pixels."""
+    """Places along a side of the grid for so many pixels of the image."""
     return (pixels - 1) // _STRIDE + 1
 
 

@@ -56,13 +56,13 @@ def imitation(descriptors: Tensor, wanted: Tensor) -> Tensor:
 
 @torch.no_grad()
 def embed_all(
-    network: SiameseNetwork, squares: NDArray[np.uint8], device: torch.device, batch: int = 64
+    network: SiameseNetwork, images: NDArray[np.uint8], device: torch.device, batch: int = 64
 ) -> NDArray[np.float32]:
     """Descriptors ``(N, D)`` of ``(N, S, S)`` images, in eval mode."""
     network.eval()
     parts = [
-        network.embed(to_tensor(squares[k : k + batch]).to(device)).cpu()
-        for k in range(0, len(squares), batch)
+        network.embed(to_tensor(images[k : k + batch]).to(device)).cpu()
+        for k in range(0, len(images), batch)
     ]
     return torch.cat(parts).numpy()
 
@@ -98,11 +98,11 @@ def validate(
         Figures of :func:`vslam.loopclosure.benchmark.summary`, and the scores and labels of the
         pairs behind them.
     """
-    squares = collection.squares[chosen]
+    images = collection.images[chosen]
     changed = np.stack(
-        [augment(s, strength, np.random.default_rng([7, k])) for k, s in enumerate(squares)]
+        [augment(s, strength, np.random.default_rng([7, k])) for k, s in enumerate(images)]
     )
-    gallery = embed_all(network, squares, device)
+    gallery = embed_all(network, images, device)
     scores = score_matrix(network, embed_all(network, changed, device), gallery, device)
     relation = collection.relation[np.ix_(chosen, chosen)].copy()
     for k, row in enumerate(relation):

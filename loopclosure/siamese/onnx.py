@@ -16,7 +16,7 @@ TOLERANCE = 1e-4  # of a descriptor of length 1
 
 
 def export_onnx(network: SiameseNetwork, path: Path) -> float:
-    """Write image ``(1, 3, S, S)`` float32 in [0, 1] to ``descriptor`` ``(1, D)`` of norm 1.
+    """Write image ``(1, 3, H, W)`` float32 in [0, 1] to ``descriptor`` ``(1, D)`` of norm 1.
 
     Returns:
         The largest difference between torch and onnxruntime on a random image.
@@ -33,7 +33,7 @@ def export_onnx(network: SiameseNetwork, path: Path) -> float:
 
     network = for_inference(copy.deepcopy(network).cpu())
     torch.manual_seed(0)
-    image = torch.rand(1, 3, network.pixels, network.pixels)
+    image = torch.rand(1, 3, *network.size)
     try:
         torch.onnx.export(
             network, (image,), str(path), input_names=["image"], output_names=["descriptor"],

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError, ResultsError
-from vslam.loopclosure.siamese.images import Fit, read_grey, to_square
+from vslam.loopclosure.siamese.images import Fit, Size, read_grey, to_size
 from vslam.trajectory import read_kitti_poses, read_table
 
 SAME, UNKNOWN, DIFFERENT = 1, 0, -1
@@ -69,13 +69,13 @@ class Places:
     def __len__(self) -> int:
         return len(self.images)
 
-    def read(self, index: int, pixels: int, fit: Fit) -> NDArray[np.uint8]:
-        """The image, undistorted and ``(pixels, pixels)``.
+    def read(self, index: int, size: Size, fit: Fit) -> NDArray[np.uint8]:
+        """The image, undistorted and of that size.
 
         Raises:
             UnreadableImageError: missing or damaged.
         """
-        return to_square(self.grey(index), pixels, fit)
+        return to_size(self.grey(index), size, fit)
 
     def grey(self, index: int) -> NDArray[np.uint8]:
         """The image, undistorted, ``(H, W)``.
@@ -465,7 +465,7 @@ def _names(files: Sequence[Path]) -> tuple[str, ...]:
     return tuple(f"{file.parent.name}/{file.name}" for file in files)
 
 
-def write_pack(sources: Sequence[Places], path: Path, pixels: int, fit: Fit) -> None:
+def write_pack(sources: Sequence[Places], path: Path, size: Size, fit: Fit) -> None:
     """Write sources as one file: images at the size of the network, JPEG, with their relations.
 
     For machines that cannot hold the originals (docs/training.md).
@@ -479,7 +479,7 @@ def write_pack(sources: Sequence[Places], path: Path, pixels: int, fit: Fit) -> 
     arrays: dict[str, NDArray] = {"count": np.array(len(sources))}
     for k, source in enumerate(sources):
         encoded = [
-            cv2.imencode(".jpg", source.read(i, pixels, fit), (cv2.IMWRITE_JPEG_QUALITY, 85))[1]
+            cv2.imencode(".jpg", source.read(i, size, fit), (cv2.IMWRITE_JPEG_QUALITY, 85))[1]
             for i in range(len(source))
         ]
         arrays[f"{k}_text"] = np.array([source.name, source.family, *source.names])

@@ -24,7 +24,7 @@ def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor
 
     Args:
         network: of a capsule branch, in eval mode.
-        batches: images of the training set, ``(N, 3, S, S)`` each.
+        batches: images of the training set, ``(N, 3, H, W)`` each.
 
     Raises:
         InputError: no images, or a network without capsules.

@@ -38,7 +38,7 @@ def milliseconds_per_image(*networks: SiameseNetwork, repeats: int = 50) -> list
     with one_thread():
         for _ in range(repeats):
             for k, network in enumerate(networks):
-                image = torch.rand(1, 3, network.pixels, network.pixels)
+                image = torch.rand(1, 3, *network.size)
                 began = time.perf_counter()
                 network.embed(image)
                 best[k] = min(best[k], time.perf_counter() - began)

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from vslam.loopclosure.siamese.detector import load_named
-from vslam.loopclosure.siamese.images import Fit, to_square
+from vslam.loopclosure.siamese.images import Fit, to_size
 from vslam.loopclosure.siamese.objective import embed_all, score_matrix
 from vslam.loopclosure.siamese.runtime import one_thread
 from vslam.loopclosure.siamese.siamese import for_inference
@@ -45,9 +45,9 @@ class NetworkScorer:
 
     def embed(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """Descriptors ``(N, D)`` of images ``(H, W)``."""
-        squares = [to_square(image, self._network.pixels, self._fit) for image in images]
+        small = [to_size(image, self._network.size, self._fit) for image in images]
         with one_thread():
-            return embed_all(self._network, np.stack(squares), _CPU)
+            return embed_all(self._network, np.stack(small), _CPU)
 
     @torch.no_grad()
     def compare(

@@ -78,7 +78,7 @@ class SiameseNetwork(nn.Module):
 
     Attributes:
         name: one of ``NETWORKS``.
-        pixels: side of the square images it takes.
+        size: height and width of the images it takes.
         dimensions: D of its descriptors.
     """
 
@@ -90,10 +90,10 @@ class SiameseNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.name, self.branch, self.head = name, branch, head
-        self.pixels, self.dimensions = branch.pixels, branch.dimensions
+        self.size, self.dimensions = branch.size, branch.dimensions
 
     def embed(self, images: Tensor) -> Tensor:
-        """``(N, 3, S, S)`` float32 in [0, 1] to ``(N, D)`` float32 descriptors of L2 norm 1."""
+        """``(N, 3, H, W)`` float32 in [0, 1] to ``(N, D)`` float32 descriptors of L2 norm 1."""
         return functional.normalize(self.branch(images).float(), dim=1)
 
     def logits(self, a: Tensor, b: Tensor) -> Tensor:

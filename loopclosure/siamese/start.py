@@ -12,7 +12,7 @@ from torch.nn import functional
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.branches import CapsuleBranch, ConvolutionalBranch
 from vslam.loopclosure.siamese.data import Collection, divide, validation_images
-from vslam.loopclosure.siamese.images import to_tensor
+from vslam.loopclosure.siamese.images import Size, to_tensor
 from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.objective import validate
 from vslam.loopclosure.siamese.pruning import (
@@ -79,14 +79,14 @@ def starting_network(
     if network.name != settings.network:
         raise InputError(f"{weights}: weights of {network.name}, not of {settings.network}.")
     if isinstance(network.branch, CapsuleBranch):
-        if settings.shape.pixels != network.pixels:
-            network = resized(network, settings.shape.pixels)
-            about["resized_to"] = settings.shape.pixels
+        if settings.shape.input != network.size:
+            network = resized(network, settings.shape.input)
+            about["resized_to"] = network.size
         settings = settings.model_copy(update={"shape": network.branch.shape})
     return network, settings, about
 
 
-def resized(network: SiameseNetwork, pixels: int) -> SiameseNetwork:
+def resized(network: SiameseNetwork, size: Size) -> SiameseNetwork:
     """A network for images of another size that computes alike; training it further mends the rest.
 
     Convolutions and transforms stay, the gains of the places are interpolated over the new grid.
@@ -101,15 +101,14 @@ def resized(network: SiameseNetwork, pixels: int) -> SiameseNetwork:
         raise InputError(f"{network.name}: cannot take images of another size.")
     if branch.shape.kept is not None:
         raise InputError(f"{network.name}: is pruned to the places of its grid; resize before.")
-    shape = branch.shape.model_copy(update={"pixels": pixels})
+    shape = branch.shape.for_images_of(size)
     larger = build_network(network.name, shape)
     state = network.state_dict()
     gains = state.pop("branch.capsules.gains")
     for name in ("place", "alive"):
         del state[f"branch.capsules.{name}"]
-    sides = [round(places**0.5) for places in (branch.shape.places, shape.places)]
-    grid = gains.transpose(1, 2).reshape(shape.types, shape.size, sides[0], sides[0])
-    grid = functional.interpolate(grid, size=(sides[1], sides[1]), mode="bilinear")
+    grid = gains.transpose(1, 2).reshape(shape.types, shape.size, *branch.shape.grid)
+    grid = functional.interpolate(grid, size=shape.grid, mode="bilinear")
     state["branch.capsules.gains"] = grid.flatten(2).transpose(1, 2).contiguous()
     larger.load_state_dict(state, strict=False)
     return larger
@@ -119,23 +118,21 @@ def _prune(
     settings: TrainSettings, collection: Collection, weights: Path, device: torch.device
 ) -> tuple[SiameseNetwork, TrainSettings, dict[str, Any]]:
     full, _ = load_network(weights)
-    if full.pixels != settings.shape.pixels:
-        raise InputError(
-            f"{weights}: takes images of {full.pixels} pixels, not of {settings.shape.pixels}; "
-            f"add --pixels {full.pixels}."
-        )
+    whole = full if settings.shape.input == full.size else resized(full, settings.shape.input)
     train, validation = divide(collection, settings.seed, settings.validation_share)
     validation = validation_images(validation, settings.validation_images, settings.seed)
     step = max(1, len(train) // _RANKED_IMAGES)
-    squares = collection.squares[train[::step]]
-    full.to(device)
-    batches = (to_tensor(squares[k : k + 32]).to(device) for k in range(0, len(squares), 32))
-    smaller = pruned(full, lowest(mean_couplings(full, batches), settings.prune_share))
+    images = collection.images[train[::step]]
+    whole.to(device)
+    batches = (to_tensor(images[k : k + 32]).to(device) for k in range(0, len(images), 32))
+    smaller = pruned(whole, lowest(mean_couplings(whole, batches), settings.prune_share))
     report: dict[str, Any] = {"pruned_from": weights.name, "pruned_share": settings.prune_share}
+    if whole is not full:
+        report["resized_to"] = whole.size
     if settings.skipped_blocks:
         smaller = with_shallower_extractor(smaller, settings.skipped_blocks)
         report["skipped_blocks"] = settings.skipped_blocks
-    for name, network in (("before", full), ("removed", smaller)):
+    for name, network in (("before", whole), ("removed", smaller)):
         figures = validate(network, collection, validation, settings.augmentation, device)[0]
         report[f"average_precision_{name}"] = figures["average_precision"]
     copies = [for_inference(copy.deepcopy(network).cpu()) for network in (full, smaller)]

@@ -253,7 +253,7 @@ def _augmented(
 ) -> torch.Tensor:
     def one(job: tuple[int, int, int]) -> NDArray[np.uint8]:
         image, pair, side = job
-        square = collection.squares[image]
+        square = collection.images[image]
         if settings.augmentation.mirror and (pair + epoch) // 2 % 2:
             square = np.ascontiguousarray(square[:, ::-1])
         rng = np.random.default_rng([settings.seed, 3, epoch, pair, side])
@@ -277,7 +277,7 @@ def _pairs_of_epoch(
     if progress.epoch > 0 and settings.hard_share > 0:  # random weights find nothing hard
         if len(images) > settings.mined_images:
             images = np.sort(rng.choice(images, settings.mined_images, replace=False))
-        descriptors = embed_all(network, collection.squares[images], device)
+        descriptors = embed_all(network, collection.images[images], device)
         hard = mine(collection, images, descriptors)
     return draw_pairs(
         collection, images, settings.pairs, rng, hard, settings.hard_share,

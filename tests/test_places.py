@@ -62,7 +62,7 @@ def test_kitti_takes_frames_by_number(tmp_path):
     ]
     assert source.relation[0].tolist() == [1, 0, -1, -1, -1]
     refuse_test_data([source])
-    assert source.read(0, 20, "squash").shape == (20, 20)
+    assert source.read(0, (20, 20), "squash").shape == (20, 20)
     (source,) = open_source(f"kitti:{tmp_path}[seq=00,first=252,last=260,every=2,near=21]")
     assert source.relation[0].tolist() == [1, 1, -1, -1, -1]
 
@@ -178,7 +178,7 @@ def test_rendered_pairs_know_their_own_pairs_only(tmp_path):
     assert source.relation.tolist() == [[1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 1, -1], [0, 0, -1, 1]]
     (tmp_path / "images" / "1b.png").unlink()
     with pytest.raises(UnreadableImageError, match=r"1b\.png: cannot be decoded"):
-        load([source], 20, "squash")
+        load([source], (20, 20), "squash")
 
 
 def test_sources_together(tmp_path):
@@ -186,26 +186,26 @@ def test_sources_together(tmp_path):
     photo_set(tmp_path / "multiview", "a", ["church"])
     photo_set(tmp_path / "zoo", "c", ["photos"])
     sources = open_source(f"photos:{tmp_path}")
-    collection = load(sources, 20, "crop")
+    collection = load(sources, (20, 20), "crop")
     assert collection.images.shape == (12, 20, 20)
     assert (collection.relation[:4, 4:8] == 0).all()  # landmarks of one family: not known
     assert (collection.relation[:8, 8:] == -1).all()
     with pytest.raises(InputError, match="two sources are called"):
-        load([sources[0], sources[0]], 20, "crop")
+        load([sources[0], sources[0]], (20, 20), "crop")
     with pytest.raises(InputError, match="at least one source"):
-        load([], 20, "crop")
+        load([], (20, 20), "crop")
 
 
 def test_a_pack_is_the_same_data(tmp_path):
     write_kitti_root(tmp_path)
     (source,) = open_source(f"kitti:{tmp_path}")
-    write_pack([source, source], tmp_path / "p.npz", 20, "squash")
+    write_pack([source, source], tmp_path / "p.npz", (20, 20), "squash")
     first, _ = open_source(f"pack:{tmp_path / 'p.npz'}")
     assert (first.name, first.names) == (source.name, source.names)
     assert np.array_equal(first.relation, source.relation)
     assert np.array_equal(first.unit, source.unit)
     for k in range(len(source)):
-        mine, wanted = first.read(k, 20, "squash"), source.read(k, 20, "squash")
+        mine, wanted = first.read(k, (20, 20), "squash"), source.read(k, (20, 20), "squash")
         assert np.abs(mine.astype(int) - wanted).max() <= 3  # JPEG
 
 
@@ -223,7 +223,7 @@ def test_no_place_is_on_both_sides_of_a_division():
 
 def test_stretches_of_road_are_parted_where_they_overlap(tmp_path):
     write_kitti_root(tmp_path, seq="05", frames=range(300), step=2.0)
-    collection = load(open_source(f"kitti:{tmp_path}[seq=05]"), 8, "squash")
+    collection = load(open_source(f"kitti:{tmp_path}[seq=05]"), (8, 8), "squash")
     train, validation = divide(collection, seed=0, share=0.3)
     gap = np.abs(train[:, None] - validation[None]) * 2.0
     assert gap.min() >= 5.0
@@ -235,7 +235,7 @@ def test_pairs_are_balanced_true_and_hard():
     chosen = np.arange(10, 60)
     rng = np.random.default_rng(0)
     descriptors = rng.standard_normal((50, 8)).astype(np.float32)
-    hard = mine(collection, chosen, descriptors, k=3)
+    hard = mine(collection, chosen, descriptors @ descriptors.T, k=3)
     for k, image in enumerate(chosen):
         assert (collection.relation[image, hard[k]] == -1).all()
         alike = descriptors @ descriptors[k]

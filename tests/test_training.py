@@ -239,6 +239,7 @@ def test_cross_entropy_is_equation_3():
 def test_contrast_leaves_out_what_is_not_known():
     e = torch.eye(4)
     a, b, same = e[:2], torch.stack([e[0], e[3]]), torch.tensor([True, False])
+    both = torch.cat([a, b])
     known = -torch.ones(4, 4, dtype=torch.int8)
     unknown = torch.zeros(4, 4, dtype=torch.int8)
     # Three others at cosine 0, the partner at cosine 1, temperature 0.5.
@@ -246,8 +247,8 @@ def test_contrast_leaves_out_what_is_not_known():
     known[0, 2] = known[2, 0] = 1
     known.fill_diagonal_(1)
     wanted = np.log(np.exp(2) + 2) - 2
-    assert contrast(a, b, same, known, 0.5).item() == pytest.approx(wanted, abs=1e-5)
-    assert contrast(a, b, same, unknown, 0.5).item() == pytest.approx(0.0, abs=1e-6)
+    assert contrast(both @ both.T, same, known, 0.5).item() == pytest.approx(wanted, abs=1e-5)
+    assert contrast(both @ both.T, same, unknown, 0.5).item() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_calibration_finds_the_law_behind_the_labels():
@@ -256,7 +257,7 @@ def test_calibration_finds_the_law_behind_the_labels():
     d = rng.uniform(0, 2, 20000)
     same = rng.random(20000) < 1 / (1 + np.exp(-(6 - 8 * d)))
     with torch.no_grad():
-        score = torch.sigmoid(network.head.of_distance(torch.from_numpy(d))).numpy()
+        score = torch.sigmoid(network.head.of_cosine(1 - torch.from_numpy(d) ** 2 / 2)).numpy()
     calibrate(network, score, same)
     a, b = network.head.log_a.exp().item(), network.head.log_b.exp().item()
     prior = np.log((~same).sum() / same.sum())  # balanced weights shift a by the prior

@@ -105,6 +105,7 @@ def train(
     """Train a loop detector; writes weights, log, pairs, checkpoints and a model card."""
     from vslam.info import available_cores
     from vslam.loopclosure.siamese.data import load, refuse_test_data
+    from vslam.loopclosure.siamese.images import parse_size
     from vslam.loopclosure.siamese.places import open_source
     from vslam.loopclosure.siamese.runtime import set_threads
     from vslam.loopclosure.siamese.settings import PRESETS, load_settings
@@ -120,7 +121,7 @@ def train(
              "prune_share": prune_share}  # fmt: skip
     chosen = chosen.model_copy(update={k: v for k, v in given.items() if v is not None})
     if pixels is not None:
-        shape = chosen.shape.for_images_of(_parse_size(pixels))
+        shape = chosen.shape.for_images_of(parse_size(pixels))
         chosen = chosen.model_copy(update={"shape": shape})
     if network in ("alexnet", "vgg16") and chosen.shape.input != (227, 227):
         raise InputError(f"vslam train {network}: takes images of 227 pixels; add --pixels 227.")
@@ -170,7 +171,7 @@ def _train(
                 "--settings: imitation needs a network of ours to stay near, --weights."
             )
         teacher, _ = load_network(weights)
-        if teacher.size != settings.shape.input:
+        if (teacher.size, teacher.branch.views) != (settings.shape.input, settings.shape.views):
             raise InputError(
                 f"{weights}: takes images of {_text(teacher.size)} pixels, a network that is to "
                 f"stay near it cannot have {_text(settings.shape.input)}."
@@ -247,28 +248,14 @@ def places(
     out: Annotated[Path, typer.Option(help="File to write.")] = Path("places.npz"),
 ) -> None:
     """Write sources of images as one small file, for training on another machine."""
+    from vslam.loopclosure.siamese.images import parse_size
     from vslam.loopclosure.siamese.places import open_source, write_pack
 
     if fit not in ("squash", "crop"):
         raise InputError(f"--fit {fit}: must be squash or crop.")
     sources = [source for spec in data for source in open_source(spec)]
-    write_pack(sources, out, _parse_size(pixels), "squash" if fit == "squash" else "crop")
+    write_pack(sources, out, parse_size(pixels), "squash" if fit == "squash" else "crop")
     typer.echo(f"{out}: {sum(map(len, sources))} images, {out.stat().st_size / 1e6:.1f} MB")
-
-
-def _parse_size(text: str) -> tuple[int, int]:
-    """``129`` or ``81x209`` to height and width.
-
-    Raises:
-        InputError: anything else, or fewer than 32 pixels.
-    """
-    height, _, width = text.lower().partition("x")
-    if not (height.isdecimal() and (width or height).isdecimal()):
-        raise InputError(f"--pixels {text}: write the side, 129, or height and width, 81x209.")
-    size = int(height), int(width or height)
-    if min(size) < 32:
-        raise InputError(f"--pixels {text}: a network needs 32 pixels each way at least.")
-    return size
 
 
 def _text(size: tuple[int, int]) -> str:

@@ -26,6 +26,9 @@ from vslam.loopclosure.siamese.weights import read_pth
 _IMAGENET_MEAN = (0.485, 0.456, 0.406)
 _IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 
+_VIEW = 0.75  # of the width of an image, where it has two views
+_STRIDE = 16  # of the extractors
+
 
 def _have_shortcuts(blocks: tuple[int, ...]) -> tuple[int, ...]:
     if not set(blocks) <= set(SKIPPABLE):
@@ -44,6 +47,7 @@ class CapsuleShape(BaseModel):
     extractor: Literal["light", "original", "lite0"] = "light"
     pixels: int = Field(227, ge=32, description="Height of the input.")
     width: int | None = Field(None, ge=32, description="Of the input; None for a square.")
+    views: Literal[1, 2] = Field(1, description="The whole image, or its left and right parts.")
     blocks: tuple[tuple[int, int, int], ...] = LIGHT_BLOCKS
     types: int = Field(32, ge=1, description="Types of primary capsules.")
     size: int = Field(8, ge=1, description="Numbers of a primary capsule.")
@@ -68,11 +72,21 @@ class CapsuleShape(BaseModel):
         return self.pixels, self.width or self.pixels
 
     @property
+    def view(self) -> Size:
+        """Height and width of what a descriptor sees: the image, or three quarters of its width.
+
+        Rounded to ``16 n + 1``, so that the columns of both views fall on columns of the image.
+        """
+        height, width = self.input
+        part = _STRIDE * round((_VIEW * width - 1) / _STRIDE) + 1
+        return height, width if self.views == 1 else min(width, part)
+
+    @property
     def grid(self) -> tuple[int, int]:
-        """Rows and columns of places."""
+        """Rows and columns of places of a view."""
         if self.extractor == "original":
             return 8, 8
-        height, width = self.input
+        height, width = self.view
         if self.extractor == "lite0":
             return lite_grid_side(height), lite_grid_side(width)
         return grid_side(height, self.blocks), grid_side(width, self.blocks)
@@ -83,21 +97,29 @@ class CapsuleShape(BaseModel):
         rows, columns = self.grid
         return rows * columns
 
-    def for_images_of(self, size: Size) -> CapsuleShape:
-        """The same branch for images of another height and width."""
+    def for_images_of(self, size: Size, views: int | None = None) -> CapsuleShape:
+        """The same branch for images of another height and width, or another number of views."""
         height, width = size
-        given = {"pixels": height, "width": None if width == height else width}
+        given = {
+            "pixels": height,
+            "width": None if width == height else width,
+            "views": views or self.views,
+        }
         return self.model_copy(update=given)
 
 
 class CapsuleBranch(nn.Module):
-    """Extractor, primary capsules, routing; the descriptor is all output capsules, flattened."""
+    """Extractor, primary capsules, routing; the descriptor is all output capsules, flattened.
+
+    With two views, those of the left view and then those of the right one.
+    """
 
     def __init__(self, shape: CapsuleShape) -> None:
         super().__init__()
         self.shape = shape
         self.size = shape.input
-        self.dimensions = shape.outputs * shape.depth
+        self.views = shape.views
+        self.dimensions = shape.views * shape.outputs * shape.depth
         self.extractor: nn.Module
         self.primary: nn.Module
         if shape.extractor == "original":
@@ -118,11 +140,15 @@ class CapsuleBranch(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """``(N, 3, H, W)`` float32 in [0, 1] to ``(N, D)``, not yet normalised."""
-        return self.routed(images)[0].flatten(1)
+        v = self.routed(images)[0].flatten(1)
+        return v if self.views == 1 else torch.cat(v.chunk(2), 1)
 
     def routed(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Output capsules ``(N, J, D)`` and couplings ``(N, J, I)``."""
+        """Output capsules ``(V N, J, D)`` and couplings ``(V N, J, I)``: all left views first."""
         grey = images.mean(1, keepdim=True)
+        if self.views == 2:
+            width = self.shape.view[1]
+            grey = torch.cat([grey[..., :width], grey[..., -width:]])
         x = standardised(grey).contiguous(memory_format=torch.channels_last)
         x = self.primary(self.extractor(x))
         # Routing sums thousands of products: never in half precision.
@@ -154,6 +180,7 @@ class ConvolutionalBranch(nn.Module):
         super().__init__()
         self.name = name
         self.size = (227, 227)
+        self.views = 1
         self.dimensions = 1024
         self.features = features
         self.pool = nn.AdaptiveAvgPool2d(side)

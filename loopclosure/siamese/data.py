@@ -209,22 +209,19 @@ def draw_pairs(
 
 
 def mine(
-    collection: Collection, chosen: NDArray[np.int64], descriptors: NDArray[np.float32], k: int = 10
+    collection: Collection, chosen: NDArray[np.int64], alike: NDArray[np.float32], k: int = 10
 ) -> NDArray[np.int64]:
     """The ``k`` images of other places that look most alike, ``(M, k)``, -1 where there are less.
 
     Args:
         chosen: ``(M,)`` images.
-        descriptors: ``(M, D)`` of these.
+        alike: ``(M, M)`` how much they look alike.
     """
     out = np.full((len(chosen), k), -1, np.int64)
-    for start in range(0, len(chosen), 512):
-        rows = chosen[start : start + 512]
-        alike = descriptors[start : start + 512] @ descriptors.T
-        alike[collection.relation[np.ix_(rows, chosen)] != DIFFERENT] = -np.inf
-        best = np.argsort(-alike, axis=1, kind="stable")[:, :k]
-        found = np.take_along_axis(alike, best, 1) > -np.inf
-        out[start : start + 512, : best.shape[1]] = np.where(found, chosen[best], -1)
+    for row, image in enumerate(chosen):
+        others = np.flatnonzero(collection.relation[image, chosen] == DIFFERENT)
+        best = others[np.argsort(-alike[row, others], kind="stable")[:k]]
+        out[row, : len(best)] = chosen[best]
     return out
 
 

@@ -10,13 +10,29 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vslam.errors import UnreadableImageError
+from vslam.errors import InputError, UnreadableImageError
 
 Fit = Literal["squash", "crop"]
 
 
 Size = tuple[int, int]
 """Height and width, pixels."""
+
+
+def parse_size(text: str) -> Size:
+    """``129`` or ``81x145`` to height and width.
+
+    Raises:
+        InputError: anything else, or fewer than 32 pixels.
+    """
+    height, by, width = text.lower().partition("x")
+    if not by:
+        width = height
+    if not (height.isdecimal() and width.isdecimal()):
+        raise InputError(f"--pixels {text}: write the side, 129, or height and width, 81x145.")
+    if min(int(height), int(width)) < 32:
+        raise InputError(f"--pixels {text}: a network needs 32 pixels each way at least.")
+    return int(height), int(width)
 
 
 def to_size(image: NDArray[np.uint8], size: Size, fit: Fit = "squash") -> NDArray[np.uint8]:

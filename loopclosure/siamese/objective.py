@@ -24,22 +24,21 @@ def cross_entropy(logits: Tensor, same: Tensor) -> Tensor:
     return functional.binary_cross_entropy_with_logits(logits, same.to(logits.dtype))
 
 
-def contrast(a: Tensor, b: Tensor, same: Tensor, relation: Tensor, temperature: float) -> Tensor:
+def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) -> Tensor:
     """Each pair of one place against all images of other places in the batch (InfoNCE).
 
     Van den Oord et al. 2018, symmetric as in CLIP. Not in the paper.
 
     Args:
-        a, b: ``(N, D)`` unit descriptors of pairs.
+        alike: ``(2 N, 2 N)`` cosines of the images of N pairs: the first of each, then the second.
         same: ``(N,)`` bool.
-        relation: ``(2 N, 2 N)`` int8 of the images of ``a`` and ``b`` together.
+        relation: ``(2 N, 2 N)`` int8 of the same images.
     """
     if not bool(same.any()):
-        return a.sum() * 0.0
-    both = torch.cat([a, b])
-    n = len(a)
-    partner = torch.arange(2 * n, device=a.device).roll(n)
-    alike = both @ both.T / temperature
+        return alike.sum() * 0.0
+    n = len(same)
+    partner = torch.arange(2 * n, device=alike.device).roll(n)
+    alike = alike / temperature
     positive = alike.gather(1, partner[:, None])
     others = alike.masked_fill(relation != DIFFERENT, -torch.inf)
     losses = torch.logsumexp(torch.cat([positive, others], 1), 1) - positive[:, 0]

@@ -35,7 +35,7 @@ def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor
         c = branch.routed(images)[1]
         summed = c.mean(1).sum(0)
         total = summed if total is None else total + summed
-        count += len(images)
+        count += len(c)
     if total is None:
         raise InputError("pruning: no images to rank the capsules with; name training data.")
     return (total / count).view(branch.shape.types, -1)

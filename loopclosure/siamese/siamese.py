@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,31 +23,65 @@ from vslam.loopclosure.siamese.branches import (
     alexnet,
     vgg16,
 )
-from vslam.loopclosure.siamese.capsules import length
 from vslam.loopclosure.siamese.extractors import fold_batch_norms
 from vslam.loopclosure.siamese.weights import NETWORKS
 
+Product = Callable[[Tensor, Tensor], Tensor]
+
+
+def each_with_each(a: Tensor, b: Tensor) -> Tensor:
+    """Products ``(N, M)`` of the rows of ``(N, D)`` and ``(M, D)``."""
+    return a @ b.T
+
+
+def one_by_one(a: Tensor, b: Tensor) -> Tensor:
+    """Products ``(N,)`` of the rows of ``(N, D)`` and ``(N, D)``."""
+    return (a * b).sum(1)
+
+
+def cosines(a: Tensor, b: Tensor, views: int = 1, product: Product = each_with_each) -> Tensor:
+    """Cosines of unit descriptors ``(N, D)`` and ``(M, D)``.
+
+    With two views the largest of three: views compared as they lie, the left one of ``a`` with the
+    right one of ``b``, and the reverse. A camera that has turned sees on its left what lay to the
+    right. (Not in the paper, which compares whole images only.)
+    """
+    straight = product(a, b)
+    if views == 1:
+        return straight
+    (left, right), (other_left, other_right) = a.chunk(2, 1), b.chunk(2, 1)
+    crossed = torch.maximum(product(left, other_right), product(right, other_left))
+    return torch.maximum(straight, 2.0 * crossed)  # each view has half of the squared length
+
+
+_TINY = 1e-12  # keeps the square root differentiable at 0
+
 
 class DistanceHead(nn.Module):
-    """``p = sigmoid(a - b d)`` (Eq. 2) of the distance d of two descriptors (Eq. 10), a, b > 0."""
+    """``p = sigmoid(a - b d)`` (Eq. 2) of the distance d of two descriptors (Eq. 10), a, b > 0.
 
-    def __init__(self) -> None:
+    With two views d is that of the descriptors in the best of the ways of :func:`cosines`.
+    """
+
+    def __init__(self, views: int = 1) -> None:
         super().__init__()
+        self.views = views
         # p = 0.5 at d = 1.1, between pairs of one and of two places under random weights.
         self.log_a = nn.Parameter(torch.tensor(1.5))
         self.log_b = nn.Parameter(torch.tensor(1.4))
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
         """Logits ``(N,)`` of pairs of ``(N, D)`` unit descriptors."""
-        return self.of_distance(length(a - b))
+        return self.of_cosine(cosines(a, b, self.views, one_by_one))
 
-    def of_distance(self, d: Tensor) -> Tensor:
-        """Logit of a distance."""
+    def of_cosine(self, cosine: Tensor) -> Tensor:
+        """Logit of the cosine of unit descriptors, at distance ``sqrt(2 - 2 cos)``."""
+        d = torch.sqrt((2.0 - 2.0 * cosine).clamp_min(0.0) + _TINY)
         return self.log_a.exp() - self.log_b.exp() * d
 
     def compare(self, query: Tensor, gallery: Tensor) -> Tensor:
         """Logits ``(M,)`` of one ``(D,)`` descriptor with each of ``(M, D)``, one product."""
-        return self.of_distance(torch.sqrt((2.0 - 2.0 * (gallery @ query)).clamp_min(0.0)))
+        return self.of_cosine(cosines(query[None], gallery, self.views)[0])
 
 
 class ConcatenationHead(nn.Module):
@@ -94,7 +130,12 @@ class SiameseNetwork(nn.Module):
 
     def embed(self, images: Tensor) -> Tensor:
         """``(N, 3, H, W)`` float32 in [0, 1] to ``(N, D)`` float32 descriptors of L2 norm 1."""
-        return functional.normalize(self.branch(images).float(), dim=1)
+        views = torch.stack(self.branch(images).float().chunk(self.branch.views, 1), 1)
+        return functional.normalize(views, dim=2).flatten(1) / math.sqrt(self.branch.views)
+
+    def cosines(self, a: Tensor, b: Tensor) -> Tensor:
+        """``(N, M)`` of descriptors ``(N, D)`` and ``(M, D)``: see :func:`cosines`."""
+        return cosines(a, b, self.branch.views)
 
     def logits(self, a: Tensor, b: Tensor) -> Tensor:
         """Logit of ``similarity``, what training works on."""
@@ -128,11 +169,12 @@ def build_network(name: str, shape: CapsuleShape | None = None) -> SiameseNetwor
         InputError: unknown name.
     """
     if name in ("capsule", "capsule-pruned"):
-        return SiameseNetwork(name, CapsuleBranch(shape or CapsuleShape()), DistanceHead())
+        branch = CapsuleBranch(shape or CapsuleShape())
+        return SiameseNetwork(name, branch, DistanceHead(branch.views))
     if name not in NETWORKS:
         raise InputError(f"{name}: no such network; choose one of {', '.join(NETWORKS)}.")
-    branch = alexnet() if name == "alexnet" else vgg16()
-    return SiameseNetwork(name, branch, ConcatenationHead(branch.dimensions))
+    other = alexnet() if name == "alexnet" else vgg16()
+    return SiameseNetwork(name, other, ConcatenationHead(other.dimensions))
 
 
 def save_network(

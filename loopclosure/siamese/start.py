@@ -79,15 +79,18 @@ def starting_network(
     if network.name != settings.network:
         raise InputError(f"{weights}: weights of {network.name}, not of {settings.network}.")
     if isinstance(network.branch, CapsuleBranch):
-        if settings.shape.input != network.size:
-            network = resized(network, settings.shape.input)
+        before, wanted = network.branch.shape, settings.shape
+        if (before.input, before.views) != (wanted.input, wanted.views):
+            network = resized(network, wanted.input, wanted.views)
             about["resized_to"] = network.size
         settings = settings.model_copy(update={"shape": network.branch.shape})
     return network, settings, about
 
 
-def resized(network: SiameseNetwork, size: Size) -> SiameseNetwork:
-    """A network for images of another size that computes alike; training it further mends the rest.
+def resized(network: SiameseNetwork, size: Size, views: int | None = None) -> SiameseNetwork:
+    """A network for images of another size or number of views that computes alike.
+
+    Training it further mends the rest.
 
     Convolutions and transforms stay, the gains of the places are interpolated over the new grid.
     So a network learns most at a small size, where an image costs a third (Howard's progressive
@@ -101,7 +104,7 @@ def resized(network: SiameseNetwork, size: Size) -> SiameseNetwork:
         raise InputError(f"{network.name}: cannot take images of another size.")
     if branch.shape.kept is not None:
         raise InputError(f"{network.name}: is pruned to the places of its grid; resize before.")
-    shape = branch.shape.for_images_of(size)
+    shape = branch.shape.for_images_of(size, views)
     larger = build_network(network.name, shape)
     state = network.state_dict()
     gains = state.pop("branch.capsules.gains")

@@ -229,7 +229,9 @@ def _step(
     if settings.loss == "bce+contrast":
         both = np.concatenate([a, b])
         relation = torch.from_numpy(collection.relation[np.ix_(both, both)]).to(device)
-        loss = loss + contrast(first, second, same, relation, settings.temperature)
+        loss = loss + contrast(
+            network.cosines(descriptors, descriptors), same, relation, settings.temperature
+        )
     if teacher is not None:
         with torch.no_grad():
             wanted = teacher.embed(images)
@@ -277,8 +279,8 @@ def _pairs_of_epoch(
     if progress.epoch > 0 and settings.hard_share > 0:  # random weights find nothing hard
         if len(images) > settings.mined_images:
             images = np.sort(rng.choice(images, settings.mined_images, replace=False))
-        descriptors = embed_all(network, collection.images[images], device)
-        hard = mine(collection, images, descriptors)
+        d = torch.from_numpy(embed_all(network, collection.images[images], device))
+        hard = mine(collection, images, network.cosines(d, d).numpy())
     return draw_pairs(
         collection, images, settings.pairs, rng, hard, settings.hard_share,
         same_share=settings.same_share, together=settings.together, emphasis=settings.emphasis,

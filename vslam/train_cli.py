@@ -158,9 +158,9 @@ def _train(
     quiet: bool,
 ) -> Outcome:
     from vslam.loopclosure.siamese.card import describe, write_card
+    from vslam.loopclosure.siamese.checkpoint import CHECKPOINT
     from vslam.loopclosure.siamese.siamese import load_network
     from vslam.loopclosure.siamese.start import starting_network
-    from vslam.loopclosure.siamese.training import CHECKPOINT
     from vslam.loopclosure.siamese.training import train as run
     from vslam.progress import training_bar
 

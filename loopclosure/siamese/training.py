@@ -13,17 +13,22 @@ import math
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from vslam.errors import InputError, ResultsError
 from vslam.loopclosure.siamese.augmentation import augment
+from vslam.loopclosure.siamese.checkpoint import (
+    CHECKPOINT,
+    Progress,
+    load_checkpoint,
+    save_checkpoint,
+)
 from vslam.loopclosure.siamese.data import (
     Collection,
     Pairs,
@@ -55,23 +60,8 @@ from vslam.loopclosure.siamese.siamese import (
 OnStep = Callable[[int, int, int, float], None]
 """``(epoch, step, steps of the epoch, loss)``"""
 
-CHECKPOINT = "checkpoint.pt"
 _CHECKPOINT_EVERY_S = 300.0
 _HEAD_RATE = 30.0  # a and b are logarithms of single numbers: Adam's steps are small for them
-
-
-@dataclass
-class Progress:
-    """Where a training stands: what a checkpoint holds beside weights and moments."""
-
-    epoch: int = 0
-    step: int = 0
-    best: float = -1.0
-    stale: int = 0
-    loss_sum: float = 0.0
-    seconds: float = 0.0
-    images: int = 0
-    history: list[dict[str, float]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -140,9 +130,9 @@ def train(
     steps = max(1, settings.pairs // settings.batch)
     weights = folder / f"{settings.network}.safetensors"
     if resume and (folder / CHECKPOINT).exists():
-        progress, pairs = _load_checkpoint(folder / CHECKPOINT, settings, network, optimiser)
+        progress, pairs = load_checkpoint(folder / CHECKPOINT, settings, network, optimiser)
     else:  # so that there is one to keep, whatever the first steps do
-        _save_checkpoint(folder / CHECKPOINT, settings, network, optimiser, progress, None)
+        save_checkpoint(folder / CHECKPOINT, settings, network, optimiser, progress, None)
     saved = time.monotonic()
     with ThreadPoolExecutor(threads) as pool:
         while progress.epoch < settings.epochs and progress.stale < settings.patience:
@@ -176,7 +166,7 @@ def train(
                 if stop or time.monotonic() - saved > _CHECKPOINT_EVERY_S:
                     progress.seconds += time.monotonic() - began
                     began = saved = time.monotonic()
-                    _save_checkpoint(
+                    save_checkpoint(
                         folder / CHECKPOINT, settings, network, optimiser, progress, pairs
                     )
                 if stop:
@@ -185,7 +175,7 @@ def train(
             progress.seconds += time.monotonic() - began
             progress.history[-1]["seconds"] = progress.seconds
             pairs = None
-            _save_checkpoint(folder / CHECKPOINT, settings, network, optimiser, progress, None)
+            save_checkpoint(folder / CHECKPOINT, settings, network, optimiser, progress, None)
             saved = time.monotonic()
             _write_log(folder / "log.csv", progress.history)
     best, about = load_network(weights)
@@ -333,62 +323,6 @@ def _open_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: torch finds no CUDA device; train with --device cpu.")
     return torch.device(name)
-
-
-def _save_checkpoint(
-    path: Path,
-    settings: TrainSettings,
-    network: SiameseNetwork,
-    optimiser: torch.optim.Optimizer,
-    progress: Progress,
-    pairs: Pairs | None,
-) -> None:
-    content = {
-        "settings": settings.model_dump_json(),
-        "network": network.state_dict(),
-        "optimiser": optimiser.state_dict(),
-        "progress": vars(progress),
-        "pairs": None if pairs is None else [torch.from_numpy(x) for x in vars(pairs).values()],
-    }
-    temporary = path.with_suffix(".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        torch.save(content, temporary)
-        temporary.replace(path)
-    except (OSError, RuntimeError) as error:
-        raise ResultsError(f"{path}: the checkpoint cannot be written ({error}).") from error
-
-
-def _load_checkpoint(
-    path: Path,
-    settings: TrainSettings,
-    network: SiameseNetwork,
-    optimiser: torch.optim.Optimizer,
-) -> tuple[Progress, Pairs | None]:
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        written = TrainSettings.model_validate_json(content["settings"])
-    except ValidationError as error:
-        raise InputError(f"{path}: of another version of vslam; use another --out.") from error
-    except Exception as error:  # torch raises half a dozen kinds
-        raise InputError(f"{path}: not a readable checkpoint; remove it to start anew.") from error
-    # A lower learning rate is what a diverged training is resumed with.
-    free = {"learning_rate": settings.learning_rate, "patience": settings.patience}
-    if written.model_copy(update=free) != settings:
-        raise InputError(
-            f"{path}: written with other settings; use those of settings.json beside it, or "
-            "another --out."
-        )
-    try:
-        network.load_state_dict(content["network"])
-        optimiser.load_state_dict(content["optimiser"])
-    except (RuntimeError, ValueError) as error:
-        raise InputError(
-            f"{path}: of another network, or of another version of vslam; use another --out."
-        ) from error
-    stored = content["pairs"]
-    pairs = None if stored is None else Pairs(*(x.numpy() for x in stored))
-    return Progress(**content["progress"]), pairs
 
 
 def _write_log(path: Path, history: list[dict[str, float]]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,32 +25,26 @@ from vslam.loopclosure.siamese.branches import (
 from vslam.loopclosure.siamese.extractors import fold_batch_norms
 from vslam.loopclosure.siamese.weights import NETWORKS
 
-Product = Callable[[Tensor, Tensor], Tensor]
 
+def arrangements(descriptors: Tensor, views: int) -> Tensor:
+    """Ways to hold images against others, ``(K, N, D)`` of unit descriptors ``(N, D)``.
 
-def each_with_each(a: Tensor, b: Tensor) -> Tensor:
-    """Products ``(N, M)`` of the rows of ``(N, D)`` and ``(M, D)``."""
-    return a @ b.T
-
-
-def one_by_one(a: Tensor, b: Tensor) -> Tensor:
-    """Products ``(N,)`` of the rows of ``(N, D)`` and ``(N, D)``."""
-    return (a * b).sum(1)
-
-
-def cosines(a: Tensor, b: Tensor, views: int = 1, product: Product = each_with_each) -> Tensor:
-    """Cosines of unit descriptors ``(N, D)`` and ``(M, D)``.
-
-    With two views the largest of three: views compared as they lie, the left one of ``a`` with the
-    right one of ``b``, and the reverse. A camera that has turned sees on its left what lay to the
-    right. (Not in the paper, which compares whole images only.)
+    With two views three: as they lie, the left view on the right one of the other image, and the
+    reverse. A camera that has turned sees on its left what lay to the right. (Not in the paper,
+    which compares whole images only.)
     """
-    straight = product(a, b)
     if views == 1:
-        return straight
-    (left, right), (other_left, other_right) = a.chunk(2, 1), b.chunk(2, 1)
-    crossed = torch.maximum(product(left, other_right), product(right, other_left))
-    return torch.maximum(straight, 2.0 * crossed)  # each view has half of the squared length
+        return descriptors[None]
+    left, right = descriptors.chunk(2, -1)
+    nothing = torch.zeros_like(left)
+    # Each view has half of the squared length.
+    to_right, to_left = torch.cat([nothing, 2 * left], -1), torch.cat([2 * right, nothing], -1)
+    return torch.stack([descriptors, to_right, to_left])
+
+
+def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
+    """Cosines ``(N, M)`` of ``(N, D)`` and ``(M, D)``, each in the best of the arrangements."""
+    return (arrangements(a, views) @ b.T).amax(0)
 
 
 _TINY = 1e-12  # keeps the square root differentiable at 0
@@ -60,7 +53,7 @@ _TINY = 1e-12  # keeps the square root differentiable at 0
 class DistanceHead(nn.Module):
     """``p = sigmoid(a - b d)`` (Eq. 2) of the distance d of two descriptors (Eq. 10), a, b > 0.
 
-    With two views d is that of the descriptors in the best of the ways of :func:`cosines`.
+    With two views d is that of the descriptors in the best of the :func:`arrangements`.
     """
 
     def __init__(self, views: int = 1) -> None:
@@ -72,7 +65,7 @@ class DistanceHead(nn.Module):
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
         """Logits ``(N,)`` of pairs of ``(N, D)`` unit descriptors."""
-        return self.of_cosine(cosines(a, b, self.views, one_by_one))
+        return self.of_cosine((arrangements(a, self.views) * b).sum(2).amax(0))
 
     def of_cosine(self, cosine: Tensor) -> Tensor:
         """Logit of the cosine of unit descriptors, at distance ``sqrt(2 - 2 cos)``."""
@@ -134,7 +127,7 @@ class SiameseNetwork(nn.Module):
         return functional.normalize(views, dim=2).flatten(1) / math.sqrt(self.branch.views)
 
     def cosines(self, a: Tensor, b: Tensor) -> Tensor:
-        """``(N, M)`` of descriptors ``(N, D)`` and ``(M, D)``: see :func:`cosines`."""
+        """``(N, M)`` of descriptors ``(N, D)`` and ``(M, D)``, each in the best arrangement."""
         return cosines(a, b, self.branch.views)
 
     def logits(self, a: Tensor, b: Tensor) -> Tensor:

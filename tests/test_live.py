@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import threading
@@ -109,6 +110,23 @@ def test_one_eye_in_real_time(kitti_tree, threads):
     outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
     assert len(outcome.tracks) == 6
     assert len(outcome.latency_ms) == sum(track.n_features > 0 for track in outcome.tracks) > 0
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_an_unreadable_image_in_real_time(kitti_tree, threads, tmp_path):
+    """Of the last frame, the one that is never dropped: the run ends all the same."""
+    root = tmp_path / "kitti"
+    shutil.copytree(kitti_tree, root)
+    image = root / "sequences" / "00" / "image_1" / "000005.png"
+    image.write_bytes(image.read_bytes()[:2000])
+    sequence = open_sequence("kitti", root, "00", max_frames=6)
+    settings = RunSettings(
+        "kitti", "00", "none", "none", "stereo", 0, threads, 0, 1, 6, Config(), realtime=True
+    )
+    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    assert len(outcome.trajectory) == len(outcome.tracks) == 6
+    assert outcome.tracks[5].state == TrackingState.LOST
+    assert [str(image) in message for message in outcome.skipped] == [True]
 
 
 def test_command_line_in_real_time(kitti_tree, tmp_path):

@@ -34,13 +34,13 @@ def small_settings(**changes: object) -> TrainSettings:
 def views(places: int, seed: int = 0) -> Collection:
     """Two views of each of some places: blobs, the second moved by 3 pixels and darker."""
     rng = np.random.default_rng(seed)
-    squares = []
+    images = []
     for _ in range(places):
         blobs = rng.integers(0, 255, (8, 8)).astype(np.uint8)
         first = cv2.resize(blobs, (64, 64), interpolation=cv2.INTER_CUBIC)
         second = np.roll(first, 3, axis=1) * 0.8 + 20 + rng.normal(0, 4, first.shape)
-        squares += [first, np.clip(second, 0, 255).astype(np.uint8)]
+        images += [first, np.clip(second, 0, 255).astype(np.uint8)]
     place = np.arange(2 * places) // 2
     relation = np.where(place[:, None] == place[None], 1, -1).astype(np.int8)
     names = tuple(f"blobs/all/{k}" for k in range(2 * places))
-    return Collection(names, np.stack(squares), relation, place, (("blobs", 2 * places),))
+    return Collection(names, np.stack(images), relation, place, (("blobs", 2 * places),))

@@ -174,6 +174,12 @@ def test_train_writes_weights_and_card(tmp_path):
     assert files >= {"capsule.safetensors", "capsule.json", "capsule.md", "log.csv",
                      "checkpoint.pt", "settings.json", "pairs"}  # fmt: skip
     full, shipped = out / "capsule.safetensors", tmp_path / "ship" / "capsule.safetensors"
+    # Without settings of its own a training takes images of the size that its weights take.
+    command = ["train", "capsule-pruned", "--data", f"pairs:{data}", "--weights", str(full)]
+    command += ["--pairs", "16", "--epochs", "1", "--out", str(tmp_path / "p"), "--threads", "1"]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    assert load_network(tmp_path / "p" / "capsule-pruned.safetensors")[0].size == (64, 64)
     done = CliRunner().invoke(
         app, ["export", "weights", "--weights", str(full), "--out", str(shipped)]
     )

@@ -223,6 +223,12 @@ def test_pruning_and_fine_tuning(tmp_path):
     cut = replace(collection, images=collection.images[:, :48])
     network, _, report = starting_network(smaller, cut, full.weights, "cpu")
     assert network.size == report["resized_to"] == (48, 64)
+    assert {"ms_before", "ms_resized", "ms_removed"} <= set(report)
+    # Ranking capsules learns nothing: statistics of normalisations stay as they were trained.
+    before, after = load_network(full.weights)[0].state_dict(), network.state_dict()
+    for name in before:
+        if "running" in name:
+            assert torch.equal(before[name], after[name]), name
     with pytest.raises(InputError, match="--weights"):
         starting_network(wanted, collection, None, "cpu")
     with pytest.raises(InputError, match="weights of capsule, not of alexnet"):

@@ -168,7 +168,7 @@ class SiameseConfig(_Section):
         15, ge=1, description="Landmarks shared with a better candidate: the same place. [OS1]"
     )
     fit: Literal["squash", "crop"] = Field(
-        "squash", description="Whole view squashed into the network's square, or its centre. [own]"
+        "squash", description="Whole view squashed into the network's input, or its middle. [own]"
     )
 
 

@@ -109,6 +109,7 @@ def train(
     from vslam.loopclosure.siamese.places import open_source
     from vslam.loopclosure.siamese.runtime import set_threads
     from vslam.loopclosure.siamese.settings import PRESETS, load_settings
+    from vslam.loopclosure.siamese.siamese import load_network
 
     if preset not in PRESETS:
         raise InputError(f"--preset {preset}: unknown; choose one of {', '.join(PRESETS)}.")
@@ -120,9 +121,14 @@ def train(
     given = {"epochs": epochs, "pairs": pairs, "seed": seed, "network": network,
              "prune_share": prune_share}  # fmt: skip
     chosen = chosen.model_copy(update={k: v for k, v in given.items() if v is not None})
+    size: tuple[int, int] = chosen.shape.input
+    views: int = chosen.shape.views
+    if weights is not None and weights.suffix == ".safetensors" and settings is None:
+        given_network, _ = load_network(weights)
+        size, views = given_network.size, given_network.branch.views
     if pixels is not None:
-        shape = chosen.shape.for_images_of(parse_size(pixels))
-        chosen = chosen.model_copy(update={"shape": shape})
+        size = parse_size(pixels)
+    chosen = chosen.model_copy(update={"shape": chosen.shape.for_images_of(size, views)})
     if network in ("alexnet", "vgg16") and chosen.shape.input != (227, 227):
         raise InputError(f"vslam train {network}: takes images of 227 pixels; add --pixels 227.")
     folder = out or Path("training") / f"{network}-{preset}"
@@ -173,8 +179,9 @@ def _train(
         teacher, _ = load_network(weights)
         if (teacher.size, teacher.branch.views) != (settings.shape.input, settings.shape.views):
             raise InputError(
-                f"{weights}: takes images of {_text(teacher.size)} pixels, a network that is to "
-                f"stay near it cannot have {_text(settings.shape.input)}."
+                f"{weights}: has {teacher.branch.views} view(s) of {_text(teacher.size)} pixels, a "
+                f"network that is to stay near it cannot have {settings.shape.views} of "
+                f"{_text(settings.shape.input)}."
             )
     start, settings, report = starting_network(
         settings, collection, weights, device, resuming=resume and (folder / CHECKPOINT).exists()

@@ -16,8 +16,10 @@ class Augmentation(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    homography: float = Field(0.10, ge=0, le=0.4, description="Largest move of a corner, of side.")
-    shift: float = Field(0.10, ge=0, le=0.5, description="Largest horizontal shift, of side.")
+    homography: float = Field(
+        0.10, ge=0, le=0.4, description="Largest move of a corner, of each side."
+    )
+    shift: float = Field(0.10, ge=0, le=0.5, description="Largest horizontal shift, of width.")
     turn: float = Field(0.0, ge=0, le=45, description="Largest turn of the camera, degrees.")
     zoom: float = Field(0.0, ge=0, le=1, description="Largest logarithm of a zoom: driven on.")
     log_gain: float = Field(0.35, ge=0, description="Deviation of the logarithm of the gain.")

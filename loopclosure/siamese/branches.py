@@ -26,8 +26,8 @@ from vslam.loopclosure.siamese.weights import read_pth
 _IMAGENET_MEAN = (0.485, 0.456, 0.406)
 _IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 
-_VIEW = 0.75  # of the width of an image, where it has two views
-_STRIDE = 16  # of the extractors
+_UNSEEN = 0.25  # of the width of an image, by each of two views
+_STRIDE = 16  # of lite0, and of light with its own blocks
 
 
 def _have_shortcuts(blocks: tuple[int, ...]) -> tuple[int, ...]:
@@ -75,11 +75,12 @@ class CapsuleShape(BaseModel):
     def view(self) -> Size:
         """Height and width of what a descriptor sees: the image, or three quarters of its width.
 
-        Rounded to ``16 n + 1``, so that the columns of both views fall on columns of the image.
+        What one view does not see is whole columns of the grid, so that those of both coincide.
         """
         height, width = self.input
-        part = _STRIDE * round((_VIEW * width - 1) / _STRIDE) + 1
-        return height, width if self.views == 1 else min(width, part)
+        if self.views == 1:
+            return height, width
+        return height, width - _STRIDE * max(1, round(_UNSEEN * width / _STRIDE))
 
     @property
     def grid(self) -> tuple[int, int]:

@@ -18,18 +18,18 @@ from torch import Tensor, nn
 
 Over = Literal["primary", "output"]
 _DEVIATION = 0.12  # of a prediction vector at the start, over the root of the capsules
-_TINY = 1e-12  # keeps the square root differentiable at 0
+TINY = 1e-12  # keeps the square root differentiable at 0
 
 
 def squash(s: Tensor) -> Tensor:
     """Eq. 8: ``|s|² / (1 + |s|²) · s / |s|`` along the last axis; the length is below 1."""
     squared = (s * s).sum(-1, keepdim=True)
-    return s * (torch.sqrt(squared + _TINY) / (1.0 + squared))
+    return s * (torch.sqrt(squared + TINY) / (1.0 + squared))
 
 
 def length(v: Tensor) -> Tensor:
     """Eq. 9: L2 norm along the last axis, with a finite gradient at 0."""
-    return torch.sqrt((v * v).sum(-1) + _TINY)
+    return torch.sqrt((v * v).sum(-1) + TINY)
 
 
 def predict(u: Tensor, W: Tensor) -> Tensor:

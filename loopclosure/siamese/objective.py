@@ -57,7 +57,7 @@ def imitation(descriptors: Tensor, wanted: Tensor) -> Tensor:
 def embed_all(
     network: SiameseNetwork, images: NDArray[np.uint8], device: torch.device, batch: int = 64
 ) -> NDArray[np.float32]:
-    """Descriptors ``(N, D)`` of ``(N, S, S)`` images, in eval mode."""
+    """Descriptors ``(N, D)`` of ``(N, H, W)`` images, in eval mode."""
     network.eval()
     parts = [
         network.embed(to_tensor(images[k : k + batch]).to(device)).cpu()

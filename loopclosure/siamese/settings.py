@@ -19,7 +19,9 @@ class TrainSettings(BaseModel):
 
     network: str = Field("capsule", description="Network to train.")
     shape: CapsuleShape = Field(CapsuleShape(), description="Of a capsule branch.")
-    fit: Literal["squash", "crop"] = Field("squash", description="Whole view, or central square.")
+    fit: Literal["squash", "crop"] = Field(
+        "squash", description="Whole view, or its middle in the aspect of the input."
+    )
     seed: int = Field(0, ge=0, description="Of weights, division, pairs and augmentation.")
     loss: Literal["bce", "bce+contrast"] = Field("bce", description="Eq. 3, or with contrast.")
     imitation: float = Field(

@@ -22,6 +22,7 @@ from vslam.loopclosure.siamese.branches import (
     alexnet,
     vgg16,
 )
+from vslam.loopclosure.siamese.capsules import TINY
 from vslam.loopclosure.siamese.extractors import fold_batch_norms
 from vslam.loopclosure.siamese.weights import NETWORKS
 
@@ -47,9 +48,6 @@ def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
     return (arrangements(a, views) @ b.T).amax(0)
 
 
-_TINY = 1e-12  # keeps the square root differentiable at 0
-
-
 class DistanceHead(nn.Module):
     """``p = sigmoid(a - b d)`` (Eq. 2) of the distance d of two descriptors (Eq. 10), a, b > 0.
 
@@ -69,7 +67,7 @@ class DistanceHead(nn.Module):
 
     def of_cosine(self, cosine: Tensor) -> Tensor:
         """Logit of the cosine of unit descriptors, at distance ``sqrt(2 - 2 cos)``."""
-        d = torch.sqrt((2.0 - 2.0 * cosine).clamp_min(0.0) + _TINY)
+        d = torch.sqrt((2.0 - 2.0 * cosine).clamp_min(0.0) + TINY)
         return self.log_a.exp() - self.log_b.exp() * d
 
     def compare(self, query: Tensor, gallery: Tensor) -> Tensor:

@@ -114,14 +114,16 @@ def resized(network: SiameseNetwork, size: Size, views: int | None = None) -> Si
     grid = functional.interpolate(grid, size=shape.grid, mode="bilinear")
     state["branch.capsules.gains"] = grid.flatten(2).transpose(1, 2).contiguous()
     larger.load_state_dict(state, strict=False)
-    return larger
+    return larger.train(network.training)
 
 
 def _prune(
     settings: TrainSettings, collection: Collection, weights: Path, device: torch.device
 ) -> tuple[SiameseNetwork, TrainSettings, dict[str, Any]]:
     full, _ = load_network(weights)
-    whole = full if settings.shape.input == full.size else resized(full, settings.shape.input)
+    size, views = settings.shape.input, settings.shape.views
+    fits = (full.size, full.branch.views) == (size, views)
+    whole = full if fits else resized(full, size, views)
     train, validation = divide(collection, settings.seed, settings.validation_share)
     validation = validation_images(validation, settings.validation_images, settings.seed)
     step = max(1, len(train) // _RANKED_IMAGES)
@@ -138,8 +140,11 @@ def _prune(
     for name, network in (("before", whole), ("removed", smaller)):
         figures = validate(network, collection, validation, settings.augmentation, device)[0]
         report[f"average_precision_{name}"] = figures["average_precision"]
-    copies = [for_inference(copy.deepcopy(network).cpu()) for network in (full, smaller)]
-    report["ms_before"], report["ms_removed"] = milliseconds_per_image(*copies)
+    timed = {"ms_before": full, "ms_removed": smaller}
+    if whole is not full:
+        timed["ms_resized"] = whole
+    copies = [for_inference(copy.deepcopy(network).cpu()) for network in timed.values()]
+    report |= dict(zip(timed, milliseconds_per_image(*copies), strict=True))
     assert isinstance(smaller.branch, CapsuleBranch)
     settings = settings.model_copy(update={"shape": smaller.branch.shape})
     return smaller, settings, report

@@ -245,11 +245,11 @@ def _augmented(
 ) -> torch.Tensor:
     def one(job: tuple[int, int, int]) -> NDArray[np.uint8]:
         image, pair, side = job
-        square = collection.images[image]
+        picture = collection.images[image]
         if settings.augmentation.mirror and (pair + epoch) // 2 % 2:
-            square = np.ascontiguousarray(square[:, ::-1])
+            picture = np.ascontiguousarray(picture[:, ::-1])
         rng = np.random.default_rng([settings.seed, 3, epoch, pair, side])
-        return augment(square, settings.augmentation, rng)
+        return augment(picture, settings.augmentation, rng)
 
     jobs = [(int(image), first + k, 0) for k, image in enumerate(a)]
     jobs += [(int(image), first + k, 1) for k, image in enumerate(b)]
@@ -270,7 +270,8 @@ def _pairs_of_epoch(
         if len(images) > settings.mined_images:
             images = np.sort(rng.choice(images, settings.mined_images, replace=False))
         d = torch.from_numpy(embed_all(network, collection.images[images], device))
-        hard = mine(collection, images, network.cosines(d, d).numpy())
+        alike = torch.cat([network.cosines(rows, d) for rows in d.split(512)])
+        hard = mine(collection, images, alike.numpy())
     return draw_pairs(
         collection, images, settings.pairs, rng, hard, settings.hard_share,
         same_share=settings.same_share, together=settings.together, emphasis=settings.emphasis,

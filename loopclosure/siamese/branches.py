@@ -19,7 +19,7 @@ from vslam.loopclosure.siamese.extractors import (
     grid_side,
 )
 from vslam.loopclosure.siamese.images import Size
-from vslam.loopclosure.siamese.lite import SKIPPABLE, LiteExtractor, lite_grid_side
+from vslam.loopclosure.siamese.lite import SKIPPABLE, STRIDE, LiteExtractor, lite_grid_side
 from vslam.loopclosure.siamese.weights import read_pth
 
 # ImageNet's statistics, which torchvision's weight files expect.
@@ -27,7 +27,6 @@ _IMAGENET_MEAN = (0.485, 0.456, 0.406)
 _IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 
 _UNSEEN = 0.25  # of the width of an image, by each of two views
-_STRIDE = 16  # of lite0, and of light with its own blocks
 
 
 def _have_shortcuts(blocks: tuple[int, ...]) -> tuple[int, ...]:
@@ -80,7 +79,7 @@ class CapsuleShape(BaseModel):
         height, width = self.input
         if self.views == 1:
             return height, width
-        return height, width - _STRIDE * max(1, round(_UNSEEN * width / _STRIDE))
+        return height, width - STRIDE * max(1, round(_UNSEEN * width / STRIDE))
 
     @property
     def grid(self) -> tuple[int, int]:

@@ -42,7 +42,7 @@ SKIPPABLE = tuple(
     if block[1] == before[1] and block[2] == 1
 )
 _STEM = 32
-_STRIDE = 16  # of stem and stages together
+STRIDE = 16  # of stem and stages together
 _BATCH_NORM_EPSILON = 1e-3
 # The branch hands over images of deviation 1; ImageNet's have about half of that after (x-127)/128.
 _DEVIATION = 0.5
@@ -142,7 +142,7 @@ class LiteExtractor(nn.Module):
 
 def lite_grid_side(pixels: int) -> int:
     """Places along a side of the grid for so many pixels of the image."""
-    return (pixels - 1) // _STRIDE + 1
+    return (pixels - 1) // STRIDE + 1
 
 
 def _folded(state: dict[str, Tensor], conv: str, norm: str) -> tuple[Tensor, Tensor]:

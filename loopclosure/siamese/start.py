@@ -79,9 +79,8 @@ def starting_network(
     if network.name != settings.network:
         raise InputError(f"{weights}: weights of {network.name}, not of {settings.network}.")
     if isinstance(network.branch, CapsuleBranch):
-        before, wanted = network.branch.shape, settings.shape
-        if (before.input, before.views) != (wanted.input, wanted.views):
-            network = resized(network, wanted.input, wanted.views)
+        given, network = network, _fitted(network, settings)
+        if network is not given:
             about["resized_to"] = network.size
         settings = settings.model_copy(update={"shape": network.branch.shape})
     return network, settings, about
@@ -117,13 +116,19 @@ def resized(network: SiameseNetwork, size: Size, views: int | None = None) -> Si
     return larger.train(network.training)
 
 
+def _fitted(network: SiameseNetwork, settings: TrainSettings) -> SiameseNetwork:
+    """The network itself where it sees as the settings say, else a resized one."""
+    size, views = settings.shape.input, settings.shape.views
+    if (network.size, network.branch.views) == (size, views):
+        return network
+    return resized(network, size, views)
+
+
 def _prune(
     settings: TrainSettings, collection: Collection, weights: Path, device: torch.device
 ) -> tuple[SiameseNetwork, TrainSettings, dict[str, Any]]:
     full, _ = load_network(weights)
-    size, views = settings.shape.input, settings.shape.views
-    fits = (full.size, full.branch.views) == (size, views)
-    whole = full if fits else resized(full, size, views)
+    whole = _fitted(full, settings)
     train, validation = divide(collection, settings.seed, settings.validation_share)
     validation = validation_images(validation, settings.validation_images, settings.seed)
     step = max(1, len(train) // _RANKED_IMAGES)

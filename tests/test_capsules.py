@@ -94,11 +94,15 @@ def test_factored_routing_is_the_paper_s_routing(over, iterations, some_dead):
         assert torch.allclose(mine, reference, atol=1e-5)
 
 
-def test_gradients_are_finite_and_pass_through_the_last_iteration_only():
+@pytest.mark.parametrize("over", ["primary", "output"])
+@pytest.mark.parametrize("iterations", [1, 3])
+@pytest.mark.parametrize("some_dead", [False, True])
+def test_gradients_are_finite_and_pass_through_the_last_iteration_only(over, iterations, some_dead):
     torch.manual_seed(3)
     u = capsules.squash(torch.randn(2, 3, 4, 5)).requires_grad_()
     W = torch.randn(2, 3, 5, 6, requires_grad=True)
-    v, c = capsules.route_factored(u, W, 3)
+    alive = torch.rand(12) > 0.3 if some_dead else None
+    v, c = capsules.route_factored(u, W, iterations, over, alive)
     assert not c.requires_grad
     by_hand = capsules.squash(capsules.combine(c, capsules.predict(u, W)))
     weight = torch.randn_like(v)
@@ -107,6 +111,17 @@ def test_gradients_are_finite_and_pass_through_the_last_iteration_only():
     for gradient, reference in zip(mine, wanted, strict=True):
         assert torch.isfinite(gradient).all()
         assert torch.allclose(gradient, reference, atol=1e-5)
+
+
+@torch.no_grad()
+def test_routing_is_never_in_half_precision():
+    layer = small_network().branch.capsules
+    u = capsules.squash(torch.randn(2, 8, layer.places, 8)).bfloat16()
+    exact = layer.routed(u.float())
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(layer(u), exact[0])
+        for mine, wanted in zip(layer.routed(u), exact, strict=True):
+            assert torch.equal(mine, wanted)
 
 
 def test_every_parameter_learns():

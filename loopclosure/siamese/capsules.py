@@ -104,21 +104,35 @@ def route_factored(
     Returns:
         As :func:`route`.
     """
+    v, e, total = _route_undivided(u, W, iterations, over, alive)
+    return v, _divided(e, total)
+
+
+def _divided(e: Tensor, total: Tensor) -> Tensor:
+    """Couplings ``(N, J, I)``."""
+    return (e / total).transpose(1, 2).flatten(2)
+
+
+def _route_undivided(
+    u: Tensor, W: Tensor, iterations: int, over: Over, alive: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Output capsules ``(N, J, D)``, and couplings as ``e / total``.
+
+    ``e`` is ``(N, T, J, P)``, ``total`` ``(N, 1, J, 1)`` or ``(1,)``: what is divided here are sums
+    over P, a sixth of the numbers.
+    """
     n, types, places, size = u.shape
     outputs, _, _, depth = W.shape
     W_j = W.reshape(outputs, types * size, depth)
     rows = u.reshape(n * types, places, size)
     present = None if alive is None else alive.view(types, 1, places)
 
-    def sums(pooled: Tensor) -> Tensor:
-        """``Σ_p c u`` of each type and output ``(N, T, J, A)`` to ``s`` ``(N, J, D)``."""
-        s = torch.bmm(pooled.permute(2, 0, 1, 3).reshape(outputs, n, types * size), W_j)
-        return s.transpose(0, 1)
-
-    def combined(c: Tensor) -> Tensor:
-        """Couplings ``(N, T, J, P)`` to ``s`` ``(N, J, D)``."""
-        pooled = torch.bmm(c.view(n * types, outputs, places), rows)
-        return sums(pooled.view(n, types, outputs, size))
+    def combined(e: Tensor, total: Tensor) -> Tensor:
+        """``s`` ``(N, J, D)``."""
+        pooled = torch.bmm(e.view(n * types, outputs, places), rows)
+        pooled = pooled.view(n, types, outputs, size) / total
+        pooled = pooled.permute(2, 0, 1, 3).reshape(outputs, n, types * size)
+        return torch.bmm(pooled, W_j).transpose(0, 1)
 
     def agreements(v: Tensor) -> Tensor:
         """Outputs ``(N, J, D)`` to agreements ``(N, T, J, P)``."""
@@ -126,30 +140,39 @@ def route_factored(
         back = back.permute(1, 2, 0, 3).reshape(n * types, outputs, size)
         return torch.bmm(back, rows.transpose(1, 2)).view(n, types, outputs, places)
 
-    def couplings(b: Tensor) -> Tensor:
-        """Eq. 6 for logits ``(N, T, J, P)``."""
+    def couplings(b: Tensor) -> tuple[Tensor, Tensor]:
+        """Eq. 6 for logits ``(N, T, J, P)``.
+
+        In place: they lose a constant for each output, which changes no softmax, now or later.
+        """
         if over == "output":
             c = torch.softmax(b, dim=2)
-            return c if present is None else c * present
+            return c if present is None else c * present, b.new_ones(1)
         if present is not None:
-            b = b.masked_fill(~present, -torch.inf)
-        e = (b - b.amax((1, 3), keepdim=True)).exp_()
-        return e.div_(e.sum((1, 3), keepdim=True))
+            b.masked_fill_(~present, -torch.inf)
+        # One axis at a time: along the last one is several times faster than along two apart.
+        b -= b.amax(3, keepdim=True).amax(1, keepdim=True)
+        e = torch.exp(b)
+        return e, e.sum(3, keepdim=True).sum(1, keepdim=True)
 
     with torch.no_grad():
-        # With b = 0 all capsules count alike: the first sums are means, without a softmax.
-        here = rows if present is None else rows * present.view(types, places, 1).repeat(n, 1, 1)
-        count = places * types if alive is None else alive.sum()
-        share = 1.0 / (count if over == "primary" else outputs)
-        means = here.sum(1).view(n, types, 1, size).expand(-1, -1, outputs, -1) * share
         if iterations == 1:
-            c = couplings(u.new_zeros((n, types, outputs, places)))
+            e, total = couplings(u.new_zeros((n, types, outputs, places)))
         else:
-            b = agreements(squash(sums(means)))
+            # With b = 0 all capsules count alike: the first sums are means, the same for all
+            # outputs, without a softmax.
+            here = rows
+            if present is not None:
+                here = rows * present.view(types, places, 1).repeat(n, 1, 1)
+            count = places * types if alive is None else alive.sum()
+            share = 1.0 / (count if over == "primary" else outputs)
+            means = here.sum(1).view(n, types * size) * share
+            s = torch.bmm(means.expand(outputs, -1, -1), W_j).transpose(0, 1)
+            b = agreements(squash(s))
             for _ in range(iterations - 2):
-                b += agreements(squash(combined(couplings(b))))
-            c = couplings(b)
-    return squash(combined(c)), c.transpose(1, 2).flatten(2)
+                b += agreements(squash(combined(*couplings(b))))
+            e, total = couplings(b)
+    return squash(combined(e, total)), e, total
 
 
 def _masked_couple(b: Tensor, over: Over, alive: Tensor | None) -> Tensor:
@@ -203,12 +226,19 @@ class CapsuleLayer(nn.Module):
 
     def forward(self, u: Tensor) -> Tensor:
         """``(N, T, P, A)`` primary capsules to ``(N, J, D)`` output capsules."""
-        return self.routed(u)[0]
+        return self._route(u)[0]
 
     def routed(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Output capsules and the couplings ``(N, J, T K)`` that led to them."""
+        v, e, total = self._route(u)
+        return v, _divided(e, total)
+
+    def _route(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         if self.place.shape[1] < self.places:
             index = self.place[None, :, :, None].expand(u.shape[0], -1, -1, u.shape[3])
             u = torch.gather(u, 2, index)
         alive = self.alive if self.masked else None
-        return route_factored(u * self.gains, self.W, self.iterations, self.over, alive)
+        # It sums thousands of products: never in half precision.
+        with torch.autocast(u.device.type, enabled=False):
+            u = u.float() * self.gains
+            return _route_undivided(u, self.W, self.iterations, self.over, alive)

@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.augmentation import turn_homography
-from vslam.loopclosure.siamese.branches import CapsuleBranch, CapsuleShape
+from vslam.loopclosure.siamese.branches import CapsuleBranch, CapsuleShape, Layout
 from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.pruning import with_shallower_extractor
 from vslam.loopclosure.siamese.siamese import load_network
@@ -163,7 +163,7 @@ def test_it_goes_on_at_another_size(imagenet):
     shape = CapsuleShape(extractor="lite0", pixels=65, types=4, outputs=4)
     network = starting_network(small_settings(shape=shape), views(8), imagenet, "cpu")[0]
     assert network is not None
-    larger = resized(network.eval(), (97, 97)).eval()
+    larger = resized(network.eval(), Layout((97, 97))).eval()
     assert larger.branch.shape.places == 49
     theirs, ours = (dict(n.branch.extractor.named_parameters()) for n in (network, larger))
     for key in theirs:

@@ -15,6 +15,7 @@ from vslam.errors import InputError, ResultsError
 from vslam.loopclosure.benchmark import average_precision, precision_recall
 from vslam.loopclosure.siamese import training
 from vslam.loopclosure.siamese.augmentation import STRONG, Augmentation, augment
+from vslam.loopclosure.siamese.branches import Layout
 from vslam.loopclosure.siamese.card import describe, write_card
 from vslam.loopclosure.siamese.checkpoint import CHECKPOINT
 from vslam.loopclosure.siamese.data import draw_pairs
@@ -181,12 +182,12 @@ def test_the_card_tells_where_the_weights_come_from(tmp_path):
 def test_a_network_goes_on_with_larger_images(tmp_path):
     collection, settings = views(20), small_settings(epochs=3)
     small = train(collection, settings, tmp_path / "small", threads=1)
-    shape = settings.shape.for_images_of((96, 96))
+    shape = settings.shape.with_layout(Layout((96, 96)))
     wanted = settings.model_copy(update={"shape": shape})
     start, fitted, report = starting_network(wanted, collection, small.weights, "cpu")
     assert (start.size, fitted.shape.input, report["resized_to"]) == ((96, 96),) * 3
     first, _ = load_network(small.weights)
-    same = resized(first, first.size).eval()
+    same = resized(first, first.branch.layout).eval()
     x = to_tensor(collection.images[:4])
     with torch.no_grad():
         assert torch.allclose(same.embed(x), first.eval().embed(x), atol=1e-6)
@@ -196,7 +197,7 @@ def test_a_network_goes_on_with_larger_images(tmp_path):
     with torch.no_grad():
         row = torch.arange(side * columns) // columns
         layer.gains.copy_(row.float()[None, :, None].expand_as(layer.gains))
-    grown = resized(first, (96, 160)).branch
+    grown = resized(first, Layout((96, 160))).branch
     assert grown.shape.grid == (12, 20)
     rows = grown.capsules.gains[0, :, 0].reshape(12, 20)
     assert torch.allclose(rows, rows[:, :1].expand_as(rows))
@@ -204,7 +205,7 @@ def test_a_network_goes_on_with_larger_images(tmp_path):
     assert rows[-1, 0].item() == pytest.approx(side - 1)
     branch = pruned(first, lowest(torch.rand(8, SMALL.places), 0.2))
     with pytest.raises(InputError, match="is pruned"):
-        resized(branch, (96, 96))
+        resized(branch, Layout((96, 96)))
 
 
 def test_pruning_and_fine_tuning(tmp_path):
@@ -219,7 +220,7 @@ def test_pruning_and_fine_tuning(tmp_path):
     assert {"average_precision_before", "average_precision_removed"} <= set(report)
     tuned = train(collection, fitted, tmp_path / "pruned", threads=1, start=start)
     assert load_network(tuned.weights)[0].name == "capsule-pruned"
-    smaller = wanted.model_copy(update={"shape": wanted.shape.for_images_of((48, 64))})
+    smaller = wanted.model_copy(update={"shape": wanted.shape.with_layout(Layout((48, 64)))})
     cut = replace(collection, images=collection.images[:, :48])
     network, _, report = starting_network(smaller, cut, full.weights, "cpu")
     assert network.size == report["resized_to"] == (48, 64)

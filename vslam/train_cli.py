@@ -11,6 +11,7 @@ import typer
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
+    from vslam.loopclosure.siamese.branches import Layout
     from vslam.loopclosure.siamese.data import Collection
     from vslam.loopclosure.siamese.settings import TrainSettings
     from vslam.loopclosure.siamese.training import Outcome
@@ -104,6 +105,7 @@ def train(
 ) -> None:
     """Train a loop detector; writes weights, log, pairs, checkpoints and a model card."""
     from vslam.info import available_cores
+    from vslam.loopclosure.siamese.branches import CapsuleBranch
     from vslam.loopclosure.siamese.data import load, refuse_test_data
     from vslam.loopclosure.siamese.images import parse_size
     from vslam.loopclosure.siamese.places import open_source
@@ -121,14 +123,17 @@ def train(
     given = {"epochs": epochs, "pairs": pairs, "seed": seed, "network": network,
              "prune_share": prune_share}  # fmt: skip
     chosen = chosen.model_copy(update={k: v for k, v in given.items() if v is not None})
-    size: tuple[int, int] = chosen.shape.input
-    views: int = chosen.shape.views
+    shape = chosen.shape
     if weights is not None and weights.suffix == ".safetensors" and settings is None:
         given_network, _ = load_network(weights)
-        size, views = given_network.size, given_network.branch.views
+        branch = given_network.branch
+        if isinstance(branch, CapsuleBranch):
+            shape = branch.shape
+        else:
+            shape = shape.with_layout(branch.layout)
     if pixels is not None:
-        size = parse_size(pixels)
-    chosen = chosen.model_copy(update={"shape": chosen.shape.for_images_of(size, views)})
+        shape = shape.for_images_of(parse_size(pixels))
+    chosen = chosen.model_copy(update={"shape": shape})
     if network in ("alexnet", "vgg16") and chosen.shape.input != (227, 227):
         raise InputError(f"vslam train {network}: takes images of 227 pixels; add --pixels 227.")
     folder = out or Path("training") / f"{network}-{preset}"
@@ -177,11 +182,10 @@ def _train(
                 "--settings: imitation needs a network of ours to stay near, --weights."
             )
         teacher, _ = load_network(weights)
-        if (teacher.size, teacher.branch.views) != (settings.shape.input, settings.shape.views):
+        if teacher.branch.layout != settings.shape.layout:
             raise InputError(
-                f"{weights}: has {teacher.branch.views} view(s) of {_text(teacher.size)} pixels, a "
-                f"network that is to stay near it cannot have {settings.shape.views} of "
-                f"{_text(settings.shape.input)}."
+                f"{weights}: has {_text(teacher.branch.layout)}, a network that is to stay near "
+                f"it cannot have {_text(settings.shape.layout)}."
             )
     start, settings, report = starting_network(
         settings, collection, weights, device, resuming=resume and (folder / CHECKPOINT).exists()
@@ -265,5 +269,6 @@ def places(
     typer.echo(f"{out}: {sum(map(len, sources))} images, {out.stat().st_size / 1e6:.1f} MB")
 
 
-def _text(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"
+def _text(layout: Layout) -> str:
+    height, width = layout.size
+    return f"{layout.views} view(s) of {height}x{layout.view_width or width} of {width} pixels"

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 from torch import Tensor, nn
 
 from vslam.errors import InputError
@@ -19,14 +26,31 @@ from vslam.loopclosure.siamese.extractors import (
     grid_side,
 )
 from vslam.loopclosure.siamese.images import Size
-from vslam.loopclosure.siamese.lite import SKIPPABLE, STRIDE, LiteExtractor, lite_grid_side
+from vslam.loopclosure.siamese.lite import (
+    EARLY_STRIDE,
+    SKIPPABLE,
+    LiteExtractor,
+    lite_grid_side,
+)
 from vslam.loopclosure.siamese.weights import read_pth
 
 # ImageNet's statistics, which torchvision's weight files expect.
 _IMAGENET_MEAN = (0.485, 0.456, 0.406)
 _IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 
-_UNSEEN = 0.25  # of the width of an image, by each of two views
+
+class Layout(NamedTuple):
+    """How a network reads an image.
+
+    Attributes:
+        size: height and width of the image.
+        views: parts of it that have a descriptor each, from left to right and equally far apart.
+        view_width: columns of a part; None for the whole image as the only one.
+    """
+
+    size: Size
+    views: int = 1
+    view_width: int | None = None
 
 
 def _have_shortcuts(blocks: tuple[int, ...]) -> tuple[int, ...]:
@@ -46,7 +70,8 @@ class CapsuleShape(BaseModel):
     extractor: Literal["light", "original", "lite0"] = "light"
     pixels: int = Field(227, ge=32, description="Height of the input.")
     width: int | None = Field(None, ge=32, description="Of the input; None for a square.")
-    views: Literal[1, 2] = Field(1, description="The whole image, or its left and right parts.")
+    views: int = Field(1, ge=1, le=16, description="Parts of the image, from left to right.")
+    view_width: int | None = Field(None, ge=32, description="Of a part; None: of the image.")
     blocks: tuple[tuple[int, int, int], ...] = LIGHT_BLOCKS
     types: int = Field(32, ge=1, description="Types of primary capsules.")
     size: int = Field(8, ge=1, description="Numbers of a primary capsule.")
@@ -65,21 +90,70 @@ class CapsuleShape(BaseModel):
             return {key: value for key, value in given.items() if key != "inner"}
         return given
 
+    @model_validator(mode="after")
+    def _views_lie_on_columns(self) -> CapsuleShape:
+        width, view = self.input[1], self.view_width
+        if self.views == 1 and view is not None:
+            raise ValueError(f"view_width {view}: one view is the whole image; leave it out")
+        if self.views == 1:
+            return self
+        if view is None:
+            raise ValueError(f"views {self.views}: needs view_width, the columns of one")
+        if view >= width:
+            raise ValueError(f"view_width {view}: must be less than the {width} of the image")
+        if (width - view) % (self.cut_stride * (self.views - 1)):
+            raise ValueError(
+                f"view_width {view}: {self.views} views in {width} columns must be a multiple of "
+                f"{self.cut_stride} columns apart"
+            )
+        return self
+
     @property
     def input(self) -> Size:
         """Height and width of the images it takes."""
         return self.pixels, self.width or self.pixels
 
     @property
-    def view(self) -> Size:
-        """Height and width of what a descriptor sees: the image, or three quarters of its width.
+    def layout(self) -> Layout:
+        """How it reads them."""
+        return Layout(self.input, self.views, self.view_width)
 
-        What one view does not see is whole columns of the grid, so that those of both coincide.
+    @property
+    def view(self) -> Size:
+        """Height and width of what a descriptor sees."""
+        return self.pixels, self.view_width or self.input[1]
+
+    @property
+    def cut_stride(self) -> int:
+        """Pixels of the image per column of what the views are cut from.
+
+        Those are early features of lite0, computed once for all views. Other extractors begin with
+        the pixels of a view.
         """
-        height, width = self.input
-        if self.views == 1:
-            return height, width
-        return height, width - STRIDE * max(1, round(_UNSEEN * width / STRIDE))
+        return EARLY_STRIDE if self.extractor == "lite0" else 1
+
+    @property
+    def cuts(self) -> list[slice]:
+        """Columns of the views there."""
+        width, view = self.input[1], self.view[1]
+        apart = (width - view) // self.cut_stride // max(1, self.views - 1)
+        columns = (view - 1) // self.cut_stride + 1
+        return [slice(k * apart, k * apart + columns) for k in range(self.views)]
+
+    def for_images_of(self, size: Size) -> CapsuleShape:
+        """The same branch for images of another height and width.
+
+        Views have the same share of the width, as nearly as they fit.
+
+        Raises:
+            InputError: views that become too narrow.
+        """
+        view = None
+        if self.view_width is not None:
+            unit, width = self.cut_stride * (self.views - 1), size[1]
+            unseen = width * (1 - self.view_width / self.input[1])
+            view = width - unit * max(1, round(unseen / unit))
+        return self.with_layout(Layout(size, self.views, view))
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -97,28 +171,37 @@ class CapsuleShape(BaseModel):
         rows, columns = self.grid
         return rows * columns
 
-    def for_images_of(self, size: Size, views: int | None = None) -> CapsuleShape:
-        """The same branch for images of another height and width, or another number of views."""
-        height, width = size
+    def with_layout(self, layout: Layout) -> CapsuleShape:
+        """The same branch that reads images in another way.
+
+        Raises:
+            InputError: views that do not fit the image.
+        """
+        height, width = layout.size
         given = {
             "pixels": height,
             "width": None if width == height else width,
-            "views": views or self.views,
+            "views": layout.views,
+            "view_width": layout.view_width,
         }
-        return self.model_copy(update=given)
+        try:
+            return CapsuleShape(**{**self.model_dump(), **given})
+        except ValidationError as error:
+            raise InputError(f"{height}x{width} pixels: {_first(error)}.") from error
 
 
 class CapsuleBranch(nn.Module):
     """Extractor, primary capsules, routing; the descriptor is all output capsules, flattened.
 
-    With two views, those of the left view and then those of the right one.
+    With several views, those of the leftmost view first. Views of lite0 are cut from early features
+    of the whole image: computed once, and with what lies just beyond a view in place of padding.
+    Where things are in a view is what later layers add.
     """
 
     def __init__(self, shape: CapsuleShape) -> None:
         super().__init__()
         self.shape = shape
-        self.size = shape.input
-        self.views = shape.views
+        self.size, self.views, self.layout = shape.input, shape.views, shape.layout
         self.dimensions = shape.views * shape.outputs * shape.depth
         self.extractor: nn.Module
         self.primary: nn.Module
@@ -140,21 +223,35 @@ class CapsuleBranch(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """``(N, 3, H, W)`` float32 in [0, 1] to ``(N, D)``, not yet normalised."""
-        v = self.routed(images)[0].flatten(1)
-        return v if self.views == 1 else torch.cat(v.chunk(2), 1)
+        v = self.capsules(self._primary_capsules(images)).flatten(1)
+        return torch.cat(v.chunk(self.views), 1)
 
     def routed(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Output capsules ``(V N, J, D)`` and couplings ``(V N, J, I)``: all left views first."""
-        grey = images.mean(1, keepdim=True)
-        if self.views == 2:
-            width = self.shape.view[1]
-            grey = torch.cat([grey[..., :width], grey[..., -width:]])
-        x = standardised(grey).contiguous(memory_format=torch.channels_last)
-        x = self.primary(self.extractor(x))
-        # Routing sums thousands of products: never in half precision.
-        with torch.autocast(x.device.type, enabled=False):
-            routed: tuple[Tensor, Tensor] = self.capsules.routed(x.float())
-        return routed
+        """Output capsules ``(V N, J, D)``, couplings ``(V N, J, I)``: all leftmost views first."""
+        return self.capsules.routed(self._primary_capsules(images))
+
+    def _primary_capsules(self, images: Tensor) -> Tensor:
+        """``(V N, T, P, A)``."""
+        x = images.mean(1, keepdim=True)
+        if isinstance(self.extractor, LiteExtractor):
+            x = standardised(x).contiguous(memory_format=torch.channels_last)
+            x = self.extractor.late(self._views(self.extractor.early(x)))
+        else:
+            x = self.extractor(standardised(self._views(x)))
+        capsules: Tensor = self.primary(x)
+        return capsules
+
+    def _views(self, x: Tensor) -> Tensor:
+        """``(N, C, h, w)`` to ``(V N, C, h, v)``."""
+        parts = torch.cat([x[..., columns] for columns in self.shape.cuts])
+        return parts.contiguous(memory_format=torch.channels_last)
+
+
+def _first(error: ValidationError) -> str:
+    """What is wrong, in a clause."""
+    first = error.errors()[0]
+    said = first["msg"].removeprefix("Value error, ")
+    return ": ".join([*map(str, first["loc"]), said])
 
 
 def standardised(images: Tensor) -> Tensor:
@@ -179,8 +276,8 @@ class ConvolutionalBranch(nn.Module):
     ) -> None:
         super().__init__()
         self.name = name
-        self.size = (227, 227)
-        self.views = 1
+        self.layout = Layout((227, 227))
+        self.size, self.views = self.layout.size, self.layout.views
         self.dimensions = 1024
         self.features = features
         self.pool = nn.AdaptiveAvgPool2d(side)

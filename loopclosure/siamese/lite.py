@@ -8,6 +8,7 @@ form: ReLU6, no squeeze and excitation.
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Collection
 from itertools import pairwise
@@ -42,7 +43,9 @@ SKIPPABLE = tuple(
     if block[1] == before[1] and block[2] == 1
 )
 _STEM = 32
-STRIDE = 16  # of stem and stages together
+_EARLY = 5  # blocks of the first three stages
+EARLY_STRIDE = 2 * math.prod(stride for _, _, stride, _ in _BLOCKS[:_EARLY])
+_STRIDE = 2 * math.prod(stride for _, _, stride, _ in _BLOCKS)
 _BATCH_NORM_EPSILON = 1e-3
 # The branch hands over images of deviation 1; ImageNet's have about half of that after (x-127)/128.
 _DEVIATION = 0.5
@@ -93,8 +96,20 @@ class LiteExtractor(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """``(N, 1, H, W)`` of mean 0 and deviation 1 to ``(N, 112, h, w)``."""
-        grid: Tensor = self.blocks(functional.relu6(self.stem(x), inplace=True))
-        return grid
+        return self.late(self.early(x))
+
+    def early(self, x: Tensor) -> Tensor:
+        """The first part of ``forward``, to ``(N, 40, h, w)`` with a stride of 8."""
+        x = functional.relu6(self.stem(x), inplace=True)
+        for number, block in self.residuals.items():
+            x = block(x) if number < _EARLY else x
+        return x
+
+    def late(self, x: Tensor) -> Tensor:
+        """The second part, from there to ``(N, 112, h, w)`` with a stride of 16."""
+        for number, block in self.residuals.items():
+            x = block(x) if number >= _EARLY else x
+        return x
 
     @property
     def residuals(self) -> dict[int, InvertedResidual]:
@@ -142,7 +157,7 @@ class LiteExtractor(nn.Module):
 
 def lite_grid_side(pixels: int) -> int:
     """Places along a side of the grid for so many pixels of the image."""
-    return (pixels - 1) // STRIDE + 1
+    return (pixels - 1) // _STRIDE + 1
 
 
 def _folded(state: dict[str, Tensor], conv: str, norm: str) -> tuple[Tensor, Tensor]:

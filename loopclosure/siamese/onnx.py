@@ -18,7 +18,7 @@ TOLERANCE = 1e-4  # of a descriptor of length 1
 def export_onnx(network: SiameseNetwork, path: Path) -> float:
     """Write image ``(1, 3, H, W)`` float32 in [0, 1] to ``descriptor`` ``(1, D)`` of norm 1.
 
-    Descriptors of two views are compared in the best of three ways, :func:`siamese.arrangements`.
+    It holds those of all views; :func:`siamese.cosines` compares them.
 
     Returns:
         The largest difference between torch and onnxruntime on a random image.

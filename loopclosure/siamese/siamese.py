@@ -27,31 +27,36 @@ from vslam.loopclosure.siamese.extractors import fold_batch_norms
 from vslam.loopclosure.siamese.weights import NETWORKS
 
 
-def arrangements(descriptors: Tensor, views: int) -> Tensor:
-    """Ways to hold images against others, ``(K, N, D)`` of unit descriptors ``(N, D)``.
+def best_alignment(alike: Tensor) -> Tensor:
+    """How alike two images are whose views are as alike as ``(..., V, V)`` says.
 
-    With two views three: as they lie, the left view on the right one of the other image, and the
-    reverse. A camera that has turned sees on its left what lay to the right. (Not in the paper,
-    which compares whole images only.)
+    The views of one lie on those of the other, or moved by some to the left or right: a camera
+    that has turned sees elsewhere what was in its middle. Each such alignment has the mean over the
+    views that meet, at least half of them, and the best one counts. (Not in the paper, which
+    compares whole images only.)
     """
-    if views == 1:
-        return descriptors[None]
-    left, right = descriptors.chunk(2, -1)
-    nothing = torch.zeros_like(left)
-    # Each view has half of the squared length.
-    to_right, to_left = torch.cat([nothing, 2 * left], -1), torch.cat([2 * right, nothing], -1)
-    return torch.stack([descriptors, to_right, to_left])
+    most = alike.shape[-1] // 2
+    moved = [alike.diagonal(s, -2, -1).mean(-1) for s in range(-most, most + 1)]
+    return torch.stack(moved).amax(0)
 
 
 def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
-    """Cosines ``(N, M)`` of ``(N, D)`` and ``(M, D)``, each in the best of the arrangements."""
-    return (arrangements(a, views) @ b.T).amax(0)
+    """Cosines ``(N, M)`` of ``(N, D)`` and ``(M, D)``, of several views in the best alignment."""
+    a, b = _unit_views(a, views), _unit_views(b, views)
+    alike = a.flatten(0, 1) @ b.flatten(0, 1).T
+    return best_alignment(alike.view(len(a), views, len(b), views).transpose(1, 2))
+
+
+def _unit_views(descriptors: Tensor, views: int) -> Tensor:
+    """``(N, V D)`` of norm 1 to ``(N, V, D)``, each of norm 1."""
+    length = descriptors.shape[1] // views
+    return descriptors.view(len(descriptors), views, length) * math.sqrt(views)
 
 
 class DistanceHead(nn.Module):
     """``p = sigmoid(a - b d)`` (Eq. 2) of the distance d of two descriptors (Eq. 10), a, b > 0.
 
-    With two views d is that of the descriptors in the best of the :func:`arrangements`.
+    With several views d is that of the :func:`best_alignment`.
     """
 
     def __init__(self, views: int = 1) -> None:
@@ -63,7 +68,8 @@ class DistanceHead(nn.Module):
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
         """Logits ``(N,)`` of pairs of ``(N, D)`` unit descriptors."""
-        return self.of_cosine((arrangements(a, self.views) * b).sum(2).amax(0))
+        alike = _unit_views(a, self.views) @ _unit_views(b, self.views).transpose(1, 2)
+        return self.of_cosine(best_alignment(alike))
 
     def of_cosine(self, cosine: Tensor) -> Tensor:
         """Logit of the cosine of unit descriptors, at distance ``sqrt(2 - 2 cos)``."""
@@ -125,7 +131,7 @@ class SiameseNetwork(nn.Module):
         return functional.normalize(views, dim=2).flatten(1) / math.sqrt(self.branch.views)
 
     def cosines(self, a: Tensor, b: Tensor) -> Tensor:
-        """``(N, M)`` of descriptors ``(N, D)`` and ``(M, D)``, each in the best arrangement."""
+        """``(N, M)`` of descriptors ``(N, D)`` and ``(M, D)``, each in the best alignment."""
         return cosines(a, b, self.branch.views)
 
     def logits(self, a: Tensor, b: Tensor) -> Tensor:

@@ -10,9 +10,9 @@ import torch
 from torch.nn import functional
 
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.branches import CapsuleBranch, ConvolutionalBranch
+from vslam.loopclosure.siamese.branches import CapsuleBranch, ConvolutionalBranch, Layout
 from vslam.loopclosure.siamese.data import Collection, divide, validation_images
-from vslam.loopclosure.siamese.images import Size, to_tensor
+from vslam.loopclosure.siamese.images import to_tensor
 from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.objective import validate
 from vslam.loopclosure.siamese.pruning import (
@@ -86,8 +86,8 @@ def starting_network(
     return network, settings, about
 
 
-def resized(network: SiameseNetwork, size: Size, views: int | None = None) -> SiameseNetwork:
-    """A network for images of another size or number of views that computes alike.
+def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
+    """A network for images of another size or other views that computes alike.
 
     Training it further mends the rest.
 
@@ -96,14 +96,15 @@ def resized(network: SiameseNetwork, size: Size, views: int | None = None) -> Si
     resizing, as in the DAWNBench entry of fast.ai, 2018).
 
     Raises:
-        InputError: a network without capsules, one that is pruned, or CapsNet's fixed grid.
+        InputError: a network without capsules, one that is pruned, CapsNet's fixed grid, or views
+            that do not fit the image.
     """
     branch = network.branch
     if not isinstance(branch, CapsuleBranch) or branch.shape.extractor == "original":
         raise InputError(f"{network.name}: cannot take images of another size.")
     if branch.shape.kept is not None:
         raise InputError(f"{network.name}: is pruned to the places of its grid; resize before.")
-    shape = branch.shape.for_images_of(size, views)
+    shape = branch.shape.with_layout(layout)
     larger = build_network(network.name, shape)
     state = network.state_dict()
     gains = state.pop("branch.capsules.gains")
@@ -118,10 +119,8 @@ def resized(network: SiameseNetwork, size: Size, views: int | None = None) -> Si
 
 def _fitted(network: SiameseNetwork, settings: TrainSettings) -> SiameseNetwork:
     """The network itself where it sees as the settings say, else a resized one."""
-    size, views = settings.shape.input, settings.shape.views
-    if (network.size, network.branch.views) == (size, views):
-        return network
-    return resized(network, size, views)
+    layout = settings.shape.layout
+    return network if network.branch.layout == layout else resized(network, layout)
 
 
 def _prune(

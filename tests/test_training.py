@@ -62,9 +62,33 @@ def test_a_network_learns_to_describe_as_its_teacher_does(tmp_path):
     assert unlike(100.0) < 0.5 * unlike(0.0)
 
 
+def test_a_share_of_what_was_learned_is_kept(tmp_path):
+    collection = views(20)
+    before, settings = small_network(1).state_dict(), small_settings(learned_share=0.25, epochs=1)
+    whole = settings.model_copy(update={"learned_share": 1.0})
+    for name, each in (("whole", whole), ("share", settings)):
+        train(collection, each, tmp_path / name, start=small_network(1), threads=1)
+    # Decided after the end, and once only.
+    for _ in range(2):
+        train(
+            collection, settings, tmp_path / "whole", start=small_network(1), threads=1, resume=True
+        )
+    after, later = (
+        load_network(tmp_path / name / "capsule.safetensors")[0].state_dict()
+        for name in ("share", "whole")
+    )
+    trained = torch.load(tmp_path / "share" / CHECKPOINT, weights_only=True)["network"]
+    assert all(torch.equal(after[key], later[key]) for key in after if "head" not in key)
+    W = "branch.capsules.W"
+    kept, learned = after[W] - before[W], trained[W] - before[W]
+    assert learned.abs().max() > 1e-3
+    assert torch.allclose(kept, 0.25 * learned, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"learned_share": 0.5}, "there is no network to go back towards"),
         ({"imitation": 1.0}, "there is no network to stay near"),
         ({"emphasis": {"bulbs": 3.0}}, "no source bulbs; there are blobs"),
     ],

@@ -80,8 +80,9 @@ def load_checkpoint(
         raise InputError(f"{path}: of another version of vslam; use another --out.") from error
     except Exception as error:  # torch raises half a dozen kinds
         raise InputError(f"{path}: not a readable checkpoint; remove it to start anew.") from error
-    # A lower learning rate is what a diverged training is resumed with.
-    free = {"learning_rate": settings.learning_rate, "patience": settings.patience}
+    # A lower learning rate is what a diverged training is resumed with; what is done at its end may
+    # be decided there.
+    free = {key: getattr(settings, key) for key in ("learning_rate", "patience", "learned_share")}
     if written.model_copy(update=free) != settings:
         raise InputError(
             f"{path}: written with other settings; use those of settings.json beside it, or "

@@ -118,6 +118,22 @@ def validate(
     return figures, score, same
 
 
+@torch.no_grad()
+def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> None:
+    """Go back towards the weights ``before``, to ``share`` of the way from them; in place.
+
+    Between a network and what fine-tuning made of it lie some that lose less on what the one knew
+    and keep most of what the other learned (WiSE-FT, Wortsman et al., CVPR 2022).
+    """
+    after = network.state_dict()
+    mixed = {
+        key: torch.lerp(before[key].to(value.device), value, share)
+        for key, value in after.items()
+        if value.is_floating_point()
+    }
+    network.load_state_dict(after | mixed)
+
+
 def calibrate(network: SiameseNetwork, score: NDArray, same: NDArray) -> None:
     """Fit a and b of ``p = sigmoid(a - b d)`` to scores, true and false pairs weighing the same.
 

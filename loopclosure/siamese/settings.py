@@ -30,6 +30,9 @@ class TrainSettings(BaseModel):
     temperature: float = Field(0.07, gt=0, description="Of the contrast.")
     learning_rate: float = Field(3e-4, gt=0, description="Of Adam. [paper]")
     extractor_rate: float = Field(1.0, ge=0, description="Of the extractor, times that rate.")
+    learned_share: float = Field(
+        1.0, gt=0, le=1, description="Of what training changed; 1 keeps nothing of the start."
+    )
     frozen: int = Field(0, ge=0, description="Blocks of a lite0 extractor that stay, and its stem.")
     schedule: Literal["constant", "cosine"] = "constant"
     batch: int = Field(64, ge=2, description="Pairs. [paper]")

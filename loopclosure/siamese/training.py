@@ -42,6 +42,7 @@ from vslam.loopclosure.siamese.data import (
 from vslam.loopclosure.siamese.images import to_tensor
 from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.objective import (
+    blend,
     calibrate,
     contrast,
     cross_entropy,
@@ -113,11 +114,13 @@ def train(
 
     Raises:
         InputError: too little data, an unknown device or source, a checkpoint of other settings, or
-            imitation without a teacher.
+            imitation or a learned share without a network to start from.
         ResultsError: the loss is not finite (the last good checkpoint stays), or a full disk.
     """
     if settings.imitation and teacher is None:
         raise InputError("imitation: there is no network to stay near; give it as the teacher.")
+    if settings.learned_share < 1 and start is None:
+        raise InputError("learned_share: there is no network to go back towards; give --weights.")
     where = _open_device(device)
     check_emphasis(collection, settings.emphasis)
     train_images, validation = divide(collection, settings.seed, settings.validation_share)
@@ -125,6 +128,7 @@ def train(
     torch.manual_seed(settings.seed)
     network = (start or build_network(settings.network, settings.shape)).to(where)
     teacher = teacher.to(where).eval() if teacher is not None and settings.imitation else None
+    before = {key: value.detach().clone() for key, value in network.state_dict().items()}
     optimiser = _optimiser(network, settings)
     progress, pairs = Progress(), None
     steps = max(1, settings.pairs // settings.batch)
@@ -179,9 +183,11 @@ def train(
             saved = time.monotonic()
             _write_log(folder / "log.csv", progress.history)
     best, about = load_network(weights)
-    figures, score, same = validate(
-        best.to(where), collection, validation, settings.augmentation, where
-    )
+    best.to(where)
+    if settings.learned_share < 1 and "learned_share" not in about:  # resumed after its end
+        blend(best, before, settings.learned_share)
+        about["learned_share"] = settings.learned_share
+    figures, score, same = validate(best, collection, validation, settings.augmentation, where)
     calibrate(best, score, same)
     figures = validate(best, collection, validation, settings.augmentation, where)[0]
     save_network(best, weights, {**about, "validation": figures})

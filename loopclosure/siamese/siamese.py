@@ -42,15 +42,14 @@ def best_alignment(alike: Tensor) -> Tensor:
 
 def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
     """Cosines ``(N, M)`` of ``(N, D)`` and ``(M, D)``, of several views in the best alignment."""
-    a, b = _unit_views(a, views), _unit_views(b, views)
-    alike = a.flatten(0, 1) @ b.flatten(0, 1).T
-    return best_alignment(alike.view(len(a), views, len(b), views).transpose(1, 2))
+    a, b = _by_view(a, views), _by_view(b, views)
+    alike = (a.flatten(0, 1) @ b.flatten(0, 1).T).view(len(a), views, len(b), views)
+    return views * best_alignment(alike.transpose(1, 2))
 
 
-def _unit_views(descriptors: Tensor, views: int) -> Tensor:
-    """``(N, V D)`` of norm 1 to ``(N, V, D)``, each of norm 1."""
-    length = descriptors.shape[1] // views
-    return descriptors.view(len(descriptors), views, length) * math.sqrt(views)
+def _by_view(descriptors: Tensor, views: int) -> Tensor:
+    """``(N, V D)`` of norm 1 to ``(N, V, D)``, in which a view has a V-th of the squared length."""
+    return descriptors.view(len(descriptors), views, descriptors.shape[1] // views)
 
 
 class DistanceHead(nn.Module):
@@ -68,8 +67,8 @@ class DistanceHead(nn.Module):
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
         """Logits ``(N,)`` of pairs of ``(N, D)`` unit descriptors."""
-        alike = _unit_views(a, self.views) @ _unit_views(b, self.views).transpose(1, 2)
-        return self.of_cosine(best_alignment(alike))
+        alike = _by_view(a, self.views) @ _by_view(b, self.views).transpose(1, 2)
+        return self.of_cosine(self.views * best_alignment(alike))
 
     def of_cosine(self, cosine: Tensor) -> Tensor:
         """Logit of the cosine of unit descriptors, at distance ``sqrt(2 - 2 cos)``."""

@@ -19,9 +19,10 @@ from vslam.loopbench import report as reporting
 from vslam.loopbench.conditions import Condition, apply, clipped, parse_conditions, turned
 from vslam.loopbench.cost import cost
 from vslam.loopbench.detectors import BowScorer, Panel, look
-from vslam.loopbench.measure import epipolar_inliers, measure
+from vslam.loopbench.measure import epipolar_inliers, measure, thinned
 from vslam.loopbench.schema import LoopsJson
 from vslam.loopbench.sets import Questions, TestSet, open_set
+from vslam.loopclosure.benchmark import average_precision, precision_recall
 from vslam.loopclosure.siamese.places import DIFFERENT, SAME, UNKNOWN
 from vslam.loopclosure.vocabulary import load
 
@@ -34,6 +35,19 @@ def texture(seed: int, height: int = 188, width: int = 620) -> np.ndarray:
 @pytest.fixture(scope="module")
 def vocabulary():
     return load()
+
+
+@pytest.mark.parametrize("apart", [10.0, 2.0])
+def test_the_curve_that_is_drawn_has_the_area_of_the_whole_one(apart):
+    """Of 20,000 pairs 50 are of one place, and a good detector has them all among the first."""
+    rng = np.random.default_rng(0)
+    same = np.arange(20_000) < 50
+    whole = precision_recall(same, rng.standard_normal(same.size) + apart * same)
+    drawn = thinned(whole)
+    assert len(drawn.recall) <= 201
+    assert (drawn.recall[0], drawn.recall[-1]) == (1.0, 0.0)
+    area = -np.trapezoid(drawn.precision, drawn.recall)
+    assert area == pytest.approx(average_precision(whole), abs=0.02)
 
 
 def test_conditions_are_kinds_times_strengths():

@@ -13,6 +13,7 @@ from vslam.loopbench.detectors import Panel, Scorer, View
 from vslam.loopbench.schema import Cell, Curve, Gain
 from vslam.loopbench.sets import Questions, TestSet
 from vslam.loopclosure.benchmark import (
+    PrecisionRecall,
     average_precision,
     balanced_accuracy,
     precision_recall,
@@ -73,8 +74,6 @@ def _cell(
     best = np.where(known, scores, -np.inf).argmax(1)
     truth = questions.relation[np.arange(len(best)), best]
     accepted = np.array([verify.accepts(q, int(g)) for q, g in enumerate(best)])
-    curve = precision_recall(same, score)
-    points = np.unique(np.linspace(0, len(curve.recall) - 1, _CURVE_POINTS).astype(int))
     return Cell(
         data=title,
         condition=condition.name,
@@ -85,10 +84,22 @@ def _cell(
         first_right=float((truth[answerable] == SAME).mean()),
         verified_right=float((accepted & (truth == SAME))[answerable].mean()),
         verified_wrong=int((accepted & (truth == DIFFERENT)).sum()),
-        curve=Curve(
-            precision=curve.precision[points].round(5).tolist(),
-            recall=curve.recall[points].round(5).tolist(),
-        ),
+        curve=thinned(precision_recall(same, score)),
+    )
+
+
+def thinned(curve: PrecisionRecall) -> Curve:
+    """The best precision at equal steps of recall, and the end where every pair is accepted.
+
+    Equal steps of the pairs would have a good detector's curve in the first of them: of thousands
+    of pairs it finds all true ones among the first few.
+    """
+    wanted = np.linspace(0.0, 1.0, _CURVE_POINTS)
+    reached = len(curve.recall) - 1 - np.searchsorted(curve.recall[::-1], wanted)
+    points = np.unique(np.append(reached, 0))
+    return Curve(
+        precision=curve.precision[points].round(5).tolist(),
+        recall=curve.recall[points].round(5).tolist(),
     )
 
 

@@ -237,6 +237,7 @@ def _curves(cells: Sequence[Cell], detectors: Sequence[str], data: str) -> Figur
         axes.set(xlim=(0, 1), ylim=(0, 1.02))
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-    figure.supxlabel("recall", fontsize=9.5)
+    for axes in grid[-1, : (len(conditions) - 1) % columns + 1]:
+        axes.set_xlabel("recall", fontsize=9.5)
     figure.supylabel("precision", fontsize=9.5)
     return figure

@@ -243,8 +243,9 @@ class CapsuleBranch(nn.Module):
 
     def _views(self, x: Tensor) -> Tensor:
         """``(N, C, h, w)`` to ``(V N, C, h, v)``."""
-        parts = torch.cat([x[..., columns] for columns in self.shape.cuts])
-        return parts.contiguous(memory_format=torch.channels_last)
+        if self.views > 1:
+            x = torch.cat([x[..., columns] for columns in self.shape.cuts])
+        return x.contiguous(memory_format=torch.channels_last)
 
 
 def _first(error: ValidationError) -> str:

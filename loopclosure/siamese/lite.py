@@ -102,13 +102,15 @@ class LiteExtractor(nn.Module):
         """The first part of ``forward``, to ``(N, 40, h, w)`` with a stride of 8."""
         x = functional.relu6(self.stem(x), inplace=True)
         for number, block in self.residuals.items():
-            x = block(x) if number < _EARLY else x
+            if number < _EARLY:
+                x = block(x)
         return x
 
     def late(self, x: Tensor) -> Tensor:
         """The second part, from there to ``(N, 112, h, w)`` with a stride of 16."""
         for number, block in self.residuals.items():
-            x = block(x) if number >= _EARLY else x
+            if number >= _EARLY:
+                x = block(x)
         return x
 
     @property

@@ -7,6 +7,7 @@ that was never interrupted (same machine, same number of threads).
 
 from __future__ import annotations
 
+import copy
 import csv
 import io
 import math
@@ -128,7 +129,7 @@ def train(
     torch.manual_seed(settings.seed)
     network = (start or build_network(settings.network, settings.shape)).to(where)
     teacher = teacher.to(where).eval() if teacher is not None and settings.imitation else None
-    before = {key: value.detach().clone() for key, value in network.state_dict().items()}
+    before = copy.deepcopy(network.state_dict()) if settings.learned_share < 1 else None
     optimiser = _optimiser(network, settings)
     progress, pairs = Progress(), None
     steps = max(1, settings.pairs // settings.batch)
@@ -184,7 +185,7 @@ def train(
             _write_log(folder / "log.csv", progress.history)
     best, about = load_network(weights)
     best.to(where)
-    if settings.learned_share < 1 and "learned_share" not in about:  # resumed after its end
+    if before is not None and "learned_share" not in about:  # resumed after its end
         blend(best, before, settings.learned_share)
         about["learned_share"] = settings.learned_share
     figures, score, same = validate(best, collection, validation, settings.augmentation, where)

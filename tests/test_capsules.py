@@ -9,7 +9,13 @@ from siamese_worlds import SMALL, small_network
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese import capsules
-from vslam.loopclosure.siamese.branches import CapsuleBranch, CapsuleShape, alexnet, standardised
+from vslam.loopclosure.siamese.branches import (
+    CapsuleBranch,
+    CapsuleShape,
+    alexnet,
+    standardised,
+    textured,
+)
 from vslam.loopclosure.siamese.extractors import LIGHT_BLOCKS, grid_side
 from vslam.loopclosure.siamese.images import to_size, to_tensor
 from vslam.loopclosure.siamese.pruning import lowest, masked, mean_couplings, pruned
@@ -174,6 +180,28 @@ def test_the_original_extractor_is_the_larger_one():
 def test_gain_and_bias_of_the_camera_drop_out():
     x = images(1)
     assert torch.allclose(standardised(0.5 * x + 0.2), standardised(x), atol=0.02)
+
+
+def test_what_shows_no_texture_changes_nothing_else():
+    """Neither what covers a part of the image, nor how bright it is."""
+    x = images(1)[:, :1]
+    dark, bright = x.clone(), x.clone()
+    dark[..., 40:], bright[..., 40:] = 0.0, 1.0
+    assert textured(dark)[..., 40:].sum() == 0
+    seen = slice(0, 39)  # the last column before it differs from what covers
+    standard = [standardised(image)[..., seen] for image in (dark, bright)]
+    assert torch.allclose(*standard, atol=0.05)
+    blank = standardised(torch.full((1, 1, 64, 64), 0.7))
+    assert torch.allclose(blank, torch.zeros(()), atol=1e-3)
+
+
+def test_texture_is_more_than_a_grey_level():
+    x = torch.zeros(1, 1, 4, 5)
+    x[..., 1, 2] = 0.9 / 255
+    assert textured(x).sum() == 0
+    x[..., 1, 2] = 3.0 / 255
+    at = textured(x)[0, 0].nonzero().tolist()
+    assert at == [[0, 2], [1, 1], [1, 2]]  # what differs from the pixel on its right or below
 
 
 def test_a_pruned_network_is_the_masked_network():

@@ -15,6 +15,7 @@ from pydantic import (
     model_validator,
 )
 from torch import Tensor, nn
+from torch.nn import functional
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.capsules import CapsuleLayer
@@ -37,6 +38,10 @@ from vslam.loopclosure.siamese.weights import read_pth
 # ImageNet's statistics, which torchvision's weight files expect.
 _IMAGENET_MEAN = (0.485, 0.456, 0.406)
 _IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
+
+
+_GREY_LEVEL = 1.0 / 255.0
+_LEAST_SHARE = 0.02  # of texture in a view: where no view shows any, all still count alike
 
 
 class Layout(NamedTuple):
@@ -193,9 +198,10 @@ class CapsuleShape(BaseModel):
 class CapsuleBranch(nn.Module):
     """Extractor, primary capsules, routing; the descriptor is all output capsules, flattened.
 
-    With several views, those of the leftmost view first. Views of lite0 are cut from early features
-    of the whole image: computed once, and with what lies just beyond a view in place of padding.
-    Where things are in a view is what later layers add.
+    With several views, those of the leftmost view first, and each as long as the share of the view
+    that shows texture: a wall of fog, or what covers the lens, tells no place from another. Views
+    of lite0 are cut from early features of the whole image: computed once, and with what lies just
+    beyond a view in place of padding. Where things are in a view is what later layers add.
     """
 
     def __init__(self, shape: CapsuleShape) -> None:
@@ -222,9 +228,10 @@ class CapsuleBranch(nn.Module):
         )  # fmt: skip
 
     def forward(self, images: Tensor) -> Tensor:
-        """``(N, 3, H, W)`` float32 in [0, 1] to ``(N, D)``, not yet normalised."""
+        """``(N, 3, H, W)`` float32 in [0, 1] to ``(N, D)``, not yet of length 1."""
         v = self.capsules(self._primary_capsules(images)).flatten(1)
-        return torch.cat(v.chunk(self.views), 1)
+        views = functional.normalize(torch.stack(v.chunk(self.views), 1), dim=2)
+        return (views * self._textured_share(images)[:, :, None]).flatten(1)
 
     def routed(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Output capsules ``(V N, J, D)``, couplings ``(V N, J, I)``: all leftmost views first."""
@@ -241,6 +248,14 @@ class CapsuleBranch(nn.Module):
         capsules: Tensor = self.primary(x)
         return capsules
 
+    def _textured_share(self, images: Tensor) -> Tensor:
+        """Of each view, ``(N, V)``."""
+        shown, stride = textured(images.mean(1, keepdim=True)), self.shape.cut_stride
+        firsts = [cut.start * stride for cut in self.shape.cuts]
+        width = self.shape.view[1]
+        shares = [shown[..., k : k + width].mean((1, 2, 3)) for k in firsts]
+        return torch.stack(shares, 1).clamp_min(_LEAST_SHARE)
+
     def _views(self, x: Tensor) -> Tensor:
         """``(N, C, h, w)`` to ``(V N, C, h, v)``."""
         if self.views > 1:
@@ -255,11 +270,27 @@ def _first(error: ValidationError) -> str:
     return ": ".join([*map(str, first["loc"]), said])
 
 
+def textured(images: Tensor) -> Tensor:
+    """``(N, 1, H, W)`` in [0, 1] to 1.0 where a pixel differs from one beside or below it, else 0.
+
+    By more than a grey level: what is black, white or covered does not.
+    """
+    beside = functional.pad((images[..., 1:] - images[..., :-1]).abs(), (0, 1))
+    below = functional.pad((images[..., 1:, :] - images[..., :-1, :]).abs(), (0, 0, 0, 1))
+    return (torch.maximum(beside, below) > _GREY_LEVEL).to(images.dtype)
+
+
 def standardised(images: Tensor) -> Tensor:
-    """Each image with mean 0 and deviation 1: gain and bias of the camera drop out."""
-    mean = images.mean((1, 2, 3), keepdim=True)
-    deviation = images.std((1, 2, 3), keepdim=True)
-    return (images - mean) / (deviation + 1e-3)
+    """Each image with mean 0 and deviation 1 where it shows texture.
+
+    Gain and bias of the camera drop out, and what is overexposed or covered does not change the
+    rest.
+    """
+    weight = textured(images) + 1e-3  # of an image without any all pixels count
+    weight = weight / weight.sum((1, 2, 3), keepdim=True)
+    centred = images - (images * weight).sum((1, 2, 3), keepdim=True)
+    deviation = torch.sqrt((centred * centred * weight).sum((1, 2, 3), keepdim=True))
+    return centred / (deviation + 1e-3)
 
 
 class ConvolutionalBranch(nn.Module):

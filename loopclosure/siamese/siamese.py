@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -27,29 +26,44 @@ from vslam.loopclosure.siamese.extractors import fold_batch_norms
 from vslam.loopclosure.siamese.weights import NETWORKS
 
 
-def best_alignment(alike: Tensor) -> Tensor:
-    """How alike two images are whose views are as alike as ``(..., V, V)`` says.
+def best_alignment(alike: Tensor, most: Tensor) -> Tensor:
+    """Cosine of two images whose views have the products ``alike`` ``(..., V, V)``.
 
     The views of one lie on those of the other, or moved by some to the left or right: a camera
-    that has turned sees elsewhere what was in its middle. Each such alignment has the mean over the
-    views that meet, at least half of them, and the best one counts. (Not in the paper, which
-    compares whole images only.)
+    that has turned sees elsewhere what was in its middle. Of each such alignment the products of
+    the views that meet, at least half of them, count together, and the best one is taken. (Not in
+    the paper, which compares whole images only.)
+
+    Args:
+        alike: scalar products of the views.
+        most: products of their lengths, ``(..., V, V)``.
     """
-    most = alike.shape[-1] // 2
-    moved = [alike.diagonal(s, -2, -1).mean(-1) for s in range(-most, most + 1)]
+    reach = alike.shape[-1] // 2
+    moved = [
+        alike.diagonal(s, -2, -1).sum(-1) / (most.diagonal(s, -2, -1).sum(-1) + TINY)
+        for s in range(-reach, reach + 1)
+    ]
     return torch.stack(moved).amax(0)
 
 
 def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
     """Cosines ``(N, M)`` of ``(N, D)`` and ``(M, D)``, of several views in the best alignment."""
+    if views == 1:
+        return a @ b.T
     a, b = _by_view(a, views), _by_view(b, views)
     alike = (a.flatten(0, 1) @ b.flatten(0, 1).T).view(len(a), views, len(b), views)
-    return views * best_alignment(alike.transpose(1, 2))
+    most = torch.einsum("nv,mw->nmvw", _lengths(a), _lengths(b))
+    return best_alignment(alike.transpose(1, 2), most)
 
 
 def _by_view(descriptors: Tensor, views: int) -> Tensor:
-    """``(N, V D)`` of norm 1 to ``(N, V, D)``, in which a view has a V-th of the squared length."""
+    """``(N, V D)`` to ``(N, V, D)``."""
     return descriptors.view(len(descriptors), views, descriptors.shape[1] // views)
+
+
+def _lengths(views: Tensor) -> Tensor:
+    """``(N, V, D)`` to ``(N, V)``."""
+    return torch.linalg.vector_norm(views, dim=2)
 
 
 class DistanceHead(nn.Module):
@@ -67,8 +81,9 @@ class DistanceHead(nn.Module):
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
         """Logits ``(N,)`` of pairs of ``(N, D)`` unit descriptors."""
-        alike = _by_view(a, self.views) @ _by_view(b, self.views).transpose(1, 2)
-        return self.of_cosine(self.views * best_alignment(alike))
+        a, b = _by_view(a, self.views), _by_view(b, self.views)
+        most = _lengths(a)[:, :, None] * _lengths(b)[:, None]
+        return self.of_cosine(best_alignment(a @ b.transpose(1, 2), most))
 
     def of_cosine(self, cosine: Tensor) -> Tensor:
         """Logit of the cosine of unit descriptors, at distance ``sqrt(2 - 2 cos)``."""
@@ -126,8 +141,7 @@ class SiameseNetwork(nn.Module):
 
     def embed(self, images: Tensor) -> Tensor:
         """``(N, 3, H, W)`` float32 in [0, 1] to ``(N, D)`` float32 descriptors of L2 norm 1."""
-        views = torch.stack(self.branch(images).float().chunk(self.branch.views, 1), 1)
-        return functional.normalize(views, dim=2).flatten(1) / math.sqrt(self.branch.views)
+        return functional.normalize(self.branch(images).float(), dim=1)
 
     def cosines(self, a: Tensor, b: Tensor) -> Tensor:
         """``(N, M)`` of descriptors ``(N, D)`` and ``(M, D)``, each in the best alignment."""

@@ -30,7 +30,7 @@ from vslam.loopclosure.siamese.objective import (
 )
 from vslam.loopclosure.siamese.pruning import lowest, pruned
 from vslam.loopclosure.siamese.settings import PRESETS, load_settings
-from vslam.loopclosure.siamese.siamese import load_network
+from vslam.loopclosure.siamese.siamese import load_network, save_network
 from vslam.loopclosure.siamese.start import resized, starting_network
 from vslam.loopclosure.siamese.training import train
 
@@ -241,6 +241,17 @@ def test_pruning_and_fine_tuning(tmp_path):
     half = wanted.model_copy(update={"prune_share": 0.5})
     fewer = starting_network(half, collection, full.weights, "cpu")[1]
     assert fewer.shape.kept == SMALL.places - round(0.5 * SMALL.places)
+    quick = wanted.model_copy(update={"prune_iterations": 2})
+    network, fewer, report = starting_network(quick, collection, full.weights, "cpu")
+    assert (start.branch.capsules.iterations, fitted.shape.iterations) == (3, 3)
+    assert (network.branch.capsules.iterations, fewer.shape.iterations) == (2, 2)
+    assert report["iterations"] == 2
+    save_network(network, tmp_path / "quick.safetensors", {})
+    again, x = load_network(tmp_path / "quick.safetensors")[0], to_tensor(collection.images[:4])
+    with torch.no_grad():
+        assert torch.equal(again.embed(x), network.eval().embed(x))
+        assert not torch.allclose(again.embed(x), start.eval().embed(x), atol=1e-4)
+    start, fitted, report = starting_network(wanted, collection, full.weights, "cpu")
     assert {"average_precision_before", "average_precision_removed"} <= set(report)
     tuned = train(collection, fitted, tmp_path / "pruned", threads=1, start=start)
     assert load_network(tuned.weights)[0].name == "capsule-pruned"

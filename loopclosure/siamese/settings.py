@@ -52,6 +52,9 @@ class TrainSettings(BaseModel):
     prune_share: float = Field(
         0.2, gt=0, lt=1, description="Of the capsules, taken out of capsule-pruned. [paper]"
     )
+    prune_iterations: int | None = Field(
+        None, ge=1, description="Of the routing of capsule-pruned; null: as many as before."
+    )
     skipped_blocks: Skipped = Field(
         (), description="Of a lite0 extractor, with a shortcut: left out of it as well."
     )

@@ -51,9 +51,10 @@ def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
     if views == 1:
         return a @ b.T
     a, b = _by_view(a, views), _by_view(b, views)
-    alike = (a.flatten(0, 1) @ b.flatten(0, 1).T).view(len(a), views, len(b), views)
+    # In this order: b is a map of thousands of keyframes, a the one that asks for its place.
+    alike = (b.flatten(0, 1) @ a.flatten(0, 1).T).view(len(b), views, len(a), views)
     most = torch.einsum("nv,mw->nmvw", _lengths(a), _lengths(b))
-    return best_alignment(alike.transpose(1, 2), most)
+    return best_alignment(alike.permute(2, 0, 3, 1), most)
 
 
 def _by_view(descriptors: Tensor, views: int) -> Tensor:

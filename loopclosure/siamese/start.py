@@ -19,6 +19,7 @@ from vslam.loopclosure.siamese.pruning import (
     lowest,
     mean_couplings,
     pruned,
+    with_iterations,
     with_shallower_extractor,
 )
 from vslam.loopclosure.siamese.runtime import milliseconds_per_image
@@ -134,8 +135,12 @@ def _prune(
     images = collection.images[train[::step]]
     whole.to(device)
     batches = (to_tensor(images[k : k + 32]).to(device) for k in range(0, len(images), 32))
-    smaller = pruned(whole, lowest(mean_couplings(whole, batches), settings.prune_share))
     report: dict[str, Any] = {"pruned_from": weights.name, "pruned_share": settings.prune_share}
+    routed = whole
+    if settings.prune_iterations is not None:
+        routed = with_iterations(whole, settings.prune_iterations)
+        report["iterations"] = settings.prune_iterations
+    smaller = pruned(routed, lowest(mean_couplings(routed, batches), settings.prune_share))
     if whole is not full:
         report["resized_to"] = whole.size
     if settings.skipped_blocks:

@@ -46,6 +46,11 @@ def test_comparison_has_medians_and_ratios(speed):
     head, _, first, *_ = table.splitlines()
     assert head == "| | vslam | ORB-SLAM3 | vslam / ORB-SLAM3 |"
     assert first == "| frames/s, whole process ↑ | 12.0 (10.0 - 20.0) | 6.0 | 2.00 |"
+    other = speed.comparison(
+        {speed.FULL: ours, speed.PEER: peer, "vslam --detector capsule": ours[1:2]}
+    )
+    assert other.splitlines()[0].startswith("| | vslam | vslam --detector capsule | ORB-SLAM3 |")
+    assert other.splitlines()[2].endswith("| 12.0 | 6.0 | 2.00 | 2.00 |")
     alone = speed.comparison({speed.FULL: ours[:1]})
     assert alone.splitlines()[2] == "| frames/s, whole process ↑ | 10.0 |"
 

@@ -1,16 +1,16 @@
 """Measure the speed of vslam beside ORB-SLAM3 (pyorbslam3), and write it down as Markdown.
 
     python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" \
-        [--flat "town 00=/data/towns:kitti00:4541"] [--ours-only] [--repeats 3] \
+        [--flat "town 00=/data/towns:kitti00:4541"] [--ours-only] [--also capsule] [--repeats 3] \
         [--peer-python PY --peer-script run_orbslam3.py --vocabulary voc.txt] \
         [--write docs/performance.md]
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run in
 turn, one at a time, after one round that is not counted; vslam with its report, with
-``--no-report``, and in the last round with ``--realtime``, which takes as long as the drive. Of a
-``--flat`` case vslam runs once, and the time of its frames is drawn along the drive. What a peer's
-script takes and prints is said in compare_peer.py; ``track_ms_median`` and ``track_ms_p95`` are
-taken where it prints them.
+``--no-report``, and in the last round with ``--realtime``, which takes as long as the drive; with
+``--also`` once more with another detector than ``bow``. Of a ``--flat`` case vslam runs once, and
+the time of its frames is drawn along the drive. What a peer's script takes and prints is said in
+compare_peer.py; ``track_ms_median`` and ``track_ms_p95`` are taken where it prints them.
 """
 
 from __future__ import annotations
@@ -123,6 +123,9 @@ def measure_case(case: Case, options: argparse.Namespace) -> dict[str, list[Run]
     """All counted runs of each system."""
     runs: dict[str, list[Run]] = {FULL: [], PEER: [], LEAN: [], LIVE: []}
     words = {FULL: (), LEAN: ("--no-report",), LIVE: ("--no-report", "--realtime")}
+    for name in options.also:
+        runs[title := f"{FULL} --detector {name}"] = []
+        words[title] = ("--detector", name)  # the last one on the command line counts
     if options.ours_only:
         del runs[PEER]
     for repeat in range(options.repeats + 1):
@@ -151,8 +154,8 @@ def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
 
 def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
     """A table of medians, with the ratios to the peer where there is one."""
-    systems = [system for system in (FULL, LEAN, PEER) if system in measured]
-    ours = [system for system in systems if system != PEER]
+    ours = [system for system in measured if system != PEER]
+    systems = ours + [PEER] * (PEER in measured)
     head = [*systems, *([f"{system} / {PEER}" for system in ours] if PEER in systems else [])]
     lines = [f"| | {' | '.join(head)} |", "|---" * (len(head) + 1) + "|"]
     for name, title, form in MEASURES:
@@ -284,6 +287,9 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--flat", type=parse_case, metavar=shape, help="draw cost along it")
     parser.add_argument("--repeats", type=int, default=3, help="counted runs of each system")
     parser.add_argument("--ours-only", action="store_true", help="leave out the peer")
+    parser.add_argument(
+        "--also", action="append", default=[], metavar="DETECTOR", help="run with it as well"
+    )
     parser.add_argument("--vslam", default=str(Path(sys.executable).with_name("vslam")))
     parser.add_argument("--peer-python", type=lambda text: Path(text).absolute())
     parser.add_argument("--peer-script", type=lambda text: Path(text).absolute())

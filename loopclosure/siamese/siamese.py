@@ -25,14 +25,18 @@ from vslam.loopclosure.siamese.capsules import TINY
 from vslam.loopclosure.siamese.extractors import fold_batch_norms
 from vslam.loopclosure.siamese.weights import NETWORKS
 
+_SOFTNESS = 0.04  # of the maximum over alignments, in cosines
 
-def best_alignment(alike: Tensor, most: Tensor) -> Tensor:
+
+def aligned(alike: Tensor, most: Tensor) -> Tensor:
     """Cosine of two images whose views have the products ``alike`` ``(..., V, V)``.
 
     The views of one lie on those of the other, or moved by some to the left or right: a camera
     that has turned sees elsewhere what was in its middle. Of each such alignment the products of
-    the views that meet, at least half of them, count together, and the best one is taken. (Not in
-    the paper, which compares whole images only.)
+    the views that meet, at least half of them, count together. The soft maximum of all alignments
+    is taken: a camera that has turned by half of the distance of two views, or has driven on, is
+    nearly aligned in two of them. So it can be a little above 1. (Not in the paper, which compares
+    whole images only.)
 
     Args:
         alike: scalar products of the views.
@@ -43,18 +47,18 @@ def best_alignment(alike: Tensor, most: Tensor) -> Tensor:
         alike.diagonal(s, -2, -1).sum(-1) / (most.diagonal(s, -2, -1).sum(-1) + TINY)
         for s in range(-reach, reach + 1)
     ]
-    return torch.stack(moved).amax(0)
+    return _SOFTNESS * torch.logsumexp(torch.stack(moved) / _SOFTNESS, 0)
 
 
 def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
-    """Cosines ``(N, M)`` of ``(N, D)`` and ``(M, D)``, of several views in the best alignment."""
+    """Cosines ``(N, M)`` of ``(N, D)`` and ``(M, D)``; those of several views :func:`aligned`."""
     if views == 1:
         return a @ b.T
     a, b = _by_view(a, views), _by_view(b, views)
     # In this order: b is a map of thousands of keyframes, a the one that asks for its place.
     alike = (b.flatten(0, 1) @ a.flatten(0, 1).T).view(len(b), views, len(a), views)
     most = torch.einsum("nv,mw->nmvw", _lengths(a), _lengths(b))
-    return best_alignment(alike.permute(2, 0, 3, 1), most)
+    return aligned(alike.permute(2, 0, 3, 1), most)
 
 
 def _by_view(descriptors: Tensor, views: int) -> Tensor:
@@ -70,7 +74,7 @@ def _lengths(views: Tensor) -> Tensor:
 class DistanceHead(nn.Module):
     """``p = sigmoid(a - b d)`` (Eq. 2) of the distance d of two descriptors (Eq. 10), a, b > 0.
 
-    With several views d is that of the :func:`best_alignment`.
+    With several views d is that of the :func:`aligned`.
     """
 
     def __init__(self, views: int = 1) -> None:
@@ -84,7 +88,7 @@ class DistanceHead(nn.Module):
         """Logits ``(N,)`` of pairs of ``(N, D)`` unit descriptors."""
         a, b = _by_view(a, self.views), _by_view(b, self.views)
         most = _lengths(a)[:, :, None] * _lengths(b)[:, None]
-        return self.of_cosine(best_alignment(a @ b.transpose(1, 2), most))
+        return self.of_cosine(aligned(a @ b.transpose(1, 2), most))
 
     def of_cosine(self, cosine: Tensor) -> Tensor:
         """Logit of the cosine of unit descriptors, at distance ``sqrt(2 - 2 cos)``."""
@@ -145,7 +149,7 @@ class SiameseNetwork(nn.Module):
         return functional.normalize(self.branch(images).float(), dim=1)
 
     def cosines(self, a: Tensor, b: Tensor) -> Tensor:
-        """``(N, M)`` of descriptors ``(N, D)`` and ``(M, D)``, each in the best alignment."""
+        """``(N, M)`` of descriptors ``(N, D)`` and ``(M, D)``, aligned."""
         return cosines(a, b, self.branch.views)
 
     def logits(self, a: Tensor, b: Tensor) -> Tensor:

@@ -235,8 +235,10 @@ class CapsuleLayer(nn.Module):
 
     def _route(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         if self.place.shape[1] < self.places:
-            index = self.place[None, :, :, None].expand(u.shape[0], -1, -1, u.shape[3])
-            u = torch.gather(u, 2, index)
+            types, kept = self.place.shape
+            first = self.places * torch.arange(types, device=u.device)[:, None]
+            rows = u.flatten(1, 2).index_select(1, (first + self.place).flatten())
+            u = rows.unflatten(1, (types, kept))  # torch.gather takes five times as long
         alive = self.alive if self.masked else None
         # It sums thousands of products: never in half precision.
         with torch.autocast(u.device.type, enabled=False):

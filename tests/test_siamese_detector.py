@@ -164,7 +164,7 @@ def test_train_writes_weights_and_card(tmp_path):
         rows.append(f"{names[0]},{names[1]},{int(same)}")
     (data / "pairs.csv").write_text("\n".join(rows) + "\n")
     settings = tmp_path / "settings.json"
-    settings.write_text(small_settings(epochs=1).model_dump_json())
+    settings.write_text(small_settings(epochs=1, seed=3).model_dump_json())
     out = tmp_path / "out"
     command = ["train", "capsule", "--data", f"pairs:{data}", "--settings", str(settings)]
     done = CliRunner().invoke(app, [*command, "--out", str(out), "--threads", "1"])
@@ -173,6 +173,7 @@ def test_train_writes_weights_and_card(tmp_path):
     files = {path.name for path in out.iterdir()}
     assert files >= {"capsule.safetensors", "capsule.json", "capsule.md", "log.csv",
                      "checkpoint.pt", "settings.json", "pairs"}  # fmt: skip
+    assert json.loads((out / "capsule.json").read_text())["seed"] == 3  # that of the settings
     full, shipped = out / "capsule.safetensors", tmp_path / "ship" / "capsule.safetensors"
     # Without settings of its own a training takes images of the size that its weights take.
     command = ["train", "capsule-pruned", "--data", f"pairs:{data}", "--weights", str(full)]

@@ -65,7 +65,10 @@ def train(
     ] = None,
     epochs: Annotated[int | None, typer.Option(min=1, help="At most so many.")] = None,
     pairs: Annotated[int | None, typer.Option(min=2, help="Pairs of an epoch.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="Of all that is random.", show_default="that of the settings"),
+    ] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     threads: Annotated[
         int | None, typer.Option(min=1, help="Threads.", show_default="cores")

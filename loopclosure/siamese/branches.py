@@ -273,7 +273,8 @@ def _first(error: ValidationError) -> str:
 def textured(images: Tensor) -> Tensor:
     """``(N, 1, H, W)`` in [0, 1] to 1.0 where a pixel differs from one beside or below it, else 0.
 
-    By more than a grey level: what is black, white or covered does not.
+    By more than a grey level (of exactly one, rounding decides): what is black, white or covered
+    does not.
     """
     beside = functional.pad((images[..., 1:] - images[..., :-1]).abs(), (0, 1))
     below = functional.pad((images[..., 1:, :] - images[..., :-1, :]).abs(), (0, 0, 0, 1))

@@ -74,7 +74,7 @@ def _lengths(views: Tensor) -> Tensor:
 class DistanceHead(nn.Module):
     """``p = sigmoid(a - b d)`` (Eq. 2) of the distance d of two descriptors (Eq. 10), a, b > 0.
 
-    With several views d is that of the :func:`aligned`.
+    With several views d is that of their :func:`aligned` cosine.
     """
 
     def __init__(self, views: int = 1) -> None:

@@ -38,8 +38,6 @@ from vslam.loopclosure.siamese.weights import read_pth
 # ImageNet's statistics, which torchvision's weight files expect.
 _IMAGENET_MEAN = (0.485, 0.456, 0.406)
 _IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
-
-
 _GREY_LEVEL = 1.0 / 255.0
 _LEAST_SHARE = 0.02  # of texture in a view: where no view shows any, all still count alike
 
@@ -229,29 +227,30 @@ class CapsuleBranch(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """``(N, 3, H, W)`` float32 in [0, 1] to ``(N, D)``, not yet of length 1."""
-        v = self.capsules(self._primary_capsules(images)).flatten(1)
+        grey = images.mean(1, keepdim=True)
+        shown = textured(grey)
+        v = self.capsules(self._primary_capsules(grey, shown)).flatten(1)
         views = functional.normalize(torch.stack(v.chunk(self.views), 1), dim=2)
-        return (views * self._textured_share(images)[:, :, None]).flatten(1)
+        return (views * self._textured_share(shown)[:, :, None]).flatten(1)
 
     def routed(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Output capsules ``(V N, J, D)``, couplings ``(V N, J, I)``: all leftmost views first."""
-        return self.capsules.routed(self._primary_capsules(images))
+        grey = images.mean(1, keepdim=True)
+        return self.capsules.routed(self._primary_capsules(grey, textured(grey)))
 
-    def _primary_capsules(self, images: Tensor) -> Tensor:
-        """``(V N, T, P, A)``."""
-        x = images.mean(1, keepdim=True)
+    def _primary_capsules(self, grey: Tensor, shown: Tensor) -> Tensor:
+        """``(V N, T, P, A)`` of ``(N, 1, H, W)`` images and where they are :func:`textured`."""
         if isinstance(self.extractor, LiteExtractor):
-            x = standardised(x).contiguous(memory_format=torch.channels_last)
+            x = standardised(grey, shown).contiguous(memory_format=torch.channels_last)
             x = self.extractor.late(self._views(self.extractor.early(x)))
         else:
-            x = self.extractor(standardised(self._views(x)))
+            x = self.extractor(standardised(self._views(grey)))
         capsules: Tensor = self.primary(x)
         return capsules
 
-    def _textured_share(self, images: Tensor) -> Tensor:
+    def _textured_share(self, shown: Tensor) -> Tensor:
         """Of each view, ``(N, V)``."""
-        shown, stride = textured(images.mean(1, keepdim=True)), self.shape.cut_stride
-        firsts = [cut.start * stride for cut in self.shape.cuts]
+        firsts = [cut.start * self.shape.cut_stride for cut in self.shape.cuts]
         width = self.shape.view[1]
         shares = [shown[..., k : k + width].mean((1, 2, 3)) for k in firsts]
         return torch.stack(shares, 1).clamp_min(_LEAST_SHARE)
@@ -281,13 +280,19 @@ def textured(images: Tensor) -> Tensor:
     return (torch.maximum(beside, below) > _GREY_LEVEL).to(images.dtype)
 
 
-def standardised(images: Tensor) -> Tensor:
+def standardised(images: Tensor, shown: Tensor | None = None) -> Tensor:
     """Each image with mean 0 and deviation 1 where it shows texture.
 
     Gain and bias of the camera drop out, and what is overexposed or covered does not change the
     rest.
+
+    Args:
+        images: ``(N, 1, H, W)``.
+        shown: what :func:`textured` says of them, where that is known.
     """
-    weight = textured(images) + 1e-3  # of an image without any all pixels count
+    weight = (
+        textured(images) if shown is None else shown
+    ) + 1e-3  # of an image without any all pixels count
     weight = weight / weight.sum((1, 2, 3), keepdim=True)
     centred = images - (images * weight).sum((1, 2, 3), keepdim=True)
     deviation = torch.sqrt((centred * centred * weight).sum((1, 2, 3), keepdim=True))

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 import torch
 from pydantic import ValidationError
-from siamese_worlds import small_network, small_settings, views
+from siamese_worlds import small_settings, views
 from torch.nn import functional
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.augmentation import turn_homography
 from vslam.loopclosure.siamese.branches import CapsuleBranch, CapsuleShape, Layout
 from vslam.loopclosure.siamese.lite import LiteExtractor
-from vslam.loopclosure.siamese.pruning import with_shallower_extractor
 from vslam.loopclosure.siamese.siamese import load_network
 from vslam.loopclosure.siamese.start import resized, starting_network
 from vslam.loopclosure.siamese.training import train
@@ -170,46 +169,24 @@ def test_it_goes_on_at_another_size(imagenet):
         torch.testing.assert_close(theirs[key], ours[key], rtol=0, atol=0)
 
 
-@torch.no_grad()
-def test_blocks_that_add_nothing_are_left_out_without_a_trace(imagenet):
-    shape = CapsuleShape(extractor="lite0", pixels=65, types=4, outputs=4)
-    network = starting_network(small_settings(shape=shape), views(8), imagenet, "cpu")[0]
-    assert network is not None
-    for number in (2, 10):
-        project = network.branch.extractor.residuals[number].project
-        project.weight.zero_()
-        project.bias.zero_()
-    network.eval()
-    shallow = with_shallower_extractor(network, (10, 2))
-    assert shallow.branch.shape.skipped == (2, 10)
-    assert list(shallow.branch.extractor.residuals) == [0, 1, 3, 4, 5, 6, 7, 8, 9]
-    x = torch.rand(2, 3, 65, 65, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(shallow.embed(x), network.embed(x), rtol=0, atol=0)
-    with pytest.raises(InputError, match="only blocks of a lite0 extractor"):
-        with_shallower_extractor(small_network(), (2,))
-    with pytest.raises(ValidationError, match="with a shortcut can be left out"):
-        CapsuleShape(extractor="lite0", skipped=(3,))
-
-
-def test_weights_that_speak_of_channels_inside_are_read_if_none_is_gone():
-    assert CapsuleShape.model_validate({"inner": None}) == CapsuleShape()
+def test_weights_that_speak_of_what_was_left_out_are_read_if_nothing_was():
+    assert CapsuleShape.model_validate({"inner": None, "skipped": []}) == CapsuleShape()
     with pytest.raises(ValidationError, match="inner"):
         CapsuleShape.model_validate({"inner": [8]})
+    with pytest.raises(ValidationError, match="skipped"):
+        CapsuleShape.model_validate({"skipped": [2]})
 
 
-def test_a_shallower_network_is_pruned_trained_and_read_again(tmp_path, imagenet):
+def test_a_lite_network_is_pruned_trained_and_read_again(tmp_path, imagenet):
     settings = small_settings(
         shape=CapsuleShape(extractor="lite0", pixels=64, types=4, outputs=4), epochs=1, pairs=8
     )
     collection = views(12)
     network = starting_network(settings, collection, imagenet, "cpu")[0]
     full = train(collection, settings, tmp_path / "full", start=network, threads=1)
-    wanted = settings.model_copy(
-        update={"network": "capsule-pruned", "prune_share": 0.5, "skipped_blocks": (4,)}
-    )
+    wanted = settings.model_copy(update={"network": "capsule-pruned", "prune_share": 0.5})
     start, fitted, about = starting_network(wanted, collection, full.weights, "cpu")
-    assert (about["pruned_share"], about["skipped_blocks"]) == (0.5, (4,))
-    assert (fitted.shape.kept, fitted.shape.skipped) == (8, (4,))
+    assert (about["pruned_share"], fitted.shape.kept) == (0.5, 8)
     outcome = train(collection, fitted, tmp_path / "pruned", start=start, threads=1)
     assert load_network(outcome.weights)[0].branch.shape == fitted.shape
 

@@ -11,7 +11,6 @@ import typer
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
-    from vslam.loopclosure.siamese.branches import Layout
     from vslam.loopclosure.siamese.data import Collection
     from vslam.loopclosure.siamese.settings import TrainSettings
     from vslam.loopclosure.siamese.training import Outcome
@@ -178,18 +177,6 @@ def _train(
     from vslam.loopclosure.siamese.training import train as run
     from vslam.progress import training_bar
 
-    teacher = None
-    if settings.imitation:
-        if weights is None or weights.suffix != ".safetensors":
-            raise InputError(
-                "--settings: imitation needs a network of ours to stay near, --weights."
-            )
-        teacher, _ = load_network(weights)
-        if teacher.branch.layout != settings.shape.layout:
-            raise InputError(
-                f"{weights}: has {_text(teacher.branch.layout)}, a network that is to stay near "
-                f"it cannot have {_text(settings.shape.layout)}."
-            )
     start, settings, report = starting_network(
         settings, collection, weights, device, resuming=resume and (folder / CHECKPOINT).exists()
     )
@@ -198,7 +185,7 @@ def _train(
     with training_bar(shown=not quiet) as on_step:
         outcome = run(
             collection, settings, folder, device=device, threads=threads, resume=resume,
-            start=start, teacher=teacher, on_step=on_step,
+            start=start, on_step=on_step,
             should_stop=None if until is None else lambda: time.monotonic() > until,
         )  # fmt: skip
     if outcome.weights.exists():
@@ -270,8 +257,3 @@ def places(
     sources = [source for spec in data for source in open_source(spec)]
     write_pack(sources, out, parse_size(pixels), "squash" if fit == "squash" else "crop")
     typer.echo(f"{out}: {sum(map(len, sources))} images, {out.stat().st_size / 1e6:.1f} MB")
-
-
-def _text(layout: Layout) -> str:
-    height, width = layout.size
-    return f"{layout.views} view(s) of {height}x{layout.view_width or width} of {width} pixels"

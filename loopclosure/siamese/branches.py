@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from pydantic import (
-    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -29,7 +28,6 @@ from vslam.loopclosure.siamese.extractors import (
 from vslam.loopclosure.siamese.images import Size
 from vslam.loopclosure.siamese.lite import (
     EARLY_STRIDE,
-    SKIPPABLE,
     LiteExtractor,
     lite_grid_side,
 )
@@ -38,7 +36,7 @@ from vslam.loopclosure.siamese.weights import read_pth
 # ImageNet's statistics, which torchvision's weight files expect.
 _IMAGENET_MEAN = (0.485, 0.456, 0.406)
 _IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
-_GREY_LEVEL = 1.0 / 255.0
+_TEXTURE = 1.5 / 255.0  # between one grey level, which is noise, and two: exact in any rounding
 _LEAST_SHARE = 0.02  # of texture in a view: where no view shows any, all still count alike
 
 
@@ -54,15 +52,6 @@ class Layout(NamedTuple):
     size: Size
     views: int = 1
     view_width: int | None = None
-
-
-def _have_shortcuts(blocks: tuple[int, ...]) -> tuple[int, ...]:
-    if not set(blocks) <= set(SKIPPABLE):
-        raise ValueError(f"only blocks with a shortcut can be left out, {SKIPPABLE}")
-    return blocks
-
-
-Skipped = Annotated[tuple[int, ...], AfterValidator(_have_shortcuts)]
 
 
 class CapsuleShape(BaseModel):
@@ -83,15 +72,15 @@ class CapsuleShape(BaseModel):
     iterations: int = Field(3, ge=1, description="Of the routing.")
     over: Literal["primary", "output"] = "primary"
     kept: int | None = Field(None, description="Places kept of each type; None before pruning.")
-    skipped: Skipped = Field((), description="Blocks of a lite0 extractor left out.")
 
     @model_validator(mode="before")
     @classmethod
     def _without_what_is_gone(cls, given: Any) -> Any:
-        """Weights of 0.1.0 before blocks were left out say that no channel was."""
-        if isinstance(given, dict) and given.get("inner", 0) is None:
-            return {key: value for key, value in given.items() if key != "inner"}
-        return given
+        """Weights of before say that no channel and no block was left out of the extractor."""
+        if not isinstance(given, dict):
+            return given
+        nothing = {key for key in ("inner", "skipped") if not given.get(key, True)}
+        return {key: value for key, value in given.items() if key not in nothing}
 
     @model_validator(mode="after")
     def _views_lie_on_columns(self) -> CapsuleShape:
@@ -214,7 +203,7 @@ class CapsuleBranch(nn.Module):
             self.primary = OriginalExtractor(shape.types, shape.size)
         else:
             lite = shape.extractor == "lite0"
-            grid = LiteExtractor(shape.skipped) if lite else LightExtractor(shape.blocks)
+            grid = LiteExtractor() if lite else LightExtractor(shape.blocks)
             self.extractor = grid
             self.primary = PrimaryCapsules(grid.out_channels, shape.types, shape.size)
         # Depthwise convolutions are faster so, forward by a third and backward by a quarter.
@@ -272,12 +261,11 @@ def _first(error: ValidationError) -> str:
 def textured(images: Tensor) -> Tensor:
     """``(N, 1, H, W)`` in [0, 1] to 1.0 where a pixel differs from one beside or below it, else 0.
 
-    By more than a grey level (of exactly one, rounding decides): what is black, white or covered
-    does not.
+    By more than a grey level: what is black, white or covered does not.
     """
     beside = functional.pad((images[..., 1:] - images[..., :-1]).abs(), (0, 1))
     below = functional.pad((images[..., 1:, :] - images[..., :-1, :]).abs(), (0, 0, 0, 1))
-    return (torch.maximum(beside, below) > _GREY_LEVEL).to(images.dtype)
+    return (torch.maximum(beside, below) > _TEXTURE).to(images.dtype)
 
 
 def standardised(images: Tensor, shown: Tensor | None = None) -> Tensor:

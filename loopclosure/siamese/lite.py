@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Collection
-from itertools import pairwise
 from pathlib import Path
 from typing import cast
 
@@ -35,12 +33,6 @@ _BLOCKS = (
     (6, 112, 1, 5),
     (6, 112, 1, 5),
     (6, 112, 1, 5),
-)
-# Those with a shortcut, which passes on what a block leaves.
-SKIPPABLE = tuple(
-    number
-    for number, (before, block) in enumerate(pairwise(_BLOCKS), 1)
-    if block[1] == before[1] and block[2] == 1
 )
 _STEM = 32
 _EARLY = 5  # blocks of the first three stages
@@ -81,15 +73,13 @@ class LiteExtractor(nn.Module):
         out_channels: of the grid.
     """
 
-    def __init__(self, skipped: Collection[int] = ()) -> None:
-        """``skipped``: numbers of blocks that are left out, of ``SKIPPABLE``."""
+    def __init__(self) -> None:
         super().__init__()
         self.stem = nn.Conv2d(1, _STEM, 3, 2, 1)
         blocks: OrderedDict[str, nn.Module] = OrderedDict()
         inputs = _STEM
         for number, (expansion, outputs, stride, kernel) in enumerate(_BLOCKS):
-            if number not in skipped:
-                blocks[str(number)] = InvertedResidual(inputs, outputs, expansion, stride, kernel)
+            blocks[str(number)] = InvertedResidual(inputs, outputs, expansion, stride, kernel)
             inputs = outputs
         self.blocks = nn.Sequential(blocks)
         self.out_channels = inputs

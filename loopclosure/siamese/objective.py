@@ -45,14 +45,6 @@ def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) 
     return losses[same.repeat(2)].mean()
 
 
-def imitation(descriptors: Tensor, wanted: Tensor) -> Tensor:
-    """Mean of 1 minus the cosine of ``(N, D)`` unit descriptors and those of another network.
-
-    What a smaller network learns from a larger one (as the hints of Romero et al., ICLR 2015).
-    """
-    return 1.0 - (descriptors * wanted).sum(1).mean()
-
-
 @torch.no_grad()
 def embed_all(
     network: SiameseNetwork, images: NDArray[np.uint8], device: torch.device, batch: int = 64

@@ -7,14 +7,13 @@ their W_ij to 0. A zero costs as much time as any number: here they are removed.
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.branches import CapsuleBranch
-from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.siamese import SiameseNetwork
 
 
@@ -97,26 +96,6 @@ def with_iterations(network: SiameseNetwork, iterations: int) -> SiameseNetwork:
     branch.shape = branch.shape.model_copy(update={"iterations": iterations})
     branch.capsules.iterations = iterations
     return copied
-
-
-def with_shallower_extractor(network: SiameseNetwork, blocks: Collection[int]) -> SiameseNetwork:
-    """A copy without these blocks of its extractor; their shortcuts stay.
-
-    Not in the paper: where the extractor takes most of the time, removing capsules saves little.
-    A residual network loses little with a block (Veit et al., NIPS 2016), and training mends that.
-
-    Raises:
-        InputError: a network without capsules, or with another extractor than lite0.
-    """
-    branch = _capsules_of(network)
-    if not isinstance(branch.extractor, LiteExtractor):
-        raise InputError(f"{network.name}: only blocks of a lite0 extractor can be left out.")
-    skipped = tuple(sorted({*branch.shape.skipped, *blocks}))
-    shape = branch.shape.model_copy(update={"skipped": skipped})
-    smaller = SiameseNetwork(network.name, CapsuleBranch(shape), copy.deepcopy(network.head))
-    state = network.state_dict()
-    smaller.load_state_dict({key: state[key] for key in smaller.state_dict()})
-    return smaller.to(branch.capsules.W.device).train(network.training)
 
 
 def _capsules_of(network: SiameseNetwork) -> CapsuleBranch:

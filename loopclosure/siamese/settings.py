@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.augmentation import STRONG, Augmentation
-from vslam.loopclosure.siamese.branches import CapsuleShape, Skipped
+from vslam.loopclosure.siamese.branches import CapsuleShape
 
 
 class TrainSettings(BaseModel):
@@ -24,9 +24,6 @@ class TrainSettings(BaseModel):
     )
     seed: int = Field(0, ge=0, description="Of weights, division, pairs and augmentation.")
     loss: Literal["bce", "bce+contrast"] = Field("bce", description="Eq. 3, or with contrast.")
-    imitation: float = Field(
-        0.0, ge=0, description="Weight of staying near the descriptors of the network at the start."
-    )
     temperature: float = Field(0.07, gt=0, description="Of the contrast.")
     learning_rate: float = Field(3e-4, gt=0, description="Of Adam. [paper]")
     extractor_rate: float = Field(1.0, ge=0, description="Of the extractor, times that rate.")
@@ -54,9 +51,6 @@ class TrainSettings(BaseModel):
     )
     prune_iterations: int | None = Field(
         None, ge=1, description="Of the routing of capsule-pruned; null: as many as before."
-    )
-    skipped_blocks: Skipped = Field(
-        (), description="Of a lite0 extractor, with a shortcut: left out of it as well."
     )
 
 

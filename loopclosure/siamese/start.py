@@ -20,7 +20,6 @@ from vslam.loopclosure.siamese.pruning import (
     mean_couplings,
     pruned,
     with_iterations,
-    with_shallower_extractor,
 )
 from vslam.loopclosure.siamese.runtime import milliseconds_per_image
 from vslam.loopclosure.siamese.settings import TrainSettings
@@ -143,9 +142,6 @@ def _prune(
     smaller = pruned(routed, lowest(mean_couplings(routed, batches), settings.prune_share))
     if whole is not full:
         report["resized_to"] = whole.size
-    if settings.skipped_blocks:
-        smaller = with_shallower_extractor(smaller, settings.skipped_blocks)
-        report["skipped_blocks"] = settings.skipped_blocks
     for name, network in (("before", whole), ("removed", smaller)):
         figures = validate(network, collection, validation, settings.augmentation, device)[0]
         report[f"average_precision_{name}"] = figures["average_precision"]

@@ -48,7 +48,6 @@ from vslam.loopclosure.siamese.objective import (
     contrast,
     cross_entropy,
     embed_all,
-    imitation,
     validate,
 )
 from vslam.loopclosure.siamese.settings import TrainSettings
@@ -95,7 +94,6 @@ def train(
     threads: int = 2,
     resume: bool = False,
     start: SiameseNetwork | None = None,
-    teacher: SiameseNetwork | None = None,
     on_step: OnStep | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Outcome:
@@ -109,17 +107,14 @@ def train(
         threads: that augment images.
         resume: go on from the folder's checkpoint, if there is one.
         start: network to start from instead of random weights (fine-tuning).
-        teacher: network whose descriptors it stays near, as ``settings.imitation`` says.
         on_step: called after each step.
         should_stop: asked after each step; a checkpoint is written before stopping.
 
     Raises:
         InputError: too little data, an unknown device or source, a checkpoint of other settings, or
-            imitation or a learned share without a network to start from.
+            a learned share without a network to start from.
         ResultsError: the loss is not finite (the last good checkpoint stays), or a full disk.
     """
-    if settings.imitation and teacher is None:
-        raise InputError("imitation: there is no network to stay near; give it as the teacher.")
     if settings.learned_share < 1 and start is None:
         raise InputError("learned_share: there is no network to go back towards; give --weights.")
     where = _open_device(device)
@@ -128,7 +123,6 @@ def train(
     validation = validation_images(validation, settings.validation_images, settings.seed)
     torch.manual_seed(settings.seed)
     network = (start or build_network(settings.network, settings.shape)).to(where)
-    teacher = teacher.to(where).eval() if teacher is not None and settings.imitation else None
     before = copy.deepcopy(network.state_dict()) if settings.learned_share < 1 else None
     optimiser = _optimiser(network, settings)
     progress, pairs = Progress(), None
@@ -153,8 +147,8 @@ def train(
             while progress.step < steps:
                 batch = slice(progress.step * settings.batch, (progress.step + 1) * settings.batch)
                 loss = _step(
-                    network, teacher, optimiser, collection, pairs, batch, settings, progress,
-                    steps, pool, where,
+                    network, optimiser, collection, pairs, batch, settings, progress, steps, pool,
+                    where,
                 )  # fmt: skip
                 if not math.isfinite(loss):
                     raise ResultsError(
@@ -197,7 +191,6 @@ def train(
 
 def _step(
     network: SiameseNetwork,
-    teacher: SiameseNetwork | None,
     optimiser: torch.optim.Optimizer,
     collection: Collection,
     pairs: Pairs,
@@ -229,10 +222,6 @@ def _step(
         loss = loss + contrast(
             network.cosines(descriptors, descriptors), same, relation, settings.temperature
         )
-    if teacher is not None:
-        with torch.no_grad():
-            wanted = teacher.embed(images)
-        loss = loss + settings.imitation * imitation(descriptors, wanted)
     value = loss.item()
     if math.isfinite(value):
         optimiser.zero_grad(set_to_none=True)

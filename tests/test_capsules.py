@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from siamese_worlds import SMALL, small_network
+from siamese_worlds import SMALL, small_network, views
+from torch.nn import functional
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese import capsules
@@ -276,6 +277,17 @@ def test_a_torchvision_file_of_another_network_is_refused(tmp_path):
         alexnet().load_torchvision(tmp_path / "x.pth")
     with pytest.raises(InputError, match="not a readable weight file"):
         alexnet().load_torchvision(tmp_path / "none.pth")
+
+
+@torch.no_grad()
+def test_before_training_alexnet_tells_images_apart_and_has_nothing_that_blurs_that():
+    torch.manual_seed(0)
+    network = build_network("alexnet")
+    images = to_tensor(views(2).images[[0, 2]]).contiguous()
+    images = functional.interpolate(images, size=network.size, mode="bilinear")
+    training = network.train().embed(images)
+    torch.testing.assert_close(training, network.eval().embed(images))
+    assert float(training[0] @ training[1]) < 0.97
 
 
 def test_alexnet_takes_a_torchvision_file(tmp_path):

@@ -205,8 +205,6 @@ def _step(
     a, b = pairs.a[batch], pairs.b[batch]
     same = torch.from_numpy(pairs.same[batch]).to(device)
     images = _augmented(collection, a, b, batch.start, settings, progress.epoch, pool).to(device)
-    # Dropout of AlexNet and VGG16 draws from torch's generator.
-    torch.manual_seed((settings.seed * 1_009 + progress.epoch) * 1_000_003 + progress.step)
     rate = _learning_rate(settings, progress.epoch * steps + progress.step, settings.epochs * steps)
     for group in optimiser.param_groups:
         group["lr"] = rate * group["factor"]

@@ -262,6 +262,12 @@ def test_weights_survive_a_file(tmp_path, half):
         assert torch.allclose(read.embed(x), network.embed(x), atol=1e-2 if half else 0)
 
 
+def test_weights_may_be_read_by_whoever_may_read_other_files(tmp_path):
+    (tmp_path / "other").touch()
+    save_network(small_network(), tmp_path / "w.safetensors", {})
+    assert (tmp_path / "w.safetensors").stat().st_mode == (tmp_path / "other").stat().st_mode
+
+
 @pytest.mark.parametrize("content", [None, b"", b"no weights at all, but long enough to parse"])
 def test_bad_weights_are_named(tmp_path, content):
     path = tmp_path / "w.safetensors"

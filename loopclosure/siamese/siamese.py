@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -216,7 +216,8 @@ def save_network(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_suffix(".part")
-        save_file({k: v.cpu().contiguous() for k, v in tensors.items()}, temporary, metadata)
+        # Not save_file, whose files only their owner can read.
+        temporary.write_bytes(save({k: v.cpu().contiguous() for k, v in tensors.items()}, metadata))
         temporary.replace(path)
     except (OSError, SafetensorError) as error:
         raise ResultsError(f"{path}: the weights cannot be written ({error}).") from error

@@ -217,11 +217,10 @@ def test_pruned_views_are_masked_views(network):
 def test_a_network_learns_with_views_and_is_read_again(tmp_path):
     collection = wide_views(20)
     shape = SMALL.model_copy(update=WIDE)
-    # Nothing mined: the pairs of all epochs are as hard as each other.
-    settings = small_settings(shape=shape, epochs=4, pairs=32, loss="bce+contrast", hard_share=0.0)
+    settings = small_settings(shape=shape, epochs=6, pairs=64, loss="bce+contrast", hard_share=0.0)
     done = train(collection, settings, tmp_path, threads=1)
-    losses = [row["loss"] for row in done.progress.history]
-    assert losses[-1] < losses[0]
+    ap = [row["average_precision"] for row in done.progress.history]
+    assert ap[0] < 0.5 < 0.9 < ap[-1]
     network, _ = load_network(done.weights)
     assert (network.size, network.branch.views) == ((48, 81), 2)
     assert network.head.views == 2

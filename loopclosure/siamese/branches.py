@@ -291,9 +291,9 @@ class ConvolutionalBranch(nn.Module):
     """AlexNet or VGG16 up to the second fully connected layer, then one to the descriptor.
 
     Modules are laid out and named as in torchvision, whose weight files can be loaded into
-    ``features`` and ``classifier``, but the dropout there is left out: before training it moves a
-    descriptor farther (cosine 0.5) than another image does (0.97), so that none begins. Random
-    weights are drawn as in He et al., ICCV 2015; with torch's own, images differ by 0.003.
+    ``features`` and ``classifier``, with nothing in place of its dropout: before training, dropout
+    moves a descriptor farther (cosine 0.5) than another image does (0.97), and nothing is learned.
+    Random weights are drawn as in He et al., ICCV 2015; with torch's own, images differ by 0.003.
     """
 
     mean: Tensor

@@ -278,9 +278,8 @@ def standardised(images: Tensor, shown: Tensor | None = None) -> Tensor:
         images: ``(N, 1, H, W)``.
         shown: what :func:`textured` says of them, where that is known.
     """
-    weight = (
-        textured(images) if shown is None else shown
-    ) + 1e-3  # of an image without any all pixels count
+    shown = textured(images) if shown is None else shown
+    weight = shown + 1e-3  # of an image without any all pixels count
     weight = weight / weight.sum((1, 2, 3), keepdim=True)
     centred = images - (images * weight).sum((1, 2, 3), keepdim=True)
     deviation = torch.sqrt((centred * centred * weight).sum((1, 2, 3), keepdim=True))

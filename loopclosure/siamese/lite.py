@@ -9,7 +9,6 @@ form: ReLU6, no squeeze and excitation.
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from pathlib import Path
 from typing import cast
 
@@ -76,12 +75,11 @@ class LiteExtractor(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.stem = nn.Conv2d(1, _STEM, 3, 2, 1)
-        blocks: OrderedDict[str, nn.Module] = OrderedDict()
+        self.blocks = nn.Sequential()
         inputs = _STEM
-        for number, (expansion, outputs, stride, kernel) in enumerate(_BLOCKS):
-            blocks[str(number)] = InvertedResidual(inputs, outputs, expansion, stride, kernel)
+        for expansion, outputs, stride, kernel in _BLOCKS:
+            self.blocks.append(InvertedResidual(inputs, outputs, expansion, stride, kernel))
             inputs = outputs
-        self.blocks = nn.Sequential(blocks)
         self.out_channels = inputs
 
     def forward(self, x: Tensor) -> Tensor:
@@ -91,28 +89,26 @@ class LiteExtractor(nn.Module):
     def early(self, x: Tensor) -> Tensor:
         """The first part of ``forward``, to ``(N, 40, h, w)`` with a stride of 8."""
         x = functional.relu6(self.stem(x), inplace=True)
-        for number, block in self.residuals.items():
-            if number < _EARLY:
-                x = block(x)
+        for block in self.residuals[:_EARLY]:
+            x = block(x)
         return x
 
     def late(self, x: Tensor) -> Tensor:
         """The second part, from there to ``(N, 112, h, w)`` with a stride of 16."""
-        for number, block in self.residuals.items():
-            if number >= _EARLY:
-                x = block(x)
+        for block in self.residuals[_EARLY:]:
+            x = block(x)
         return x
 
     @property
-    def residuals(self) -> dict[int, InvertedResidual]:
-        """The blocks by their numbers."""
-        return {int(k): cast(InvertedResidual, v) for k, v in self.blocks.named_children()}
+    def residuals(self) -> list[InvertedResidual]:
+        """The blocks."""
+        return [cast(InvertedResidual, block) for block in self.blocks]
 
     def freeze(self, blocks: int) -> None:
         """Leave the stem and the first blocks out of the training; 0 trains everything."""
         if blocks:
             self.stem.requires_grad_(False)
-        for number, block in self.residuals.items():
+        for number, block in enumerate(self.residuals):
             block.requires_grad_(number >= blocks)
 
     @torch.no_grad()
@@ -131,7 +127,7 @@ class LiteExtractor(nn.Module):
             weight, bias = _folded(state, "_conv_stem", "_bn0")
             self.stem.weight.copy_(weight.sum(1, keepdim=True) * _DEVIATION)
             self.stem.bias.copy_(bias)  # type: ignore[union-attr]
-            for number, block in self.residuals.items():
+            for number, block in enumerate(self.residuals):
                 layers = {
                     "_depthwise_conv": ("depthwise", "_bn1"),
                     "_project_conv": ("project", "_bn2"),

@@ -77,12 +77,16 @@ def test_settings_that_would_do_nothing_are_refused(tmp_path, changes, message):
         train(views(8), small_settings(**changes), tmp_path, threads=1)
 
 
-@pytest.mark.parametrize(("loss", "epochs"), [("bce", 14), ("bce+contrast", 12)])
-def test_64_pairs_are_learned_by_heart(tmp_path, loss, epochs):
+@pytest.mark.parametrize(
+    ("loss", "epochs", "mixed"),
+    [("bce", 14, False), ("bce+contrast", 12, False), ("bce+contrast", 12, True)],
+)
+def test_64_pairs_are_learned_by_heart(tmp_path, loss, epochs, mixed):
     collection = views(46)
     settings = small_settings(
-        epochs=epochs, pairs=64, batch=32, loss=loss, patience=99, learning_rate=5e-3
-    )
+        epochs=epochs, pairs=64, batch=32, loss=loss, patience=99, learning_rate=5e-3,
+        mixed_precision=mixed,
+    )  # fmt: skip
     outcome = train(collection, settings, tmp_path, threads=1)
     assert len(outcome.train) == 64
     network, _ = load_network(outcome.weights)
@@ -94,6 +98,19 @@ def test_64_pairs_are_learned_by_heart(tmp_path, loss, epochs):
     learned = precision_recall(pairs.same, score[pairs.a, pairs.b])
     assert average_precision(learned) == 1.0
     assert outcome.figures["average_precision"] > 0.9  # of places it never saw
+
+
+@pytest.mark.parametrize("mixed", [True, False, None])
+def test_mixed_precision_is_what_the_settings_say(tmp_path, mixed):
+    start, computed_in = small_network(1), []
+    start.branch.primary.register_forward_hook(
+        lambda module, images, capsules: computed_in.append((module.training, capsules.dtype))
+    )
+    settings = small_settings(epochs=1, mixed_precision=mixed)
+    train(views(20), settings, tmp_path, threads=1, start=start)
+    expected = torch.bfloat16 if mixed else torch.float32
+    assert {dtype for learning, dtype in computed_in if learning} == {expected}
+    assert {dtype for learning, dtype in computed_in if not learning} == {torch.float32}
 
 
 def test_a_resumed_training_has_the_bits_of_an_uninterrupted_one(tmp_path):

@@ -103,7 +103,7 @@ def train(
         collection: images and their relations.
         settings: see there.
         folder: to write to; ``settings.network`` names the file of the weights.
-        device: ``cpu`` or ``cuda``, which computes in bfloat16 where it can.
+        device: ``cpu`` or ``cuda``.
         threads: that augment images.
         resume: go on from the folder's checkpoint, if there is one.
         start: network to start from instead of random weights (fine-tuning).
@@ -209,7 +209,9 @@ def _step(
     for group in optimiser.param_groups:
         group["lr"] = rate * group["factor"]
     network.train()
-    half = device.type == "cuda" and torch.cuda.is_bf16_supported()
+    half = settings.mixed_precision
+    if half is None:
+        half = device.type == "cuda" and torch.cuda.is_bf16_supported()
     with torch.autocast(device.type, torch.bfloat16, enabled=half):
         descriptors = network.embed(images)
     first, second = descriptors[: len(a)], descriptors[len(a) :]

@@ -22,8 +22,16 @@ from vslam.errors import InputError
 from vslam.evaluate import evaluate
 from vslam.overview import write_overview
 from vslam.overview.collect import collect
-from vslam.overview.schema import MEASURES, Drive, OverviewJson, RunEntry
-from vslam.overview.summary import compare, least_pairs, make_rows, strengths, systems
+from vslam.overview.render import tables
+from vslam.overview.schema import MEASURES, Drive, OverviewJson, RunEntry, Spread
+from vslam.overview.summary import (
+    compare,
+    least_pairs,
+    make_rows,
+    strengths,
+    summarize,
+    systems,
+)
 from vslam.trajectory import read_trajectory, write_kitti, write_tum
 
 LAWS = ("none", "brightness:0.5", "brightness:1")
@@ -241,6 +249,25 @@ def test_changes_of_a_rendered_town_are_perturbations(run_folder: Path, tmp_path
     assert {drive.sequence for drive in drives} == {"05"}
     assert [drive.perturb for drive in drives] == ["none", "change:0.5", "change:1,blur:1"]
     assert list(strengths(drives, "change").values()) == [0.0, 0.5]
+
+
+def test_towns_of_other_seeds_are_put_together_as_seeds_are(run_folder: Path, tmp_path: Path):
+    for town, ate in (("05+change:0.5", 1.0), ("05+change:0.5+seed:1", 2.0), ("05+seed:2", 4.0)):
+        copy_run(
+            run_folder,
+            tmp_path / town,
+            dataset="synthetic",
+            sequence=town,
+            perturb="none",
+            ate_rmse_m=ate,
+            seed=3,
+        )
+    report = summarize(collect([tmp_path], []))
+    found = {row.drive.perturb: row.measures["ate_rmse_m"] for row in report.rows}
+    assert found["change:0.5"] == Spread(n=2, median=1.5, least=1.0, greatest=2.0)
+    assert found["none"] == Spread(n=1, median=4.0, least=4.0, greatest=4.0)
+    (runs,) = (table for table in tables(report) if table.title == "Runs")
+    assert sorted(row[3] for row in runs.rows) == ["3", "3, town 1", "3, town 2"]
 
 
 def test_csv_has_a_line_for_each_row(written):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from vslam.datasets.synthetic import parse_drive
 from vslam.errors import InputError
 from vslam.evaluate import evaluate
 from vslam.overview.schema import MEASURES, Drive, RunEntry
@@ -126,11 +127,15 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
     detector = (
         report.detector if report.sensor == "stereo" else f"{report.detector}, {report.sensor}"
     )
-    # What changes a rendered town is a perturbation, too: 05+change:0.5 is the route 05.
-    sequence, *town = (
-        report.sequence.split("+") if report.dataset == "synthetic" else [report.sequence]
-    )
-    laws = [*town, *([report.perturb] if report.perturb != "none" else [])]
+    sequence, town = report.sequence, None
+    laws: list[str] = []
+    if report.dataset == "synthetic":
+        # What changes a rendered town is a perturbation, too: 05+change:0.5 is the route 05.
+        laws = [part for part in sequence.split("+")[1:] if not part.startswith("seed:")]
+        sequence, variation = parse_drive(sequence)
+        town = variation.seed
+    if report.perturb != "none":
+        laws.append(report.perturb)
     return RunEntry(
         drive=Drive(
             dataset=report.dataset,
@@ -140,6 +145,7 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
         ),
         system=detector,
         seed=report.seed,
+        town=town,
         frames=report.frames,
         measures={name: getattr(report, name) for name, *_ in MEASURES},
         source=str(folder),

@@ -138,7 +138,7 @@ def _runs(report: OverviewJson) -> Table:
             run.drive.place,
             run.drive.perturb,
             run.system,
-            "-" if run.seed is None else str(run.seed),
+            _seed(run),
             str(run.frames),
             _figure(run, "ate_rmse_m", 3),
             run.source,
@@ -165,6 +165,12 @@ def _cell(spread: Spread | None, decimals: int) -> str:
     least, greatest = f"{spread.least:.{decimals}f}", f"{spread.greatest:.{decimals}f}"
     median = f"{spread.median:.{half}f}"
     return median if least == greatest else f"{median} ({least}-{greatest})"
+
+
+def _seed(run: RunEntry) -> str:
+    if run.seed is None:
+        return "-"
+    return f"{run.seed}, town {run.town}" if run.town else str(run.seed)
 
 
 def _figure(run: RunEntry, name: str, decimals: int) -> str:

@@ -44,12 +44,14 @@ class RunEntry(_Model):
     """One run. ``measures`` has the names of ``MEASURES``; None where a run has no such figure.
 
     ``system`` is the loop detector, or the name of another system; ``source`` the folder of the
-    run or the file of the trajectory; ``seed`` is None for other systems.
+    run or the file of the trajectory; ``seed`` is None for other systems. ``town`` is the seed of
+    a rendered town: one drive in other towns is that drive again, as with another ``seed``.
     """
 
     drive: Drive
     system: str
     seed: int | None
+    town: int | None = None
     frames: int
     measures: dict[str, float | None]
     source: str

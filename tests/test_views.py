@@ -17,6 +17,7 @@ from vslam.loopclosure.siamese.branches import CapsuleShape, Layout
 from vslam.loopclosure.siamese.images import parse_size, to_size
 from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.onnx import export_onnx
+from vslam.loopclosure.siamese.preprocessing import Unrolling
 from vslam.loopclosure.siamese.pruning import lowest, masked, mean_couplings, pruned
 from vslam.loopclosure.siamese.siamese import (
     SiameseNetwork,
@@ -242,7 +243,28 @@ def test_whole_images_become_views(tmp_path):
         assert torch.allclose(first, left, atol=1e-5)
 
 
-@pytest.mark.parametrize("network", [small_network(**WIDE), lite_network()], ids=["light", "lite0"])
+def test_networks_for_flat_images_become_those_for_unrolled_ones(tmp_path):
+    path = tmp_path / "capsule.safetensors"
+    flat = small_network(**WIDE).eval()
+    save_network(flat, path, {})
+    shape = SMALL.model_copy(update=WIDE | {"half_angle": 30.0, "middle": 0.9})
+    assert shape.for_images_of((48, 113)).layout[3:] == (30.0, 0.9)
+    start, fitted, _ = starting_network(small_settings(shape=shape), wide_views(8), path, "cpu")
+    assert fitted.shape == shape
+    save_network(start, path, {})
+    x = wide_images(2)
+    with torch.no_grad():
+        unrolled = Unrolling((48, 81), 30.0, 0.9)(x)
+        assert not torch.allclose(flat.embed(x), flat.embed(unrolled), atol=1e-2)
+        again = load_network(path)[0].embed(x)
+    assert torch.allclose(again, flat.embed(unrolled), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "network",
+    [small_network(**WIDE), lite_network(), small_network(**WIDE, half_angle=30.0, middle=0.9)],
+    ids=["light", "lite0", "unrolled"],
+)
 def test_views_are_exported(network, tmp_path):
     pytest.importorskip("onnxscript")
     assert export_onnx(network, tmp_path / "capsule.onnx") < 1e-4

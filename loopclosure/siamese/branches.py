@@ -31,12 +31,12 @@ from vslam.loopclosure.siamese.lite import (
     LiteExtractor,
     lite_grid_side,
 )
+from vslam.loopclosure.siamese.preprocessing import Unrolling, standardised, textured
 from vslam.loopclosure.siamese.weights import read_pth
 
 # ImageNet's statistics, which torchvision's weight files expect.
 _IMAGENET_MEAN = (0.485, 0.456, 0.406)
 _IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
-_TEXTURE = 1.5 / 255.0  # between one grey level, which is noise, and two: exact in any rounding
 _LEAST_SHARE = 0.02  # of texture in a view: where no view shows any, all still count alike
 
 
@@ -47,11 +47,14 @@ class Layout(NamedTuple):
         size: height and width of the image.
         views: parts of it that have a descriptor each, from left to right and equally far apart.
         view_width: columns of a part; None for the whole image as the only one.
+        half_angle, middle: how it is unrolled (:class:`preprocessing.Unrolling`); 0 leaves it flat.
     """
 
     size: Size
     views: int = 1
     view_width: int | None = None
+    half_angle: float = 0.0
+    middle: float = 1.0
 
 
 class CapsuleShape(BaseModel):
@@ -64,6 +67,10 @@ class CapsuleShape(BaseModel):
     width: int | None = Field(None, ge=32, description="Of the input; None for a square.")
     views: int = Field(1, ge=1, le=16, description="Parts of the image, from left to right.")
     view_width: int | None = Field(None, ge=32, description="Of a part; None: of the image.")
+    half_angle: float = Field(
+        0.0, ge=0, le=60, description="Degrees from middle to side when unrolled; 0: left flat."
+    )
+    middle: float = Field(1.0, gt=0, le=1, description="Of the height: seen in the middle then.")
     blocks: tuple[tuple[int, int, int], ...] = LIGHT_BLOCKS
     types: int = Field(32, ge=1, description="Types of primary capsules.")
     size: int = Field(8, ge=1, description="Numbers of a primary capsule.")
@@ -108,7 +115,7 @@ class CapsuleShape(BaseModel):
     @property
     def layout(self) -> Layout:
         """How it reads them."""
-        return Layout(self.input, self.views, self.view_width)
+        return Layout(self.input, self.views, self.view_width, self.half_angle, self.middle)
 
     @property
     def view(self) -> Size:
@@ -145,7 +152,7 @@ class CapsuleShape(BaseModel):
             unit, width = self.cut_stride * (self.views - 1), size[1]
             unseen = width * (1 - self.view_width / self.input[1])
             view = width - unit * max(1, round(unseen / unit))
-        return self.with_layout(Layout(size, self.views, view))
+        return self.with_layout(self.layout._replace(size=size, view_width=view))
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -175,6 +182,8 @@ class CapsuleShape(BaseModel):
             "width": None if width == height else width,
             "views": layout.views,
             "view_width": layout.view_width,
+            "half_angle": layout.half_angle,
+            "middle": layout.middle,
         }
         try:
             return CapsuleShape(**{**self.model_dump(), **given})
@@ -196,6 +205,7 @@ class CapsuleBranch(nn.Module):
         self.shape = shape
         self.size, self.views, self.layout = shape.input, shape.views, shape.layout
         self.dimensions = shape.views * shape.outputs * shape.depth
+        self.unrolling = Unrolling(shape.input, shape.half_angle, shape.middle)
         self.extractor: nn.Module
         self.primary: nn.Module
         if shape.extractor == "original":
@@ -216,7 +226,7 @@ class CapsuleBranch(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """``(N, 3, H, W)`` float32 in [0, 1] to ``(N, D)``, not yet of length 1."""
-        grey = images.mean(1, keepdim=True)
+        grey = self.unrolling(images.mean(1, keepdim=True))
         shown = textured(grey)
         v = self.capsules(self._primary_capsules(grey, shown)).flatten(1)
         views = functional.normalize(torch.stack(v.chunk(self.views), 1), dim=2)
@@ -224,7 +234,7 @@ class CapsuleBranch(nn.Module):
 
     def routed(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Output capsules ``(V N, J, D)``, couplings ``(V N, J, I)``: all leftmost views first."""
-        grey = images.mean(1, keepdim=True)
+        grey = self.unrolling(images.mean(1, keepdim=True))
         return self.capsules.routed(self._primary_capsules(grey, textured(grey)))
 
     def _primary_capsules(self, grey: Tensor, shown: Tensor) -> Tensor:
@@ -256,34 +266,6 @@ def _first(error: ValidationError) -> str:
     first = error.errors()[0]
     said = first["msg"].removeprefix("Value error, ")
     return ": ".join([*map(str, first["loc"]), said])
-
-
-def textured(images: Tensor) -> Tensor:
-    """``(N, 1, H, W)`` in [0, 1] to 1.0 where a pixel differs from one beside or below it, else 0.
-
-    By more than a grey level: what is black, white or covered does not.
-    """
-    beside = functional.pad((images[..., 1:] - images[..., :-1]).abs(), (0, 1))
-    below = functional.pad((images[..., 1:, :] - images[..., :-1, :]).abs(), (0, 0, 0, 1))
-    return (torch.maximum(beside, below) > _TEXTURE).to(images.dtype)
-
-
-def standardised(images: Tensor, shown: Tensor | None = None) -> Tensor:
-    """Each image with mean 0 and deviation 1 where it shows texture.
-
-    Gain and bias of the camera drop out, and what is overexposed or covered does not change the
-    rest.
-
-    Args:
-        images: ``(N, 1, H, W)``.
-        shown: what :func:`textured` says of them, where that is known.
-    """
-    shown = textured(images) if shown is None else shown
-    weight = shown + 1e-3  # of an image without any all pixels count
-    weight = weight / weight.sum((1, 2, 3), keepdim=True)
-    centred = images - (images * weight).sum((1, 2, 3), keepdim=True)
-    deviation = torch.sqrt((centred * centred * weight).sum((1, 2, 3), keepdim=True))
-    return centred / (deviation + 1e-3)
 
 
 class ConvolutionalBranch(nn.Module):

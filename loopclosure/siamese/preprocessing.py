@@ -1,0 +1,81 @@
+"""What is done to a grey image before a network looks for features in it."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from vslam.loopclosure.siamese.images import Size
+
+_TEXTURE = 1.5 / 255.0  # between one grey level, which is noise, and two: exact in any rounding
+
+
+class Unrolling(nn.Module):
+    """Images on a cylinder around the camera, where turning it moves everything alike.
+
+    On a flat image what moves to the side becomes wider and taller, so that an image turned by 30
+    degrees is no moved copy of what it was, and no alignment of views fits all of it.
+
+    Column ``x`` in [-1, 1] is the direction ``x half_angle``; there, with the sides of the flat
+    image at ``tan(half_angle)``, row ``y`` shows the flat row ``middle y / cos(x half_angle)``.
+    What lies beyond the image is black.
+
+    Args:
+        size: height and width of the images.
+        half_angle: degrees from the middle to either side. One for all cameras, since a camera
+            that is not calibrated may ask, too.
+        middle: share of the height that the column in the middle keeps. With the cosine of
+            ``half_angle`` the sides keep all of it and nothing is black; with 1 the middle does.
+    """
+
+    grid: Tensor | None
+
+    def __init__(self, size: Size, half_angle: float, middle: float) -> None:
+        super().__init__()
+        half = math.radians(half_angle)
+        grid = None
+        if half > 0:
+            height, width = size
+            x = ((torch.arange(width, dtype=torch.float64) + 0.5) / width * 2 - 1) * half
+            y = (torch.arange(height, dtype=torch.float64) + 0.5) / height * 2 - 1
+            across = (x.tan() / math.tan(half)).expand(height, width)
+            grid = torch.stack([across, middle * y[:, None] / x.cos()], 2).float()[None]
+        self.register_buffer("grid", grid, persistent=False)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """``(N, 1, H, W)`` to the same shape."""
+        if self.grid is None:
+            return images
+        grid = self.grid.expand(len(images), -1, -1, -1)
+        return functional.grid_sample(images, grid, align_corners=False)
+
+
+def textured(images: Tensor) -> Tensor:
+    """``(N, 1, H, W)`` in [0, 1] to 1.0 where a pixel differs from one beside or below it, else 0.
+
+    By more than a grey level: what is black, white or covered does not.
+    """
+    beside = functional.pad((images[..., 1:] - images[..., :-1]).abs(), (0, 1))
+    below = functional.pad((images[..., 1:, :] - images[..., :-1, :]).abs(), (0, 0, 0, 1))
+    return (torch.maximum(beside, below) > _TEXTURE).to(images.dtype)
+
+
+def standardised(images: Tensor, shown: Tensor | None = None) -> Tensor:
+    """Each image with mean 0 and deviation 1 where it shows texture.
+
+    Gain and bias of the camera drop out, and what is overexposed or covered does not change the
+    rest.
+
+    Args:
+        images: ``(N, 1, H, W)``.
+        shown: what :func:`textured` says of them, where that is known.
+    """
+    shown = textured(images) if shown is None else shown
+    weight = shown + 1e-3  # of an image without any all pixels count
+    weight = weight / weight.sum((1, 2, 3), keepdim=True)
+    centred = images - (images * weight).sum((1, 2, 3), keepdim=True)
+    deviation = torch.sqrt((centred * centred * weight).sum((1, 2, 3), keepdim=True))
+    return centred / (deviation + 1e-3)

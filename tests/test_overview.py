@@ -266,8 +266,32 @@ def test_towns_of_other_seeds_are_put_together_as_seeds_are(run_folder: Path, tm
     found = {row.drive.perturb: row.measures["ate_rmse_m"] for row in report.rows}
     assert found["change:0.5"] == Spread(n=2, median=1.5, least=1.0, greatest=2.0)
     assert found["none"] == Spread(n=1, median=4.0, least=4.0, greatest=4.0)
+    assert not any("towns" in note for note in report.notes)
     (runs,) = (table for table in tables(report) if table.title == "Runs")
     assert sorted(row[3] for row in runs.rows) == ["3", "3, town 1", "3, town 2"]
+
+
+def test_medians_of_unlike_towns_are_noted(run_folder: Path, tmp_path: Path):
+    for system, town in (("bow", "05"), ("bow", "05+seed:1"), ("capsule", "05+seed:1")):
+        copy_run(
+            run_folder, tmp_path / (system + town), dataset="synthetic", sequence=town,
+            perturb="none", detector=system,
+        )  # fmt: skip
+    notes = summarize(collect([tmp_path], [])).notes
+    assert any(
+        note.endswith("none: runs in towns of different seeds (bow in 0, 1; capsule in 1)")
+        for note in notes
+    )
+
+
+def test_a_report_of_an_unknown_town_is_left_out_with_a_note(run_folder: Path, tmp_path: Path):
+    copy_run(run_folder, tmp_path / "known", dataset="synthetic", sequence="05", perturb="none")
+    copy_run(run_folder, tmp_path / "odd", dataset="synthetic", sequence="05+fog", perturb="none")
+    found = collect([tmp_path], [])
+    assert [run.drive.sequence for run in found.runs] == ["05"]
+    assert any(
+        f"{tmp_path / 'odd'} is left out: " in note and "fog" in note for note in found.notes
+    )
 
 
 def test_csv_has_a_line_for_each_row(written):

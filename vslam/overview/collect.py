@@ -47,7 +47,11 @@ def collect(folders: Sequence[Path], trajectories: Sequence[str]) -> Found:
         report = _read(folder, found.notes)
         if report is None:
             continue
-        entry = _entry(report, folder)
+        try:
+            entry = _entry(report, folder)
+        except InputError as error:
+            found.notes.append(f"{folder} is left out: {error}")
+            continue
         found.runs.append(entry)
         found.estimate[entry.source] = folder / "trajectory.tum"
         if (folder / "ground_truth_kitti.txt").is_file():

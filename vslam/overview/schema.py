@@ -27,7 +27,10 @@ class _Model(BaseModel):
 
 
 class Drive(_Model):
-    """Images that systems are compared on; ``excerpt`` is empty for a whole sequence."""
+    """Images that systems are compared on, but for the seeds of what was drawn.
+
+    ``excerpt`` is empty for a whole sequence.
+    """
 
     dataset: str
     sequence: str

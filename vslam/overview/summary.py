@@ -8,7 +8,7 @@ counting each of them would make the test believe in more than it has seen.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from itertools import combinations
 
@@ -42,13 +42,27 @@ def summarize(found: Found) -> OverviewJson:
     ]
     order = {(row.drive, row.system): k for k, row in enumerate(rows)}
     return OverviewJson(
-        notes=found.notes,
+        notes=[*found.notes, *_unlike_towns(found.runs)],
         rows=rows,
         comparisons=compared,
         runs=sorted(found.runs, key=lambda run: order[run.drive, run.system]),
         versions=versions(),
         created=datetime.now(UTC).replace(microsecond=0),
     )
+
+
+def _unlike_towns(runs: Iterable[RunEntry]) -> Iterator[str]:
+    """Drives whose medians are not of the same rendered towns in all systems."""
+    towns: dict[Drive, dict[str, set[int]]] = {}
+    for run in runs:
+        if run.town is not None:
+            towns.setdefault(run.drive, {}).setdefault(run.system, set()).add(run.town)
+    for drive, seeds in towns.items():
+        if len(set(map(frozenset, seeds.values()))) > 1:
+            had = "; ".join(
+                f"{system} in {', '.join(map(str, sorted(seeds[system])))}" for system in seeds
+            )
+            yield f"{drive.place}, {drive.perturb}: runs in towns of different seeds ({had})"
 
 
 def systems(runs: Iterable[RunEntry | Row]) -> list[str]:

@@ -36,10 +36,10 @@ def test_unrolled_images_show_the_cylinder_whatever_the_heading(heading, middle)
     beyond = np.abs(middle * y[:, None] / np.cos(direction)) > 1 + 1 / SIZE[0]
     expected = walls(direction + heading, middle * np.repeat(y[:, None], SIZE[1], 1))
     within = np.abs(middle * y[:, None] / np.cos(direction)) < 1 - 1 / SIZE[0]
-    # Borders are half black; elsewhere only what lies between pixels is guessed.
-    assert np.abs(seen - expected)[within][1:-1].max() < 0.01
+    # The outermost pixels are half black.
+    assert np.abs(seen - expected)[within].max() < 0.01
     assert np.all(seen[beyond] == 0)
-    assert beyond.any() == (middle > math.cos(math.radians(HALF_ANGLE)))
+    assert np.all(seen > 0) == (middle < 0.9)
 
 
 def test_no_angle_leaves_images_as_they_are():

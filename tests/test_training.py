@@ -113,6 +113,14 @@ def test_mixed_precision_is_what_the_settings_say(tmp_path, mixed):
     assert {dtype for learning, dtype in computed_in if not learning} == {torch.float32}
 
 
+def test_a_gpu_without_bfloat16_is_not_asked_for_it(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda: False)
+    cuda = torch.device("cuda")
+    assert training._mixed_precision(small_settings(), cuda) is False
+    with pytest.raises(InputError, match="this GPU has no bfloat16"):
+        training._mixed_precision(small_settings(mixed_precision=True), cuda)
+
+
 def test_a_resumed_training_has_the_bits_of_an_uninterrupted_one(tmp_path):
     collection, settings = views(20), small_settings()
     whole = train(collection, settings, tmp_path / "whole", threads=1)

@@ -254,10 +254,20 @@ def test_networks_for_flat_images_become_those_for_unrolled_ones(tmp_path):
     save_network(start, path, {})
     x = wide_images(2)
     with torch.no_grad():
-        unrolled = Unrolling((48, 81), 30.0, 0.9)(x)
+        unrolled = Unrolling((48, 81), 30.0, 0.9)(x[:, :1]).expand(-1, 3, -1, -1)
         assert not torch.allclose(flat.embed(x), flat.embed(unrolled), atol=1e-2)
-        again = load_network(path)[0].embed(x)
-    assert torch.allclose(again, flat.embed(unrolled), atol=1e-6)
+        again = load_network(path)[0]
+        assert torch.allclose(again.embed(x), flat.embed(unrolled), atol=1e-5)
+        # What the pruning ranks capsules by.
+        for seen, expected in zip(
+            again.branch.routed(x), flat.branch.routed(unrolled), strict=True
+        ):
+            assert torch.allclose(seen, expected, atol=1e-5)
+
+
+def test_flat_images_keep_their_height():
+    with pytest.raises(ValidationError, match=r"middle 0.9: is of unrolled images"):
+        CapsuleShape(middle=0.9)
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,9 @@ class CapsuleShape(BaseModel):
     half_angle: float = Field(
         0.0, ge=0, le=60, description="Degrees from middle to side when unrolled; 0: left flat."
     )
-    middle: float = Field(1.0, gt=0, le=1, description="Of the height: seen in the middle then.")
+    middle: float = Field(
+        1.0, gt=0, le=1, description="Share of the height that its middle column keeps then."
+    )
     blocks: tuple[tuple[int, int, int], ...] = LIGHT_BLOCKS
     types: int = Field(32, ge=1, description="Types of primary capsules.")
     size: int = Field(8, ge=1, description="Numbers of a primary capsule.")
@@ -88,6 +90,12 @@ class CapsuleShape(BaseModel):
             return given
         nothing = {key for key in ("inner", "skipped") if not given.get(key, True)}
         return {key: value for key, value in given.items() if key not in nothing}
+
+    @model_validator(mode="after")
+    def _flat_images_keep_their_height(self) -> CapsuleShape:
+        if self.middle < 1 and self.half_angle == 0:
+            raise ValueError(f"middle {self.middle:g}: is of unrolled images; give half_angle")
+        return self
 
     @model_validator(mode="after")
     def _views_lie_on_columns(self) -> CapsuleShape:
@@ -226,7 +234,7 @@ class CapsuleBranch(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """``(N, 3, H, W)`` float32 in [0, 1] to ``(N, D)``, not yet of length 1."""
-        grey = self.unrolling(images.mean(1, keepdim=True))
+        grey = self._unrolled(images)
         shown = textured(grey)
         v = self.capsules(self._primary_capsules(grey, shown)).flatten(1)
         views = functional.normalize(torch.stack(v.chunk(self.views), 1), dim=2)
@@ -234,8 +242,13 @@ class CapsuleBranch(nn.Module):
 
     def routed(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Output capsules ``(V N, J, D)``, couplings ``(V N, J, I)``: all leftmost views first."""
-        grey = self.unrolling(images.mean(1, keepdim=True))
+        grey = self._unrolled(images)
         return self.capsules.routed(self._primary_capsules(grey, textured(grey)))
+
+    def _unrolled(self, images: Tensor) -> Tensor:
+        """``(N, 1, H, W)`` grey of ``(N, 3, H, W)``."""
+        grey: Tensor = self.unrolling(images.mean(1, keepdim=True))
+        return grey
 
     def _primary_capsules(self, grey: Tensor, shown: Tensor) -> Tensor:
         """``(V N, T, P, A)`` of ``(N, 1, H, W)`` images and where they are :func:`textured`."""

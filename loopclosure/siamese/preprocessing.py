@@ -14,10 +14,11 @@ _TEXTURE = 1.5 / 255.0  # between one grey level, which is noise, and two: exact
 
 
 class Unrolling(nn.Module):
-    """Images on a cylinder around the camera, where turning it moves everything alike.
+    """Cylindrical projection, where a camera that turns moves everything alike.
 
-    On a flat image what moves to the side becomes wider and taller, so that an image turned by 30
-    degrees is no moved copy of what it was, and no alignment of views fits all of it.
+    Szeliski, Image Alignment and Stitching: A Tutorial, 2006, section 2.3. On a flat image what
+    moves to the side becomes wider and taller, so that an image turned by 30 degrees is no moved
+    copy of what it was, and no alignment of views fits all of it. (Not in the paper.)
 
     Column ``x`` in [-1, 1] is the direction ``x half_angle``; there, with the sides of the flat
     image at ``tan(half_angle)``, row ``y`` shows the flat row ``middle y / cos(x half_angle)``.
@@ -25,8 +26,9 @@ class Unrolling(nn.Module):
 
     Args:
         size: height and width of the images.
-        half_angle: degrees from the middle to either side. One for all cameras, since a camera
-            that is not calibrated may ask, too.
+        half_angle: degrees from the middle to either side; 0 leaves images flat. One for all
+            cameras, since one that is not calibrated may ask, too: turning is a shift exactly
+            where it is the camera's own, and nearly so elsewhere.
         middle: share of the height that the column in the middle keeps. With the cosine of
             ``half_angle`` the sides keep all of it and nothing is black; with 1 the middle does.
     """

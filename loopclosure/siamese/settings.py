@@ -33,7 +33,7 @@ class TrainSettings(BaseModel):
     frozen: int = Field(0, ge=0, description="Blocks of a lite0 extractor that stay, and its stem.")
     schedule: Literal["constant", "cosine"] = "constant"
     mixed_precision: bool | None = Field(
-        None, description="bfloat16 up to the descriptor; null: on a GPU that can."
+        None, description="bfloat16, but for the routing; null: on a GPU that can."
     )
     batch: int = Field(64, ge=2, description="Pairs. [paper]")
     epochs: int = Field(40, ge=1, description="At most.")

@@ -80,14 +80,14 @@ def starting_network(
         raise InputError(f"{weights}: weights of {network.name}, not of {settings.network}.")
     if isinstance(network.branch, CapsuleBranch):
         given, network = network, _fitted(network, settings)
-        if network is not given:
+        if network.size != given.size:
             about["resized_to"] = network.size
         settings = settings.model_copy(update={"shape": network.branch.shape})
     return network, settings, about
 
 
 def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
-    """A network for images of another size or other views that computes alike.
+    """A network for images of another size, other views or unrolled ones, that computes alike.
 
     Training it further mends the rest.
 
@@ -101,9 +101,9 @@ def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
     """
     branch = network.branch
     if not isinstance(branch, CapsuleBranch) or branch.shape.extractor == "original":
-        raise InputError(f"{network.name}: cannot take images of another size.")
+        raise InputError(f"{network.name}: cannot read images in another way (size, views).")
     if branch.shape.kept is not None:
-        raise InputError(f"{network.name}: is pruned to the places of its grid; resize before.")
+        raise InputError(f"{network.name}: is pruned for how it reads images; resize before.")
     shape = branch.shape.with_layout(layout)
     larger = build_network(network.name, shape)
     state = network.state_dict()
@@ -140,7 +140,7 @@ def _prune(
         routed = with_iterations(whole, settings.prune_iterations)
         report["iterations"] = settings.prune_iterations
     smaller = pruned(routed, lowest(mean_couplings(routed, batches), settings.prune_share))
-    if whole is not full:
+    if whole.size != full.size:
         report["resized_to"] = whole.size
     for name, network in (("before", whole), ("removed", smaller)):
         figures = validate(network, collection, validation, settings.augmentation, device)[0]

@@ -111,13 +111,15 @@ def train(
         should_stop: asked after each step; a checkpoint is written before stopping.
 
     Raises:
-        InputError: too little data, an unknown device or source, a checkpoint of other settings, or
-            a learned share without a network to start from.
+        InputError: too little data, an unknown device or source, a device without bfloat16 where
+            the settings ask for it, a checkpoint of other settings, or a learned share without a
+            network to start from.
         ResultsError: the loss is not finite (the last good checkpoint stays), or a full disk.
     """
     if settings.learned_share < 1 and start is None:
         raise InputError("learned_share: there is no network to go back towards; give --weights.")
     where = _open_device(device)
+    _mixed_precision(settings, where)
     check_emphasis(collection, settings.emphasis)
     train_images, validation = divide(collection, settings.seed, settings.validation_share)
     validation = validation_images(validation, settings.validation_images, settings.seed)
@@ -209,9 +211,7 @@ def _step(
     for group in optimiser.param_groups:
         group["lr"] = rate * group["factor"]
     network.train()
-    half = settings.mixed_precision
-    if half is None:
-        half = device.type == "cuda" and torch.cuda.is_bf16_supported()
+    half = _mixed_precision(settings, device)
     with torch.autocast(device.type, torch.bfloat16, enabled=half):
         descriptors = network.embed(images)
     first, second = descriptors[: len(a)], descriptors[len(a) :]
@@ -320,6 +320,15 @@ def _open_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: torch finds no CUDA device; train with --device cpu.")
     return torch.device(name)
+
+
+def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
+    can = device.type == "cpu" or torch.cuda.is_bf16_supported()
+    if settings.mixed_precision and not can:
+        raise InputError("mixed_precision: this GPU has no bfloat16; leave it out.")
+    if settings.mixed_precision is None:
+        return can and device.type == "cuda"
+    return settings.mixed_precision
 
 
 def _write_log(path: Path, history: list[dict[str, float]]) -> None:

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from vslam.loopclosure.siamese.images import Size
 
-_TEXTURE = 1.5 / 255.0  # between one grey level, which is noise, and two: exact in any rounding
+_TEXTURE = 1.5 / 255.0  # between one grey level, which is noise, and two
 
 
 class Unrolling(nn.Module):

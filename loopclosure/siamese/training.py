@@ -119,7 +119,7 @@ def train(
     if settings.learned_share < 1 and start is None:
         raise InputError("learned_share: there is no network to go back towards; give --weights.")
     where = _open_device(device)
-    _mixed_precision(settings, where)
+    half = _mixed_precision(settings, where)
     check_emphasis(collection, settings.emphasis)
     train_images, validation = divide(collection, settings.seed, settings.validation_share)
     validation = validation_images(validation, settings.validation_images, settings.seed)
@@ -150,7 +150,7 @@ def train(
                 batch = slice(progress.step * settings.batch, (progress.step + 1) * settings.batch)
                 loss = _step(
                     network, optimiser, collection, pairs, batch, settings, progress, steps, pool,
-                    where,
+                    where, half,
                 )  # fmt: skip
                 if not math.isfinite(loss):
                     raise ResultsError(
@@ -202,6 +202,7 @@ def _step(
     steps: int,
     pool: ThreadPoolExecutor,
     device: torch.device,
+    half: bool,
 ) -> float:
     """One step of Adam; the weights are untouched where the loss is not finite."""
     a, b = pairs.a[batch], pairs.b[batch]
@@ -211,7 +212,6 @@ def _step(
     for group in optimiser.param_groups:
         group["lr"] = rate * group["factor"]
     network.train()
-    half = _mixed_precision(settings, device)
     with torch.autocast(device.type, torch.bfloat16, enabled=half):
         descriptors = network.embed(images)
     first, second = descriptors[: len(a)], descriptors[len(a) :]
@@ -323,6 +323,7 @@ def _open_device(name: str) -> torch.device:
 
 
 def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
+    """Whether to compute in bfloat16."""
     can = device.type == "cpu" or torch.cuda.is_bf16_supported()
     if settings.mixed_precision and not can:
         raise InputError("mixed_precision: this GPU has no bfloat16; leave it out.")

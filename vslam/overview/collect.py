@@ -9,7 +9,6 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from vslam.datasets.synthetic import parse_drive
 from vslam.errors import InputError
 from vslam.evaluate import evaluate
 from vslam.overview.schema import MEASURES, Drive, RunEntry
@@ -134,6 +133,8 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
     sequence, town = report.sequence, None
     laws: list[str] = []
     if report.dataset == "synthetic":
+        from vslam.datasets.synthetic import parse_drive  # and with it the renderer
+
         # What changes a rendered town is a perturbation, too: 05+change:0.5 is the route 05.
         laws = [part for part in sequence.split("+")[1:] if not part.startswith("seed:")]
         sequence, variation = parse_drive(sequence)

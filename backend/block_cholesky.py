@@ -26,7 +26,6 @@ class Structure(NamedTuple):
 
     Attributes:
         order: ``(n,)`` int64, block of the caller that is eliminated i-th.
-        position: ``(n,)`` int64, its inverse: when a block of the caller is eliminated.
         first: ``(n + 1,)`` int64, slots of column c are ``first[c]:first[c + 1]``.
         row: ``(slots,)`` int32, block row of each slot, ascending; the first of a column is its
             diagonal. The second is the column's parent in the elimination tree.
@@ -37,7 +36,6 @@ class Structure(NamedTuple):
     """
 
     order: NDArray[np.int64]
-    position: NDArray[np.int64]
     first: NDArray[np.int64]
     row: NDArray[np.int32]
     row_first: NDArray[np.int64]
@@ -50,12 +48,7 @@ def analyse(n: int, pairs: NDArray[np.int64]) -> Structure:
 
     Pairs may come in any order, repeated or not. Memory is ``n * n / 8`` bytes while it runs.
     """
-    order, first, row, row_first, row_slot, row_column = _analyse(
-        n, np.ascontiguousarray(pairs, np.int64).reshape(-1, 2)
-    )
-    position = np.empty(n, np.int64)
-    position[order] = np.arange(n)
-    return Structure(order, position, first, row, row_first, row_slot, row_column)
+    return Structure(*_analyse(n, np.ascontiguousarray(pairs, np.int64).reshape(-1, 2)))
 
 
 @kernel
@@ -124,20 +117,6 @@ def _analyse(n, pairs):
             row_slot[k] = filled[column]
             filled[column] += 1
     return order, first, row, row_first, row_slot, row_column
-
-
-@kernel
-def find_slot(structure, row, column):
-    """Slot of a block with ``row >= column``, both in elimination order; -1 if it is zero."""
-    low, high = structure.first[column], structure.first[column + 1]
-    while low < high:
-        middle = (low + high) // 2
-        if structure.row[middle] < row:
-            low = middle + 1
-        else:
-            high = middle
-    found = low < structure.first[column + 1] and structure.row[low] == row
-    return low if found else -1
 
 
 @kernel

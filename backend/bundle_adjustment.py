@@ -9,13 +9,14 @@ modern synthesis", section 6).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import CHI2_MONO, CHI2_STEREO
 from vslam.geometry import compose, orthonormalised, se3_exp
 from vslam.kernels import inner_kernel, kernel
+from vslam.reprojection import chi_square, residual
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,32 @@ class BundleProblem:
     uvr: NDArray[np.float64]
     inverse_sigma2: NDArray[np.float64]
     intrinsics: NDArray[np.float64]
+
+
+class Observations(NamedTuple):
+    """The observations of a ``BundleProblem`` as kernels see them; ``used`` (O,) bool: those that
+    count."""
+
+    first: NDArray[np.int64]
+    camera: NDArray[np.int64]
+    uvr: NDArray[np.float64]
+    inverse_sigma2: NDArray[np.float64]
+    used: NDArray[np.bool_]
+    intrinsics: NDArray[np.float64]
+
+
+class NormalEquations(NamedTuple):
+    """Gauss-Newton's system in blocks.
+
+    ``W`` (O, 3, 6) point x camera; ``V`` (P, 3, 3), ``g`` (P, 3) of the points; ``U`` (K, 6, 6),
+    ``b`` (K, 6) of the free cameras.
+    """
+
+    W: NDArray[np.float64]
+    V: NDArray[np.float64]
+    g: NDArray[np.float64]
+    U: NDArray[np.float64]
+    b: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -67,48 +94,57 @@ def adjust(
     Args:
         use: ``(O,)`` bool, observations that count; all by default.
     """
-    used = np.ones(len(problem.camera), np.bool_) if use is None else use
     T_cw, points, cost, inlier, count = _adjust(
         problem.T_cw,
         problem.n_free,
         problem.points,
-        problem.first,
-        problem.camera,
-        problem.uvr,
-        problem.inverse_sigma2,
-        used,
-        problem.intrinsics,
+        observations_of(problem, use),
         iterations,
         tolerance,
     )
     return BundleSolution(T_cw, points, cost, inlier, count)
 
 
+def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Observations:
+    """The observations of a problem, all of them used where ``use`` is None."""
+    return Observations(
+        problem.first,
+        problem.camera,
+        problem.uvr,
+        problem.inverse_sigma2,
+        np.ones(len(problem.camera), np.bool_) if use is None else use,
+        problem.intrinsics,
+    )
+
+
+def empty_equations(n_free: int, n_points: int, n_observations: int) -> NormalEquations:
+    """Room for the normal equations; entries of W that no one writes are 0."""
+    return NormalEquations(
+        np.zeros((n_observations, 3, 6)),
+        np.empty((n_points, 3, 3)),
+        np.empty((n_points, 3)),
+        np.empty((n_free, 6, 6)),
+        np.empty((n_free, 6)),
+    )
+
+
 @inner_kernel
-def residual(T, p, uvr, intrinsics, r, q):
-    """Reprojection error into ``r`` (3,), camera point into ``q`` (3,); returns if it is stereo."""
-    fx, fy, cx, cy, bf = intrinsics
+def _in_camera(T, p, q):
     for i in range(3):
         q[i] = T[i, 0] * p[0] + T[i, 1] * p[1] + T[i, 2] * p[2] + T[i, 3]
-    iz = 1.0 / q[2]
-    u = fx * q[0] * iz + cx
-    r[0] = uvr[0] - u
-    r[1] = uvr[1] - (fy * q[1] * iz + cy)
-    stereo = uvr[2] == uvr[2]
-    r[2] = uvr[2] - (u - bf * iz) if stereo else 0.0
-    return stereo
 
 
 @inner_kernel
-def evaluate(T_cw, points, first, camera, uvr, inverse_sigma2, used, intrinsics, inlier):
+def robust_cost(T_cw, points, observations, inlier):
     """Half the sum of Huber losses; sets ``inlier`` by the chi-square test."""
+    first, camera, uvr, inverse_sigma2, used, intrinsics = observations
     cost = 0.0
     r, q = np.empty(3), np.empty(3)
     for p in range(len(points)):
         for o in range(first[p], first[p + 1]):
-            stereo = residual(T_cw[camera[o]], points[p], uvr[o], intrinsics, r, q)
-            limit = CHI2_STEREO if stereo else CHI2_MONO
-            chi2 = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]) * inverse_sigma2[o]
+            _in_camera(T_cw[camera[o]], points[p], q)
+            stereo = residual(q[0], q[1], q[2], uvr[o], intrinsics, r)
+            chi2, limit = chi_square(r, stereo, inverse_sigma2[o])
             inlier[o] = q[2] > 0.0 and chi2 <= limit
             if used[o]:
                 cost += 0.5 * chi2 if chi2 <= limit else np.sqrt(chi2 * limit) - 0.5 * limit
@@ -116,68 +152,34 @@ def evaluate(T_cw, points, first, camera, uvr, inverse_sigma2, used, intrinsics,
 
 
 @kernel
-def _adjust(
-    T_start,
-    n_free,
-    points_start,
-    first,
-    camera,
-    uvr,
-    inverse_sigma2,
-    used,
-    intrinsics,
-    iterations,
-    tolerance,
-):
-    n_points, n_observations = len(points_start), len(camera)
+def _adjust(T_start, n_free, points_start, observations, iterations, tolerance):
+    n_points, n_observations = len(points_start), len(observations.camera)
     size = 6 * n_free
     T_cw, points = T_start.copy(), points_start.copy()
     T_trial, points_trial = T_start.copy(), points_start.copy()
     inlier = np.ones(n_observations, np.bool_)
-    cost = evaluate(T_cw, points, first, camera, uvr, inverse_sigma2, used, intrinsics, inlier)
-    # W: blocks camera x point; V, g: blocks of the points; U, b: blocks of the cameras.
-    W = np.zeros((n_observations, 3, 6))
-    V, g = np.empty((n_points, 3, 3)), np.empty((n_points, 3))
-    U, b = np.empty((n_free, 6, 6)), np.empty((n_free, 6))
+    cost = robust_cost(T_cw, points, observations, inlier)
+    equations = NormalEquations(
+        np.zeros((n_observations, 3, 6)),
+        np.empty((n_points, 3, 3)),
+        np.empty((n_points, 3)),
+        np.empty((n_free, 6, 6)),
+        np.empty((n_free, 6)),
+    )
     S, rhs = np.empty((size, size)), np.empty(size)
     V_inverse = np.empty((n_points, 3, 3))
     damping, growth = 1e-5, 2.0
     done = 0
     for _ in range(iterations):
-        linearise(
-            T_cw,
-            n_free,
-            points,
-            first,
-            camera,
-            uvr,
-            inverse_sigma2,
-            used,
-            intrinsics,
-            W,
-            V,
-            g,
-            U,
-            b,
-        )
+        linearise(T_cw, n_free, points, observations, equations)
         improved, small = False, False
         for _ in range(8):
-            reduce_points(n_free, first, camera, used, W, V, g, U, b, damping, S, rhs, V_inverse)
+            reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse)
             solved = cholesky_solve(S, rhs)
             if solved:
-                step_points(n_free, first, camera, used, W, g, rhs, V_inverse, points, points_trial)
+                step_points(n_free, observations, equations, rhs, V_inverse, points, points_trial)
                 step_cameras(n_free, rhs, T_cw, T_trial)
-                trial = evaluate(
-                    T_trial,
-                    points_trial,
-                    first,
-                    camera,
-                    uvr,
-                    inverse_sigma2,
-                    used,
-                    intrinsics,
-                    inlier,
-                )
+                trial = robust_cost(T_trial, points_trial, observations, inlier)
                 if trial < cost:
                     small = cost - trial < tolerance * cost
                     cost = trial
@@ -191,15 +193,15 @@ def _adjust(
         done += 1
         if not improved or small:
             break
-    cost = evaluate(T_cw, points, first, camera, uvr, inverse_sigma2, used, intrinsics, inlier)
+    cost = robust_cost(T_cw, points, observations, inlier)
     return T_cw, points, cost, inlier, done
 
 
 @inner_kernel
-def linearise(
-    T_cw, n_free, points, first, camera, uvr, inverse_sigma2, used, intrinsics, W, V, g, U, b
-):
+def linearise(T_cw, n_free, points, observations, equations):
     """Normal equations at the current estimate, in blocks."""
+    first, camera, uvr, inverse_sigma2, used, intrinsics = observations
+    W, V, g, U, b = equations
     fx, fy, bf = intrinsics[0], intrinsics[1], intrinsics[4]
     U[:] = 0.0
     b[:] = 0.0
@@ -213,10 +215,10 @@ def linearise(
                 continue
             k = camera[o]
             T = T_cw[k]
-            stereo = residual(T, points[p], uvr[o], intrinsics, r, q)
+            _in_camera(T, points[p], q)
+            stereo = residual(q[0], q[1], q[2], uvr[o], intrinsics, r)
             weight = inverse_sigma2[o]
-            chi2 = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]) * weight
-            limit = CHI2_STEREO if stereo else CHI2_MONO
+            chi2, limit = chi_square(r, stereo, weight)
             if chi2 > limit:
                 weight *= np.sqrt(limit / chi2)
             iz = 1.0 / q[2]
@@ -265,8 +267,10 @@ def linearise(
 
 
 @inner_kernel
-def reduce_points(n_free, first, camera, used, W, V, g, U, b, damping, S, rhs, V_inverse):
+def reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse):
     """Reduced camera system ``S x = rhs`` (upper triangle) after eliminating the points."""
+    first, camera, used = observations.first, observations.camera, observations.used
+    W, V, g, U, b = equations
     S[:] = 0.0
     for k in range(n_free):
         for i in range(6):
@@ -320,8 +324,10 @@ def invert_damped(V, damping, N):
 
 
 @inner_kernel
-def step_points(n_free, first, camera, used, W, g, camera_step, V_inverse, points, points_trial):
+def step_points(n_free, observations, equations, camera_step, V_inverse, points, points_trial):
     """Back-substitution: move each point by what the camera steps leave."""
+    first, camera, used = observations.first, observations.camera, observations.used
+    W, g = equations.W, equations.g
     for p in range(len(points)):
         d0, d1, d2 = g[p, 0], g[p, 1], g[p, 2]
         for o in range(first[p], first[p + 1]):

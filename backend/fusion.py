@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import CHI2_MONO, CHI2_STEREO, StereoCamera
+from vslam.camera import Camera
 from vslam.config import Config
 from vslam.features import CELL, FeatureGrid
 from vslam.kernels import hamming, kernel
 from vslam.loops import LoopEdge
 from vslam.map import Map
-from vslam.observations import collect_landmarks, link, merge_landmarks, observed_by, predict_octave
+from vslam.map_kernels import collect_landmarks, link, merge_landmarks, observed_by, predict_octave
+from vslam.reprojection import chi_square_ratio
 
 
-def fuse_neighbourhood(map_: Map, keyframe: int, camera: StereoCamera, config: Config) -> None:
+def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Project the landmarks of a keyframe into its neighbours and theirs into it.
 
     A projection that meets a feature with a landmark of its own merges the two; one that meets a
@@ -47,7 +48,7 @@ def fuse_loop(
     edge: LoopEdge,
     query_side: list[int],
     match_side: list[int],
-    camera: StereoCamera,
+    camera: Camera,
     config: Config,
 ) -> int:
     """Make one what the two sides of a loop hold twice (ORB-SLAM, VII-D).
@@ -95,7 +96,7 @@ def _fuse_pairs(a, rows, landmarks, keyframe):
 
 
 def fuse_into(
-    map_: Map, landmarks: NDArray[np.int32], keyframe: int, camera: StereoCamera, config: Config
+    map_: Map, landmarks: NDArray[np.int32], keyframe: int, camera: Camera, config: Config
 ) -> int:
     """Fuse ``(N,)`` landmarks with what one keyframe sees; returns how many were."""
     a, rows = map_.arrays, map_.rows(keyframe)
@@ -104,9 +105,7 @@ def fuse_into(
         a,
         landmarks,
         keyframe,
-        grid.start,
-        grid.items,
-        grid.columns,
+        grid,
         camera.intrinsics,
         camera.width,
         camera.height,
@@ -121,9 +120,7 @@ def _fuse(
     a,
     landmarks,
     keyframe,
-    start,
-    items,
-    columns,
+    grid,
     intrinsics,
     width,
     height,
@@ -131,12 +128,13 @@ def _fuse(
     window,
     max_distance,
 ):
-    fx, fy, cx, cy, bf = intrinsics
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    start, items, columns = grid
     T = a.T_cw[keyframe]
     first_row = a.first_row[keyframe]
     grid_rows = (len(start) - 1) // columns
     log_scale = np.log(scales[1] / scales[0])
-    centre = np.empty(3)
+    centre, uvr = np.empty(3), np.empty(3)
     for i in range(3):
         centre[i] = -(T[0, i] * T[0, 3] + T[1, i] * T[1, 3] + T[2, i] * T[2, 3])
     fused = 0
@@ -147,22 +145,25 @@ def _fuse(
         z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
         if z <= 0.1:
             continue
-        u = fx * (T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]) / z + cx
-        v = fy * (T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]) / z + cy
+        x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+        y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+        u, v = fx * x / z + cx, fy * y / z + cy
         if u < 0.0 or u >= width or v < 0.0 or v >= height:
             continue
         dx, dy, dz = p[0] - centre[0], p[1] - centre[1], p[2] - centre[2]
         distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-        if distance < 0.8 * a.reach[landmark, 0] or distance > 1.2 * a.reach[landmark, 1]:
+        if (
+            distance < 0.8 * a.distance_range[landmark, 0]
+            or distance > 1.2 * a.distance_range[landmark, 1]
+        ):
             continue
         normal = a.normal[landmark]
         if dx * normal[0] + dy * normal[1] + dz * normal[2] < 0.5 * distance:
             continue
         if observed_by(a, landmark, keyframe) >= 0:
             continue
-        octave = predict_octave(distance, a.reach[landmark, 1], log_scale, len(scales))
+        octave = predict_octave(distance, a.distance_range[landmark, 1], log_scale, len(scales))
         r = window * scales[octave]
-        u_right = u - bf / z
         # A bare -1 would make Numba compile ``link`` for the constant as well.
         best, best_distance = np.int64(-1), max_distance + 1
         column_first, column_last = max(0, int((u - r) / CELL)), int((u + r) / CELL)
@@ -178,13 +179,8 @@ def _fuse(
                 level = int(a.octave[row])
                 if level < octave - 1 or level > octave:
                     continue
-                e_u, e_v = a.xy[row, 0] - u, a.xy[row, 1] - v
-                chi2 = e_u * e_u + e_v * e_v
-                limit = CHI2_MONO
-                if not np.isnan(a.u_right[row]):
-                    chi2 += (a.u_right[row] - u_right) ** 2
-                    limit = CHI2_STEREO
-                if chi2 > limit * scales[level] ** 2:
+                uvr[0], uvr[1], uvr[2] = a.xy[row, 0], a.xy[row, 1], a.u_right[row]
+                if chi_square_ratio(x, y, z, uvr, scales[level] ** -2.0, intrinsics) > 1.0:
                     continue
                 bits = hamming(a.landmark_descriptor[landmark], a.descriptor[row])
                 if bits < best_distance:

@@ -17,9 +17,11 @@ from vslam.backend.block_cholesky import analyse, factor_solve, panel
 from vslam.backend.bundle_adjustment import (
     BundleProblem,
     BundleSolution,
-    evaluate,
+    Observations,
+    empty_equations,
     invert_damped,
     linearise,
+    robust_cost,
     step_cameras,
     step_points,
 )
@@ -52,44 +54,38 @@ def adjust_globally(
     cameras = np.concatenate([structure.order, np.arange(n_free, len(problem.T_cw))])
     rank = np.argsort(cameras)
     points_order, order = working_order(problem.first, rank[problem.camera], len(cameras))
-    observations = (
-        np.concatenate([[0], np.cumsum(np.diff(problem.first)[points_order])]),
-        rank[problem.camera[order]],
-        problem.uvr[order],
-        problem.inverse_sigma2[order],
-        used[order],
-        problem.intrinsics,
+    observations = Observations(
+        first=np.concatenate([[0], np.cumsum(np.diff(problem.first)[points_order])]),
+        camera=rank[problem.camera[order]],
+        uvr=problem.uvr[order],
+        inverse_sigma2=problem.inverse_sigma2[order],
+        used=used[order],
+        intrinsics=problem.intrinsics,
     )
-    first, camera, used = observations[0], observations[1], observations[4]
-    slots = pair_slots(structure, first, camera, used, n_free)
+    slots = pair_slots(
+        structure, observations.first, observations.camera, observations.used, n_free
+    )
     T_cw, points = problem.T_cw[cameras], problem.points[points_order]
     T_trial, points_trial = T_cw.copy(), points.copy()
     inlier = np.ones(n_observations, np.bool_)
-    cost = _evaluate(T_cw, points, *observations, inlier)
-    # Blocks of the normal equations, named as in ``bundle_adjustment``.
-    n_points = len(points)
-    W = np.zeros((n_observations, 3, 6))
-    V, g = np.empty((n_points, 3, 3)), np.empty((n_points, 3))
-    U, b = np.empty((n_free, 6, 6)), np.empty((n_free, 6))
+    cost = _robust_cost(T_cw, points, observations, inlier)
+    equations = empty_equations(n_free, len(points), n_observations)
     S, x = np.empty(36 * len(structure.row)), np.empty((n_free, 6))
-    V_inverse = np.empty((n_points, 3, 3))
+    V_inverse = np.empty((len(points), 3, 3))
     damping, growth, done = 1e-5, 2.0, 0
     for _ in range(iterations):
         if stop is not None and stop():
             break
-        _linearise(T_cw, n_free, points, *observations, W, V, g, U, b)
+        _linearise(T_cw, n_free, points, observations, equations)
         improved, small = False, False
         for _ in range(8):
             reduce_points_sparsely(
-                structure, slots, n_free, first, camera, used, W, V, g, U, b, damping, S, x,
-                V_inverse,
-            )  # fmt: skip
+                structure, slots, n_free, observations, equations, damping, S, x, V_inverse
+            )
             if factor_solve(structure, S, x):
-                _step(
-                    n_free, first, camera, used, W, g, x, V_inverse, T_cw, points, T_trial,
-                    points_trial,
-                )  # fmt: skip
-                trial = _evaluate(T_trial, points_trial, *observations, inlier)
+                _step_points(n_free, observations, equations, x, V_inverse, points, points_trial)
+                _step_cameras(n_free, x, T_cw, T_trial)
+                trial = _robust_cost(T_trial, points_trial, observations, inlier)
                 if trial < cost:
                     small = cost - trial < tolerance * cost
                     cost = trial
@@ -102,7 +98,7 @@ def adjust_globally(
         done += 1
         if not improved or small:
             break
-    cost = _evaluate(T_cw, points, *observations, inlier)
+    cost = _robust_cost(T_cw, points, observations, inlier)
     points_trial[points_order] = points
     inlier_as_given = np.empty_like(inlier)
     inlier_as_given[order] = inlier
@@ -198,24 +194,22 @@ def pair_slots(structure, first, camera, used, n_free):
 
 
 @kernel
-def _evaluate(T_cw, points, first, camera, uvr, inverse_sigma2, used, intrinsics, inlier):
-    return evaluate(T_cw, points, first, camera, uvr, inverse_sigma2, used, intrinsics, inlier)
+def _robust_cost(T_cw, points, observations, inlier):
+    return robust_cost(T_cw, points, observations, inlier)
 
 
 @kernel
-def _linearise(
-    T_cw, n_free, points, first, camera, uvr, inverse_sigma2, used, intrinsics, W, V, g, U, b
-):
-    linearise(
-        T_cw, n_free, points, first, camera, uvr, inverse_sigma2, used, intrinsics, W, V, g, U, b
-    )
+def _linearise(T_cw, n_free, points, observations, equations):
+    linearise(T_cw, n_free, points, observations, equations)
 
 
 @kernel
 def reduce_points_sparsely(
-    structure, slots, n_free, first, camera, used, W, V, g, U, b, damping, S, x, V_inverse
+    structure, slots, n_free, observations, equations, damping, S, x, V_inverse
 ):
     """Reduced camera system ``S x = rhs``, in panels, after eliminating the points."""
+    first, camera, used = observations.first, observations.camera, observations.used
+    W, V, g, U, b = equations
     for i in range(len(S)):
         S[i] = 0.0
     for k in range(n_free):
@@ -261,7 +255,10 @@ def subtract_coupling(Y, W, o, S, offset, width):
 
 
 @kernel
-def _step(n_free, first, camera, used, W, g, x, V_inverse, T_cw, points, T_trial, points_trial):
-    twists = x.reshape(-1)
-    step_points(n_free, first, camera, used, W, g, twists, V_inverse, points, points_trial)
-    step_cameras(n_free, twists, T_cw, T_trial)
+def _step_points(n_free, observations, equations, x, V_inverse, points, points_trial):
+    step_points(n_free, observations, equations, x.reshape(-1), V_inverse, points, points_trial)
+
+
+@kernel
+def _step_cameras(n_free, x, T_cw, T_trial):
+    step_cameras(n_free, x.reshape(-1), T_cw, T_trial)

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from vslam.backend.bundle_adjustment import BundleProblem, BundleSolution
 from vslam.backend.local_mapping import assemble
 from vslam.backend.loop_correction import carry_landmarks
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.geometry import compose, inverse, orthonormalised
 from vslam.kernels import kernel
 from vslam.map import Map
-from vslam.observations import refresh_landmarks, unlink
+from vslam.map_kernels import refresh_landmarks, unlink
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class GlobalSnapshot:
     n_landmarks: int
 
 
-def take_snapshot(map_: Map, camera: StereoCamera) -> GlobalSnapshot:
+def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
     """Copy all living keyframes and landmarks into a bundle problem.
 
     The first keyframe is held. So is the first of every part of the map that no landmark connects

@@ -10,16 +10,17 @@ from numpy.typing import NDArray
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.backend.fusion import fuse_neighbourhood
 from vslam.backend.triangulation import triangulate_with_neighbours
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.config import Config
 from vslam.kernels import kernel
 from vslam.map import Map
-from vslam.observations import erase_landmark, refresh_landmarks, unlink
+from vslam.map_kernels import erase_landmark, refresh_landmarks, unlink
+from vslam.reprojection import stack_uvr
 
 RECENT_KEYFRAMES = 3  # a landmark is on probation for this many keyframes (ORB-SLAM, VI-B)
 
 
-def map_keyframe(map_: Map, keyframe: int, camera: StereoCamera, config: Config) -> None:
+def map_keyframe(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Bring the map up to date with a keyframe that was just inserted and linked."""
     cull_recent_landmarks(map_, keyframe, camera, config)
     triangulate_with_neighbours(map_, keyframe, camera, config)
@@ -31,11 +32,11 @@ def map_keyframe(map_: Map, keyframe: int, camera: StereoCamera, config: Config)
 
 
 def refresh_keyframe(map_: Map, keyframe: int) -> None:
-    """Recompute descriptor, normal and reach of the landmarks that a keyframe observes."""
+    """Recompute descriptor, normal and distance range of the landmarks that a keyframe observes."""
     refresh_landmarks(map_.arrays, map_.landmarks_of(keyframe), map_.scales)
 
 
-def cull_recent_landmarks(map_: Map, keyframe: int, camera: StereoCamera, config: Config) -> None:
+def cull_recent_landmarks(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Erase landmarks on probation that tracking rarely finds or too few keyframes see."""
     _cull_landmarks(
         map_.arrays,
@@ -63,7 +64,7 @@ def _cull_landmarks(a, first, last, keyframe, min_found_ratio, too_few):
             erase_landmark(a, landmark)
 
 
-def adjust_locally(map_: Map, keyframe: int, camera: StereoCamera, config: Config) -> None:
+def adjust_locally(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Local bundle adjustment (ORB-SLAM, VI-D).
 
     The keyframe and its covisible keyframes move with all landmarks that they see; other
@@ -139,7 +140,7 @@ def assemble(
     free: NDArray[np.int64],
     fixed: NDArray[np.int64],
     landmarks: NDArray[np.int32],
-    camera: StereoCamera,
+    camera: Camera,
 ) -> tuple[BundleProblem, NDArray[np.int64]]:
     """The bundle problem of some keyframes and landmarks, and the map row of each observation."""
     a = map_.arrays
@@ -147,16 +148,13 @@ def assemble(
     index = np.full(map_.n_keyframes, -1, np.int64)
     index[cameras] = np.arange(len(cameras))
     first, rows = gather_observations(a, landmarks, index)
-    uvr = np.empty((len(rows), 3))
-    uvr[:, :2] = a.xy[rows]
-    uvr[:, 2] = a.u_right[rows]
     problem = BundleProblem(
         T_cw=a.T_cw[cameras],
         n_free=len(free),
         points=a.xyz[landmarks],
         first=first,
         camera=index[a.keyframe[rows]],
-        uvr=uvr,
+        uvr=stack_uvr(a.xy[rows], a.u_right[rows]),
         inverse_sigma2=map_.scales[a.octave[rows]] ** -2.0,
         intrinsics=camera.intrinsics,
     )
@@ -194,7 +192,7 @@ def remove_observations(a, rows):
             unlink(a, row)
 
 
-def cull_keyframes(map_: Map, keyframe: int, camera: StereoCamera, config: Config) -> None:
+def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Remove covisible keyframes most of whose close landmarks at least three others see as well,
     at the same or a finer scale (ORB-SLAM, VI-E). Without stereo all landmarks count."""
     neighbours, shared = map_.covisible(keyframe)

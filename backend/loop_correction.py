@@ -1,4 +1,4 @@
-"""Moving keyframes, and the landmarks with them, when a loop closure has corrected their poses."""
+"""Moving keyframes, and the landmarks with them, when a loop has corrected them."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ def move_keyframes(
 
     The anchor is the keyframe that saw the landmark first (ORB-SLAM, VII-C), or if that was
     culled, the first of those that see it; landmarks anchored in keyframes that are not named
-    stay. Seen from its anchor nothing changes, so that the reach is as before and the normal turns
-    with the anchor: it is exact where all observers move as one. Culled keyframes follow the
-    living ones they are placed by.
+    stay. Seen from its anchor nothing changes, so that the distance range is as before and the
+    normal turns with the anchor: it is exact where all observers move as one. Culled keyframes
+    follow the living ones they are placed by.
 
     Args:
         keyframes: ``(N,)`` ids of living keyframes.
@@ -53,7 +53,7 @@ def carry_landmarks_by(map_: Map, motion: NDArray[np.float64], moved: NDArray[np
 
     Args:
         motion: ``(K, 4, 4)`` of each keyframe, world to world, similarities too: then normal and
-            reach are to be refreshed.
+            distance range are to be refreshed.
         moved: ``(K,)`` bool, keyframes that have one.
     """
     _carry(map_.arrays, np.arange(map_.n_landmarks), motion, moved)

@@ -1,4 +1,4 @@
-"""The pose graph behind a loop closure: how its error is spread over the path, and whether it may.
+"""The pose graph behind a closed loop: how its error is spread over the path, and whether it may.
 
 The essential graph of ORB-SLAM (Mur-Artal et al., T-RO 2015, III-D and VII-C): spanning tree,
 strong covisibility edges and loop edges. Poses go in as ``T_cw`` and come out as ``T_cw``. GTSAM
@@ -7,7 +7,7 @@ does the optimisation, from its built-in factors; it is loaded by the first loop
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from vslam.geometry import compose, inverse, inverses, orthonormalised, se3_log
 from vslam.kernels import kernel
 from vslam.loops import LoopEdge
 from vslam.map import Map
-from vslam.observations import covisible_pairs
+from vslam.map_kernels import covisible_pairs
 
 TREE, COVISIBLE, WEAK, LOOP, GAP = range(5)  # kinds of edges
 HOLD = 1e-6  # sigma, m and rad, of the prior that holds a keyframe
@@ -55,10 +55,10 @@ class Consistency:
     """Whether the edges of an optimised graph agree.
 
     Attributes:
-        consistent: whether the closure may stand.
+        consistent: whether the correction may stand.
         reason: "consistent", or in a few words what speaks against it.
         strain: chi-square of the tree, covisibility and gap edges: how much drift, in the units of
-            the drift model, the closure implies.
+            the drift model, the correction implies.
         closed: loop edges that were open before: what the strain is to be shared by.
         loop_error: ``(E,)`` chi-square of the loop edges, NaN for others.
     """
@@ -72,11 +72,11 @@ class Consistency:
 
 def essential_graph(
     map_: Map,
-    loops: Sequence[LoopEdge],
+    loops: Collection[LoopEdge],
     config: PoseGraphConfig,
     *,
     weak: Collection[int] = (),
-    guessed: Collection[int] = (),
+    unpredicted: Collection[int] = (),
     driven: bool = False,
 ) -> PoseGraph:
     """The essential graph of a map, *before* anything of the new loop has been written to it.
@@ -93,7 +93,7 @@ def essential_graph(
         loops: that were closed, and last the new one; all with their pose.
         weak: keyframes that began anew after tracking was lost, culled ones too. Tree edges that
             lead past one of them, and whose ends share hardly a landmark, come from a prediction.
-        guessed: those of them that not even a prediction led to: always WEAK.
+        unpredicted: those of them that not even a prediction led to: always WEAK.
         driven: trust such an edge as far as a car's motion can be predicted over that time (GAP);
             otherwise the camera may have been carried anywhere (WEAK).
 
@@ -108,7 +108,7 @@ def essential_graph(
     seen = set(map(tuple, pairs.tolist()))
     # Edge by the pair of its ends: what is written later wins.
     kind = dict.fromkeys(map(tuple, pairs[shared >= config.min_shared].tolist()), COVISIBLE)
-    restarts, guesses = (np.array(sorted(at), np.int64) for at in (weak, guessed))
+    restarts, unpredicted_restarts = (np.array(sorted(at), np.int64) for at in (weak, unpredicted))
     for child in living.tolist():
         parent = map_.parents[child]
         if parent >= 0:
@@ -116,7 +116,7 @@ def essential_graph(
             if not _passes(pair, restarts) or pair in seen:
                 kind[pair] = TREE
             else:
-                kind[pair] = GAP if driven and not _passes(pair, guesses) else WEAK
+                kind[pair] = GAP if driven and not _passes(pair, unpredicted_restarts) else WEAK
     measured: dict[tuple[int, int], tuple[NDArray[np.float64], float]] = {}
     for loop in loops:
         query, match, T = _loop_of_living(map_, loop)
@@ -270,10 +270,10 @@ def consistency(
     """
     before = edge_errors(graph.T_cw, graph.edges, graph.T_i_j, graph.sigmas)
     after = edge_errors(T_cw, graph.edges, graph.T_i_j, graph.sigmas)
-    return judge(graph, before, after, config)
+    return check_graph(graph, before, after, config)
 
 
-def judge(
+def check_graph(
     graph: PoseGraph,
     before: NDArray[np.float64],
     after: NDArray[np.float64],

@@ -15,14 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.loop_correction import carry_landmarks_by
-from vslam.backend.pose_graph import GAP, HOLD, LOOP, WEAK, Consistency, PoseGraph, judge
+from vslam.backend.pose_graph import GAP, HOLD, LOOP, WEAK, Consistency, PoseGraph, check_graph
 from vslam.config import PoseGraphConfig
-from vslam.geometry import inverses, se3_log
+from vslam.geometry import Matrix, inverses, se3_log
 from vslam.loops import LoopEdge
 from vslam.map import Map
-from vslam.observations import refresh_landmarks
-
-Matrix = NDArray[np.float64]
+from vslam.map_kernels import refresh_landmarks
 
 
 def similarity(T_a_b: Matrix, scale: NDArray[np.float64] | float) -> Matrix:
@@ -102,7 +100,7 @@ def similarity_consistency(
 ) -> Consistency:
     """``pose_graph.consistency`` for similarities before and after optimisation."""
     before, after = (edge_errors(graph, S, config) for S in (S_wc_before, S_wc))
-    return judge(graph, before, after, config)
+    return check_graph(graph, before, after, config)
 
 
 def edge_errors(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> NDArray[np.float64]:
@@ -121,7 +119,7 @@ def move_keyframes_similarly(
     """Move keyframes and take each landmark along with its anchor, growing or shrinking what is
     around it (ORB-SLAM, VII-C).
 
-    Culled keyframes follow the living ones they are placed by; ``map_.rescaled`` keeps account.
+    Culled keyframes follow the living ones they are placed by; ``map_.unit_scale`` keeps account.
 
     Args:
         keyframes: ``(N,)`` ids of living keyframes; S_wc: ``(N, 4, 4)`` their similarities.
@@ -143,7 +141,7 @@ def move_keyframes_similarly(
         map_.T_c_parent[k] = map_.T_c_parent[k].copy()
         map_.T_c_parent[k][:3, 3] *= growth[k]
     for k in range(n):
-        map_.rescaled[k] *= float(growth[k])
+        map_.unit_scale[k] *= float(growth[k])
     refresh_landmarks(a, map_.living_landmarks().astype(np.int32), map_.scales)
     return growth
 

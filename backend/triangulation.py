@@ -5,19 +5,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import CHI2_MONO, CHI2_STEREO, StereoCamera
+from vslam.camera import Camera
 from vslam.config import Config
 from vslam.geometry import inverse
 from vslam.kernels import hamming, inner_kernel, kernel
 from vslam.map import NONE, Map
-from vslam.observations import link_many
+from vslam.map_kernels import link_many
+from vslam.reprojection import chi_square_ratio
 
 EPIPOLAR_CHI2 = 3.84  # 95 % quantile with 1 degree of freedom
 MIN_CLOSE = 100  # stereo points mapped even if none is close (ORB-SLAM2, III-E)
 
 
 def map_stereo_points(
-    map_: Map, keyframe: int, camera: StereoCamera, config: Config
+    map_: Map, keyframe: int, camera: Camera, config: Config
 ) -> NDArray[np.int32]:
     """Map the close stereo features of a keyframe that observe no landmark yet.
 
@@ -40,7 +41,7 @@ def map_stereo_points(
 
 
 def triangulate_with_neighbours(
-    map_: Map, keyframe: int, camera: StereoCamera, config: Config
+    map_: Map, keyframe: int, camera: Camera, config: Config
 ) -> NDArray[np.int32]:
     """Match unmapped features of a keyframe with those of its covisible keyframes along epipolar
     lines and triangulate them (ORB-SLAM, VI-C). Returns the ids of the new landmarks."""
@@ -204,7 +205,7 @@ def world_ray(T_cw, xy, intrinsics, ray):
 
 @inner_kernel
 def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_cosine, point):
-    """Put into ``point`` (3,) where two rays meet, or the stereo point of the eye pair that has
+    """Put into ``point`` (3,) where two rays meet, or the stereo point of the camera pair that has
     more parallax than the rays have; False if neither is sound.
 
     ``depth_i`` is the stereo depth of each feature, NaN without; ``ray_i`` its ``world_ray``.
@@ -212,11 +213,11 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
     dot = dot3(ray_1, ray_2)
     square_1, square_2 = dot3(ray_1, ray_1), dot3(ray_2, ray_2)
     cosine = dot / np.sqrt(square_1 * square_2)
-    # Angle between the eyes, seen from the stereo point.
-    eyes_1 = 2.0 * np.arctan(0.5 * baseline / (depth_1 * np.sqrt(square_1)))
-    eyes_2 = 2.0 * np.arctan(0.5 * baseline / (depth_2 * np.sqrt(square_2)))
+    # Angle between the cameras, seen from the stereo point.
+    angle_1 = 2.0 * np.arctan(0.5 * baseline / (depth_1 * np.sqrt(square_1)))
+    angle_2 = 2.0 * np.arctan(0.5 * baseline / (depth_2 * np.sqrt(square_2)))
     stereo_1, stereo_2 = depth_1 > 0.0, depth_2 > 0.0  # False for NaN
-    stereo_cosine = min(np.cos(eyes_1) if stereo_1 else 2.0, np.cos(eyes_2) if stereo_2 else 2.0)
+    stereo_cosine = min(np.cos(angle_1) if stereo_1 else 2.0, np.cos(angle_2) if stereo_2 else 2.0)
     if 0.0 < cosine < stereo_cosine and (stereo_1 or stereo_2 or cosine < max_cosine):
         # Midpoint of the shortest segment between the rays; bundle adjustment does the rest.
         on_1, on_2 = 0.0, 0.0
@@ -229,7 +230,7 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
         for i in range(3):
             point[i] = 0.5 * (centre_1[i] + s * ray_1[i] + centre_2[i] + t * ray_2[i])
         return s > 0.0 and t > 0.0
-    if stereo_1 and (not stereo_2 or eyes_1 >= eyes_2):
+    if stereo_1 and (not stereo_2 or angle_1 >= angle_2):
         for i in range(3):
             point[i] = centre_1[i] + depth_1 * ray_1[i]
         return True
@@ -241,15 +242,11 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
 @inner_kernel
 def agrees(T, p, xy, u_right, scale, intrinsics):
     """Whether a point in front of the camera reprojects within the chi-square limit."""
-    fx, fy, cx, cy, bf = intrinsics
     z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
     if z <= 0.0:
         return False
     x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
     y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
-    u = fx * x / z + cx
-    chi2 = (xy[0] - u) ** 2 + (xy[1] - fy * y / z - cy) ** 2
-    if np.isnan(u_right):
-        return chi2 <= CHI2_MONO * scale * scale
-    chi2 += (u_right - u + bf / z) ** 2
-    return chi2 <= CHI2_STEREO * scale * scale
+    uvr = np.empty(3)
+    uvr[0], uvr[1], uvr[2] = xy[0], xy[1], u_right
+    return chi_square_ratio(x, y, z, uvr, 1.0 / (scale * scale), intrinsics) <= 1.0

@@ -12,18 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.features import Features
-from vslam.geometry import compose, inverse, transform
+from vslam.geometry import Matrix, compose, inverse, transform
 from vslam.map import Map
-from vslam.observations import link_many, refresh_landmarks
+from vslam.map_kernels import link_many, refresh_landmarks
+from vslam.reprojection import stack_uvr
 
-Matrix = NDArray[np.float64]
 ITERATIONS = 20
 
 
 def adjust_two_views(
-    T_2_1: Matrix, points: Matrix, uv: Matrix, sigma: Matrix, camera: StereoCamera, depth: float
+    T_2_1: Matrix, points: Matrix, uv: Matrix, sigma: Matrix, camera: Camera, depth: float
 ) -> tuple[Matrix, Matrix, NDArray[np.bool_]]:
     """Bundle adjustment of two views, scaled to a median depth.
 
@@ -38,8 +38,7 @@ def adjust_two_views(
         ``T_2_1``, points, and ``(N,)`` bool: those that fit both views.
     """
     n = len(points)
-    uvr = np.full((2 * n, 3), np.nan)
-    uvr[:, :2] = uv.reshape(2 * n, 2)
+    uvr = stack_uvr(uv.reshape(2 * n, 2), np.full(2 * n, np.nan))
     problem = BundleProblem(
         T_cw=np.stack([T_2_1, np.eye(4)]),
         n_free=1,

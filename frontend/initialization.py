@@ -17,12 +17,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import CHI2_MONO, StereoCamera
+from vslam.camera import Camera
 from vslam.config import InitializationConfig
-from vslam.frontend.matching import consistent_orientation, search_windows
-from vslam.frontend.tracking import Frame, Tracker
+from vslam.frontend.matching import Projections, Searchable, consistent_orientation, search_windows
+from vslam.frontend.tracking import Frame, TrackingContext
+from vslam.geometry import Matrix
+from vslam.reprojection import CHI2_MONO, stack_uvr
 
-Matrix = NDArray[np.float64]
 CHI2_LINE = 3.841  # 95 % quantile with 1 degree of freedom: a point's distance from a line
 SAMPLE = 8  # matches of a draw: what the eight-point algorithm needs; the homography has four over
 # Points with less parallax than this (0.36 degrees) are counted, but not mapped (ORB-SLAM).
@@ -63,26 +64,22 @@ class TwoViews:
 
 
 def match_views(
-    one: Frame, two: Frame, tracker: Tracker
+    one: Frame, two: Frame, context: TrackingContext
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Features of two frames ``(N,)`` each that look alike and lie not far apart."""
-    config, before, now = tracker.config.initialization, one.features, two.features
+    config, before, now = context.config.initialization, one.features, two.features
     n = len(before)
     octave = before.octave.astype(np.int64)
     found, _ = search_windows(
-        np.column_stack([before.xy, np.zeros(n)]).astype(np.float64),
-        np.full(n, config.window),
-        octave,
-        octave,
-        before.descriptors.view(np.uint64),
-        now.xy,
-        now.octave,
-        now.u_right,
-        now.descriptors.view(np.uint64),
+        Projections(
+            stack_uvr(before.xy, np.zeros(n)),
+            np.full(n, config.window),
+            octave,
+            octave,
+            before.descriptors.view(np.uint64),
+        ),
+        Searchable.of_features(now, two.grid),
         np.ones(len(now), np.bool_),
-        two.grid.start,
-        two.grid.items,
-        two.grid.columns,
         config.match_distance,
         config.match_ratio,
     )
@@ -98,7 +95,7 @@ def reconstruct(
     xy_1: Matrix,
     xy_2: Matrix,
     sigma: Matrix,
-    camera: StereoCamera,
+    camera: Camera,
     config: InitializationConfig,
     *,
     seed: int,
@@ -313,7 +310,7 @@ def _triangulate(
     xy_1: Matrix,
     xy_2: Matrix,
     sigma: Matrix,
-    camera: StereoCamera,
+    camera: Camera,
     config: InitializationConfig,
 ) -> tuple[Matrix, NDArray[np.bool_], Matrix]:
     """Points ``(N, 3)`` in camera 1; whether each lies in front of both cameras and reprojects

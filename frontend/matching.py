@@ -6,20 +6,22 @@ looked for only near its projection and near the pyramid level at which it shoul
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import CELL
+from vslam.features import CELL, FeatureGrid, Features
 from vslam.kernels import hamming, kernel
-from vslam.observations import predict_octave
+from vslam.map_kernels import predict_octave
 
 ORIENTATION_BINS = 30
 
 
 @kernel
-def predict_view(T, xyz, normal, reach, intrinsics, width, height, scales, window):
-    """Where landmarks should appear (ORB-SLAM, V-D): in the image, within reach, seen from a
-    direction at most 60 degrees off the mean one.
+def predict_view(T, xyz, normal, distance_range, intrinsics, width, height, scales, window):
+    """Where landmarks should appear (ORB-SLAM, V-D): in the image, within their distance
+    range, seen from a direction at most 60 degrees off the mean one.
 
     Returns:
         ``uvr`` ``(N, 3)``; search radius ``(N,)``, 0 if not visible; octave ``(N,)`` int64.
@@ -48,51 +50,69 @@ def predict_view(T, xyz, normal, reach, intrinsics, width, height, scales, windo
             continue
         dx, dy, dz = p[0] - centre[0], p[1] - centre[1], p[2] - centre[2]
         distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-        if distance < 0.8 * reach[i, 0] or distance > 1.2 * reach[i, 1]:
+        if distance < 0.8 * distance_range[i, 0] or distance > 1.2 * distance_range[i, 1]:
             continue
         cos = (dx * normal[i, 0] + dy * normal[i, 1] + dz * normal[i, 2]) / distance
         if cos < 0.5:
             continue
-        octave[i] = predict_octave(distance, reach[i, 1], log_scale, len(scales))
+        octave[i] = predict_octave(distance, distance_range[i, 1], log_scale, len(scales))
         uvr[i, 0], uvr[i, 1], uvr[i, 2] = u, v, u - bf / z
         # Seen head-on the prediction is better.
         radius[i] = (window if cos > 0.998 else 1.6 * window) * scales[octave[i]]
     return uvr, radius, octave
 
 
+class Projections(NamedTuple):
+    """M landmarks where they should appear.
+
+    ``uvr`` (M, 3) f8 predicted u, v, u_right; ``radius`` (M,) f8 half width of the window in
+    pixels, not positive: skip; ``octave_low``, ``octave_high`` (M,) int levels to accept;
+    ``descriptor`` (M, 4) u8.
+    """
+
+    uvr: NDArray[np.float64]
+    radius: NDArray[np.float64]
+    octave_low: NDArray[np.int64]
+    octave_high: NDArray[np.int64]
+    descriptor: NDArray[np.uint64]
+
+
+class Searchable(NamedTuple):
+    """N features of an image, by cell.
+
+    ``xy`` (N, 2) f4; ``octave`` (N,) u1; ``u_right`` (N,) f4; ``descriptor`` (N, 4) u8; ``grid``.
+    """
+
+    xy: NDArray[np.float32]
+    octave: NDArray[np.uint8]
+    u_right: NDArray[np.float32]
+    descriptor: NDArray[np.uint64]
+    grid: FeatureGrid
+
+    @classmethod
+    def of_features(cls, features: Features, grid: FeatureGrid) -> Searchable:
+        """Those of a frame."""
+        descriptor = features.descriptors.view(np.uint64)
+        return cls(features.xy, features.octave, features.u_right, descriptor, grid)
+
+
 @kernel
-def search_windows(
-    uvr,
-    radius,
-    octave_low,
-    octave_high,
-    descriptors,
-    xy,
-    octave,
-    u_right,
-    frame_descriptors,
-    free,
-    start,
-    items,
-    columns,
-    max_distance,
-    ratio,
-):
+def search_windows(projections, features, free, max_distance, ratio):
     """Best feature for each of M projected landmarks.
 
     Args:
-        uvr: ``(M, 3)`` float64, predicted u, v, u_right.
-        radius: ``(M,)`` float64, window half width in pixels; not positive: skip.
-        octave_low, octave_high: ``(M,)`` int, levels to accept.
-        descriptors: ``(M, 4)`` uint64; frame_descriptors: ``(N, 4)`` uint64.
+        projections: ``Projections``; features: ``Searchable``.
         free: ``(N,)`` bool, features that may be matched.
-        start, items, columns: the frame's grid.
+        max_distance: of the descriptors, bits.
         ratio: best over second best, where both are of one level (1 switches the test off).
 
     Returns:
         ``(M,)`` int32 feature or -1, no feature twice (the closest descriptor keeps it), and
         ``(M,)`` int32 distances.
     """
+    uvr, radius, octave_low, octave_high, descriptors = projections
+    xy, octave, u_right, frame_descriptors, grid = features
+    start, items, columns = grid
     m, n = len(uvr), len(xy)
     rows = (len(start) - 1) // columns
     matches = np.full(m, -1, np.int32)

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from vslam.camera import CHI2_MONO, CHI2_STEREO
 from vslam.geometry import symmetric_eigen
 from vslam.kernels import inner_kernel, kernel
-from vslam.sampling import draw_three, draws_needed
+from vslam.ransac import draw_three, draws_needed
+from vslam.reprojection import chi_square_ratio
 
 
 @kernel
@@ -247,9 +247,8 @@ def _triad(points, axes):
 
 
 @inner_kernel
-def _judge(T, points, uvr, inverse_sigma2, intrinsics, to_beat, inlier):
+def _score_pose(T, points, uvr, inverse_sigma2, intrinsics, to_beat, inlier):
     """MSAC score of a pose (Torr and Zisserman, CVIU 2000); sets ``inlier``, gives up early."""
-    fx, fy, cx, cy, bf = intrinsics
     n = len(points)
     score, count = 0.0, 0
     for i in range(n):
@@ -262,13 +261,7 @@ def _judge(T, points, uvr, inverse_sigma2, intrinsics, to_beat, inlier):
             continue
         x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
         y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
-        u = fx * x / z + cx
-        chi2 = (uvr[i, 0] - u) ** 2 + (uvr[i, 1] - fy * y / z - cy) ** 2
-        limit = CHI2_MONO
-        if not np.isnan(uvr[i, 2]):
-            chi2 += (uvr[i, 2] - u + bf / z) ** 2
-            limit = CHI2_STEREO
-        error = chi2 * inverse_sigma2[i] / limit
+        error = chi_square_ratio(x, y, z, uvr[i], inverse_sigma2[i], intrinsics)
         if error <= 1.0:
             inlier[i] = True
             count += 1
@@ -320,7 +313,7 @@ def ransac_pose(points, uvr, inverse_sigma2, intrinsics, seed, min_inliers, max_
                 three[i, k] = points[sample[i], k]
                 three_rays[i, k] = rays[sample[i], k]
         for s in range(solve_p3p(three, three_rays, poses)):
-            score, count = _judge(
+            score, count = _score_pose(
                 poses[s], points, uvr, inverse_sigma2, intrinsics, best_score, inlier
             )
             if score <= best_score:

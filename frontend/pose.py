@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from vslam.camera import CHI2_MONO, CHI2_STEREO
 from vslam.geometry import compose, orthonormalised, se3_exp, solve_positive
 from vslam.kernels import inner_kernel, kernel
+from vslam.reprojection import chi_square, chi_square_ratio, residual
 
 ROUNDS = 4
 ITERATIONS = 10
@@ -30,7 +30,7 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
         ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers.
     """
     n = len(points)
-    fx, fy, cx, cy, bf = intrinsics
+    fx, fy, bf = intrinsics[0], intrinsics[1], intrinsics[4]
     T = T_cw.copy()
     inlier = np.ones(n, np.bool_)
     for turn in range(ROUNDS):
@@ -50,14 +50,10 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
                 z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
                 if z <= 1e-6:
                     continue
-                stereo = not np.isnan(uvr[i, 2])
-                iz = 1.0 / z
-                r[0] = uvr[i, 0] - (fx * x * iz + cx)
-                r[1] = uvr[i, 1] - (fy * y * iz + cy)
-                r[2] = uvr[i, 2] - (fx * x * iz + cx - bf * iz) if stereo else 0.0
-                chi2 = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]) * inverse_sigma2[i]
+                stereo = residual(x, y, z, uvr[i], intrinsics, r)
+                chi2, limit = chi_square(r, stereo, inverse_sigma2[i])
                 weight = inverse_sigma2[i]
-                limit = CHI2_STEREO if stereo else CHI2_MONO
+                iz = 1.0 / z
                 if robust and chi2 > limit:
                     weight *= np.sqrt(limit / chi2)
                 used += 1
@@ -92,16 +88,10 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
 @inner_kernel
 def classify(T, points, uvr, inverse_sigma2, intrinsics, inlier):
     """Set ``inlier`` to those that pass the chi-square test at pose ``T``."""
-    fx, fy, cx, cy, bf = intrinsics
     for i in range(len(points)):
         p = points[i]
         x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
         y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
         z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
-        u = fx * x / z + cx
-        chi2 = (uvr[i, 0] - u) ** 2 + (uvr[i, 1] - fy * y / z - cy) ** 2
-        limit = CHI2_MONO
-        if not np.isnan(uvr[i, 2]):
-            chi2 += (uvr[i, 2] - u + bf / z) ** 2
-            limit = CHI2_STEREO
-        inlier[i] = z > 0.0 and chi2 * inverse_sigma2[i] <= limit
+        ratio = chi_square_ratio(x, y, z, uvr[i], inverse_sigma2[i], intrinsics)
+        inlier[i] = z > 0.0 and ratio <= 1.0

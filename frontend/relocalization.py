@@ -6,12 +6,12 @@ import numpy as np
 
 from vslam.frontend.matching import count_elsewhere, search_all
 from vslam.frontend.pnp import ransac_pose
-from vslam.frontend.tracking import Frame, Tracker, observations, refine, track_local_map
+from vslam.frontend.tracking import Frame, TrackingContext, observations, refine, track_local_map
 from vslam.map import LocalMap
 
 
 def relocalise(
-    frame: Frame, place: LocalMap, surroundings: LocalMap, tracker: Tracker, seed: int
+    frame: Frame, place: LocalMap, surroundings: LocalMap, context: TrackingContext, seed: int
 ) -> int:
     """Find the pose of a frame of which nothing is known, at a place that it resembles.
 
@@ -29,9 +29,9 @@ def relocalise(
         Inliers, at least ``relocalization.min_inliers`` and not all on one object; 0 without
         success.
     """
-    inliers = _locate(frame, place, surroundings, tracker, seed)
-    config = tracker.config.relocalization
-    elsewhere = count_elsewhere(frame.features.xy[frame.landmark >= 0, 0], tracker.camera.width)
+    inliers = _locate(frame, place, surroundings, context, seed)
+    config = context.config.relocalization
+    elsewhere = count_elsewhere(frame.features.xy[frame.landmark >= 0, 0], context.camera.width)
     if inliers >= config.min_inliers and elsewhere >= config.min_elsewhere:
         return inliers
     frame.T_cw = np.eye(4)
@@ -41,9 +41,9 @@ def relocalise(
 
 
 def _locate(
-    frame: Frame, place: LocalMap, surroundings: LocalMap, tracker: Tracker, seed: int
+    frame: Frame, place: LocalMap, surroundings: LocalMap, context: TrackingContext, seed: int
 ) -> int:
-    config = tracker.config.relocalization
+    config = context.config.relocalization
     found = search_all(
         place.descriptor,
         frame.features.descriptors.view(np.uint64),
@@ -56,8 +56,8 @@ def _locate(
     feature = found[hit]
     T_cw, inlier = ransac_pose(
         place.xyz[hit],
-        *observations(frame, feature, tracker),
-        tracker.camera.intrinsics,
+        *observations(frame, feature, context),
+        context.camera.intrinsics,
         np.uint64(seed),
         config.min_consensus,
         config.max_draws,
@@ -69,9 +69,9 @@ def _locate(
     frame.xyz[:] = np.nan
     frame.landmark[feature[inlier]] = place.ids[hit[inlier]]
     frame.xyz[feature[inlier]] = place.xyz[hit[inlier]]
-    inliers = refine(frame, T_cw, tracker)
-    for window in (config.first_window, tracker.config.tracking.local_window):
+    inliers = refine(frame, T_cw, context)
+    for window in (config.first_window, context.config.tracking.local_window):
         if inliers < config.min_consensus:
             return 0
-        _, inliers, _ = track_local_map(frame, surroundings, tracker, window)
+        _, inliers, _ = track_local_map(frame, surroundings, context, window)
     return inliers

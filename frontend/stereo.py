@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.config import StereoConfig
 from vslam.frontend.orb import Extraction
 from vslam.kernels import hamming, inner_kernel, kernel
@@ -14,7 +16,7 @@ MEDIAN_FACTOR = 1.5 * 1.4826  # 1.5 standard deviations, from the median of a ha
 
 
 def match_stereo(
-    left: Extraction, right: Extraction, camera: StereoCamera, config: StereoConfig
+    left: Extraction, right: Extraction, camera: Camera, config: StereoConfig
 ) -> NDArray[np.float32]:
     """Column in the right image of each left feature, ``(N,)`` float32, NaN without a match.
 
@@ -23,14 +25,8 @@ def match_stereo(
     window slid at the left feature's level then places the match to a fraction of a pixel.
     """
     u_right, sad = _match(
-        left.xy,
-        left.octave,
-        left.descriptors.view(np.uint64),
-        left.pyramid.pixels,
-        right.xy,
-        right.octave,
-        right.descriptors.view(np.uint64),
-        right.pyramid.pixels,
+        _Side.of_extraction(left),
+        _Side.of_extraction(right),
         left.pyramid.offsets,
         left.pyramid.shapes,
         left.pyramid.scales,
@@ -45,6 +41,21 @@ def match_stereo(
             limit = MEDIAN_FACTOR * np.median(sad[matched])
             u_right[matched[sad[matched] > limit]] = np.nan
     return u_right
+
+
+class _Side(NamedTuple):
+    """One image: ``xy`` (N, 2) f4, ``octave`` (N,) u1, ``descriptor`` (N, 4) u8 of its features;
+    ``pixels`` u1, its pyramid."""
+
+    xy: NDArray[np.float32]
+    octave: NDArray[np.uint8]
+    descriptor: NDArray[np.uint64]
+    pixels: NDArray[np.uint8]
+
+    @classmethod
+    def of_extraction(cls, found: Extraction) -> _Side:
+        descriptor = found.descriptors.view(np.uint64)
+        return cls(found.xy, found.octave, descriptor, found.pyramid.pixels)
 
 
 @kernel
@@ -72,24 +83,10 @@ def rows_to_features(xy, octave, scales, height):
 
 
 @kernel
-def _match(
-    xy_l,
-    octave_l,
-    descriptors_l,
-    pixels_l,
-    xy_r,
-    octave_r,
-    descriptors_r,
-    pixels_r,
-    offsets,
-    shapes,
-    scales,
-    max_disparity,
-    max_distance,
-    half,
-    reach,
-):
+def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, half, reach):
     """Returns ``u_right`` ``(N,)`` float32 and the SAD of each match (-1 without), ``(N,)``."""
+    xy_l, octave_l, descriptors_l, pixels_l = left
+    xy_r, octave_r, descriptors_r, pixels_r = right
     n = len(xy_l)
     u_right = np.full(n, np.nan, np.float32)
     sad = np.full(n, -1.0, np.float32)

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera, ImageMap
 from vslam.config import Config
-from vslam.eyes import EachEye
 from vslam.features import FeatureGrid, Features
 from vslam.frontend.matching import (
+    Projections,
+    Searchable,
     consistent_orientation,
     predict_view,
     search_all,
@@ -26,6 +27,7 @@ from vslam.frontend.pose import optimise_pose
 from vslam.frontend.stereo import match_stereo
 from vslam.geometry import compose, inverse, transform
 from vslam.map import LocalMap
+from vslam.reprojection import stack_uvr
 
 NEVER = np.iinfo(np.int64).max
 
@@ -35,12 +37,18 @@ class Frame:
     """A frame being tracked.
 
     Attributes:
+        index: number of the frame in the run, from 0.
+        timestamp: seconds.
+        image: ``(H, W)`` uint8 left image, for loop detectors that look at it, or None.
         features, grid: of the left image.
         T_cw: ``(4, 4)`` pose estimate.
         landmark: ``(N,)`` int32, landmark that each feature tracks, or -1.
         xyz: ``(N, 3)`` float64, its position; NaN without one.
     """
 
+    index: int
+    timestamp: float
+    image: NDArray[np.uint8] | None
     features: Features
     grid: FeatureGrid
     T_cw: NDArray[np.float64]
@@ -48,21 +56,43 @@ class Frame:
     xyz: NDArray[np.float64]
 
     @classmethod
-    def untracked(cls, features: Features, grid: FeatureGrid) -> Frame:
+    def untracked(
+        cls,
+        features: Features,
+        camera: Camera,
+        index: int = 0,
+        timestamp: float = 0.0,
+        image: NDArray[np.uint8] | None = None,
+    ) -> Frame:
+        """A frame of which nothing is known but its features."""
         n = len(features)
-        return cls(features, grid, np.eye(4), np.full(n, -1, np.int32), np.full((n, 3), np.nan))
+        return cls(
+            index=index,
+            timestamp=timestamp,
+            image=image,
+            features=features,
+            grid=FeatureGrid.of_positions(features.xy, camera.width, camera.height),
+            T_cw=np.eye(4),
+            landmark=np.full(n, -1, np.int32),
+            xyz=np.full((n, 3), np.nan),
+        )
+
+    @property
+    def n_stereo(self) -> int:
+        """Features with a stereo match."""
+        return int(np.count_nonzero(np.isfinite(self.features.u_right)))
 
 
 @dataclass(frozen=True)
-class Tracker:
+class TrackingContext:
     """Camera and thresholds, with what follows from them."""
 
-    camera: StereoCamera
+    camera: Camera
     config: Config
     scales: NDArray[np.float64]
 
     @classmethod
-    def create(cls, camera: StereoCamera, config: Config) -> Tracker:
+    def create(cls, camera: Camera, config: Config) -> TrackingContext:
         return cls(camera, config, scale_factors(config.orb))
 
     @property
@@ -74,30 +104,30 @@ class Tracker:
 def extract_features(
     left: NDArray[np.uint8],
     right: NDArray[np.uint8] | None,
-    tracker: Tracker,
-    each_eye: EachEye = map,
+    context: TrackingContext,
+    image_map: ImageMap = map,
 ) -> Features:
     """ORB features of the left image with their stereo matches, none without a right image.
 
-    A pure function, whatever ``each_eye`` is.
+    A pure function, whatever ``image_map`` is.
     """
-    config = tracker.config
+    config = context.config
     images = [left] if right is None else [left, right]
-    in_left, *in_right = each_eye(lambda image: extract(image, config.orb), images)
+    in_left, *in_right = image_map(lambda image: extract(image, config.orb), images)
     if in_right:
-        u_right = match_stereo(in_left, in_right[0], tracker.camera, config.stereo)
+        u_right = match_stereo(in_left, in_right[0], context.camera, config.stereo)
     else:
         u_right = np.full(len(in_left.xy), np.nan, np.float32)
     return Features(in_left.xy, in_left.octave, in_left.angle, in_left.descriptors, u_right)
 
 
-def feature_depth(features: Features, camera: StereoCamera) -> NDArray[np.float64]:
+def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
     """``(N,)`` depth in metres from stereo, NaN without a match."""
     return camera.bf / (features.xy[:, 0].astype(np.float64) - features.u_right)
 
 
 def track_motion(
-    frame: Frame, previous: Frame, T_cw: NDArray[np.float64], tracker: Tracker
+    frame: Frame, previous: Frame, T_cw: NDArray[np.float64], context: TrackingContext
 ) -> tuple[int, int]:
     """Match what the previous frame saw near where the predicted pose puts it; refine the pose.
 
@@ -108,8 +138,8 @@ def track_motion(
         Matches, and inliers of the pose optimisation; ``frame`` holds the pose and the matched
         landmarks.
     """
-    config, camera = tracker.config.tracking, tracker.camera
-    points, source = trackable_points(previous, tracker)
+    config, camera = context.config.tracking, context.camera
+    points, source = trackable_points(previous, context)
     before = previous.features
     octave = before.octave[source].astype(np.int64)
     in_camera = transform(T_cw, points)
@@ -125,16 +155,12 @@ def track_motion(
         low, high = np.zeros_like(octave), octave
     matches, inliers = 0, 0
     for widening in (1.0, 2.0, 4.0):
-        radius = np.where(ahead, config.motion_window * widening * tracker.scales[octave], 0.0)
+        radius = np.where(ahead, config.motion_window * widening * context.scales[octave], 0.0)
         found = _search(
             frame,
-            uvr,
-            radius,
-            low,
-            high,
-            before.descriptors[source].view(np.uint64),
+            Projections(uvr, radius, low, high, before.descriptors[source].view(np.uint64)),
             np.ones(len(frame.features), np.bool_),
-            tracker,
+            context,
             1.0,
         )
         hit = np.flatnonzero(found >= 0)
@@ -148,21 +174,21 @@ def track_motion(
         frame.xyz[:] = np.nan
         frame.landmark[found[hit]] = previous.landmark[source[hit]]
         frame.xyz[found[hit]] = points[hit]
-        inliers = refine(frame, T_cw, tracker)
+        inliers = refine(frame, T_cw, context)
         if inliers >= config.min_inliers_motion:
             break
     return matches, inliers
 
 
 def trackable_points(
-    previous: Frame, tracker: Tracker
+    previous: Frame, context: TrackingContext
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """World points ``(M, 3)`` that a frame saw, and the ``(M,)`` features that saw them."""
     points = previous.xyz.copy()
     known = np.isfinite(points[:, 0])
-    depth = feature_depth(previous.features, tracker.camera)
-    close = ~known & (depth < tracker.close_depth) & (depth > 0)
-    lifted = tracker.camera.backproject(previous.features.xy[close], depth[close])
+    depth = feature_depth(previous.features, context.camera)
+    close = ~known & (depth < context.close_depth) & (depth > 0)
+    lifted = context.camera.backproject(previous.features.xy[close], depth[close])
     points[close] = transform(inverse(previous.T_cw), lifted)
     source = np.flatnonzero(known | close)
     return points[source], source
@@ -172,7 +198,7 @@ def track_descriptors(
     frame: Frame,
     reference: LocalMap,
     T_cw: NDArray[np.float64],
-    tracker: Tracker,
+    context: TrackingContext,
 ) -> int:
     """Match landmarks by descriptor alone and refine the pose from ``T_cw``: no prediction needed.
 
@@ -182,7 +208,7 @@ def track_descriptors(
     Returns:
         Inliers of the pose optimisation; ``frame`` holds the pose and the matched landmarks.
     """
-    config = tracker.config.tracking
+    config = context.config.tracking
     found = search_all(
         reference.descriptor,
         frame.features.descriptors.view(np.uint64),
@@ -196,11 +222,11 @@ def track_descriptors(
         return 0
     frame.landmark[found[hit]] = reference.ids[hit]
     frame.xyz[found[hit]] = reference.xyz[hit]
-    return refine(frame, T_cw, tracker)
+    return refine(frame, T_cw, context)
 
 
 def track_local_map(
-    frame: Frame, local: LocalMap, tracker: Tracker, window: float | None = None
+    frame: Frame, local: LocalMap, context: TrackingContext, window: float | None = None
 ) -> tuple[int, int, NDArray[np.int32]]:
     """Match every local landmark that should be visible, then refine the pose with all matches.
 
@@ -210,7 +236,7 @@ def track_local_map(
     Returns:
         Matches, inliers, and the ids of the landmarks that should be visible.
     """
-    config, camera = tracker.config.tracking, tracker.camera
+    config, camera = context.config.tracking, context.camera
     points = np.flatnonzero(frame.landmark < 0)
     frame.xyz[points] = np.nan  # points outside the map have done their work
     tracked = np.isin(local.ids, frame.landmark[frame.landmark >= 0])
@@ -218,74 +244,50 @@ def track_local_map(
         frame.T_cw,
         local.xyz,
         local.normal,
-        local.reach,
+        local.distance_range,
         camera.intrinsics,
         camera.width,
         camera.height,
-        tracker.scales,
+        context.scales,
         config.local_window if window is None else window,
     )
     visible = radius > 0
     radius[tracked] = 0.0
     found = _search(
         frame,
-        uvr,
-        radius,
-        octave - 1,
-        octave,
-        local.descriptor,
+        Projections(uvr, radius, octave - 1, octave, local.descriptor),
         frame.landmark < 0,
-        tracker,
+        context,
         config.match_ratio,
     )
     hit = np.flatnonzero(found >= 0)
     frame.landmark[found[hit]] = local.ids[hit]
     frame.xyz[found[hit]] = local.xyz[hit]
     matches = int(np.count_nonzero(frame.landmark >= 0))
-    inliers = refine(frame, frame.T_cw, tracker)
+    inliers = refine(frame, frame.T_cw, context)
     return matches, inliers, local.ids[visible | tracked]
 
 
 def _search(
     frame: Frame,
-    uvr: NDArray[np.float64],
-    radius: NDArray[np.float64],
-    octave_low: NDArray[np.int64],
-    octave_high: NDArray[np.int64],
-    descriptors: NDArray[np.uint64],
+    projections: Projections,
     free: NDArray[np.bool_],
-    tracker: Tracker,
+    context: TrackingContext,
     ratio: float,
 ) -> NDArray[np.int32]:
-    features, grid = frame.features, frame.grid
-    found, _ = search_windows(
-        uvr,
-        radius,
-        octave_low,
-        octave_high,
-        descriptors,
-        features.xy,
-        features.octave,
-        features.u_right,
-        features.descriptors.view(np.uint64),
-        free,
-        grid.start,
-        grid.items,
-        grid.columns,
-        tracker.config.tracking.match_distance,
-        ratio,
-    )
-    return found
+    features = Searchable.of_features(frame.features, frame.grid)
+    max_distance = context.config.tracking.match_distance
+    return search_windows(projections, features, free, max_distance, ratio)[0]
 
 
-def refine(frame: Frame, T_cw: NDArray[np.float64], tracker: Tracker) -> int:
+def refine(frame: Frame, T_cw: NDArray[np.float64], context: TrackingContext) -> int:
     """Optimise the pose from all matches, drop the outliers, return the number of inliers."""
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
     frame.T_cw, inlier = optimise_pose(
         T_cw,
         frame.xyz[matched],
-        *observations(frame, matched, tracker),
-        tracker.camera.intrinsics,
+        *observations(frame, matched, context),
+        context.camera.intrinsics,
     )
     outliers = matched[~inlier]
     frame.landmark[outliers] = -1
@@ -294,11 +296,9 @@ def refine(frame: Frame, T_cw: NDArray[np.float64], tracker: Tracker) -> int:
 
 
 def observations(
-    frame: Frame, feature: NDArray[np.integer], tracker: Tracker
+    frame: Frame, feature: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """``(N, 3)`` u, v, u_right of ``(N,)`` features, and ``(N,)`` their inverse variances."""
     features = frame.features
-    uvr = np.empty((len(feature), 3))
-    uvr[:, :2] = features.xy[feature]
-    uvr[:, 2] = features.u_right[feature]
-    return uvr, tracker.scales[features.octave[feature]] ** -2.0
+    uvr = stack_uvr(features.xy[feature], features.u_right[feature])
+    return uvr, context.scales[features.octave[feature]] ** -2.0

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from vslam.config import BowConfig
 from vslam.features import Features
 from vslam.kernels import inner_kernel, kernel
-from vslam.loopclosure.bow_index import InvertedIndex, Likeness, NodeIndex, grown, index_nodes
+from vslam.loopclosure.bow_index import InvertedIndex, Likeness, grown
 from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
 from vslam.loops import LoopCandidate
 from vslam.map import Map
-from vslam.observations import count_shared
+from vslam.map_kernels import count_shared
 
 
 class BowDetector:
@@ -28,12 +28,10 @@ class BowDetector:
     def __init__(self, vocabulary: Vocabulary, config: BowConfig | None = None) -> None:
         self.vocabulary = vocabulary
         self.config = config or BowConfig()
-        self._node_of_word = vocabulary.ancestors(self.config.direct_level)
         self._index = InvertedIndex(vocabulary.n_words)
-        # Features of all keyframes, sorted by node within each: those of keyframe k are entries
-        # start[k] to start[k + 1]. Keyframes that were never added have none.
+        # Words of all keyframes: those of keyframe k are entries start[k] to start[k + 1].
+        # Keyframes that were never added have none.
         self._start = np.zeros(65, np.int64)
-        self._feature = np.empty(65536, np.int32)
         self._word = np.empty(65536, np.int32)
         self._n_keyframes = 0  # one more than the newest id
 
@@ -46,7 +44,7 @@ class BowDetector:
         if keyframe < self._n_keyframes:
             raise ValueError(f"keyframe {keyframe} comes after {self._n_keyframes - 1}")
         words = self.vocabulary.words(features.descriptors)
-        self._index_features(keyframe, words)
+        self._store(keyframe, words)
         self._index.add(keyframe, bow_vector(self.vocabulary, words))
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
@@ -76,22 +74,12 @@ class BowDetector:
         eligible = map_.arrays.keyframe_alive[: len(likeness.score)].copy()
         return self._candidates(-1, likeness, eligible, 0.0, map_)
 
-    def node_index(self, keyframe: int) -> NodeIndex:
-        """Direct index of a keyframe added before."""
-        entries = self._entries(keyframe)
-        return NodeIndex(self._node_of_word[self._word[entries]], self._feature[entries])
-
-    def node_index_of(self, features: Features) -> NodeIndex:
-        """Direct index of a frame outside the map."""
-        return index_nodes(self._node_of_word[self.vocabulary.words(features.descriptors)])
-
-    def _index_features(self, keyframe: int, words: NDArray[np.int32]) -> None:
+    def _store(self, keyframe: int, words: NDArray[np.int32]) -> None:
         first = int(self._start[self._n_keyframes])
         last = first + len(words)
         self._start = grown(self._start, keyframe + 2)
-        self._word, self._feature = grown(self._word, last), grown(self._feature, last)
-        order = index_nodes(self._node_of_word[words]).feature
-        self._feature[first:last], self._word[first:last] = order, words[order]
+        self._word = grown(self._word, last)
+        self._word[first:last] = words
         self._start[self._n_keyframes : keyframe + 1] = first
         self._start[keyframe + 1] = last
         self._n_keyframes = keyframe + 1

@@ -15,10 +15,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.config import VerificationConfig
 from vslam.features import FeatureGrid
 from vslam.frontend.matching import (
+    Projections,
+    Searchable,
     consistent_orientation,
     count_elsewhere,
     predict_view,
@@ -26,18 +28,18 @@ from vslam.frontend.matching import (
     search_windows,
 )
 from vslam.frontend.pose import optimise_pose
-from vslam.geometry import inverse, orthonormalised, transform
-from vslam.loopclosure.alignment import Sightings, align
+from vslam.geometry import Matrix, inverse, orthonormalised, transform
+from vslam.loopclosure.sim3_ransac import Sightings, align
 from vslam.loops import LoopCandidate, LoopEdge
 from vslam.map import Map
-from vslam.observations import collect_landmarks
+from vslam.map_kernels import collect_landmarks
+from vslam.reprojection import stack_uvr
 
-Matrix = NDArray[np.float64]
 GRID_COLUMNS, GRID_ROWS = 8, 4
 MIN_DEPTHS = 10  # depths on both sides that a median ratio takes
 
 
-class View(NamedTuple):
+class GuidedMatches(NamedTuple):
     """What a camera should see of M landmarks, and does see.
 
     Attributes:
@@ -63,7 +65,7 @@ class View(NamedTuple):
 def verify(
     map_: Map,
     candidate: LoopCandidate,
-    camera: StereoCamera,
+    camera: Camera,
     config: VerificationConfig,
 ) -> LoopEdge:
     """Decide whether the query keyframe shows the place of the match. Reads the map only.
@@ -90,19 +92,19 @@ def verify(
     place = place_of(map_, match, query, config)
     T_mw = map_.keyframe_pose(match)
     landmarks = collect_landmarks(map_.arrays, place, map_.n_landmarks)
-    view = look(map_, query, landmarks, T_query_match @ T_mw, camera, config)
-    T_query_match = orthonormalised(view.T_cw @ inverse(T_mw))
+    guided = guided_match(map_, query, landmarks, T_query_match @ T_mw, camera, config)
+    T_query_match = orthonormalised(guided.T_cw @ inverse(T_mw))
     edge = replace(
         edge,
-        n_matches=view.n_matches,
-        n_inliers=int(np.count_nonzero(view.seen)),
+        n_matches=guided.n_matches,
+        n_inliers=int(np.count_nonzero(guided.seen)),
         T_query_match=T_query_match,
-        features=view.feature[view.seen],
-        landmarks=view.landmarks[view.seen],
+        features=guided.feature[guided.seen],
+        landmarks=guided.landmarks[guided.seen],
     )
     if camera.monocular:
-        edge = replace(edge, scale=scale_of_view(map_, query, view, default=scale))
-    reason = _objection(map_, edge, view, T_query_match, camera, config)
+        edge = replace(edge, scale=relative_scale(map_, query, guided, default=scale))
+    reason = _objection(map_, edge, guided, T_query_match, camera, config)
     return replace(edge, accepted=not reason, reason=reason or "verified")
 
 
@@ -131,7 +133,7 @@ def _consensus(
     match: int,
     rows_q: NDArray[np.int64],
     rows_m: NDArray[np.int64],
-    camera: StereoCamera,
+    camera: Camera,
     config: VerificationConfig,
 ) -> tuple[Matrix | None, float, int]:
     """``T_query_match`` and scale of most of the matches, and how many; None if too few agree."""
@@ -152,17 +154,17 @@ def _consensus(
     return T_query_match, found.scale, int(np.count_nonzero(found.inlier))
 
 
-def scale_of_view(map_: Map, query: int, view: View, *, default: float) -> float:
+def relative_scale(map_: Map, query: int, guided: GuidedMatches, *, default: float) -> float:
     """Units around the query for one around the match: the median ratio of the depths that the
     query's own landmarks and those of the place give the same features."""
     a = map_.arrays
-    feature, landmarks = view.feature[view.seen], view.landmarks[view.seen]
+    feature, landmarks = guided.feature[guided.seen], guided.landmarks[guided.seen]
     own = a.landmark[map_.rows(query)][feature]
     both = own >= 0
     if np.count_nonzero(both) < MIN_DEPTHS:
         return default
     depth = transform(a.T_cw[query], a.xyz[own[both]])[:, 2]
-    depth_of_place = transform(view.T_cw, a.xyz[landmarks[both]])[:, 2]
+    depth_of_place = transform(guided.T_cw, a.xyz[landmarks[both]])[:, 2]
     return float(np.median(depth / depth_of_place))
 
 
@@ -175,7 +177,7 @@ def _sightings(map_: Map, keyframe: int, rows: NDArray[np.int64]) -> Sightings:
 def _observations(map_: Map, rows: NDArray[np.int64]) -> tuple[Matrix, Matrix]:
     """``(N, 3)`` u, v, u_right of rows, and ``(N,)`` their inverse variances."""
     a = map_.arrays
-    uvr = np.column_stack([a.xy[rows], a.u_right[rows]]).astype(np.float64)
+    uvr = stack_uvr(a.xy[rows], a.u_right[rows])
     return uvr, map_.scales[a.octave[rows]] ** -2.0
 
 
@@ -186,14 +188,14 @@ def place_of(map_: Map, match: int, query: int, config: VerificationConfig) -> N
     return np.array([match, *around[: config.place_keyframes]], np.int64)
 
 
-def look(
+def guided_match(
     map_: Map,
     keyframe: int,
     landmarks: NDArray[np.int32],
     T_cw: Matrix,
-    camera: StereoCamera,
+    camera: Camera,
     config: VerificationConfig,
-) -> View:
+) -> GuidedMatches:
     """Guided matching: find ``(N,)`` landmarks near where a pose of a keyframe puts them, refine
     the pose with all that was found, and once more in narrower windows.
 
@@ -203,13 +205,14 @@ def look(
     """
     a, rows = map_.arrays, map_.rows(keyframe)
     grid = FeatureGrid.of_positions(a.xy[rows], camera.width, camera.height)
+    features = Searchable(a.xy[rows], a.octave[rows], a.u_right[rows], a.descriptor[rows], grid)
     free = np.ones(rows.stop - rows.start, np.bool_)
     for window in (config.first_window, config.second_window):
         uvr, radius, octave = predict_view(
             T_cw,
             a.xyz[landmarks],
             a.normal[landmarks],
-            a.reach[landmarks],
+            a.distance_range[landmarks],
             camera.intrinsics,
             camera.width,
             camera.height,
@@ -217,19 +220,9 @@ def look(
             window,
         )
         found, _ = search_windows(
-            uvr,
-            radius,
-            octave - 1,
-            octave + 1,
-            a.landmark_descriptor[landmarks],
-            a.xy[rows],
-            a.octave[rows],
-            a.u_right[rows],
-            a.descriptor[rows],
+            Projections(uvr, radius, octave - 1, octave + 1, a.landmark_descriptor[landmarks]),
+            features,
             free,
-            grid.start,
-            grid.items,
-            grid.columns,
             config.guided_distance,
             1.0,
         )
@@ -243,15 +236,15 @@ def look(
     visible = np.flatnonzero(radius > 0)
     feature = np.full(len(landmarks), -1, np.int32)
     feature[hit[inlier]] = found[hit[inlier]]
-    return View(landmarks[visible], feature[visible], uvr[visible, :2], len(hit), T_cw)
+    return GuidedMatches(landmarks[visible], feature[visible], uvr[visible, :2], len(hit), T_cw)
 
 
 def _objection(
     map_: Map,
     edge: LoopEdge,
-    view: View,
+    guided: GuidedMatches,
     T_query_match: Matrix,
-    camera: StereoCamera,
+    camera: Camera,
     config: VerificationConfig,
 ) -> str:
     """What speaks against a refined loop, "" if nothing does."""
@@ -262,44 +255,46 @@ def _objection(
     distance = float(np.linalg.norm(inverse(T_query_match)[:3, 3]))
     if distance > config.max_distance:
         return f"{distance:.0f} m from the place"
-    expected, occupied = occupied_cells(view, camera)
+    expected, occupied = occupied_cells(guided, camera)
     if occupied < max(config.min_cells, config.min_cell_ratio * expected):
         return f"inliers in {occupied} of {expected} cells of the image only"
-    elsewhere = count_elsewhere(view.uv[view.seen, 0], camera.width)
+    elsewhere = count_elsewhere(guided.uv[guided.seen, 0], camera.width)
     if elsewhere < config.min_elsewhere:
         return f"only {elsewhere} inliers outside one third of the image"
-    seen, total = seen_of(map_, edge.match, view)
+    seen, total = seen_of(map_, edge.match, guided)
     if seen < config.min_seen_ratio * total:
         return f"only {seen} of {total} landmarks of the place are seen"
-    seen, total = seen_of(map_, edge.query, look_back(map_, edge, T_query_match, camera, config))
+    seen, total = seen_of(
+        map_, edge.query, reverse_match(map_, edge, T_query_match, camera, config)
+    )
     if seen < config.min_seen_ratio * total:
         return f"the place saw only {seen} of {total} landmarks of the query"
     return ""
 
 
-def look_back(
+def reverse_match(
     map_: Map,
     edge: LoopEdge,
     T_query_match: Matrix,
-    camera: StereoCamera,
+    camera: Camera,
     config: VerificationConfig,
-) -> View:
+) -> GuidedMatches:
     """What the match sees of the landmarks of the query."""
     T_match_query = inverse(T_query_match)
     T_match_query[:3, 3] *= edge.scale  # to the query's unit, which its landmarks are in
     T_mw = T_match_query @ map_.keyframe_pose(edge.query)
-    return look(map_, edge.match, map_.landmarks_of(edge.query), T_mw, camera, config)
+    return guided_match(map_, edge.match, map_.landmarks_of(edge.query), T_mw, camera, config)
 
 
-def seen_of(map_: Map, keyframe: int, view: View) -> tuple[int, int]:
-    """How many of the landmarks of a keyframe a view has, and how many it should have."""
-    own = np.isin(view.landmarks, map_.landmarks_of(keyframe))
-    return int(np.count_nonzero(view.seen & own)), int(np.count_nonzero(own))
+def seen_of(map_: Map, keyframe: int, guided: GuidedMatches) -> tuple[int, int]:
+    """How many of the landmarks of a keyframe a guided has, and how many it should have."""
+    own = np.isin(guided.landmarks, map_.landmarks_of(keyframe))
+    return int(np.count_nonzero(guided.seen & own)), int(np.count_nonzero(own))
 
 
-def occupied_cells(view: View, camera: StereoCamera) -> tuple[int, int]:
+def occupied_cells(guided: GuidedMatches, camera: Camera) -> tuple[int, int]:
     """Cells of the image where landmarks should be, and cells where they are."""
-    column = (view.uv[:, 0] * GRID_COLUMNS / camera.width).astype(np.int64)
-    row = (view.uv[:, 1] * GRID_ROWS / camera.height).astype(np.int64)
+    column = (guided.uv[:, 0] * GRID_COLUMNS / camera.width).astype(np.int64)
+    row = (guided.uv[:, 1] * GRID_ROWS / camera.height).astype(np.int64)
     cell = row * GRID_COLUMNS + column
-    return len(np.unique(cell)), len(np.unique(cell[view.seen]))
+    return len(np.unique(cell)), len(np.unique(cell[guided.seen]))

@@ -8,7 +8,7 @@ and the random numbers are our own, so that a seed means the same tree everywher
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ ITERATIONS = 12  # of the majority vote in a node; most nodes settle earlier
 
 
 def train(
-    descriptors_of_images: Sequence[NDArray[np.uint8]],
+    descriptors_of_images: list[NDArray[np.uint8]],
     branching: int = 10,
     levels: int = 5,
     seed: int = 0,

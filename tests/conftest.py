@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.geometry import se3_exp
 from vslam.map import Map
 from vslam.trajectory import write_kitti
@@ -30,7 +30,7 @@ CEILING = -6.0  # walls end here; above is sky
 class StereoSequence:
     """``left`` and ``right`` images, ``timestamps`` and true ``T_wc`` of N frames."""
 
-    camera: StereoCamera
+    camera: Camera
     left: list[np.ndarray]
     right: list[np.ndarray]
     timestamps: np.ndarray
@@ -54,7 +54,7 @@ def corridor_mipmaps(seed: int = 7) -> list[np.ndarray]:
     return levels
 
 
-def render(mipmaps: list[np.ndarray], camera: StereoCamera, T_wc: np.ndarray) -> np.ndarray:
+def render(mipmaps: list[np.ndarray], camera: Camera, T_wc: np.ndarray) -> np.ndarray:
     """What a pinhole camera at ``T_wc`` sees of the corridor, ray by ray, without aliasing."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = np.stack(
@@ -101,7 +101,7 @@ def render(mipmaps: list[np.ndarray], camera: StereoCamera, T_wc: np.ndarray) ->
 @pytest.fixture(scope="session")
 def corridor() -> StereoSequence:
     """28 stereo frames at 10 Hz down a textured corridor: 0.35 m a frame, with a slight turn."""
-    camera = StereoCamera(240.0, 240.0, 239.5, 79.5, 0.5, 480, 160)
+    camera = Camera(240.0, 240.0, 239.5, 79.5, 0.5, 480, 160)
     mipmaps = corridor_mipmaps()
     frames = 28
     T_wc = [np.eye(4)]
@@ -109,10 +109,10 @@ def corridor() -> StereoSequence:
         yaw = 0.012 if 8 <= k < 20 else 0.0  # rad a frame
         T_wc.append(T_wc[-1] @ se3_exp(np.array([0.0, 0.0, 0.35, 0.0, yaw, 0.0])))
     poses = np.array(T_wc)
-    eye = np.eye(4)
-    eye[0, 3] = camera.baseline
+    side = np.eye(4)
+    side[0, 3] = camera.baseline
     left = [render(mipmaps, camera, T) for T in poses]
-    right = [render(mipmaps, camera, T @ eye) for T in poses]
+    right = [render(mipmaps, camera, T @ side) for T in poses]
     return StereoSequence(camera, left, right, 100.0 + 0.1 * np.arange(frames), poses)
 
 
@@ -121,16 +121,16 @@ def kitti_tree(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactor
     """The corridor as KITTI odometry sequence 00 with ground truth; read only."""
     root = tmp_path_factory.mktemp("kitti")
     folder = root / "sequences" / "00"
-    for eye, images in (("image_0", corridor.left), ("image_1", corridor.right)):
-        (folder / eye).mkdir(parents=True)
+    for side, images in (("image_0", corridor.left), ("image_1", corridor.right)):
+        (folder / side).mkdir(parents=True)
         for k, image in enumerate(images):
-            assert cv2.imwrite(str(folder / eye / f"{k:06d}.png"), image)
+            assert cv2.imwrite(str(folder / side / f"{k:06d}.png"), image)
     c = corridor.camera
     lines = []
-    for eye in range(4):
-        shift = -c.bf if eye % 2 else 0.0
+    for side in range(4):
+        shift = -c.bf if side % 2 else 0.0
         numbers = [c.fx, 0, c.cx, shift, 0, c.fy, c.cy, 0, 0, 0, 1, 0]
-        lines.append(f"P{eye}: " + " ".join(f"{x:.12e}" for x in numbers) + "\n")
+        lines.append(f"P{side}: " + " ".join(f"{x:.12e}" for x in numbers) + "\n")
     (folder / "calib.txt").write_text("".join(lines))
     times = corridor.timestamps - corridor.timestamps[0]
     (folder / "times.txt").write_text("".join(f"{t:.6e}\n" for t in times))

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.features import Features
 from vslam.geometry import inverse
 from vslam.loops import LoopCandidate
 from vslam.map import Map
 
-CAMERA = StereoCamera(500.0, 500.0, 400.0, 150.0, 0.5, 800, 300)
+CAMERA = Camera(500.0, 500.0, 400.0, 150.0, 0.5, 800, 300)
 RADIUS, STEP = 50.0, 1.5  # metres: of the road, and between frames
 LAP = round(2 * np.pi * RADIUS / STEP)  # frames
 

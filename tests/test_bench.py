@@ -13,9 +13,9 @@ import psutil
 import pytest
 from stub_runner import COMMAND, started, wait_for
 
-from vslam import cli
 from vslam.bench import estimate, execute, grid, table
 from vslam.bench.grid import Cell
+from vslam.cli import main as cli
 from vslam.config import Config
 from vslam.errors import InputError, ResultsError
 
@@ -96,7 +96,7 @@ def test_a_cell_is_finished_only_by_a_whole_run_of_the_same_settings(run_folder:
     assert not grid.is_finished(cell, run_folder.parent, CONFIG)
 
 
-@pytest.mark.parametrize("change", ['"schema_version": 2|"schema_version": 1', "{|", "0|"])
+@pytest.mark.parametrize("change", ['"schema_version": 3|"schema_version": 2', "{|", "0|"])
 def test_a_report_of_another_schema_or_damaged_is_none(run_folder, tmp_path, change):
     old, new = change.split("|")
     text = (run_folder / "report.json").read_text()
@@ -212,7 +212,7 @@ def test_table_counts_cells(stub: Path, tmp_path: Path):
     from rich.console import Console
 
     (stub / "fail-00-none-bow-0").touch()
-    progress = table.Progress(CELLS, [], {"00": 100, "05": 100}, tmp_path, 1)
+    progress = table.GridProgress(CELLS, [], {"00": 100, "05": 100}, tmp_path, 1)
     outcomes = execute.run_here(CELLS[:2], options_for(tmp_path), 1, tmp_path)
     said = [progress.add(outcome) for outcome in outcomes]
     assert said[0].startswith("1/12 kitti-00-none-none-seed0: ATE 1.")
@@ -229,8 +229,8 @@ def test_table_counts_cells(stub: Path, tmp_path: Path):
 
 def test_table_stays_on_a_terminal(monkeypatch, capsys, tmp_path: Path):
     monkeypatch.setenv("FORCE_COLOR", "1")
-    progress = table.Progress(CELLS, [], {"00": 100, "05": 100}, tmp_path, 1)
-    with table.live(progress, shown=True) as say:
+    progress = table.GridProgress(CELLS, [], {"00": 100, "05": 100}, tmp_path, 1)
+    with table.shown_live(progress, shown=True) as say:
         say("a line for logs")
         progress.add(execute.Failed(CELLS[0], "no luck"))
     text = capsys.readouterr().err
@@ -246,7 +246,7 @@ def bench(stub: Path, kitti_tree: Path, tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setattr(
         execute, "RunOptions", functools.partial(execute.RunOptions, command=COMMAND)
     )
-    monkeypatch.setattr("vslam.warmup.is_cold", lambda: False)
+    monkeypatch.setattr("vslam.run.warmup.is_cold", lambda: False)
 
     def call(*words: object) -> tuple[int, str, str]:
         line = ["vslam", "bench", "--data", kitti_tree, "--seqs", "00", "--runs", 2, *words]
@@ -292,20 +292,20 @@ def test_bench_counts_failures_and_ends_with_1(bench, stub: Path):
 
 
 def test_bench_loses_nothing_to_an_interrupt(bench, stub: Path, monkeypatch):
-    add = table.Progress.add
+    add = table.GridProgress.add
 
     def interrupted(self, outcome):
         if len(self.reports) == 2:
             raise KeyboardInterrupt
         return add(self, outcome)
 
-    monkeypatch.setattr(table.Progress, "add", interrupted)
+    monkeypatch.setattr(table.GridProgress, "add", interrupted)
     code, out, _ = bench()
     assert code == 1
     assert "stopped: 2 of 6 cells finished" in out
     kept = {path.name for path in Path("bench").glob("kitti-*")}
     assert len(kept) >= 3  # the one at hand, too
-    monkeypatch.setattr(table.Progress, "add", add)
+    monkeypatch.setattr(table.GridProgress, "add", add)
     assert bench()[0] == 0
     done = started(stub)
     assert len(done) <= 7  # the one that was running is done again
@@ -320,7 +320,6 @@ def test_bench_loses_nothing_to_an_interrupt(bench, stub: Path, monkeypatch):
         ("--detectors orb", ["--detectors orb", "unknown"]),
         ("--seqs 00-02", ["no such sequence", "01"]),
         ("--perturb fog", ["unknown law 'fog'"]),
-        ("--dataset euroc", ["--dataset euroc", "unknown"]),
     ],
 )
 def test_bench_refuses_before_it_starts(bench, words, parts):
@@ -365,6 +364,6 @@ def test_a_real_grid_killed_and_resumed(kitti_tree: Path, tmp_path: Path):
 
 
 def test_a_run_ends_by_itself_though_its_standard_input_is_open():
-    command = [sys.executable, "-m", "vslam.bench.child", "--version"]
+    command = [sys.executable, "-m", "vslam.cli.child", "--version"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.wait(60) == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vslam.backend.block_cholesky import Structure, analyse, factor_solve, find_slot, panel
+from vslam.backend.block_cholesky import Structure, analyse, factor_solve, panel
 
 
 def chain(n: int, reach: int) -> list[tuple[int, int]]:
@@ -67,7 +67,7 @@ def test_solution_is_numpys(name):
     assert np.abs(S).sum() == pytest.approx(np.abs(np.tril(dense)).sum())
     assert factor_solve(structure, S, x)
     expected = np.linalg.solve(dense, b.ravel()).reshape(n, 6)
-    np.testing.assert_allclose(x[structure.position], expected, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(x[np.argsort(structure.order)], expected, rtol=1e-8, atol=1e-10)
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -76,7 +76,7 @@ def test_structure_is_that_of_elimination(name):
     n, pairs = SYSTEMS[name]
     structure = analyse(n, np.array(pairs).reshape(-1, 2))
     assert sorted(structure.order.tolist()) == list(range(n))
-    np.testing.assert_array_equal(structure.order[structure.position], np.arange(n))
+    position = np.argsort(structure.order)
     neighbours = {i: set() for i in range(n)}
     for i, j in pairs:
         if i != j:
@@ -89,13 +89,14 @@ def test_structure_is_that_of_elimination(name):
             neighbours[i] |= mine - {i}
             neighbours[i].discard(chosen)
         rows = structure.row[structure.first[c] : structure.first[c + 1]].tolist()
-        assert rows == [c, *sorted(structure.position[list(mine)].tolist())]
+        assert rows == [c, *sorted(position[list(mine)].tolist())]
     for r in range(n):
         left = slice(structure.row_first[r], structure.row_first[r + 1])
         columns, slots = structure.row_column[left], structure.row_slot[left]
         assert (np.diff(columns) > 0).all()
         assert (structure.row[slots] == r).all()
-        assert [find_slot(structure, r, c) for c in columns] == slots.tolist()
+        inside = (structure.first[columns] < slots) & (slots < structure.first[columns + 1])
+        assert inside.all(), "a slot lies in its column"
 
 
 def test_arrows_and_chains_do_not_fill():
@@ -116,9 +117,7 @@ def test_a_long_chain_with_loops_stays_sparse():
 
 
 def test_a_block_outside_the_structure_has_no_slot():
-    structure = analyse(5, np.array([[0, 1]]))
-    i, j = structure.position[[2, 3]]
-    assert find_slot(structure, max(i, j), min(i, j)) == -1
+    assert len(analyse(5, np.array([[0, 1]])).row) == 5 + 1
 
 
 def test_repeated_and_reversed_pairs_change_nothing():

@@ -15,12 +15,12 @@ from vslam.datasets.synthetic.site import Variation
 from vslam.features import Features
 from vslam.frontend.orb import extract
 from vslam.loopclosure.bow import BowDetector
-from vslam.loopclosure.bow_index import InvertedIndex, match_by_node
+from vslam.loopclosure.bow_index import InvertedIndex, index_nodes, match_by_node
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.vocabulary import Vocabulary, bow_vector, from_children, load, score
 from vslam.loopclosure.vocabulary_training import train
 from vslam.map import Map
-from vslam.observations import link_many
+from vslam.map_kernels import link_many
 from vslam.trajectory import read_kitti_poses
 
 WORDS = 400
@@ -227,20 +227,17 @@ def test_a_keyframe_that_the_detector_was_not_told_of_sets_no_bar(tree):
     assert world.query(query) == []
 
 
-# -- direct index ---------------------------------------------------------------------------------
+# -- matching by node -----------------------------------------------------------------------------
 
 
-def test_the_direct_index_groups_features_by_node(tree):
-    detector = BowDetector(tree, BowConfig(direct_level=1))
+def test_features_are_grouped_by_node(tree):
     words = np.random.default_rng(2).integers(0, WORDS, 300)
     image = image_of(tree, words)
-    detector.add(0, None, image_of(tree, PLACE))
-    detector.add(2, None, image)
-    for index in (detector.node_index(2), detector.node_index_of(image)):
-        assert sorted(index.feature.tolist()) == list(range(300))
-        np.testing.assert_array_equal(index.node, 1 + words[index.feature] // 20)
-        assert (np.diff(index.node) >= 0).all()
-    assert len(detector.node_index(1).node) == 0
+    index = index_nodes(tree.ancestors(1)[tree.words(image.descriptors)])
+    assert sorted(index.feature.tolist()) == list(range(300))
+    np.testing.assert_array_equal(index.node, 1 + words[index.feature] // 20)
+    assert (np.diff(index.node) >= 0).all()
+    assert len(index_nodes(np.empty(0, np.int32)).node) == 0
 
 
 def match_in_plain_python(a, b, use_a, use_b, node_a, node_b, max_distance, ratio):
@@ -269,18 +266,14 @@ def test_matching_by_node_is_matching_within_nodes():
     noise = np.packbits(rng.random((len(b), 256)) < 0.04, axis=1)
     b = (b ^ noise)[rng.permutation(len(b))]
     tree = train([a], 4, 2)
-    detector = BowDetector(tree, BowConfig(direct_level=1))
-    detector.add(0, None, features_of(a))
-    detector.add(1, None, features_of(b))
     use_a, use_b = rng.random(len(a)) < 0.9, rng.random(len(b)) < 0.9
     node = tree.ancestors(1)
+    node_a, node_b = node[tree.words(a)], node[tree.words(b)]
     for max_distance, ratio in ((50, 0.75), (256, 1.0), (10, 0.9)):
-        expected = match_in_plain_python(
-            a, b, use_a, use_b, node[tree.words(a)], node[tree.words(b)], max_distance, ratio
-        )
+        expected = match_in_plain_python(a, b, use_a, use_b, node_a, node_b, max_distance, ratio)
         got = match_by_node(
-            *detector.node_index(0), a.view(np.uint64), use_a,
-            *detector.node_index(1), b.view(np.uint64), use_b,
+            *index_nodes(node_a), a.view(np.uint64), use_a,
+            *index_nodes(node_b), b.view(np.uint64), use_b,
             max_distance, ratio,
         )  # fmt: skip
         np.testing.assert_array_equal(got, expected)

@@ -8,17 +8,12 @@ import gtsam
 import numpy as np
 import pytest
 
-from vslam.backend.bundle_adjustment import (
-    CHI2_MONO,
-    CHI2_STEREO,
-    BundleProblem,
-    adjust,
-    cholesky_solve,
-)
-from vslam.camera import StereoCamera
+from vslam.backend.bundle_adjustment import BundleProblem, adjust, cholesky_solve
+from vslam.camera import Camera
 from vslam.geometry import se3_exp, se3_log, transform
+from vslam.reprojection import CHI2_MONO, CHI2_STEREO
 
-CAMERA = StereoCamera(400.0, 410.0, 320.0, 120.0, 0.5, 640, 240)
+CAMERA = Camera(400.0, 410.0, 320.0, 120.0, 0.5, 640, 240)
 N_FREE, N_FIXED = 4, 2
 
 

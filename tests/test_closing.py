@@ -65,25 +65,25 @@ def test_a_closed_loop_takes_the_drift_out(check_map):
     assert after[-1] < 0.8
     assert np.sqrt((after**2).mean()) < 0.5 * np.sqrt((before**2).mean())
     accepted = [edge for edge in slam.loops if edge.accepted]
-    assert [edge.reason for edge in accepted] == ["closed"] * len(slam.closures)
-    assert slam.closures
+    assert [edge.reason for edge in accepted] == ["closed"] * len(slam.corrections)
+    assert slam.corrections
     check_map(slam.map)
 
 
 def test_both_ends_of_a_loop_see_the_same_landmarks_afterwards():
     slam = closed()
-    edge = slam.closures[0].edge
+    edge = slam.corrections[0].edge
     shared = dict(zip(*(x.tolist() for x in slam.map.covisible(edge.query)), strict=True))
     assert shared[edge.match] >= 40
 
 
 def test_a_closure_says_where_the_keyframes_were():
-    closure = closed().closures[0]
-    query = int(np.flatnonzero(closure.keyframes == closure.edge.query)[0])
-    match = int(np.flatnonzero(closure.keyframes == closure.edge.match)[0])
+    correction = closed().corrections[0]
+    query = int(np.flatnonzero(correction.keyframes == correction.edge.query)[0])
+    match = int(np.flatnonzero(correction.keyframes == correction.edge.match)[0])
     gap = [
-        np.linalg.norm((T[query] @ inverse(T[match]))[:3, 3] - closure.edge.T_query_match[:3, 3])
-        for T in (closure.T_cw_before, closure.T_cw_after)
+        np.linalg.norm((T[query] @ inverse(T[match]))[:3, 3] - correction.edge.T_query_match[:3, 3])
+        for T in (correction.T_cw_before, correction.T_cw_after)
     ]
     assert gap[0] > 2.0
     assert gap[1] < 0.1
@@ -124,7 +124,7 @@ def test_parts_of_the_map_are_joined_by_a_loop(check_map, threads):
     frames = [*ROUND[:80], *ROUND[140:]]  # 60 frames, 90 m, cut out
     slam, results = run(EXACT, frames, Oracle(EXACT, frames), threads=threads)
     assert len(slam.map.restarts) == 1
-    assert slam.closures
+    assert slam.corrections
     tracked = [r.index for r in results if r.state is not TrackingState.LOST]
     found = errors(slam, EXACT, frames)
     assert found[tracked].max() < 0.7  # the part after the cut lay some 70 m off
@@ -163,8 +163,8 @@ def test_a_gap_is_driven_over_first_and_carried_over_if_that_cannot_be(
     monkeypatch.setattr(LoopClosing, "_solve", noted)
     slam, _ = run(ring, frames, Oracle(ring, frames), dark=dark)
     assert len(slam.map.restarts) == 1
-    assert not slam.map.guesses
-    assert slam.closures
+    assert not slam.map.unpredicted_restarts
+    assert slam.corrections
     assert asked[: len(stories)] == stories
 
 
@@ -173,7 +173,7 @@ def test_where_no_speed_was_known_a_restart_is_a_guess():
     frames = [0.0, *ROUND[30:60]]
     slam, results = run(EXACT, frames)
     assert [r.state for r in results[:3]].count(TrackingState.LOST) == 1
-    assert slam.map.restarts == slam.map.guesses == [1]
+    assert slam.map.restarts == slam.map.unpredicted_restarts == [1]
 
 
 def test_past_a_guess_the_second_story_is_asked_for_too(monkeypatch):
@@ -190,6 +190,6 @@ def test_past_a_guess_the_second_story_is_asked_for_too(monkeypatch):
     monkeypatch.setattr(LoopClosing, "_solve", first_contradicted)
     frames = [0.0, *ROUND[30:]]
     slam, _ = run(EXACT, frames, Oracle(EXACT, frames))
-    assert slam.map.guesses == [1]
+    assert slam.map.unpredicted_restarts == [1]
     assert asked == [True, False]
-    assert len(slam.closures) == 1
+    assert len(slam.corrections) == 1

@@ -9,7 +9,7 @@ from vslam.backend.bundle_adjustment import BundleSolution
 from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.global_mapping import connected_parts, merge_solution, take_snapshot
 from vslam.geometry import inverse, se3_exp, transform
-from vslam.observations import link_many, merge_landmarks
+from vslam.map_kernels import link_many, merge_landmarks
 
 
 def pose(k: int) -> np.ndarray:

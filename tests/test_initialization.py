@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.config import InitializationConfig
 from vslam.frontend.initialization import (
     motions_of_essential,
@@ -15,7 +15,7 @@ from vslam.frontend.initialization import (
 )
 from vslam.geometry import inverse, se3_exp, transform
 
-CAMERA = StereoCamera(500.0, 500.0, 320.0, 240.0, 0.0, 640, 480)
+CAMERA = Camera(500.0, 500.0, 320.0, 240.0, 0.0, 640, 480)
 CONFIG = InitializationConfig()
 ASIDE = se3_exp(np.array([-0.8, 0.05, 0.1, 0.01, -0.05, 0.02]))
 AHEAD = se3_exp(np.array([0.05, 0.0, -1.5, 0.01, 0.04, -0.01]))

@@ -83,19 +83,19 @@ def decide_monocular(**changes) -> bool:
     return needs_monocular_keyframe(replace(CONTENT, **changes), config)
 
 
-def test_one_eye_needs_a_keyframe_once_a_tenth_of_the_reference_is_gone():
+def test_one_camera_needs_a_keyframe_once_a_tenth_of_the_reference_is_gone():
     assert not decide_monocular(n_inliers=180)
     assert decide_monocular(n_inliers=179)
     assert not decide_monocular(n_inliers=179, mapping_idle=False)
 
 
-def test_one_eye_does_not_wait_where_half_is_gone_or_little_is_left():
+def test_one_camera_does_not_wait_where_half_is_gone_or_little_is_left():
     assert not decide_monocular(n_inliers=100, mapping_idle=False)
     assert decide_monocular(n_inliers=99, mapping_idle=False)
     assert not decide_monocular(n_inliers=80, n_reference=90, mapping_idle=False)
     assert decide_monocular(n_inliers=79, n_reference=90, mapping_idle=False)
 
 
-def test_one_eye_needs_no_keyframe_by_time_alone():
+def test_one_camera_needs_no_keyframe_by_time_alone():
     assert not decide_monocular(seconds_since_keyframe=60.0)
     assert decide_monocular(seconds_since_keyframe=1.0, n_inliers=179, mapping_idle=False)

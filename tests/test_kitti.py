@@ -87,8 +87,8 @@ def test_only_selected_frames_are_checked(root):
 
 @pytest.mark.parametrize("suffix", [".jpg", ".webp"])
 def test_other_image_formats(root, suffix):
-    for eye in "01":
-        for path in (root / f"sequences/00/image_{eye}").iterdir():
+    for side in "01":
+        for path in (root / f"sequences/00/image_{side}").iterdir():
             write_image(path.with_suffix(suffix))
             path.unlink()
     assert open_kitti(root, "00").read(0)[0].shape == (HEIGHT, WIDTH)
@@ -108,9 +108,9 @@ def test_calibration_without_prefixes(root):
 
 
 def test_excerpt_is_matched_by_number_to_longer_times_and_poses(root):
-    for eye in "01":
+    for side in "01":
         for k in (0, 1):
-            (root / f"sequences/00/image_{eye}/{k:06d}.png").unlink()
+            (root / f"sequences/00/image_{side}/{k:06d}.png").unlink()
     sequence = open_kitti(root, "00")
     np.testing.assert_allclose(sequence.timestamps, [0.2, 0.3, 0.4, 0.5])
     np.testing.assert_array_equal(sequence.ground_truth[:, 2, 3], [2, 3, 4, 5])
@@ -157,18 +157,18 @@ def test_start_beyond_the_end(root):
     refused(root, "--start 6", "has 6 frames", "at most 5", start=6)
 
 
-@pytest.mark.parametrize(("eye", "word"), [(0, "left"), (1, "right")])
-def test_no_images_of_one_eye(root, eye, word):
-    for path in (root / f"sequences/00/image_{eye}").iterdir():
+@pytest.mark.parametrize(("side", "word"), [(0, "left"), (1, "right")])
+def test_no_images_of_one_camera(root, side, word):
+    for path in (root / f"sequences/00/image_{side}").iterdir():
         path.unlink()
-    refused(root, f"image_{eye}", f"no images of the {word} eye", "22 GB")
+    refused(root, f"image_{side}", f"no images of the {word} camera", "22 GB")
 
 
-def test_the_left_eye_alone(root):
+def test_the_left_camera_alone(root):
     for path in (root / "sequences/00/image_1").iterdir():
         path.unlink()
     (root / "sequences/00/image_1").rmdir()
-    refused(root, "no images of the right eye", "--sensor mono")
+    refused(root, "no images of the right camera", "--sensor mono")
     sequence = open_kitti(root, "00", monocular=True, max_frames=3)
     assert len(sequence) == 3
     assert sequence.camera.monocular
@@ -210,7 +210,7 @@ def test_first_image_unreadable(root):
     refused(root, "image_0/000000.png", "cannot be decoded", "download")
 
 
-def test_eyes_of_different_size(root):
+def test_cameras_of_different_size(root):
     write_image(root / "sequences/00/image_1/000000.png", size=(30, 60))
     refused(root, "image_1/000000.png", "60x30", "64x32")
 

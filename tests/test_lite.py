@@ -14,9 +14,9 @@ from torch.nn import functional
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.augmentation import turn_homography
 from vslam.loopclosure.siamese.branches import CapsuleBranch, CapsuleShape, Layout
+from vslam.loopclosure.siamese.initial_network import resized, starting_network
 from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.siamese import load_network
-from vslam.loopclosure.siamese.start import resized, starting_network
 from vslam.loopclosure.siamese.training import train
 
 # Input, output, expansion, stride and kernel of every block of EfficientNet-Lite0 up to stride 16

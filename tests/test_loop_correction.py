@@ -8,7 +8,7 @@ from test_mapping import CAMERA, World, make_world
 
 from vslam.backend.loop_correction import move_keyframes
 from vslam.geometry import inverse, se3_exp, transform
-from vslam.observations import refresh_landmarks
+from vslam.map_kernels import refresh_landmarks
 
 POSES = [se3_exp(np.array([0.1 * k, 0.0, -0.6 * k, 0.0, 0.01 * k, 0.0])) for k in range(5)]
 
@@ -39,14 +39,14 @@ def test_nothing_changes_as_seen_from_the_anchor():
     anchored = [np.flatnonzero(a.first_keyframe[: world.map.n_landmarks] == k) for k in range(5)]
     assert min(map(len, anchored)) > 30
     before = [reprojection(world, k, anchored[k]) for k in range(5)]
-    reach = a.reach.copy()
+    reach = a.distance_range.copy()
     new = moved_poses(range(5))
     move_keyframes(world.map, np.arange(5), new)
     np.testing.assert_array_equal(a.T_cw[:5], new)
     for k in range(5):
         after = reprojection(world, k, anchored[k])
         np.testing.assert_allclose(after, before[k], rtol=1e-9, atol=1e-9)
-    np.testing.assert_array_equal(a.reach, reach)
+    np.testing.assert_array_equal(a.distance_range, reach)
 
 
 def test_only_the_named_keyframes_and_what_is_anchored_in_them_move():
@@ -70,10 +70,10 @@ def test_a_common_motion_leaves_nothing_to_refresh():
     xyz = transform(motion, a.xyz[:n])
     move_keyframes(world.map, np.arange(5), new)
     np.testing.assert_allclose(a.xyz[:n], xyz, atol=1e-12)
-    normal, reach = a.normal[:n].copy(), a.reach[:n].copy()
+    normal, reach = a.normal[:n].copy(), a.distance_range[:n].copy()
     refresh_landmarks(a, np.arange(n), world.map.scales)
     np.testing.assert_allclose(normal, a.normal[:n], atol=1e-12)
-    np.testing.assert_allclose(reach, a.reach[:n], rtol=1e-12)
+    np.testing.assert_allclose(reach, a.distance_range[:n], rtol=1e-12)
 
 
 def test_landmarks_of_a_culled_anchor_move_with_the_next_that_sees_them(check_map):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+from contextlib import contextmanager
 from datetime import UTC, datetime
 
 import cv2
@@ -12,19 +13,24 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from vslam.cli import app
+from vslam.cli.main import app
 from vslam.datasets.synthetic import store
 from vslam.errors import InputError
 from vslam.loopbench import report as reporting
 from vslam.loopbench.conditions import Condition, apply, clipped, parse_conditions, turned
 from vslam.loopbench.cost import cost
-from vslam.loopbench.detectors import BowScorer, Panel, look
+from vslam.loopbench.detectors import BowScorer, DetectorSet, describe
 from vslam.loopbench.measure import epipolar_inliers, measure, thinned
 from vslam.loopbench.schema import LoopsJson
-from vslam.loopbench.sets import Questions, TestSet, open_set
+from vslam.loopbench.sets import QuerySet, TestSet, open_set
 from vslam.loopclosure.benchmark import average_precision, precision_recall
-from vslam.loopclosure.siamese.places import DIFFERENT, SAME, UNKNOWN
+from vslam.loopclosure.siamese.image_sources import DIFFERENT, SAME, UNKNOWN
 from vslam.loopclosure.vocabulary import load
+
+
+@contextmanager
+def no_bar(what: str, total: int):
+    yield lambda: None
 
 
 def texture(seed: int, height: int = 188, width: int = 620) -> np.ndarray:
@@ -114,22 +120,22 @@ def test_a_drive_asks_for_what_lies_long_before(tmp_path):
     poses[55, 2, 3] = poses[2, 2, 3]
     (tmp_path / "poses").mkdir()
     np.savetxt(tmp_path / "poses" / "00.txt", poses.reshape(60, 12))
-    (found,) = open_set(f"kitti:{tmp_path}", tmp_path, threads=1, shown=False)
-    asked = found.ask(Condition("none"), 0)
+    (found,) = open_set(f"kitti:{tmp_path}", tmp_path, threads=1, progress_bar=no_bar)
+    asked = found.query_set(Condition("none"), 0)
     assert asked.relation.shape == (10, 10)
     same = np.argwhere(asked.relation == SAME)
     assert same.tolist() == [[5, 2]]
     assert (asked.relation[0, 1:] == UNKNOWN).all()  # image 50 does not ask for image 1 and later
     assert asked.relation[9, 0] == DIFFERENT
-    assert found.ask(Condition("change", 1.0), 0) is None
+    assert found.query_set(Condition("change", 1.0), 0) is None
 
 
 def test_of_pairs_the_second_images_ask(tmp_path):
     rows = []
     (tmp_path / "images").mkdir()
     for k in range(3):
-        for eye in "ab":
-            cv2.imwrite(str(tmp_path / "images" / f"{k}{eye}.png"), texture(k, 40, 80))
+        for side in "ab":
+            cv2.imwrite(str(tmp_path / "images" / f"{k}{side}.png"), texture(k, 40, 80))
         place = {"x_a": 0.0, "z_a": 200.0 * k, "yaw_a": 0.0}
         moved = {"x_b": 1.0, "z_b": 200.0 * k, "yaw_b": 20.0}
         rows.append({"a": f"images/{k}a.png", "b": f"images/{k}b.png", "same": 1, **place, **moved})
@@ -137,8 +143,8 @@ def test_of_pairs_the_second_images_ask(tmp_path):
         table = csv.DictWriter(file, list(rows[0]))
         table.writeheader()
         table.writerows(rows)
-    (found,) = open_set(f"pairs:{tmp_path}", tmp_path, threads=1, shown=False)
-    asked = found.ask(Condition("none"), 0)
+    (found,) = open_set(f"pairs:{tmp_path}", tmp_path, threads=1, progress_bar=no_bar)
+    asked = found.query_set(Condition("none"), 0)
     assert asked.relation.tolist() == (2 * np.eye(3) - 1).astype(int).tolist()
 
 
@@ -147,14 +153,14 @@ def test_of_pairs_the_second_images_ask(tmp_path):
 )
 def test_sets_that_are_refused(spec, tmp_path):
     with pytest.raises(InputError, match=re.escape(f"--data {spec}")):
-        open_set(spec, tmp_path, threads=1, shown=False)
+        open_set(spec, tmp_path, threads=1, progress_bar=no_bar)
 
 
 def test_one_epipolar_geometry_tells_a_place_from_another(vocabulary):
     image = texture(1)
     H = np.array([[1.02, 0.01, 6.0], [-0.01, 0.99, -3.0], [2e-5, 0.0, 1.0]])
     moved = cv2.warpPerspective(image, H, image.shape[::-1])
-    one, two, other = look([image, moved, texture(2)], vocabulary, 1)
+    one, two, other = describe([image, moved, texture(2)], vocabulary, 1)
     assert epipolar_inliers(one, two) > 100
     assert epipolar_inliers(one, other) == 0
 
@@ -179,9 +185,9 @@ def test_figures_of_detectors_that_know_and_that_err(vocabulary):
     images = [texture(k) for k in range(6)]
     relation = (2 * np.eye(6) - 1).astype(np.int8)
     relation[0, 1] = UNKNOWN
-    test_set = TestSet("walls", lambda condition, seed: Questions(images, images, relation))
+    test_set = TestSet("walls", lambda condition, seed: QuerySet(images, images, relation))
     scorers = [Told("liar", relation, -1.0), Told("sage", relation, 1.0)]
-    cells, gains = measure(test_set, Condition("none"), Panel(scorers, vocabulary, 1), 0)
+    cells, gains = measure(test_set, Condition("none"), DetectorSet(scorers, vocabulary, 1), 0)
     liar, sage = cells
     assert sage.figures["average_precision"] == 1.0
     assert sage.figures["recall_at_100_precision"] == 1.0
@@ -194,29 +200,29 @@ def test_figures_of_detectors_that_know_and_that_err(vocabulary):
     (gain,) = gains
     assert gain.low > 0.7
     assert gain.difference == pytest.approx(1.0 - liar.figures["average_precision"])
-    assert test_set.ask(Condition("none"), 0).relation[0, 1] == UNKNOWN
+    assert test_set.query_set(Condition("none"), 0).relation[0, 1] == UNKNOWN
 
 
 def test_what_is_made_of_images_asked_for_is_kept_while_they_are_asked_for(vocabulary):
     told = Told("sage", np.ones((2, 2)), 1.0)
-    panel = Panel([told], vocabulary, 1)
+    detectors = DetectorSet([told], vocabulary, 1)
     galleries = [[texture(k), texture(k + 1)] for k in range(5)]
-    views, _ = panel.gallery(galleries[0])
+    views, _ = detectors.gallery(galleries[0])
     for k in (0, 1, 2, 0, 3):  # one with others of its own between
-        panel.gallery([image.copy() for image in galleries[k]])
-    assert panel.gallery(galleries[0])[0] is views
+        detectors.gallery([image.copy() for image in galleries[k]])
+    assert detectors.gallery(galleries[0])[0] is views
     assert len(told.stored) == 4
-    panel.gallery(galleries[1])
+    detectors.gallery(galleries[1])
     assert len(told.stored) == 5
-    assert panel.gallery(galleries[0][::-1])[0] is not views
+    assert detectors.gallery(galleries[0][::-1])[0] is not views
 
 
 def test_report_says_who_wins_in_all_three_files(vocabulary, tmp_path):
     images = [texture(k) for k in range(4)]
     relation = (2 * np.eye(4) - 1).astype(np.int8)
-    test_set = TestSet("walls", lambda condition, seed: Questions(images, images, relation))
+    test_set = TestSet("walls", lambda condition, seed: QuerySet(images, images, relation))
     scorers = [BowScorer(vocabulary), Told("liar", relation, -1.0)]
-    cells, gains = measure(test_set, Condition("none"), Panel(scorers, vocabulary, 1), 0)
+    cells, gains = measure(test_set, Condition("none"), DetectorSet(scorers, vocabulary, 1), 0)
     found = LoopsJson(
         seed=0, cells=cells, gains=gains, costs=[], machine="a <b> machine", versions={},
         created=datetime(2026, 1, 1, tzinfo=UTC),

@@ -10,7 +10,7 @@ import pytest
 from vslam.features import Features
 from vslam.geometry import se3_exp
 from vslam.map import LANDMARK_FIELDS, ROW_FIELDS, Map, local_map
-from vslam.observations import (
+from vslam.map_kernels import (
     collect_landmarks,
     count_seen_by,
     erase_landmark,
@@ -281,7 +281,9 @@ def test_refresh_computes_mean_direction_and_reach():
         np.testing.assert_allclose(a.normal[i], mean / np.linalg.norm(mean), rtol=0, atol=1e-12)
         reference = a.keyframe[rows].argmin()
         farthest = distance[reference] * SCALES[a.octave[rows[reference]]]
-        np.testing.assert_allclose(a.reach[i], [farthest / SCALES[-1], farthest], rtol=1e-12)
+        np.testing.assert_allclose(
+            a.distance_range[i], [farthest / SCALES[-1], farthest], rtol=1e-12
+        )
 
 
 def test_predicted_octave_is_the_one_the_reach_was_computed_from():

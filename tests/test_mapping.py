@@ -23,14 +23,14 @@ from vslam.backend.triangulation import (
     triangulate_pair,
     triangulate_with_neighbours,
 )
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.config import Config, MappingConfig, StereoConfig
 from vslam.features import Features
 from vslam.geometry import inverse, se3_exp, se3_log, transform
 from vslam.map import Map
-from vslam.observations import link_many
+from vslam.map_kernels import link_many
 
-CAMERA = StereoCamera(320.0, 320.0, 319.5, 119.5, 0.5, 640, 240)
+CAMERA = Camera(320.0, 320.0, 319.5, 119.5, 0.5, 640, 240)
 CONFIG = Config()
 SCALES = 1.2 ** np.arange(8)
 FLIPPED_BITS = 8
@@ -352,7 +352,7 @@ def test_fusion_leaves_strangers_alone(spoil):
     elif spoil == "direction":
         a.normal[ids] *= -1
     else:
-        a.reach[ids] *= 4
+        a.distance_range[ids] *= 4
     assert fuse_into(world.map, ids, 1, CAMERA, CONFIG) <= 0.01 * len(ids)
 
 

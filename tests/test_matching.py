@@ -7,6 +7,8 @@ import pytest
 
 from vslam.features import CELL, FeatureGrid
 from vslam.frontend.matching import (
+    Projections,
+    Searchable,
     consistent_orientation,
     count_elsewhere,
     search_all,
@@ -155,10 +157,21 @@ def scene(seed: int, *, octaves: int = 8, n: int = 400, m: int = 300) -> dict:
 
 
 def run_search(scene: dict, max_distance: int, ratio: float):
-    grid = FeatureGrid.of_positions(scene["xy"], WIDTH, HEIGHT)
-    return search_windows(
-        *scene.values(), grid.start, grid.items, grid.columns, max_distance, ratio
+    projections = Projections(
+        scene["uvr"],
+        scene["radius"],
+        scene["octave_low"],
+        scene["octave_high"],
+        scene["descriptors"],
     )
+    features = Searchable(
+        scene["xy"],
+        scene["octave"],
+        scene["u_right"],
+        scene["frame_descriptors"],
+        FeatureGrid.of_positions(scene["xy"], WIDTH, HEIGHT),
+    )
+    return search_windows(projections, features, scene["free"], max_distance, ratio)
 
 
 @pytest.mark.parametrize("seed", range(4))

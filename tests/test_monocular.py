@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from ring import CAMERA, LAP, Oracle, Ring
 
-from vslam.evaluate import evaluate
+from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.features import Features, TrackingState
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory
 
-EYE = CAMERA.left_eye()
+LEFT_CAMERA = CAMERA.left_camera()
 RING = Ring.create()
 ROUND = [float(k) for k in range(LAP + 40)]
 
 
 def see(k):
-    """What the left eye sees at frame k; near points at coarse levels of the pyramid, as in an
+    """What the left camera sees at frame k; near points at coarse levels of the pyramid, as in an
     image: what is mapped from two places must be found from a third."""
     features = RING.see(k, 1)
     depth = CAMERA.bf / (features.xy[:, 0] - features.u_right)
@@ -30,7 +30,7 @@ def see(k):
 
 
 def run(frames, detector=None, *, threads=1, dark=()):
-    slam = Slam(EYE, None, detector, threads=threads)
+    slam = Slam(LEFT_CAMERA, None, detector, threads=threads)
     results = []
     for i, k in enumerate(frames):
         image = np.array([[i & 255, i >> 8]], np.uint8)  # tells the oracle which frame it is
@@ -45,7 +45,7 @@ def error(slam, frames, chosen=slice(None)):
     found = slam.trajectory()
     truth = Trajectory(found.timestamps, np.array([RING.pose(k) for k in frames]))
     indices = np.arange(len(frames))[chosen]
-    return evaluate(found.select(indices), truth.select(indices), "sim3").ate_rmse_m
+    return evaluate_trajectory(found.select(indices), truth.select(indices), "sim3").ate_rmse_m
 
 
 @cache
@@ -73,7 +73,7 @@ def test_the_first_landmarks_make_the_unit():
 def test_a_loop_corrects_the_scale(check_map):
     without, _ = run(ROUND)
     slam, _ = closed()
-    assert slam.closures
+    assert slam.corrections
     assert all(edge.reason == "closed" for edge in slam.loops if edge.accepted)
     assert error(slam, ROUND) < min(1.0, 0.5 * error(without, ROUND))
     check_map(slam.map)
@@ -88,12 +88,12 @@ def test_a_lost_camera_begins_a_sub_map_that_a_loop_joins(check_map):
     frames = [*ROUND[:80], *ROUND[140:], *(k + LAP for k in ROUND[40:70])]
     slam, results = run(frames, Oracle(RING, frames))
     assert len(slam.map.restarts) == 1
-    assert slam.closures
+    assert slam.corrections
     lost = sum(r.state is TrackingState.LOST for r in results)
     assert lost < 25
     tracked = [r.index for r in results if r.state is not TrackingState.LOST]
     assert error(slam, frames, tracked) < 1.5
-    assert len(set(slam.map.rescaled)) > 1
+    assert len(set(slam.map.unit_scale)) > 1
     check_map(slam.map)
 
 
@@ -123,10 +123,10 @@ def test_a_camera_that_stands_still_begins_no_map():
 
 
 def test_images_must_be_those_of_the_camera():
-    image = np.zeros((EYE.height, EYE.width), np.uint8)
+    image = np.zeros((LEFT_CAMERA.height, LEFT_CAMERA.width), np.uint8)
     with pytest.raises(ValueError, match="right image"):
-        Slam(EYE).step(image, image, 0.0)
+        Slam(LEFT_CAMERA).step(image, image, 0.0)
     with pytest.raises(ValueError, match="right image"):
         Slam(CAMERA).step(image, None, 0.0)
     with pytest.raises(ValueError, match="images are"):
-        Slam(EYE).step(image[:-1], None, 0.0)
+        Slam(LEFT_CAMERA).step(image[:-1], None, 0.0)

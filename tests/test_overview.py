@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vslam import cli
+from vslam.cli import main as cli
 from vslam.errors import InputError
-from vslam.evaluate import evaluate
+from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.overview import write_overview
 from vslam.overview.collect import collect
 from vslam.overview.render import tables
@@ -135,7 +135,7 @@ def test_external_trajectory_is_evaluated_like_a_run(written, run_folder: Path):
     )
     ate = row.measures["ate_rmse_m"]
     assert ate is not None
-    assert ate.median == pytest.approx(evaluate(estimate, truth).ate_rmse_m, abs=1e-9)
+    assert ate.median == pytest.approx(evaluate_trajectory(estimate, truth).ate_rmse_m, abs=1e-9)
     assert row.measures["lost_frames"] is row.measures["loops_found"] is row.measures["fps"] is None
     assert (row.drive.perturb, row.drive.sequence) == ("none", "00")
 

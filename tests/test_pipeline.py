@@ -19,18 +19,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from vslam.comparison import figures_without_loops, loop_figures, with_comparison
 from vslam.config import Config
 from vslam.datasets import open_sequence
-from vslam.evaluate import evaluate
+from vslam.datasets.perturbation import parse_perturbation
+from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.features import TrackingState
-from vslam.frontend.tracking import Tracker
+from vslam.frontend.tracking import TrackingContext
 from vslam.loops import LoopEdge
-from vslam.mapio import load_map, save_map
-from vslam.perturb import parse_perturbation
-from vslam.pipeline import _tell_loops, prepare_frame, run_sequence
-from vslam.recorder import NullRecorder
-from vslam.run import RunOutcome, RunSettings
+from vslam.maps.storage import load_map, save_map
+from vslam.report.schema import LoopFigures
+from vslam.report.summary import summarize
+from vslam.run.outcome import RunOutcome, RunSettings
+from vslam.run.pipeline import _tell_loops, prepare_frame, run_sequence, with_comparison
+from vslam.run.recorder import NullRecorder
 from vslam.trajectory import Trajectory, read_kitti_poses
 
 KITTI = Path(__file__).parents[2] / "shared" / "data" / "kitti"
@@ -66,19 +67,19 @@ def test_same_bytes_with_any_number_of_threads(kitti_tree):
 
 
 @pytest.mark.parametrize("monocular", [False, True])
-def test_both_eyes_at_once_are_prepared_to_the_same_bytes(kitti_tree, monocular):
+def test_both_cameras_at_once_are_prepared_to_the_same_bytes(kitti_tree, monocular):
     sequence = open_sequence("kitti", kitti_tree, "00", monocular=monocular)
     law = parse_perturbation("brightness:1", 0, sequence.timestamps)
-    tracker = Tracker.create(sequence.camera, Config())
+    context = TrackingContext.create(sequence.camera, Config())
     met = threading.Barrier(1 if monocular else 2, timeout=60.0)
 
-    def at_once(function, eyes):
-        return pool.map(lambda eye: (met.wait(), function(eye))[1], eyes)
+    def at_once(function, sides):
+        return pool.map(lambda side: (met.wait(), function(side))[1], sides)
 
     with ThreadPoolExecutor(2) as pool:
         for index in range(3):
-            one = prepare_frame(sequence, index, law, tracker)
-            other = prepare_frame(sequence, index, law, tracker, at_once)
+            one = prepare_frame(sequence, index, law, context)
+            other = prepare_frame(sequence, index, law, context, at_once)
             assert one.left.tobytes() == other.left.tobytes()
             for name, value in vars(one.features).items():
                 assert value.tobytes() == getattr(other.features, name).tobytes(), name
@@ -86,7 +87,7 @@ def test_both_eyes_at_once_are_prepared_to_the_same_bytes(kitti_tree, monocular)
 
 def test_corridor_is_tracked_to_centimetres(kitti_tree):
     outcome = run(kitti_tree)
-    evaluation = evaluate(outcome.trajectory, ground_truth(outcome))
+    evaluation = evaluate_trajectory(outcome.trajectory, ground_truth(outcome))
     path = evaluation.distances_m[-1]
     assert path == pytest.approx(27 * 0.35, rel=1e-4)  # chords of the turn
     assert evaluation.ate_rmse_m < 0.03
@@ -125,9 +126,13 @@ def test_comparison_runs_the_same_images_again(kitti_tree):
     assert without.map is None
     assert without.trajectory.T_wc.tobytes() == outcome.trajectory.T_wc.tobytes()
     truth = ground_truth(outcome)
-    with_ = loop_figures(compared, evaluate(outcome.trajectory, truth))
-    assert figures_without_loops(compared) == with_  # there is no loop in the corridor
-    assert with_.ate_rmse_m is not None
+    evaluation = evaluate_trajectory(outcome.trajectory, truth)
+    report = summarize(compared, evaluation, None, None)
+    figures = report.without_loops
+    assert figures is not None
+    assert figures.ate_rmse_m is not None
+    for name in LoopFigures.model_fields:  # there is no loop in the corridor
+        assert getattr(figures, name) == getattr(report, name)
 
 
 def test_truncated_image_is_skipped_and_counted(kitti_tree, tmp_path):
@@ -193,9 +198,9 @@ def test_interrupt_finishes_the_report_of_the_frames_done(kitti_tree, tmp_path):
     # The corridor there and back often enough to be still running when the signal comes.
     folder = root / "sequences" / "00"
     order = [*range(28), *range(26, 0, -1)] * 12
-    for eye in ("image_0", "image_1"):
+    for side in ("image_0", "image_1"):
         for index, source in enumerate(order[28:], 28):
-            os.link(folder / eye / f"{source:06d}.png", folder / eye / f"{index:06d}.png")
+            os.link(folder / side / f"{source:06d}.png", folder / side / f"{index:06d}.png")
     (folder / "times.txt").write_text("".join(f"{0.1 * k:.6e}\n" for k in range(len(order))))
     shutil.rmtree(root / "poses")
     command = [sys.executable, "-m", "vslam", "run", "--data", str(root), "--no-record"]
@@ -226,13 +231,14 @@ def test_interrupt_finishes_the_report_of_the_frames_done(kitti_tree, tmp_path):
 
 
 def test_full_disk_keeps_what_was_written(kitti_tree, tmp_path, monkeypatch, capsys):
-    from vslam import cli, mapio
+    from vslam.cli import main as cli
+    from vslam.maps import storage
 
     def full(path, *_):
         path.write_bytes(b"half a map")
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
-    monkeypatch.setattr(mapio, "save_map", full)
+    monkeypatch.setattr(storage, "save_map", full)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         sys, "argv", ["vslam", "run", "--data", str(kitti_tree), "--max-frames", "5", "--no-record"]
@@ -267,13 +273,13 @@ def test_map_round_trip(kitti_tree, tmp_path, check_map):
 def test_kitti_06_is_tracked_through_changing_light(seed):
     outcome = run(KITTI, "06", perturb="brightness:1", seed=seed, max_frames=51)
     assert not [t.index for t in outcome.tracks if t.state == TrackingState.LOST]
-    assert evaluate(outcome.trajectory, ground_truth(outcome)).ate_rmse_m <= 0.07
+    assert evaluate_trajectory(outcome.trajectory, ground_truth(outcome)).ate_rmse_m <= 0.07
 
 
 @needs_kitti
 def test_kitti_06_is_as_good_as_orb_slam3():
     outcome = run(KITTI, "06", max_frames=51)
-    evaluation = evaluate(outcome.trajectory, ground_truth(outcome))
+    evaluation = evaluate_trajectory(outcome.trajectory, ground_truth(outcome))
     assert evaluation.ate_rmse_m <= 0.07
     assert evaluation.rpe_m <= 0.015
 
@@ -282,7 +288,7 @@ def test_kitti_06_is_as_good_as_orb_slam3():
 def test_kitti_00_is_as_good_as_orb_slam3():
     outcome = run(KITTI, "00", max_frames=216)
     assert not [t.index for t in outcome.tracks if t.state == TrackingState.LOST]
-    evaluation = evaluate(outcome.trajectory, ground_truth(outcome))
+    evaluation = evaluate_trajectory(outcome.trajectory, ground_truth(outcome))
     assert evaluation.ate_rmse_m <= 0.40
     assert evaluation.t_rel_percent is not None
     assert evaluation.t_rel_percent <= 1.5

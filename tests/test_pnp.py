@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.frontend.pnp import ransac_pose, solve_p3p
 from vslam.geometry import inverse, se3_exp, se3_log, transform
 
-CAMERA = StereoCamera(718.0, 718.0, 607.0, 185.0, 0.54, 1241, 376)
+CAMERA = Camera(718.0, 718.0, 607.0, 185.0, 0.54, 1241, 376)
 
 
 def unit(rays: np.ndarray) -> np.ndarray:

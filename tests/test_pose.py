@@ -6,11 +6,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.frontend.pose import optimise_pose
 from vslam.geometry import inverse, se3_exp, se3_log, solve_positive, transform
 
-CAMERA = StereoCamera(400.0, 410.0, 320.0, 120.0, 0.5, 640, 240)
+CAMERA = Camera(400.0, 410.0, 320.0, 120.0, 0.5, 640, 240)
 TRUTH = se3_exp(np.array([0.4, -0.2, 1.1, 0.05, -0.1, 0.02]))
 START = se3_exp(np.array([0.1, -0.08, 0.2, 0.02, 0.03, -0.02])) @ TRUTH
 KINDS = ["mono", "stereo", "mixed"]

@@ -25,7 +25,7 @@ from vslam.features import Features
 from vslam.geometry import inverse, inverses, orthonormalised, se3_exp, se3_log
 from vslam.loops import LoopEdge
 from vslam.map import Map
-from vslam.observations import covisible_pairs, link_many
+from vslam.map_kernels import covisible_pairs, link_many
 
 CONFIG = PoseGraphConfig()
 
@@ -222,7 +222,7 @@ def test_culled_keyframes_are_left_out_and_their_loops_kept():
 
 
 def test_the_loop_edge_wins_over_the_edge_of_the_same_keyframes():
-    """DESIGN, section 7: a drifted covisibility edge won, and ATE went from 0.96 to 5.2 m."""
+    """docs/design.md, section 14: a drifted covisibility edge won; ATE rose from 0.96 to 5.2 m."""
     map_ = line_map()
     T_covisible, T_tree = translation(0, 0, 1.5), translation(0, 0, 0.75)
     for loops in (
@@ -241,7 +241,7 @@ def test_the_loop_edge_wins_over_the_edge_of_the_same_keyframes():
 
 
 def test_a_drifted_covisibility_edge_would_hold_the_drift():
-    """What de-duplication is for: the same closure with and without the drifted edge beside it."""
+    """What de-duplication is for: the same loop with and without the drifted edge beside it."""
     T_wc, loops, true = simulate(3)
     graph = chain_graph(T_wc, loops, true, reach=3)
     alone = consistency(graph, optimise(graph, CONFIG), CONFIG)
@@ -299,7 +299,7 @@ def test_edges_past_a_restart_are_weak():
     ]
     assert graph.sigmas[e].tolist() == pytest.approx(expected)
     # Not where nobody knew how fast it went.
-    graph = essential_graph(map_, [], CONFIG, weak={4}, guessed={4}, driven=True)
+    graph = essential_graph(map_, [], CONFIG, weak={4}, unpredicted={4}, driven=True)
     assert named(graph)[3, 5] == WEAK
 
 

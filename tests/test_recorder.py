@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.loops import LoopEdge
 from vslam.map import Map
-from vslam.recorder import NullRecorder, Recorder, RerunRecorder
+from vslam.run.recorder import NullRecorder, Recorder, RerunRecorder
 from vslam.trajectory import Trajectory
 
 pytest.importorskip("rerun.chunk", reason="this rerun cannot read recordings in Python")
 
-CAMERA = StereoCamera(718.9, 718.9, 607.2, 185.2, 0.537, 1241, 376)
+CAMERA = Camera(718.9, 718.9, 607.2, 185.2, 0.537, 1241, 376)
 FRAMES, FRAMES_PER_KEYFRAME, LANDMARKS_PER_KEYFRAME = 100, 3, 150
 
 REJECTED = LoopEdge(3, 0, 0.2, False, "too few inliers", 14, 7)
@@ -213,7 +213,7 @@ def test_null_recorder_takes_every_call() -> None:
 
 
 def test_unwritable_path_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING, "vslam.recorder"):
+    with caplog.at_level(logging.WARNING, "vslam.run.recorder"):
         record(RerunRecorder(tmp_path / "missing" / "recording.rrd"), frames=4)
     assert "recording ends here" in caplog.text
 
@@ -224,7 +224,7 @@ def test_almost_full_disk_ends_the_recording_cleanly(
     usage = namedtuple("usage", "total used free")
     free = iter([2**40, 2**40, 2**20])
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage(0, 0, next(free)))
-    with caplog.at_level(logging.WARNING, "vslam.recorder"):
+    with caplog.at_level(logging.WARNING, "vslam.run.recorder"):
         record(RerunRecorder(tmp_path / "recording.rrd"), frames=20)
     assert "almost full" in caplog.text
     assert len(rows(tmp_path / "recording.rrd", "world/camera/image")) == 1 + 2
@@ -237,10 +237,10 @@ def test_failing_disk_neither_ends_nor_hangs_the_run(tmp_path: Path) -> None:
     script = """
         import resource, sys
         from pathlib import Path
-        import vslam.recorder
+        import vslam.run.recorder
         from test_recorder import RerunRecorder, record
 
-        vslam.recorder._FLUSH_TIMEOUT_S = 1.0
+        vslam.run.recorder._FLUSH_TIMEOUT_S = 1.0
         recorder = RerunRecorder(Path(sys.argv[1]))
         resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
         record(recorder)

@@ -8,13 +8,13 @@ from test_mapping import CAMERA, World, make_world
 from test_verification import forward, in_strip, link_pass
 
 from vslam.config import Config, RelocalizationConfig
-from vslam.features import FeatureGrid, Features
+from vslam.features import Features
 from vslam.frontend.relocalization import relocalise
-from vslam.frontend.tracking import Frame, Tracker
+from vslam.frontend.tracking import Frame, TrackingContext
 from vslam.geometry import inverse, se3_exp, se3_log
 from vslam.map import local_map
 
-TRACKER = Tracker.create(CAMERA, Config())
+TRACKER = TrackingContext.create(CAMERA, Config())
 KEYFRAMES = 4
 
 
@@ -42,8 +42,7 @@ def lost_frame(world: World, T_cw: np.ndarray, *, mono: bool = False, among=None
         a.descriptor[rows].copy().view(np.uint8),
         a.u_right[rows].copy(),
     )
-    grid = FeatureGrid.of_positions(features.xy, CAMERA.width, CAMERA.height)
-    return Frame.untracked(features, grid)
+    return Frame.untracked(features, CAMERA)
 
 
 def find(world: World, frame: Frame, seed: int = 0) -> int:
@@ -94,8 +93,7 @@ def test_a_frame_that_is_not_found_is_left_untracked(case):
     among = {"elsewhere": [], "too few": in_strip(world, 250, 290)}.get(case)
     frame = lost_frame(world, forward(1.2, 0.3), among=among)
     if case == "no features":
-        grid = FeatureGrid.of_positions(np.empty((0, 2), np.float32), CAMERA.width, CAMERA.height)
-        frame = Frame.untracked(Features.none(), grid)
+        frame = Frame.untracked(Features.none(), CAMERA)
     if case == "no landmarks":
         world = mapped_street()
         nothing = local_map(world.map, 1, 1)
@@ -115,6 +113,6 @@ def test_one_object_that_looks_the_same_brings_inliers_but_is_no_place():
     frame = lost_frame(world, forward(1.2, 0.3), among=in_strip(world, 200, 390))
     assert find(world, frame) == 0
     config = Config(relocalization=RelocalizationConfig(min_elsewhere=0))
-    tracker = Tracker.create(CAMERA, config)
+    context = TrackingContext.create(CAMERA, config)
     place, surroundings = local_map(world.map, 1, 1), local_map(world.map, 1, 80)
-    assert relocalise(frame, place, surroundings, tracker, 0) >= 50
+    assert relocalise(frame, place, surroundings, context, 0) >= 50

@@ -11,19 +11,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.config import Config, load_config
-from vslam.evaluate import evaluate, read_pair
+from vslam.evaluation.loops import evaluate_loops
+from vslam.evaluation.trajectories import evaluate_trajectory, read_pair
 from vslam.features import TrackingState, TrackResult
-from vslam.loop_evaluation import evaluate_loops
-from vslam.loops import Closure, LoopEdge
-from vslam.report import write_report
+from vslam.loops import LoopCorrection, LoopEdge
+from vslam.report.folder import write_results
 from vslam.report.maps import loop_closing, top_view
 from vslam.report.render import headlines
 from vslam.report.schema import ReportJson
 from vslam.report.summary import summarize
-from vslam.run import RunOutcome, RunSettings
-from vslam.runfolder import matched_ground_truth
+from vslam.run.outcome import RunOutcome, RunSettings, matched_ground_truth
 from vslam.trajectory import Trajectory, read_trajectory
 
 FIGURES = {
@@ -45,8 +44,8 @@ class _Sequence:
     name: str = "00"
 
     @property
-    def camera(self) -> StereoCamera:
-        return StereoCamera(718.9, 718.9, 607.2, 185.2, 0.537, 1241, 376)
+    def camera(self) -> Camera:
+        return Camera(718.9, 718.9, 607.2, 185.2, 0.537, 1241, 376)
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -172,13 +171,13 @@ def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
         edge(92, 29, False, "not consistent with the group"),
         edge(100, 37, True, "closed"),
     ]
-    closures = []
+    corrections = []
     for loop in (loop for loop in loops if loop.accepted):
         living = np.setdiff1d(np.arange(loop.query + 1), [50])
         T_wc = truth[keyframe_frames[living]].copy()
         T_cw_after = np.linalg.inv(T_wc)
         T_wc[:, 0, 3] += 8.0 * living / len(keyframe_frames)  # drift before, none after
-        closures.append(Closure(loop, living, np.linalg.inv(T_wc), T_cw_after, 0.12))
+        corrections.append(LoopCorrection(loop, living, np.linalg.inv(T_wc), T_cw_after, 0.12))
     timestamps = np.arange(frames) * 0.1
     settings = replace(plain.settings, detector="bow", perturb="none")
     return replace(
@@ -188,7 +187,7 @@ def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
         trajectory=Trajectory(timestamps, estimate),
         keyframes=Trajectory(timestamps[keyframe_frames], estimate[keyframe_frames]),
         loops=loops,
-        closures=closures,
+        corrections=corrections,
         keyframe_frames=keyframe_frames,
         n_submaps=2,
         without_loops=replace(plain, sequence=_Sequence(timestamps, truth)),
@@ -196,13 +195,10 @@ def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
 
 
 def report_of(outcome: RunOutcome, folder: Path) -> ReportJson:
-    """Write the report as the command line does, read back its JSON."""
-    ground_truth = matched_ground_truth(outcome)
-    evaluation = None
-    if ground_truth is not None and len(ground_truth) > 2:
-        evaluation = evaluate(outcome.trajectory, ground_truth)
-    write_report(outcome, evaluation, folder)
-    return ReportJson.model_validate_json((folder / "report.json").read_bytes())
+    """Write the report as the command line does; what is on the disk is what is returned."""
+    report = write_results(folder, outcome)
+    assert ReportJson.model_validate_json((folder / "report.json").read_bytes()) == report
+    return report
 
 
 def figures_of(folder: Path) -> set[str]:
@@ -245,9 +241,17 @@ def test_json_holds_the_numbers_of_the_run(written: tuple[RunOutcome, Path]) -> 
     outcome, folder = written
     truth = matched_ground_truth(outcome)
     assert truth is not None
-    evaluation = evaluate(outcome.trajectory, truth)
+    evaluation = evaluate_trajectory(outcome.trajectory, truth)
     report = json.loads((folder / "report.json").read_text())
-    for name in ("ate_rmse_m", "rpe_m", "rpe_deg", "t_rel_percent", "alignment"):
+    for name in (
+        "ate_rmse_m",
+        "ate_mean_m",
+        "ate_max_m",
+        "rpe_m",
+        "rpe_deg",
+        "t_rel_percent",
+        "alignment",
+    ):
         assert report[name] == getattr(evaluation, name)
     assert (report["lost_frames"], report["weak_frames"], report["frames"]) == (6, 8, 160)
     assert (report["skipped_frames"], report["skipped_messages"]) == (1, outcome.skipped)
@@ -256,7 +260,7 @@ def test_json_holds_the_numbers_of_the_run(written: tuple[RunOutcome, Path]) -> 
     assert report["keyframes"] == 40
     assert report["landmarks"] == 9600
     assert report["seed"] == 3
-    assert report["schema_version"] == 2
+    assert report["schema_version"] == 3
     assert (report["loops"], report["revisits"], report["without_loops"]) == ([], [], None)
     assert (report["loops_closed"], report["loops_missed"], report["revisit_stretches"]) == (
         0,
@@ -280,7 +284,7 @@ def test_evo_command_names_files_that_reproduce_the_ate(written: tuple[RunOutcom
     report = ReportJson.model_validate_json((folder / "report.json").read_bytes())
     truth, estimate = folder / "ground_truth_kitti.txt", folder / "trajectory_kitti.txt"
     assert report.evo_command == f"evo_ape kitti {truth} {estimate} --align"
-    again = evaluate(*read_pair(estimate, truth))
+    again = evaluate_trajectory(*read_pair(estimate, truth))
     assert again.ate_rmse_m == pytest.approx(report.ate_rmse_m, abs=1e-9)
 
 
@@ -349,7 +353,7 @@ def test_comparison_is_in_every_text(looped: tuple[RunOutcome, Path]) -> None:
     without, truth = outcome.without_loops, matched_ground_truth(outcome)
     assert without is not None
     assert truth is not None
-    expected = evaluate(without.trajectory, truth)
+    expected = evaluate_trajectory(without.trajectory, truth)
     report = ReportJson.model_validate_json((folder / "report.json").read_bytes())
     assert report.without_loops is not None
     assert report.without_loops.ate_rmse_m == expected.ate_rmse_m
@@ -385,7 +389,7 @@ def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) 
 
 def test_missed_revisit_is_named(tmp_path: Path) -> None:
     outcome = two_laps()
-    report = report_of(replace(outcome, loops=outcome.loops[1:3], closures=[]), tmp_path)
+    report = report_of(replace(outcome, loops=outcome.loops[1:3], corrections=[]), tmp_path)
     assert (report.loops_closed, report.loops_missed, report.loops_wrong) == (0, 1, 0)
     assert report.revisits[0].loop_frame is None
     assert "missed" in (tmp_path / "report.md").read_text().split("## Revisits")[1]
@@ -416,7 +420,7 @@ def test_loops_without_ground_truth() -> None:
 def test_interrupted_run_is_not_blamed_for_revisits_to_come() -> None:
     outcome = two_laps()
     done = np.arange(240)
-    outcome = replace(outcome, trajectory=outcome.trajectory.select(done), loops=[], closures=[])
+    outcome = replace(outcome, trajectory=outcome.trajectory.select(done), loops=[], corrections=[])
     report = summarize(outcome, None, evaluate_loops(outcome), None)
     assert (report.revisit_stretches, report.loops_missed) == (0, 0)
 
@@ -427,16 +431,16 @@ def test_before_is_drawn_in_the_frame_of_the_ground_truth() -> None:
     T = np.eye(4)
     T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
     T[:3, 3] = [50.0, 0.0, -20.0]
-    first = outcome.closures[0]
+    first = outcome.corrections[0]
     turned = replace(first, T_cw_before=first.T_cw_after @ np.linalg.inv(T))
     truth = matched_ground_truth(outcome)
     assert truth is not None
     trajectory = Trajectory(outcome.trajectory.timestamps, T @ truth.T_wc)
-    outcome = replace(outcome, trajectory=trajectory, closures=[turned])
+    outcome = replace(outcome, trajectory=trajectory, corrections=[turned])
     for scale, alignment in ((1.0, "se3"), (1.5, "sim3")):
         poses = truth.T_wc.copy()
         poses[:, :3, 3] *= scale
-        evaluation = evaluate(trajectory, Trajectory(truth.timestamps, poses), alignment)
+        evaluation = evaluate_trajectory(trajectory, Trajectory(truth.timestamps, poses), alignment)
         axes = loop_closing(outcome, evaluation, truth).axes[0]
         (before,) = (line for line in axes.lines if line.get_label() == "before")
         expected = scale * truth.T_wc[outcome.keyframe_frames[turned.keyframes]][:, [0, 2], 3]

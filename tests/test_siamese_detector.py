@@ -13,7 +13,7 @@ import torch
 from siamese_worlds import small_network, small_settings, views
 from typer.testing import CliRunner
 
-from vslam.cli import app
+from vslam.cli.main import app
 from vslam.config import Config, SiameseConfig
 from vslam.errors import InputError
 from vslam.features import Features
@@ -23,7 +23,7 @@ from vslam.loopclosure.siamese.scoring import NetworkScorer
 from vslam.loopclosure.siamese.siamese import build_network, load_network, save_network
 from vslam.loopclosure.siamese.weights import SHIPPED, find_weights
 from vslam.map import Map
-from vslam.observations import link
+from vslam.map_kernels import link
 
 
 def features(n: int) -> Features:
@@ -213,7 +213,7 @@ def test_shipped_weights_know_a_place_again(name):
 
 def test_neither_help_nor_a_run_without_it_loads_torch():
     script = (
-        "import sys\nfrom vslam import cli\nimport vslam.pipeline, vslam.loopclosure.detector\n"
+        "import sys\nimport vslam.cli.main, vslam.run.pipeline, vslam.loopclosure.detector\n"
         "sys.stdout.write(' '.join({'torch', 'onnx', 'safetensors'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd="/")

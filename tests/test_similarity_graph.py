@@ -24,7 +24,7 @@ from vslam.features import Features
 from vslam.geometry import inverse, inverses, se3_exp, transform
 from vslam.loops import LoopEdge
 from vslam.map import Map
-from vslam.observations import link_many
+from vslam.map_kernels import link_many
 
 CONFIG = PoseGraphConfig()
 
@@ -196,10 +196,10 @@ def test_a_correction_leaves_every_keyframe_its_picture():
         np.testing.assert_allclose(a.T_cw[k][:3, :3] @ a.T_cw[k][:3, :3].T, np.eye(3), atol=1e-12)
         ids = map_.landmarks_of(k)
         away = np.linalg.norm(a.xyz[ids] - inverse(a.T_cw[k])[:3, 3], axis=1)
-        np.testing.assert_allclose(a.reach[ids, 1], away)
+        np.testing.assert_allclose(a.distance_range[ids, 1], away)
     # A culled keyframe keeps its place beside the one that took its place.
     np.testing.assert_allclose(map_.T_c_parent[1][:3, 3], 1.5 * offset[:3, 3])
-    np.testing.assert_allclose(map_.rescaled, [1.5, 1.5, 0.5])
+    np.testing.assert_allclose(map_.unit_scale, [1.5, 1.5, 0.5])
 
 
 def test_a_closed_loop_is_kept_in_the_units_of_today():

@@ -13,7 +13,7 @@ from vslam.config import Config, KeyframeConfig, MappingConfig, OrbConfig, Track
 from vslam.datasets.kitti import open_kitti
 from vslam.features import TrackResult
 from vslam.geometry import inverse, se3_log
-from vslam.observations import detach_keyframe
+from vslam.map_kernels import detach_keyframe
 from vslam.slam import Slam
 
 ORB = OrbConfig(n_features=800)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from vslam.config import Config
-from vslam.frontend.tracking import Tracker, extract_features
+from vslam.frontend.tracking import TrackingContext, extract_features
 from vslam.kernels import kernel
 from vslam.slam import Slam
 
@@ -63,8 +63,8 @@ def units(call: Callable[[], object]) -> float:
 
 
 def test_extraction_of_a_pair(corridor):
-    tracker = Tracker.create(corridor.camera, Config())
-    ratio = units(lambda: extract_features(corridor.left[0], corridor.right[0], tracker))
+    context = TrackingContext.create(corridor.camera, Config())
+    ratio = units(lambda: extract_features(corridor.left[0], corridor.right[0], context))
     assert ratio < 2.5 * 0.68
 
 

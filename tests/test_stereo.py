@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.config import OrbConfig, StereoConfig
 from vslam.frontend.orb import Extraction, extract
 from vslam.frontend.stereo import match_stereo, rows_to_features, slide
@@ -42,7 +42,7 @@ def match(
     rng = np.random.default_rng(9)
     left = extracted(image + noise * rng.normal(size=image.shape))
     right = extracted(shifted(image, dx, dy) + noise * rng.normal(size=image.shape))
-    camera = StereoCamera(fx, fx, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
+    camera = Camera(fx, fx, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
     u_right = match_stereo(left, right, camera, StereoConfig())
     assert u_right.dtype == np.float32
     return left, left.xy[:, 0] - u_right
@@ -117,14 +117,14 @@ def test_rows_that_do_not_correspond_match_rarely():
 
 def test_strangers_match_rarely():
     left, right = extracted(texture(0)), extracted(texture(1))
-    camera = StereoCamera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
+    camera = Camera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
     matched = np.isfinite(match_stereo(left, right, camera, StereoConfig()))
     assert np.count_nonzero(matched) < 0.05 * len(matched)
 
 
 def test_an_empty_image_matches_nothing():
     left, black = extracted(texture()), extracted(np.zeros((HEIGHT, WIDTH)))
-    camera = StereoCamera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
+    camera = Camera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
     assert np.isnan(match_stereo(left, black, camera, StereoConfig())).all()
     assert match_stereo(black, left, camera, StereoConfig()).shape == (0,)
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.datasets import open_sequence
 from vslam.datasets.kitti import open_kitti
 from vslam.datasets.synthetic import houses, parse_drive, store, textures, vehicles
@@ -36,7 +36,7 @@ from vslam.datasets.synthetic.solids import turn
 from vslam.datasets.synthetic.town import build_town
 from vslam.errors import InputError
 
-CAMERA = StereoCamera(360.0, 360.0, 300.3, 95.7, 0.54, 620, 190)
+CAMERA = Camera(360.0, 360.0, 300.3, 95.7, 0.54, 620, 190)
 BY_DAY = Light(np.array([0.0, -0.8, -0.6]), visibility=1e9, haze=0.0)
 SIDE = 1024
 DOTS = 8  # a row and a column
@@ -422,8 +422,8 @@ class Renderings:
         self.calls += 1
         self.missing = missing
         for k in missing:
-            for eye in ("image_0", "image_1"):
-                (folder / eye / f"{k:06d}.png").write_bytes(b"png")
+            for side in ("image_0", "image_1"):
+                (folder / side / f"{k:06d}.png").write_bytes(b"png")
 
 
 def there_and_back(n=85):
@@ -483,7 +483,7 @@ def rounds(n, radius=32.0, laps=1.6):
 
 def test_pairs_are_labelled(tmp_path):
     route = route_of_poses(rounds(160), "round")
-    cheap = replace(route, camera=StereoCamera(180.0, 180.0, 155.0, 47.0, 0.54, 310, 94))
+    cheap = replace(route, camera=Camera(180.0, 180.0, 155.0, 47.0, 0.54, 310, 94))
     render_pairs(cheap, Variation(seed=1, change=0.6), tmp_path, 20)
     rows = list(csv.DictReader((tmp_path / "pairs.csv").open()))
     assert {row["kind"] for row in rows} == {"shift", "pass", "alike", "random"}
@@ -496,7 +496,7 @@ def test_pairs_are_labelled(tmp_path):
         assert abs(float(row["lateral_m"])) <= 1.4
         assert abs(float(row["heading_deg"])) <= 14.0
         assert abs(float(row["height_m"])) <= 0.25
-        images = [cv2.imread(str(tmp_path / row[eye]), cv2.IMREAD_UNCHANGED) for eye in "ab"]
+        images = [cv2.imread(str(tmp_path / row[side]), cv2.IMREAD_UNCHANGED) for side in "ab"]
         assert all(image.shape == (94, 310) and image.std() > 15 for image in images)
         ratio = images[1].mean() / images[0].mean()
         assert not same or 0.3 < ratio / float(row["exposure_ratio"]) < 3.0

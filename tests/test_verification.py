@@ -8,9 +8,9 @@ from test_mapping import CAMERA, World, make_world
 
 from vslam.config import VerificationConfig
 from vslam.geometry import inverse, se3_exp, se3_log
-from vslam.loopclosure.verification import look, look_back, verify
+from vslam.loopclosure.verification import guided_match, reverse_match, verify
 from vslam.loops import LoopCandidate
-from vslam.observations import link_many, refresh_landmarks
+from vslam.map_kernels import link_many, refresh_landmarks
 
 CONFIG = VerificationConfig()
 PASS = 4  # keyframes of each pass
@@ -212,10 +212,10 @@ def test_every_gate_says_what_it_missed(change, reason):
 def test_both_sides_of_a_revisit_see_each_other():
     world = street()
     edge = check(world)
-    view = look_back(world.map, edge, edge.T_query_match, CAMERA, CONFIG)
-    assert np.mean(view.seen) > 0.7
+    found = reverse_match(world.map, edge, edge.T_query_match, CAMERA, CONFIG)
+    assert np.mean(found.seen) > 0.7
     np.testing.assert_allclose(
-        view.T_cw @ inverse(world.map.keyframe_pose(6)), inverse(edge.T_query_match), atol=0.03
+        found.T_cw @ inverse(world.map.keyframe_pose(6)), inverse(edge.T_query_match), atol=0.03
     )
 
 
@@ -223,8 +223,8 @@ def test_a_keyframe_finds_the_landmarks_it_sees():
     world = street()
     landmarks = world.map.landmarks_of(1)
     start = se3_exp(np.array([0.05, 0.0, 0.05, 0.0, 0.004, 0.0])) @ world.map.keyframe_pose(1)
-    view = look(world.map, 1, landmarks, start, CAMERA, CONFIG)
-    assert np.mean(view.seen) > 0.9
-    assert np.abs(se3_log(view.T_cw @ inverse(world.truth[1]))).max() < 0.02
-    rows = world.map.arrays.first_row[1] + view.feature[view.seen]
-    assert np.mean(world.map.arrays.landmark[rows] == view.landmarks[view.seen]) > 0.99
+    found = guided_match(world.map, 1, landmarks, start, CAMERA, CONFIG)
+    assert np.mean(found.seen) > 0.9
+    assert np.abs(se3_log(found.T_cw @ inverse(world.truth[1]))).max() < 0.02
+    rows = world.map.arrays.first_row[1] + found.feature[found.seen]
+    assert np.mean(world.map.arrays.landmark[rows] == found.landmarks[found.seen]) > 0.99

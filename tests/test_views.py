@@ -15,6 +15,7 @@ from vslam.errors import InputError
 from vslam.loopclosure.siamese.augmentation import STRONG, augment
 from vslam.loopclosure.siamese.branches import CapsuleShape, Layout
 from vslam.loopclosure.siamese.images import parse_size, to_size
+from vslam.loopclosure.siamese.initial_network import resized, starting_network
 from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.onnx import export_onnx
 from vslam.loopclosure.siamese.preprocessing import Unrolling
@@ -27,7 +28,6 @@ from vslam.loopclosure.siamese.siamese import (
     load_network,
     save_network,
 )
-from vslam.loopclosure.siamese.start import resized, starting_network
 from vslam.loopclosure.siamese.training import train
 
 WIDE = {"pixels": 48, "width": 81, "views": 2, "view_width": 65}

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vslam import cli
+from vslam.cli import main as cli
 from vslam.errors import InputError, ResultsError
 from vslam.loopclosure.vocabulary import (
     SHIPPED,

@@ -1,4 +1,4 @@
-"""Compiling in two processes: the halves cover everything, and nothing depends on them."""
+"""Compiling in two processes: the shares cover everything, and nothing depends on them."""
 
 from __future__ import annotations
 
@@ -10,58 +10,58 @@ from types import SimpleNamespace
 
 import pytest
 
-from vslam import warmup
+from vslam.run import warmup
 
 # In a process of its own, because other tests have called kernels in this one.
-HALVES = """
+SHARES = """
 import gc
 from numba.core.dispatcher import Dispatcher
-from vslam import warmup
+from vslam.run import warmup
 
 def signatures():
     kernels = (o for o in gc.get_objects() if isinstance(o, Dispatcher))
     ours = (k for k in kernels if k.py_func.__module__.startswith("vslam."))
     return {(k.py_func.__module__, k.py_func.__name__): set(k.signatures) for k in ours}
 
-for share in warmup.HALVES["first"]:
+for share in warmup.COMPILE_SHARES["first"]:
     share()
 first = signatures()
-for share in warmup.HALVES["second"]:
+for share in warmup.COMPILE_SHARES["second"]:
     share()
 both = signatures()
 for name, known in first.items():
-    assert not known or both[name] == known, f"both halves compile {name}, for other types"
+    assert not known or both[name] == known, f"both shares compile {name}, for other types"
 for share in warmup.EVERYTHING:
     share()
 for name, known in signatures().items():
-    assert both[name] == known, f"neither half compiles {name}{known - both[name]}"
+    assert both[name] == known, f"neither share compiles {name}{known - both[name]}"
 assert len([name for name, known in both.items() if known]) > 30
 warmup.mark_warm()
 assert not warmup.is_cold()
 
 from test_closing import EXACT, closed, run
 from vslam.config import Config
-from vslam.detectors import create_detector
+from vslam.loopclosure.registry import create_detector
 
 warm = signatures()
-assert closed().closures
+assert closed().corrections
 jump = [*range(40), *(k + 0.4 for k in range(10, 20))]
 _, results = run(EXACT, jump, create_detector("bow", Config()))
 assert results[-1].state.name == "OK", "not relocalised"
 for name, known in signatures().items():
     assert known <= warm.get(name, set()), f"a loop compiles {name}{known - warm.get(name, set())}"
 
-from test_monocular import closed as closed_with_one_eye
+from test_monocular import closed as closed_with_one_camera
 
-assert closed_with_one_eye()[0].closures
+assert closed_with_one_camera()[0].corrections
 for name, known in signatures().items():
-    assert known <= warm.get(name, set()), f"one eye compiles {name}{known - warm.get(name, set())}"
+    assert known <= warm.get(name, set()), f"mono compiles {name}{known - warm.get(name, set())}"
 """
 
 
-def test_the_two_halves_compile_all_that_slam_calls() -> None:
+def test_the_two_shares_compile_all_that_slam_calls() -> None:
     done = subprocess.run(
-        [sys.executable, "-c", HALVES], capture_output=True, text=True, cwd=Path(__file__).parent
+        [sys.executable, "-c", SHARES], capture_output=True, text=True, cwd=Path(__file__).parent
     )
     assert done.returncode == 0, done.stderr
 
@@ -79,7 +79,7 @@ def test_kernels_are_cold_without_a_cache_newer_than_the_source(
         os.utime(index, (changed, changed))
     kernel = SimpleNamespace(stats=SimpleNamespace(cache_path=str(tmp_path)))
     module = SimpleNamespace(__file__=str(source), _adjust=kernel)
-    monkeypatch.setattr(warmup, "TELLING", ((module, "_adjust"),))
+    monkeypatch.setattr(warmup, "COLD_PROBES", ((module, "_adjust"),))
     assert warmup.is_cold() is cold
 
 
@@ -106,7 +106,7 @@ def python_is(monkeypatch: pytest.MonkeyPatch, folder: Path, script: str) -> Pat
 
 
 def assert_both_ended(traces: Path) -> None:
-    assert {trace.name for trace in traces.iterdir()} == set(warmup.HALVES)
+    assert {trace.name for trace in traces.iterdir()} == set(warmup.COMPILE_SHARES)
     for trace in traces.iterdir():
         with pytest.raises(ProcessLookupError):
             os.kill(int(trace.read_text()), 0)

@@ -1,4 +1,4 @@
-"""Time what runs behind a loop closure, on simulated drives with loops.
+"""Time what runs behind a closed loop, on simulated drives with loops.
 
     python tools/bench_optimisers.py [bundle] [graph] [covisibility]
 
@@ -26,15 +26,15 @@ from vslam.backend.pose_graph import (
     essential_graph,
     optimise,
 )
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.config import PoseGraphConfig
 from vslam.features import Features
 from vslam.geometry import inverse, inverses, se3_exp
-from vslam.info import peak_memory_mb
+from vslam.machine import peak_memory_mb
 from vslam.map import Map
-from vslam.observations import covisible_pairs, link_many
+from vslam.map_kernels import covisible_pairs, link_many
 
-CAMERA = StereoCamera(718.0, 718.0, 607.0, 185.0, 0.54, 1241, 376)
+CAMERA = Camera(718.0, 718.0, 607.0, 185.0, 0.54, 1241, 376)
 BLOCK = (200.0, 120.0)  # sides of the block of houses that the car drives round, metres
 
 

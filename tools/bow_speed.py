@@ -17,7 +17,7 @@ from vslam.features import Features
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.vocabulary import load
 from vslam.map import Map
-from vslam.observations import link_many
+from vslam.map_kernels import link_many
 
 REPEATS = 50
 NEIGHBOURS, LANDMARKS = 10, 50  # a keyframe sees so many new ones, and those of so many before

@@ -13,7 +13,7 @@ import numpy as np
 
 from vslam.config import OrbConfig
 from vslam.datasets.synthetic import open_synthetic
-from vslam.evaluate import evaluate, read_pair
+from vslam.evaluation.trajectories import evaluate_trajectory, read_pair
 from vslam.frontend.orb import extract
 
 HEIGHT = 376
@@ -35,7 +35,7 @@ def main(folder: Path, out: Path, frame: int) -> None:
     for track, colour, width in ((truth, TRUTH, 5), (estimate, PATH, 2)):
         at = (track.T_wc[:, [0, 2], 3] - middle) * [scale, -scale] + HEIGHT / 2
         cv2.polylines(top, [np.rint(at).astype(np.int32)], False, colour, width, cv2.LINE_AA)
-    error = evaluate(estimate, truth, "se3").ate_rmse_m
+    error = evaluate_trajectory(estimate, truth, "se3").ate_rmse_m
     label = f"ATE {error:.2f} m of {len(truth)} frames"
     cv2.putText(top, label, (10, HEIGHT - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.5, INK, 1, cv2.LINE_AA)
     sheet = np.hstack([picture, top])

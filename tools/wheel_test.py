@@ -47,14 +47,14 @@ def write_sequence(root: Path) -> None:
     wall = np.clip(128 + 2.0 * (fine - 128) + 4.0 * (coarse - 128), 0, 255).astype(np.uint8)
     depth = FOCAL * BASELINE / DISPARITY
     folder = root / "sequences" / "00"
-    for eye in ("image_0", "image_1"):
-        (folder / eye).mkdir(parents=True)
+    for side in ("image_0", "image_1"):
+        (folder / side).mkdir(parents=True)
     poses = []
     for k in range(FRAMES):
         x, y = STEP * k, 20 + STEP * (k % 4)
-        for eye, shift in (("image_0", 0), ("image_1", DISPARITY)):
+        for side, shift in (("image_0", 0), ("image_1", DISPARITY)):
             view = wall[y : y + HEIGHT, x + shift : x + shift + WIDTH]
-            cv2.imwrite(str(folder / eye / f"{k:06d}.png"), view)
+            cv2.imwrite(str(folder / side / f"{k:06d}.png"), view)
         T_wc = np.eye(4)
         T_wc[:2, 3] = np.array([x, y - 20]) * depth / FOCAL
         poses.append(" ".join(map(str, T_wc[:3].ravel())))
@@ -62,8 +62,8 @@ def write_sequence(root: Path) -> None:
     (root / "poses" / "00.txt").write_text("\n".join(poses) + "\n")
     (folder / "times.txt").write_text("".join(f"{0.1 * k:.6e}\n" for k in range(FRAMES)))
     rows = (
-        f"P{eye}: {FOCAL} 0 {WIDTH / 2} {offset} 0 {FOCAL} {HEIGHT / 2} 0 0 0 1 0\n"
-        for eye, offset in enumerate((0.0, -FOCAL * BASELINE))
+        f"P{side}: {FOCAL} 0 {WIDTH / 2} {offset} 0 {FOCAL} {HEIGHT / 2} 0 0 0 1 0\n"
+        for side, offset in enumerate((0.0, -FOCAL * BASELINE))
     )
     (folder / "calib.txt").write_text("".join(rows))
 

@@ -11,17 +11,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
-__all__ = ["Slam", "StereoCamera", "TrackResult", "TrackingState", "__version__"]
+__all__ = ["Camera", "Slam", "TrackResult", "TrackingState", "__version__"]
 
 _HOME = {
     "Slam": "vslam.slam",
-    "StereoCamera": "vslam.camera",
+    "Camera": "vslam.camera",
     "TrackResult": "vslam.features",
     "TrackingState": "vslam.features",
 }
 
 if TYPE_CHECKING:
-    from vslam.camera import StereoCamera
+    from vslam.camera import Camera
     from vslam.features import TrackingState, TrackResult
     from vslam.slam import Slam
 

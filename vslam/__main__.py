@@ -1,6 +1,6 @@
 """``python -m vslam``."""
 
-from vslam.cli import main
+from vslam.cli.main import main
 
 if __name__ == "__main__":
     main()

@@ -5,26 +5,23 @@ Camera frame: x right, y down, z forward. Units: metres and pixels.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-# 95 % quantiles of chi-square with 2 and 3 degrees of freedom: the largest reprojection error, in
-# variances, of an inlier seen by one eye (u, v) or by both (u, v, u_right). ORB-SLAM2, III-C.
-CHI2_MONO = 5.991
-CHI2_STEREO = 7.815
-
 
 @dataclass(frozen=True)
-class StereoCamera:
-    """A rectified stereo pair: both eyes share one focal length, rows correspond.
+class Camera:
+    """A rectified stereo pair: both cameras share one focal length, rows correspond.
 
     Attributes:
         fx, fy: focal lengths in pixels.
-        cx, cy: principal point of the left eye in pixels.
-        baseline: distance from the left to the right eye in metres; 0 says that there is no
-            right eye, and a map has no metres but a unit of its own (``backend/two_views.py``).
+        cx, cy: principal point of the left camera in pixels.
+        baseline: distance from the left to the right camera in metres; 0 says that there is no
+            right camera, and a map has no metres but a unit of its own (``backend/two_views.py``).
         width, height: image size in pixels.
     """
 
@@ -38,11 +35,11 @@ class StereoCamera:
 
     @property
     def monocular(self) -> bool:
-        """Whether there is a left eye only."""
+        """Whether there is a left camera only."""
         return self.baseline == 0.0
 
-    def left_eye(self) -> StereoCamera:
-        """The left eye alone."""
+    def left_camera(self) -> Camera:
+        """The left camera alone."""
         return replace(self, baseline=0.0)
 
     @property
@@ -69,3 +66,16 @@ class StereoCamera:
         x = (xy[:, 0] - self.cx) * z / self.fx
         y = (xy[:, 1] - self.cy) * z / self.fy
         return np.stack([x, y, z], axis=1)
+
+
+Given = TypeVar("Given")
+Made = TypeVar("Made")
+
+
+class ImageMap(Protocol):
+    """How a function is applied to the images of a frame: ``map``, one after the other, or the
+    ``map`` of a pool of threads, both at once. The results and their order are the same."""
+
+    def __call__(
+        self, function: Callable[[Given], Made], images: Iterable[Given], /
+    ) -> Iterator[Made]: ...

@@ -38,17 +38,15 @@ from vslam.backend.similarity_graph import (
     rigid,
     similarity_consistency,
 )
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.config import Config
 from vslam.features import Features
-from vslam.geometry import compose, inverse, inverses, orthonormalised
+from vslam.geometry import Matrix, compose, inverse, inverses, orthonormalised
 from vslam.loopclosure.consistency import LoopConsistency
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.verification import verify
-from vslam.loops import Closure, LoopCandidate, LoopEdge
+from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map
-
-Matrix = NDArray[np.float64]
 
 
 class LoopClosing:
@@ -57,16 +55,16 @@ class LoopClosing:
     Attributes:
         detector: what finds candidates.
         edges: every candidate and what became of it, in order.
-        closures: the loops that were closed.
+        corrections: the loops that were closed.
     """
 
     def __init__(
-        self, detector: LoopDetector, camera: StereoCamera, config: Config, *, threads: int
+        self, detector: LoopDetector, camera: Camera, config: Config, *, threads: int
     ) -> None:
         self.detector = detector
         self.edges: list[LoopEdge] = []
-        self.closures: list[Closure] = []
-        self._closed: list[LoopEdge] = []  # closures' edges, in the units of today
+        self.corrections: list[LoopCorrection] = []
+        self._closed: list[LoopEdge] = []  # corrections' edges, in the units of today
         self._camera = camera
         self._config = config
         self._consistency = LoopConsistency(config.consistency)
@@ -125,17 +123,25 @@ class LoopClosing:
         fuse_loop(map_, edge, query_side, match_side, self._camera, config)
         adjust_locally(map_, edge.query, self._camera, config)
         edge = replace(edge, reason="closed")
-        closure = Closure(edge, keyframes, before, solved.T_cw, time.perf_counter() - start)
-        self.closures.append(closure)
+        correction = LoopCorrection(
+            edge, keyframes, before, solved.T_cw, time.perf_counter() - start
+        )
+        self.corrections.append(correction)
         self._global = self._start_global(map_, edge.query)
         return edge
 
     def _solve(self, map_: Map, edge: LoopEdge, *, driven: bool) -> _Solution:
-        """The pose graph with a new loop, under one of two stories about where tracking was lost:
-        the camera drove on about as predicted, or it was carried to where the loop puts it."""
+        """The pose graph with a new loop, under one of two hypotheses of what happened where
+        tracking was lost: the camera drove on about as predicted, or it was carried to where the
+        loop puts it."""
         config, loops = self._config.pose_graph, [*self._closed, edge]
         graph = essential_graph(
-            map_, loops, config, weak=map_.restarts, guessed=map_.guesses, driven=driven
+            map_,
+            loops,
+            config,
+            weak=map_.restarts,
+            unpredicted=map_.unpredicted_restarts,
+            driven=driven,
         )
         now = map_.arrays.T_cw[: map_.n_keyframes]
         if self._camera.monocular:
@@ -193,8 +199,8 @@ class LoopClosing:
     def joined_submaps(self, map_: Map) -> NDArray[np.int64]:
         """``(n_keyframes,)`` sub-map of each keyframe; those joined by loops count as one."""
         submap = map_.submaps()
-        for closure in self.closures:
-            one, other = submap[closure.edge.query], submap[closure.edge.match]
+        for correction in self.corrections:
+            one, other = submap[correction.edge.query], submap[correction.edge.match]
             submap[submap == max(one, other)] = min(one, other)
         return submap
 

@@ -1,7 +1,11 @@
-"""Every threshold of the pipeline in one tree, with its unit and source.
+"""Every threshold of the pipeline in one tree; docs/thresholds.md is made from it.
 
-Sources: [ORB] Rublee et al., ICCV 2011; [OS1] Mur-Artal et al., ORB-SLAM, T-RO 2015;
-[OS2] Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017; [own] measured here, see docs/design.md.
+One file because whoever looks for a threshold, or tunes several, looks in one place.
+
+A description ends with the source of the value: [own], or the paper and section of the rule and
+what the value is: printed there, customary in the programs of the ORB-SLAM family, or our own.
+OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017.
+ZS: Zhou and Sun, Sci Rep 15, 7644 (2025).
 """
 
 from __future__ import annotations
@@ -21,224 +25,423 @@ class _Section(BaseModel):
 class OrbConfig(_Section):
     """ORB extraction."""
 
-    n_features: int = Field(2000, ge=100, description="Features for each image. [OS2, IV-A]")
-    n_levels: int = Field(8, ge=2, le=16, description="Pyramid levels. [OS1, V-A]")
-    scale_factor: float = Field(1.2, gt=1.0, le=2.0, description="Between levels. [OS1, V-A]")
-    fast_threshold: int = Field(12, ge=1, le=255, description="FAST threshold, grey levels.")
-    fast_threshold_min: int = Field(
-        7, ge=1, le=255, description="Threshold in cells where the first finds nothing. [OS1, V-A]"
+    n_features: int = Field(2000, ge=100, description="Features per image. [OS1 V-A, printed]")
+    n_levels: int = Field(8, ge=2, le=16, description="Pyramid levels. [OS1 V-A, printed]")
+    scale_factor: float = Field(
+        1.2,
+        gt=1.0,
+        le=2.0,
+        description="Scale from one pyramid level to the next. [OS1 V-A, printed]",
     )
-    cell_size: int = Field(35, ge=16, description="Cell of the adaptive threshold, pixels.")
+    fast_threshold: int = Field(
+        12, ge=1, le=255, description="FAST threshold, grey levels. [OS1 V-A, customary]"
+    )
+    fast_threshold_min: int = Field(
+        7,
+        ge=1,
+        le=255,
+        description="FAST threshold of cells without a corner, grey levels. [OS1 V-A, customary]",
+    )
+    cell_size: int = Field(
+        35,
+        ge=16,
+        description="Side of a cell of the adaptive threshold, pixels. [OS1 V-A, customary]",
+    )
 
 
 class StereoConfig(_Section):
     """Stereo matching [OS2, III-A]."""
 
-    max_descriptor_distance: int = Field(75, ge=0, le=256, description="Hamming distance, bits.")
-    sad_window: int = Field(5, ge=1, description="Half width of the SAD patch, pixels.")
-    sad_search: int = Field(5, ge=1, description="Search of the SAD refinement, pixels each way.")
+    max_descriptor_distance: int = Field(
+        75,
+        ge=0,
+        le=256,
+        description="Descriptor distance, upper bound, bits. [OS2 III-A, customary]",
+    )
+    sad_window: int = Field(
+        5, ge=1, description="Half width of the SAD patch, pixels. [OS2 III-A, customary]"
+    )
+    sad_search: int = Field(
+        5, ge=1, description="SAD search to each side, pixels. [OS2 III-A, customary]"
+    )
     close_depth_baselines: float = Field(
-        40.0, gt=0, description="Close: depth below this many baselines. [OS2, III-A]"
+        40.0,
+        gt=0,
+        description="Depth below which a point is close, baselines. [OS2 III-A, printed]",
     )
 
 
 class TrackingConfig(_Section):
     """Frame-to-map tracking."""
 
-    match_distance: int = Field(100, ge=0, le=256, description="Projection search, bits. [OS1]")
-    match_ratio: float = Field(0.8, gt=0, le=1, description="Best over second best. [OS1, V-D]")
-    reference_distance: int = Field(50, ge=0, le=256, description="Brute-force search, bits.")
-    reference_ratio: float = Field(0.7, gt=0, le=1, description="Brute-force search. [OS1]")
-    motion_window: float = Field(7.0, gt=0, description="Radius at octave 0, pixels. [OS2]")
-    local_window: float = Field(2.5, gt=0, description="Radius in the local map, pixels. [OS1]")
-    local_keyframes: int = Field(80, ge=1, description="Keyframes of the local map. [OS1]")
+    match_distance: int = Field(
+        100,
+        ge=0,
+        le=256,
+        description="Descriptor distance, projection search, bits. [OS1 V-D, customary]",
+    )
+    match_ratio: float = Field(
+        0.8,
+        gt=0,
+        le=1,
+        description="Best over second-best distance, local map. [OS1 V-D, customary]",
+    )
+    reference_distance: int = Field(
+        50,
+        ge=0,
+        le=256,
+        description="Descriptor distance, reference keyframe, bits. [OS1 V-B, customary]",
+    )
+    reference_ratio: float = Field(
+        0.7,
+        gt=0,
+        le=1,
+        description="Best over second-best, reference keyframe. [OS1 V-B, customary]",
+    )
+    motion_window: float = Field(
+        7.0,
+        gt=0,
+        description="Search radius at octave 0, previous frame, pixels. [OS1 V-B, customary]",
+    )
+    local_window: float = Field(
+        2.5, gt=0, description="Search radius at octave 0, local map, pixels. [OS1 V-D, customary]"
+    )
+    local_keyframes: int = Field(
+        80, ge=1, description="Keyframes of the local map, at most. [OS1 V-D, customary]"
+    )
     min_stereo_start: int = Field(
-        100, ge=10, description="Stereo features that a map can start from. [own]"
+        100, ge=10, description="Stereo features that a map can start from. [OS2 III-B, own]"
     )
-    min_inliers_motion: int = Field(20, ge=3, description="Below: try the reference keyframe.")
+    min_inliers_motion: int = Field(
+        20,
+        ge=3,
+        description="Inliers; with fewer, the reference keyframe is tried. [OS1 V-B, customary]",
+    )
     min_inlier_ratio: float = Field(
-        0.3, ge=0, le=1, description="Of the motion matches; below: likewise. [own]"
+        0.3,
+        ge=0,
+        le=1,
+        description="Inliers over matches; below, the reference keyframe is tried. [own]",
     )
-    min_inliers_frame: int = Field(10, ge=3, description="Below, the local map is not tried. [OS1]")
-    min_inliers: int = Field(30, ge=3, description="Below, the frame is WEAK. [OS1]")
-    min_inliers_lost: int = Field(15, ge=3, description="Below, the frame is LOST. [own]")
+    min_inliers_frame: int = Field(
+        10,
+        ge=3,
+        description="Inliers; with fewer, the local map is not tried. [OS1 V-B, customary]",
+    )
+    min_inliers: int = Field(
+        30, ge=3, description="Inliers; with fewer, the frame is WEAK. [OS1 V-D, customary]"
+    )
+    min_inliers_lost: int = Field(
+        15, ge=3, description="Inliers; with fewer, the frame is LOST. [own]"
+    )
     lost_frames_before_restart: int = Field(
-        3, ge=1, description="Lost this long, mapping restarts at the predicted pose. [own]"
+        3, ge=1, description="Stereo: lost frames until a sub-map starts at the prediction. [own]"
     )
     young_keyframes: int = Field(
-        5, ge=0, description="Stereo: with no more in all, one lost frame restarts. [own]"
+        5, ge=0, description="Stereo: keyframes up to which one lost frame is enough. [own]"
     )
     monocular_lost_frames: int = Field(
-        4, ge=1, description="Monocular, whatever the age: after this, two views anew. [own]"
+        4, ge=1, description="Monocular: lost frames until two views start a sub-map. [own]"
     )
 
 
 class InitializationConfig(_Section):
     """The first two keyframes of a monocular map [OS1, IV]."""
 
-    min_features: int = Field(200, ge=20, description="Of a frame to begin with. [own]")
-    window: float = Field(100.0, gt=0, description="Search in the second frame, pixels. [OS1]")
-    match_distance: int = Field(50, ge=0, le=256, description="Descriptor search, bits. [OS1]")
-    match_ratio: float = Field(0.9, gt=0, le=1, description="Best over second best. [OS1]")
-    min_matches: int = Field(100, ge=8, description="Below, begin with another frame. [OS1]")
-    draws: int = Field(300, ge=1, description="RANSAC draws of each model; OS1 has 200. [own]")
+    min_features: int = Field(200, ge=20, description="Features of the first view. [own]")
+    window: float = Field(
+        100.0, gt=0, description="Search radius in the second view, pixels. [OS1 IV, customary]"
+    )
+    match_distance: int = Field(
+        50, ge=0, le=256, description="Descriptor distance, bits. [OS1 IV, customary]"
+    )
+    match_ratio: float = Field(
+        0.9, gt=0, le=1, description="Best over second-best distance. [OS1 IV, customary]"
+    )
+    min_matches: int = Field(
+        100,
+        ge=8,
+        description="Matches; with fewer, another first view is taken. [OS1 IV, customary]",
+    )
+    draws: int = Field(
+        300, ge=1, description="RANSAC draws of each model; ORB-SLAM has 200. [OS1 IV, own]"
+    )
     homography_share: float = Field(
-        0.45, gt=0, lt=1, description="Of both scores; above, the homography is taken. [OS1, IV]"
+        0.45,
+        gt=0,
+        lt=1,
+        description="Share of both scores above which the homography wins. [OS1 IV, printed]",
     )
-    max_error: float = Field(2.0, gt=0, description="Reprojection at octave 0, pixels. [OS1]")
+    max_error: float = Field(
+        2.0,
+        gt=0,
+        description="Reprojection error of an inlier at octave 0, pixels. [OS1 IV, customary]",
+    )
     min_parallax_deg: float = Field(
-        1.0, gt=0, description="That min_points must have; OS1: 1 degree. [OS1]"
+        1.0, gt=0, description="Parallax that min_points must have, degrees. [OS1 IV, customary]"
     )
-    min_points: int = Field(50, ge=8, description="Triangulated with that parallax. [OS1]")
+    min_points: int = Field(
+        50, ge=8, description="Triangulated points with that parallax. [OS1 IV, customary]"
+    )
     min_point_share: float = Field(
-        0.7, gt=0, le=1, description="Of the model's inliers in front of both cameras. [own]"
+        0.7,
+        gt=0,
+        le=1,
+        description="Inliers of the model in front of both cameras, share. [OS1 IV, own]",
     )
     max_rival_share: float = Field(
-        0.7, gt=0, le=1, description="Of the best motion's points, for the second best. [OS1]"
+        0.7,
+        gt=0,
+        le=1,
+        description="Points of the second-best motion, share of the best. [OS1 IV, customary]",
     )
-    min_landmarks: int = Field(100, ge=8, description="After the first bundle adjustment. [OS1]")
+    min_landmarks: int = Field(
+        100, ge=8, description="Landmarks after the first bundle adjustment. [OS1 IV, customary]"
+    )
     median_depth: float = Field(
-        15.0, gt=0, description="Of the first landmarks: makes the unit of the map. [own]"
+        15.0, gt=0, description="Median depth of the first landmarks, map units. [own]"
     )
     max_rescaling: float = Field(
         10.0,
         gt=1,
-        description="Of a sub-map, to go on at the speed before; beyond, it tells nothing. [own]",
+        description="Factor at most that matches a sub-map to the speed before it. [own]",
     )
     max_seconds: float = Field(
-        1.5, gt=0, description="Between the two keyframes; then begin with another frame. [own]"
+        1.5, gt=0, description="Longest time between the two views, seconds. [own]"
     )
 
 
 class KeyframeConfig(_Section):
     """Keyframe decision [OS2, III-E]."""
 
-    max_interval_s: float = Field(1.0, gt=0, description="Never longer between keyframes.")
-    min_tracked_close: int = Field(100, ge=0, description="Tracked close points below this and")
-    min_new_close: int = Field(70, ge=0, description="this many untracked: insert. [OS2, III-E]")
+    max_interval_s: float = Field(
+        1.0, gt=0, description="Longest time without a keyframe, seconds. [OS1 V-E, customary]"
+    )
+    min_tracked_close: int = Field(
+        100, ge=0, description="Tracked close points; fewer are too few. [OS2 III-E, printed]"
+    )
+    min_new_close: int = Field(
+        70,
+        ge=0,
+        description="Untracked close points; insert with more, if too few are tracked. "
+        "[OS2 III-E, printed]",
+    )
     max_tracked_ratio: float = Field(
-        0.75, gt=0, le=1, description="Of the points the reference keyframe tracks. [OS1, V-E]"
+        0.75,
+        gt=0,
+        le=1,
+        description="Tracked share of the reference keyframe's points; insert below. "
+        "[OS1 V-E, customary]",
     )
     urgent_ratio: float = Field(
-        0.25, gt=0, le=1, description="Below this ratio, do not wait for local mapping. [OS2]"
+        0.25,
+        gt=0,
+        le=1,
+        description="Tracked share below which insertion does not wait for mapping. "
+        "[OS1 V-E, customary]",
     )
     monocular_ratio: float = Field(
-        0.9, gt=0, le=1, description="max_tracked_ratio of a monocular camera. [OS1, V-E]"
+        0.9, gt=0, le=1, description="max_tracked_ratio of a monocular camera. [OS1 V-E, printed]"
     )
     monocular_min_tracked: int = Field(
-        100, ge=0, description="Points; below, a monocular camera does not wait either. [own]"
+        100, ge=0, description="Monocular: with fewer tracked points, do not wait either. [own]"
     )
     monocular_urgent_ratio: float = Field(
         0.5, gt=0, le=1, description="urgent_ratio of a monocular camera. [own]"
     )
     merge_after_frames: int = Field(
-        2, ge=1, description="Local mapping is merged this many frames later. [own]"
+        2, ge=1, description="Frames after which local mapping is merged. [own]"
     )
 
 
 class MappingConfig(_Section):
     """Local mapping and bundle adjustment."""
 
-    neighbours: int = Field(10, ge=1, description="Covisible keyframes triangulated with. [OS2]")
-    fuse_neighbours: int = Field(10, ge=1, description="Covisible keyframes fused with. [OS2]")
+    neighbours: int = Field(
+        10, ge=1, description="Covisible keyframes to triangulate with. [OS1 VI-C, customary]"
+    )
+    fuse_neighbours: int = Field(
+        10, ge=1, description="Covisible keyframes to fuse with. [OS1 VI-C, customary]"
+    )
     monocular_neighbours: int = Field(
-        20, ge=1, description="Covisible keyframes triangulated with, monocular. [OS1]"
+        20,
+        ge=1,
+        description="Covisible keyframes to triangulate with, monocular. [OS1 VI-C, customary]",
     )
     min_baseline_ratio: float = Field(
-        0.01, ge=0, description="Monocular baseline over median depth, to triangulate. [OS1]"
+        0.01, ge=0, description="Monocular: baseline over median depth. [OS1 VI-C, customary]"
     )
-    min_parallax_cosine: float = Field(0.9998, gt=0, le=1, description="Triangulation. [OS1]")
-    epipolar_distance: int = Field(50, ge=0, le=256, description="Triangulation, bits. [OS1]")
-    fuse_distance: int = Field(50, ge=0, le=256, description="Fusion, bits. [OS1]")
-    fuse_window: float = Field(3.0, gt=0, description="Radius at octave 0, pixels. [OS1]")
-    min_found_ratio: float = Field(0.25, ge=0, le=1, description="Landmark culling. [OS1, VI-B]")
-    redundant_ratio: float = Field(0.9, gt=0, le=1, description="Keyframe culling. [OS1, VI-E]")
-    min_shared: int = Field(15, ge=1, description="Landmarks that make a covisibility edge. [OS1]")
-    max_ba_keyframes: int = Field(60, ge=2, description="Free keyframes in local BA. [own]")
-    ba_iterations: int = Field(10, ge=1, description="Levenberg-Marquardt iterations at most.")
+    min_parallax_cosine: float = Field(
+        0.9998, gt=0, le=1, description="Cosine of the parallax, upper bound. [OS1 VI-C, customary]"
+    )
+    epipolar_distance: int = Field(
+        50,
+        ge=0,
+        le=256,
+        description="Descriptor distance, triangulation, bits. [OS1 VI-C, customary]",
+    )
+    fuse_distance: int = Field(
+        50, ge=0, le=256, description="Descriptor distance, fusion, bits. [OS1 VI-C, customary]"
+    )
+    fuse_window: float = Field(
+        3.0, gt=0, description="Search radius at octave 0, fusion, pixels. [OS1 VI-C, customary]"
+    )
+    min_found_ratio: float = Field(
+        0.25,
+        ge=0,
+        le=1,
+        description="Landmark culling: frames that find it over frames that should. "
+        "[OS1 VI-B, printed]",
+    )
+    redundant_ratio: float = Field(
+        0.9,
+        gt=0,
+        le=1,
+        description="Keyframe culling: share of redundant landmarks. [OS1 VI-E, printed]",
+    )
+    min_shared: int = Field(
+        15, ge=1, description="Shared landmarks of a covisibility edge. [OS1 III-D, printed]"
+    )
+    max_ba_keyframes: int = Field(
+        60, ge=2, description="Free keyframes of local bundle adjustment. [OS1 VI-D, own]"
+    )
+    ba_iterations: int = Field(
+        10,
+        ge=1,
+        description="Iterations of local bundle adjustment; half as many before. "
+        "[OS1 VI-D, customary]",
+    )
 
 
 class SiameseConfig(_Section):
     """Learned loop detectors. [ZS]: Zhou and Sun, Sci Rep 15, 7644 (2025)."""
 
-    threshold: float = Field(0.9, ge=0, le=1, description="Similarity of a loop. [ZS]")
+    threshold: float = Field(0.9, ge=0, le=1, description="Similarity of a loop. [ZS, printed]")
     max_candidates: int = Field(5, ge=1, description="Candidates of a query, best first. [own]")
-    recent_keyframes: int = Field(10, ge=0, description="Newest keyframes never asked. [own]")
+    recent_keyframes: int = Field(
+        10, ge=0, description="Newest keyframes that are no candidates. [own]"
+    )
     min_shared: int = Field(
-        15, ge=1, description="Landmarks shared with a better candidate: the same place. [OS1]"
+        15,
+        ge=1,
+        description="Shared landmarks that make two candidates one place. [OS1 III-D, printed]",
     )
     fit: Literal["squash", "crop"] = Field(
-        "squash", description="Whole view squashed into the network's input, or its middle. [own]"
+        "squash", description="Input: whole image squashed, or its middle cropped. [own]"
     )
 
 
 class VerificationConfig(_Section):
     """When a loop candidate is a revisit [OS1, VII-B; OS2, III-C]."""
 
-    match_distance: int = Field(50, ge=0, le=256, description="Descriptor search, bits. [OS1]")
-    match_ratio: float = Field(0.8, gt=0, le=1, description="Best over second best. [OS1]")
-    min_matches: int = Field(20, ge=3, description="Landmarks matched by descriptor. [OS1, VII-B]")
-    max_draws: int = Field(600, ge=1, description="RANSAC draws. [own]")
-    confidence: float = Field(0.99, gt=0, lt=1, description="That RANSAC missed nothing. [OS1]")
-    min_consensus: int = Field(15, ge=6, description="Inliers of RANSAC. [own]")
-    place_keyframes: int = Field(
-        10, ge=0, description="Covisible keyframes that make up a place with the match. [own]"
+    match_distance: int = Field(
+        50, ge=0, le=256, description="Descriptor distance, bits. [OS1 VII-B, customary]"
     )
-    first_window: float = Field(8.0, gt=0, description="Guided search, radius in pixels. [OS1]")
-    second_window: float = Field(4.0, gt=0, description="Its repetition, likewise. [own]")
-    guided_distance: int = Field(64, ge=0, le=256, description="Guided search, bits. [own]")
-    min_inliers: int = Field(40, ge=6, description="After guided search. [OS1, VII-B]")
+    match_ratio: float = Field(
+        0.8, gt=0, le=1, description="Best over second-best distance. [OS1 VII-B, own]"
+    )
+    min_matches: int = Field(
+        20, ge=3, description="Landmarks matched by descriptor. [OS1 VII-B, customary]"
+    )
+    max_draws: int = Field(600, ge=1, description="RANSAC draws, at most. [OS1 VII-B, own]")
+    confidence: float = Field(
+        0.99, gt=0, lt=1, description="Probability of one draw without outliers. [OS1 VII-B, own]"
+    )
+    min_consensus: int = Field(15, ge=6, description="Inliers of RANSAC. [OS1 VII-B, own]")
+    place_keyframes: int = Field(
+        10, ge=0, description="Covisible keyframes that form a place with the match. [own]"
+    )
+    first_window: float = Field(
+        8.0, gt=0, description="Guided search, radius at octave 0, pixels. [OS1 VII-B, own]"
+    )
+    second_window: float = Field(
+        4.0,
+        gt=0,
+        description="Guided search, radius of the second search, pixels. [OS1 VII-B, own]",
+    )
+    guided_distance: int = Field(
+        64, ge=0, le=256, description="Descriptor distance, guided search, bits. [OS1 VII-B, own]"
+    )
+    min_inliers: int = Field(
+        40, ge=6, description="Inliers after guided search. [OS1 VII-B, customary]"
+    )
     min_inlier_ratio: float = Field(
-        0.5, ge=0, le=1, description="Of the guided matches that fit one pose. [own]"
+        0.5, ge=0, le=1, description="Inliers over guided matches. [own]"
     )
     min_elsewhere: int = Field(
         15,
         ge=0,
-        description="Inliers outside the third of the image, as a strip, with the most. [own]",
+        description="Inliers outside the third of the image that has the most. [own]",
     )
-    min_cells: int = Field(
-        8, ge=1, description="Cells of a grid of 8 x 4 over the image that hold inliers. [own]"
-    )
+    min_cells: int = Field(8, ge=1, description="Cells with inliers, grid of 8 x 4. [own]")
     min_cell_ratio: float = Field(
-        0.3, ge=0, le=1, description="Of the cells where the place should appear. [own]"
+        0.3,
+        ge=0,
+        le=1,
+        description="Cells with inliers over cells where the place should appear. [own]",
     )
     min_seen_ratio: float = Field(
-        0.07, ge=0, le=1, description="Of a keyframe's landmarks that the other must see. [own]"
+        0.07, ge=0, le=1, description="Landmarks of one side that the other sees, share. [own]"
     )
-    max_distance: float = Field(15.0, gt=0, description="Between the two cameras, metres. [own]")
+    max_distance: float = Field(
+        15.0, gt=0, description="Distance between the two cameras, metres. [own]"
+    )
 
 
 class ConsistencyConfig(_Section):
     """What makes verified candidates a loop [OS1, VII-A]."""
 
     min_keyframes: int = Field(
-        2, ge=1, description="Keyframes in a row that a place must resemble; OS1 has 3. [own]"
+        2, ge=1, description="Keyframes in a row with this place; OS1: 3. [OS1 VII-A, own]"
     )
-    max_gap: int = Field(1, ge=0, description="Keyframes in between that may not. [own]")
+    max_gap: int = Field(
+        1, ge=0, description="Keyframes in between without it; OS1: 0. [OS1 VII-A, own]"
+    )
     min_shared: int = Field(
-        30, ge=1, description="Landmarks that make a keyframe part of a candidate's group. [own]"
+        30, ge=1, description="Shared landmarks that put a keyframe into a candidate's group. [own]"
     )
     min_verified: int = Field(2, ge=1, description="Verified keyframes that must agree. [own]")
-    verified_memory: int = Field(5, ge=1, description="Keyframes that a verified one counts. [own]")
-    max_apart: float = Field(0.5, gt=0, description="Of agreeing loops, metres. [own]")
-    max_turn: float = Field(1.0, gt=0, description="Of agreeing loops, degrees. [own]")
+    verified_memory: int = Field(
+        5, ge=1, description="Keyframes during which a verified loop counts. [own]"
+    )
+    max_apart: float = Field(
+        0.5, gt=0, description="Distance between agreeing loops, metres. [own]"
+    )
+    max_turn: float = Field(
+        1.0, gt=0, description="Rotation between agreeing loops, degrees. [own]"
+    )
 
 
 class RelocalizationConfig(_Section):
     """Finding a lost camera [OS1, V-C]."""
 
-    match_distance: int = Field(50, ge=0, le=256, description="Descriptor search, bits. [OS1]")
-    match_ratio: float = Field(0.75, gt=0, le=1, description="Best over second best. [OS1]")
-    min_matches: int = Field(15, ge=4, description="Landmarks matched by descriptor. [OS1]")
-    max_draws: int = Field(600, ge=1, description="RANSAC draws. [own]")
-    confidence: float = Field(0.99, gt=0, lt=1, description="That RANSAC missed nothing. [OS1]")
-    min_consensus: int = Field(10, ge=4, description="Inliers of RANSAC. [OS1]")
-    first_window: float = Field(8.0, gt=0, description="Projection search, pixels. [OS1]")
-    min_inliers: int = Field(50, ge=6, description="Of the frame once it is found. [OS1]")
-    min_elsewhere: int = Field(
-        15, ge=0, description="Of these, outside the third of the image with the most. [own]"
+    match_distance: int = Field(
+        50, ge=0, le=256, description="Descriptor distance, bits. [OS1 V-C, customary]"
     )
-    max_candidates: int = Field(5, ge=1, description="Places tried for each lost frame. [own]")
+    match_ratio: float = Field(
+        0.75, gt=0, le=1, description="Best over second-best distance. [OS1 V-C, customary]"
+    )
+    min_matches: int = Field(
+        15, ge=4, description="Landmarks matched by descriptor. [OS1 V-C, customary]"
+    )
+    max_draws: int = Field(600, ge=1, description="RANSAC draws, at most. [OS1 V-C, own]")
+    confidence: float = Field(
+        0.99,
+        gt=0,
+        lt=1,
+        description="Probability of one draw without outliers. [OS1 V-C, customary]",
+    )
+    min_consensus: int = Field(10, ge=4, description="Inliers of RANSAC. [OS1 V-C, customary]")
+    first_window: float = Field(
+        8.0, gt=0, description="Search radius at octave 0, first search, pixels. [OS1 V-C, own]"
+    )
+    min_inliers: int = Field(
+        50, ge=6, description="Inliers of a frame that is found. [OS1 V-C, customary]"
+    )
+    min_elsewhere: int = Field(
+        15, ge=0, description="Inliers outside the third of the image that has the most. [own]"
+    )
+    max_candidates: int = Field(5, ge=1, description="Places tried per lost frame. [own]")
     neighbours: int = Field(20, ge=1, description="Keyframes whose landmarks are searched. [own]")
 
 
@@ -246,37 +449,37 @@ class LoopConfig(_Section):
     """Closing a verified loop [OS1, VII]."""
 
     global_iterations: int = Field(
-        10, ge=1, description="Of global bundle adjustment, at most. [OS2]"
+        10, ge=1, description="Iterations of global bundle adjustment. [OS2 III-D, customary]"
     )
     observations_per_keyframe: int = Field(
         25000,
         ge=1,
-        description="Global bundle adjustment is merged after one keyframe for so many. [own]",
+        description="Observations per keyframe until global adjustment is merged. [own]",
     )
 
 
 class BowConfig(_Section):
     """Loop candidates by bag of words [OS1, III-E and VII-A]."""
 
-    min_shared: int = Field(15, ge=1, description="Landmarks that make neighbours. [OS1, III-D]")
+    min_shared: int = Field(
+        15, ge=1, description="Shared landmarks of neighbours. [OS1 III-D, printed]"
+    )
     exclude_recent: int = Field(
-        20, ge=1, description="The query and the keyframes before it, so many in all. [own]"
+        20, ge=1, description="Newest keyframes that are no candidates, query included. [own]"
     )
     common_words_ratio: float = Field(
-        0.8, ge=0, le=1, description="Of the most words that any keyframe shares. [OS1]"
+        0.8,
+        ge=0,
+        le=1,
+        description="Common words, share of the most of any keyframe. [OS1 III-E, customary]",
     )
     group_size: int = Field(
-        10, ge=0, description="Best covisible keyframes that add to a group's score. [OS1]"
+        10, ge=0, description="Best covisible keyframes in a group. [OS1 III-E, customary]"
     )
     group_score_ratio: float = Field(
-        0.75, ge=0, le=1, description="Of the best group's score. [OS1, III-E]"
+        0.75, ge=0, le=1, description="Group's score over the best group's. [OS1 III-E, printed]"
     )
-    max_groups: int = Field(
-        30, ge=1, description="Keyframes whose group is counted, best first: bounds work. [own]"
-    )
-    direct_level: int = Field(
-        2, ge=1, le=10, description="Level of the direct index, root 0: about k^2 nodes. [own]"
-    )
+    max_groups: int = Field(30, ge=1, description="Groups formed, best keyframe first. [own]")
 
 
 class PoseGraphConfig(_Section):
@@ -287,41 +490,58 @@ class PoseGraphConfig(_Section):
     """
 
     min_shared: int = Field(
-        100, ge=1, description="Landmarks that make a strong covisibility edge. [OS1, III-D]"
+        100,
+        ge=1,
+        description="Shared landmarks of a strong covisibility edge. [OS1 III-D, printed]",
     )
     min_shared_tree: int = Field(
-        15, ge=1, description="Below, a tree edge past a restart of tracking is weak. [OS1, III-D]"
+        15,
+        ge=1,
+        description="Shared landmarks; with fewer, a tree edge past a restart is weak. "
+        "[OS1 III-D, printed]",
     )
-    translation_drift: float = Field(0.03, gt=0, description="m per root of a metre. [own]")
-    rotation_drift: float = Field(0.001, gt=0, description="rad per root of a metre. [own]")
+    translation_drift: float = Field(
+        0.03, gt=0, description="Sigma of odometry, metres per root of a metre. [own]"
+    )
+    rotation_drift: float = Field(
+        0.001, gt=0, description="Sigma of odometry, radians per root of a metre. [own]"
+    )
     scale_drift: float = Field(
-        0.01, gt=0, description="Of a monocular map, logarithm per root of a unit. [own]"
+        0.01, gt=0, description="Sigma of monocular odometry, log scale per root of a unit. [own]"
     )
     min_length: float = Field(
-        0.3, gt=0, description="No edge is trusted as if it were shorter than this, m. [own]"
+        0.3, gt=0, description="Shortest length that an edge counts with, metres. [own]"
     )
-    loop_translation: float = Field(0.1, gt=0, description="Sigma of a verified loop, m. [own]")
-    loop_rotation: float = Field(0.005, gt=0, description="Sigma of a verified loop, rad. [own]")
-    loop_scale: float = Field(0.02, gt=0, description="Sigma of a verified loop, log. [own]")
-    weak_scale: float = Field(3.0, gt=0, description="Sigma where tracking was lost, log. [own]")
-    weak_translation: float = Field(
-        100.0, gt=0, description="Sigma where tracking was lost, m. [own]"
+    loop_translation: float = Field(
+        0.1, gt=0, description="Sigma of a verified loop, metres. [own]"
     )
-    weak_rotation: float = Field(1.0, gt=0, description="Sigma where tracking was lost, rad. [own]")
+    loop_rotation: float = Field(
+        0.005, gt=0, description="Sigma of a verified loop, radians. [own]"
+    )
+    loop_scale: float = Field(0.02, gt=0, description="Sigma of a verified loop, log scale. [own]")
+    weak_scale: float = Field(3.0, gt=0, description="Sigma of a weak edge, log scale. [own]")
+    weak_translation: float = Field(100.0, gt=0, description="Sigma of a weak edge, metres. [own]")
+    weak_rotation: float = Field(1.0, gt=0, description="Sigma of a weak edge, radians. [own]")
     gap_translation: float = Field(
-        0.5, gt=0, description="Where the camera drove on lost: of the way predicted. [own]"
+        0.5, gt=0, description="Sigma of a gap, share of the distance predicted. [own]"
     )
-    gap_speed: float = Field(2.0, gt=0, description="The same, at least, m per second. [own]")
-    gap_rotation: float = Field(0.3, gt=0, description="The same, rad per second. [own]")
-    gap_scale: float = Field(0.3, gt=0, description="The same, log: speeds change. [own]")
-    min_gap: float = Field(0.3, gt=0, description="No gap is taken for shorter, s. [own]")
-    robust_scale: float = Field(3.0, gt=0, description="Of the Cauchy loss on loops, sigmas. [own]")
-    iterations: int = Field(50, ge=1, description="Levenberg-Marquardt iterations at most.")
+    gap_speed: float = Field(
+        2.0, gt=0, description="Sigma of a gap, at least, metres per second. [own]"
+    )
+    gap_rotation: float = Field(0.3, gt=0, description="Sigma of a gap, radians per second. [own]")
+    gap_scale: float = Field(0.3, gt=0, description="Sigma of a gap, log scale. [own]")
+    min_gap: float = Field(
+        0.3, gt=0, description="Shortest time that a gap counts with, seconds. [own]"
+    )
+    robust_scale: float = Field(
+        3.0, gt=0, description="Scale of the Cauchy loss on loops, sigmas. [own]"
+    )
+    iterations: int = Field(50, ge=1, description="Levenberg-Marquardt iterations, at most. [own]")
     max_loop_error: float = Field(
-        30.0, gt=0, description="Chi-square of a loop beyond which it is contradicted. [own]"
+        30.0, gt=0, description="Chi-square of a loop, upper bound. [own]"
     )
     max_strain: float = Field(
-        60.0, gt=0, description="Chi-square of the drift that closing one loop may imply. [own]"
+        60.0, gt=0, description="Chi-square of all other edges per closed loop, upper bound. [own]"
     )
 
 

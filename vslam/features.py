@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +47,8 @@ class Features:
         )
 
 
-@dataclass(frozen=True)
-class FeatureGrid:
-    """Features by image cell: those of cell c are ``items[start[c]:start[c + 1]]``."""
+class FeatureGrid(NamedTuple):
+    """Features by image cell, row by row: those of cell c are ``items[start[c]:start[c + 1]]``."""
 
     start: NDArray[np.int64]
     items: NDArray[np.int32]

@@ -55,7 +55,7 @@ class LoopEdge:
 
 
 @dataclass(frozen=True)
-class Closure:
+class LoopCorrection:
     """What one closed loop did to the map.
 
     Attributes:

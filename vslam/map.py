@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from vslam.features import Features
 from vslam.geometry import compose, inverse, orthonormalised
-from vslam.observations import collect_landmarks, count_shared, detach_keyframe
+from vslam.map_kernels import collect_landmarks, count_shared, detach_keyframe
 
 NONE = -1
 
@@ -25,11 +25,12 @@ class Arrays(NamedTuple):
     """The map as kernels see it. K keyframes, L landmarks, R rows (capacities, not counts).
 
     Keyframes: ``T_cw`` (K, 4, 4) f8; ``first_row`` (K + 1,) i8; ``keyframe_alive`` (K,) bool.
-    Landmarks: ``xyz`` (L, 3) f8 world; ``normal`` (L, 3) f8 mean viewing direction; ``reach``
-    (L, 2) f8 least and greatest distance at which the pyramid sees it; ``landmark_descriptor``
-    (L, 4) u8; ``first_keyframe`` (L,) i4; ``visible``, ``found`` (L,) i4 frames that should, and
-    did, see it; ``landmark_alive`` (L,) bool; ``merged_into`` (L,) i4; ``head`` (L,) i4 first row
-    of its chain; ``n_observations`` (L,) i4, stereo ones counting twice (ORB-SLAM2).
+    Landmarks: ``xyz`` (L, 3) f8 world; ``normal`` (L, 3) f8 mean viewing direction;
+    ``distance_range`` (L, 2) f8 least and greatest distance at which the pyramid sees it;
+    ``landmark_descriptor`` (L, 4) u8; ``first_keyframe`` (L,) i4; ``visible``, ``found`` (L,) i4
+    frames that should, and did, see it; ``landmark_alive`` (L,) bool; ``merged_into`` (L,) i4;
+    ``head`` (L,) i4 first row of its chain; ``n_observations`` (L,) i4, stereo ones counting twice
+    (ORB-SLAM2).
     Rows: ``xy`` (R, 2) f4; ``u_right`` (R,) f4; ``octave`` (R,) u1; ``angle`` (R,) f4;
     ``descriptor`` (R, 4) u8; ``keyframe`` (R,) i4; ``landmark``, ``next_row`` (R,) i4.
     """
@@ -39,7 +40,7 @@ class Arrays(NamedTuple):
     keyframe_alive: NDArray[np.bool_]
     xyz: NDArray[np.float64]
     normal: NDArray[np.float64]
-    reach: NDArray[np.float64]
+    distance_range: NDArray[np.float64]
     landmark_descriptor: NDArray[np.uint64]
     first_keyframe: NDArray[np.int32]
     visible: NDArray[np.int32]
@@ -77,11 +78,12 @@ class Map:
         n_keyframes, n_landmarks, n_rows: how much of the capacity is in use, dead ones included.
         timestamps, frames, parents: of each keyframe: seconds, frame index, spanning-tree parent.
         T_c_parent: pose relative to the parent, set when a keyframe is culled.
-        rescaled: of each keyframe: units of the map around it that were one when it was added. 1 in
-            metric maps; loops of monocular ones change it.
+        unit_scale: of each keyframe: units of the map around it that were one when it was
+            added. 1 in metric maps; loops of monocular ones change it.
         restarts: keyframes at which mapping began anew after the camera was lost, in order; each
             is the root of a sub-map, its pose relative to its parent only a prediction.
-        guesses: those of them whose pose is not even that: how fast the camera went was not known.
+        unpredicted_restarts: those of them whose pose is not even that, since the speed of the
+            camera was not known.
     """
 
     def __init__(self, scales: NDArray[np.float64]) -> None:
@@ -94,9 +96,9 @@ class Map:
         self.frames: list[int] = []
         self.parents: list[int] = []
         self.T_c_parent: dict[int, NDArray[np.float64]] = {}
-        self.rescaled: list[float] = []
+        self.unit_scale: list[float] = []
         self.restarts: list[int] = []
-        self.guesses: list[int] = []
+        self.unpredicted_restarts: list[int] = []
         k, n, r = 64, 8192, 65536
         self.arrays = Arrays(
             T_cw=np.zeros((k, 4, 4)),
@@ -104,7 +106,7 @@ class Map:
             keyframe_alive=np.zeros(k, np.bool_),
             xyz=np.zeros((n, 3)),
             normal=np.zeros((n, 3)),
-            reach=np.zeros((n, 2)),
+            distance_range=np.zeros((n, 2)),
             landmark_descriptor=np.zeros((n, 4), np.uint64),
             first_keyframe=np.zeros(n, np.int32),
             visible=np.zeros(n, np.int32),
@@ -155,7 +157,7 @@ class Map:
         self.timestamps.append(timestamp)
         self.frames.append(frame)
         self.parents.append(NONE)
-        self.rescaled.append(1.0)
+        self.unit_scale.append(1.0)
         self.n_rows += n
         self.n_keyframes += 1
         return k
@@ -221,6 +223,14 @@ class Map:
         detach_keyframe(a, keyframe)
         a.keyframe_alive[keyframe] = False
 
+    def begin_submap(self, keyframe: int, parent: int, *, predicted: bool) -> None:
+        """Note that mapping began anew at a keyframe; its pose relative to the parent is a
+        prediction, or not even that."""
+        self.parents[keyframe] = parent
+        self.restarts.append(keyframe)
+        if not predicted:
+            self.unpredicted_restarts.append(keyframe)
+
     def submaps(self) -> NDArray[np.int64]:
         """``(n_keyframes,)`` the sub-map of each keyframe, by the keyframe at which it began."""
         root = np.zeros(self.n_keyframes, np.int64)
@@ -241,13 +251,14 @@ class Map:
 class LocalMap(NamedTuple):
     """A copy of the landmarks around a keyframe, so that tracking can go on while mapping writes.
 
-    ``ids`` (N,) i4; ``xyz``, ``normal`` (N, 3) f8; ``reach`` (N, 2) f8; ``descriptor`` (N, 4) u8.
+    ``ids`` (N,) i4; ``xyz``, ``normal`` (N, 3) f8; ``distance_range`` (N, 2) f8; ``descriptor``
+    (N, 4) u8.
     """
 
     ids: NDArray[np.int32]
     xyz: NDArray[np.float64]
     normal: NDArray[np.float64]
-    reach: NDArray[np.float64]
+    distance_range: NDArray[np.float64]
     descriptor: NDArray[np.uint64]
 
 
@@ -263,4 +274,6 @@ def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
     chosen = [keyframe, *first[: limit - 1].tolist()]
     a = map_.arrays
     ids = collect_landmarks(a, np.array(chosen, np.int64), map_.n_landmarks)
-    return LocalMap(ids, a.xyz[ids], a.normal[ids], a.reach[ids], a.landmark_descriptor[ids])
+    return LocalMap(
+        ids, a.xyz[ids], a.normal[ids], a.distance_range[ids], a.landmark_descriptor[ids]
+    )

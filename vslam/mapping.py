@@ -17,31 +17,28 @@ from numpy.typing import NDArray
 from vslam.backend.local_mapping import map_keyframe, refresh_keyframe
 from vslam.backend.triangulation import map_stereo_points
 from vslam.backend.two_views import map_two_views
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.closing import LoopClosing
 from vslam.config import Config
-from vslam.features import Features
+from vslam.frontend.tracking import Frame
+from vslam.geometry import Matrix
 from vslam.map import LocalMap, Map, local_map
-from vslam.monocular import FirstView, Start
-from vslam.observations import count_seen_by, link_many, resolve
-
-Matrix = NDArray[np.float64]
+from vslam.map_kernels import count_seen_by, link_many, resolve
+from vslam.monocular import TwoViewStart
 
 
-class DeferredMapping:
-    """The map, and what tracking may see of it.
+class MappingThread:
+    """The map, and what tracking may see of it while a keyframe is being mapped.
 
     Attributes:
-        map: read it only while ``busy`` is False.
-        busy: a keyframe is being mapped.
-        reference: the last keyframe.
+        reference: the keyframe that frames are tracked and placed by, the last one as a rule.
+        n_keyframes: keyframes made, culled ones included.
+        last_frame, last_timestamp: index and seconds of the frame that became the last keyframe.
         local: landmarks around the reference keyframe, as of the last merge.
         reference_view: landmarks of the reference keyframe alone.
         n_reference: of these, those that at least three keyframes see (all in a young map).
     """
 
-    map: Map
-    reference: int
     local: LocalMap
     reference_view: LocalMap
     n_reference: int
@@ -49,96 +46,101 @@ class DeferredMapping:
     def __init__(
         self,
         scales: NDArray[np.float64],
-        camera: StereoCamera,
+        camera: Camera,
         config: Config,
         closing: LoopClosing,
         *,
         threads: int,
     ) -> None:
-        self.map = Map(scales)
         self.reference = 0
+        self.n_keyframes = 0
+        self.last_frame = -1
+        self.last_timestamp = -np.inf
+        self._map = Map(scales)
         self._camera = camera
         self._config = config
         self._closing = closing
         self._executor = ThreadPoolExecutor(1, "mapping") if threads > 1 else None
         self._pending: Callable[[], None] | None = None
         self._T_reference = np.eye(4)
-        self._rescaled_reference = 1.0
+        self._reference_unit_scale = 1.0
         self._visible: list[NDArray[np.int32]] = []
         self._found: list[NDArray[np.int32]] = []
 
     @property
     def busy(self) -> bool:
+        """Whether a keyframe is being mapped."""
         return self._pending is not None
 
-    def insert(
-        self,
-        features: Features,
-        landmark: NDArray[np.int32],
-        T_cw: Matrix,
-        timestamp: float,
-        frame: int,
-        image: NDArray[np.uint8] | None = None,
-    ) -> tuple[NDArray[np.int32], Matrix]:
-        """Add a keyframe, map its stereo points and start its local mapping. Merge first.
+    @property
+    def map(self) -> Map:
+        """The map.
+
+        Raises:
+            RuntimeError: a keyframe is being mapped, so that another thread may be writing.
+        """
+        if self.busy:
+            raise RuntimeError("a keyframe is being mapped: merge before reading the map")
+        return self._map
+
+    def insert(self, frame: Frame, *, predicted: bool = True) -> None:
+        """Make a frame a keyframe, map its stereo points and start its local mapping. Merge first.
+
+        The frame's landmarks become those that its features observe now, new ones included. A
+        frame that shares none with the map is the root of a sub-map.
 
         Args:
-            landmark: ``(N,)`` landmark that each feature tracks, or -1.
-            image: the left image, for loop detectors that look at it.
-
-        Returns:
-            The landmarks that its features observe now, new ones included, and where they are, as
-            ``current`` gives them.
+            predicted: whether the pose of such a root is at least a prediction.
         """
         self._write_counts()
-        map_ = self.map
-        keyframe = map_.add_keyframe(features, T_cw, timestamp, frame)
-        tracked = np.flatnonzero(landmark >= 0)
-        link_many(map_.arrays, map_.rows(keyframe).start + tracked, landmark[tracked])
+        map_ = self._map
+        keyframe = map_.add_keyframe(frame.features, frame.T_cw, frame.timestamp, frame.index)
+        tracked = np.flatnonzero(frame.landmark >= 0)
+        link_many(map_.arrays, map_.rows(keyframe).start + tracked, frame.landmark[tracked])
         if keyframe > 0:
             neighbours, _ = map_.covisible(keyframe)
-            map_.parents[keyframe] = int(neighbours[0]) if len(neighbours) else self.reference
-            if len(neighbours) == 0:
-                map_.restarts.append(keyframe)
+            if len(neighbours):
+                map_.parents[keyframe] = int(neighbours[0])
+            else:
+                map_.begin_submap(keyframe, self.reference, predicted=predicted)
         map_stereo_points(map_, keyframe, self._camera, self._config)
         refresh_keyframe(map_, keyframe)
-        self.reference = keyframe
-        self._copy_view()
+        self._set_newest(keyframe, frame)
         # The map is the thread's from here on.
-        observed = self.current(map_.arrays.landmark[map_.rows(keyframe)])
+        self._observe(frame, keyframe)
         if keyframe > 0:
-            self._pending = self._start(keyframe, features, image)
+            self._pending = self._start(keyframe, frame)
         else:
-            self._closing.process(map_, keyframe, features, image)
-        return observed
+            self._closing.process(map_, keyframe, frame.features, frame.image)
 
-    def begin(self, start: Start, second: FirstView) -> tuple[NDArray[np.int32], Matrix]:
+    def begin(self, start: TwoViewStart) -> tuple[int, int]:
         """Add the first two keyframes of a monocular map or sub-map. Merge first.
 
+        The second frame's landmarks become those that its features observe.
+
         Returns:
-            The landmarks that the second view's features observe, and where they are.
+            The keyframes that the two frames are.
         """
         self._write_counts()
-        map_, views = self.map, (start.first, second)
+        map_, views = self._map, (start.first, start.second)
         one, two = map_two_views(
             map_,
-            (views[0].frame.features, views[1].frame.features),
+            (start.first.features, start.second.features),
             start.features,
-            start.first.frame.T_cw,
+            start.first.T_cw,
             start.T_2_1,
             start.points,
-            (views[0].timestamp, views[1].timestamp),
-            (views[0].index, views[1].index),
+            (start.first.timestamp, start.second.timestamp),
+            (start.first.index, start.second.index),
         )
         if one > 0:
-            map_.parents[one] = self.reference
-            map_.restarts.append(one)
+            map_.begin_submap(one, self.reference, predicted=start.predicted)
         map_.parents[two] = one
         for keyframe, view in zip((one, two), views, strict=True):
-            self._closing.process(map_, keyframe, view.frame.features, view.image)
-        self.reference = two
-        self._copy_view()
-        return self.current(map_.arrays.landmark[map_.rows(two)])
+            self._closing.process(map_, keyframe, view.features, view.image)
+        self._set_newest(two, start.second)
+        self._observe(start.second, two)
+        return one, two
 
     def merge(self) -> bool:
         """Wait for the pending mapping and show its result; returns whether there was one."""
@@ -153,8 +155,8 @@ class DeferredMapping:
     def finish(self) -> None:
         """Complete all that is pending, global bundle adjustment included."""
         self.merge()
-        self._closing.finish(self.map)
-        if self.map.n_keyframes:
+        self._closing.finish(self._map)
+        if self.n_keyframes:
             self._copy_view()
 
     def count(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
@@ -165,54 +167,60 @@ class DeferredMapping:
     def keyframe_pose(self, keyframe: int) -> Matrix:
         """``T_cw``; while a keyframe is being mapped, only that of the reference keyframe, as it
         was inserted."""
-        if self.busy:
-            if keyframe != self.reference:
-                raise RuntimeError("a keyframe is being mapped: merge before reading other poses")
+        if self.busy and keyframe == self.reference:
             return self._T_reference
         return self.map.keyframe_pose(keyframe)
 
-    def rescaled(self, keyframe: int) -> float:
-        """``Map.rescaled`` of a keyframe; while one is being mapped, of the reference only."""
-        if self.busy:
-            if keyframe != self.reference:
-                raise RuntimeError("a keyframe is being mapped: merge before reading its scale")
-            return self._rescaled_reference
-        return self.map.rescaled[keyframe]
+    def unit_scale(self, keyframe: int) -> float:
+        """``Map.unit_scale`` of a keyframe; while one is being mapped, of the reference only."""
+        if self.busy and keyframe == self.reference:
+            return self._reference_unit_scale
+        return self.map.unit_scale[keyframe]
 
-    def current(self, landmark: NDArray[np.int32]) -> tuple[NDArray[np.int32], Matrix]:
-        """What ``(N,)`` landmark ids stand for after a merge, and where that is: ``(N,)`` ids and
-        ``(N, 3)`` points, -1 and NaN for landmarks that are gone.
+    def update(self, frame: Frame) -> None:
+        """Bring a frame's landmarks up to what they stand for after a merge, and where that is:
+        -1 and NaN for those that are gone.
 
         Two landmarks may have become one: the first feature keeps it.
         """
-        ids = resolve(self.map.arrays, landmark)
+        arrays = self.map.arrays
+        ids = resolve(arrays, frame.landmark)
         _, first = np.unique(ids, return_index=True)
         repeated = np.ones(len(ids), np.bool_)
         repeated[first] = False
         ids[repeated] = -1
-        xyz = np.where((ids >= 0)[:, None], self.map.arrays.xyz[ids], np.nan)
-        return ids, xyz
+        frame.landmark = ids
+        frame.xyz = np.where((ids >= 0)[:, None], arrays.xyz[ids], np.nan)
+
+    def set_reference(self, keyframe: int) -> None:
+        """Make another keyframe the reference, and show tracking what is around it."""
+        self.reference = keyframe
+        self._copy_view()
+
+    def _observe(self, frame: Frame, keyframe: int) -> None:
+        frame.landmark = self._map.arrays.landmark[self._map.rows(keyframe)]
+        self.update(frame)
+
+    def _set_newest(self, keyframe: int, frame: Frame) -> None:
+        self.n_keyframes = keyframe + 1
+        self.last_frame, self.last_timestamp = frame.index, frame.timestamp
+        self.set_reference(keyframe)
 
     def _write_counts(self) -> None:
         for seen, counter in (
-            (self._visible, self.map.arrays.visible),
-            (self._found, self.map.arrays.found),
+            (self._visible, self._map.arrays.visible),
+            (self._found, self._map.arrays.found),
         ):
             for ids in seen:
                 counter[ids] += 1
             seen.clear()
 
-    def look_at(self, keyframe: int) -> None:
-        """Make another keyframe the reference, and show tracking what is around it."""
-        self.reference = keyframe
-        self._copy_view()
+    def _start(self, keyframe: int, frame: Frame) -> Callable[[], None]:
+        features, image = frame.features, frame.image
 
-    def _start(
-        self, keyframe: int, features: Features, image: NDArray[np.uint8] | None
-    ) -> Callable[[], None]:
         def work() -> None:
-            map_keyframe(self.map, keyframe, self._camera, self._config)
-            self._closing.process(self.map, keyframe, features, image)
+            map_keyframe(self._map, keyframe, self._camera, self._config)
+            self._closing.process(self._map, keyframe, features, image)
 
         if self._executor is None:
             return work
@@ -220,13 +228,14 @@ class DeferredMapping:
         return future.result
 
     def _copy_view(self) -> None:
-        self.local = local_map(self.map, self.reference, self._config.tracking.local_keyframes)
-        self.reference_view = local_map(self.map, self.reference, 1)
-        living = self.map.living_keyframes()
-        if self._camera.monocular and self.map.restarts:
+        map_, reference = self._map, self.reference
+        self.local = local_map(map_, reference, self._config.tracking.local_keyframes)
+        self.reference_view = local_map(map_, reference, 1)
+        living = map_.living_keyframes()
+        if self._camera.monocular and map_.restarts:
             # A sub-map is young once more: without stereo nothing but this tells when to go on.
-            living = living[living >= self.map.restarts[-1]]
+            living = living[living >= map_.restarts[-1]]
         needed = min(3, len(living))
-        self.n_reference = count_seen_by(self.map.arrays, self.reference, needed)
-        self._T_reference = self.map.keyframe_pose(self.reference)
-        self._rescaled_reference = self.map.rescaled[self.reference]
+        self.n_reference = count_seen_by(map_.arrays, reference, needed)
+        self._T_reference = map_.keyframe_pose(reference)
+        self._reference_unit_scale = map_.unit_scale[reference]

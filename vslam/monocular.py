@@ -9,85 +9,87 @@ from numpy.typing import NDArray
 
 from vslam.backend.two_views import adjust_two_views
 from vslam.frontend.initialization import match_views, reconstruct
-from vslam.frontend.tracking import Frame, Tracker
-
-Matrix = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class FirstView:
-    """A frame that a map may begin with.
-
-    Attributes:
-        frame: with its features, and the pose that the map is to begin at.
-        timestamp: seconds.
-        index: number of the frame in the run.
-        image: the left image, for loop detectors that look at it.
-    """
-
-    frame: Frame
-    timestamp: float
-    index: int
-    image: NDArray[np.uint8] | None
+from vslam.frontend.tracking import Frame, TrackingContext
+from vslam.geometry import Matrix, se3_log
 
 
 @dataclass(frozen=True)
-class Start:
-    """Two views that make a map.
+class TwoViewStart:
+    """Two frames that make a map.
 
     Attributes:
-        first: the earlier one; the later one is the frame in hand.
+        first, second: the frames; the first has the pose that the map is to begin at.
         T_2_1: ``(4, 4)`` motion from the first to the second.
         features: ``(N,)`` int64 features of both that see the same point.
         points: ``(N, 3)`` in the first camera.
+        predicted: whether the unit follows from the speed of the camera before.
     """
 
-    first: FirstView
+    first: Frame
+    second: Frame
     T_2_1: Matrix
     features: tuple[NDArray[np.int64], NDArray[np.int64]]
     points: Matrix
+    predicted: bool = False
 
-    def scaled(self, factor: float) -> Start:
-        """The same views in another unit."""
+    @property
+    def velocity(self) -> Matrix:
+        """``(6,)`` twist per second from the first frame to the second."""
+        return se3_log(self.T_2_1) / (self.second.timestamp - self.first.timestamp)
+
+    def at_speed(self, velocity: Matrix | None, max_rescaling: float) -> TwoViewStart:
+        """The start of a sub-map in the unit of the map before it, as far as anything tells: the
+        camera drives on as fast as it did.
+
+        Args:
+            velocity: ``(6,)`` twist per second before, None if unknown.
+            max_rescaling: beyond this factor the speed tells nothing.
+        """
+        if velocity is None:
+            return self
+        moved = np.linalg.norm(velocity[:3]) * (self.second.timestamp - self.first.timestamp)
+        factor = float(moved / np.linalg.norm(self.T_2_1[:3, 3]))
+        if not 1.0 / max_rescaling < factor < max_rescaling:
+            return self
         T_2_1 = self.T_2_1.copy()
         T_2_1[:3, 3] *= factor
-        return replace(self, T_2_1=T_2_1, points=factor * self.points)
+        return replace(self, T_2_1=T_2_1, points=factor * self.points, predicted=True)
 
 
 class Initialiser:
     """Looks for two views that make a map, one frame after the other."""
 
-    def __init__(self, tracker: Tracker) -> None:
-        self._tracker = tracker
-        self._first: FirstView | None = None
+    def __init__(self, context: TrackingContext) -> None:
+        self._context = context
+        self._first: Frame | None = None
 
     def reset(self) -> None:
         """Forget the frame kept."""
         self._first = None
 
-    def offer(self, view: FirstView) -> Start | None:
+    def offer(self, frame: Frame) -> TwoViewStart | None:
         """Try a frame with the one kept; where they have too little in common, keep this one."""
-        config = self._tracker.config.initialization
-        if self._first is None or view.timestamp - self._first.timestamp > config.max_seconds:
-            self._keep(view)
+        config = self._context.config.initialization
+        if self._first is None or frame.timestamp - self._first.timestamp > config.max_seconds:
+            self._keep(frame)
             return None
-        features = match_views(self._first.frame, view.frame, self._tracker)
+        features = match_views(self._first, frame, self._context)
         if len(features[0]) < config.min_matches:
-            self._keep(view)
+            self._keep(frame)
             return None
-        return self._pair(self._first, view, features)
+        return self._pair(self._first, frame, features)
 
-    def _keep(self, view: FirstView) -> None:
-        enough = len(view.frame.features) >= self._tracker.config.initialization.min_features
-        self._first = view if enough else None
+    def _keep(self, frame: Frame) -> None:
+        enough = len(frame.features) >= self._context.config.initialization.min_features
+        self._first = frame if enough else None
 
     def _pair(
-        self, first: FirstView, second: FirstView, features: tuple[NDArray, NDArray]
-    ) -> Start | None:
-        config, camera = self._tracker.config.initialization, self._tracker.camera
-        of_1, of_2 = first.frame.features, second.frame.features
+        self, first: Frame, second: Frame, features: tuple[NDArray, NDArray]
+    ) -> TwoViewStart | None:
+        config, camera = self._context.config.initialization, self._context.camera
+        of_1, of_2 = first.features, second.features
         xy_1, xy_2 = of_1.xy[features[0]].astype(float), of_2.xy[features[1]].astype(float)
-        sigma = self._tracker.scales[of_1.octave[features[0]]]
+        sigma = self._context.scales[of_1.octave[features[0]]]
         found = reconstruct(xy_1, xy_2, sigma, camera, config, seed=second.index)
         if found is None:
             return None
@@ -103,4 +105,5 @@ class Initialiser:
         if np.count_nonzero(kept) < config.min_landmarks:
             return None
         match = match[kept]
-        return Start(first, T_2_1, (features[0][match], features[1][match]), points[kept])
+        features = features[0][match], features[1][match]
+        return TwoViewStart(first, second, T_2_1, features, points[kept])

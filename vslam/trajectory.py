@@ -56,13 +56,16 @@ def bridge_gaps(trajectory: Trajectory, known: NDArray[np.bool_]) -> Trajectory:
     return Trajectory(times, T_wc)
 
 
-def read_table(path: Path, columns: tuple[int, ...], what: str) -> NDArray[np.float64]:
+def read_table(
+    path: Path, columns: tuple[int, ...], what: str, max_rows: int | None = None
+) -> NDArray[np.float64]:
     """Read a text file of numbers; blank lines and lines that begin with ``#`` are passed over.
 
     Args:
         path: file to read.
         columns: the numbers of columns allowed; all lines must agree.
         what: what a line holds, for the error messages ("a pose").
+        max_rows: read and check no more than so many.
 
     Returns:
         ``(N, C)`` float64 with N >= 1, all finite.
@@ -100,18 +103,20 @@ def read_table(path: Path, columns: tuple[int, ...], what: str) -> NDArray[np.fl
                 f"{where} holds NaN or infinity; repair the line or download the file again."
             )
         rows.append(row)
+        if len(rows) == max_rows:
+            break
     if not rows:
         raise InputError(f"{path}: the file is empty; it must have {what} on each line.")
     return np.array(rows)
 
 
 def trajectory_format(path: Path) -> Literal["kitti", "tum"]:
-    """Tell the two formats apart by the number of columns.
+    """Tell the two formats apart by the number of columns of the first pose.
 
     Raises:
         InputError: as :func:`read_table`.
     """
-    return _FORMAT_OF_COLUMNS[read_table(path, (12, 8), "a pose").shape[1]]
+    return _FORMAT_OF_COLUMNS[read_table(path, (12, 8), "a pose", max_rows=1).shape[1]]
 
 
 def read_kitti_poses(path: Path) -> NDArray[np.float64]:

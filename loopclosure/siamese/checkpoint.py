@@ -17,7 +17,7 @@ CHECKPOINT = "checkpoint.pt"
 
 
 @dataclass
-class Progress:
+class TrainingProgress:
     """Where a training stands: what a checkpoint holds beside weights and moments."""
 
     epoch: int = 0
@@ -35,7 +35,7 @@ def save_checkpoint(
     settings: TrainSettings,
     network: SiameseNetwork,
     optimiser: torch.optim.Optimizer,
-    progress: Progress,
+    progress: TrainingProgress,
     pairs: Pairs | None,
 ) -> None:
     """Write everything that a killed training goes on from.
@@ -67,7 +67,7 @@ def load_checkpoint(
     settings: TrainSettings,
     network: SiameseNetwork,
     optimiser: torch.optim.Optimizer,
-) -> tuple[Progress, Pairs | None]:
+) -> tuple[TrainingProgress, Pairs | None]:
     """Read one into the network and the optimiser; the pairs are those of the epoch under way.
 
     Raises:
@@ -97,4 +97,4 @@ def load_checkpoint(
         ) from error
     stored = content["pairs"]
     pairs = None if stored is None else Pairs(*(x.numpy() for x in stored))
-    return Progress(**content["progress"]), pairs
+    return TrainingProgress(**content["progress"]), pairs

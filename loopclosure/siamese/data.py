@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError, ResultsError
+from vslam.loopclosure.siamese.image_sources import DIFFERENT, SAME, UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.images import Fit, Size
-from vslam.loopclosure.siamese.places import DIFFERENT, SAME, UNKNOWN, Places
 
 # Frames of each sequence that training may use; the others are what loop detectors are tested on.
 TRAINING_FRAMES = {"kitti00": (250, 1500)}
@@ -57,7 +57,7 @@ class Pairs:
         return len(self.a)
 
 
-def refuse_test_data(sources: Sequence[Places]) -> None:
+def refuse_test_data(sources: list[ImageSource]) -> None:
     """No trajectory is both learned from and tested on.
 
     Raises:
@@ -80,7 +80,7 @@ def refuse_test_data(sources: Sequence[Places]) -> None:
             )
 
 
-def load(sources: Sequence[Places], size: Size, fit: Fit, threads: int = 2) -> Collection:
+def load(sources: list[ImageSource], size: Size, fit: Fit, threads: int = 2) -> Collection:
     """Decode all images of all sources into memory (51 kB an image at 227 pixels).
 
     Raises:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from typing import cast
 
 import torch
@@ -95,7 +95,7 @@ class LightExtractor(nn.Sequential):
         out_channels: of the grid.
     """
 
-    def __init__(self, blocks: Sequence[Block] = LIGHT_BLOCKS) -> None:
+    def __init__(self, blocks: Collection[Block] = LIGHT_BLOCKS) -> None:
         stem, *rest = blocks
         layers: list[nn.Module] = [Stem(stem[0], stem[1])]
         inputs = stem[0]
@@ -106,7 +106,7 @@ class LightExtractor(nn.Sequential):
         self.out_channels = inputs
 
 
-def grid_side(pixels: int, blocks: Sequence[Block] = LIGHT_BLOCKS) -> int:
+def grid_side(pixels: int, blocks: Collection[Block] = LIGHT_BLOCKS) -> int:
     """Places along a side of the grid for so many pixels of the image."""
     for _, stride, _ in blocks:
         pixels = (pixels - 1) // stride + 1

@@ -12,8 +12,8 @@ from torch.nn import functional
 from vslam.loopclosure.benchmark import balanced_accuracy, summary
 from vslam.loopclosure.siamese.augmentation import Augmentation, augment
 from vslam.loopclosure.siamese.data import Collection
+from vslam.loopclosure.siamese.image_sources import DIFFERENT, SAME, UNKNOWN
 from vslam.loopclosure.siamese.images import to_tensor
-from vslam.loopclosure.siamese.places import DIFFERENT, SAME, UNKNOWN
 from vslam.loopclosure.siamese.siamese import DistanceHead, SiameseNetwork
 
 _MOST_SAME = 5  # images of its place that a validation image asks for

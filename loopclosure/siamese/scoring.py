@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +43,7 @@ class NetworkScorer:
         with one_thread():
             return score_matrix(self._network, queries, gallery, _CPU).astype(np.float64)
 
-    def embed(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+    def embed(self, images: Collection[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """Descriptors ``(N, D)`` of images ``(H, W)``."""
         small = [to_size(image, self._network.size, self._fit) for image in images]
         with one_thread():

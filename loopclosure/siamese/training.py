@@ -26,7 +26,7 @@ from vslam.errors import InputError, ResultsError
 from vslam.loopclosure.siamese.augmentation import augment
 from vslam.loopclosure.siamese.checkpoint import (
     CHECKPOINT,
-    Progress,
+    TrainingProgress,
     load_checkpoint,
     save_checkpoint,
 )
@@ -66,7 +66,7 @@ _HEAD_RATE = 30.0  # a and b are logarithms of single numbers: Adam's steps are 
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrainingOutcome:
     """What a training came to.
 
     Attributes:
@@ -79,7 +79,7 @@ class Outcome:
 
     finished: bool
     figures: dict[str, float]
-    progress: Progress
+    progress: TrainingProgress
     weights: Path
     train: NDArray[np.int64]
     validation: NDArray[np.int64]
@@ -96,7 +96,7 @@ def train(
     start: SiameseNetwork | None = None,
     on_step: OnStep | None = None,
     should_stop: Callable[[], bool] | None = None,
-) -> Outcome:
+) -> TrainingOutcome:
     """Train a network and write it, its log, its lists of pairs and checkpoints to a folder.
 
     Args:
@@ -127,7 +127,7 @@ def train(
     network = (start or build_network(settings.network, settings.shape)).to(where)
     before = copy.deepcopy(network.state_dict()) if settings.learned_share < 1 else None
     optimiser = _optimiser(network, settings)
-    progress, pairs = Progress(), None
+    progress, pairs = TrainingProgress(), None
     steps = max(1, settings.pairs // settings.batch)
     weights = folder / f"{settings.network}.safetensors"
     if resume and (folder / CHECKPOINT).exists():
@@ -171,7 +171,7 @@ def train(
                         folder / CHECKPOINT, settings, network, optimiser, progress, pairs
                     )
                 if stop:
-                    return Outcome(False, {}, progress, weights, train_images, validation)
+                    return TrainingOutcome(False, {}, progress, weights, train_images, validation)
             _end_epoch(network, collection, validation, settings, progress, weights, steps, where)
             progress.seconds += time.monotonic() - began
             progress.history[-1]["seconds"] = progress.seconds
@@ -188,7 +188,7 @@ def train(
     calibrate(best, score, same)
     figures = validate(best, collection, validation, settings.augmentation, where)[0]
     save_network(best, weights, {**about, "validation": figures})
-    return Outcome(True, figures, progress, weights, train_images, validation)
+    return TrainingOutcome(True, figures, progress, weights, train_images, validation)
 
 
 def _step(
@@ -198,7 +198,7 @@ def _step(
     pairs: Pairs,
     batch: slice,
     settings: TrainSettings,
-    progress: Progress,
+    progress: TrainingProgress,
     steps: int,
     pool: ThreadPoolExecutor,
     device: torch.device,
@@ -257,7 +257,7 @@ def _pairs_of_epoch(
     images: NDArray[np.int64],
     settings: TrainSettings,
     network: SiameseNetwork,
-    progress: Progress,
+    progress: TrainingProgress,
     device: torch.device,
 ) -> Pairs:
     rng = np.random.default_rng([settings.seed, 4, progress.epoch])
@@ -279,7 +279,7 @@ def _end_epoch(
     collection: Collection,
     validation: NDArray[np.int64],
     settings: TrainSettings,
-    progress: Progress,
+    progress: TrainingProgress,
     weights: Path,
     steps: int,
     device: torch.device,

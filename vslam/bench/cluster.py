@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Generator, Sequence
+from collections.abc import Collection, Generator
 from contextlib import suppress
 from pathlib import Path
 
-from vslam.bench.execute import Failed, Outcome, RunOptions, publish, run_cell
+from vslam.bench.execute import CellOutcome, Failed, RunOptions, publish, run_cell
 from vslam.bench.grid import Cell
 from vslam.errors import InputError
 
@@ -21,8 +21,8 @@ _ASK_S = 2.0  # each question whether to stop goes to the scheduler
 
 
 def run_on_cluster(
-    cells: Sequence[Cell], options: RunOptions, scheduler: str, out: Path
-) -> Generator[Outcome, None, None]:
+    cells: Collection[Cell], options: RunOptions, scheduler: str, out: Path
+) -> Generator[CellOutcome, None, None]:
     """Run cells on the workers of a scheduler, publish each here and yield it as it arrives.
 
     A worker takes as many cells at a time as it has threads. Leaving the iteration stops them.
@@ -60,7 +60,7 @@ def run_on_cluster(
         client.close()
 
 
-def _run_on_worker(cell: Cell, options: RunOptions, stop: str) -> Outcome:
+def _run_on_worker(cell: Cell, options: RunOptions, stop: str) -> CellOutcome:
     """Run a cell where this is called, until the benchmark sets the event ``stop``."""
     from distributed import Event
 

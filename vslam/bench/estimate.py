@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +28,7 @@ class Estimate:
 
 
 def estimate(
-    missing: Sequence[Cell],
+    missing: Collection[Cell],
     finished: Mapping[Cell, ReportJson],
     frames: Mapping[str, int],
     jobs: int,
@@ -89,5 +89,5 @@ def size(n_bytes: float) -> str:
     return f"{n_bytes / 1e6:.0f} MB" if n_bytes < 1e9 else f"{n_bytes / 1e9:.1f} GB"
 
 
-def _mean(values: Sequence[float], otherwise: float) -> float:
+def _mean(values: Collection[float], otherwise: float) -> float:
     return sum(values) / len(values) if values else otherwise

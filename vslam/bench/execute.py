@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Collection, Generator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass
@@ -65,12 +65,12 @@ class Failed:
     log: str = ""
 
 
-Outcome = Finished | Failed
+CellOutcome = Finished | Failed
 
 
 def run_cell(
     cell: Cell, options: RunOptions, stopped: Callable[[], bool] = lambda: False
-) -> Outcome:
+) -> CellOutcome:
     """Run one cell and bring back its files; nothing stays on this machine.
 
     Args:
@@ -81,7 +81,7 @@ def run_cell(
     with tempfile.TemporaryDirectory(prefix=f"{cell.name}.", dir=options.scratch) as name:
         work = Path(name)
         (work / "config.json").write_text(options.config)
-        command = list(options.command or (sys.executable, "-m", "vslam.bench.child"))
+        command = list(options.command or (sys.executable, "-m", "vslam.cli.child"))
         command += ["run", *cell.arguments(), "--threads", str(options.threads)]
         command += ["--data", str(options.data)] if options.data else []
         command += ["--config", str(work / "config.json"), "--no-record", "--no-report", "--quiet"]
@@ -96,8 +96,8 @@ def run_cell(
 
 
 def run_here(
-    cells: Sequence[Cell], options: RunOptions, jobs: int, out: Path
-) -> Generator[Outcome, None, None]:
+    cells: Collection[Cell], options: RunOptions, jobs: int, out: Path
+) -> Generator[CellOutcome, None, None]:
     """Run cells on this machine, ``jobs`` at a time, publish each and yield it as it ends.
 
     Threads are enough: each only waits for a process. They publish, too, so that a cell that ends
@@ -108,7 +108,7 @@ def run_here(
     """
     stop = threading.Event()
 
-    def run_and_publish(cell: Cell) -> Outcome:
+    def run_and_publish(cell: Cell) -> CellOutcome:
         try:
             outcome = run_cell(cell, options, stop.is_set)
         except OSError as error:  # it could not be started, or its files not read
@@ -127,12 +127,12 @@ def run_here(
             pool.shutdown(cancel_futures=True)
 
 
-def finished_cells(cells: Sequence[Cell], out: Path, config: str) -> list[Cell]:
+def finished_cells(cells: Collection[Cell], out: Path, config: str) -> list[Cell]:
     """Those whose results are in ``out`` already."""
     return [cell for cell in cells if is_finished(cell, out / cell.name, config)]
 
 
-def publish(outcome: Outcome, out: Path) -> None:
+def publish(outcome: CellOutcome, out: Path) -> None:
     """Write a finished cell into ``out``, whole or not at all; of a failed one what it said.
 
     Raises:

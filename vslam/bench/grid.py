@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from vslam.datasets.perturbation import parse_perturbation
 from vslam.errors import InputError
-from vslam.perturb import parse_perturbation
 from vslam.report.schema import ReportJson
 
 _UNSEEDED = {"none", "blur"}

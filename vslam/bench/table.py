@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,12 +12,12 @@ from rich.live import Live
 from rich.table import Table
 
 from vslam.bench.estimate import duration, estimate
-from vslam.bench.execute import Failed, Outcome
+from vslam.bench.execute import CellOutcome, Failed
 from vslam.bench.grid import Cell, read_report
 from vslam.report.schema import ReportJson
 
 
-class Progress:
+class GridProgress:
     """Which cells are finished, failed or missing, and what the finished ones say.
 
     Attributes:
@@ -28,8 +28,8 @@ class Progress:
 
     def __init__(
         self,
-        cells: Sequence[Cell],
-        finished: Sequence[Cell],
+        cells: Collection[Cell],
+        finished: Collection[Cell],
         frames: Mapping[str, int],
         out: Path,
         jobs: int,
@@ -46,7 +46,7 @@ class Progress:
         """Neither finished nor failed."""
         return [c for c in self.cells if c not in self.reports and c not in self.failed]
 
-    def add(self, outcome: Outcome) -> str:
+    def add(self, outcome: CellOutcome) -> str:
         """Take note of a cell that has been published; returns a line that says so."""
         cell = outcome.cell
         if isinstance(outcome, Failed):
@@ -88,7 +88,7 @@ class Progress:
 
 
 @contextmanager
-def live(progress: Progress, *, shown: bool) -> Iterator[Callable[[str], None]]:
+def shown_live(progress: GridProgress, *, shown: bool) -> Iterator[Callable[[str], None]]:
     """Show the table on stderr and keep it up to date; where that is no terminal, print the lines
     given to what this yields, and the table at the end."""
     console = Console(stderr=True, quiet=not shown, highlight=False, soft_wrap=True)

@@ -22,7 +22,7 @@ def open_sequence(
 ) -> Sequence:
     """Open a sequence and check the frames that ``start``, ``every``, ``max_frames`` select.
 
-    With ``monocular`` the left eye is read alone.
+    With ``monocular`` the left camera is read alone.
 
     A synthetic sequence has no ``root``: it is rendered into the user's cache on first use, and
     ``on_render`` is told the frames done and in all.

@@ -1,6 +1,6 @@
 """KITTI odometry, grey stereo [Geiger et al., CVPR 2012].
 
-root/sequences/NN/{image_0,image_1}/000000.png   left and right eye, rectified; .jpg, .webp too
+root/sequences/NN/{image_0,image_1}/000000.png   left and right camera, rectified; .jpg, .webp too
 root/sequences/NN/{calib.txt,times.txt}
 root/poses/NN.txt                                ground truth, for 00 to 10
 """
@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera, ImageMap
 from vslam.datasets.sequence import Image
 from vslam.errors import InputError, UnreadableImageError
-from vslam.eyes import EachEye
 from vslam.trajectory import read_kitti_poses, read_table
 
 _HOME = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php"
@@ -33,11 +32,11 @@ class KittiSequence:
         timestamps: ``(N,)`` float64 seconds since the first frame of the whole sequence.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` or None; the world is the first left camera
             of the whole sequence.
-        left, right: N image files each, of equal stems; right is empty for the left eye alone.
+        left, right: N image files each, of equal stems; right is empty for the left camera alone.
     """
 
     name: str
-    camera: StereoCamera
+    camera: Camera
     timestamps: NDArray[np.float64]
     ground_truth: NDArray[np.float64] | None
     left: tuple[Path, ...]
@@ -50,15 +49,15 @@ class KittiSequence:
     def __len__(self) -> int:
         return len(self.left)
 
-    def read(self, index: int, each_eye: EachEye = map) -> tuple[Image, Image | None]:
+    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
         """Left and right image ``(H, W)`` uint8 of one frame, None for the right one where the left
-        eye is read alone. Safe to call from several threads.
+        camera is read alone. Safe to call from several threads.
 
         Raises:
             UnreadableImageError: a file is missing, damaged or not of the calibrated size.
         """
-        files = [eye[index] for eye in (self.left, self.right) if eye]
-        left, *right = each_eye(self._read, files)
+        files = [side[index] for side in (self.left, self.right) if side]
+        left, *right = image_map(self._read, files)
         return left, right[0] if right else None
 
     def _read(self, path: Path) -> Image:
@@ -95,7 +94,7 @@ def open_kitti(
         start: first frame, counted over the images present.
         every: take every N-th frame.
         max_frames: at most so many, None for all.
-        monocular: read the left eye alone; the right one's images need not be there.
+        monocular: read the left camera alone; the right one's images need not be there.
 
     Raises:
         InputError: data missing, images unequal or empty, calibration, times or poses unusable.
@@ -103,10 +102,10 @@ def open_kitti(
     """
     base = _find_root(root)
     folder = _find_sequence(base, name)
-    eyes = [_list_images(folder / f"image_{eye}") for eye in range(1 if monocular else 2)]
-    stems = sorted(set().union(*eyes), key=_by_number)
+    sides = [_list_images(folder / f"image_{side}") for side in range(1 if monocular else 2)]
+    stems = sorted(set().union(*sides), key=_by_number)
     chosen = _select(folder, len(stems), start, every, max_frames)
-    rows = _check_frames(folder, eyes, [stems[k] for k in chosen])
+    rows = _check_frames(folder, sides, [stems[k] for k in chosen])
     left, *right = zip(*rows, strict=True)
 
     sizes = [_decode(path).shape for path in rows[0]]
@@ -114,14 +113,14 @@ def open_kitti(
         raise UnreadableImageError(
             rows[0][1],
             f"{_size(sizes[1])} pixels but the left image has {_size(sizes[0])}; "
-            "use the rectified images of both eyes.",
+            "use the rectified images of both cameras.",
         )
     times = _read_times(folder / "times.txt")
     frames = _row_numbers(folder / "times.txt", stems, len(times))[chosen]
     camera = read_calibration(folder / "calib.txt", width=sizes[0][1], height=sizes[0][0])
     return KittiSequence(
         name=name,
-        camera=camera.left_eye() if monocular else camera,
+        camera=camera.left_camera() if monocular else camera,
         timestamps=times[frames],
         ground_truth=_read_ground_truth(base / "poses" / f"{name}.txt", stems, len(times), chosen),
         left=left,
@@ -142,7 +141,7 @@ def list_kitti(root: Path) -> list[tuple[str, int, int]]:
     ]
 
 
-def read_calibration(path: Path, *, width: int, height: int) -> StereoCamera:
+def read_calibration(path: Path, *, width: int, height: int) -> Camera:
     """Read P0 and P1 of ``calib.txt``, with or without the ``P0:`` at the beginning of the line.
 
     Args:
@@ -181,7 +180,7 @@ def read_calibration(path: Path, *, width: int, height: int) -> StereoCamera:
             f"{path}: the principal point ({cx:.1f}, {cy:.1f}) lies outside the "
             f"{width}x{height} image; {fix}."
         )
-    return StereoCamera(float(fx), float(fy), float(cx), float(cy), float(baseline), width, height)
+    return Camera(float(fx), float(fy), float(cx), float(cy), float(baseline), width, height)
 
 
 def _find_root(root: Path) -> Path:
@@ -234,27 +233,27 @@ def _select(
 
 
 def _check_frames(
-    folder: Path, eyes: list[dict[str, Path]], stems: list[str]
+    folder: Path, sides: list[dict[str, Path]], stems: list[str]
 ) -> list[tuple[Path, ...]]:
-    for eye, images in enumerate(eyes):
+    for side, images in enumerate(sides):
         if not images:
-            instead = ", or run on the left eye alone with --sensor mono" if eye else ""
+            instead = ", or run on the left camera alone with --sensor mono" if side else ""
             raise InputError(
-                f"{folder}/image_{eye}: no images of the {('left', 'right')[eye]} eye; stereo "
+                f"{folder}/image_{side}: no images of the {('left', 'right')[side]} camera; stereo "
                 f"needs both, download the grayscale images (22 GB) from {_HOME}{instead}."
             )
-    complete = [all(stem in eye for eye in eyes) for stem in stems]
+    complete = [all(stem in side for side in sides) for stem in stems]
     if not all(complete):
         first = complete.index(False)
-        eye = 0 if stems[first] not in eyes[0] else 1
-        fix = f"restore image_{eye}/{stems[first]}"
+        side = 0 if stems[first] not in sides[0] else 1
+        fix = f"restore image_{side}/{stems[first]}"
         if first:
             fix += f" and those after it, or add --max-frames {first}"
         raise InputError(
-            f"{folder}: unequal counts, {len(eyes[0])} left and {len(eyes[1])} right images of "
-            f"which {len(eyes[0].keys() & eyes[1].keys())} frames have both; {fix}."
+            f"{folder}: unequal counts, {len(sides[0])} left and {len(sides[1])} right images of "
+            f"which {len(sides[0].keys() & sides[1].keys())} frames have both; {fix}."
         )
-    frames = [tuple(eye[stem] for eye in eyes) for stem in stems]
+    frames = [tuple(side[stem] for side in sides) for stem in stems]
     for path in (path for frame in frames for path in frame):
         if _is_empty(path):
             raise UnreadableImageError(path, "the file is empty; download it again.")

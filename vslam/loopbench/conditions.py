@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.datasets.perturbation import parse_perturbation
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.augmentation import turn_homography
-from vslam.perturb import parse_perturbation
 
 Image = NDArray[np.uint8]
 
@@ -88,7 +88,7 @@ def parse_conditions(kinds: str, strengths: str) -> list[Condition]:
 
 
 def apply(
-    condition: Condition, images: Sequence[Image], seed: int, *, rendered: bool
+    condition: Condition, images: Collection[Image], seed: int, *, rendered: bool
 ) -> list[Image]:
     """The images under a condition, each drawn anew.
 

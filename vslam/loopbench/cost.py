@@ -34,7 +34,7 @@ def _median_ms(call: Callable[[], object]) -> float:
 
 
 def _bow() -> Cost:
-    from vslam.info import peak_memory_mb
+    from vslam.machine import peak_memory_mb
 
     began = time.perf_counter()
     from vslam.loopclosure.bow_index import InvertedIndex
@@ -62,7 +62,7 @@ def _bow() -> Cost:
 
 
 def _network(name: str, weights: Path | None) -> Cost:
-    from vslam.info import peak_memory_mb
+    from vslam.machine import peak_memory_mb
 
     began = time.perf_counter()
     from vslam.config import SiameseConfig

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import BowConfig, OrbConfig
+from vslam.config import OrbConfig
 from vslam.frontend.orb import extract
 from vslam.loopbench.conditions import Image
 from vslam.loopclosure.bow_index import InvertedIndex, NodeIndex, index_nodes
@@ -23,11 +22,12 @@ if TYPE_CHECKING:  # torch is loaded for those who ask for a network
     from vslam.loopclosure.siamese.scoring import NetworkScorer
 
 
+_MATCHING_LEVEL = 2  # of the vocabulary: features of a node there, of about 100, are matched
 _KEPT_GALLERIES = 3  # the unchanged one survives two strengths of a condition with its own
 
 
 @dataclass(frozen=True)
-class View:
+class DescribedImage:
     """An image with its ORB features.
 
     Attributes:
@@ -45,14 +45,16 @@ class View:
     nodes: NodeIndex
 
 
-def look(images: Sequence[Image], vocabulary: Vocabulary, threads: int) -> list[View]:
+def describe(images: list[Image], vocabulary: Vocabulary, threads: int) -> list[DescribedImage]:
     """Extract the features of all images, as a run does."""
-    node_of_word = vocabulary.ancestors(BowConfig().direct_level)
+    node_of_word = vocabulary.ancestors(_MATCHING_LEVEL)
 
-    def one(image: Image) -> View:
+    def one(image: Image) -> DescribedImage:
         found = extract(image, OrbConfig())
         words = vocabulary.words(found.descriptors)
-        return View(image, found.xy, found.descriptors, words, index_nodes(node_of_word[words]))
+        return DescribedImage(
+            image, found.xy, found.descriptors, words, index_nodes(node_of_word[words])
+        )
 
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(one, images))
@@ -65,10 +67,10 @@ class Scorer(Protocol):
     probability: bool
     """Whether scores are probabilities, with thresholds at 0.5 and 0.9."""
 
-    def store(self, gallery: Sequence[View]) -> Any:
+    def store(self, gallery: list[DescribedImage]) -> Any:
         """What it keeps of the images asked for."""
 
-    def scores(self, queries: Sequence[View], stored: Any) -> NDArray[np.float64]:
+    def scores(self, queries: list[DescribedImage], stored: Any) -> NDArray[np.float64]:
         """``(Q, G)``, greater is more alike."""
 
 
@@ -81,17 +83,17 @@ class BowScorer:
     def __init__(self, vocabulary: Vocabulary) -> None:
         self._vocabulary = vocabulary
 
-    def store(self, gallery: Sequence[View]) -> InvertedIndex:
+    def store(self, gallery: list[DescribedImage]) -> InvertedIndex:
         """See :class:`Scorer`."""
         index = InvertedIndex(self._vocabulary.n_words)
-        for number, view in enumerate(gallery):
-            index.add(number, bow_vector(self._vocabulary, view.words))
+        for number, one in enumerate(gallery):
+            index.add(number, bow_vector(self._vocabulary, one.words))
         return index
 
-    def scores(self, queries: Sequence[View], stored: InvertedIndex) -> NDArray[np.float64]:
+    def scores(self, queries: list[DescribedImage], stored: InvertedIndex) -> NDArray[np.float64]:
         """See :class:`Scorer`."""
         return np.stack(
-            [stored.compare(bow_vector(self._vocabulary, view.words)).score for view in queries]
+            [stored.compare(bow_vector(self._vocabulary, one.words)).score for one in queries]
         ).astype(np.float64)
 
 
@@ -106,11 +108,11 @@ def open_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scor
     from vslam.config import SiameseConfig
     from vslam.loopclosure.siamese.scoring import NetworkScorer
 
-    return _NetworkViews(NetworkScorer(name, weights, SiameseConfig().fit))
+    return _NetworkScorer(NetworkScorer(name, weights, SiameseConfig().fit))
 
 
-class _NetworkViews:
-    """Hands the images of views to a network."""
+class _NetworkScorer:
+    """Hands the images of described to a network."""
 
     probability = True
 
@@ -118,26 +120,28 @@ class _NetworkViews:
         self.name = network.name
         self._network = network
 
-    def store(self, gallery: Sequence[View]) -> NDArray[np.float32]:
+    def store(self, gallery: list[DescribedImage]) -> NDArray[np.float32]:
         """Descriptors ``(G, D)``."""
-        return self._network.embed([view.image for view in gallery])
+        return self._network.embed([one.image for one in gallery])
 
-    def scores(self, queries: Sequence[View], stored: NDArray[np.float32]) -> NDArray[np.float64]:
+    def scores(
+        self, queries: list[DescribedImage], stored: NDArray[np.float32]
+    ) -> NDArray[np.float64]:
         return self._network.scores(self.store(queries), stored)
 
 
-class Panel:
+class DetectorSet:
     """The detectors of a benchmark, the first of which the others are compared with.
 
     Most conditions ask for the same images: what was made of the last few galleries is kept.
     """
 
-    def __init__(self, scorers: Sequence[Scorer], vocabulary: Vocabulary, threads: int) -> None:
+    def __init__(self, scorers: list[Scorer], vocabulary: Vocabulary, threads: int) -> None:
         self.scorers = tuple(scorers)
         self._vocabulary, self._threads = vocabulary, threads
-        self._kept: OrderedDict[bytes, tuple[list[View], dict[str, Any]]] = OrderedDict()
+        self._kept: OrderedDict[bytes, tuple[list[DescribedImage], dict[str, Any]]] = OrderedDict()
 
-    def gallery(self, images: Sequence[Image]) -> tuple[list[View], dict[str, Any]]:
+    def gallery(self, images: list[Image]) -> tuple[list[DescribedImage], dict[str, Any]]:
         """Features of the images, and what each detector keeps of them."""
         hashed = hashlib.blake2b()
         for image in images:
@@ -145,13 +149,13 @@ class Panel:
             hashed.update(image.tobytes())
         digest = hashed.digest()
         if digest not in self._kept:
-            views = self.look(images)
-            self._kept[digest] = views, {one.name: one.store(views) for one in self.scorers}
+            described = self.describe(images)
+            self._kept[digest] = described, {one.name: one.store(described) for one in self.scorers}
             while len(self._kept) > _KEPT_GALLERIES:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(digest)
         return self._kept[digest]
 
-    def look(self, images: Sequence[Image]) -> list[View]:
-        """See :func:`look`."""
-        return look(images, self._vocabulary, self._threads)
+    def describe(self, images: list[Image]) -> list[DescribedImage]:
+        """See :func:`describe`."""
+        return describe(images, self._vocabulary, self._threads)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import VerificationConfig
+from vslam.geometry import Matrix
 from vslam.loopbench.conditions import Condition
-from vslam.loopbench.detectors import Panel, Scorer, View
-from vslam.loopbench.schema import Cell, Curve, Gain
-from vslam.loopbench.sets import Questions, TestSet
+from vslam.loopbench.detectors import DescribedImage, DetectorSet, Scorer
+from vslam.loopbench.schema import Curve, Gain, Score
+from vslam.loopbench.sets import QuerySet, TestSet
 from vslam.loopclosure.benchmark import (
     PrecisionRecall,
     average_precision,
@@ -20,61 +19,59 @@ from vslam.loopclosure.benchmark import (
     summary,
 )
 from vslam.loopclosure.bow_index import match_by_node
-from vslam.loopclosure.siamese.places import DIFFERENT, SAME, UNKNOWN
+from vslam.loopclosure.siamese.image_sources import DIFFERENT, SAME, UNKNOWN
 
 MIN_MATCHES = 20  # that obey one epipolar geometry (ORB-SLAM, VII-B, asks for 20 in 3D)
 _EPIPOLAR_PIXELS = 2.0
 _CURVE_POINTS = 200
 _RESAMPLES = 200  # of the queries, for the interval of a difference
 
-Matrix = NDArray[np.float64]
-
 
 def measure(
     test_set: TestSet,
     condition: Condition,
-    panel: Panel,
+    detectors: DetectorSet,
     seed: int,
-) -> tuple[list[Cell], list[Gain]]:
+) -> tuple[list[Score], list[Gain]]:
     """All detectors on one set under one condition; nothing where that is not to be had."""
-    questions = test_set.ask(condition, seed)
-    if questions is None:
+    query_set = test_set.query_set(condition, seed)
+    if query_set is None:
         return [], []
-    queries = panel.look(questions.queries)
-    gallery, stored = panel.gallery(questions.gallery)
+    queries = detectors.describe(query_set.queries)
+    gallery, stored = detectors.gallery(query_set.gallery)
     verify = _Verification(queries, gallery)
-    found = {one.name: one.scores(queries, stored[one.name]) for one in panel.scorers}
-    cells = [
-        _cell(test_set.title, condition, scorer, found[scorer.name], questions, verify)
-        for scorer in panel.scorers
+    found = {one.name: one.scores(queries, stored[one.name]) for one in detectors.scorers}
+    scores = [
+        _score(test_set.title, condition, scorer, found[scorer.name], query_set, verify)
+        for scorer in detectors.scorers
     ]
     first, *others = found
     gains = [
-        _gain(test_set.title, condition, first, other, found, questions.relation)
+        _gain(test_set.title, condition, first, other, found, query_set.relation)
         for other in others
     ]
-    return cells, gains
+    return scores, gains
 
 
-def _cell(
+def _score(
     title: str,
     condition: Condition,
     scorer: Scorer,
     scores: Matrix,
-    questions: Questions,
+    query_set: QuerySet,
     verify: _Verification,
-) -> Cell:
-    known = questions.relation != UNKNOWN
-    same, score = questions.relation[known] == SAME, scores[known]
+) -> Score:
+    known = query_set.relation != UNKNOWN
+    same, score = query_set.relation[known] == SAME, scores[known]
     accuracy: dict[str, float | None] = {
         str(threshold): balanced_accuracy(same, score, threshold) if scorer.probability else None
         for threshold in (0.5, 0.9)
     }
-    answerable = (questions.relation == SAME).any(1)
+    answerable = (query_set.relation == SAME).any(1)
     best = np.where(known, scores, -np.inf).argmax(1)
-    truth = questions.relation[np.arange(len(best)), best]
+    truth = query_set.relation[np.arange(len(best)), best]
     accepted = np.array([verify.accepts(q, int(g)) for q, g in enumerate(best)])
-    return Cell(
+    return Score(
         data=title,
         condition=condition.name,
         detector=scorer.name,
@@ -135,7 +132,7 @@ def _gain(
 class _Verification:
     """Whether two images obey one epipolar geometry; each pair is asked for once."""
 
-    def __init__(self, queries: Sequence[View], gallery: Sequence[View]) -> None:
+    def __init__(self, queries: list[DescribedImage], gallery: list[DescribedImage]) -> None:
         self._queries, self._gallery = queries, gallery
         self._known: dict[tuple[int, int], bool] = {}
 
@@ -147,7 +144,9 @@ class _Verification:
         return self._known[key]
 
 
-def epipolar_inliers(a: View, b: View, config: VerificationConfig | None = None) -> int:
+def epipolar_inliers(
+    a: DescribedImage, b: DescribedImage, config: VerificationConfig | None = None
+) -> int:
     """Matches of two images that obey the best fundamental matrix found."""
     import cv2
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from vslam.errors import ResultsError
 from vslam.loopbench.measure import MIN_MATCHES
-from vslam.loopbench.schema import Cell, LoopsJson
+from vslam.loopbench.schema import LoopsJson, Score
 from vslam.report.drawing import (
     AMBER,
     BLUE,
@@ -25,8 +25,7 @@ from vslam.report.drawing import (
     ReportFigure,
     save,
 )
-from vslam.report.loop_tables import Table
-from vslam.report.render import markdown_table, render_page
+from vslam.report.page import Table, markdown_table, render_page
 
 MEAN = "mean of all"
 _COLORS = [GREY, BLUE, VIOLET, AMBER, GREEN, RED]
@@ -138,7 +137,7 @@ def tables(report: LoopsJson) -> list[Table]:
     return found
 
 
-def _accuracies(cell: Cell) -> str:
+def _accuracies(cell: Score) -> str:
     return ", ".join("-" if a is None else f"{a:.3f}" for a in cell.accuracy.values())
 
 
@@ -171,7 +170,7 @@ def _ap_rows(report: LoopsJson) -> list[tuple[str, ...]]:
     return rows
 
 
-def _table(report: LoopsJson, name: str, shown: Callable[[Cell], str], note: str) -> Table:
+def _table(report: LoopsJson, name: str, shown: Callable[[Score], str], note: str) -> Table:
     names = _detectors(report)
     cells = {(c.data, c.condition, c.detector): shown(c) for c in report.cells}
     rows = [
@@ -219,7 +218,7 @@ def draw(report: LoopsJson) -> list[ReportFigure]:
     return figures
 
 
-def _curves(cells: Sequence[Cell], detectors: Sequence[str], data: str) -> Figure:
+def _curves(cells: list[Score], detectors: list[str], data: str) -> Figure:
     conditions = list(dict.fromkeys(c.condition for c in cells))
     columns = min(3, len(conditions))
     rows = -(-len(conditions) // columns)

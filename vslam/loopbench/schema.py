@@ -19,7 +19,7 @@ class Curve(_Model):
     recall: list[float]
 
 
-class Cell(_Model):
+class Score(_Model):
     """One detector on one set of images under one condition.
 
     ``figures`` are those of :func:`vslam.loopclosure.benchmark.summary`, of descriptors alone;
@@ -75,7 +75,7 @@ class LoopsJson(_Model):
     schema_version: int = 1
 
     seed: int
-    cells: list[Cell]
+    cells: list[Score]
     gains: list[Gain]
     costs: list[Cost]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,16 +12,18 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError
 from vslam.loopbench.conditions import Condition, Image, apply
-from vslam.loopclosure.siamese.places import UNKNOWN, Places, open_source, split_spec
-from vslam.progress import count_bar
+from vslam.loopclosure.siamese.image_sources import UNKNOWN, ImageSource, open_source, split_spec
 
-_GAP = 50  # images of a drive: it does not ask for the place where it just was
+ProgressBar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
+"""``(what, how many)`` opens a bar; what it yields is called after each of them."""
+
+_GAP = 50  # images of a drive before a query that are not searched: it was just there
 _OPTIONS = {"seed": "0", "aliased": "0", "places": "150"}
 
 
 @dataclass(frozen=True)
-class Questions:
-    """Images that ask for their place, images asked for, and what is true.
+class QuerySet:
+    """Query images, the gallery that is searched for their places, and what is true.
 
     Attributes:
         queries: Q images ``(H, W)`` uint8, under the condition.
@@ -39,19 +42,23 @@ class TestSet:
 
     Attributes:
         title: of the report.
-        ask: questions under a condition, None where the set cannot be put under it.
+        query_set: ``(condition, seed)`` to the images under it, None where the set has no such.
     """
 
     __test__ = False  # no test, whatever pytest thinks of its name
 
     title: str
-    ask: Callable[[Condition, int], Questions | None]
+    query_set: Callable[[Condition, int], QuerySet | None]
 
 
-def open_set(spec: str, cache: Path, *, threads: int, shown: bool) -> list[TestSet]:
+def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar) -> list[TestSet]:
     """Open ``town:ROUTE[seed=101,aliased=1,places=150]`` or a source as of ``vslam train``.
 
     A town is rendered on first use, anew for each viewpoint and change, into ``cache``.
+
+    Args:
+        cache: folder of rendered towns.
+        progress_bar: opened while a town is rendered.
 
     Raises:
         InputError: unknown kind, route or option, or data that is missing or malformed.
@@ -71,54 +78,63 @@ def open_set(spec: str, cache: Path, *, threads: int, shown: bool) -> list[TestS
         seed, aliased, places = (int(options[key]) for key in _OPTIONS)
     except ValueError as error:
         raise InputError(f"--data {spec}: an option is not a number.") from error
-    return [_town(route, seed, bool(aliased), places, cache, threads=threads, shown=shown)]
+    return [
+        _town(route, seed, bool(aliased), places, cache, threads=threads, progress_bar=progress_bar)
+    ]
 
 
-def _images(source: Places) -> TestSet:
-    asks = source.asks
+def _images(source: ImageSource) -> TestSet:
+    is_query = source.is_query
     index = np.arange(len(source))
-    queries = index if asks is None else np.flatnonzero(asks)
-    gallery = index if asks is None else np.flatnonzero(~asks)
+    queries = index if is_query is None else np.flatnonzero(is_query)
+    gallery = index if is_query is None else np.flatnonzero(~is_query)
     relation = source.relation[np.ix_(queries, gallery)].copy()
-    if asks is None:
+    if is_query is None:
         relation[index[:, None] - index[None] < _GAP] = UNKNOWN
         queries, gallery = queries[_GAP:], gallery[:-_GAP]
         relation = relation[_GAP:, :-_GAP]
 
-    def ask(condition: Condition, seed: int) -> Questions | None:
+    def query_set(condition: Condition, seed: int) -> QuerySet | None:
         if condition.kind == "change":
             return None
         asked = [source.grey(int(i)) for i in gallery]
         asking = apply(condition, [source.grey(int(i)) for i in queries], seed, rendered=False)
-        return Questions(asking, asked, relation)
+        return QuerySet(asking, asked, relation)
 
-    return TestSet(source.name, ask)
+    return TestSet(source.name, query_set)
 
 
 def _town(
-    name: str, seed: int, aliased: bool, places: int, cache: Path, *, threads: int, shown: bool
+    name: str,
+    seed: int,
+    aliased: bool,
+    places: int,
+    cache: Path,
+    *,
+    threads: int,
+    progress_bar: ProgressBar,
 ) -> TestSet:
     from vslam.datasets.synthetic import built_in_route, store
     from vslam.datasets.synthetic.pairs import Moves, render_pairs
     from vslam.datasets.synthetic.site import Variation
 
-    def ask(condition: Condition, draw: int) -> Questions | None:
+    def query_set(condition: Condition, draw: int) -> QuerySet | None:
         change, view = condition.change, condition.view
         town = f"{name}-seed{seed}{'-aliased' if aliased else ''}-{places}"
         folder = store.place_folder(cache) / f"{town}-view{view:g}-change{change:g}"
         if not (folder / "pairs.csv").exists():
             variation = Variation(seed, aliased, change)
             moves = Moves(condition.lateral, condition.heading)
-            with count_bar(f"rendering {folder.name}", places, shown=shown) as advance:
+            with progress_bar(f"rendering {folder.name}", places) as advance:
                 render_pairs(
                     built_in_route(name), variation, folder, places, moves,
                     kinds=("shift",), threads=threads, on_frame=lambda done, of: advance(),
                 )  # fmt: skip
         (source,) = open_source(f"pairs:{folder}")
-        assert source.asks is not None
-        queries, gallery = np.flatnonzero(source.asks), np.flatnonzero(~source.asks)
+        assert source.is_query is not None
+        queries, gallery = np.flatnonzero(source.is_query), np.flatnonzero(~source.is_query)
         asking = apply(condition, [source.grey(int(i)) for i in queries], draw, rendered=True)
         relation = source.relation[np.ix_(queries, gallery)]
-        return Questions(asking, [source.grey(int(i)) for i in gallery], relation)
+        return QuerySet(asking, [source.grey(int(i)) for i in gallery], relation)
 
-    return TestSet(f"{name} {'aliased ' if aliased else ''}town {seed}", ask)
+    return TestSet(f"{name} {'aliased ' if aliased else ''}town {seed}", query_set)

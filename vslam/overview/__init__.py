@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,9 @@ if TYPE_CHECKING:
 __all__ = ["write_overview"]
 
 
-def write_overview(runs: Sequence[Path], trajectories: Sequence[str], out: Path) -> OverviewJson:
+def write_overview(
+    runs: Collection[Path], trajectories: Collection[str], out: Path
+) -> OverviewJson:
     """Gather finished runs and write ``report.{html,md,json}`` and ``table.csv`` into ``out``.
 
     Args:

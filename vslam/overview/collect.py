@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from vslam.errors import InputError
-from vslam.evaluate import evaluate
+from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.overview.schema import MEASURES, Drive, RunEntry
 from vslam.report.schema import ReportJson
 from vslam.trajectory import Trajectory, read_trajectory
@@ -31,7 +31,7 @@ class Found:
     truth: dict[tuple[str, str], Path] = field(default_factory=dict)
 
 
-def collect(folders: Sequence[Path], trajectories: Sequence[str]) -> Found:
+def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
     """Read every run below ``folders`` and evaluate ``trajectories`` on the same sequences.
 
     Interrupted runs and reports of another schema are left out, with a note.
@@ -84,14 +84,14 @@ def read_aligned(found: Found, run: RunEntry) -> tuple[Trajectory, Trajectory | 
     if truth is None:
         return estimate, None
     try:
-        evaluation = evaluate(estimate, truth)
+        evaluation = evaluate_trajectory(estimate, truth)
     except InputError:  # too short to align
         return estimate, None
     # Matched by time, an estimate may have fewer poses than the truth; only places are drawn.
     return Trajectory(estimate.timestamps[: evaluation.frames], evaluation.T_wc_aligned), truth
 
 
-def _run_folders(folders: Sequence[Path]) -> list[Path]:
+def _run_folders(folders: Collection[Path]) -> list[Path]:
     found: dict[Path, Path] = {}
     for folder in folders:
         if not folder.is_dir():
@@ -183,7 +183,7 @@ def _add_external(text: str, found: Found) -> None:
     if truth is None:
         raise InputError(f"--trajectory {text}: none of the runs of {sequence} has a ground truth.")
     path = Path(file)
-    evaluation = evaluate(read_trajectory(path, truth.timestamps), truth)
+    evaluation = evaluate_trajectory(read_trajectory(path, truth.timestamps), truth)
     if evaluation.frames < len(truth):
         found.notes.append(
             f"{system} has a pose for {evaluation.frames} of {len(truth)} frames of {drive.place}, "

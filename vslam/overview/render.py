@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 from vslam.overview.schema import MEASURES, Measure, OverviewJson, RunEntry, Spread
 from vslam.overview.summary import ALPHA, systems
-from vslam.report.loop_tables import Table
-from vslam.report.render import markdown_table, render_page
+from vslam.report.page import Table, markdown_table, render_page
 
 if TYPE_CHECKING:
     from vslam.report.drawing import ReportFigure
@@ -58,7 +57,7 @@ def render_markdown(report: OverviewJson) -> str:
     return "\n".join(lines)
 
 
-def render_html(report: OverviewJson, figures: Sequence[ReportFigure]) -> str:
+def render_html(report: OverviewJson, figures: Collection[ReportFigure]) -> str:
     """One self-contained page: style, figures and numbers are inside, nothing is loaded."""
     return render_page(
         "overview.html.jinja",
@@ -92,7 +91,7 @@ def _results(report: OverviewJson) -> list[Table]:
     """Two tables of the same rows: one would be too wide to read."""
     texts = ("sequence", "perturbation", "system")
 
-    def table(name: str, measures: Sequence[Measure], note: str) -> Table:
+    def table(name: str, measures: Collection[Measure], note: str) -> Table:
         columns = [f"{title} ({unit})" if unit else title for _, title, unit, *_ in measures]
         rows: list[tuple[str, ...]] = [
             (

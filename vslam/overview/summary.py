@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from itertools import combinations
 
-from vslam.info import versions
+from vslam.machine import versions
 from vslam.overview.collect import Found
 from vslam.overview.schema import (
     MEASURES,

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from vslam.evaluate import Evaluation
+from vslam.evaluation.loops import LoopEvaluation
+from vslam.evaluation.trajectories import Evaluation
 from vslam.features import TrackingState
-from vslam.loop_evaluation import LoopEvaluation
 from vslam.report.drawing import (
     AMBER,
     BLUE,
@@ -33,7 +33,7 @@ from vslam.report.drawing import (
 )
 from vslam.report.maps import loop_closing, top_view
 from vslam.report.summary import stage_names
-from vslam.run import RunOutcome
+from vslam.run.outcome import RunOutcome
 from vslam.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def _draw(
         if evaluation is not None and evaluation.alignment != "none":
             caption += f" Estimate after {evaluation.alignment.upper()} alignment."
         yield "top_view", caption, top_view(outcome, evaluation, ground_truth, verdict)
-    if outcome.closures:
+    if outcome.corrections:
         caption = (
             "Keyframes just before the first loop was closed and at the end. Dashed: each loop, "
             "from where its keyframes stood before its own correction: what they lie apart is the "

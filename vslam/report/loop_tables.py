@@ -4,27 +4,12 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from dataclasses import dataclass
 
-from vslam.comparison import LoopFigures, comparison_rows
-from vslam.report.schema import LoopEntry, ReportJson
+from vslam.report.page import Row, Table
+from vslam.report.schema import LoopEntry, LoopFigures, ReportJson
 
 _MAX_CLOSED = 60
 _MAX_REJECTED = 12
-
-Row = tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Table:
-    """``texts``: the columns that hold words, aligned to the left; ``note`` goes below."""
-
-    title: str
-    head: Row
-    rows: list[Row]
-    texts: Row = ()
-    note: str = ""
-    folded: bool = False
 
 
 def loop_tables(report: ReportJson) -> list[Table]:
@@ -32,7 +17,7 @@ def loop_tables(report: ReportJson) -> list[Table]:
     return [
         table
         for table in (
-            _comparison(report),
+            comparison_table(report),
             _revisits(report),
             _closed(report),
             _reasons(report),
@@ -42,14 +27,31 @@ def loop_tables(report: ReportJson) -> list[Table]:
     ]
 
 
-def _comparison(report: ReportJson) -> Table:
+def comparison_table(report: ReportJson) -> Table:
+    """The figures that loop closing can change, with it and without it; no rows where no second
+    run was made (``--compare-loops``)."""
     rows: list[Row] = []
     if report.without_loops:
-        names = ("ate_rmse_m", "rpe_m", "t_rel_percent", "lost_frames", "loops_closed")
-        with_ = LoopFigures(**{name: getattr(report, name) for name in names})
-        without = LoopFigures(**report.without_loops.model_dump())
-        rows += comparison_rows(with_, without)
+        with_ = LoopFigures(**{name: getattr(report, name) for name in LoopFigures.model_fields})
+        rows = [
+            (title, _figure(getattr(with_, name), form), _figure(without, form))
+            for title, name, form in _COMPARED
+            for without in [getattr(report.without_loops, name)]
+        ]
     return Table("With and without loop closing", ("", report.detector, "without"), rows, ("",))
+
+
+_COMPARED = (
+    ("ATE rmse", "ate_rmse_m", "{:.3f} m"),
+    ("RPE per frame", "rpe_m", "{:.4f} m"),
+    ("t_rel", "t_rel_percent", "{:.3f} %"),
+    ("lost frames", "lost_frames", "{}"),
+    ("loops closed", "loops_closed", "{}"),
+)
+
+
+def _figure(value: float | None, form: str) -> str:
+    return "n/a" if value is None else form.format(value)
 
 
 def _revisits(report: ReportJson) -> Table:

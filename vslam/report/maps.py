@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from vslam.evaluate import Evaluation
+from vslam.evaluation.loops import LoopEvaluation
+from vslam.evaluation.trajectories import Evaluation
 from vslam.geometry import inverses
-from vslam.loop_evaluation import LoopEvaluation
 from vslam.report.drawing import (
     AMBER,
     BLUE,
@@ -24,7 +24,7 @@ from vslam.report.drawing import (
     add_legend,
     new_figure,
 )
-from vslam.run import RunOutcome
+from vslam.run.outcome import RunOutcome
 from vslam.trajectory import Trajectory
 
 Points = NDArray[np.float64]
@@ -92,7 +92,7 @@ def loop_closing(
     if evaluation is not None and ground_truth is not None:
         truth = ground_truth.T_wc[:, :3, 3]
         axes.plot(truth[:, 0], truth[:, 2], color=GREY, linewidth=3.4, alpha=0.65, label="truth")
-    before = _aligned(outcome, evaluation, _centres(outcome.closures[0].T_cw_before))
+    before = _aligned(outcome, evaluation, _centres(outcome.corrections[0].T_cw_before))
     after = _aligned(outcome, evaluation, outcome.keyframes.T_wc[:, :3, 3])
     for points, color, label in ((before, AMBER, "before"), (after, BLUE, "after")):
         axes.plot(
@@ -105,12 +105,13 @@ def loop_closing(
             label=label,
         )
     ends = []
-    for closure in outcome.closures:
+    for correction in outcome.corrections:
         at = [
-            np.flatnonzero(closure.keyframes == k) for k in (closure.edge.query, closure.edge.match)
+            np.flatnonzero(correction.keyframes == k)
+            for k in (correction.edge.query, correction.edge.match)
         ]
         if all(map(len, at)):
-            ends.append(_centres(closure.T_cw_before[np.concatenate(at)]))
+            ends.append(_centres(correction.T_cw_before[np.concatenate(at)]))
     if ends:
         lines = _lines(_aligned(outcome, evaluation, np.concatenate(ends)).reshape(-1, 2, 3))
         label = f"loop, before ({len(ends)})"
@@ -125,7 +126,7 @@ def _centres(T_cw: NDArray[np.float64]) -> Points:
     return inverses(T_cw)[:, :3, 3]
 
 
-def _lines(ends: Points) -> Sequence[Points]:
+def _lines(ends: Points) -> Collection[Points]:
     """x and z of ``(M, 2, 3)`` lines as one polyline each, with gaps."""
     gaps = np.full((len(ends), 1, 3), np.nan)
     points = np.concatenate([ends, gaps], axis=1).reshape(-1, 3)

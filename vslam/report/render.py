@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from vslam.report.loop_tables import loop_tables
+from vslam.report.page import markdown_table, render_page
 from vslam.report.schema import ReportJson
 
 if TYPE_CHECKING:
@@ -110,7 +111,7 @@ def render_markdown(report: ReportJson) -> str:
     return "\n".join(lines)
 
 
-def render_html(report: ReportJson, config: str, figures: Sequence[ReportFigure]) -> str:
+def render_html(report: ReportJson, config: str, figures: Collection[ReportFigure]) -> str:
     """One self-contained page: style, figures and numbers are inside, nothing is loaded.
 
     Args:
@@ -129,20 +130,6 @@ def render_html(report: ReportJson, config: str, figures: Sequence[ReportFigure]
         config=config,
         figures=figures,
     )
-
-
-def render_page(template: str, **values: object) -> str:
-    """Fill in one of the templates of this package; all text is escaped."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("vslam.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template(template).render(**values)
 
 
 def stage_rows(report: ReportJson) -> list[tuple[str, ...]]:
@@ -181,14 +168,3 @@ def _number(value: float | None, unit: str) -> str:
         return "n/a"
     decimals = 1 if value >= 100 else 2 if value >= 10 else 3 if value >= 0.1 else 4
     return f"{value:.{decimals}f}{unit if unit == '°' else ' ' + unit}"
-
-
-def markdown_table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """Lines of a table whose columns are aligned in the text, too."""
-    rows = [tuple(cell.replace("|", "\\|").replace("\n", " ") for cell in row) for row in rows]
-    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
-    rule = tuple("-" * max(width, 3) for width in widths)
-    return [
-        "| " + " | ".join(cell.ljust(max(w, 3)) for cell, w in zip(row, widths, strict=True)) + " |"
-        for row in (head, rule, *rows)
-    ]

@@ -55,8 +55,8 @@ class RevisitEntry(_Model):
     loop_frame: int | None
 
 
-class WithoutLoops(_Model):
-    """The same run with the detector ``none`` (``--compare-loops``)."""
+class LoopFigures(_Model):
+    """The figures of a run that loop closing can change; None where they cannot be given."""
 
     ate_rmse_m: float | None
     rpe_m: float | None
@@ -77,16 +77,18 @@ class Machine(_Model):
 class ReportJson(_Model):
     """One run in numbers.
 
-    Errors are None without ground truth, and KITTI's drift also on paths shorter than 100 m.
+    Errors are None without ground truth, and KITTI's drift also on paths shorter than 100 m;
+    ``evaluation_remark`` says why there are none. ``without_loops`` is of the same run with the
+    detector ``none`` (``--compare-loops``).
     ``frames`` counts the frames done; of them ``skipped_frames`` had an unreadable image and
     ``dropped_frames`` were overtaken by a newer one in a real-time run, whose ``latency_ms`` is
     from the time of an image to its pose (None in any other run).
     ``loops_closed`` and ``loops_rejected`` count candidates, ``loops_wrong`` the closed ones that
     are wrong; ``loops_found`` and ``loops_missed`` count the ``revisit_stretches``. The last four
-    are None without ground truth. See :mod:`vslam.loop_evaluation`.
+    are None without ground truth. See :mod:`vslam.evaluation.loops`.
     """
 
-    schema_version: int = 2
+    schema_version: int = 3
 
     lost_frames: int
     weak_frames: int
@@ -98,11 +100,14 @@ class ReportJson(_Model):
 
     alignment: str | None
     ate_rmse_m: float | None
+    ate_mean_m: float | None = None
+    ate_max_m: float | None = None
     rpe_m: float | None
     rpe_deg: float | None
     t_rel_percent: float | None
     r_rel_deg_per_100m: float | None
     evo_command: str | None
+    evaluation_remark: str | None = None
 
     fps: float
     cpu_ms_per_frame: float
@@ -122,7 +127,7 @@ class ReportJson(_Model):
     revisit_stretches: int | None
     revisits: list[RevisitEntry]
     loops: list[LoopEntry]
-    without_loops: WithoutLoops | None
+    without_loops: LoopFigures | None
 
     dataset: str
     sequence: str

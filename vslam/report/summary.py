@@ -6,26 +6,25 @@ import platform
 from collections import Counter
 from dataclasses import asdict
 from datetime import UTC, datetime
-from pathlib import Path
 
 import numpy as np
 
-from vslam.comparison import figures_without_loops
-from vslam.evaluate import Evaluation
+from vslam.errors import InputError
+from vslam.evaluation.loops import LoopEvaluation
+from vslam.evaluation.trajectories import Evaluation, evaluate_trajectory
 from vslam.features import TrackingState, TrackResult
 from vslam.geometry import inverses
-from vslam.info import available_cores, versions
-from vslam.loop_evaluation import LoopEvaluation
-from vslam.loops import Closure
+from vslam.loops import LoopCorrection
+from vslam.machine import available_cores, cpu_name, versions
 from vslam.report.schema import (
     LoopEntry,
+    LoopFigures,
     Machine,
     ReportJson,
     RevisitEntry,
     StageTime,
-    WithoutLoops,
 )
-from vslam.run import RunOutcome
+from vslam.run.outcome import RunOutcome, matched_ground_truth
 
 
 def summarize(
@@ -33,10 +32,14 @@ def summarize(
     evaluation: Evaluation | None,
     verdict: LoopEvaluation | None,
     evo_command: str | None,
+    remark: str | None = None,
 ) -> ReportJson:
     """Reduce a run to what ``report.json`` holds.
 
-    The errors are None without an evaluation, the judgement of loops is without a verdict.
+    The errors are None without an evaluation, the figures of loops are without a verdict.
+
+    Args:
+        remark: why there is no evaluation.
     """
     frames = len(outcome.tracks)
     states = Counter(track.state for track in outcome.tracks)
@@ -45,7 +48,6 @@ def summarize(
     del options["config"]
     loops = _loops(outcome, verdict)
     closed = sum(loop.accepted for loop in loops)
-    without = figures_without_loops(outcome)
     return ReportJson(
         lost_frames=states[TrackingState.LOST],
         weak_frames=states[TrackingState.WEAK],
@@ -56,11 +58,14 @@ def summarize(
         interrupted=outcome.interrupted,
         alignment=evaluation.alignment if evaluation else None,
         ate_rmse_m=evaluation.ate_rmse_m if evaluation else None,
+        ate_mean_m=evaluation.ate_mean_m if evaluation else None,
+        ate_max_m=evaluation.ate_max_m if evaluation else None,
         rpe_m=evaluation.rpe_m if evaluation else None,
         rpe_deg=evaluation.rpe_deg if evaluation else None,
         t_rel_percent=evaluation.t_rel_percent if evaluation else None,
         r_rel_deg_per_100m=evaluation.r_rel_deg_per_100m if evaluation else None,
         evo_command=evo_command,
+        evaluation_remark=remark,
         fps=done / outcome.wall_s if outcome.wall_s > 0 else 0.0,
         cpu_ms_per_frame=1000.0 * outcome.cpu_s / done if done else 0.0,
         startup_s=outcome.startup_s,
@@ -78,11 +83,37 @@ def summarize(
         revisit_stretches=len(verdict.revisits) if verdict else None,
         revisits=_revisits(verdict) if verdict else [],
         loops=loops,
-        without_loops=WithoutLoops(**asdict(without)) if without else None,
+        without_loops=_figures_without_loops(outcome),
         machine=this_machine(),
         versions=versions(),
         created=datetime.now(UTC).replace(microsecond=0),
         **options,
+    )
+
+
+def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
+    """Errors of a run's final trajectory, or None and the reason why there are none."""
+    ground_truth = matched_ground_truth(outcome)
+    if ground_truth is None:
+        return None, "no ground truth"
+    try:
+        alignment = outcome.settings.alignment
+        return evaluate_trajectory(outcome.trajectory, ground_truth, alignment), None
+    except InputError as error:  # a clip too short to align is no reason to lose the run
+        return None, str(error)
+
+
+def _figures_without_loops(outcome: RunOutcome) -> LoopFigures | None:
+    without = outcome.without_loops
+    if without is None:
+        return None
+    evaluation, _ = evaluate_run(without)
+    return LoopFigures(
+        ate_rmse_m=evaluation.ate_rmse_m if evaluation else None,
+        rpe_m=evaluation.rpe_m if evaluation else None,
+        t_rel_percent=evaluation.t_rel_percent if evaluation else None,
+        lost_frames=sum(track.state is TrackingState.LOST for track in without.tracks),
+        loops_closed=sum(edge.accepted for edge in without.loops),
     )
 
 
@@ -93,11 +124,11 @@ def stage_names(tracks: list[TrackResult]) -> list[str]:
 
 def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntry]:
     frames = outcome.keyframe_frames
-    closures = {(c.edge.query, c.edge.match): c for c in outcome.closures}
+    corrections = {(c.edge.query, c.edge.match): c for c in outcome.corrections}
     right = verdict.right if verdict else (None,) * len(outcome.loops)
     entries = []
     for edge, is_right in zip(outcome.loops, right, strict=True):
-        closure = closures.get((edge.query, edge.match)) if edge.accepted else None
+        correction = corrections.get((edge.query, edge.match)) if edge.accepted else None
         entries.append(
             LoopEntry(
                 query_frame=int(frames[edge.query]) if edge.query >= 0 else None,
@@ -108,15 +139,15 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
                 accepted=edge.accepted,
                 right=is_right,
                 reason=edge.reason,
-                moved_m=_moved(closure) if closure else None,
-                correction_s=closure.seconds if closure else None,
+                moved_m=_moved(correction) if correction else None,
+                correction_s=correction.seconds if correction else None,
             )
         )
     return entries
 
 
-def _moved(closure: Closure) -> float:
-    before, after = inverses(closure.T_cw_before), inverses(closure.T_cw_after)
+def _moved(correction: LoopCorrection) -> float:
+    before, after = inverses(correction.T_cw_before), inverses(correction.T_cw_after)
     return float(np.linalg.norm((after - before)[:, :3, 3], axis=1).max())
 
 
@@ -150,20 +181,8 @@ def _stage_time(ms: list[float]) -> StageTime:
 def this_machine() -> Machine:
     """Where this process runs."""
     return Machine(
-        cpu=_cpu_name(),
+        cpu=cpu_name(),
         cores=available_cores(),
         python=platform.python_version(),
         platform=platform.platform(),
     )
-
-
-def _cpu_name() -> str:
-    # platform.processor() is empty or just "x86_64" on Linux.
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    for line in lines:
-        if line.startswith("model name"):
-            return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()

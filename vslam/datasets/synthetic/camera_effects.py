@@ -1,4 +1,4 @@
-"""From light to bytes: what lens and sensor add. Deterministic by seed, frame and eye."""
+"""From light to bytes: what lens and sensor add. Deterministic by seed, frame and side."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 
 SHUTTER = 0.004  # s
 _BLUR = 0.55  # px, deviation of the lens
@@ -17,7 +17,7 @@ _KNEE, _ROLL = 170.0, 0.5  # grey where the response bends, and its slope from t
 
 def sensor_image(
     radiance: NDArray[np.float32],
-    camera: StereoCamera,
+    camera: Camera,
     *,
     yaw_rate: float,
     night: float,
@@ -30,7 +30,7 @@ def sensor_image(
         camera: for the scale of motion blur.
         yaw_rate: rad/s.
         night: 0 to 1; longer exposure and more gain.
-        key: seed, frame, eye.
+        key: seed, frame, side.
     """
     image = radiance
     streak = abs(yaw_rate) * SHUTTER * (1 + 2 * night) * camera.fx
@@ -57,7 +57,7 @@ def _streak(length: float) -> NDArray[np.float32]:
     return np.asarray(weight / weight.sum(), np.float32)
 
 
-def _vignette(camera: StereoCamera) -> NDArray[np.float32]:
+def _vignette(camera: Camera) -> NDArray[np.float32]:
     u = (np.arange(camera.width) - camera.cx) / camera.fx
     v = (np.arange(camera.height) - camera.cy) / camera.fx
     square = (u[None, :] ** 2 + v[:, None] ** 2) / (u.max() ** 2 + v.max() ** 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ def frame_files(folder: Path, frame: int, depth: bool) -> list[Path]:
     return [folder / name / f"{frame:06d}.png" for name in names]
 
 
-def checksum(paths: Sequence[Path]) -> str:
+def checksum(paths: Collection[Path]) -> str:
     """64 bits of the SHA-256 of the files' contents, one after the other."""
     digest = hashlib.sha256()
     for path in paths:
@@ -36,7 +36,7 @@ def checksum(paths: Sequence[Path]) -> str:
     return digest.hexdigest()[:16]
 
 
-def size(paths: Sequence[Path]) -> int:
+def size(paths: Collection[Path]) -> int:
     """Bytes of all the files; -1 if one is missing."""
     try:
         return sum(path.stat().st_size for path in paths)

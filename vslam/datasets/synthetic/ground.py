@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +14,8 @@ from scipy.spatial import cKDTree
 from vslam.datasets.synthetic.scene import AtlasBuilder, Surfaces, join, patches
 from vslam.datasets.synthetic.terrain import Roads, Terrain
 from vslam.datasets.synthetic.textures import Rng, detail, noise
-from vslam.info import available_cores
 from vslam.kernels import kernel
+from vslam.machine import available_cores
 
 TILE = 12.8  # m
 _FINE, _COARSE = 512, 64  # texels of a tile with and without road
@@ -43,6 +44,41 @@ class RoadStyle:
     wear: float
 
 
+class _RoadArrays(NamedTuple):
+    """M samples of the middle lines of all roads and their cross-section, as `_paint` sees them.
+
+    ``xz`` (M, 2) f8, ``heading``, ``along`` (M,) f8, ``junction`` (M,) bool: see `terrain.Roads`;
+    ``marks`` (M, 10) f8: see `_road_marks`; ``lane``, ``parking``, ``walk``, ``dash`` f8,
+    ``edge_line`` bool: see `RoadStyle`; ``period`` f8 metres of a lane mark with its gap.
+    """
+
+    xz: NDArray[np.float64]
+    heading: NDArray[np.float64]
+    along: NDArray[np.float64]
+    junction: NDArray[np.bool_]
+    marks: NDArray[np.float64]
+    lane: float
+    parking: float
+    walk: float
+    dash: float
+    period: float
+    edge_line: bool
+
+
+class _TileGrid(NamedTuple):
+    """Where a tile lies.
+
+    ``x``, ``z`` f8 corner in metres; ``texel`` f8 metres that a texel covers; ``nearest`` (N, N) i8
+    nearest sample of the roads at the nodes of a coarse mesh; ``mesh`` f8 metres between nodes.
+    """
+
+    x: float
+    z: float
+    texel: float
+    nearest: NDArray[np.int64]
+    mesh: float
+
+
 def make_ground(
     rng: Rng, atlas: AtlasBuilder, roads: Roads, terrain: Terrain, style: RoadStyle
 ) -> Surfaces:
@@ -57,8 +93,19 @@ def make_ground(
     marks = _road_marks(rng, roads, style)
     asphalt = atlas.add(detail(rng, 0.20, 2.5))
     meadow = atlas.add(detail(rng, 0.38, 5.0))
-    section = np.array([style.lane, style.parking, style.walk, style.dash, style.dash + style.gap,
-                        float(style.edge_line)])  # fmt: skip
+    road = _RoadArrays(
+        roads.xz,
+        roads.heading,
+        roads.along,
+        roads.junction,
+        marks,
+        float(style.lane),
+        float(style.parking),
+        float(style.walk),
+        float(style.dash),
+        float(style.dash + style.gap),
+        style.edge_line,
+    )
 
     def paint(at_corner: NDArray[np.float64], distance: float) -> NDArray[np.float32]:
         x, z = at_corner
@@ -70,8 +117,7 @@ def make_ground(
         at = np.stack(np.meshgrid(x + nodes, z + nodes), axis=-1)
         nearest = tree.query(at.reshape(-1, 2))[1].reshape(len(nodes), len(nodes))
         image = np.empty((side, side), np.float32)
-        _paint(image, x, z, TILE / side, nearest, 0.4, roads.xz, roads.heading, roads.along,
-               roads.junction, marks, section, grain)  # fmt: skip
+        _paint(image, _TileGrid(x, z, TILE / side, nearest, 0.4), road, grain)
         return image
 
     parts = []
@@ -155,12 +201,20 @@ def _hash(a, b):
 
 
 @kernel
-def _paint(
-    image, x0, z0, texel, nearest, mesh, xz, heading, along, junction, marks, section, grain
-):
-    """Albedo of a tile whose corner is ``(x0, z0)``; ``nearest``: road sample on a coarse mesh."""
+def _paint(image, tile, road, grain):
+    """Write the albedo of a tile.
+
+    Args:
+        image: ``(S, S)`` float32, written.
+        tile, road: `_TileGrid`, `_RoadArrays`.
+        grain: ``(2, 1024, 1024)`` float32 coarse and fine noise.
+    """
+    x0, z0, texel, nearest, mesh = tile.x, tile.z, tile.texel, tile.nearest, tile.mesh
+    xz, heading, along = road.xz, road.heading, road.along
+    junction, marks = road.junction, road.marks
+    lane, parking, walk = road.lane, road.parking, road.walk
+    dash, period, edge_line = road.dash, road.period, road.edge_line
     rows, columns = image.shape
-    lane, parking, walk = section[0], section[1], section[2]
     for r in range(rows):
         z = z0 + (r + 0.5) * texel
         for c in range(columns):
@@ -205,9 +259,9 @@ def _paint(
                     if ring < 0.36:
                         grey = 46.0 if ring > 0.29 or int(a * 14 + 99) % 2 == 0 else 78.0
                 if not junction[i]:
-                    if section[3] > 0.0 and abs(lateral) < 0.07 and s % section[4] < section[3]:
+                    if dash > 0.0 and abs(lateral) < 0.07 and s % period < dash:
                         grey = 175.0 + 22.0 * fine
-                    if section[5] > 0.0 and abs(off - lane + 0.35) < 0.08:
+                    if edge_line and abs(off - lane + 0.35) < 0.08:
                         grey = 180.0 + 20.0 * fine
             elif edge < parking:
                 slab = math.floor(s / 0.22) * 4096 + math.floor(lateral / 0.22)

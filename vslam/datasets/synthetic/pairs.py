@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.datasets.synthetic import solids
 from vslam.datasets.synthetic.camera_effects import sensor_image
 from vslam.datasets.synthetic.files import check_disk, write_png, writing
@@ -123,11 +123,11 @@ def render_pairs(
             ratio = float(np.exp(rng.normal(0.0, _EXPOSURE)))
             names: list[str] = []
             cameras: list[float] = []
-            for eye, (frame, when) in enumerate(zip((first, second), whens, strict=True)):
-                T = route.T_wc[frame] if eye == 0 else _shifted(route.T_wc[frame], *shift)
-                image = _view(renderer, route, passes, T, when, 1.0 if eye == 0 else ratio,
-                              key=(variation.seed, k, eye))  # fmt: skip
-                names.append(f"images/{k:06d}_{'ab'[eye]}.png")
+            for side, (frame, when) in enumerate(zip((first, second), whens, strict=True)):
+                T = route.T_wc[frame] if side == 0 else _shifted(route.T_wc[frame], *shift)
+                image = _view(renderer, route, passes, T, when, 1.0 if side == 0 else ratio,
+                              key=(variation.seed, k, side))  # fmt: skip
+                names.append(f"images/{k:06d}_{'ab'[side]}.png")
                 write_png(folder / names[-1], image, 1)
                 yaw = float(np.degrees(np.arctan2(T[0, 2], T[2, 2])))
                 cameras += [T[0, 3], T[2, 3], yaw]
@@ -183,7 +183,7 @@ def _look_alikes(route: Route, town: Town, passes: Passes, threads: int) -> NDAr
     """
     chosen = np.unique(np.linspace(0, len(route.T_wc) - 1, _PLACES).astype(int))
     camera = route.camera
-    small = StereoCamera(
+    small = Camera(
         camera.fx / _SMALL,
         camera.fy / _SMALL,
         camera.cx / _SMALL,

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.kernels import borrowed, inline, kernel
 
@@ -16,47 +18,55 @@ _SEAM = 1e-6  # overlap of neighbours, in parts of an edge, so that no sample fa
 # Columns of a row of ``find_visible``: three affine functions of the pixel (u, v) for s/z, t/z and
 # 1/z, two for the texture coordinates over z, then the rest.
 PLANE, TEXTURE, FIRST_ROW, LAST_ROW, TRIANGLE, LAYER = 0, 9, 15, 16, 17, 18
-NUMBER, DETAIL_U, DETAIL_V, DETAIL, AMBIENT, SUN, GLOW, KEY, COLUMNS = (
-    19,
-    20,
-    21,
-    22,
-    23,
-    24,
-    25,
-    26,
-    27,
-)
+NUMBER, DETAIL_U, DETAIL_V, DETAIL, AMBIENT, SUN, GLOW, KEY, COLUMNS = range(19, 28)
+
+
+class _Span(NamedTuple):
+    """Neighbouring samples of one row that lie on one surface.
+
+    ``begin``, ``end`` i8 numbers of the samples, ``end`` excluded; ``v`` f8 row in pixels; sample
+    ``i`` lies at column ``shift + step i`` in pixels (f8), and has 1/z = ``value + slope i`` (f8).
+    """
+
+    begin: int
+    end: int
+    v: float
+    shift: float
+    step: float
+    value: float
+    slope: float
+
+
+class _AlphaMap(NamedTuple):
+    """Alpha of one texture: ``alpha`` (N,) u1 of all textures; ``offset`` (L,) i8 where its levels
+    begin; ``log_size`` (2,) i8 binary logarithms of width and height of level 0."""
+
+    alpha: NDArray[np.uint8]
+    offset: NDArray[np.int64]
+    log_size: NDArray[np.int64]
 
 
 @kernel
-def find_visible(
-    origin,
-    edge_s,
-    edge_t,
-    uv,
-    texture,
-    detail,
-    detail_size,
-    gain,
-    triangle,
-    layer,
-    material,
-    log_size,
-    T_wc,
-    intrinsics,
-    height,
-    width,
-    lamp,
-):
+def find_visible(surfaces, atlas, camera, light):
     """Project the surfaces that a camera may see, nearest first.
+
+    Args:
+        surfaces, atlas, camera, light: `SurfaceArrays`, `AtlasArrays`, `PosedCamera`,
+            `LightValues`.
 
     Returns:
         ``(V, COLUMNS)`` float64; the columns are named above.
     """
     origin, edge_s, edge_t, T_wc = (
-        borrowed(origin), borrowed(edge_s), borrowed(edge_t), borrowed(T_wc))  # fmt: skip
-    fx, fy, cx, cy = intrinsics
+        borrowed(surfaces.origin), borrowed(surfaces.edge_s), borrowed(surfaces.edge_t),
+        borrowed(camera.T_wc))  # fmt: skip
+    uv, texture, gain, material = surfaces.uv, surfaces.texture, surfaces.gain, surfaces.material
+    detail, detail_size = surfaces.detail, surfaces.detail_size
+    triangle, layer, log_size = surfaces.triangle, surfaces.layer, atlas.log_size
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    height, width = camera.height, camera.width
+    sun_x, sun_y, sun_z = light.sun_x, light.sun_y, light.sun_z
+    direct, ambient, glow = light.direct, light.ambient, light.glow
     found = np.empty((1024, COLUMNS))
     n = 0
     corner = np.empty((4, 3))
@@ -136,18 +146,18 @@ def find_visible(
             fine = float(1 << log_size[detail[q], 0])
             row[DETAIL_U] = metres_u / texels_u / detail_size[q] * fine
             row[DETAIL_V] = metres_v / texels_v / detail_size[q] * fine
-        # World normal, on the side of the camera.
+        # World normal, turned towards the camera.
         wx, wy, wz = sy * tz - sz * ty, sz * tx - sx * tz, sx * ty - sy * tx
         sign = -1.0 / norm if wx * ox + wy * oy + wz * oz > 0.0 else 1.0 / norm
         up = -sign * wy
-        facing = sign * (wx * lamp[0] + wy * lamp[1] + wz * lamp[2])
+        facing = sign * (wx * sun_x + wy * sun_y + wz * sun_z)
         if material[q] == 1:
-            row[AMBIENT] = gain[q] * lamp[4] * 0.75
-            row[SUN] = gain[q] * lamp[3] * (0.42 + 0.2 * facing)
+            row[AMBIENT] = gain[q] * ambient * 0.75
+            row[SUN] = gain[q] * direct * (0.42 + 0.2 * facing)
         else:
-            row[AMBIENT] = gain[q] * lamp[4] * (0.62 + 0.38 * up)
-            row[SUN] = gain[q] * lamp[3] * max(facing, 0.0)
-        row[GLOW] = gain[q] * lamp[5] if material[q] == 2 else 0.0
+            row[AMBIENT] = gain[q] * ambient * (0.62 + 0.38 * up)
+            row[SUN] = gain[q] * direct * max(facing, 0.0)
+        row[GLOW] = gain[q] * glow if material[q] == 2 else 0.0
         row[KEY] = mx * mx + my * my + mz * mz - radius * radius
     found = found[:n]
     return found[np.argsort(found[:, KEY], kind="mergesort")]
@@ -192,19 +202,19 @@ def _box(corner, fx, fy, cx, cy):
 
 
 @kernel
-def rasterise(visible, first_row, samples, alpha, alpha_offset, log_size, inverse_depth, seen):
-    """Draw a band of sample rows.
+def rasterise(visible, atlas, band):
+    """Draw the surfaces into a band of samples.
 
     Args:
-        visible: from :func:`find_visible`.
-        first_row: number of the band's first row of samples in the whole image.
-        samples: samples a pixel in each direction.
-        alpha, alpha_offset, log_size: see `scene.Atlas`.
-        inverse_depth: ``(h, w)`` float32, updated: 1/z of the nearest surface, 0 without one.
-        seen: ``(h, w)`` int32, updated: its row in ``visible``.
+        visible: from `find_visible`.
+        atlas: `AtlasArrays`.
+        band: `SampleBand`; ``inverse_depth`` and ``seen`` are updated.
     """
-    visible, alpha, alpha_offset = borrowed(visible), borrowed(alpha), borrowed(alpha_offset)
-    log_size, inverse_depth, seen = borrowed(log_size), borrowed(inverse_depth), borrowed(seen)
+    visible, alpha = borrowed(visible), borrowed(atlas.alpha)
+    alpha_offset, log_size = borrowed(atlas.alpha_offset), borrowed(atlas.log_size)
+    inverse_depth, seen = borrowed(band.inverse_depth), borrowed(band.seen)
+    samples = band.samples
+    first_row = band.first_row * samples  # in samples
     height, width = inverse_depth.shape
     step = 1.0 / samples
     shift = 0.5 * step - 0.5  # pixel coordinate of sample 0
@@ -248,10 +258,9 @@ def rasterise(visible, first_row, samples, alpha, alpha_offset, log_size, invers
             slope = q[6] * step
             value = q[6] * shift + q[7] * v + q[8]
             if cut_out:
-                _fill_cut_out(
-                    q, k, v, begin, end, step, shift, value, slope,
-                    alpha, alpha_offset[number], log_size[number], inverse_depth[j], seen[j],
-                )  # fmt: skip
+                span = _Span(begin, end, v, shift, step, value, slope)
+                mask = _AlphaMap(alpha, alpha_offset[number], log_size[number])
+                _fill_cut_out(q, k, span, mask, inverse_depth[j], seen[j])
             else:
                 _fill(
                     value * q[LAYER],
@@ -266,6 +275,8 @@ def rasterise(visible, first_row, samples, alpha, alpha_offset, log_size, invers
 
 @kernel
 def _fill(value, slope, number, begin, inverse_depth, seen):
+    """Draw surface ``number`` on a part of a row that begins with sample ``begin``; its 1/z at
+    sample ``i`` of the whole row is ``value + slope i``."""
     value += slope * begin
     for i in range(np.uintp(len(seen))):
         near = np.float32(value + slope * np.float64(np.int32(i)))
@@ -276,23 +287,17 @@ def _fill(value, slope, number, begin, inverse_depth, seen):
 
 
 @kernel
-def _fill_cut_out(
-    q,
-    number,
-    v,
-    begin,
-    end,
-    step,
-    shift,
-    value,
-    slope,
-    alpha,
-    offset,
-    log_size,
-    inverse_depth,
-    seen,
-):
-    """As :func:`_fill` where the alpha of the texture is at least one half."""
+def _fill_cut_out(q, number, span, mask, inverse_depth, seen):
+    """As `_fill` where the alpha of the texture is at least one half.
+
+    Args:
+        q, number: a surface: its row of `find_visible` and the number of this row.
+        span, mask: `_Span`, `_AlphaMap`.
+        inverse_depth, seen: one row of the `SampleBand`, updated.
+    """
+    begin, end, v = span.begin, span.end, span.v
+    shift, step, value, slope = span.shift, span.step, span.value, span.slope
+    alpha, offset, log_size = mask.alpha, mask.offset, mask.log_size
     u_slope, v_slope = q[TEXTURE] * step, q[TEXTURE + 3] * step
     u_value = q[TEXTURE] * shift + q[TEXTURE + 1] * v + q[TEXTURE + 2]
     v_value = q[TEXTURE + 3] * shift + q[TEXTURE + 4] * v + q[TEXTURE + 5]
@@ -316,7 +321,7 @@ def _fill_cut_out(
         z = 1.0 / inverse
         x = (u_value + u_slope * i) * z * scale - 0.5
         y = (v_value + v_slope * i) * z * scale - 0.5
-        if level > 0:  # texels smaller than samples: the nearest will do
+        if level > 0:  # texels smaller than samples: take the nearest
             c0, r0 = math.floor(x + 0.5) & mask_u, math.floor(y + 0.5) & mask_v
             if alpha[np.uintp(at + (r0 << row_log) + c0)] < 128:
                 continue

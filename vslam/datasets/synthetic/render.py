@@ -12,18 +12,26 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
+from vslam.datasets.synthetic.kernel_arrays import (
+    AtlasArrays,
+    LightValues,
+    PosedCamera,
+    SampleBand,
+    SurfaceArrays,
+)
 from vslam.datasets.synthetic.rasterise import find_visible, rasterise
 from vslam.datasets.synthetic.scene import Atlas, Surfaces
 from vslam.datasets.synthetic.shade import shade
 from vslam.datasets.synthetic.shadows import NO_LAMPS, LampPools, ShadowMap
 
 SAMPLES = 2  # visibility samples a pixel, in each direction
-_BANDS = 2  # bands of rows of an eye, the unit of work of a thread
+_BANDS = 2  # bands of rows of an image, the unit of work of a thread
 
 Float32 = NDArray[np.float32]
 
@@ -52,15 +60,15 @@ class Light:
     exposure: float = 1.95
     headlight: float = 0.0
 
-    def as_array(self) -> NDArray[np.float64]:
-        """``(10,)`` float64, the form that the kernels take."""
+    def values(self) -> LightValues:
+        """The form that the kernels take."""
+        sky = (self.direct, self.ambient, self.glow)
         air = (self.haze, self.visibility, self.exposure)
-        return np.array([*self.sun, self.direct, self.ambient, self.glow, *air, self.headlight])
+        return LightValues(*(float(x) for x in (*self.sun, *sky, *air, self.headlight)))
 
 
-@dataclass(frozen=True)
-class View:
-    """What one eye sees: ``image`` ``(H, W)`` float32 grey before the sensor (0 to 255 and above)
+class RenderedView(NamedTuple):
+    """What a camera sees: ``image`` ``(H, W)`` float32 grey before the sensor (0 to 255 and above)
     and ``depth`` ``(H, W)`` float32 metres along z, 0 where there is sky."""
 
     image: Float32
@@ -70,10 +78,10 @@ class View:
 class Renderer:
     """Draws stereo pairs. The bytes do not depend on the number of threads."""
 
-    def __init__(self, camera: StereoCamera, atlas: Atlas, sky: int, threads: int = 1) -> None:
+    def __init__(self, camera: Camera, atlas: Atlas, sky: int, threads: int = 1) -> None:
         """``sky``: number of the panorama texture; see `textures.sky`."""
         self._camera = camera
-        self._atlas = atlas
+        self._atlas = AtlasArrays.of(atlas)
         self._sky = sky
         self._pool = ThreadPoolExecutor(threads)
 
@@ -87,7 +95,7 @@ class Renderer:
         light: Light,
         T_wc: NDArray[np.float64],
         pools: LampPools = NO_LAMPS,
-    ) -> tuple[View, View]:
+    ) -> tuple[RenderedView, RenderedView]:
         """Left and right view of a rig whose left camera stands at ``T_wc`` ``(4, 4)``."""
         right = T_wc.copy()
         right[:3, 3] += T_wc[:3, 0] * self._camera.baseline
@@ -101,12 +109,14 @@ class Renderer:
         light: Light,
         T_wc: Iterable[NDArray[np.float64]],
         pools: LampPools = NO_LAMPS,
-    ) -> list[View]:
+    ) -> list[RenderedView]:
         """A view from each of the poses ``(4, 4)``."""
-        eyes = [self._pool.submit(self._prepare, surfaces, shadows, light, T, pools) for T in T_wc]
+        prepared = [
+            self._pool.submit(self._prepare, surfaces, shadows, light, T, pools) for T in T_wc
+        ]
         views, jobs = [], []
-        for eye in eyes:
-            view, bands = eye.result()
+        for preparation in prepared:
+            view, bands = preparation.result()
             views.append(view)
             jobs += [self._pool.submit(band) for band in bands]
         for job in jobs:
@@ -120,66 +130,25 @@ class Renderer:
         light: Light,
         T_wc: NDArray[np.float64],
         pools: LampPools,
-    ) -> tuple[View, list[Callable[[], None]]]:
-        camera, atlas = self._camera, self._atlas
-        height, width = camera.height, camera.width
-        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        lamp = light.as_array()
-        T_wc = np.ascontiguousarray(T_wc)
-        visible = find_visible(
-            surfaces.origin,
-            surfaces.edge_s,
-            surfaces.edge_t,
-            surfaces.uv,
-            surfaces.texture,
-            surfaces.detail,
-            surfaces.detail_size,
-            surfaces.gain,
-            surfaces.triangle,
-            surfaces.layer,
-            surfaces.material,
-            atlas.log_size,
-            T_wc,
-            intrinsics,
-            height,
-            width,
-            lamp,
+    ) -> tuple[RenderedView, list[Callable[[], None]]]:
+        fx, fy, cx, cy = (
+            float(x) for x in (self._camera.fx, self._camera.fy, self._camera.cx, self._camera.cy)
         )
-        view = View(np.empty((height, width), np.float32), np.empty((height, width), np.float32))
+        height, width = self._camera.height, self._camera.width
+        camera = PosedCamera(np.ascontiguousarray(T_wc), fx, fy, cx, cy, height, width)
+        values = light.values()
+        visible = find_visible(SurfaceArrays.of(surfaces), self._atlas, camera, values)
+        view = RenderedView(
+            np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+        )
         edges = np.linspace(0, height, _BANDS + 1).astype(int)
 
         def band(first: int, end: int) -> None:
             shape = (SAMPLES * (end - first), SAMPLES * width)
             inverse_depth, seen = np.zeros(shape, np.float32), np.full(shape, -1, np.int32)
-            rasterise(
-                visible,
-                SAMPLES * first,
-                SAMPLES,
-                atlas.alpha,
-                atlas.alpha_offset,
-                atlas.log_size,
-                inverse_depth,
-                seen,
-            )
-            shade(
-                visible,
-                first,
-                SAMPLES,
-                seen,
-                atlas.texels,
-                atlas.offset,
-                atlas.log_size,
-                self._sky,
-                shadows.height_cm,
-                shadows.frame,
-                pools.light,
-                pools.frame,
-                T_wc,
-                intrinsics,
-                lamp,
-                view.image,
-                view.depth,
-            )
+            samples = SampleBand(first, SAMPLES, inverse_depth, seen)
+            rasterise(visible, self._atlas, samples)
+            shade(visible, samples, self._atlas, self._sky, values, shadows, pools, camera, view)
 
         # Defaults bind the loop's values.
         return (

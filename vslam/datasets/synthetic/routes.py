@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.datasets.synthetic.terrain import Roads, Terrain, roads_of
 from vslam.errors import InputError
 
@@ -19,9 +19,9 @@ RATE = 10.0  # frames a second
 _MAX_STEP = 5.0  # m between frames
 _LANE = 1.6  # m from the middle of the road to the middle of a lane
 _CAMERAS = {  # as in KITTI's three recording periods: 00-02, 03, 04-12
-    "00-02": StereoCamera(718.856, 718.856, 607.1928, 185.2157, 0.53716, 1241, 376),
-    "03": StereoCamera(721.5377, 721.5377, 609.5593, 172.854, 0.53715, 1242, 375),
-    "04-12": StereoCamera(707.0912, 707.0912, 601.8873, 183.1104, 0.53715, 1226, 370),
+    "00-02": Camera(718.856, 718.856, 607.1928, 185.2157, 0.53716, 1241, 376),
+    "03": Camera(721.5377, 721.5377, 609.5593, 172.854, 0.53715, 1242, 375),
+    "04-12": Camera(707.0912, 707.0912, 601.8873, 183.1104, 0.53715, 1226, 370),
 }
 
 CALIBRATIONS = tuple(_CAMERAS)
@@ -43,7 +43,7 @@ class Route:
     name: str
     about: str
     land: str
-    camera: StereoCamera
+    camera: Camera
     T_wc: Float
     roads: Roads
     terrain: Terrain

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import cv2
@@ -63,7 +62,7 @@ class Surfaces:
         return Surfaces(**values)
 
 
-def join(parts: Sequence[Surfaces]) -> Surfaces:
+def join(parts: list[Surfaces]) -> Surfaces:
     """All surfaces of ``parts`` (at least one) in their order."""
     if len(parts) == 1:
         return parts[0]
@@ -77,7 +76,7 @@ def patches(
     edge_t: Float,
     texture: int,
     *,
-    uv: Sequence[float] | Float = (0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
+    uv: tuple[float, ...] | Float = (0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
     detail: int = -1,
     detail_size: float = 1.0,
     gain: float = 1.0,
@@ -156,7 +155,7 @@ class AtlasBuilder:
         return len(self._grey) - 1
 
     def build(self) -> Atlas:
-        offset, texels = _flatten(self._grey)
+        offset, texels = _flatten([*self._grey])
         alpha_offset, alpha = _flatten(self._alpha)
         log_size = [[int(n).bit_length() - 1 for n in p[0].shape[::-1]] for p in self._grey]
         return Atlas(texels, alpha, offset, alpha_offset, np.array(log_size, np.int64))
@@ -174,7 +173,7 @@ def _pyramid(image: NDArray[np.floating]) -> list[NDArray[np.uint8]]:
 
 
 def _flatten(
-    pyramids: Sequence[list[NDArray[np.uint8]] | None],
+    pyramids: list[list[NDArray[np.uint8]] | None],
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
     depth = max(len(p) for p in pyramids if p is not None) if any(pyramids) else 1
     offset = np.full((len(pyramids), depth), -1, np.int64)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from vslam.datasets.synthetic.kernel_arrays import AtlasArrays, PosedCamera
 from vslam.datasets.synthetic.rasterise import (
     AMBIENT,
     DETAIL,
@@ -16,6 +19,7 @@ from vslam.datasets.synthetic.rasterise import (
     SUN,
     TEXTURE,
 )
+from vslam.datasets.synthetic.shadows import LampPools, ShadowMap
 from vslam.kernels import borrowed, inline, kernel
 
 _SCALE = 0.5 ** np.arange(24)  # of the levels of a mipmap
@@ -27,6 +31,35 @@ SKY_FALL = 0.1  # and of the depression at its lower edge
 _GLARE, _GLARE_WIDTH = 120.0, 0.10  # grey that the sky gains towards the sun; 1 - cos of its half
 _POOL_GAIN = 2.5  # brightness under a street lamp by that of a lit window
 _SHADE_BIAS = 0.35  # m that an occluder must rise above a point to shade it
+
+
+class _PixelRun(NamedTuple):
+    """Neighbouring pixels of one row that see one surface.
+
+    ``start``, ``end`` i8 columns, ``end`` excluded; ``x``, ``y`` f8 where the first pixel is
+    sampled, the others likewise; ``weight`` f8 part of each pixel that the surface covers.
+    """
+
+    start: int
+    end: int
+    x: float
+    y: float
+    weight: float
+
+
+class _RowBuffers(NamedTuple):
+    """What is known of one row of W pixels so far.
+
+    ``total`` (W,) f8 radiance; ``nearest`` (W,) f8 greatest 1/z. Of the present run: ``texel``
+    (6, W) f8 depth, s, t, half the distance of two samples of the texture in s and t, albedo;
+    ``size`` (W,) f4 texels that a pixel covers; ``bits`` (W,) i4 the same memory seen as integers.
+    """
+
+    total: NDArray[np.float64]
+    nearest: NDArray[np.float64]
+    texel: NDArray[np.float64]
+    size: NDArray[np.float32]
+    bits: NDArray[np.int32]
 
 
 @inline
@@ -68,7 +101,7 @@ def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
         low, part = 0, np.float32(0.0)
     if low >= top:
         low, part = top, np.float32(0.0)
-    # One way out: else Numba counts the references of the arrays at each call.
+    # One return only: with several, Numba counts the references of the arrays at each call.
     row = np.uintp(number)
     high = low
     if part >= 1.0:
@@ -83,51 +116,52 @@ def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
 
 
 @inline
-def _sky(texels, offset, log_size, number, lamp, x, y, z, bits):
+def _sky(atlas, number, light, x, y, z, bits):
     """Panorama in the world direction ``(x, y, z)`` with the glow of the sky about the sun;
     ``bits``: texels that a pixel covers, as a float32's bits."""
+    texels, offset, log_size = atlas.texels, atlas.offset, atlas.log_size
     log_w, log_h = log_size[number, 0], log_size[number, 1]
     square = x * x + z * z
     flat = math.sqrt(square)
     rise = (SKY_RISE + y / flat) / (SKY_RISE + SKY_FALL)
     u = (math.atan2(x, z) / (2.0 * math.pi) + 0.5) * (1 << log_w)
     v = min(max(rise, 0.0), 0.9999) * ((1 << log_h) - 1) + 0.5
-    away = 1.0 - (x * lamp[0] + y * lamp[1] + z * lamp[2]) / math.sqrt(square + y * y)
-    glow = lamp[3] * (_GLARE / (1.0 + away / _GLARE_WIDTH) ** 2)
+    away = 1.0 - (x * light.sun_x + y * light.sun_y + z * light.sun_z) / math.sqrt(square + y * y)
+    glow = light.direct * (_GLARE / (1.0 + away / _GLARE_WIDTH) ** 2)
     return _trilinear(texels, offset, number, log_w, log_h, bits, u, v) + glow
 
 
 @inline
-def _lit(shadow, frame, lamp, slope, x, y, z):
+def _lit(shadow, frame, light, slope, x, y, z):
     """Part of the sun that reaches a world point: 0 in shadow to 1, soft at the edge."""
     up = -y
-    a = (x - lamp[0] * slope * up - frame[0]) / frame[2] - 0.5
-    b = (z - lamp[2] * slope * up - frame[1]) / frame[2] - 0.5
+    a = (x - light.sun_x * slope * up - frame[0]) / frame[2] - 0.5
+    b = (z - light.sun_z * slope * up - frame[1]) / frame[2] - 0.5
     a0, b0 = math.floor(a), math.floor(b)
     c, r = int(a0), int(b0)
-    light = 1.0
+    part = 1.0
     if c >= 0 and r >= 0 and c < shadow.shape[1] - 1 and r < shadow.shape[0] - 1:
         level = (up + _SHADE_BIAS - frame[3]) * 100.0
         fa, fb = a - a0, b - b0
-        light = 0.0
+        part = 0.0
         r, c = np.uintp(r), np.uintp(c)
         one = np.uintp(1)
         if shadow[r, c] <= level:
-            light += (1.0 - fa) * (1.0 - fb)
+            part += (1.0 - fa) * (1.0 - fb)
         if shadow[r, c + one] <= level:
-            light += fa * (1.0 - fb)
+            part += fa * (1.0 - fb)
         if shadow[r + one, c] <= level:
-            light += (1.0 - fa) * fb
+            part += (1.0 - fa) * fb
         if shadow[r + one, c + one] <= level:
-            light += fa * fb
-    return light
+            part += fa * fb
+    return part
 
 
 @inline
-def _pool(pools, pool_frame, x, y, z):
+def _pool(pools, frame, x, y, z):
     """Light of the street lamps at a world point, 1 under a lamp."""
-    a = (x - pool_frame[0]) / pool_frame[2]
-    b = (z - pool_frame[1]) / pool_frame[2]
+    a = (x - frame[0]) / frame[2]
+    b = (z - frame[1]) / frame[2]
     c, r = math.floor(a), math.floor(b)
     light = 0.0
     if c >= 0 and r >= 0 and c < pools.shape[1] - 1 and r < pools.shape[0] - 1:
@@ -141,46 +175,30 @@ def _pool(pools, pool_frame, x, y, z):
 
 
 @kernel
-def shade(
-    visible,
-    first_row,
-    samples,
-    seen,
-    texels,
-    offset,
-    log_size,
-    sky,
-    shadow,
-    frame,
-    pools,
-    pool_frame,
-    T_wc,
-    intrinsics,
-    lamp,
-    image,
-    depth,
-):
-    """Fill the rows of ``image`` and ``depth`` that belong to a band of samples.
+def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
+    """Fill the rows of a view that belong to a band of samples.
 
     Pixels whose samples all see one surface are shaded in runs, the others once for each surface.
 
     Args:
         visible: from `rasterise.find_visible`.
-        first_row: first row of the band in the image.
-        samples: samples a pixel in each direction.
-        seen: ``(samples h, samples W)`` int32 from `rasterise.rasterise`.
-        texels, offset, log_size: see `scene.Atlas`.
-        sky: number of the sky's panorama.
-        shadow, frame: see `shadows.ShadowMap`.
-        pools, pool_frame: see `shadows.LampPools`.
-        T_wc, intrinsics, lamp: pose, ``fx fy cx cy``, `render.Light.as_array`.
-        image, depth: ``(H, W)`` float32, written; see `render.View`.
+        band: `rasterise.SampleBand`, from `rasterise.rasterise`.
+        atlas, light, camera: `rasterise.AtlasArrays`, `LightValues`, `PosedCamera`.
+        sky: number of the sky's panorama in the atlas.
+        shadows, pools: `shadows.ShadowMap`, `shadows.LampPools`.
+        view: `render.RenderedView`, written.
     """
-    visible, seen, texels, offset = (
-        borrowed(visible), borrowed(seen), borrowed(texels), borrowed(offset))  # fmt: skip
-    log_size, shadow, frame = borrowed(log_size), borrowed(shadow), borrowed(frame)
-    pools, pool_frame, lamp = borrowed(pools), borrowed(pool_frame), borrowed(lamp)
-    T_wc, intrinsics = borrowed(T_wc), borrowed(intrinsics)
+    visible, seen = borrowed(visible), borrowed(band.seen)
+    first_row, samples = band.first_row, band.samples
+    image, depth = view.image, view.depth
+    atlas = AtlasArrays(
+        borrowed(atlas.texels), borrowed(atlas.alpha), borrowed(atlas.offset),
+        borrowed(atlas.alpha_offset), borrowed(atlas.log_size))  # fmt: skip
+    shadows = ShadowMap(borrowed(shadows.height_cm), borrowed(shadows.frame))
+    pools = LampPools(borrowed(pools.light), borrowed(pools.frame))
+    camera = PosedCamera(
+        borrowed(camera.T_wc), camera.fx, camera.fy, camera.cx, camera.cy, camera.height,
+        camera.width)  # fmt: skip
     width = image.shape[1]
     room = samples * samples
     held_number, held = np.empty(room, np.int64), np.empty((3, room))
@@ -189,6 +207,7 @@ def shade(
     held_rows, held_size = np.empty((8, width)), np.empty(width, np.float32)
     texel, total, nearest = borrowed(held_rows[2:]), borrowed(held_rows[0]), borrowed(held_rows[1])
     size, bits = borrowed(held_size), borrowed(held_size.view(np.int32))
+    buffers = _RowBuffers(total, nearest, texel, size, bits)
     for j in range(seen.shape[0] // samples):
         v = first_row + j
         total[:] = 0.0
@@ -209,21 +228,16 @@ def shade(
                 )
             for k in range(kinds):
                 x, y = start + shift_u[k] / weight[k], v + shift_v[k] / weight[k]
-                part = weight[k] / room
+                run = _PixelRun(start, end, x, y, weight[k] / room)
                 if number[k] < 0:
-                    _sky_run(
-                        start, end, x, y, part, texels, offset, log_size, sky, T_wc, intrinsics,
-                        lamp, size, bits, total,
-                    )  # fmt: skip
+                    _sky_run(run, atlas, sky, light, camera, buffers)
                 else:
                     _shade_run(
-                        visible, number[k], start, end, x, y, part, texels, offset, log_size,
-                        shadow, frame, pools, pool_frame, T_wc, intrinsics, lamp, texel, size,
-                        bits, total, nearest,
-                    )  # fmt: skip
+                        run, visible, number[k], atlas, light, shadows, pools, camera, buffers
+                    )
             start = end
         for u in range(width):
-            image[v, u] = total[u] * lamp[8]
+            image[v, u] = total[u] * light.exposure
             depth[v, u] = 1.0 / nearest[u] if nearest[u] > 0.0 else 0.0
     # What is borrowed above must live until here.
     held[0, 0] = held_number[0] + held_rows[0, 0] + held_size[0]
@@ -261,12 +275,12 @@ def _alike(seen, row, column, samples, first):
 
 
 @inline
-def _sky_run(
-    start, end, x0, y, weight, texels, offset, log_size, sky, T_wc, intrinsics, lamp, size, bits,
-    total,
-):  # fmt: skip
+def _sky_run(run, atlas, sky, light, camera, buffers):
     """As `_shade_run`, for the sky."""
-    fx, fy, cx, cy = intrinsics
+    start, end, x0, y, weight = run.start, run.end, run.x, run.y, run.weight
+    log_size, T_wc = atlas.log_size, camera.T_wc
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    size, bits, total = buffers.size, buffers.bits, buffers.total
     scale_u = (1 << log_size[sky, 0]) / (2.0 * math.pi)
     scale_v = (1 << log_size[sky, 1]) / (SKY_RISE + SKY_FALL)
     size[0] = max(scale_u, scale_v) / fx
@@ -274,22 +288,23 @@ def _sky_run(
     for u in range(start, end):
         rx = (x0 + (u - start) - cx) / fx
         grey = _sky(
-            texels, offset, log_size, sky, lamp, T_wc[0, 0] * rx + T_wc[0, 1] * ry + T_wc[0, 2],
+            atlas, sky, light, T_wc[0, 0] * rx + T_wc[0, 1] * ry + T_wc[0, 2],
             T_wc[1, 0] * rx + T_wc[1, 1] * ry + T_wc[1, 2],
             T_wc[2, 0] * rx + T_wc[2, 1] * ry + T_wc[2, 2], bits[0],
         )  # fmt: skip
-        total[u] += weight * grey * lamp[6] / _SKY_HAZE
+        total[u] += weight * grey * light.haze / _SKY_HAZE
 
 
 @inline
-def _shade_run(
-    visible, number, start, end, x0, y, weight, texels, offset, log_size, shadow, frame,
-    pools, pool_frame, T_wc, intrinsics, lamp, texel, size, bits, total, nearest,
-):  # fmt: skip
-    """Add one surface on the pixels ``start`` to ``end`` of a row, the first of which is sampled at
-    ``(x0, y)``, to ``total`` and ``nearest``. ``texel``, ``size``: room for one row;
-    ``bits``: ``size`` seen as integers."""
-    fx, fy, cx, cy = intrinsics
+def _shade_run(run, visible, number, atlas, light, shadows, pools, camera, buffers):
+    """Add surface ``number`` of ``visible`` to ``buffers.total`` and ``buffers.nearest`` on the
+    pixels of a run; the other arguments are those of `shade`."""
+    start, end, x0, y, weight = run.start, run.end, run.x, run.y, run.weight
+    texels, offset, log_size, T_wc = atlas.texels, atlas.offset, atlas.log_size, camera.T_wc
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    texel, size, bits = buffers.texel, buffers.size, buffers.bits
+    total, nearest = buffers.total, buffers.nearest
+    shadow, frame, pool, pool_frame = shadows.height_cm, shadows.frame, pools.light, pools.frame
     ry = (y - cy) / fy
     count = end - start
     # Direction of the ray: base + x step.
@@ -346,25 +361,26 @@ def _shade_run(
                     / 128.0
                 )  # fmt: skip
     ambient, sun = visible[n, AMBIENT] + visible[n, GLOW], visible[n, SUN]
-    slope = 1.0 / max(-lamp[1], 0.05)
-    rate = 1.0 / lamp[7]
-    lamps, beams = lamp[5] > 0.0, lamp[9] > 0.0
-    gain = visible[n, AMBIENT] / max(lamp[4], 1e-6)
+    slope = 1.0 / max(-light.sun_y, 0.05)
+    rate = 1.0 / light.visibility
+    glow, headlight, haze = light.glow, light.headlight, light.haze
+    lamps, beams = glow > 0.0, headlight > 0.0
+    gain = visible[n, AMBIENT] / max(light.ambient, 1e-6)
     for i in range(count):
         z = texel[0, i]
-        light = ambient
+        received = ambient
         if sun > 0.0 or lamps:
             x = T_wc[0, 3] + z * (base_x + i * step_x)
             up = T_wc[1, 3] + z * (base_y + i * step_y)
             far = T_wc[2, 3] + z * (base_z + i * step_z)
             if sun > 0.0:
-                light += sun * _lit(shadow, frame, lamp, slope, x, up, far)
+                received += sun * _lit(shadow, frame, light, slope, x, up, far)
             if lamps:
-                light += _POOL_GAIN * gain * lamp[5] * _pool(pools, pool_frame, x, up, far)
+                received += _POOL_GAIN * gain * glow * _pool(pool, pool_frame, x, up, far)
         if beams:
             rx = (x0 + i - cx) / fx
             beam = math.exp(-3.0 * rx * rx - 30.0 * (ry - 0.08) * (ry - 0.08))
-            light += lamp[9] * beam * 200.0 / (100.0 + z * z)
+            received += headlight * beam * 200.0 / (100.0 + z * z)
         clear = 1.0 / (1.0 + z * rate * (1.0 + 0.5 * z * rate))
-        total[start + i] += weight * (texel[5, i] * light * clear + lamp[6] * (1.0 - clear))
+        total[start + i] += weight * (texel[5, i] * received * clear + haze * (1.0 - clear))
         nearest[start + i] = max(nearest[start + i], 1.0 / z)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.datasets.synthetic.kernel_arrays import AtlasArrays, SurfaceArrays
 from vslam.datasets.synthetic.scene import Atlas, Surfaces
 from vslam.kernels import kernel
 
@@ -16,8 +17,7 @@ _FINEST = 0.08  # m
 _POOL_CELL, _POOL_REACH = 0.5, 16.0  # m
 
 
-@dataclass(frozen=True)
-class ShadowMap:
+class ShadowMap(NamedTuple):
     """All points of one sun ray share a cell: the point where the ray meets height 0.
 
     Attributes:
@@ -31,8 +31,7 @@ class ShadowMap:
     frame: NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class LampPools:
+class LampPools(NamedTuple):
     """Light that street lamps cast, whatever the height: a lamp's cone is taken as a cylinder.
 
     Attributes:
@@ -84,39 +83,24 @@ def cast_shadows(surfaces: Surfaces, atlas: Atlas, sun: NDArray[np.float64]) -> 
     cell = max(_FINEST, math.sqrt(float(np.prod(high - low)) / _MAX_CELLS))
     columns, rows = np.ceil((high - low) / cell).astype(int) + 1
     frame = np.array([low[0], low[1], cell, float(up.min()) - 1.0])
-    height_cm = np.zeros((rows, columns), np.uint16)
-    _cast(
-        casts.origin,
-        casts.edge_s,
-        casts.edge_t,
-        casts.uv,
-        casts.texture,
-        casts.triangle,
-        atlas.alpha,
-        atlas.alpha_offset,
-        atlas.log_size,
-        slope,
-        frame,
-        height_cm,
-    )
-    return ShadowMap(height_cm, frame)
+    shadows = ShadowMap(np.zeros((rows, columns), np.uint16), frame)
+    _cast(SurfaceArrays.of(casts), AtlasArrays.of(atlas), slope, shadows)
+    return shadows
 
 
 @kernel
-def _cast(
-    origin,
-    edge_s,
-    edge_t,
-    uv,
-    texture,
-    triangle,
-    alpha,
-    alpha_offset,
-    log_size,
-    slope,
-    frame,
-    height_cm,
-):
+def _cast(surfaces, atlas, slope, shadows):
+    """Raise the heights of a shadow map to those of all occluders.
+
+    Args:
+        surfaces, atlas: `SurfaceArrays` of the occluders, `AtlasArrays`.
+        slope: ``(2,)`` float64 metres that a ray of the sun moves along x and z for one metre up.
+        shadows: `ShadowMap`, updated.
+    """
+    origin, edge_s, edge_t = surfaces.origin, surfaces.edge_s, surfaces.edge_t
+    uv, texture, triangle = surfaces.uv, surfaces.texture, surfaces.triangle
+    alpha, alpha_offset, log_size = atlas.alpha, atlas.alpha_offset, atlas.log_size
+    height_cm, frame = shadows.height_cm, shadows.frame
     rows, columns = height_cm.shape
     for q in range(len(origin)):
         up = -origin[q, 1]

@@ -6,7 +6,6 @@ viewer, so that the front lies in z = 0 or faces -z.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from vslam.datasets.synthetic.textures import Rng
 
 FOUNDATION = 1.2  # m that walls reach below the ground, for slopes
 
-Vector = Sequence[float] | NDArray[np.float64]
+Vector = tuple[float, ...] | NDArray[np.float64]
 
 
 def turn(heading: float) -> NDArray[np.float64]:
@@ -46,7 +45,7 @@ def box(
 
 
 def walls(
-    size: tuple[float, float, float], textures: Sequence[int], lights: Sequence[int], fine: int,
+    size: tuple[float, float, float], textures: list[int], lights: list[int], fine: int,
     *, thing: int,
 ) -> Surfaces:  # fmt: skip
     """Front, right, back and left of a house ``(width, height, depth)``.
@@ -118,7 +117,7 @@ def roof(
 
 
 def tree(
-    rng: Rng, twigs: Sequence[int], bark: int, *, height: float, thing: int, conifer: bool = False
+    rng: Rng, twigs: list[int], bark: int, *, height: float, thing: int, conifer: bool = False
 ) -> Surfaces:
     """Trunk and a crown of see-through twigs."""
     radius = float(rng.uniform(0.018, 0.028)) * height
@@ -148,7 +147,7 @@ def tree(
     return join(parts)
 
 
-def bush(rng: Rng, twigs: Sequence[int], *, height: float, thing: int) -> Surfaces:
+def bush(rng: Rng, twigs: list[int], *, height: float, thing: int) -> Surfaces:
     """Twigs from the ground on."""
     cards = int(rng.integers(4, 8))
     middle = np.column_stack([
@@ -182,7 +181,7 @@ def _branch(rng: Rng, start: Vector, end: Vector, radius: float, bark: int, thin
 
 
 def _cards(
-    rng: Rng, middle: NDArray[np.float64], size: NDArray[np.float64], twigs: Sequence[int],
+    rng: Rng, middle: NDArray[np.float64], size: NDArray[np.float64], twigs: list[int],
     thing: int, gain: float,
 ) -> Surfaces:  # fmt: skip
     """Square twigs at ``middle`` ``(N, 3)`` with sides ``size`` ``(N,)``, turned at random."""
@@ -242,7 +241,7 @@ def lamp_post(height: float, arm: float, metal: int, screen: int, thing: int) ->
 
 
 def sign_post(
-    rng: Rng, height: float, metal: int, faces: Sequence[tuple[int, int]], thing: int
+    rng: Rng, height: float, metal: int, faces: list[tuple[int, int]], thing: int
 ) -> Surfaces:
     """Signs on a pole, facing -z; ``faces``: textures of the front and the back of each."""
     parts = [box((-0.035, -height, -0.035), (0.035, 0.3, 0.035), metal, thing=thing)]

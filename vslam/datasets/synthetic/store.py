@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from vslam.camera import StereoCamera
+from vslam.camera import Camera
 from vslam.datasets.synthetic.camera_effects import sensor_image
 from vslam.datasets.synthetic.files import (
     check_disk,
@@ -131,7 +131,7 @@ def render_sequence(
         route: drive to render.
         variation: of the town.
         cache: folder for the trees; see `cache_folder`.
-        depth: write ``depth_0``, 16-bit PNG in centimetres of the left eye, too.
+        depth: write ``depth_0``, 16-bit PNG in centimetres of the left camera, too.
         until: render the frames before this one only; a later call goes on from there.
         verify: compare the checksum of every frame. Without it the sizes of all files and the
             checksums of a few frames are compared. Damaged frames are rendered again, with a
@@ -181,9 +181,7 @@ def render_sequence(
     return root
 
 
-def _matching_record(
-    folder: Path, wanted: dict[str, Any], camera: StereoCamera
-) -> dict[str, Any] | None:
+def _matching_record(folder: Path, wanted: dict[str, Any], camera: Camera) -> dict[str, Any] | None:
     """The manifest of a folder, if it is one of what is wanted."""
     found = _read_record(folder)
     if found is None or any(found.get(key) != value for key, value in wanted.items()):
@@ -220,13 +218,13 @@ def _render(
             moment.surfaces, moment.shadows, moment.light, route.T_wc[k], moment.pools
         )
         paths = frame_files(folder, k, depth)
-        for eye, (view, path) in enumerate(zip(views, paths, strict=False)):
+        for side, (view, path) in enumerate(zip(views, paths, strict=False)):
             image = sensor_image(
                 view.image,
                 route.camera,
                 yaw_rate=float(yaw_rate[k]),
                 night=moment.night,
-                key=(variation.seed, k, eye),
+                key=(variation.seed, k, side),
             )
             write_png(path, image, 1)
         if depth:
@@ -274,10 +272,10 @@ def _read_record(folder: Path) -> dict[str, Any] | None:
         return None
 
 
-def _calibration(camera: StereoCamera) -> str:
+def _calibration(camera: Camera) -> str:
     lines = []
-    for eye in range(4):
-        shift = -camera.bf if eye % 2 else 0.0
+    for side in range(4):
+        shift = -camera.bf if side % 2 else 0.0
         numbers = [camera.fx, 0, camera.cx, shift, 0, camera.fy, camera.cy, 0, 0, 0, 1, 0]
-        lines.append(f"P{eye}: " + " ".join(f"{x:.12e}" for x in numbers) + "\n")
+        lines.append(f"P{side}: " + " ".join(f"{x:.12e}" for x in numbers) + "\n")
     return "".join(lines)

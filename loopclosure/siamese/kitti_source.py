@@ -1,0 +1,103 @@
+"""Images of a KITTI sequence; its poses, or a matrix of its loops, tell which show one place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError
+from vslam.loopclosure.siamese.source import (
+    DIFFERENT,
+    SAME,
+    UNKNOWN,
+    ImageSource,
+    images_in,
+    names_of,
+    read_loop_matrix,
+)
+from vslam.trajectory import read_kitti_poses
+
+_FAR = 25.0  # m, beyond which two images of a drive show different places
+
+
+def read_kitti(
+    root: Path,
+    seq: str = "00",
+    first: str = "0",
+    last: str = "1000000",
+    every: str = "1",
+    frames: str = "",
+    truth: str = "",
+    near: str = "5",
+) -> list[ImageSource]:
+    """Left grey images of a KITTI sequence; those numbered first to last, both included.
+
+    Args:
+        root: KITTI root.
+        seq, first, last, every: which images; every second one for 2.
+        frames: ranges instead of first and last, ``0-249+1500-1699``.
+        truth: ``.mat`` file with a matrix of the whole sequence that marks the same places; the
+            others are different beyond 25 m and not known below.
+        near: metres within which two images show one place, below 25. The matrices of loop
+            detection count places as the same up to 20 m apart and more.
+
+    Raises:
+        InputError: no images in that range, no poses for them, no such matrix, or a ``near`` that
+            is out of range.
+    """
+    base = root if (root / "sequences").is_dir() else root / "dataset"
+    folder = base / "sequences" / seq / "image_0"
+    spans = [span.split("-") for span in frames.split("+")] if frames else [[first, last]]
+    wanted = [range(int(low), int(high) + 1, int(every)) for low, high in spans]
+    files = [f for f in images_in(folder) if f.stem.isdecimal()]
+    files = [f for f in files if any(int(f.stem) in span for span in wanted)]
+    if len(files) < 2:
+        numbers = frames or f"{first} to {last}"
+        raise InputError(f"{folder}: no images numbered {numbers}; see datasets.md.")
+    poses = read_kitti_poses(base / "poses" / f"{seq}.txt")
+    number = np.array([int(f.stem) for f in files])
+    if number[-1] >= len(poses):
+        raise InputError(
+            f"{base}/poses/{seq}.txt: {len(poses)} poses, none for image {files[-1].stem}; take "
+            "the file of this sequence."
+        )
+    T_wc = poses[number]
+    steps = np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1)
+    stretch = (np.concatenate([[0.0], np.cumsum(steps)]) // 100.0).astype(np.int32)  # of 100 m
+    if not 0.0 < float(near) < _FAR:
+        raise InputError(f"near={near}: must be above 0 and below {_FAR:g} m.")
+    relation = relation_of_poses(T_wc, near=float(near))
+    if truth:
+        path = Path(truth).expanduser()
+        loops = read_loop_matrix(path)
+        if len(loops) <= number[-1]:
+            raise InputError(
+                f"{path}: {len(loops)} rows, none for image {files[-1].stem}; take the matrix of "
+                "this sequence."
+            )
+        marked = loops[np.ix_(number, number)]
+        relation[relation == SAME] = UNKNOWN
+        relation[marked | marked.T] = SAME
+        np.fill_diagonal(relation, SAME)
+    name = f"kitti{seq}"
+    return [ImageSource(name, name, names_of(files), tuple(files), relation, stretch)]
+
+
+def relation_of_poses(
+    T_wc: NDArray[np.float64],
+    *,
+    near: float = 5.0,
+    turned: float = 30.0,
+    far: float = _FAR,
+) -> NDArray[np.int8]:
+    """Same place: nearer than ``near`` metres and ``turned`` degrees; different: beyond ``far``."""
+    centre, forward = T_wc[:, :3, 3], T_wc[:, :3, 2]
+    apart = np.linalg.norm(centre[:, None] - centre[None], axis=2)
+    cosine = forward @ forward.T
+    relation = np.zeros(apart.shape, np.int8)
+    relation[(apart < near) & (cosine > np.cos(np.radians(turned)))] = SAME
+    relation[apart > far] = DIFFERENT
+    np.fill_diagonal(relation, SAME)
+    return relation

@@ -1,0 +1,102 @@
+"""The model card: what a set of weights was made of, written next to them."""
+
+from __future__ import annotations
+
+import json
+import platform
+import subprocess
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from vslam.errors import ResultsError
+from vslam.loopclosure.siamese.data import Collection
+from vslam.loopclosure.siamese.settings import TrainSettings
+from vslam.loopclosure.siamese.siamese import SiameseNetwork
+from vslam.loopclosure.siamese.training import TrainingOutcome
+
+
+def describe(
+    network: SiameseNetwork,
+    collection: Collection,
+    settings: TrainSettings,
+    outcome: TrainingOutcome,
+    *,
+    preset: str,
+    data: list[str],
+    device: str,
+) -> dict[str, Any]:
+    """Everything that a reader needs to judge the weights or to make them again."""
+    return {
+        "network": network.name,
+        "parameters": network.n_parameters(),
+        "dimensions": network.dimensions,
+        "preset": preset,
+        "seed": settings.seed,
+        "data": data,
+        "sources": dict(collection.sources),
+        "images_trained": len(outcome.train),
+        "images_validated": len(outcome.validation),
+        "division": "whole units (folders, stretches of road), by seed; same places left out",
+        "finished": outcome.finished,
+        "epochs": outcome.progress.epoch,
+        "best_epoch": max(
+            range(len(outcome.progress.history)),
+            key=lambda k: outcome.progress.history[k]["average_precision"],
+            default=-1,
+        ),
+        "validation": outcome.figures,
+        "seconds": round(outcome.progress.seconds, 1),
+        "images_per_second": round(outcome.progress.images / max(outcome.progress.seconds, 1e-9)),
+        "device": device,
+        "machine": platform.processor() or platform.machine(),
+        "torch": torch.__version__,
+        "vslam": version("vslam"),
+        "commit": _commit(),
+        "settings": settings.model_dump(mode="json"),
+    }
+
+
+def write_card(card: dict[str, Any], weights: Path) -> tuple[Path, Path]:
+    """Write ``NAME.json`` and ``NAME.md`` beside the weights; returns both.
+
+    Raises:
+        ResultsError: they cannot be written.
+    """
+    figures = "".join(f"| {k} | {v:.4g} |\n" for k, v in card["validation"].items())
+    sources = "".join(f"| {k} | {v} |\n" for k, v in card["sources"].items())
+    text = (
+        f"# {card['network']}\n\n"
+        f"{card['parameters']:,} parameters, descriptor of {card['dimensions']} numbers. Preset "
+        f"`{card['preset']}`, seed {card['seed']}, best of {card['epochs']} epochs: "
+        f"{card['best_epoch']}. {card['seconds'] / 60:.1f} minutes on {card['device']} "
+        f"({card['machine']}), torch {card['torch']}, vslam {card['vslam']}, commit "
+        f"{card['commit']}.\n\n"
+        "## Validation\n\nEach validation image, augmented, against all others; all pairs whose "
+        f"relation is known.\n\n| figure | value |\n|---|---|\n{figures}\n"
+        f"## Data\n\n{card['images_trained']} images trained on, {card['images_validated']} "
+        f"validated on. Division: {card['division']}. Test data were not seen.\n\n"
+        f"| source | images |\n|---|---|\n{sources}\n"
+        "Command: " + " ".join(f"`--data {spec}`" for spec in card["data"]) + "\n\n"
+        f"## Settings\n\n```json\n{json.dumps(card['settings'], indent=1)}\n```\n"
+    )
+    paths = weights.with_suffix(".json"), weights.with_suffix(".md")
+    try:
+        paths[0].write_text(json.dumps(card, indent=2) + "\n")
+        paths[1].write_text(text)
+    except OSError as error:
+        raise ResultsError(f"{weights.parent}: cannot be written ({error.strerror}).") from error
+    return paths
+
+
+def _commit() -> str:
+    try:
+        done = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12"],
+            capture_output=True, text=True, cwd=Path(__file__).parent, check=True, timeout=5,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return done.stdout.strip()

@@ -1,0 +1,62 @@
+"""Image sources in one small file, for machines that cannot hold the original images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError, ResultsError
+from vslam.loopclosure.siamese.images import Fit, Size
+from vslam.loopclosure.siamese.source import ImageSource
+
+
+def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> None:
+    """Write sources as one file: images at the size of the network, JPEG, with their relations.
+
+    See docs/training.md.
+
+    Raises:
+        UnreadableImageError: an image is missing or damaged.
+        ResultsError: the file cannot be written.
+    """
+    import cv2
+
+    arrays: dict[str, NDArray] = {"count": np.array(len(sources))}
+    for k, source in enumerate(sources):
+        encoded = [
+            cv2.imencode(".jpg", source.read(i, size, fit), (cv2.IMWRITE_JPEG_QUALITY, 85))[1]
+            for i in range(len(source))
+        ]
+        arrays[f"{k}_text"] = np.array([source.name, source.family, *source.names])
+        arrays[f"{k}_sizes"] = np.array([len(e) for e in encoded])
+        arrays[f"{k}_bytes"] = np.concatenate([e.ravel() for e in encoded])
+        arrays[f"{k}_relation"], arrays[f"{k}_unit"] = source.relation, source.unit
+    try:
+        np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error
+
+
+def read_pack(path: Path) -> list[ImageSource]:
+    """Read what `write_pack` wrote.
+
+    Raises:
+        InputError: missing or damaged file.
+    """
+    try:
+        with np.load(path) as content:
+            sources = []
+            for k in range(int(content["count"])):
+                name, family, *names = content[f"{k}_text"].tolist()
+                ends = np.cumsum(content[f"{k}_sizes"])[:-1]
+                images = tuple(np.split(content[f"{k}_bytes"], ends))
+                relation, unit = content[f"{k}_relation"], content[f"{k}_unit"]
+                sources.append(ImageSource(name, family, tuple(names), images, relation, unit))
+    except (OSError, KeyError, ValueError, BadZipFile) as error:
+        raise InputError(
+            f"{path}: not a pack of places; write it with 'vslam export places'."
+        ) from error
+    return sources

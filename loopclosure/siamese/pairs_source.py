@@ -1,0 +1,94 @@
+"""Pairs of views that ``vslam synth --pairs`` rendered; where the cameras stood tells the rest."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError
+from vslam.loopclosure.siamese.source import DIFFERENT, SAME, ImageSource, names_of
+
+_VIEW = ("x_a", "z_a", "yaw_a", "x_b", "z_b", "yaw_b")
+_CELL = 80.0  # m, of a rendered town: stays together when training and validation are divided
+
+
+def read_pairs(folder: Path) -> list[ImageSource]:
+    """Rendered pairs: ``pairs.csv`` with columns a, b (files) and same (1 or 0), others allowed.
+
+    With the columns x_a, z_a, yaw_a and those of b (m, degrees), images of different pairs are
+    related, too: `relation_of_views`. Without, nothing is known across pairs.
+
+    Raises:
+        InputError: no or malformed list, or no pair in it.
+    """
+    path = folder / "pairs.csv"
+    try:
+        with path.open(newline="") as file:
+            rows = [(row["a"], row["b"], int(row["same"]), row) for row in csv.DictReader(file)]
+        placed = bool(rows) and set(_VIEW) <= set(rows[0][3])
+        found = [[float(row[key]) for key in _VIEW] for *_, row in rows] if placed else []
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise InputError(
+            f"{path}: no list of pairs (columns a, b, same); write it with 'vslam synth --pairs'."
+        ) from error
+    if not rows:
+        raise InputError(f"{path}: no pair in it; write it again with 'vslam synth --pairs'.")
+    number: dict[str, int] = {}
+    for a, b, *_ in rows:
+        number.setdefault(a, len(number))
+        number.setdefault(b, len(number))
+    relation = np.zeros((len(number), len(number)), np.int8)
+    unit = np.zeros(len(number), np.int32)
+    if placed:
+        views = np.zeros((len(number), 3))
+        for (a, b, *_), view in zip(rows, found, strict=True):
+            views[[number[a], number[b]]] = np.array(view).reshape(2, 3)
+        relation = relation_of_views(views)
+        cell = np.floor(views[:, :2] / _CELL).astype(np.int64)
+        unit = np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
+    for k, (a, b, same, _) in enumerate(rows):
+        i, j = number[a], number[b]
+        relation[i, j] = relation[j, i] = SAME if same else DIFFERENT
+        if not placed:
+            unit[i] = unit[j] = k
+    np.fill_diagonal(relation, SAME)
+    files = tuple(folder / name for name in number)
+    is_query = np.isin([*number], [b for _, b, *_ in rows])
+    return [
+        ImageSource(
+            folder.name, folder.name, names_of(files), files, relation, unit, is_query=is_query
+        )
+    ]
+
+
+def relation_of_views(
+    views: NDArray[np.float64],
+    *,
+    near: float = 5.0,
+    turned: float = 35.0,
+    far: float = 40.0,
+    sight: float = 160.0,
+    street: float = 25.0,
+) -> NDArray[np.int8]:
+    """Same place: nearer than ``near`` metres and ``turned`` degrees.
+
+    Different: beyond ``far`` metres, and not within ``sight`` in one street (``street`` metres to
+    the side) seen in one direction or against it.
+
+    Args:
+        views: ``(N, 3)`` x and z in metres, yaw in degrees from z towards x.
+    """
+    xz, yaw = views[:, :2], np.radians(views[:, 2])
+    ahead = np.stack([np.sin(yaw), np.cos(yaw)], 1)
+    away = xz[None] - xz[:, None]
+    distance = np.linalg.norm(away, axis=2)
+    aside = np.abs(away[..., 0] * ahead[:, None, 1] - away[..., 1] * ahead[:, None, 0])
+    cosine = ahead @ ahead.T
+    along = (np.abs(cosine) > 0.7) & (aside < street) & (distance < sight)
+    relation = np.zeros(distance.shape, np.int8)
+    relation[(distance < near) & (cosine > np.cos(np.radians(turned)))] = SAME
+    relation[(distance > far) & ~(along | along.T)] = DIFFERENT
+    return relation

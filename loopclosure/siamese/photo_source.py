@@ -1,0 +1,118 @@
+"""Sets of photographs; folders and a NOTES.txt tell which show one place."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vslam.errors import InputError
+from vslam.loopclosure.siamese.source import (
+    DIFFERENT,
+    SAME,
+    UNKNOWN,
+    ImageSource,
+    images_in,
+    names_of,
+)
+
+_STRETCH = 25  # frames of a video that stay together when training and validation are divided
+
+
+@dataclass(frozen=True)
+class _SpecialSet:
+    """What holds for a set beyond its kind, from its own notes.
+
+    Attributes:
+        reach: photographs of a folder farther apart in its order may show different things.
+        region: of a folder; what folders of one region have in common is not known.
+        family: of the set.
+        singles: folders of photographs that have nothing to do with each other.
+    """
+
+    reach: int | None = None
+    region: Callable[[str], str] | None = None
+    family: str | None = None
+    singles: tuple[str, ...] = ()
+
+
+_SPECIAL_SETS = {
+    # Turning round one standpoint: distant photographs show different things.
+    "pano_rotation": _SpecialSet(reach=1, family="landmarks"),
+    # Opposite walls of one yard.
+    "strecha": _SpecialSet(reach=3, family="landmarks"),
+    # Folders are headings of one walk, and overlap at their borders.
+    "pano360": _SpecialSet(reach=2, region=lambda folder: folder.split("_")[0]),
+    # Several passes of one floor.
+    "ie_tower": _SpecialSet(reach=1, region=lambda folder: folder.split("__")[0]),
+    # Windows cut from one panorama.
+    "webcams": _SpecialSet(region=lambda folder: folder.split("_")[0]),
+    "multiview": _SpecialSet(reach=4, family="landmarks"),
+    "wxbs_evd": _SpecialSet(family="landmarks"),
+    "stitch_pairs": _SpecialSet(reach=2, family="landmarks"),
+    "megadepth_landmarks": _SpecialSet(family="landmarks"),
+    # Some buildings appear twice.
+    "landmarks_misc": _SpecialSet(region=lambda folder: folder, family="landmarks"),
+    "sf_toy": _SpecialSet(region=lambda _: "", singles=("single",)),
+    "camvid": _SpecialSet(region=lambda _: ""),
+    "highway_us": _SpecialSet(region=lambda _: "", singles=("udacity_stills", "tusimple_stills")),
+    "freiburg_bonn_stills": _SpecialSet(singles=("stills",)),
+    "kitti_city_pedestrian": _SpecialSet(family="kitti"),
+    "kitti_sfnd": _SpecialSet(family="kitti"),
+}
+
+
+def read_photos(folder: Path) -> list[ImageSource]:
+    """Sets of photographs of places, ``folder/SET/SUBFOLDER/*`` with ``folder/SET/NOTES.txt``.
+
+    The first line of the notes tells the kind: (a) each subfolder shows one place, (b) each is a
+    video in order, whose neighbours overlap, (c) unrelated photographs. ``_SPECIAL_SETS`` holds
+    what a set's own notes add.
+
+    Raises:
+        InputError: no such set, or notes that name no kind.
+    """
+    notes = sorted(folder.glob("*/NOTES.txt")) or sorted(folder.glob("NOTES.txt"))
+    if not notes:
+        raise InputError(f"{folder}: no set of photographs (SET/NOTES.txt); see datasets.md.")
+    return [_read_photo_set(path.parent) for path in notes]
+
+
+def _read_photo_set(folder: Path) -> ImageSource:
+    first_line = (folder / "NOTES.txt").read_text(errors="replace").partition("\n")[0]
+    found = re.search(r"kind \((a/b|a|b|c)\)", first_line)
+    if found is None:
+        raise InputError(f"{folder}/NOTES.txt: the first line names no kind (a), (b) or (c).")
+    kind = found[1]
+    special = _SPECIAL_SETS.get(folder.name, _SpecialSet())
+    of_set = special.reach if special.reach is not None else 1_000_000
+    files: list[Path] = []
+    rows: list[tuple[int, int, int, int]] = []  # folder, position, reach, unit
+    regions: list[str] = []
+    for number, subfolder in enumerate(sorted(p for p in folder.iterdir() if p.is_dir())):
+        single = kind == "c" or subfolder.name in special.singles
+        reach = 0 if single else of_set if kind == "a" else 1
+        stretch = 1 if single else 1_000_000 if kind == "a" else _STRETCH
+        for k, file in enumerate(images_in(subfolder)):
+            files.append(file)
+            rows.append((number, k, reach, number * 10_000 + k // stretch))
+            regions.append(special.region(subfolder.name) if special.region else "")
+    if not files:
+        raise InputError(f"{folder}: no photographs in its subfolders; restore them.")
+    number, position, reach, unit = np.array(rows).T
+    together = number[:, None] == number[None]
+    relation = np.full(together.shape, DIFFERENT, np.int8)
+    if special.region is not None:
+        _, region = np.unique(regions, return_inverse=True)
+        relation[region[:, None] == region[None]] = UNKNOWN
+    if kind != "c":
+        relation[together] = UNKNOWN
+    apart = np.abs(position[:, None] - position[None])
+    relation[together & (apart <= reach)] = SAME
+    family = special.family or folder.name
+    return ImageSource(
+        folder.name, family, names_of(files), tuple(files), relation, unit.astype(np.int32)
+    )

@@ -1,0 +1,217 @@
+"""Trajectories with a known error must be given just that error."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vslam.errors import InputError
+from vslam.evaluation.trajectories import (
+    evaluate_trajectory,
+    evo_command,
+    kitti_drift,
+    path_length,
+    read_pair,
+)
+from vslam.trajectory import Trajectory, trajectory_format, write_kitti, write_tum
+
+
+def drive(n: int = 2001, step: float = 0.5, turn: float = 0.004) -> Trajectory:
+    """A camera on a circle: ``step`` metres forward and ``turn`` radians of yaw a frame."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([0, turn, 0]).as_matrix()
+    T[2, 3] = step
+    T_wc = np.empty((n, 4, 4))
+    T_wc[0] = np.eye(4)
+    for k in range(1, n):
+        T_wc[k] = T_wc[k - 1] @ T
+    return Trajectory(0.1 * np.arange(n), T_wc)
+
+
+def straight(n: int, step: float) -> Trajectory:
+    return drive(n, step, turn=0.0)
+
+
+def moved(trajectory: Trajectory, T: np.ndarray) -> Trajectory:
+    return Trajectory(trajectory.timestamps, T @ trajectory.T_wc)
+
+
+def scaled(trajectory: Trajectory, factor: float) -> Trajectory:
+    T_wc = trajectory.T_wc.copy()
+    T_wc[:, :3, 3] *= factor
+    return Trajectory(trajectory.timestamps, T_wc)
+
+
+def noisy(trajectory: Trajectory, deviation: float) -> Trajectory:
+    T_wc = trajectory.T_wc.copy()
+    T_wc[:, :3, 3] += np.random.default_rng(0).normal(0, deviation, (len(T_wc), 3))
+    return Trajectory(trajectory.timestamps, T_wc)
+
+
+RIGID = np.eye(4)
+RIGID[:3, :3] = Rotation.from_euler("xyz", [20, -70, 110], degrees=True).as_matrix()
+RIGID[:3, 3] = [100.0, -20.0, 3.0]
+
+
+def test_a_rigid_motion_is_no_error():
+    truth = drive()
+    result = evaluate_trajectory(moved(truth, RIGID), truth)
+    assert result.frames == 2001
+    assert result.ate_rmse_m < 1e-9
+    assert result.rpe_m < 1e-9
+    assert result.t_rel_percent < 1e-6
+    assert result.r_rel_deg_per_100m < 1e-6
+    np.testing.assert_allclose(result.T_wc_aligned, truth.T_wc, atol=1e-9)
+    np.testing.assert_allclose(result.distances_m, 0.5 * np.arange(2001))
+
+
+def test_without_alignment_a_constant_offset_is_the_error():
+    truth = drive(300)
+    offset = np.eye(4)
+    offset[:3, 3] = [3.0, 0.0, 4.0]
+    result = evaluate_trajectory(moved(truth, offset), truth, "none")
+    assert result.ate_rmse_m == pytest.approx(5.0)
+    assert result.ate_mean_m == pytest.approx(5.0)
+    assert result.ate_max_m == pytest.approx(5.0)
+    assert result.rpe_m < 1e-9
+
+
+def test_alignment_of_position_noise():
+    truth = drive()
+    result = evaluate_trajectory(noisy(truth, 0.3), truth)
+    assert result.ate_rmse_m == pytest.approx(0.3 * np.sqrt(3), rel=0.03)
+    assert result.rpe_m == pytest.approx(0.3 * np.sqrt(6), rel=0.03)
+    assert result.rpe_deg < 1e-5
+    assert result.errors_m.shape == (2001,)
+
+
+def test_scale_error_is_drift_in_se3_and_none_in_sim3():
+    truth = straight(2001, 0.5)
+    drift = kitti_drift(scaled(truth, 1.01).T_wc, truth.T_wc)
+    # Each length ends at the first frame beyond it, here a step of 0.5 m later.
+    assert drift == pytest.approx((1.0, 0.0), abs=0.003)
+    truth = drive()
+    assert evaluate_trajectory(scaled(truth, 1.01), truth).ate_rmse_m > 0.5
+    assert evaluate_trajectory(scaled(truth, 1.01), truth, "sim3").ate_rmse_m < 1e-9
+
+
+def test_scale_error_of_one_percent_in_the_limit_of_short_steps():
+    truth = straight(8001, 0.015625)  # an exact binary fraction, so that 100 m fall on a frame
+    t_rel, r_rel = kitti_drift(scaled(truth, 1.01).T_wc, truth.T_wc)
+    assert t_rel == pytest.approx(1.000, abs=5e-4)
+    assert r_rel == pytest.approx(0.0, abs=1e-9)
+
+
+def test_yaw_rate_error_gives_its_rate_as_rotation_drift():
+    truth = straight(1801, 0.5)
+    error_deg_per_m = 0.01
+    estimate = drive(1801, 0.5, turn=np.radians(error_deg_per_m * 0.5))
+    t_rel, r_rel = kitti_drift(estimate.T_wc, truth.T_wc)
+    assert r_rel == pytest.approx(100 * error_deg_per_m, rel=0.003)
+    # Over a length L the chord of an arc of curvature c ends about c L^2 / 2 to the side.
+    lengths, frames = np.arange(100, 801, 100), 1801
+    starts = [
+        np.arange(0, frames, 10)[np.arange(0, frames, 10) + 2 * x + 1 < frames].size
+        for x in lengths
+    ]
+    sideways = np.radians(error_deg_per_m) * lengths / 2
+    assert t_rel == pytest.approx(100 * np.average(sideways, weights=starts), rel=0.01)
+
+
+def test_drift_needs_100_m():
+    short = drive(200)
+    result = evaluate_trajectory(noisy(short, 0.01), short)
+    assert result.t_rel_percent is None
+    assert result.r_rel_deg_per_100m is None
+    assert kitti_drift(drive(203).T_wc, drive(203).T_wc) is not None
+
+
+def test_path_length():
+    assert path_length(np.eye(4)[None]).tolist() == [0.0]
+    np.testing.assert_allclose(path_length(drive(5).T_wc), [0, 0.5, 1, 1.5, 2])
+
+
+def test_different_lengths_are_matched_by_time():
+    truth = drive(500)
+    estimate = moved(truth.select(np.arange(100, 400, 3)), RIGID)
+    estimate = Trajectory(estimate.timestamps + 0.004, estimate.T_wc)
+    result = evaluate_trajectory(estimate, truth)
+    assert result.frames == 100
+    assert result.ate_rmse_m < 1e-9
+    # The other way round, the longer one is the estimate.
+    assert evaluate_trajectory(truth, estimate).frames == 100
+
+
+def test_equal_lengths_at_other_times_are_matched_by_time():
+    truth = drive(500)
+    result = evaluate_trajectory(truth.select(np.arange(100)), truth.select(np.arange(50, 150)))
+    assert result.frames == 50
+    assert result.ate_rmse_m < 1e-9
+
+
+def test_no_common_times():
+    truth = drive(50)
+    later = Trajectory(truth.timestamps + 1e6, truth.T_wc)
+    with pytest.raises(InputError, match="none of the 50 poses lies within 10 ms"):
+        evaluate_trajectory(later, truth)
+
+
+@pytest.mark.parametrize("trajectory", [drive(1), straight(20, 0.5), straight(20, 0.0)])
+def test_too_little_motion_to_align(trajectory):
+    with pytest.raises(InputError, match="too little motion"):
+        evaluate_trajectory(trajectory, trajectory)
+
+
+def test_unknown_alignment():
+    with pytest.raises(InputError, match=r"--align rigid: unknown .* se3, sim3, none"):
+        evaluate_trajectory(drive(9), drive(9), "rigid")
+
+
+@pytest.mark.parametrize("alignment", ["se3", "sim3", "none"])
+@pytest.mark.parametrize("write", [lambda p, t: write_kitti(p, t.T_wc), write_tum])
+def test_evo_command_reproduces_the_ate(tmp_path, write, alignment):
+    truth = drive(120)
+    estimate = scaled(noisy(moved(truth, RIGID), 0.2), 1.05)
+    paths = tmp_path / "an estimate.txt", tmp_path / "truth.txt"
+    for path, trajectory in zip(paths, (estimate, truth), strict=True):
+        write(path, trajectory)
+    ours = evaluate_trajectory(*read_pair(*paths), alignment).ate_rmse_m
+    words = shlex.split(evo_command(*paths, alignment, trajectory_format(paths[1])))
+    words[0] = str(Path(sys.executable).with_name(words[0]))
+    printed = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    rmse = re.search(r"rmse\s+([0-9.]+)", printed)
+    assert rmse is not None
+    assert ours == pytest.approx(float(rmse[1]), abs=1e-6)
+
+
+def test_read_pair_mixes_formats_with_times(tmp_path):
+    truth = drive(60)
+    write_kitti(tmp_path / "truth.txt", truth.T_wc)
+    write_tum(tmp_path / "estimate.txt", truth.select(np.arange(10, 40)))
+    np.savetxt(tmp_path / "times.txt", truth.timestamps)
+    pair = tmp_path / "estimate.txt", tmp_path / "truth.txt"
+    assert evaluate_trajectory(*read_pair(*pair, tmp_path / "times.txt")).frames == 30
+    with pytest.raises(InputError, match="give them with --times"):
+        read_pair(*pair)
+
+
+def test_read_pair_refuses_kitti_files_of_different_length(tmp_path):
+    write_kitti(tmp_path / "truth.txt", drive(60).T_wc)
+    write_kitti(tmp_path / "estimate.txt", drive(50).T_wc)
+    with pytest.raises(InputError, match=r"50 poses but 60 .* ground_truth_kitti\.txt"):
+        read_pair(tmp_path / "estimate.txt", tmp_path / "truth.txt")
+
+
+def test_summary_has_the_numbers_only():
+    truth = drive(50)
+    summary = evaluate_trajectory(noisy(truth, 0.1), truth).summary()
+    assert "errors_m" not in summary
+    assert summary["frames"] == 50
+    assert isinstance(summary["ate_rmse_m"], float)

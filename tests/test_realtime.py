@@ -1,0 +1,152 @@
+"""A sequence played in real time: nothing before its time, and who is late misses frames."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from vslam.config import Config, OrbConfig
+from vslam.datasets import open_sequence
+from vslam.datasets.perturbation import Perturbation
+from vslam.features import TrackingState
+from vslam.run.outcome import RunSettings
+from vslam.run.pipeline import run_sequence
+from vslam.run.realtime import play
+from vslam.run.recorder import NullRecorder
+from vslam.slam import Slam
+
+
+def cameras() -> list[str]:
+    return [thread.name for thread in threading.enumerate() if thread.name == "camera"]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_no_frame_comes_before_its_time_and_the_last_one_always_comes(threads):
+    times = 100.0 + 0.02 * np.arange(20)
+    begin, seen = time.perf_counter(), []
+    for index, made, came in play(times, lambda k: (k, time.perf_counter()), threads):
+        assert made[0] == index
+        assert made[1] >= came >= begin + 0.02 * index
+        assert came == pytest.approx(begin + 0.02 * index, abs=0.5)
+        seen.append(index)
+    assert (seen[0], seen[-1]) == (0, 19)
+    assert seen == sorted(set(seen))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_who_is_late_gets_the_newest_frame(threads):
+    seen, waits = [], []
+    for index, _, came in play(0.01 * np.arange(60), lambda k: k, threads):
+        waits.append(time.perf_counter() - came)
+        time.sleep(0.05)
+        seen.append(index)
+    assert len(seen) <= 60 / 5 + 3  # five frames come while one is used
+    assert seen[-1] == 59
+    # None queues: a frame waits while one other is used, not for all before it.
+    assert np.median(waits) < 0.2
+
+
+def test_with_one_thread_a_frame_is_prepared_after_the_last_one_was_used():
+    used, order = [], []
+
+    def prepare(k: int) -> int:
+        order.append((k, len(used)))
+        return k
+
+    for index, _, _ in play(0.005 * np.arange(10), prepare, 1):
+        time.sleep(0.002)
+        used.append(index)
+    assert [n for _, n in order] == list(range(len(order)))
+
+
+def test_who_stops_listening_stops_the_camera():
+    frames = play(10.0 * np.arange(5), lambda k: k, 2)
+    next(frames)
+    assert cameras()
+    frames.close()
+    assert not cameras()
+
+
+def test_an_error_of_the_preparation_is_the_listeners():
+    def fail(k: int) -> int:
+        raise OSError("no such image")
+
+    with pytest.raises(OSError, match="no such image"):
+        list(play(np.arange(3.0), fail, 2))
+    assert not cameras()
+
+
+def test_frames_that_were_dropped_are_not_lost(corridor, check_map):
+    """Of seven frames four are dropped: tracking goes on, and their poses lie on the way."""
+    slam = Slam(corridor.camera, Config(orb=OrbConfig(n_features=800)), threads=1)
+    states = []
+    for k in range(len(corridor.left)):
+        if k % 7 in (2, 3, 5, 6):
+            states.append(slam.skip(corridor.timestamps[k], dropped=True).state)
+        else:
+            result = slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
+            states.append(result.state)
+    slam.finish()
+    assert set(states) == {TrackingState.OK, TrackingState.DROPPED}
+    assert not slam.map.restarts
+    steps = np.diff(slam.trajectory().T_wc[:, :3, 3], axis=0)
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=1), 0.35, atol=0.08)
+    check_map(slam.map)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_one_camera_in_real_time(kitti_tree, threads):
+    sequence = open_sequence("kitti", kitti_tree, "00", max_frames=6, monocular=True)
+    settings = RunSettings(
+        "kitti", "00", "none", "none", "mono", 0, threads, 0, 1, 6, Config(), realtime=True
+    )
+    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    assert len(outcome.tracks) == 6
+    assert len(outcome.latency_ms) == sum(track.n_features > 0 for track in outcome.tracks) > 0
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_an_unreadable_image_in_real_time(kitti_tree, threads, tmp_path):
+    """Of the last frame, the one that is never dropped: the run ends all the same."""
+    root = tmp_path / "kitti"
+    shutil.copytree(kitti_tree, root)
+    image = root / "sequences" / "00" / "image_1" / "000005.png"
+    image.write_bytes(image.read_bytes()[:2000])
+    sequence = open_sequence("kitti", root, "00", max_frames=6)
+    settings = RunSettings(
+        "kitti", "00", "none", "none", "stereo", 0, threads, 0, 1, 6, Config(), realtime=True
+    )
+    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    assert len(outcome.trajectory) == len(outcome.tracks) == 6
+    assert outcome.tracks[5].state == TrackingState.LOST
+    assert [str(image) in message for message in outcome.skipped] == [True]
+
+
+def test_command_line_in_real_time(kitti_tree, tmp_path):
+    command = [sys.executable, "-m", "vslam", "run", "--data", str(kitti_tree), "--realtime"]
+    done = subprocess.run(
+        [*command, "--no-record", "--detector", "none"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "frames dropped, latency" in done.stdout
+    folder = tmp_path / "runs" / "latest"
+    report = json.loads((folder / "report.json").read_text())
+    assert report["realtime"] is True
+    assert report["frames"] == 28
+    assert len((folder / "trajectory_kitti.txt").read_text().splitlines()) == 28
+    latency = report["latency_ms"]
+    assert 0.0 < latency["median"] <= latency["p95"] <= latency["p99"]
+    assert "| Latency" in (folder / "report.md").read_text()
+    refused = subprocess.run(
+        [*command, "--compare-loops"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert refused.returncode == 2
+    assert "leave out --realtime" in refused.stderr

@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from vslam.errors import InputError
+from vslam.report.folder import create_run_folder, write_trajectories
+from vslam.run.outcome import matched_ground_truth
+from vslam.trajectory import Trajectory, read_kitti_poses, read_trajectory
+
+
+def test_name_and_latest(tmp_path):
+    folder = create_run_folder(
+        tmp_path / "a/runs", "kitti", "00", "brightness:1.5,blur:0.5", "none"
+    )
+    assert re.fullmatch(r"\d{8}-\d{6}-kitti-00-brightness1\.5\+blur0\.5-none", folder.name)
+    assert folder.is_dir()
+    assert (tmp_path / "a/runs/latest").resolve() == folder
+
+
+def test_two_runs_in_one_second_have_two_folders(tmp_path):
+    folders = {create_run_folder(tmp_path, "kitti", "00", "none", "none") for _ in range(3)}
+    assert len(folders) == 3
+
+
+def test_names_stay_inside_the_folder(tmp_path):
+    folder = create_run_folder(tmp_path, "kitti", "../../x y", "none", "none")
+    assert folder.parent == tmp_path
+    assert folder.name.endswith("-kitti-.._.._x_y-none-none")
+
+
+def test_a_real_folder_called_latest_is_left_alone(tmp_path):
+    (tmp_path / "latest").mkdir()
+    assert create_run_folder(tmp_path, "kitti", "00", "none", "none").is_dir()
+    assert not (tmp_path / "latest").is_symlink()
+
+
+def test_unwritable_place(tmp_path):
+    (tmp_path / "runs").write_text("a file, not a folder")
+    with pytest.raises(InputError, match=r"cannot create a run folder .* --out"):
+        create_run_folder(tmp_path / "runs", "kitti", "00", "none", "none")
+
+
+@dataclass
+class _Sequence:
+    timestamps: np.ndarray = field(default_factory=lambda: 0.1 * np.arange(5))
+    ground_truth: np.ndarray | None = None
+
+
+def test_ground_truth_of_just_the_frames_done(tmp_path):
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 2, 3] = np.arange(5)
+    sequence = _Sequence(ground_truth=poses)
+    done = np.array([0, 1, 3])  # frame 2 was unreadable, the run ended before frame 4
+    outcome = SimpleNamespace(
+        sequence=sequence, trajectory=Trajectory(sequence.timestamps[done], poses[done])
+    )
+    matched = matched_ground_truth(outcome)
+    np.testing.assert_array_equal(matched.timestamps, outcome.trajectory.timestamps)
+    write_trajectories(tmp_path, outcome)
+    for name in ("trajectory_kitti.txt", "ground_truth_kitti.txt"):
+        np.testing.assert_array_equal(read_kitti_poses(tmp_path / name)[:, 2, 3], done)
+    np.testing.assert_allclose(
+        read_trajectory(tmp_path / "trajectory.tum").timestamps, [0, 0.1, 0.3]
+    )
+
+
+def test_no_ground_truth(tmp_path):
+    sequence = _Sequence()
+    outcome = SimpleNamespace(
+        sequence=sequence, trajectory=Trajectory(sequence.timestamps, np.tile(np.eye(4), (5, 1, 1)))
+    )
+    assert matched_ground_truth(outcome) is None
+    write_trajectories(tmp_path, outcome)
+    assert not (tmp_path / "ground_truth_kitti.txt").exists()

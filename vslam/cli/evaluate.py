@@ -1,0 +1,51 @@
+"""The command ``vslam eval``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vslam.cli.options import AlignmentName
+
+_EXAMPLE = (
+    "[b]Example[/b]\n\n  vslam eval runs/latest/trajectory_kitti.txt "
+    "--gt runs/latest/ground_truth_kitti.txt"
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the application."""
+    app.command("eval", epilog=_EXAMPLE)(evaluate_files)
+
+
+def evaluate_files(
+    estimate: Annotated[Path, typer.Argument(help="Trajectory, KITTI or TUM format.")],
+    gt: Annotated[Path, typer.Option(help="Ground truth, KITTI or TUM format.")],
+    align: Annotated[
+        AlignmentName, typer.Option(help="What is fitted first; [b]sim3[/b] fits the scale, too.")
+    ] = "se3",
+    times: Annotated[
+        Path | None, typer.Option(help="times.txt of a KITTI file, to compare it with a TUM file.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Compare a trajectory with the ground truth: ATE, RPE and KITTI drift."""
+    import json
+
+    from vslam.cli.summary import error_rows, print_rows
+    from vslam.evaluation.trajectories import evaluate_trajectory, evo_command, read_pair
+    from vslam.trajectory import trajectory_format
+
+    trajectory, ground_truth = read_pair(estimate, gt, times)
+    evaluation = evaluate_trajectory(trajectory, ground_truth, align)
+    if as_json:
+        typer.echo(json.dumps(evaluation.summary(), indent=2))
+        return
+    matched = f"{evaluation.frames} matched of {len(trajectory)}"
+    rows = [("frames", matched), ("alignment", align), *error_rows(evaluation)]
+    # evo compares files of one format only.
+    if (format_ := trajectory_format(gt)) == trajectory_format(estimate):
+        rows.append(("reproduce", evo_command(estimate, gt, align, format_)))
+    print_rows(rows)

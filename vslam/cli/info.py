@@ -1,0 +1,62 @@
+"""The command ``vslam info``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import typer
+
+from vslam.cli.options import KITTI_ROOT, Data
+from vslam.cli.summary import print_rows
+from vslam.errors import InputError
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the application."""
+    app.command()(info)
+
+
+def info(data: Data = KITTI_ROOT) -> None:
+    """Show versions, cores, compiled kernels and the data found."""
+    from vslam import machine
+    from vslam.datasets.kitti import list_kitti
+
+    versions = machine.versions()
+    cores = machine.available_cores()
+    rows = [*versions.items(), ("cores", f"{cores} (--threads {min(cores, 4)} unless given)")]
+    rows += [
+        ("numba cache", f"{folder}: {size / 2**20:.1f} MB")
+        for folder, size in _numba_caches().items()
+    ]
+    try:
+        rows += [
+            (f"kitti {name}", f"{left} left, {right} right images")
+            for name, left, right in list_kitti(data)
+        ]
+        rows.append(("kitti root", str(data)))
+    except InputError as error:
+        rows.append(("kitti", str(error)))
+    if warning := machine.opencv_conflict(versions):
+        rows.append(("warning", warning))
+    print_rows(rows)
+
+
+def _numba_caches() -> dict[Path, int]:
+    """Folders with compiled kernels, and the bytes in each."""
+    import platformdirs
+
+    import vslam
+    import vslam.backend
+    import vslam.frontend
+    import vslam.loopclosure
+
+    packages = (vslam, vslam.frontend, vslam.loopclosure, vslam.backend)
+    folders = [Path(next(iter(package.__path__))) / "__pycache__" for package in packages]
+    folders.append(Path(platformdirs.user_cache_dir("numba", appauthor=False)))
+    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
+        folders.append(Path(chosen))
+    sizes = {
+        folder: sum(file.stat().st_size for file in folder.rglob("*.nb[ic]")) for folder in folders
+    }
+    return {folder: size for folder, size in sizes.items() if size}

@@ -1,0 +1,100 @@
+"""What the command line prints of a run and of an evaluation: rows of a name and a value."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+if TYPE_CHECKING:
+    from vslam.evaluation.trajectories import Evaluation
+    from vslam.report.schema import ReportJson
+
+Rows = list[tuple[str, str]]
+_LOOK_AT = (("report", "report.html"), ("recording", "recording.rrd"))
+
+
+def print_rows(rows: Rows) -> None:
+    """Print names and values, the values one below the other."""
+    width = max(len(name) for name, _ in rows)
+    for name, value in rows:
+        typer.echo(f"{name:<{width}}  {value}")
+
+
+def error_rows(errors: Evaluation | ReportJson) -> Rows:
+    """ATE, RPE and drift."""
+    rows = [
+        ("ATE rmse", f"{errors.ate_rmse_m:.3f} m"),
+        ("ATE mean, max", f"{errors.ate_mean_m:.3f} m, {errors.ate_max_m:.3f} m"),
+        ("RPE per frame", f"{errors.rpe_m:.4f} m, {errors.rpe_deg:.4f} deg"),
+    ]
+    if errors.t_rel_percent is None:
+        return [*rows, ("drift", "path shorter than 100 m")]
+    return [
+        *rows,
+        ("t_rel", f"{errors.t_rel_percent:.3f} %"),
+        ("r_rel", f"{errors.r_rel_deg_per_100m:.3f} deg/100 m"),
+    ]
+
+
+def print_summary(report: ReportJson, folder: Path) -> None:
+    """Print what matters of a run that is over; ``folder`` holds its results."""
+    evaluated = report.alignment is not None
+    submaps = f" in {report.submaps} sub-maps" if report.submaps > 1 else ""
+    print_rows(
+        [
+            *([("interrupted", report.interrupted)] if report.interrupted else []),
+            *_scale(report),
+            (
+                "frames",
+                f"{report.frames} done, {report.lost_frames} lost, "
+                f"{report.skipped_frames} unreadable",
+            ),
+            *_latency(report),
+            *(error_rows(report) if evaluated else [("evaluation", f"{report.evaluation_remark}")]),
+            ("loops", _loops(report)),
+            ("speed", f"{report.fps:.1f} fps" if report.fps else "-"),
+            ("map", f"{report.keyframes} keyframes, {report.landmarks} landmarks{submaps}"),
+            ("folder", str(folder)),
+            *((name, str(folder / file)) for name, file in _LOOK_AT if (folder / file).exists()),
+        ]
+    )
+    _print_comparison(report)
+
+
+def _latency(report: ReportJson) -> Rows:
+    if (ms := report.latency_ms) is None:
+        return []
+    dropped = f"{report.dropped_frames} frames dropped"
+    return [("real time", f"{dropped}, latency {ms.median:.0f} ms, p99 {ms.p99:.0f} ms")]
+
+
+def _scale(report: ReportJson) -> Rows:
+    if report.sensor != "mono":
+        return []
+    return [("scale", "arbitrary: one camera; errors are after Sim3 alignment")]
+
+
+def _loops(report: ReportJson) -> str:
+    judged = report.revisit_stretches is not None
+    if report.detector == "none":
+        return f"not looked for, {report.loops_missed} missed" if judged else "not looked for"
+    counts = [f"{report.loops_closed} closed"]
+    if judged:
+        counts += [f"{report.loops_missed} missed", f"{report.loops_wrong} wrong"]
+    return ", ".join([*counts, f"{report.loops_rejected} candidates rejected"])
+
+
+def _print_comparison(report: ReportJson) -> None:
+    from vslam.report.loop_tables import comparison_table
+
+    compared = comparison_table(report).rows
+    if not compared:
+        return
+    table = [("", "with loops", "without"), *compared]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    typer.echo()
+    for name, *values in table:
+        cells = (f"{value:>{width}}" for value, width in zip(values, widths[1:], strict=True))
+        typer.echo("  ".join([f"{name:<{widths[0]}}", *cells]))

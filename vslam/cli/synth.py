@@ -1,0 +1,150 @@
+"""The command ``vslam synth``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vslam.errors import InputError
+
+_EXAMPLES = """
+[b]Examples[/b]
+
+  vslam synth --list
+
+  vslam synth 05 --change 0.5 --dynamic 6
+
+  vslam synth mine --trajectory poses/07.txt --calibration 04-12
+
+  vslam synth demo --pairs 1000 --aliased --change 0.8 --out pairs
+
+  vslam synth 05 --pairs 500 --lateral=-3.2:1.4 --heading 0:30 --out pairs
+"""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the application."""
+    app.command(epilog=_EXAMPLES)(synth)
+
+
+def synth(
+    route: Annotated[str, typer.Argument(help="Built-in route, or a name for --trajectory.")] = "",
+    trajectory: Annotated[
+        Path | None, typer.Option(help="KITTI poses to drive along, at 10 Hz.")
+    ] = None,
+    calibration: Annotated[
+        str,
+        typer.Option(
+            metavar="NN",
+            help="Camera of which KITTI sequences, with --trajectory: 00-02, 03 or 04-12.",
+        ),
+    ] = "00-02",
+    max_frames: Annotated[
+        int | None, typer.Option(min=1, help="Render only so many frames; more can follow later.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the town.")] = 0,
+    aliased: Annotated[bool, typer.Option("--aliased", help="Few facades, again and again.")] = (
+        False
+    ),
+    dynamic: Annotated[int, typer.Option(min=0, help="Number of moving cars.")] = 0,
+    change: Annotated[
+        float,
+        typer.Option(min=0, max=1, help="Change between passes; above 0.7 it grows dark."),
+    ] = 0.0,
+    depth: Annotated[bool, typer.Option("--depth", help="Write 16-bit depth (cm), too.")] = False,
+    pairs: Annotated[
+        int, typer.Option(min=0, help="Render so many labelled pairs for training instead.")
+    ] = 0,
+    lateral: Annotated[
+        str,
+        typer.Option(
+            metavar="LOW:HIGH",
+            help="With --pairs: metres that second views are moved to the right; -3.2 is the "
+            "other lane.",
+        ),
+    ] = "-1.4:1.4",
+    heading: Annotated[
+        str,
+        typer.Option(
+            metavar="LOW:HIGH", help="With --pairs: degrees that they are turned, to either side."
+        ),
+    ] = "0:14",
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write to.", show_default="user's cache")
+    ] = None,
+    list_: Annotated[bool, typer.Option("--list", help="List routes and what is rendered.")] = (
+        False
+    ),
+    clean: Annotated[
+        bool, typer.Option("--clean", help="Remove what is rendered, of ROUTE or all.")
+    ] = False,
+    verify: Annotated[
+        bool,
+        typer.Option("--verify", help="Compare all checksums; render damaged frames again."),
+    ] = False,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="Threads; the bytes do not depend on it.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
+) -> None:
+    """Render a town in KITTI format, with exact ground truth."""
+    from vslam.cli.progress import render_bar
+    from vslam.datasets.synthetic import ROUTES, built_in_route, route_of_poses, store
+    from vslam.datasets.synthetic.site import Variation
+    from vslam.machine import available_cores
+    from vslam.trajectory import read_kitti_poses
+
+    cache = out or store.cache_folder()
+    if list_:
+        for name, about in ROUTES.items():
+            typer.echo(f"{name:<6}{about}")
+        for found in store.list_stored(cache):
+            state = "complete" if found.complete else "in part"
+            folder = found.root / "sequences" / found.name
+            typer.echo(f"{folder}: {found.frames} frames, {found.size / 1e6:.0f} MB, {state}")
+        return
+    if clean:
+        freed = store.clean(cache, route or None)
+        typer.echo(f"{cache}: {freed / 1e6:.0f} MB removed")
+        return
+    if not route:
+        raise InputError(f"vslam synth: name a route, one of {', '.join(ROUTES)}, or --list.")
+    drive = (
+        built_in_route(route)
+        if trajectory is None
+        else route_of_poses(read_kitti_poses(trajectory), route, calibration)
+    )
+    variation = Variation(seed, aliased, change, dynamic)
+    threads = threads or min(available_cores(), 4)
+    with render_bar(shown=not quiet) as on_frame:
+        if pairs:
+            from vslam.datasets.synthetic.pairs import Moves, render_pairs
+
+            root = out or Path("pairs")
+            moves = Moves(_range("--lateral", lateral, -4.0), _range("--heading", heading, 0.0))
+            render_pairs(drive, variation, root, pairs, moves, threads=threads, on_frame=on_frame)
+        else:
+            root = store.render_sequence(
+                drive,
+                variation,
+                cache,
+                depth=depth,
+                until=max_frames,
+                verify=verify,
+                threads=threads,
+                on_frame=on_frame,
+            )
+    typer.echo(f"{root}: " + (f"{pairs} pairs" if pairs else f"sequence {route}"))
+
+
+def _range(option: str, given: str, least: float) -> tuple[float, float]:
+    low, _, high = given.partition(":")
+    try:
+        found = float(low), float(high)
+    except ValueError as error:
+        raise InputError(f"{option} {given}: must be LOW:HIGH, two numbers.") from error
+    if not least <= found[0] <= found[1] <= 45.0:
+        raise InputError(f"{option} {given}: must not fall, from {least:g} on.")
+    return found

@@ -1,0 +1,263 @@
+"""The commands ``vslam train`` and ``vslam export``. torch is imported inside them."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from vslam.errors import InputError
+
+if TYPE_CHECKING:
+    from vslam.loopclosure.siamese.data import Collection
+    from vslam.loopclosure.siamese.settings import TrainSettings
+    from vslam.loopclosure.siamese.training import TrainingOutcome
+
+_TRAIN_EXAMPLES = """
+[b]Examples[/b]
+
+  vslam train capsule --data "kitti:~/kitti\\[seq=00,first=250,last=1500]" --data photos:~/places
+
+  vslam train capsule --data pairs:town1 --data pairs:town2 --preset best --device cuda
+
+  vslam train capsule --data pairs:town1 --out training/capsule --resume
+
+  vslam train capsule-pruned --weights training/capsule/capsule.safetensors --data pairs:town1
+"""
+_EXPORT_EXAMPLES = """
+[b]Example[/b]
+
+  vslam export onnx --weights training/capsule/capsule.safetensors --out capsule.onnx
+"""
+_PLACES_EXAMPLES = """
+[b]Example[/b]
+
+  vslam export places --data "kitti:~/kitti\\[first=250,last=1500]" --data photos:~/places
+"""
+
+export = typer.Typer(help="Export a trained network, or images to train on.", no_args_is_help=True)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the application."""
+    app.command(epilog=_TRAIN_EXAMPLES)(train)
+    app.add_typer(export, name="export")
+
+
+NetworkName = Literal["capsule", "capsule-pruned", "alexnet", "vgg16"]
+PresetName = Literal["paper", "best", "pretrained"]
+DeviceName = Literal["cpu", "cuda"]
+FitName = Literal["squash", "crop"]
+DataSources = Annotated[
+    list[str],
+    typer.Option(
+        "--data", help="Source of images, [b]KIND:PATH\\[options][/b]; again for more. Kinds: "
+        "kitti, fabmap, pairs, photos, pack (docs/training.md).",
+    ),
+]  # fmt: skip
+
+
+def train(
+    network: Annotated[NetworkName, typer.Argument(help="What to train.", show_default=False)],
+    data: DataSources,
+    preset: Annotated[
+        PresetName, typer.Option(help="Settings; [b]paper[/b]'s, or better ones.")
+    ] = ("paper"),
+    settings: Annotated[
+        Path | None, typer.Option(help="JSON with settings, instead of the preset's.")
+    ] = None,
+    epochs: Annotated[int | None, typer.Option(min=1, help="At most so many.")] = None,
+    pairs: Annotated[int | None, typer.Option(min=2, help="Pairs of an epoch.")] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="Of all that is random.", show_default="that of the settings"),
+    ] = None,
+    device: Annotated[DeviceName, typer.Option(help="Where to train.")] = "cpu",
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="Threads.", show_default="cores")
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(
+            help="Network to start from; for capsule-pruned the one to prune; for alexnet and "
+            "vgg16 a weight file of torchvision."
+        ),
+    ] = None,
+    pixels: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SIDE|HEIGHTxWIDTH",
+            help="Size of the images of a capsule network; smaller ones train faster.",
+        ),
+    ] = None,
+    prune_share: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=0.99, help="Share of the capsules that capsule-pruned lacks."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder to write to.", show_default="training/NETWORK-PRESET"),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")
+    ] = False,
+    max_minutes: Annotated[
+        float | None, typer.Option(min=0, help="Stop after so long, with a checkpoint.")
+    ] = None,
+    allow_test_data: Annotated[
+        bool, typer.Option("--allow-test-data", help="Train on the frames kept for testing.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
+) -> None:
+    """Train a loop detector; writes weights, log, pairs, checkpoints and a model card."""
+    from vslam.loopclosure.siamese.branches import CapsuleBranch
+    from vslam.loopclosure.siamese.data import load, refuse_test_data
+    from vslam.loopclosure.siamese.image_sources import open_source
+    from vslam.loopclosure.siamese.images import parse_size
+    from vslam.loopclosure.siamese.runtime import set_threads
+    from vslam.loopclosure.siamese.settings import PRESETS, load_settings
+    from vslam.loopclosure.siamese.siamese import load_network
+    from vslam.machine import available_cores
+
+    began = time.monotonic()
+    sources = [source for spec in data for source in open_source(spec)]
+    if not allow_test_data:
+        refuse_test_data(sources)
+    chosen = load_settings(settings) if settings else PRESETS[preset]
+    given = {"epochs": epochs, "pairs": pairs, "seed": seed, "network": network,
+             "prune_share": prune_share}  # fmt: skip
+    chosen = chosen.model_copy(update={k: v for k, v in given.items() if v is not None})
+    shape = chosen.shape
+    if weights is not None and weights.suffix == ".safetensors" and settings is None:
+        given_network, _ = load_network(weights)
+        branch = given_network.branch
+        if isinstance(branch, CapsuleBranch):
+            shape = branch.shape
+        else:
+            shape = shape.with_layout(branch.layout)
+    if pixels is not None:
+        shape = shape.for_images_of(parse_size(pixels))
+    chosen = chosen.model_copy(update={"shape": shape})
+    if network in ("alexnet", "vgg16") and chosen.shape.input != (227, 227):
+        raise InputError(f"vslam train {network}: takes images of 227 pixels; add --pixels 227.")
+    folder = out or Path("training") / f"{network}-{preset}"
+    threads = threads or available_cores()
+    set_threads(threads)
+    collection = load(sources, chosen.shape.input, chosen.fit, threads)
+    outcome = _train(
+        collection, chosen, folder, settings.name if settings else preset, data, device, threads,
+        resume, weights,
+        None if max_minutes is None else began + 60.0 * max_minutes, quiet,
+    )  # fmt: skip
+    if quiet:
+        return
+    if not outcome.finished:
+        typer.echo(f"{folder}: stopped in epoch {outcome.progress.epoch}; go on with --resume")
+        return
+    for name, value in outcome.figures.items():
+        typer.echo(f"{name:<28}{value:.4f}")
+    typer.echo(f"{'weights':<28}{outcome.weights}")
+
+
+def _train(
+    collection: Collection,
+    settings: TrainSettings,
+    folder: Path,
+    preset: str,
+    data: list[str],
+    device: str,
+    threads: int,
+    resume: bool,
+    weights: Path | None,
+    until: float | None,
+    quiet: bool,
+) -> TrainingOutcome:
+    from vslam.cli.progress import training_bar
+    from vslam.loopclosure.siamese.checkpoint import CHECKPOINT
+    from vslam.loopclosure.siamese.initial_network import starting_network
+    from vslam.loopclosure.siamese.model_card import describe, write_card
+    from vslam.loopclosure.siamese.siamese import load_network
+    from vslam.loopclosure.siamese.training import train as run
+
+    start, settings, report = starting_network(
+        settings, collection, weights, device, resuming=resume and (folder / CHECKPOINT).exists()
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "settings.json").write_text(settings.model_dump_json(indent=1) + "\n")
+    with training_bar(shown=not quiet) as on_step:
+        outcome = run(
+            collection, settings, folder, device=device, threads=threads, resume=resume,
+            start=start, on_step=on_step,
+            should_stop=None if until is None else lambda: time.monotonic() > until,
+        )  # fmt: skip
+    if outcome.weights.exists():
+        network, _ = load_network(outcome.weights)
+        card = describe(
+            network, collection, settings, outcome, preset=preset, data=data, device=device
+        )
+        write_card({**card, **report}, outcome.weights)
+    return outcome
+
+
+@export.command("onnx", epilog=_EXPORT_EXAMPLES)
+def onnx(
+    weights: Annotated[Path, typer.Option(help="Weights, .safetensors.")],
+    out: Annotated[Path, typer.Option(help="ONNX file to write.")] = Path("capsule.onnx"),
+) -> None:
+    """Write the branch (image to descriptor) as ONNX, and check it against torch."""
+    from vslam.loopclosure.siamese.onnx import export_onnx
+    from vslam.loopclosure.siamese.siamese import load_network
+
+    network, _ = load_network(weights)
+    difference = export_onnx(network, out)
+    typer.echo(
+        f"{out}: {out.stat().st_size / 1e6:.1f} MB, images (1, 3, {network.size[0]}, "
+        f"{network.size[1]}) to descriptor (1, {network.dimensions}); differs from torch by at "
+        f"most {difference:.1e}"
+    )
+
+
+@export.command("weights")
+def weights_(
+    weights: Annotated[Path, typer.Option(help="Weights of a training, .safetensors.")],
+    out: Annotated[Path, typer.Option(help="File to write, .safetensors.")],
+) -> None:
+    """Write weights in half precision, with their model card, as vslam ships them."""
+    import shutil
+
+    from vslam.errors import ResultsError
+    from vslam.loopclosure.siamese.siamese import load_network, save_network
+
+    network, about = load_network(weights)
+    save_network(network, out, about, half=True)
+    cards = [weights.with_suffix(end) for end in (".md", ".json")]
+    try:
+        for card in filter(Path.exists, cards):
+            shutil.copyfile(card, out.with_suffix(card.suffix))
+    except OSError as error:
+        raise ResultsError(
+            f"{out.parent}: the model card cannot be written ({error.strerror})."
+        ) from error
+    typer.echo(f"{out}: {network.name}, {out.stat().st_size / 1e6:.2f} MB")
+
+
+@export.command("places", epilog=_PLACES_EXAMPLES)
+def places(
+    data: DataSources,
+    fit: Annotated[
+        FitName, typer.Option(help="The whole view [b]squash[/b]ed into a square, or its middle.")
+    ] = "squash",
+    pixels: Annotated[
+        str, typer.Option(metavar="SIDE|HEIGHTxWIDTH", help="Size of the images.")
+    ] = "227",
+    out: Annotated[Path, typer.Option(help="File to write.")] = Path("places.npz"),
+) -> None:
+    """Write sources of images as one small file, for training on another machine."""
+    from vslam.loopclosure.siamese.image_sources import open_source, write_pack
+    from vslam.loopclosure.siamese.images import parse_size
+
+    sources = [source for spec in data for source in open_source(spec)]
+    write_pack(sources, out, parse_size(pixels), fit)
+    typer.echo(f"{out}: {sum(map(len, sources))} images, {out.stat().st_size / 1e6:.1f} MB")

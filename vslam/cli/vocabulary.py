@@ -1,0 +1,165 @@
+"""The commands ``vslam vocabulary ...``: train, convert and look at visual vocabularies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vslam.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from vslam.config import OrbConfig
+
+_IMAGES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
+
+commands = typer.Typer(
+    help="Train, convert and look at vocabularies of visual words.", no_args_is_help=True
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the application."""
+    app.add_typer(commands, name="vocabulary")
+
+
+@commands.command(
+    epilog="[b]Examples[/b]\n\n  vslam vocabulary train photos kitti/sequences/01/image_0"
+    "\n\n  vslam vocabulary train 'photos/*/*.jpg' --levels 6 --out mine.npz"
+)
+def train(
+    images: Annotated[list[str], typer.Argument(help="Image files, folders or globs.")],
+    k: Annotated[int, typer.Option(min=2, max=20, help="Children of a node.")] = 10,
+    levels: Annotated[int, typer.Option(min=1, max=10, help="Levels: k^levels words.")] = 5,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same words.")] = 0,
+    out: Annotated[Path, typer.Option(help="File to write, .npz or .txt.")] = Path(
+        "vocabulary.npz"
+    ),
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
+) -> None:
+    """Train a vocabulary on images: better on many places than on many views of one."""
+    from vslam.cli.progress import announce, count_bar
+    from vslam.config import OrbConfig
+    from vslam.loopclosure import vocabulary_training
+    from vslam.loopclosure.vocabulary_text import is_text, write_vocabulary
+
+    is_text(out)  # refuse what cannot be written before the work, not after
+    if not out.parent.is_dir():
+        raise InputError(f"{out}: there is no folder {out.parent}; make it or choose another.")
+    paths = _find(images)
+    descriptors, unreadable = [], 0
+    with count_bar("images", len(paths), shown=not quiet) as advance:
+        for path, found in zip(paths, _extract_all(paths, OrbConfig()), strict=True):
+            if found is None:
+                typer.echo(f"{path}: cannot be read as an image; skipped", err=True)
+                unreadable += 1
+            elif len(found):
+                descriptors.append(found)
+            advance()
+    n = sum(map(len, descriptors))
+    announce(f"{n} descriptors of {len(descriptors)} images", shown=not quiet)
+
+    def on_level(level: int, nodes: int) -> None:
+        announce(f"level {level}: {nodes} nodes", shown=not quiet)
+
+    try:
+        trained = vocabulary_training.train(descriptors, k, levels, seed, on_level)
+    except ValueError as error:
+        raise InputError(
+            f"vslam vocabulary train: {error}; {unreadable} of {len(paths)} images cannot be read."
+        ) from error
+    write_vocabulary(trained, out)
+    typer.echo(
+        f"{out}: {trained.n_words} words from {n} descriptors of {len(descriptors)} images, "
+        f"k {k}, levels {levels}, seed {seed}"
+    )
+
+
+@commands.command(epilog="[b]Example[/b]\n\n  vslam vocabulary convert ORBvoc.txt orbvoc.npz")
+def convert(
+    source: Annotated[Path, typer.Argument(help="Vocabulary, .npz or .txt (DBoW2).")],
+    target: Annotated[Path, typer.Argument(help="File to write, .npz or .txt (DBoW2).")],
+) -> None:
+    """Convert between vslam's npz and the text format of DBoW2 and ORB-SLAM."""
+    from vslam.loopclosure.vocabulary_text import is_text, read_vocabulary, write_vocabulary
+
+    is_text(target)
+    read = read_vocabulary(source)
+    write_vocabulary(read, target)
+    typer.echo(f"{target}: {read.n_words} words, {target.stat().st_size / 1e6:.1f} MB")
+
+
+@commands.command()
+def info(
+    file: Annotated[
+        Path | None, typer.Argument(help="Vocabulary.", show_default="the one of vslam")
+    ] = None,
+) -> None:
+    """Show what a vocabulary holds."""
+    import time
+
+    import numpy as np
+
+    from vslam.loopclosure.vocabulary import SHIPPED
+    from vslam.loopclosure.vocabulary_text import read_vocabulary
+
+    file = file or SHIPPED
+    start = time.perf_counter()
+    v = read_vocabulary(file)
+    elapsed = time.perf_counter() - start
+    depth = v.level[v.word >= 0]
+    idf = np.percentile(v.weight, [0, 5, 50, 95, 100])
+    rows = [
+        ("file", f"{file}: {file.stat().st_size / 1e6:.2f} MB, read in {elapsed * 1e3:.0f} ms"),
+        ("tree", f"{v.branching} children at most, {v.levels} levels, {len(v.word)} nodes"),
+        ("words", f"{v.n_words}, of which {np.count_nonzero(v.weight == 0)} weigh nothing"),
+        ("by level", ", ".join(f"{k}: {n}" for k, n in enumerate(np.bincount(depth)) if n)),
+        ("idf", "least, 5 %, median, 95 %, most: " + ", ".join(f"{x:.2f}" for x in idf)),
+    ]
+    for name, value in rows:
+        typer.echo(f"{name:<10}{value}")
+
+
+def _find(images: list[str]) -> list[Path]:
+    """Image files, those of a folder or glob in order of their names, each once."""
+    import glob
+
+    found: dict[Path, None] = {}
+    for name in images:
+        path = Path(name)
+        if path.is_dir():
+            files = sorted(p for p in path.rglob("*") if p.suffix.lower() in _IMAGES)
+        elif path.is_file():
+            files = [path]
+        else:
+            files = sorted(Path(p) for p in glob.glob(name, recursive=True))
+        if not files:
+            raise InputError(f"{name}: no image there; name files, folders or globs of images.")
+        found.update(dict.fromkeys(files))
+    return list(found)
+
+
+def _extract_all(paths: list[Path], config: OrbConfig) -> Iterator[NDArray[np.uint8] | None]:
+    """Yield the ``(n, 32)`` descriptors of each image in turn, None if it cannot be read."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    import cv2
+    import numpy as np
+
+    from vslam.frontend.orb import extract
+    from vslam.machine import available_cores
+
+    def one(path: Path) -> NDArray[np.uint8] | None:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        return None if image is None else extract(np.asarray(image, np.uint8), config).descriptors
+
+    threads = min(available_cores(), 4)
+    with ThreadPoolExecutor(threads) as pool:
+        for start in range(0, len(paths), 16 * threads):  # few descriptors wait
+            yield from pool.map(one, paths[start : start + 16 * threads])

@@ -1,0 +1,265 @@
+"""Seeded photometric perturbations of a stereo sequence (docs/design.md, section 10).
+
+With v a grey value, s the strength (1 unless ``law:s`` says otherwise), t seconds since the first
+frame, k the frame and n a standard normal number:
+
+==========  ======================================================================================
+brightness  v exp(g(t)) + b(t): g and b are Ornstein-Uhlenbeck walks, time constant 2 s, deviations
+            0.35 s and 20 s grey levels. Three times a minute on average both jump (tunnel,
+            auto-exposure): they are drawn anew, 1.5 times as wide. g is clipped to
+            [-1.2, 0.7] max(1, s).
+gamma       255 (v / 255)^exp(g(t)): g is such a walk of deviation 0.35 s, without jumps.
+flicker     v exp(0.15 s n_k): one n for each frame, as under mains lighting.
+noise       v + 8 s n: one n for each pixel, frame and camera.
+blur        Gaussian blur of deviation 1.5 s pixels.
+occlusion   a grey rectangle, as of dirt on the glass, over min(0.15 s, 0.9) of the image's area;
+            place, shape and grey value are drawn anew every second.
+==========  ======================================================================================
+
+Each law rounds and clips to 8 bits, is the same for both cameras (noise alone is drawn for each)
+and draws from its own random stream: it does the same alone and in company, and what it does to
+frame k depends on the seed, k and the time of k only, not on the frames asked for before.
+Walks live on a fixed grid in time, so that dropping frames does not change the light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from math import exp, inf, isfinite
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.datasets.sequence import Image, Sequence
+from vslam.errors import InputError
+
+Law = Callable[[int, int, Image], Image]
+"""``(frame, side, image) -> image`` of the same shape; side 0 is left, 1 is right."""
+
+_STEP_S = 0.01
+_TIME_CONSTANT_S = 2.0
+_JUMPS_PER_S = 3.0 / 60.0
+_JUMP_WIDENING = 1.5
+_MAX_STRENGTH = 10.0
+_GREYS = np.arange(256, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """Laws applied one after the other; without any, the images pass unchanged.
+
+    Attributes:
+        name: canonical spelling, ``none`` or ``brightness:1.5,blur:0.5`` for example.
+        laws: see the module.
+    """
+
+    name: str
+    laws: tuple[Law, ...] = ()
+
+    def apply(self, index: int, left: Image, right: Image | None) -> tuple[Image, Image | None]:
+        """Perturb both ``(H, W)`` uint8 images of frame ``index``; safe in several threads.
+
+        The left one becomes the same with and without a right one.
+        """
+        for law in self.laws:
+            left = law(index, 0, left)
+            right = None if right is None else law(index, 1, right)
+        return left, right
+
+
+def parse_perturbation(spec: str, seed: int, timestamps: NDArray[np.float64]) -> Perturbation:
+    """Build the perturbation that ``--perturb`` names.
+
+    Args:
+        spec: ``law[:strength]``, several joined by commas, applied in this order; ``none`` or
+            nothing for the identity.
+        seed: not negative; equal seeds give equal images.
+        timestamps: ``(N,)`` seconds of the frames, increasing.
+
+    Raises:
+        InputError: unknown or repeated law, strength no number or not within 0 to 10, or a
+            negative seed.
+    """
+    if seed < 0:
+        raise InputError(f"--seed {seed}: must not be negative.")
+    if spec.strip() in ("", "none"):
+        return Perturbation("none")
+    t = np.asarray(timestamps - timestamps[0], np.float64)
+    strengths: dict[str, float] = {}
+    for item in spec.split(","):
+        law, _, strength = item.strip().partition(":")
+        if law not in _MAKERS:
+            raise InputError(
+                f"--perturb {spec}: unknown law '{law}'; choose from none, {', '.join(_MAKERS)}."
+            )
+        if law in strengths:
+            raise InputError(f"--perturb {spec}: {law} is given twice; add up its strengths.")
+        strengths[law] = _parse_strength(spec, strength) if ":" in item else 1.0
+    return Perturbation(
+        ",".join(f"{law}:{strength:g}" for law, strength in strengths.items()),
+        tuple(
+            _MAKERS[law](strength, (seed, crc32(law.encode())), t)
+            for law, strength in strengths.items()
+        ),
+    )
+
+
+def contact_sheet(
+    sequence: Sequence, perturbation: Perturbation, indices: Collection[int]
+) -> Image:
+    """A grey image with a row for each frame: left image as it is, both images perturbed.
+
+    Raises:
+        UnreadableImageError: one of the frames cannot be read.
+    """
+    import cv2
+
+    rows = []
+    for index in indices:
+        left, right = sequence.read(index)
+        width = 480
+        height = round(width * left.shape[0] / left.shape[1])
+        row = np.hstack(
+            [
+                cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+                for image in (left, *perturbation.apply(index, left, right))
+                if image is not None
+            ]
+        )
+        label = f"frame {index}, {sequence.timestamps[index]:.1f} s"
+        row[:20, :150] = 0
+        cv2.putText(row, label, (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, 255, 1)
+        rows.append(row)
+    return np.vstack(rows)
+
+
+def ou_walk(
+    duration: float,
+    deviation: float,
+    rng: np.random.Generator,
+    jumps: Collection[float] = (),
+) -> NDArray[np.float64]:
+    """An Ornstein-Uhlenbeck walk of time constant 2 s, exact on a grid of 10 ms.
+
+    Args:
+        duration: seconds to cover.
+        deviation: stationary standard deviation; the walk begins in the stationary state.
+        rng: source of its normal numbers.
+        jumps: times in seconds at which the walk is drawn anew, 1.5 times as wide.
+
+    Returns:
+        ``(floor(duration / 0.01) + 1,)`` float64.
+    """
+    noise = rng.standard_normal(int(duration / _STEP_S) + 1)
+    jumped = {round(time / _STEP_S) for time in jumps}
+    decay = exp(-_STEP_S / _TIME_CONSTANT_S)
+    spread = (1.0 - decay**2) ** 0.5
+    walk = np.empty_like(noise)
+    x = walk[0] = noise[0]
+    for k in range(1, len(noise)):
+        x = _JUMP_WIDENING * noise[k] if k in jumped else decay * x + spread * noise[k]
+        walk[k] = x
+    return deviation * walk
+
+
+def _parse_strength(spec: str, text: str) -> float:
+    try:
+        strength = float(text)
+    except ValueError:
+        strength = inf
+    if not (isfinite(strength) and 0.0 <= strength <= _MAX_STRENGTH):
+        raise InputError(
+            f"--perturb {spec}: bad strength '{text}'; give a number from 0 to "
+            f"{_MAX_STRENGTH:g}, 1 is the default."
+        )
+    return strength
+
+
+def _on_grid(t: NDArray[np.float64]) -> NDArray[np.int64]:
+    # The small offset keeps a time that lies on the grid from rounding into the cell before it.
+    return np.floor(t / _STEP_S + 1e-6).astype(np.int64)
+
+
+def _pointwise(curves: NDArray[np.float64]) -> Law:
+    """A law that sends grey value v of frame k to ``curves[k, v]``."""
+    tables = np.clip(np.rint(curves), 0, 255).astype(np.uint8)
+
+    def law(frame: int, side: int, image: Image) -> Image:
+        import cv2
+
+        return np.asarray(cv2.LUT(image, tables[frame]), np.uint8)
+
+    return law
+
+
+def _brightness(strength: float, stream: tuple[int, int], t: NDArray[np.float64]) -> Law:
+    rng_gain, rng_bias, rng_jumps = (np.random.default_rng([*stream, k]) for k in range(3))
+    jumps: list[float] = []
+    time = rng_jumps.exponential(1.0 / _JUMPS_PER_S)
+    while time < t[-1]:
+        jumps.append(time)
+        time += rng_jumps.exponential(1.0 / _JUMPS_PER_S)
+    at = _on_grid(t)
+    limit = max(1.0, strength)
+    log_gain = ou_walk(t[-1] + _STEP_S, 0.35 * strength, rng_gain, jumps)[at]
+    gain = np.exp(np.clip(log_gain, -1.2 * limit, 0.7 * limit))
+    bias = ou_walk(t[-1] + _STEP_S, 20.0 * strength, rng_bias, jumps)[at]
+    return _pointwise(gain[:, None] * _GREYS + bias[:, None])
+
+
+def _gamma(strength: float, stream: tuple[int, int], t: NDArray[np.float64]) -> Law:
+    walk = ou_walk(t[-1] + _STEP_S, 0.35 * strength, np.random.default_rng(stream))[_on_grid(t)]
+    return _pointwise(255.0 * (_GREYS / 255.0) ** np.exp(walk)[:, None])
+
+
+def _flicker(strength: float, stream: tuple[int, int], t: NDArray[np.float64]) -> Law:
+    log_gain = 0.15 * strength * np.random.default_rng(stream).standard_normal(len(t))
+    return _pointwise(np.exp(log_gain)[:, None] * _GREYS)
+
+
+def _noise(strength: float, stream: tuple[int, int], t: NDArray[np.float64]) -> Law:
+    def law(frame: int, side: int, image: Image) -> Image:
+        rng = np.random.Generator(np.random.SFC64([*stream, frame, side]))
+        grain = rng.standard_normal(image.shape, dtype=np.float32)
+        return np.clip(np.rint(image + 8.0 * strength * grain), 0, 255).astype(np.uint8)
+
+    return law
+
+
+def _blur(strength: float, stream: tuple[int, int], t: NDArray[np.float64]) -> Law:
+    def law(frame: int, side: int, image: Image) -> Image:
+        import cv2
+
+        if strength == 0:
+            return image
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), 1.5 * strength), np.uint8)
+
+    return law
+
+
+def _occlusion(strength: float, stream: tuple[int, int], t: NDArray[np.float64]) -> Law:
+    area = min(0.15 * strength, 0.9)
+
+    def law(frame: int, side: int, image: Image) -> Image:
+        rng = np.random.default_rng([*stream, int(t[frame])])
+        height, width = image.shape
+        across = rng.uniform(area, 1.0)  # fraction of the width; the height follows from the area
+        box_w, box_h = round(across * width), round(area / across * height)
+        x, y = rng.integers(width - box_w + 1), rng.integers(height - box_h + 1)
+        covered = image.copy()
+        covered[y : y + box_h, x : x + box_w] = rng.integers(256)
+        return covered
+
+    return law
+
+
+_MAKERS: dict[str, Callable[[float, tuple[int, int], NDArray[np.float64]], Law]] = {
+    "brightness": _brightness,
+    "gamma": _gamma,
+    "flicker": _flicker,
+    "noise": _noise,
+    "blur": _blur,
+    "occlusion": _occlusion,
+}

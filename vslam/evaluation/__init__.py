@@ -1,0 +1,1 @@
+"""How good a run is: its trajectory, and its loops."""

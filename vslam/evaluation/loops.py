@@ -1,0 +1,285 @@
+"""Loops against the ground truth: where the camera came back, and whether that was noticed.
+
+ATE alone cannot tell: a missed loop costs nothing where there was no drift, and a wrong one may
+bend the map where few frames are. Here each loop and each return is judged by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.evaluation.trajectories import path_length
+from vslam.geometry import inverses
+from vslam.loops import LoopEdge
+from vslam.run.outcome import RunOutcome
+
+_SAMPLE_M = 1.0  # the path is looked at once a metre, so that standing still costs nothing
+_UNIT_FRAMES = 20  # each way, to tell the unit of a monocular map
+_MAX_STEP_M = 20.0  # between two frames farther apart nobody knows where the path went
+
+Indices = NDArray[np.int64]
+Poses = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LoopLimits:
+    """What counts as a revisit, and as a right loop.
+
+    Attributes:
+        min_length_m: shorter stretches are not expected to be found.
+        max_lateral_m: distance from the earlier path; the next lane is 3 to 4 m away.
+        max_heading_deg: between the optical axes; a place seen from behind is another picture.
+        min_seconds, min_path_m: time and way since the earlier passage.
+        max_interruption_m: revisits with less between them are one stretch: tracking does not
+            let go of the old map so soon.
+        max_translation_m, max_rotation_deg: error of a right loop's relative pose. Well above the
+            error of KITTI's ground truth between two passages, well below a row of houses.
+    """
+
+    min_length_m: float = 20.0
+    max_lateral_m: float = 5.0
+    max_heading_deg: float = 30.0
+    min_seconds: float = 10.0
+    min_path_m: float = 50.0
+    max_interruption_m: float = 10.0
+    max_translation_m: float = 2.0
+    max_rotation_deg: float = 5.0
+
+
+@dataclass(frozen=True)
+class Revisits:
+    """M stretches of the path on which the camera is where it was before, in order.
+
+    Attributes:
+        first, last: ``(M,)`` first and last frame of each stretch.
+        first_match, last_match: ``(M,)`` the earlier frames nearest to those two.
+        length_m: ``(M,)`` way from first to last.
+    """
+
+    first: Indices
+    last: Indices
+    first_match: Indices
+    last_match: Indices
+    length_m: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+
+@dataclass(frozen=True)
+class LoopEvaluation:
+    """Loops and revisits set against each other.
+
+    Attributes:
+        revisits: M stretches.
+        loop_frame: ``(M,)`` query frame of the first right loop closed on each, -1 if missed.
+        right: for each edge, rejected ones too, whether its relative pose is the true one; None
+            where that cannot be said: no pose, or frames without ground truth.
+        n_wrong: accepted edges that are not right.
+    """
+
+    revisits: Revisits
+    loop_frame: Indices
+    right: tuple[bool | None, ...]
+    n_wrong: int
+
+    @property
+    def n_found(self) -> int:
+        """Stretches with a right loop; once the old map is found, tracking holds on to it."""
+        return int(np.count_nonzero(self.loop_frame >= 0))
+
+    @property
+    def n_missed(self) -> int:
+        """Stretches without a right loop."""
+        return len(self.revisits) - self.n_found
+
+
+_DEFAULT_LIMITS = LoopLimits()
+
+
+def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
+    """Judge the loops of a run over the frames that it has done; None without ground truth."""
+    T_wc, times = outcome.sequence.ground_truth, outcome.sequence.timestamps
+    if T_wc is None or not len(outcome.trajectory):
+        return None
+    done = int(np.searchsorted(times, outcome.trajectory.timestamps[-1], side="right"))
+    loops = outcome.loops
+    if outcome.settings.alignment == "sim3":
+        metres = metres_per_unit(np.array([track.T_wc for track in outcome.tracks]), T_wc[:done])
+        frames = outcome.keyframe_frames
+        loops = [_in_metres(edge, float(metres[frames[edge.match]])) for edge in loops]
+    return judge_loops(loops, outcome.keyframe_frames, T_wc[:done], times[:done])
+
+
+def metres_per_unit(T_wc: Poses, T_wc_true: Poses) -> NDArray[np.float64]:
+    """What a monocular map's unit was when each frame was tracked, ``(N,)``: the median ratio of
+    true and estimated steps from frame to frame, over the 41 frames around it; 1 where nothing
+    moved."""
+    true, estimated = (
+        np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) for T in (T_wc_true, T_wc)
+    )
+    n = len(T_wc)
+    metres = np.ones(n)
+    for k in range(n):
+        steps = slice(max(0, k - _UNIT_FRAMES), k + _UNIT_FRAMES)
+        moved = (estimated[steps] > 0) & (true[steps] > 0)
+        if moved.any():
+            metres[k] = np.median(true[steps][moved] / estimated[steps][moved])
+    return metres
+
+
+def _in_metres(edge: LoopEdge, metres: float) -> LoopEdge:
+    if edge.T_query_match is None:
+        return edge
+    T = edge.T_query_match.copy()
+    T[:3, 3] *= metres
+    return replace(edge, T_query_match=T)
+
+
+def revisits(
+    T_wc: Poses, timestamps: NDArray[np.float64], limits: LoopLimits = _DEFAULT_LIMITS
+) -> Revisits:
+    """Find the stretches on which the camera drives where it drove before, in that direction.
+
+    A frame is back when the path driven at least ``min_seconds`` and ``min_path_m`` before runs
+    past it within ``max_lateral_m`` and, there, within ``max_heading_deg`` of its axis. The path
+    between frames is straight.
+
+    Args:
+        T_wc: ``(N, 4, 4)`` ground truth.
+        timestamps: ``(N,)`` seconds.
+    """
+    none = np.zeros(0, np.int64)
+    if len(T_wc) < 2:
+        return Revisits(none, none, none, none, np.zeros(0))
+    path = path_length(T_wc)
+    sampled = np.searchsorted(path, np.arange(0.0, path[-1], _SAMPLE_M))
+    sampled = np.unique(np.append(sampled, len(T_wc) - 1))
+    match = _earlier_passage(T_wc[sampled], timestamps[sampled], path[sampled], limits)
+
+    back = np.flatnonzero(match >= 0)
+    if not len(back):
+        return Revisits(none, none, none, none, np.zeros(0))
+    at = path[sampled]
+    gap = np.diff(at[back])
+    interrupted = (np.diff(back) > 1) & (gap >= limits.max_interruption_m)
+    apart = np.flatnonzero(interrupted | (gap > _MAX_STEP_M))
+    first, last = back[np.append(0, apart + 1)], back[np.append(apart, len(back) - 1)]
+    long_enough = at[last] - at[first] >= limits.min_length_m
+    first, last = first[long_enough], last[long_enough]
+    return Revisits(
+        first=sampled[first],
+        last=sampled[last],
+        first_match=sampled[match[first]],
+        last_match=sampled[match[last]],
+        length_m=at[last] - at[first],
+    )
+
+
+def judge_loops(
+    edges: Collection[LoopEdge],
+    frames: Indices,
+    T_wc: Poses,
+    timestamps: NDArray[np.float64],
+    limits: LoopLimits = _DEFAULT_LIMITS,
+) -> LoopEvaluation:
+    """Say of each edge whether it is right, and of each revisit whether a loop found it.
+
+    An edge is right when ``T_query_match`` is the ground truth's within the limits. It finds a
+    stretch when it is right, accepted, reaches back to an earlier passage (not to the frames just
+    before) and its query lies on the stretch, or within ``max_interruption_m`` of it: the camera
+    sees the place a little longer than it is there.
+
+    Args:
+        edges: E loops, accepted or not.
+        frames: ``(K,)`` frame of each keyframe that the edges name.
+        T_wc: ``(N, 4, 4)`` ground truth of the frames.
+        timestamps: ``(N,)`` seconds.
+    """
+    found = revisits(T_wc, timestamps, limits)
+    right = tuple(_is_right(edge, frames, T_wc, limits) for edge in edges)
+    loop_frame = np.full(len(found), -1, np.int64)
+    path = path_length(T_wc)
+    slack = limits.max_interruption_m
+    for edge, is_right in zip(edges, right, strict=True):
+        if not (edge.accepted and is_right):
+            continue
+        query, match = sorted((int(frames[edge.query]), int(frames[edge.match])), reverse=True)
+        if not _long_ago(path, timestamps, query, match, limits):
+            continue
+        near = (path[found.first] - slack <= path[query]) & (
+            path[query] <= path[found.last] + slack
+        )
+        earlier = near & ((loop_frame < 0) | (query < loop_frame))
+        loop_frame[earlier] = query
+    n_wrong = sum(
+        edge.accepted and is_right is False for edge, is_right in zip(edges, right, strict=True)
+    )
+    return LoopEvaluation(found, loop_frame, right, n_wrong)
+
+
+def _is_right(edge: LoopEdge, frames: Indices, T_wc: Poses, limits: LoopLimits) -> bool | None:
+    if edge.T_query_match is None or edge.query < 0:
+        return None
+    query, match = frames[edge.query], frames[edge.match]
+    if max(query, match) >= len(T_wc):
+        return None
+    T_wq, T_wm = T_wc[query], T_wc[match]
+    T_match_query = inverses(T_wm[None])[0] @ T_wq
+    error = edge.T_query_match @ T_match_query  # the identity if the edge is right
+    cosine = np.clip((np.trace(error[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
+    return bool(
+        np.linalg.norm(error[:3, 3]) <= limits.max_translation_m
+        and np.degrees(np.arccos(cosine)) <= limits.max_rotation_deg
+    )
+
+
+def _earlier_passage(
+    T_wc: Poses, timestamps: NDArray[np.float64], path: NDArray[np.float64], limits: LoopLimits
+) -> Indices:
+    """``(S,)`` for each sample the nearest one of an earlier passage, -1 without one."""
+    from scipy.spatial import cKDTree
+
+    position, axis = T_wc[:, :3, 3], T_wc[:, :3, 2]
+    forward = np.diff(position, axis=0, append=position[-1:])  # to the next sample
+    length = np.linalg.norm(forward, axis=1)
+    forward[length > _MAX_STEP_M] = 0.0
+    length[length > _MAX_STEP_M] = 0.0
+
+    # The nearest point of a step lies beside it, or at an end: no farther than this from its start.
+    radius = float(np.hypot(limits.max_lateral_m, length.max()))
+    pairs = cKDTree(position).query_pairs(radius, output_type="ndarray")
+    start, query = pairs[:, 0], pairs[:, 1]
+    kept = _long_ago(path, timestamps, query, start, limits)
+    start, query = start[kept], query[kept]
+
+    offset = position[query] - position[start]
+    along = np.einsum("ni,ni->n", offset, forward[start]) / np.maximum(length[start], 1e-9) ** 2
+    along = np.clip(along, 0.0, 1.0)
+    distance = np.linalg.norm(offset - along[:, None] * forward[start], axis=1)
+    nearest = start + (along > 0.5)
+    cosine = np.einsum("ni,ni->n", axis[query], axis[nearest])
+    same = (distance <= limits.max_lateral_m) & (
+        cosine >= np.cos(np.radians(limits.max_heading_deg))
+    )
+    query, nearest, distance = query[same], nearest[same], distance[same]
+
+    match = np.full(len(T_wc), -1, np.int64)
+    order = np.lexsort((nearest, -distance, query))  # the nearest of each query is written last
+    match[query[order]] = nearest[order]
+    return match
+
+
+def _long_ago(
+    path: NDArray[np.float64],
+    timestamps: NDArray[np.float64],
+    query: Indices | int,
+    match: Indices | int,
+    limits: LoopLimits,
+) -> NDArray[np.bool_]:
+    apart = path[query] - path[match] >= limits.min_path_m
+    return apart & (timestamps[query] - timestamps[match] >= limits.min_seconds)

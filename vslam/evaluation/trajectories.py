@@ -1,0 +1,217 @@
+"""How good a trajectory is: ATE, RPE and KITTI's drift, in the definitions that papers use.
+
+ATE and RPE come from evo (Grupp, 2017), so that anyone can repeat them with its command line; this
+is the only module that imports it.
+"""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError
+from vslam.trajectory import Trajectory, read_table, read_trajectory, trajectory_format
+
+MAX_TIME_DIFFERENCE_S = 0.01  # evo's default
+_LENGTHS_M = np.arange(100.0, 801.0, 100.0)
+_STEP_FRAMES = 10
+_EVO_FLAGS = {"se3": " --align", "sim3": " --align --correct_scale", "none": ""}
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Errors of an estimate against the ground truth over N matched frames.
+
+    Attributes:
+        frames: N, the frames compared.
+        alignment: ``se3``, ``sim3`` or ``none``: what was fitted before comparing.
+        ate_rmse_m, ate_mean_m, ate_max_m: of ``errors_m``.
+        errors_m: ``(N,)`` distance of each aligned position from the ground truth.
+        T_wc_aligned: ``(N, 4, 4)`` the estimate, aligned to the ground truth.
+        distances_m: ``(N,)`` length of the path along the ground truth.
+        rpe_m, rpe_deg: RMSE of the motion from one frame to the next.
+        t_rel_percent, r_rel_deg_per_100m: KITTI's drift over 100 to 800 m, None on paths shorter
+            than 100 m.
+    """
+
+    frames: int
+    alignment: str
+    ate_rmse_m: float
+    ate_mean_m: float
+    ate_max_m: float
+    errors_m: NDArray[np.float64]
+    T_wc_aligned: NDArray[np.float64]
+    distances_m: NDArray[np.float64]
+    rpe_m: float
+    rpe_deg: float
+    t_rel_percent: float | None
+    r_rel_deg_per_100m: float | None
+
+    def summary(self) -> dict[str, float | int | str | None]:
+        """The numbers without the arrays, for JSON."""
+        return {
+            name: value for name, value in vars(self).items() if not isinstance(value, np.ndarray)
+        }
+
+
+def evaluate_trajectory(
+    estimate: Trajectory, ground_truth: Trajectory, alignment: str = "se3"
+) -> Evaluation:
+    """Compare an estimate with the ground truth, aligned by ``se3``, ``sim3`` or not (``none``).
+
+    Equally long trajectories with the same times are compared frame by frame, others by time: each
+    pose with the nearest one at most 10 ms away; ``Evaluation.frames`` says how many had one.
+    ATE: RMSE of positions after alignment (Umeyama, TPAMI 1991; without scale for ``se3``) [Sturm
+    et al., IROS 2012]. RPE: over one frame. KITTI drift: see :func:`kitti_drift`.
+
+    Raises:
+        InputError: unknown alignment, no frames in common, or too little motion to align.
+    """
+    from evo import EvoException
+    from evo.core.metrics import APE, RPE, PoseRelation
+    from evo.core.trajectory import PoseTrajectory3D
+
+    if alignment not in _EVO_FLAGS:
+        raise InputError(
+            f"--align {alignment}: unknown alignment; choose one of {', '.join(_EVO_FLAGS)}."
+        )
+    estimate, ground_truth = _associate(estimate, ground_truth)
+    reference, aligned = (
+        PoseTrajectory3D(poses_se3=list(t.T_wc), timestamps=t.timestamps)
+        for t in (ground_truth, estimate)
+    )
+    try:
+        if alignment != "none":
+            aligned.align(reference, correct_scale=alignment == "sim3")
+        ape = APE(PoseRelation.translation_part)
+        ape.process_data((reference, aligned))
+        rpe_m, rpe_deg = RPE(PoseRelation.translation_part), RPE(PoseRelation.rotation_angle_deg)
+        for rpe in (rpe_m, rpe_deg):
+            rpe.process_data((reference, aligned))
+    except EvoException as error:
+        raise InputError(
+            f"--align {alignment}: {len(estimate)} frames with too little motion to compare; "
+            "alignment takes three that are not on one line, --align none takes two."
+        ) from error
+
+    T_wc_aligned = np.array(aligned.poses_se3)
+    errors = np.asarray(ape.error)
+    distances = path_length(ground_truth.T_wc)
+    drift = kitti_drift(T_wc_aligned, ground_truth.T_wc)
+    return Evaluation(
+        frames=len(errors),
+        alignment=alignment,
+        ate_rmse_m=_rmse(errors),
+        ate_mean_m=float(errors.mean()),
+        ate_max_m=float(errors.max()),
+        errors_m=errors,
+        T_wc_aligned=T_wc_aligned,
+        distances_m=distances,
+        rpe_m=_rmse(np.asarray(rpe_m.error)),
+        rpe_deg=_rmse(np.asarray(rpe_deg.error)),
+        t_rel_percent=None if drift is None else drift[0],
+        r_rel_deg_per_100m=None if drift is None else drift[1],
+    )
+
+
+def path_length(T_wc: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``(N,)`` metres travelled from the first pose to each of ``(N, 4, 4)`` poses."""
+    steps = np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def kitti_drift(
+    T_wc: NDArray[np.float64], T_wc_ground_truth: NDArray[np.float64]
+) -> tuple[float, float] | None:
+    """Average drift over 100, 200 ... 800 m, as the KITTI development kit defines it.
+
+    From every tenth frame, each length ends at the first frame beyond it along the ground truth;
+    the error of the motion in between is divided by the length [Geiger et al., CVPR 2012].
+
+    Args:
+        T_wc: ``(N, 4, 4)`` estimate.
+        T_wc_ground_truth: ``(N, 4, 4)`` of the same frames.
+
+    Returns:
+        ``t_rel`` in percent and ``r_rel`` in degrees per 100 m, None on a path below 100 m.
+    """
+    distances = path_length(T_wc_ground_truth)
+    starts = np.arange(0, len(distances), _STEP_FRAMES)
+    first, length = (grid.ravel() for grid in np.meshgrid(starts, _LENGTHS_M, indexing="ij"))
+    last = np.searchsorted(distances, distances[first] + length, side="right")
+    inside = last < len(distances)
+    if not inside.any():
+        return None
+    first, last, length = first[inside], last[inside], length[inside]
+    motion = np.linalg.inv(T_wc[first]) @ T_wc[last]
+    true_motion = np.linalg.inv(T_wc_ground_truth[first]) @ T_wc_ground_truth[last]
+    error = np.linalg.inv(motion) @ true_motion
+    cosine = (np.trace(error[:, :3, :3], axis1=1, axis2=2) - 1.0) / 2.0
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    shift = np.linalg.norm(error[:, :3, 3], axis=1)
+    return float(100.0 * (shift / length).mean()), float(100.0 * (angle / length).mean())
+
+
+def read_pair(
+    estimate: Path, ground_truth: Path, times: Path | None = None
+) -> tuple[Trajectory, Trajectory]:
+    """Read an estimate and its ground truth, each in either format.
+
+    Args:
+        estimate, ground_truth: KITTI or TUM files.
+        times: seconds, one a line, of every KITTI file among them (``times.txt``).
+
+    Raises:
+        InputError: a malformed file, or a KITTI file that cannot be matched without times.
+    """
+    timestamps = None if times is None else read_table(times, (1,), "a time in seconds")[:, 0]
+    formats = {trajectory_format(estimate), trajectory_format(ground_truth)}
+    if timestamps is None and len(formats) == 2:
+        raise InputError(
+            f"{estimate} and {ground_truth}: one is a KITTI file, which has no times; "
+            "give them with --times."
+        )
+    pair = read_trajectory(estimate, timestamps), read_trajectory(ground_truth, timestamps)
+    if timestamps is None and formats == {"kitti"} and len(pair[0]) != len(pair[1]):
+        raise InputError(
+            f"{estimate}: {len(pair[0])} poses but {len(pair[1])} in {ground_truth}; take "
+            "ground_truth_kitti.txt of the run folder, or the run's TUM file and --times."
+        )
+    return pair
+
+
+def evo_command(
+    estimate: Path, ground_truth: Path, alignment: str, format_: Literal["kitti", "tum"]
+) -> str:
+    """The ``evo_ape`` command line that reproduces the ATE of two files of one format."""
+    files = shlex.join([str(ground_truth), str(estimate)])
+    return f"evo_ape {format_} {files}{_EVO_FLAGS[alignment]}"
+
+
+def _associate(estimate: Trajectory, ground_truth: Trajectory) -> tuple[Trajectory, Trajectory]:
+    from evo.core.sync import matching_time_indices
+
+    times, true_times = estimate.timestamps, ground_truth.timestamps
+    if len(times) == len(true_times) and np.allclose(
+        times, true_times, rtol=0.0, atol=MAX_TIME_DIFFERENCE_S
+    ):
+        return estimate, ground_truth
+    if len(true_times) > len(times):  # evo looks up the poses of the shorter one in the longer
+        mine, true = matching_time_indices(times, true_times, MAX_TIME_DIFFERENCE_S)
+    else:
+        true, mine = matching_time_indices(true_times, times, MAX_TIME_DIFFERENCE_S)
+    if not mine:
+        raise InputError(
+            f"none of the {len(estimate)} poses lies within {1000 * MAX_TIME_DIFFERENCE_S:.0f} ms "
+            f"of the ground truth's {len(ground_truth)}; compare files of one sequence and clock."
+        )
+    return estimate.select(np.array(mine)), ground_truth.select(np.array(true))
+
+
+def _rmse(errors: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(errors**2)))

@@ -1,0 +1,104 @@
+"""The pose of every frame of a run, relative to a keyframe: where that moves, it follows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from vslam.geometry import Matrix, inverse, orthonormalised
+from vslam.trajectory import Trajectory, bridge_gaps
+
+
+class KeyframePoses(Protocol):
+    """What frames are placed by: the poses of keyframes as they are now.
+
+    Attributes:
+        n_keyframes: how many there are, culled ones included.
+        reference: the keyframe that new frames are placed by.
+    """
+
+    @property
+    def n_keyframes(self) -> int: ...
+    @property
+    def reference(self) -> int: ...
+
+    def keyframe_pose(self, keyframe: int) -> Matrix:
+        """``T_cw`` of a keyframe."""
+        ...
+
+    def unit_scale(self, keyframe: int) -> float:
+        """Units of the map around a keyframe that were one when it was added: 1 in metric maps."""
+        ...
+
+
+@dataclass(frozen=True)
+class FramePose:
+    """One frame. ``unit_scale`` is that of the keyframe when ``T_c_reference`` was measured."""
+
+    timestamp: float
+    reference: int
+    T_c_reference: Matrix
+    tracked: bool
+    unit_scale: float = 1.0
+
+
+class FramePoses:
+    """The poses of all frames, in order; those before the first keyframe are in the world."""
+
+    def __init__(self, keyframes: KeyframePoses) -> None:
+        self._keyframes = keyframes
+        self._frames: list[FramePose] = []
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    @property
+    def unit(self) -> float:
+        """``unit_scale`` of the reference keyframe, 1 before there is one."""
+        keyframes = self._keyframes
+        return keyframes.unit_scale(keyframes.reference) if keyframes.n_keyframes else 1.0
+
+    def timestamp(self, index: int) -> float:
+        """Seconds, of a frame; the last one is -1."""
+        return self._frames[index].timestamp
+
+    def append(self, timestamp: float, T_cw: Matrix, *, tracked: bool) -> None:
+        """Place the next frame.
+
+        Args:
+            tracked: False for a pose that is only predicted.
+        """
+        keyframes = self._keyframes
+        reference = keyframes.reference
+        T_rw = keyframes.keyframe_pose(reference) if keyframes.n_keyframes else np.eye(4)
+        relative = orthonormalised(T_cw @ inverse(T_rw))
+        self._frames.append(FramePose(timestamp, reference, relative, tracked, self.unit))
+
+    def replace(self, index: int, keyframe: int) -> None:
+        """A frame has become a keyframe: from now on it is where that is."""
+        unit = self._keyframes.unit_scale(keyframe)
+        timestamp = self._frames[index].timestamp
+        self._frames[index] = FramePose(timestamp, keyframe, np.eye(4), True, unit)
+
+    def pose(self, index: int) -> Matrix:
+        """``T_cw`` of a frame as its keyframe is placed now; the last one is -1."""
+        frame = self._frames[index]
+        T_c_reference = frame.T_c_reference
+        if self._keyframes.n_keyframes == 0:
+            return T_c_reference
+        unit = self._keyframes.unit_scale(frame.reference)
+        if unit != frame.unit_scale:
+            T_c_reference = T_c_reference.copy()
+            T_c_reference[:3, 3] *= unit / frame.unit_scale
+        return T_c_reference @ self._keyframes.keyframe_pose(frame.reference)
+
+    def trajectory(self) -> Trajectory:
+        """Pose of every frame, those that were only predicted interpolated between the frames
+        tracked before and after."""
+        times = np.array([frame.timestamp for frame in self._frames], np.float64)
+        poses = [inverse(self.pose(k)) for k in range(len(self._frames))]
+        tracked = np.array([frame.tracked for frame in self._frames], np.bool_)
+        T_wc = np.array(poses, np.float64).reshape(-1, 4, 4)
+        return bridge_gaps(Trajectory(times, T_wc), tracked)

@@ -1,0 +1,87 @@
+"""This machine and this process. Nothing heavy is imported to find it out."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import time
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+_PACKAGES = (
+    "vslam",
+    "numpy",
+    "numba",
+    "opencv-python-headless",
+    "opencv-python",
+    "opencv-contrib-python-headless",
+    "opencv-contrib-python",
+    "evo",
+    "rerun-sdk",
+    "torch",
+    "gtsam",
+)
+
+
+def versions() -> dict[str, str]:
+    """Version of Python and of each package that is installed."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def opencv_conflict(found: dict[str, str]) -> str | None:
+    """A warning where two wheels that overwrite each other's ``cv2`` are installed."""
+    wheels = [name for name in found if name.startswith("opencv-")]
+    if len(wheels) < 2:
+        return None
+    return (
+        f"{' and '.join(wheels)} both install cv2 and overwrite each other: uninstall all, "
+        "then install opencv-python-headless"
+    )
+
+
+def available_cores() -> int:
+    """Cores that this process may use, which in a container are fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def process_age() -> float:
+    """Seconds since this process started."""
+    import psutil
+
+    return time.time() - psutil.Process().create_time()
+
+
+def peak_memory_mb() -> float:
+    """Most memory that this process has held so far."""
+    import resource
+
+    # Linux's getrusage counts what the parent had before this process was its own program.
+    with suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 2**10
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def cpu_name() -> str:
+    """The processor's name as its maker writes it."""
+    # platform.processor() is empty or just "x86_64" on Linux.
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,270 @@
+"""Kernels that read and write the observations of a map.
+
+``a`` is the map's ``Arrays`` (vslam/map.py): the rows of a landmark hang on a chain from ``head``
+through ``next_row``, so that adding, removing and merging touch nothing but that chain.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vslam.kernels import hamming, inner_kernel, kernel
+
+
+@kernel
+def count_shared(a, keyframe, n_keyframes):
+    """Landmarks shared with each keyframe, ``(n_keyframes,)`` int64; 0 for itself."""
+    counts = np.zeros(n_keyframes, np.int64)
+    for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
+        landmark = a.landmark[row]
+        if landmark < 0:
+            continue
+        other = a.head[landmark]
+        while other >= 0:
+            counts[a.keyframe[other]] += 1
+            other = a.next_row[other]
+    counts[keyframe] = 0
+    return counts
+
+
+@kernel
+def link(a, row, landmark):
+    """Let a free row observe a landmark."""
+    a.landmark[row] = landmark
+    a.next_row[row] = a.head[landmark]
+    a.head[landmark] = row
+    a.n_observations[landmark] += 1 if np.isnan(a.u_right[row]) else 2
+
+
+@kernel
+def link_many(a, rows, landmarks):
+    """Let each of ``(N,)`` free rows observe its landmark."""
+    for i in range(len(rows)):
+        link(a, rows[i], landmarks[i])
+
+
+@kernel
+def unlink(a, row):
+    """Remove one observation. A landmark left with none is dead."""
+    landmark = a.landmark[row]
+    if a.head[landmark] == row:
+        a.head[landmark] = a.next_row[row]
+    else:
+        other = a.head[landmark]
+        while a.next_row[other] != row:
+            other = a.next_row[other]
+        a.next_row[other] = a.next_row[row]
+    a.landmark[row] = -1
+    a.next_row[row] = -1
+    a.n_observations[landmark] -= 1 if np.isnan(a.u_right[row]) else 2
+    if a.head[landmark] < 0:
+        a.landmark_alive[landmark] = False
+
+
+@kernel
+def erase_landmark(a, landmark):
+    """Remove a landmark and its observations."""
+    row = a.head[landmark]
+    while row >= 0:
+        following = a.next_row[row]
+        a.landmark[row] = -1
+        a.next_row[row] = -1
+        row = following
+    a.head[landmark] = -1
+    a.n_observations[landmark] = 0
+    a.landmark_alive[landmark] = False
+
+
+@kernel
+def detach_keyframe(a, keyframe):
+    """Remove all observations of a keyframe."""
+    for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
+        if a.landmark[row] >= 0:
+            unlink(a, row)
+
+
+@kernel
+def observed_by(a, landmark, keyframe):
+    """Row of ``keyframe`` that observes the landmark, or -1."""
+    row = a.head[landmark]
+    while row >= 0:
+        if a.keyframe[row] == keyframe:
+            return row
+        row = a.next_row[row]
+    return -1
+
+
+@kernel
+def merge_landmarks(a, loser, winner):
+    """Move the observations of ``loser`` to ``winner``; a keyframe that sees both keeps one.
+
+    int64 is what other callers give ``link`` and ``observed_by``: compiled once, not twice.
+    """
+    row = np.int64(a.head[loser])
+    while row >= 0:
+        following = np.int64(a.next_row[row])
+        a.landmark[row] = -1
+        a.next_row[row] = -1
+        if observed_by(a, winner, np.int64(a.keyframe[row])) < 0:
+            link(a, row, winner)
+        row = following
+    a.head[loser] = -1
+    a.n_observations[loser] = 0
+    a.landmark_alive[loser] = False
+    a.merged_into[loser] = winner
+    a.visible[winner] += a.visible[loser]
+    a.found[winner] += a.found[loser]
+
+
+@kernel
+def resolve(a, landmarks):
+    """Follow merges: living landmark that each id stands for today, or -1. Returns ``(N,)`` i4."""
+    out = np.empty(len(landmarks), np.int32)
+    for i in range(len(landmarks)):
+        landmark = landmarks[i]
+        while landmark >= 0 and not a.landmark_alive[landmark]:
+            landmark = a.merged_into[landmark]
+        out[i] = landmark
+    return out
+
+
+@inner_kernel
+def lower_median(values, n):
+    """Median of the first ``n`` values, the lower one of two; sorts them by insertion."""
+    for i in range(1, n):
+        value, j = values[i], i
+        while j > 0 and values[j - 1] > value:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = value
+    return values[(n - 1) // 2]
+
+
+@kernel
+def refresh_landmarks(a, landmarks, scales):
+    """Recompute what follows from the observations: descriptor, normal and distance range.
+
+    The descriptor is the observation's with the least median distance to the others (ORB-SLAM,
+    III-C); the distance range follows from the octave in the first keyframe that
+    observes it. At most the newest 32 observations vote on the descriptor: bounded work.
+    """
+    limit = 32
+    rows = np.empty(limit, np.int64)
+    distances = np.empty((limit, limit), np.int64)
+    for i in range(len(landmarks)):
+        landmark = landmarks[i]
+        if not a.landmark_alive[landmark]:
+            continue
+        n = 0
+        first, first_row = 2**31 - 1, -1
+        nx, ny, nz = 0.0, 0.0, 0.0
+        row = a.head[landmark]
+        while row >= 0:
+            k = a.keyframe[row]
+            T = a.T_cw[k]
+            # Centre of the camera: -R' t.
+            dx = a.xyz[landmark, 0] + T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3]
+            dy = a.xyz[landmark, 1] + T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3]
+            dz = a.xyz[landmark, 2] + T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3]
+            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+            nx += dx / distance
+            ny += dy / distance
+            nz += dz / distance
+            if k < first:
+                first, first_row = k, row
+                farthest = distance * scales[a.octave[row]]
+                a.distance_range[landmark, 0] = farthest / scales[-1]
+                a.distance_range[landmark, 1] = farthest
+            if n < limit:
+                rows[n] = row
+                n += 1
+            row = a.next_row[row]
+        norm = np.sqrt(nx * nx + ny * ny + nz * nz)
+        if norm > 0:
+            a.normal[landmark, 0] = nx / norm
+            a.normal[landmark, 1] = ny / norm
+            a.normal[landmark, 2] = nz / norm
+        for p in range(n):
+            distances[p, p] = 0
+            for q in range(p):
+                d = hamming(a.descriptor[rows[p]], a.descriptor[rows[q]])
+                distances[p, q] = d
+                distances[q, p] = d
+        best, best_median = first_row, 1000
+        for p in range(n):
+            median = lower_median(distances[p], n)
+            if median < best_median:
+                best, best_median = rows[p], median
+        for word in range(4):
+            a.landmark_descriptor[landmark, word] = a.descriptor[best, word]
+
+
+@kernel
+def predict_octave(distance, farthest, log_scale, levels):
+    """Pyramid level at which a landmark should appear at a distance (ORB-SLAM, V-D)."""
+    level = int(np.ceil(np.log(farthest / distance) / log_scale))
+    return min(max(level, 0), levels - 1)
+
+
+@kernel
+def collect_landmarks(a, keyframes, n_landmarks):
+    """Ids of the landmarks that any of the keyframes observes, ``(N,)`` i4, in id order."""
+    seen = np.zeros(n_landmarks, np.bool_)
+    for keyframe in keyframes:
+        for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
+            if a.landmark[row] >= 0:
+                seen[a.landmark[row]] = True
+    return np.flatnonzero(seen).astype(np.int32)
+
+
+@kernel
+def count_seen_by(a, keyframe, needed):
+    """Landmarks of a keyframe that at least ``needed`` keyframes see, it included."""
+    count = 0
+    for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
+        if a.landmark[row] < 0:
+            continue
+        seen = 0
+        other = a.head[a.landmark[row]]
+        while other >= 0 and seen < needed:
+            seen += 1
+            other = a.next_row[other]
+        if seen >= needed:
+            count += 1
+    return count
+
+
+@kernel
+def covisible_pairs(a, keyframes, n_keyframes, minimum):
+    """Pairs of ``(N,)`` keyframes that share at least ``minimum`` landmarks, in one pass.
+
+    Returns ``(M, 2)`` int64 with the lower id first, in ascending order, and ``(M,)`` how many
+    landmarks each pair shares.
+    """
+    counts = np.zeros(n_keyframes, np.int64)
+    listed = np.zeros(n_keyframes, np.bool_)
+    for keyframe in keyframes:
+        listed[keyframe] = True
+    pairs, shared = np.empty((64, 2), np.int64), np.empty(64, np.int64)
+    n = 0
+    for keyframe in range(n_keyframes):
+        if not listed[keyframe]:
+            continue
+        for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
+            if a.landmark[row] < 0:
+                continue
+            other = a.head[a.landmark[row]]
+            while other >= 0:
+                k = a.keyframe[other]
+                if k > keyframe and listed[k]:
+                    counts[k] += 1
+                other = a.next_row[other]
+        for k in range(keyframe + 1, n_keyframes):
+            if counts[k] >= max(1, minimum):
+                if n == len(pairs):
+                    pairs = np.concatenate((pairs, np.empty_like(pairs)))
+                    shared = np.concatenate((shared, np.empty_like(shared)))
+                pairs[n, 0], pairs[n, 1], shared[n] = keyframe, k, counts[k]
+                n += 1
+            counts[k] = 0
+    return pairs[:n], shared[:n]

@@ -1,0 +1,124 @@
+"""The folder of one run: its name, and everything that is written to it when the run ends."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from datetime import datetime
+from itertools import count
+from pathlib import Path
+
+from vslam.errors import InputError, ResultsError
+from vslam.report.frames import write_frames
+from vslam.report.schema import ReportJson
+from vslam.run.outcome import RunOutcome, matched_ground_truth
+from vslam.trajectory import write_kitti, write_tum
+
+
+def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, detector: str) -> Path:
+    """Create ``out/<YYYYmmdd-HHMMSS>-<dataset>-<sequence>-<perturb>-<detector>``.
+
+    A number is added to a name in use. ``out/latest`` becomes a link to the folder where the file
+    system has links.
+
+    Raises:
+        InputError: the folder cannot be created.
+    """
+    parts = [dataset, sequence, perturb.replace(":", "").replace(",", "+"), detector]
+    safe = [re.sub(r"[^A-Za-z0-9.+-]+", "_", part) for part in parts]
+    name = "-".join([f"{datetime.now():%Y%m%d-%H%M%S}", *safe])
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for number in count(1):
+            folder = out / (name if number == 1 else f"{name}-{number}")
+            with contextlib.suppress(FileExistsError):
+                folder.mkdir()
+                break
+    except OSError as error:
+        raise InputError(
+            f"{out}: cannot create a run folder here ({error.strerror}); "
+            "name a writable folder with --out."
+        ) from error
+    with contextlib.suppress(OSError):
+        (out / "latest").unlink(missing_ok=True)
+        (out / "latest").symlink_to(folder.name, target_is_directory=True)
+    return folder
+
+
+def write_results(
+    folder: Path, outcome: RunOutcome, *, pages: bool = True, ply: bool = False
+) -> ReportJson:
+    """Evaluate a run, in any state of completion, and write all that is known of it.
+
+    Files: ``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``,
+    ``config.json`` (read by ``--config``), ``keyframes.tum``, ``frames.csv``, ``report.json``,
+    ``report.md``, ``report.html`` (one file, no network request), ``figures/*.png``, ``map.npz``,
+    ``map.ply``; what matters most comes first.
+
+    Args:
+        folder: an existing folder; what is written replaces files of an earlier report.
+        outcome: the run; it may be interrupted, all lost, or without a single frame.
+        pages: write what people read, too: Markdown, HTML and figures.
+        ply: write the landmarks as ``map.ply``, too.
+
+    Raises:
+        ResultsError: a file could not be written; those before it are complete.
+    """
+    from vslam.maps.ply import save_ply
+    from vslam.maps.storage import save_map
+
+    try:
+        write_trajectories(folder, outcome)
+        write_tum(folder / "keyframes.tum", outcome.keyframes)
+        write_frames(folder / "frames.csv", outcome.tracks)
+        config = outcome.settings.config.model_dump_json(indent=2) + "\n"
+        (folder / "config.json").write_text(config)
+        report = _write_report(folder, outcome, config, pages=pages)
+        if outcome.map is not None:
+            save_map(folder / "map.npz", outcome.map, outcome.sequence.camera)
+            if ply:
+                landmarks = outcome.map.living_landmarks()
+                save_ply(folder / "map.ply", outcome.map.arrays.xyz[landmarks])
+    except OSError as error:
+        files = sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime_ns)
+        raise ResultsError(
+            f"{folder}: not all results could be written ({error.strerror or error}); there are "
+            f"{', '.join(file.name for file in files)}, the last of them incomplete. Free some "
+            "space or name another folder with --out."
+        ) from error
+    return report
+
+
+def write_trajectories(folder: Path, outcome: RunOutcome) -> None:
+    """Write the final trajectory in both formats and the ground truth of the same frames."""
+    write_kitti(folder / "trajectory_kitti.txt", outcome.trajectory.T_wc)
+    write_tum(folder / "trajectory.tum", outcome.trajectory)
+    if (ground_truth := matched_ground_truth(outcome)) is not None:
+        write_kitti(folder / "ground_truth_kitti.txt", ground_truth.T_wc)
+
+
+def _write_report(folder: Path, outcome: RunOutcome, config: str, *, pages: bool) -> ReportJson:
+    """``report.json``, and with ``pages`` what people read."""
+    from vslam.evaluation.loops import evaluate_loops
+    from vslam.evaluation.trajectories import evo_command
+    from vslam.report.summary import evaluate_run, summarize
+
+    evaluation, remark = evaluate_run(outcome)
+    verdict = evaluate_loops(outcome)
+    command = None
+    if evaluation is not None:
+        estimate, truth = folder / "trajectory_kitti.txt", folder / "ground_truth_kitti.txt"
+        command = evo_command(estimate, truth, evaluation.alignment, "kitti")
+    report = summarize(outcome, evaluation, verdict, command, remark)
+    (folder / "report.json").write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    if pages:
+        from vslam.report.figures import draw_figures
+        from vslam.report.render import render_html, render_markdown
+
+        (folder / "report.md").write_text(render_markdown(report), encoding="utf-8")
+        figures = draw_figures(outcome, evaluation, matched_ground_truth(outcome), verdict)
+        (folder / "figures").mkdir(exist_ok=True)
+        for figure in figures:
+            (folder / "figures" / f"{figure.name}.png").write_bytes(figure.png)
+        (folder / "report.html").write_text(render_html(report, config, figures), encoding="utf-8")
+    return report

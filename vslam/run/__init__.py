@@ -1,0 +1,1 @@
+"""A run over a sequence: frames prepared, tracked and recorded, and what came of it."""

@@ -1,0 +1,100 @@
+"""What one finished run says: the type that reports are made from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.config import Config
+from vslam.datasets.sequence import Sequence
+from vslam.features import TrackResult
+from vslam.loops import LoopCorrection, LoopEdge
+from vslam.map import Map
+from vslam.trajectory import Trajectory
+
+
+def alignment_of(sensor: str) -> str:
+    """``sim3`` for a monocular trajectory, whose scale is arbitrary, ``se3`` for all others."""
+    return "sim3" if sensor == "mono" else "se3"
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """The options of a run as the user gave them."""
+
+    dataset: str
+    sequence: str
+    perturb: str
+    detector: str
+    sensor: str
+    seed: int
+    threads: int
+    start: int
+    every: int
+    max_frames: int | None
+    config: Config
+    weights: Path | None = None
+    realtime: bool = False
+
+    @property
+    def alignment(self) -> str:
+        """What is fitted before a trajectory is compared with the ground truth."""
+        return alignment_of(self.sensor)
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """All that the report needs.
+
+    Attributes:
+        trajectory: final pose of every frame done, lost ones included.
+        keyframes: final keyframe poses.
+        tracks: one result a frame.
+        skipped: messages of the frames whose images could not be read.
+        latency_ms: of each frame tracked in a real-time run, from its time to its pose.
+        wall_s, cpu_s: seconds from the first frame read to the last one tracked and mapped.
+        startup_s: seconds from the start of the process to the first frame.
+        peak_memory_mb: of the process.
+        n_landmarks, n_keyframes: in the final map.
+        map: the final map, None for a trajectory from elsewhere.
+        loops: all that became of loop candidates, in the order of their decision.
+        corrections: what the accepted ones did to the map, in order.
+        keyframe_frames: ``(K,)`` int64, the frame of this run that each keyframe was, culled ones
+            included: loops speak of keyframes, people of frames.
+        n_submaps: how often mapping began, the first time included; 0 before the first keyframe.
+        interrupted: why the run ended early ("Ctrl-C"), or None.
+        without_loops: the same run without a loop detector, if one was made to compare.
+    """
+
+    settings: RunSettings
+    sequence: Sequence
+    trajectory: Trajectory
+    keyframes: Trajectory
+    tracks: list[TrackResult]
+    skipped: list[str]
+    wall_s: float
+    cpu_s: float
+    startup_s: float
+    peak_memory_mb: float
+    n_keyframes: int
+    n_landmarks: int
+    latency_ms: list[float] = field(default_factory=list)
+    map: Map | None = None
+    loops: list[LoopEdge] = field(default_factory=list)
+    corrections: list[LoopCorrection] = field(default_factory=list)
+    keyframe_frames: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    n_submaps: int = 1
+    interrupted: str | None = None
+    without_loops: RunOutcome | None = None
+
+
+def matched_ground_truth(outcome: RunOutcome) -> Trajectory | None:
+    """The ground truth of just the frames that ``outcome.trajectory`` has, None without any."""
+    poses = outcome.sequence.ground_truth
+    if poses is None:
+        return None
+    done = np.isin(outcome.sequence.timestamps, outcome.trajectory.timestamps)
+    return Trajectory(outcome.sequence.timestamps, poses).select(np.flatnonzero(done))

@@ -1,0 +1,390 @@
+"""The recording of a run, to be replayed offline in the Rerun viewer (``rerun recording.rrd``).
+
+The only module that imports rerun. A :class:`Recorder` is called from one thread.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import logging
+import shutil
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any, Concatenate, ParamSpec, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Camera
+from vslam.features import Features, TrackingState, TrackResult
+from vslam.geometry import inverses
+from vslam.loops import LoopEdge
+from vslam.map import Map
+from vslam.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
+_P = ParamSpec("_P")
+
+# Budget: 50 MB for 1,000 frames. At 350 keyframes of 1241x376 with 2,000 features, images take
+# about 11 MB, keypoints 6 MB, 14 maps 5 MB and all that is logged each frame 0.3 MB. A map after
+# each loop, at most one in ten keyframes, can add 35 x 0.36 = 13 MB; loops themselves are lines.
+_IMAGE_SCALE = 0.5
+_JPEG_QUALITY = 75
+_KEYFRAMES_PER_MAP = 25
+_KEYFRAMES_PER_CORRECTED_MAP = 10
+_MAX_POINTS_PER_MAP = 30_000  # the last map is complete
+
+_REJECTED_SHOWN_FRAMES = 20  # then the lines of rejected loops vanish
+_FRAMES_PER_BATCH = 50
+_FLUSH_TIMEOUT_S = 5.0
+_RESERVED_BYTES = 64 * 2**20  # left on the disk for the map, the trajectories and the report
+
+_GREEN, _AMBER, _RED = (16, 185, 129), (245, 158, 11), (239, 68, 68)
+_BLUE, _GREY = (59, 130, 246), (148, 163, 184)
+_FAINT_RED = (239, 68, 68, 80)
+_STATE_COLORS = {TrackingState.OK: _GREEN, TrackingState.WEAK: _AMBER, TrackingState.LOST: _RED}
+_POINT_SERIES = {"stereo": _GREY, "matches": _AMBER, "inliers": _BLUE}
+
+
+class Recorder(Protocol):
+    """What the pipeline tells of a run. No method raises because a recording cannot be written."""
+
+    def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
+        """Log what does not change; once, before the first frame.
+
+        Args:
+            camera: of the images given to :meth:`keyframe`.
+            ground_truth: of the frames of this run, in any world frame, or None.
+        """
+
+    def frame(self, result: TrackResult, T_wc: NDArray[np.float64]) -> None:
+        """Log one frame; ``T_wc`` is its ``(4, 4)`` pose (camera to world). Costs 0.1 ms."""
+
+    def keyframe(
+        self,
+        result: TrackResult,
+        image: NDArray[np.uint8],
+        features: Features,
+        tracked: NDArray[np.bool_],
+    ) -> None:
+        """Log image and keypoints of a keyframe, after :meth:`frame`.
+
+        Args:
+            result: of this frame.
+            image: ``(H, W)`` uint8 left image.
+            features: N features of the left image.
+            tracked: ``(N,)`` whether the feature is an inlier of the map.
+        """
+
+    def map(self, map_: Map) -> None:
+        """Offer the map, whenever nobody writes it; the recorder decides which states to log."""
+
+    def loops(self, edges: Collection[LoopEdge], map_: Map) -> None:
+        """Log loops just decided, accepted or not, after :meth:`frame` while nobody writes the map.
+
+        Args:
+            edges: those decided since the last call.
+            map_: after their correction.
+        """
+
+    def finish(self, trajectory: Trajectory, map_: Map) -> None:
+        """Log the final trajectory and map, write all that is pending and close the file."""
+
+
+class NullRecorder:
+    """Records nothing (``--no-record``)."""
+
+    def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None: ...
+    def frame(self, result: TrackResult, T_wc: NDArray[np.float64]) -> None: ...
+    def keyframe(
+        self,
+        result: TrackResult,
+        image: NDArray[np.uint8],
+        features: Features,
+        tracked: NDArray[np.bool_],
+    ) -> None: ...
+    def map(self, map_: Map) -> None: ...
+    def loops(self, edges: Collection[LoopEdge], map_: Map) -> None: ...
+    def finish(self, trajectory: Trajectory, map_: Map) -> None: ...
+
+
+def _guarded(
+    method: Callable[Concatenate[RerunRecorder, _P], None],
+) -> Callable[Concatenate[RerunRecorder, _P], None]:
+    """Do nothing once the recording is closed; close it instead of raising."""
+
+    @functools.wraps(method)
+    def call(self: RerunRecorder, *args: _P.args, **kwargs: _P.kwargs) -> None:
+        if not self._open:
+            return
+        try:
+            method(self, *args, **kwargs)
+        except (OSError, RuntimeError, cv2.error) as error:
+            self._abandon(error)
+
+    return call
+
+
+class RerunRecorder:
+    """Writes a ``.rrd`` file; timelines ``frame`` (number) and ``time`` (seconds).
+
+    Entities: ``world/camera`` (every frame), ``world/camera/image`` with ``tracked`` and
+    ``untracked`` keypoints (keyframes, half size), ``world/landmarks`` and ``world/keyframes``
+    (every 25 keyframes, after a loop and at the end), ``world/loops/accepted`` (green, from the
+    loop on) and ``rejected`` (faint red, for 20 frames), ``world/ground_truth`` and
+    ``world/trajectory`` (static), ``points/*`` and ``stage_ms/*`` (every frame), ``state`` (on
+    change) and ``state/loops`` (each with its reason). The world is the one of the estimate: first
+    frame of the run, x right, y down, z forward.
+
+    Failing to write never ends a run. Rerun writes in a thread of its own, whose errors only a
+    later flush reports, and after an error waiting for that thread can last forever. Therefore the
+    recording ends, with a warning in the log, when the disk has less than 64 MB left: it is then
+    complete up to there. When a flush fails or takes longer than 5 s, the recording is given up
+    with a warning: its file may be cut off within a message.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open ``path``, replacing an old recording; where that fails, warn and record nothing."""
+        import rerun as rr
+
+        self._path = path
+        self._recording = rr.RecordingStream("vslam")
+        self._open = True
+        self._state: TrackingState | None = None
+        self._index = 0  # of the last frame
+        self._frames: list[tuple[TrackResult, NDArray[np.float64]]] = []
+        self._keyframes = 0
+        self._mapped_keyframes = -_KEYFRAMES_PER_MAP
+        self._accepted: list[LoopEdge] = []
+        self._hide_rejected_at: int | None = None  # frame
+        try:
+            self._recording.set_log_time_enabled(False)  # would be the viewer's default timeline
+            self._recording.save(path)  # before the first log call, or that one is lost
+        except (OSError, RuntimeError) as error:
+            self._abandon(error)
+
+    @_guarded
+    def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
+        import rerun as rr
+
+        log = functools.partial(self._recording.log, static=True)
+        self._recording.send_blueprint(_blueprint())
+        log("world", rr.ViewCoordinates.RDF)
+        s = _IMAGE_SCALE
+        pinhole = rr.Pinhole(
+            focal_length=[s * camera.fx, s * camera.fy],
+            principal_point=list(_half(np.array([camera.cx, camera.cy]))),
+            resolution=[round(s * camera.width), round(s * camera.height)],
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=4.0 * (camera.baseline or 0.5),
+        )
+        log("world/camera/image", pinhole)
+        for name, color, radius in (("tracked", _GREEN, -2.0), ("untracked", _GREY, -1.0)):
+            style = rr.Points2D.from_fields(colors=[color], radii=[radius])  # < 0: screen units
+            log(f"world/camera/image/{name}", style)
+        log("world/landmarks", rr.Points3D.from_fields(colors=[_GREY], radii=[-1.2]))
+        for name, color in _POINT_SERIES.items():
+            log(f"points/{name}", rr.SeriesLines(colors=[color], names=[name]))
+        if ground_truth is not None and len(ground_truth):
+            # The ground truth's world is the first camera of the data set, not of the run.
+            T_wc = np.linalg.inv(ground_truth.T_wc[0]) @ ground_truth.T_wc
+            log("world/ground_truth", _path(T_wc, _GREY))
+
+    @_guarded
+    def frame(self, result: TrackResult, T_wc: NDArray[np.float64]) -> None:
+        import rerun as rr
+
+        # Sent in columns: four times faster than one log call for each value.
+        self._frames.append((result, T_wc.copy()))
+        self._index = result.index
+        if len(self._frames) == _FRAMES_PER_BATCH:
+            self._send_frames()
+        self._set_time(result)
+        if result.state != self._state:
+            self._state = result.state
+            text = f"{result.state} with {result.n_inliers} inliers"
+            self._recording.log("state", rr.TextLog(text, color=_STATE_COLORS[result.state]))
+        if self._hide_rejected_at is not None and result.index >= self._hide_rejected_at:
+            self._recording.log("world/loops/rejected", rr.LineStrips3D([]))
+            self._hide_rejected_at = None
+
+    @_guarded
+    def keyframe(
+        self,
+        result: TrackResult,
+        image: NDArray[np.uint8],
+        features: Features,
+        tracked: NDArray[np.bool_],
+    ) -> None:
+        import rerun as rr
+
+        if shutil.disk_usage(self._path.parent).free < _RESERVED_BYTES:
+            _log.warning("%s: the disk is almost full, recording ends here.", self._path)
+            self._close()
+            return
+        self._keyframes += 1
+        self._set_time(result)
+        half = cv2.resize(
+            image, None, fx=_IMAGE_SCALE, fy=_IMAGE_SCALE, interpolation=cv2.INTER_AREA
+        )
+        jpeg = cv2.imencode(".jpg", half, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+        path = "world/camera/image"
+        self._recording.log(path, rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
+        for name, chosen in (("tracked", tracked), ("untracked", ~tracked)):
+            positions = _half(features.xy[chosen])
+            self._recording.log(f"{path}/{name}", rr.Points2D.from_fields(positions=positions))
+
+    @_guarded
+    def map(self, map_: Map) -> None:
+        if self._keyframes < self._mapped_keyframes + _KEYFRAMES_PER_MAP:
+            return
+        self._log_map(map_, _MAX_POINTS_PER_MAP)
+        self._flush()
+
+    @_guarded
+    def loops(self, edges: Collection[LoopEdge], map_: Map) -> None:
+        import rerun as rr
+
+        accepted = [edge for edge in edges if edge.accepted]
+        rejected = [edge for edge in edges if not edge.accepted]
+        if rejected:
+            self._log_lines("rejected", rejected, map_, _FAINT_RED)
+            self._hide_rejected_at = self._index + _REJECTED_SHOWN_FRAMES
+        if accepted:
+            self._accepted += accepted
+            if self._keyframes >= self._mapped_keyframes + _KEYFRAMES_PER_CORRECTED_MAP:
+                self._log_map(map_, _MAX_POINTS_PER_MAP)
+            else:
+                self._log_lines("accepted", self._accepted, map_, _GREEN)
+        for edge in edges:
+            color = _GREEN if edge.accepted else _GREY
+            self._recording.log("state/loops", rr.TextLog(_in_words(edge, map_), color=color))
+
+    @_guarded
+    def finish(self, trajectory: Trajectory, map_: Map) -> None:
+        self._log_map(map_, map_.n_landmarks)
+        self._recording.log("world/trajectory", _path(trajectory.T_wc, _BLUE), static=True)
+        self._close()
+
+    def _set_time(self, result: TrackResult) -> None:
+        self._recording.set_time("frame", sequence=result.index)
+        self._recording.set_time("time", duration=result.timestamp)
+
+    def _log_map(self, map_: Map, limit: int) -> None:
+        import rerun as rr
+
+        self._mapped_keyframes = self._keyframes
+        landmarks = map_.living_landmarks()
+        landmarks = landmarks[:: max(1, -(-len(landmarks) // max(1, limit)))]
+        xyz = map_.arrays.xyz[landmarks].astype(np.float32)
+        T_wc_keyframes = inverses(map_.arrays.T_cw[map_.living_keyframes()])
+        self._recording.log("world/landmarks", rr.Points3D.from_fields(positions=xyz))
+        self._recording.log("world/keyframes", _path(T_wc_keyframes, _AMBER))
+        if self._accepted:
+            self._log_lines("accepted", self._accepted, map_, _GREEN)
+
+    def _log_lines(
+        self, name: str, edges: list[LoopEdge], map_: Map, color: tuple[int, ...]
+    ) -> None:
+        """From the query to the match of each loop; a frame outside the map has no place yet."""
+        import rerun as rr
+
+        ends = [(edge.match, edge.query) for edge in edges if edge.query >= 0]
+        poses = np.array([[map_.keyframe_pose(k) for k in pair] for pair in ends])
+        centres = inverses(poses.reshape(-1, 4, 4))[:, :3, 3].reshape(-1, 2, 3).astype(np.float32)
+        lines = rr.LineStrips3D(list(centres), colors=[color], radii=[-1.5])
+        self._recording.log(f"world/loops/{name}", lines)
+
+    def _send_frames(self) -> None:
+        import rerun as rr
+
+        if not self._frames:
+            return
+        frames, self._frames = self._frames, []
+        results = [result for result, _ in frames]
+        T_wc = np.array([pose for _, pose in frames])
+        poses = rr.Transform3D.columns(translation=T_wc[:, :3, 3], mat3x3=T_wc[:, :3, :3])
+        self._recording.send_columns("world/camera", _times(results), poses)
+        for name in _POINT_SERIES:
+            counts = np.array([getattr(result, f"n_{name}") for result in results], np.float64)
+            scalars = rr.Scalars.columns(scalars=counts)
+            self._recording.send_columns(f"points/{name}", _times(results), scalars)
+        for stage in dict.fromkeys(name for result in results for name in result.stage_ms):
+            timed = [result for result in results if stage in result.stage_ms]
+            scalars = rr.Scalars.columns(scalars=[result.stage_ms[stage] for result in timed])
+            self._recording.send_columns(f"stage_ms/{stage}", _times(timed), scalars)
+
+    def _flush(self) -> None:
+        self._send_frames()
+        self._recording.flush(timeout_sec=_FLUSH_TIMEOUT_S)
+
+    def _close(self) -> None:
+        # Only after a flush that succeeded: disconnecting from a dead writer can wait forever.
+        self._flush()
+        self._recording.disconnect()
+        self._open = False
+
+    def _abandon(self, error: Exception) -> None:
+        import rerun as rr
+
+        _log.warning("%s: recording ends here (%s).", self._path, error)
+        # rerun 0.41 waits without a limit for its dead writer when a stream is deleted and at the
+        # end of the process. A stream that never dies and no hook at the end avoid both.
+        rr.unregister_shutdown()
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._recording))
+        self._open = False
+
+
+def _times(results: list[TrackResult]) -> list[Any]:
+    import rerun as rr
+
+    return [
+        rr.TimeColumn("frame", sequence=[result.index for result in results]),
+        rr.TimeColumn("time", duration=[result.timestamp for result in results]),
+    ]
+
+
+def _path(T_wc: NDArray[np.float64], color: tuple[int, int, int]) -> Any:
+    import rerun as rr
+
+    points = T_wc[:, :3, 3].astype(np.float32)
+    return rr.LineStrips3D([points], colors=[color], radii=[-1.0])
+
+
+def _in_words(edge: LoopEdge, map_: Map) -> str:
+    query = f"frame {map_.frames[edge.query]}" if edge.query >= 0 else "a lost frame"
+    evidence = f"{edge.n_inliers} inliers of {edge.n_matches} matches"
+    return f"{query} to frame {map_.frames[edge.match]}: {edge.reason}, {evidence}"
+
+
+def _half(xy: NDArray[np.floating]) -> NDArray[np.floating]:
+    # Ours has the first pixel's centre at 0, rerun at 0.5.
+    return (xy + 0.5) * _IMAGE_SCALE
+
+
+def _blueprint() -> Any:
+    import rerun.blueprint as rrb
+
+    scene = rrb.Spatial3DView(
+        origin="world",
+        contents=[
+            "+ $origin/**",
+            "- /world/camera/image/tracked",
+            "- /world/camera/image/untracked",
+        ],
+        name="Map",
+    )
+    column = rrb.Vertical(
+        rrb.Spatial2DView(origin="world/camera/image", name="Keyframe"),
+        rrb.TimeSeriesView(origin="points", name="Tracked points"),
+        rrb.TimeSeriesView(origin="stage_ms", name="Time per stage (ms)"),
+        rrb.TextLogView(origin="state", name="State"),
+        row_shares=[4, 3, 3, 2],
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(scene, column, column_shares=[3, 2]),
+        rrb.TimePanel(timeline="frame", state="collapsed"),
+        collapse_panels=True,
+    )

@@ -1,0 +1,305 @@
+"""Compile every kernel before the first frame, so that no run is timed while it compiles.
+
+Compiling takes longer than anything else in a first run, and one process compiles one kernel at a
+time: Numba holds a lock. Two processes, ``python -m vslam.run.warmup first`` and ``... second``,
+share the work and find each other's in Numba's cache. The process that is to run then calls
+``EVERYTHING``: it loads what was compiled, and compiles what the two did not, all of it if there
+were none. It holds no compiler's memory.
+
+A module with new kernels adds a function that calls them to the shorter of ``COMPILE_SHARES`` (and
+to ``EVERYTHING``, if the small SLAM there does not reach them; and its last kernel to
+``COLD_PROBES``). Which one is shorter:
+
+    for share in first second; do
+        time NUMBA_CACHE_DIR=$(mktemp -d) python -m vslam.run.warmup $share
+    done
+
+Monocular runs call no others: their two views and similarities are NumPy's work.
+
+A kernel that both need is compiled by whoever comes to it first. Both must call it with the same
+types: for one signature two writers of Numba's cache cannot harm each other, for two they can.
+"""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+
+from vslam.backend import (
+    block_cholesky,
+    bundle_adjustment,
+    global_bundle_adjustment,
+    global_mapping,
+)
+from vslam.backend.bundle_adjustment import BundleProblem, adjust
+from vslam.backend.fusion import fuse_loop
+from vslam.backend.global_bundle_adjustment import adjust_globally
+from vslam.backend.global_mapping import merge_solution, take_snapshot
+from vslam.backend.loop_correction import move_keyframes
+from vslam.backend.pose_graph import consistency, essential_graph
+from vslam.camera import Camera
+from vslam.closing import LoopClosing
+from vslam.config import Config, KeyframeConfig, MappingConfig
+from vslam.features import Features
+from vslam.frontend import pnp
+from vslam.frontend.orb import scale_factors
+from vslam.frontend.relocalization import relocalise
+from vslam.frontend.tracking import Frame, TrackingContext
+from vslam.loopclosure import bow, sim3_ransac
+from vslam.loopclosure.bow import BowDetector
+from vslam.loopclosure.detector import NoDetector
+from vslam.loopclosure.verification import verify
+from vslam.loopclosure.vocabulary import Vocabulary, from_children
+from vslam.loops import LoopCandidate, LoopEdge
+from vslam.machine import available_cores
+from vslam.map import Map, local_map
+from vslam.mapping import MappingThread
+from vslam.slam import Slam
+
+WIDTH, HEIGHT, DISPARITY, STEP, FRAMES = 480, 240, 12, 6, 6
+CAMERA = Camera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
+# A process that takes longer is stuck: both have less than a minute's work on a slow machine.
+PATIENCE_S = 300.0
+
+
+def compile_kernels(*, processes: int = 2) -> None:
+    """Call every kernel once; Numba caches what it compiles.
+
+    Args:
+        processes: with 1 no other process is started, nor if the kernels are compiled already or
+            there is one core only.
+    """
+    if not is_cold():
+        # Kernels of loop closing need not be loaded now: few runs close a loop at once.
+        EVERYTHING[0]()
+        return
+    if processes > 1 and available_cores() > 1:
+        compile_shares()
+    for share in EVERYTHING:
+        share()
+    mark_warm()
+
+
+def is_cold() -> bool:
+    """Whether kernels must be compiled: one of ``COLD_PROBES`` is not in Numba's cache, or older
+    there than its source."""
+    return any(
+        all(index.stat().st_mtime < source.stat().st_mtime for index in indexes)
+        for source, indexes in map(cached, COLD_PROBES)
+    )
+
+
+def mark_warm() -> None:
+    """Date what is cached now: Numba compares the content of a source, and keeps a kernel whose
+    source has only a new date, as after a change of branch."""
+    for _, indexes in map(cached, COLD_PROBES):
+        for index in indexes:
+            with suppress(OSError):
+                index.touch()
+
+
+def cached(kernel: tuple[ModuleType, str]) -> tuple[Path, list[Path]]:
+    """The source of a kernel, and its index files in Numba's cache."""
+    module, name = kernel
+    source = Path(str(module.__file__))
+    folder = Path(getattr(module, name).stats.cache_path)
+    return source, list(folder.glob(f"{source.stem}.{name}-*.nbi"))
+
+
+def compile_shares() -> None:
+    """Run each of ``COMPILE_SHARES`` in a process of its own and wait for both.
+
+    One that fails costs only its help. An exception, Ctrl-C above all, ends them.
+    """
+    # The executable of a frozen application is not Python.
+    if not sys.executable or getattr(sys, "frozen", False):
+        return
+    processes = []
+    quiet = subprocess.DEVNULL
+    try:
+        for name in COMPILE_SHARES:
+            # -P: not from a folder "vslam" that happens to be where we are.
+            command = [sys.executable, "-P", "-m", "vslam.run.warmup", name]
+            process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)
+            processes.append(process)
+        for process in processes:
+            process.wait(PATIENCE_S)
+    except (OSError, subprocess.TimeoutExpired):
+        pass
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def run_everything() -> None:
+    """Run SLAM on a few small images with a keyframe at each.
+
+    A camera slides along a textured wall: enough for tracking, triangulation, fusion and bundle
+    adjustment to take all their branches.
+    """
+    every_frame = KeyframeConfig(max_interval_s=0.05, merge_after_frames=1)
+    run_slam(Config(keyframes=every_frame), FRAMES)
+
+
+def compile_tracking() -> None:
+    """Extraction, stereo, matching, pose and tracking: the small SLAM with one keyframe."""
+    no_other = KeyframeConfig(max_interval_s=1e9, max_tracked_ratio=1e-6, min_tracked_close=0)
+    run_slam(Config(keyframes=no_other), 3)
+
+
+def run_slam(config: Config, frames: int) -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.uniform(0, 255, (HEIGHT, WIDTH + DISPARITY + STEP * FRAMES)).astype(np.float32)
+    wall = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    wall = np.clip(128 + 5.0 * (wall - 128), 0, 255).astype(np.uint8)
+    slam = Slam(CAMERA, config, threads=1)
+    for k in range(frames):
+        x = STEP * k
+        left, right = wall[:, x : x + WIDTH], wall[:, x + DISPARITY : x + DISPARITY + WIDTH]
+        slam.step(np.ascontiguousarray(left), np.ascontiguousarray(right), 0.1 * k)
+    slam.finish()
+    slam.trajectory()
+
+
+def compile_insertion() -> None:
+    """What inserting a keyframe needs, in tracking's time."""
+    map_synthetic(1)
+
+
+def compile_local_mapping() -> None:
+    """What follows an insertion: triangulation, fusion, bundle adjustment, culling."""
+    map_synthetic(4)
+
+
+def map_synthetic(keyframes: int) -> tuple[Map, Features]:
+    """Map a camera that moves sideways past a cloud of points, without images.
+
+    Returns the map, and what the last keyframe saw.
+
+    Every keyframe sees all points. The first half of them are near and have a stereo match, the
+    rest are left for triangulation. A keyframe is redundant from one landmark, so that the fourth
+    insertion culls one.
+    """
+    config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
+    closing = LoopClosing(NoDetector(), CAMERA, config, threads=1)
+    mapping = MappingThread(scale_factors(config.orb), CAMERA, config, closing, threads=1)
+    rng = np.random.default_rng(0)
+    n = 400
+    points = rng.uniform([-5.0, -4.0, 9.0], [9.0, 4.0, 12.0], (n, 3))
+    descriptors = rng.integers(0, 256, (n, 32), dtype=np.uint8)
+    landmark = np.full(n, -1, np.int32)
+    for k in range(keyframes):
+        T_cw = np.eye(4)
+        T_cw[0, 3] = -1.0 * k
+        uvr = CAMERA.project(points + T_cw[:3, 3])
+        uvr[n // 2 :, 2] = np.nan
+        features = Features(
+            uvr[:, :2].astype(np.float32),
+            np.zeros(n, np.uint8),
+            np.zeros(n, np.float32),
+            descriptors,
+            uvr[:, 2].astype(np.float32),
+        )
+        frame = Frame.untracked(features, CAMERA, k, 0.1 * k)
+        frame.T_cw, frame.landmark = T_cw, landmark
+        mapping.insert(frame)
+        mapping.merge()
+        mapping.update(frame)
+        landmark = frame.landmark
+    return mapping.map, features
+
+
+def compile_recognition() -> None:
+    """Loop detection, verification and relocalisation: a keyframe is compared with itself."""
+    config = Config()
+    map_, features = map_synthetic(1)
+    verify(map_, LoopCandidate(0, 0, 1.0), CAMERA, config.verification)
+
+    place = local_map(map_, 0, 1)
+    context = TrackingContext.create(CAMERA, config)
+    relocalise(Frame.untracked(features, CAMERA), place, place, context, seed=0)
+
+    detector = BowDetector(smallest_vocabulary())
+    detector.add(0, None, features)
+    detector.query(0, map_)
+
+
+def compile_correction() -> None:
+    """Pose graph, loop fusion and global bundle adjustment: the steps of ``LoopClosing``.
+
+    GTSAM alone is left out: it takes a second to import and has nothing to compile.
+    """
+    config = Config()
+    map_, _ = map_synthetic(3)
+    nothing = np.empty(0, np.int32)
+    edge = LoopEdge(
+        2, 0, 1.0, True, "", T_query_match=np.eye(4), features=nothing, landmarks=nothing
+    )
+    graph = essential_graph(map_, [edge], config.pose_graph)
+    consistency(graph, graph.T_cw, config.pose_graph)
+    move_keyframes(map_, graph.keyframes, graph.T_cw)
+    fuse_loop(map_, edge, [2], [0], CAMERA, config)
+    snapshot = take_snapshot(map_, CAMERA)
+    merge_solution(map_, snapshot, adjust_globally(snapshot.problem, iterations=1))
+
+
+def smallest_vocabulary() -> Vocabulary:
+    """Two words."""
+    centres = np.array([[0] * 4, [0] * 4, [2**64 - 1] * 4], np.uint64)
+    return from_children(2, 1, centres, np.array([2, 0, 0], np.uint8), np.ones(2, np.float32))
+
+
+def compile_bundle_adjustment() -> None:
+    """A problem of one free camera and two points, as ``assemble`` makes them."""
+    points = np.array([[-1.0, 0.5, 8.0], [1.0, -0.5, 9.0]])
+    uvr = np.repeat(CAMERA.project(points), 2, axis=0)
+    problem = BundleProblem(
+        T_cw=np.stack([np.eye(4), np.eye(4)]),
+        n_free=1,
+        points=points,
+        first=np.array([0, 2, 4], np.int64),
+        camera=np.array([0, 1, 0, 1], np.int64),
+        uvr=uvr,
+        inverse_sigma2=np.ones(4),
+        intrinsics=CAMERA.intrinsics,
+    )
+    adjust(problem, iterations=1)
+
+
+# The second starts with what it needs alone: when it comes to insert keyframes, the kernels for
+# that are in the cache, because the first starts with them.
+COMPILE_SHARES: dict[str, tuple[Callable[[], None], ...]] = {
+    "first": (compile_insertion, compile_tracking, compile_recognition),
+    "second": (compile_bundle_adjustment, compile_local_mapping, compile_correction),
+}
+EVERYTHING: tuple[Callable[[], None], ...] = (
+    run_everything,
+    compile_recognition,
+    compile_correction,
+)
+# Of each module with much to compile the kernel that is compiled last.
+COLD_PROBES: tuple[tuple[ModuleType, str], ...] = (
+    (bundle_adjustment, "_adjust"),
+    (sim3_ransac, "_ransac"),
+    (pnp, "ransac_pose"),
+    (bow, "choose_candidates"),
+    (global_bundle_adjustment, "_step_cameras"),
+    (block_cholesky, "factor_solve"),
+    (global_mapping, "remove_unchanged"),
+)
+
+
+if __name__ == "__main__":
+    # Searching for garbage is 14 % of compiling, which keeps most of what it makes.
+    gc.disable()
+    for share in COMPILE_SHARES[sys.argv[1]]:
+        share()

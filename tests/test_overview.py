@@ -21,7 +21,7 @@ from vslam.cli import main as cli
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.overview import write_overview
-from vslam.overview.collect import collect
+from vslam.overview.collect import collect, read_aligned
 from vslam.overview.render import tables
 from vslam.overview.schema import MEASURES, Drive, OverviewJson, RunEntry, Spread
 from vslam.overview.summary import (
@@ -32,7 +32,7 @@ from vslam.overview.summary import (
     summarize,
     systems,
 )
-from vslam.trajectory import read_trajectory, write_kitti, write_tum
+from vslam.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 
 LAWS = ("none", "brightness:0.5", "brightness:1")
 
@@ -98,7 +98,7 @@ def test_json_is_versioned_and_round_trips(written):
     report, out = written
     text = (out / "report.json").read_text()
     found = json.loads(text)
-    assert (found["kind"], found["schema_version"]) == ("overview", 1)
+    assert (found["kind"], found["schema_version"]) == ("overview", 2)
     assert OverviewJson.model_validate_json(text).model_dump_json(indent=2) + "\n" == text
     assert OverviewJson.model_validate_json(text) == report
 
@@ -292,6 +292,51 @@ def test_a_report_of_an_unknown_town_is_left_out_with_a_note(run_folder: Path, t
     assert any(
         f"{tmp_path / 'odd'} is left out: " in note and "fog" in note for note in found.notes
     )
+
+
+@pytest.fixture(scope="module")
+def monocular(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose trajectory is right but for its unit, as a monocular one is."""
+    folder = copy_run(
+        run_folder, tmp_path_factory.mktemp("mono") / "mono", sensor="mono", detector="bow",
+        perturb="none", alignment="sim3", ate_rmse_m=0.25,
+    )  # fmt: skip
+    truth = read_trajectory(folder / "ground_truth_kitti.txt", read_trajectory(
+        folder / "trajectory.tum").timestamps)  # fmt: skip
+    T_wc = truth.T_wc.copy()
+    T_wc[:, :3, 3] *= 0.1
+    write_kitti(folder / "trajectory_kitti.txt", T_wc)
+    write_tum(folder / "trajectory.tum", Trajectory(truth.timestamps, T_wc))
+    return folder
+
+
+def test_monocular_runs_are_aligned_with_scale(monocular: Path):
+    found = collect([monocular], [f"ORB-SLAM3={monocular / 'trajectory.tum'}"])
+    assert [(run.system, run.alignment) for run in found.runs] == [
+        ("bow, mono", "sim3"), ("ORB-SLAM3", "sim3"),
+    ]  # fmt: skip
+    aligned, truth = read_aligned(found, found.runs[0])
+    assert truth is not None
+    np.testing.assert_allclose(aligned.T_wc[:, :3, 3], truth.T_wc[:, :3, 3], atol=1e-4)
+    ate = found.runs[1].measures["ate_rmse_m"]
+    assert ate is not None
+    assert ate < 1e-4
+    (errors,) = (table for table in tables(summarize(found)) if table.title == "Errors")
+    column = errors.head.index("alignment")
+    assert [row[column] for row in errors.rows] == ["Sim3", "Sim3"]
+
+
+def test_different_alignments_are_not_compared(run_folder: Path, monocular: Path, tmp_path: Path):
+    stereo = copy_run(run_folder, tmp_path / "stereo", detector="bow", perturb="none")
+    estimate = monocular / "trajectory.tum"
+    found = collect([stereo, monocular], [f"ORB-SLAM3, mono={estimate}", f"ORB-SLAM3={estimate}"])
+    report = summarize(found)
+    assert {run.system: run.alignment for run in report.runs} == {
+        "bow": "se3", "bow, mono": "sim3", "ORB-SLAM3, mono": "sim3", "ORB-SLAM3": "se3",
+    }  # fmt: skip
+    assert {(c.first, c.second) for c in report.comparisons} == {
+        ("bow", "ORB-SLAM3"), ("bow, mono", "ORB-SLAM3, mono"),
+    }  # fmt: skip
 
 
 def test_csv_has_a_line_for_each_row(written):

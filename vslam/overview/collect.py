@@ -13,7 +13,10 @@ from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.overview.schema import MEASURES, Drive, RunEntry
 from vslam.report.schema import ReportJson
+from vslam.run.outcome import alignment_of
 from vslam.trajectory import Trajectory, read_trajectory
+
+_MONOCULAR = ", mono"  # ends the name of a monocular system
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,7 @@ def read_aligned(found: Found, run: RunEntry) -> tuple[Trajectory, Trajectory | 
     if truth is None:
         return estimate, None
     try:
-        evaluation = evaluate_trajectory(estimate, truth)
+        evaluation = evaluate_trajectory(estimate, truth, run.alignment)
     except InputError:  # too short to align
         return estimate, None
     # Matched by time, an estimate may have fewer poses than the truth; only places are drawn.
@@ -127,9 +130,7 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
     parts = [f"frames from {report.start}"] if report.start else []
     parts += [f"every {report.every}"] if report.every > 1 else []
     parts += [f"{report.max_frames} frames"] if report.max_frames else []
-    detector = (
-        report.detector if report.sensor == "stereo" else f"{report.detector}, {report.sensor}"
-    )
+    detector = report.detector + (_MONOCULAR if report.sensor == "mono" else "")
     sequence, town = report.sequence, None
     laws: list[str] = []
     if report.dataset == "synthetic":
@@ -151,6 +152,7 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
         system=detector,
         seed=report.seed,
         town=town,
+        alignment=alignment_of(report.sensor),
         frames=report.frames,
         measures={name: getattr(report, name) for name, *_ in MEASURES},
         source=str(folder),
@@ -183,7 +185,8 @@ def _add_external(text: str, found: Found) -> None:
     if truth is None:
         raise InputError(f"--trajectory {text}: none of the runs of {sequence} has a ground truth.")
     path = Path(file)
-    evaluation = evaluate_trajectory(read_trajectory(path, truth.timestamps), truth)
+    alignment = _alignment_of_external(system, drive, found)
+    evaluation = evaluate_trajectory(read_trajectory(path, truth.timestamps), truth, alignment)
     if evaluation.frames < len(truth):
         found.notes.append(
             f"{system} has a pose for {evaluation.frames} of {len(truth)} frames of {drive.place}, "
@@ -198,6 +201,7 @@ def _add_external(text: str, found: Found) -> None:
             drive=drive,
             system=system,
             seed=None,
+            alignment=alignment,
             frames=evaluation.frames,
             measures=measures,
             source=source,
@@ -205,6 +209,15 @@ def _add_external(text: str, found: Found) -> None:
         )
     )
     found.estimate[source] = path
+
+
+def _alignment_of_external(system: str, drive: Drive, found: Found) -> str:
+    """That of vslam's runs of the same place. Where some of them are monocular and some are not,
+    a name that ends as those of monocular runs do decides."""
+    there = {run.alignment for run in found.runs if run.drive.place == drive.place}
+    if len(there) == 1:
+        return there.pop()
+    return alignment_of("mono" if system.endswith(_MONOCULAR) else "stereo")
 
 
 def _truth(found: Found, drive: Drive) -> Trajectory | None:

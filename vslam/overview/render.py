@@ -16,12 +16,14 @@ if TYPE_CHECKING:
 
 _OTHER = ("loops_found", "loops_missed", "loops_wrong", "fps")
 _ABOUT_ERRORS = (
-    "Medians over runs, in brackets the least and the greatest. ATE after SE3 alignment, of every "
-    "frame, lost ones included; RPE from one frame to the next."
+    "Medians over runs, in brackets the least and the greatest. ATE after the alignment named, of "
+    "every frame, lost ones included: SE3 without scale, Sim3 with scale for monocular runs, which "
+    "have none. Systems with different alignments are not compared. RPE from one frame to the next."
 )
 _ABOUT_OTHERS = (
     "Loops by the ground truth. fps of the frame loop: runs made side by side have fewer."
 )
+ALIGNMENTS = {"se3": "SE3", "sim3": "Sim3"}
 _TESTED = (
     "Pairs are sequences, each with the median of its runs: runs of one sequence are not "
     f"independent. Two-sided, level {ALPHA:g}, not corrected for the number of tests."
@@ -91,14 +93,16 @@ def _results(report: OverviewJson) -> list[Table]:
     """Two tables of the same rows: one would be too wide to read."""
     texts = ("sequence", "perturbation", "system")
 
-    def table(name: str, measures: Collection[Measure], note: str) -> Table:
-        columns = [f"{title} ({unit})" if unit else title for _, title, unit, *_ in measures]
+    def table(name: str, measures: Collection[Measure], note: str, *, aligned: bool) -> Table:
+        columns = ["alignment"] if aligned else []
+        columns += [f"{title} ({unit})" if unit else title for _, title, unit, *_ in measures]
         rows: list[tuple[str, ...]] = [
             (
                 row.drive.place,
                 row.drive.perturb,
                 row.system,
                 str(row.runs),
+                *([ALIGNMENTS[row.alignment]] if aligned else []),
                 *(_cell(row.measures[measure], decimals) for measure, _, _, decimals in measures),
             )
             for row in report.rows
@@ -108,8 +112,8 @@ def _results(report: OverviewJson) -> list[Table]:
     errors = [measure for measure in MEASURES if measure[0] not in _OTHER]
     others = [measure for measure in MEASURES if measure[0] in _OTHER]
     return [
-        table("Errors", errors, _ABOUT_ERRORS),
-        table("Loops and speed", others, _ABOUT_OTHERS),
+        table("Errors", errors, _ABOUT_ERRORS, aligned=True),
+        table("Loops and speed", others, _ABOUT_OTHERS, aligned=False),
     ]
 
 

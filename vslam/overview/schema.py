@@ -49,12 +49,15 @@ class RunEntry(_Model):
     ``system`` is the loop detector, or the name of another system; ``source`` the folder of the
     run or the file of the trajectory; ``seed`` is None for other systems. ``town`` is the seed of
     a rendered town: one drive in other towns is that drive again, as with another ``seed``.
+    ``alignment`` is what was fitted before errors were computed: ``se3``, or ``sim3`` for a
+    monocular run, whose scale is arbitrary.
     """
 
     drive: Drive
     system: str
     seed: int | None
     town: int | None = None
+    alignment: str = "se3"
     frames: int
     measures: dict[str, float | None]
     source: str
@@ -71,10 +74,12 @@ class Spread(_Model):
 
 
 class Row(_Model):
-    """All runs of one system on one drive; None for a measure that no run has."""
+    """All runs of one system on one drive; None for a measure that no run has. ``alignment`` is
+    that of its runs."""
 
     drive: Drive
     system: str
+    alignment: str = "se3"
     runs: int
     frames: int
     measures: dict[str, Spread | None]
@@ -113,7 +118,7 @@ class OverviewJson(_Model):
     """``kind`` tells this file from the ``report.json`` of one run."""
 
     kind: Literal["overview"] = "overview"
-    schema_version: int = 1
+    schema_version: int = 2
 
     notes: list[str]
     rows: list[Row]

@@ -87,6 +87,7 @@ def make_rows(runs: list[RunEntry]) -> list[Row]:
         Row(
             drive=drive,
             system=system,
+            alignment=members[0].alignment,
             runs=len(members),
             frames=max(run.frames for run in members),
             measures={
@@ -101,7 +102,10 @@ def compare(
     rows: list[Row], first: str, second: str, perturb: str, measure: str
 ) -> Comparison | None:
     """The second system against the first, by the medians of a measure of which less is better;
-    None where they share no drive."""
+    None where they share no drive, or where their errors are after different alignments."""
+    alignments = {row.alignment for row in rows if row.system in (first, second)}
+    if len(alignments) > 1:
+        return None
     medians: dict[str, dict[Drive, float]] = {first: {}, second: {}}
     for row in rows:
         spread = row.measures[measure]

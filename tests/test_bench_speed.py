@@ -1,4 +1,4 @@
-"""The arithmetic and the tables of tools/bench_speed.py, without a peer."""
+"""The arithmetic and the tables of tools/bench_speed.py, without ORB-SLAM3."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ TOOLS = Path(__file__).parents[1] / "tools"
 def speed(monkeypatch):
     monkeypatch.syspath_prepend(str(TOOLS))
     yield importlib.import_module("bench_speed")
-    for name in ("bench_speed", "compare_peer"):
+    for name in ("bench_speed", "compare_orbslam3"):
         sys.modules.pop(name, None)
 
 
 def made_run(speed, report, held=(), memory_mb=300.0):
-    process = speed.compare_peer.Process("", 10.0, 15.0, memory_mb, list(held))
+    process = speed.compare_orbslam3.Process("", 10.0, 15.0, memory_mb, list(held))
     return speed.Run(process, report, 0, (0, 0, 0), "")
 
 
@@ -41,13 +41,13 @@ def test_reading_is_measured(speed, kitti_tree):
 def test_comparison_has_medians_and_ratios(speed):
     names = [name for name, *_ in speed.MEASURES]
     ours = [dict.fromkeys(names, value) for value in (10.0, 12.0, 20.0)]
-    peer = [dict.fromkeys(names, 6.0)]
-    table = speed.comparison({speed.FULL: ours, speed.PEER: peer})
+    theirs = [dict.fromkeys(names, 6.0)]
+    table = speed.comparison({speed.FULL: ours, speed.ORBSLAM3: theirs})
     head, _, first, *_ = table.splitlines()
     assert head == "| | vslam | ORB-SLAM3 | vslam / ORB-SLAM3 |"
     assert first == "| frames/s, whole process ↑ | 12.0 (10.0 - 20.0) | 6.0 | 2.00 |"
     other = speed.comparison(
-        {speed.FULL: ours, speed.PEER: peer, "vslam --detector capsule": ours[1:2]}
+        {speed.FULL: ours, speed.ORBSLAM3: theirs, "vslam --detector capsule": ours[1:2]}
     )
     assert other.splitlines()[0].startswith("| | vslam | vslam --detector capsule | ORB-SLAM3 |")
     assert other.splitlines()[2].endswith("| 12.0 | 6.0 | 2.00 | 2.00 |")
@@ -55,7 +55,7 @@ def test_comparison_has_medians_and_ratios(speed):
     assert alone.splitlines()[2] == "| frames/s, whole process ↑ | 10.0 |"
 
 
-def test_latency_of_the_peer_is_left_out_where_it_is_silent(speed, kitti_tree):
+def test_latency_of_orbslam3_is_left_out_where_it_is_silent(speed, kitti_tree):
     case = speed.Case("", kitti_tree, "00", 28)
     report = {"latency_ms": {"median": 40.0, "p95": 50.0, "p99": 55.0}, "dropped_frames": 0}
     ours = made_run(speed, report)
@@ -63,10 +63,10 @@ def test_latency_of_the_peer_is_left_out_where_it_is_silent(speed, kitti_tree):
         made_run(speed, {}),
         made_run(speed, {"track_ms_median": 60.0, "track_ms_p95": 90.0}),
     )
-    short = speed.latency({speed.LIVE: [ours], speed.PEER: [silent]}, case)
+    short = speed.latency({speed.LIVE: [ours], speed.ORBSLAM3: [silent]}, case)
     assert short.splitlines()[2] == "| vslam, image to pose, 10 Hz | 40 | 50 | 55 | 0 |"
     assert "ORB-SLAM3" not in short
-    assert "| 60 | 90 | | |" in speed.latency({speed.LIVE: [ours], speed.PEER: [talking]}, case)
+    assert "| 60 | 90 | | |" in speed.latency({speed.LIVE: [ours], speed.ORBSLAM3: [talking]}, case)
 
 
 def test_a_keyframe_costs_what_memory_grew_by(speed):

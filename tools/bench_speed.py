@@ -2,15 +2,16 @@
 
     python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" \
         [--flat "town 00=/data/towns:kitti00:4541"] [--ours-only] [--also capsule] [--repeats 3] \
-        [--peer-python PY --peer-script run_orbslam3.py --vocabulary voc.txt] \
+        [--orbslam3-python PY --orbslam3-script run_orbslam3.py --vocabulary voc.txt] \
         [--write docs/performance.md]
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run in
 turn, one at a time, after one round that is not counted; vslam with its report, with
 ``--no-report``, and in the last round with ``--realtime``, which takes as long as the drive; with
 ``--also`` once more with another detector than ``bow``. Of a ``--flat`` case vslam runs once, and
-the time of its frames is drawn along the drive. What a peer's script takes and prints is said in
-compare_peer.py; ``track_ms_median`` and ``track_ms_p95`` are taken where it prints them.
+the time of its frames is drawn along the drive. What the script of ORB-SLAM3 takes and prints is
+said in compare_orbslam3.py; ``track_ms_median`` and ``track_ms_p95`` are taken where it prints
+them.
 """
 
 from __future__ import annotations
@@ -27,23 +28,24 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import compare_peer
-from compare_peer import Run, spread
+import compare_orbslam3
+from compare_orbslam3 import Run, spread
 
 BLOCK = 100  # frames that one point of the drawing stands for
 AHEAD = {"read_ms", "extract_ms"}  # stages done by the pool, beside tracking
-FULL, LEAN, LIVE, PEER = "vslam", "vslam --no-report", "vslam --realtime", "ORB-SLAM3"
+FULL, LEAN, LIVE, ORBSLAM3 = "vslam", "vslam --no-report", "vslam --realtime", "ORB-SLAM3"
 SHOWN = {
     "process_fps", "loop_fps", "process_cpu_ms", "loop_cpu_ms", "memory_mb", "lost", "ate_m"
 }  # fmt: skip
 HEAD = """# Performance
 
-Written by the command at the end, one process at a time; the load says how idle the machine was
-when it began. Whole process: from the start of Python to its end, vocabulary, kernels from Numba's
-cache and all files written; frame loop: from the first image to the last pose. vslam runs with the
-detector `bow`, since ORB-SLAM3 always looks for loops. Reading images is the CPU time of
-`cv2.imread` on both eyes, measured in a process of its own and subtracted from both systems alike.
-In real time and along the drive vslam runs once a case.
+The command at the end of this page writes it. It runs one process at a time. *Load* is the load \
+of the machine when the command began. *Whole process* is the time from the start of Python to \
+its end, including the vocabulary, the kernels from Numba's cache and all files written. *Frame \
+loop* is the time from the first image to the last pose. vslam runs with the detector `bow`, \
+because ORB-SLAM3 always looks for loops. *Reading images* is the CPU time of `cv2.imread` on \
+both images of a frame; it is measured in a separate process and subtracted from both systems \
+alike. The real-time run and the run along a drive are done once per case.
 """
 READING = """
 import sys, time, cv2
@@ -57,8 +59,8 @@ print(time.process_time() - start)
 
 
 def measures() -> Iterator[tuple[str, str, str]]:
-    """Key, title and format of each row: of compare_peer.py's, CPU times without reading, too."""
-    for key, title, form in compare_peer.MEASURES:
+    """Key, title and format of each row: compare_orbslam3.py's, and CPU times without reading."""
+    for key, title, form in compare_orbslam3.MEASURES:
         if key in SHOWN:
             yield key, title, form
             if key.endswith("_cpu_ms"):
@@ -88,20 +90,20 @@ def parse_case(text: str) -> Case:
     if not (data / "sequences" / parts[1]).is_dir():
         raise argparse.ArgumentTypeError(f"{data / 'sequences' / parts[1]}: not there")
     case = Case(title, data, parts[1], int(parts[2]))
-    here = min(len(list(eye.iterdir())) for eye in eyes(case))
+    here = min(len(list(side.iterdir())) for side in sides(case))
     if not 2 <= case.frames <= here:
         raise argparse.ArgumentTypeError(f"{text}: FRAMES must be from 2 to {here}")
     return case
 
 
-def eyes(case: Case) -> list[Path]:
+def sides(case: Case) -> list[Path]:
     """Folders of the left and right images."""
-    return [case.data / "sequences" / case.seq / f"image_{eye}" for eye in (0, 1)]
+    return [case.data / "sequences" / case.seq / f"image_{side}" for side in (0, 1)]
 
 
 def reading_ms(case: Case) -> float:
     """CPU milliseconds that decoding both images of a frame takes, in one thread."""
-    files = [str(path) for eye in eyes(case) for path in sorted(eye.iterdir())[: case.frames]]
+    files = [str(path) for side in sides(case) for path in sorted(side.iterdir())[: case.frames]]
     command = [sys.executable, "-c", READING]
     done = subprocess.run(
         command, input="\n".join(files), capture_output=True, text=True, check=True
@@ -110,31 +112,31 @@ def reading_ms(case: Case) -> float:
 
 
 def all_options(case: Case, options: argparse.Namespace) -> argparse.Namespace:
-    """What compare_peer.py asks for."""
+    """The options that compare_orbslam3.py takes."""
     fixed = {"detector": "bow", "sensor": "stereo", "threads": None}
     return argparse.Namespace(**vars(options) | case._asdict() | fixed)
 
 
 def run_vslam(case: Case, options: argparse.Namespace, scratch: str, *words: str) -> Run:
-    return compare_peer.run_vslam(all_options(case, options), Path(scratch), *words)
+    return compare_orbslam3.run_vslam(all_options(case, options), Path(scratch), *words)
 
 
 def measure_case(case: Case, options: argparse.Namespace) -> dict[str, list[Run]]:
     """All counted runs of each system."""
-    runs: dict[str, list[Run]] = {FULL: [], PEER: [], LEAN: [], LIVE: []}
+    runs: dict[str, list[Run]] = {FULL: [], ORBSLAM3: [], LEAN: [], LIVE: []}
     words = {FULL: (), LEAN: ("--no-report",), LIVE: ("--no-report", "--realtime")}
     for name in options.also:
         runs[title := f"{FULL} --detector {name}"] = []
         words[title] = ("--detector", name)  # the last one on the command line counts
     if options.ours_only:
-        del runs[PEER]
+        del runs[ORBSLAM3]
     for repeat in range(options.repeats + 1):
         for system, done in runs.items():
             if system == LIVE and repeat < options.repeats:
                 continue
             with tempfile.TemporaryDirectory(prefix="vslam-speed-") as scratch:
-                if system == PEER:
-                    run = compare_peer.run_peer(all_options(case, options), Path(scratch))
+                if system == ORBSLAM3:
+                    run = compare_orbslam3.run_orbslam3(all_options(case, options), Path(scratch))
                 else:
                     run = run_vslam(case, options, scratch, *words[system])
             counted = f"{repeat} of {options.repeats}" if repeat else "not counted"
@@ -146,30 +148,33 @@ def measure_case(case: Case, options: argparse.Namespace) -> dict[str, list[Run]
 
 def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
     """Every measure of one run."""
-    found = compare_peer.figures(run, argparse.Namespace(**case._asdict(), sensor="stereo"))
+    found = compare_orbslam3.figures(run, argparse.Namespace(**case._asdict(), sensor="stereo"))
     for name in ("process", "loop"):
         found[f"{name}_bare_ms"] = found[f"{name}_cpu_ms"] - reading
     return found
 
 
 def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
-    """A table of medians, with the ratios to the peer where there is one."""
-    ours = [system for system in measured if system != PEER]
-    systems = ours + [PEER] * (PEER in measured)
-    head = [*systems, *([f"{system} / {PEER}" for system in ours] if PEER in systems else [])]
+    """A table of medians, with the ratios to ORB-SLAM3 where it ran."""
+    ours = [system for system in measured if system != ORBSLAM3]
+    systems = ours + [ORBSLAM3] * (ORBSLAM3 in measured)
+    head = [
+        *systems,
+        *([f"{system} / {ORBSLAM3}" for system in ours] if ORBSLAM3 in systems else []),
+    ]
     lines = [f"| | {' | '.join(head)} |", "|---" * (len(head) + 1) + "|"]
     for name, title, form in MEASURES:
         medians = {s: statistics.median(run[name] for run in measured[s]) for s in systems}
         cells = [spread([run[name] for run in measured[s]], form) for s in systems]
-        if PEER in systems:
-            peer = medians[PEER]
-            cells += [f"{medians[s] / peer:.2f}" if peer else "-" for s in ours]
+        if ORBSLAM3 in systems:
+            theirs = medians[ORBSLAM3]
+            cells += [f"{medians[s] / theirs:.2f}" if theirs else "-" for s in ours]
         lines.append(f"| {title} | {' | '.join(cells)} |".replace("nan", "-"))
     return "\n".join(lines)
 
 
 def latency(runs: dict[str, list[Run]], case: Case) -> str:
-    """Milliseconds from the time of an image to its pose, and what the peer says of its frames."""
+    """Milliseconds from the time of an image to its pose, and what ORB-SLAM3 says of its frames."""
     ours = [run.report for run in runs[LIVE]]
     values = [
         spread([report["latency_ms"][key] for report in ours], ".0f")
@@ -179,13 +184,15 @@ def latency(runs: dict[str, list[Run]], case: Case) -> str:
     lines = ["| ms per frame | p50 | p95 | p99 | dropped |", "|---|---|---|---|---|"]
     row = f"| vslam, image to pose, {rate(case):.0f} Hz | {' | '.join(values)} | {dropped} |"
     lines.append(row)
-    peers = [run.report for run in runs.get(PEER, [])]
-    if peers and "track_ms_median" in peers[0]:
+    theirs = [run.report for run in runs.get(ORBSLAM3, [])]
+    if theirs and "track_ms_median" in theirs[0]:
         cells = [
-            spread([peer[key] for peer in peers], ".0f")
+            spread([report[key] for report in theirs], ".0f")
             for key in ("track_ms_median", "track_ms_p95")
         ]
-        lines.append(f"| ORB-SLAM3, its call alone, images decoded | {' | '.join(cells)} | | |")
+        lines.append(
+            f"| ORB-SLAM3, tracking call only, images already decoded | {' | '.join(cells)} | | |"
+        )
     return "\n".join(lines)
 
 
@@ -213,7 +220,8 @@ def memory(run: Run) -> str:
     kept = run.report["keyframes"]
     return (
         f"Memory: {before[-1]:.0f} MB before the first frame, {run.process.memory_mb:.0f} MB at "
-        f"its peak, with {kept} keyframes in the final map: {grown / kept:.2f} MB for each."
+        f"its peak, with {kept} keyframes in the final map: {grown / kept:.2f} MB for each "
+        "keyframe."
     )
 
 
@@ -246,7 +254,8 @@ def measure_flat(case: Case, options: argparse.Namespace) -> str:
         shown = os.path.relpath(options.image, options.write.parent)
     return (
         f"## Along the drive: {case.title}\n\n![Time per frame]({shown})\n\n"
-        f"{frames} frames at {fps:.1f} frames/s. First and last {BLOCK} frames, ms: all stages "
+        f"{frames} frames at {fps:.1f} frames/s. Mean over the first and the last {BLOCK} frames, "
+        "ms: all stages "
         f"{everything[0]:.1f} and {everything[-1]:.1f}, tracking and waiting for mapping "
         f"{in_turn[0]:.1f} and {in_turn[-1]:.1f}. {memory(run)}\n"
     )
@@ -286,13 +295,13 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--case", type=parse_case, action="append", default=[], metavar=shape)
     parser.add_argument("--flat", type=parse_case, metavar=shape, help="draw cost along it")
     parser.add_argument("--repeats", type=int, default=3, help="counted runs of each system")
-    parser.add_argument("--ours-only", action="store_true", help="leave out the peer")
+    parser.add_argument("--ours-only", action="store_true", help="leave out ORB-SLAM3")
     parser.add_argument(
         "--also", action="append", default=[], metavar="DETECTOR", help="run with it as well"
     )
     parser.add_argument("--vslam", default=str(Path(sys.executable).with_name("vslam")))
-    parser.add_argument("--peer-python", type=lambda text: Path(text).absolute())
-    parser.add_argument("--peer-script", type=lambda text: Path(text).absolute())
+    parser.add_argument("--orbslam3-python", type=lambda text: Path(text).absolute())
+    parser.add_argument("--orbslam3-script", type=lambda text: Path(text).absolute())
     parser.add_argument("--vocabulary", type=lambda text: Path(text).absolute())
     parser.add_argument("--write", type=Path, help="file to write; printed unless given")
     parser.add_argument("--image", type=Path, default=Path("docs/images/cost-along-drive.png"))
@@ -301,26 +310,34 @@ def parse_options() -> argparse.Namespace:
         parser.error("nothing to measure: give --case or --flat")
     if options.repeats < 1:
         parser.error("--repeats: at least 1")
-    peer = (options.peer_python, options.peer_script, options.vocabulary)
-    if options.case and not options.ours_only and not all(peer):
-        parser.error("--peer-python, --peer-script and --vocabulary, or --ours-only")
+    needed = (options.orbslam3_python, options.orbslam3_script, options.vocabulary)
+    if options.case and not options.ours_only and not all(needed):
+        parser.error("--orbslam3-python, --orbslam3-script and --vocabulary, or --ours-only")
     return options
+
+
+def anonymous(command: str) -> str:
+    """A command without the paths of this machine."""
+    for name in ("KITTI_ROOT", "HOME"):
+        if path := os.environ.get(name, "").rstrip("/"):
+            command = command.replace(path, f"${name}")
+    return command
 
 
 def main() -> None:
     options = parse_options()
     load = os.getloadavg()[0]
-    # Nothing heavy is imported before the last run: see compare_peer.measure.
+    # Nothing heavy is imported before the last run: see compare_orbslam3.measure.
     measured = [(case, measure_case(case, options)) for case in options.case]
     flat = [measure_flat(options.flat, options)] if options.flat else []
     parts = [HEAD, *(section(case, runs) for case, runs in measured), *flat]
     if measured:
         report = measured[0][1][FULL][0].report
-        peer = None if options.ours_only else options.peer_python
-        setting = compare_peer.setting(report, peer, options.repeats)
+        python = None if options.ours_only else options.orbslam3_python
+        setting = compare_orbslam3.setting(report, python, options.repeats)
         setting = setting[0].upper() + setting[1:]
-        parts.append(f"## Setting\n\n{setting} Load when it began: {load:.1f}.\n")
-    parts.append(f"```sh\npython {shlex.join(sys.argv)}\n```\n")
+        parts.append(f"## Setting\n\n{setting} Load at the start: {load:.1f}.\n")
+    parts.append(f"```sh\npython {anonymous(shlex.join(sys.argv))}\n```\n")
     text = "\n".join(parts)
     if options.write:
         options.write.write_text(text, encoding="utf-8")

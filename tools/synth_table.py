@@ -1,8 +1,9 @@
-"""Write docs/results.md: vslam with and without loop closing, and a peer, on rendered drives.
+"""Write docs/results/drives.csv: vslam, with and without loop closing, and ORB-SLAM3 on rendered
+drives.
 
-    python tools/synth_table.py --routes demo,05 --lights clean,brightness:1.0 \
+    python tools/synth_table.py --routes demo,05 --lights "clean;brightness:1.0" \
         [--kitti KITTI --along 00,07] [--aliased demo:10] [--sensor mono] \
-        [--peer-python PY --peer-script run_orbslam3.py --vocabulary voc.txt]
+        [--orbslam3-python PY --orbslam3-script run_orbslam3.py --vocabulary voc.txt]
 
 A drive is a built-in route; with ``--along`` the poses of a KITTI sequence (KITTI/poses/NN.txt) in
 a rendered town; with ``--aliased ROUTE:N`` a built-in route through N towns of few facades. What is
@@ -10,13 +11,14 @@ missing is rendered first. A light is ``clean``, a perturbation as of ``vslam ru
 a kidnapping: ``cut:300`` takes 300 frames out, ``black:20`` blackens 20. What is changed is written
 to a folder, and every system reads the same images. Each finished row is kept in a JSON file beside
 the table and not measured again unless the bytes of the drives changed or ``--again`` names its
-system. The table is always written whole. For what a peer's script takes and prints see
-compare_peer.py.
+system. The table is always written whole. For what the script of ORB-SLAM3 takes and prints see
+compare_orbslam3.py.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import sys
@@ -27,29 +29,27 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import compare_peer
+import compare_orbslam3
 
 OURS = {"vslam": "bow", "vslam without loops": "none"}
-PEER = "ORB-SLAM3"
+ORBSLAM3 = "ORB-SLAM3"
 GAPS = ("cut", "black")
-HEAD = """# Results on rendered drives
-
-Written by `python tools/synth_table.py`, one run each on the images of one folder, one at a time.
-Lost: frames. ATE: of every frame, after SE3 alignment. Loops: closed / missed / wrong by the ground
-truth; a revisit counts where the camera passes a place again for 20 m in the same direction. Of
-ORB-SLAM3 only the loops it closes are known. fps: frames a second of the frame loop. Load: of the
-machine (mean of five minutes); above 2, on two cores, the fps are too low. Brightness: seed 0.
-"""
-COLUMNS = """
-| drive | frames | path m | light | system | lost | ATE m | ATE % | t_rel % | loops | fps | load |
-|---|---|---|---|---|---|---|---|---|---|---|---|
-"""
-MONOCULAR = """
-## Monocular: the left eye alone
-
-ATE after Sim3 alignment, of vslam for every frame, of ORB-SLAM3 for the keyframes that it keeps; it
-is given 20 images a second, vslam as many as it takes.
-"""
+COLUMNS = {  # of the table: of a row
+    "sensor": "sensor",
+    "drive": "drive",
+    "frames": "frames",
+    "path_m": "path_m",
+    "lighting": "light",
+    "system": "system",
+    "lost_frames": "lost",
+    "ate_m": "ate_m",
+    "ate_percent": "ate_percent",
+    "t_rel_percent": "t_rel",
+    "loops_closed": "loops_closed",
+    "loops_missed": "loops_missed",
+    "loops_wrong": "loops_wrong",
+}
+DECIMALS = {"ate_m": 3, "ate_percent": 3, "t_rel": 3}
 Row = dict[str, Any]
 
 
@@ -70,22 +70,22 @@ def main() -> None:
     parser.add_argument(
         "--lights", default="clean", help="clean, perturbations, kidnappings; with semicolons"
     )
-    parser.add_argument("--out", type=Path, default=Path("docs/results.md"))
+    parser.add_argument("--out", type=Path, default=Path("docs/results/drives.csv"))
     parser.add_argument("--sensor", default="stereo", choices=("stereo", "mono"))
     parser.add_argument("--again", default="", help="systems to measure again, with commas")
-    parser.add_argument("--peer-python", type=Path)
-    parser.add_argument("--peer-script", type=Path)
+    parser.add_argument("--orbslam3-python", type=Path)
+    parser.add_argument("--orbslam3-script", type=Path)
     parser.add_argument("--vocabulary", type=Path)
     options = parser.parse_args()
     again = options.again.split(",")
     kept = {key: row for key, row in _read(options.out).items() if row["system"] not in again}
     for drive in _drives(options):
         for light in options.lights.split(";"):
-            # What loop closing is worth is asked once for each drive.
+            # Without loop closing vslam runs once for each drive.
             systems = [*OURS] if light == "clean" and "aliased" not in drive.title else ["vslam"]
-            systems += [PEER] if options.peer_python else []
-            eye = ", mono" if options.sensor == "mono" else ""
-            wanted = {f"{drive.title}, {light}, {system}{eye}": system for system in systems}
+            systems += [ORBSLAM3] if options.orbslam3_python else []
+            side = ", mono" if options.sensor == "mono" else ""
+            wanted = {f"{drive.title}, {light}, {system}{side}": system for system in systems}
             missing = {key: system for key, system in wanted.items() if key not in kept}
             if not missing:
                 continue
@@ -108,7 +108,7 @@ def _drives(options: argparse.Namespace) -> Iterator[Drive]:
         calibration = "00-02" if name < "03" else "03" if name == "03" else "04-12"
         poses = read_kitti_poses(options.kitti / "poses" / f"{name}.txt")
         route = route_of_poses(poses, f"kitti{name}", calibration)
-        yield Drive(f"KITTI {name}", render_sequence(route, Variation(), cache), route.name)
+        yield Drive(f"along KITTI {name}", render_sequence(route, Variation(), cache), route.name)
     if options.aliased:
         name, count = options.aliased.split(":")
         for seed in range(int(count)):
@@ -128,7 +128,7 @@ def _in_light(drive: Drive, light: str) -> Iterator[Path]:
     import numpy as np
 
     from vslam.datasets import open_sequence
-    from vslam.perturb import parse_perturbation
+    from vslam.datasets.perturbation import parse_perturbation
 
     if light == "clean":
         yield drive.root
@@ -141,8 +141,8 @@ def _in_light(drive: Drive, light: str) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="vslam-light-") as scratch:
         root = Path(scratch)
         folder = root / "sequences" / drive.name
-        eyes = [folder / "image_0", folder / "image_1"]
-        for made in (*eyes, root / "poses"):
+        sides = [folder / "image_0", folder / "image_1"]
+        for made in (*sides, root / "poses"):
             made.mkdir(parents=True)
         source = drive.root / "sequences" / drive.name
         (folder / "calib.txt").write_bytes((source / "calib.txt").read_bytes())
@@ -153,9 +153,9 @@ def _in_light(drive: Drive, light: str) -> Iterator[Path]:
         def write(number: int) -> None:
             k = frames[number]
             images = law.apply(k, *sequence.read(k))
-            for eye, image in zip(eyes, images, strict=True):
+            for side, image in zip(sides, images, strict=True):
                 image = np.zeros_like(image) if kind == "black" and k in gap else image
-                path = eye / f"{number:06d}.png"
+                path = side / f"{number:06d}.png"
                 cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 
         with ThreadPoolExecutor(2) as pool:
@@ -168,7 +168,7 @@ def _row(drive: Drive, light: str, system: str, data: Path, options: argparse.Na
 
     from vslam.datasets.kitti import read_kitti_poses
     from vslam.datasets.synthetic import store
-    from vslam.evaluate import path_length
+    from vslam.evaluation.trajectories import path_length
 
     truth = read_kitti_poses(data / "poses" / f"{drive.name}.txt")
     run_options = argparse.Namespace(
@@ -179,13 +179,13 @@ def _row(drive: Drive, light: str, system: str, data: Path, options: argparse.Na
         detector=OURS.get(system),
         sensor=options.sensor,
         vslam=str(Path(sys.executable).with_name("vslam")),
-        peer_python=options.peer_python and options.peer_python.absolute(),
-        peer_script=options.peer_script and options.peer_script.absolute(),
+        orbslam3_python=options.orbslam3_python and options.orbslam3_python.absolute(),
+        orbslam3_script=options.orbslam3_script and options.orbslam3_script.absolute(),
         vocabulary=options.vocabulary and options.vocabulary.absolute(),
     )
-    start = compare_peer.run_vslam if system in OURS else compare_peer.run_peer
+    start = compare_orbslam3.run_vslam if system in OURS else compare_orbslam3.run_orbslam3
     with tempfile.TemporaryDirectory(prefix="vslam-table-") as scratch:
-        found = compare_peer.figures(start(run_options, Path(scratch)), run_options)
+        found = compare_orbslam3.figures(start(run_options, Path(scratch)), run_options)
     return {
         "drive": drive.title,
         "light": light,
@@ -199,16 +199,18 @@ def _row(drive: Drive, light: str, system: str, data: Path, options: argparse.Na
     }
 
 
-def _line(row: Row) -> str:
-    def shown(key: str, form: str) -> str:
-        return "-" if row[key] is None else format(row[key], form)
+def _cells(row: Row) -> list[str]:
+    ate = row["ate_m"]
+    row = {"sensor": "stereo", **row}
+    row["ate_percent"] = None if ate is None else 100 * ate / row["path_m"]
 
-    loops = [shown(f"loops_{what}", ".0f") for what in ("closed", "missed", "wrong")]
-    percent = "-" if row["ate_m"] is None else f"{100 * row['ate_m'] / row['path_m']:.3f}"
-    cells = [row["drive"], f"{row['frames']}", f"{row['path_m']:.0f}", row["light"], row["system"]]
-    cells += [shown("lost", ".0f"), shown("ate_m", ".3f"), percent, shown("t_rel", ".3f")]
-    cells += [" / ".join(loops), shown("loop_fps", ".1f"), shown("load", ".1f")]
-    return f"| {' | '.join(cells)} |\n"
+    def shown(key: str) -> str:
+        value = row[key]
+        if value is None or isinstance(value, str):
+            return value or ""
+        return f"{value:.{DECIMALS.get(key, 0)}f}"
+
+    return [shown(key) for key in COLUMNS.values()]
 
 
 def _read(out: Path) -> dict[str, Row]:
@@ -223,18 +225,20 @@ def _read(out: Path) -> dict[str, Row]:
 
 
 def _write(out: Path, rows: dict[str, Row]) -> None:
-    order = [*OURS, PEER]
+    order = [*OURS, ORBSLAM3]
     lines = sorted(
-        rows.values(), key=lambda row: (row["drive"], row["light"], order.index(row["system"]))
+        rows.values(),
+        key=lambda row: (
+            row.get("sensor", "stereo") == "mono",
+            row["drive"],
+            row["light"],
+            order.index(row["system"]),
+        ),
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     out.with_suffix(".json").write_text(json.dumps(rows, indent=1) + "\n")
-    parts = {
-        sensor: "".join(_line(row) for row in lines if row.get("sensor", "stereo") == sensor)
-        for sensor in ("stereo", "mono")
-    }
-    text = HEAD + COLUMNS + parts["stereo"]
-    out.write_text(text + (MONOCULAR + COLUMNS + parts["mono"] if parts["mono"] else ""))
+    with out.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *map(_cells, lines)])
 
 
 if __name__ == "__main__":

@@ -3,17 +3,18 @@
 Each system runs as a process of its own, alternately and never at once, after one round that is
 not counted (compiled kernels, disk cache). Wall time, CPU time and peak memory are the kernel's
 figures for the whole process: start, vocabulary, files written and all. Errors come from
-vslam.evaluate for both, on the trajectory files that they wrote.
+vslam.evaluation.trajectories for both, on the trajectory files that they wrote.
 
-The peer is a script that takes VOCABULARY SEQUENCE_FOLDER OUT --frames N, writes a pose a frame to
-OUT in KITTI's format and prints a JSON object with frames, fps, cpu_ms_per_frame and lost. With
-``--sensor mono`` it is given ``--mono --rate 20`` (it loses its way when images come faster than
-its mapping) and writes its keyframes in TUM's format: its ATE is that of its keyframes alone. Loops
-are found, missed and wrong by the ground truth for vslam (vslam.loop_evaluation); of the peer only
-the closed ones are known: ``loops`` of that object, or the lines that ORB-SLAM3 prints for them.
+ORB-SLAM3 is run by a script that takes VOCABULARY SEQUENCE_FOLDER OUT --frames N, writes a pose a
+frame to OUT in KITTI's format and prints a JSON object with frames, fps, cpu_ms_per_frame and
+lost. With ``--sensor mono`` it is given ``--mono --rate 20`` (it loses its way when images come
+faster than its mapping) and writes its keyframes in TUM's format: its ATE is that of its keyframes
+alone. Loops are found, missed and wrong by the ground truth for vslam (vslam.evaluation.loops); of
+ORB-SLAM3 only the closed ones are known: ``loops`` of that object, or the lines that ORB-SLAM3
+prints for them.
 
-usage: python tools/compare_peer.py --data KITTI --seq 06 --frames 51 --repeats 3 \
-           --peer-python PY --peer-script run_orbslam3.py --vocabulary voc.txt
+usage: python tools/compare_orbslam3.py --data KITTI --seq 06 --frames 51 --repeats 3 \
+           --orbslam3-python PY --orbslam3-script run_orbslam3.py --vocabulary voc.txt
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-PEER_PACKAGE = "pyorbslam3"
-PEER_LOOP = "*Loop detected"  # printed once for each loop that it closes
+PACKAGE = "pyorbslam3"
+LOOP_MESSAGE = "*Loop detected"  # printed once for each loop that it closes
 MEASURES = (  # key, title with an arrow to the better side, format
     ("process_fps", "frames/s, whole process ↑", ".1f"),
     ("loop_fps", "frames/s, frame loop ↑", ".1f"),
@@ -123,15 +124,15 @@ def run_vslam(options: argparse.Namespace, folder: Path, *words: str) -> Run:
     return Run(process, report, report["lost_frames"], loops, trajectory)
 
 
-def run_peer(options: argparse.Namespace, folder: Path) -> Run:
+def run_orbslam3(options: argparse.Namespace, folder: Path) -> Run:
     sequence = options.data / "sequences" / options.seq
-    command = [str(options.peer_python), str(options.peer_script), str(options.vocabulary)]
+    command = [str(options.orbslam3_python), str(options.orbslam3_script), str(options.vocabulary)]
     command += [str(sequence), "out.txt", "--frames", str(options.frames)]
     command += ["--mono", "--rate", "20"] if options.sensor == "mono" else []
     process = measure(command, folder)
     said = next(line for line in reversed(process.output.splitlines()) if line.startswith("{"))
     report = json.loads(said)
-    loops = report.get("loops", process.output.count(PEER_LOOP))
+    loops = report.get("loops", process.output.count(LOOP_MESSAGE))
     trajectory = (folder / "out.txt").read_text()
     return Run(process, report, report["lost"], (loops, None, None), trajectory)
 
@@ -140,7 +141,7 @@ def figures(run: Run, options: argparse.Namespace) -> dict[str, float]:
     """Every measure of one run; NaN where it has no value, as t_rel on a path below 100 m."""
     from vslam.datasets import open_sequence
     from vslam.errors import InputError
-    from vslam.evaluate import evaluate
+    from vslam.evaluation.trajectories import evaluate_trajectory
     from vslam.trajectory import Trajectory, read_trajectory
 
     process, frames = run.process, run.report["frames"]
@@ -169,9 +170,9 @@ def figures(run: Run, options: argparse.Namespace) -> dict[str, float]:
         except InputError:  # too few poses: which belongs to which frame is not known
             return found
     truth = Trajectory(sequence.timestamps, sequence.ground_truth)
-    if options.sensor == "mono":  # without a unit, and of the peer keyframes alone
-        return found | {"ate_m": evaluate(estimate, truth, "sim3").ate_rmse_m}
-    errors = evaluate(estimate, truth)
+    if options.sensor == "mono":  # without a unit, and of ORB-SLAM3 keyframes alone
+        return found | {"ate_m": evaluate_trajectory(estimate, truth, "sim3").ate_rmse_m}
+    errors = evaluate_trajectory(estimate, truth)
     t_rel = errors.t_rel_percent
     found |= {"ate_m": errors.ate_rmse_m, "rpe_m": errors.rpe_m}
     return found | {"t_rel": nan if t_rel is None else t_rel}
@@ -184,12 +185,12 @@ def spread(values: list[float], form: str) -> str:
     return median if low == high else f"{median} ({low} - {high})"
 
 
-def table(ours: list[dict[str, float]], peers: list[dict[str, float]]) -> str:
+def table(ours: list[dict[str, float]], theirs: list[dict[str, float]]) -> str:
     """Markdown: median (least - greatest) of each, and the ratio of the medians."""
     lines = ["| | vslam | ORB-SLAM3 | ratio |", "|---|---|---|---|"]
     for name, title, form in MEASURES:
         cells, medians = [], []
-        for runs in (ours, peers):
+        for runs in (ours, theirs):
             values = [run[name] for run in runs]
             medians.append(statistics.median(values))
             cells.append(spread(values, form))
@@ -200,18 +201,19 @@ def table(ours: list[dict[str, float]], peers: list[dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
-def setting(report: dict[str, Any], peer_python: Path | None, repeats: int) -> str:
+def setting(report: dict[str, Any], orbslam3_python: Path | None, repeats: int) -> str:
     """Machine, versions and the number of runs, as one paragraph, from a report of vslam."""
-    ask = f"from importlib.metadata import version; print(version('{PEER_PACKAGE}'))"
-    peer = ""
-    if peer_python is not None:
-        said = subprocess.run([peer_python, "-c", ask], capture_output=True, text=True)
-        peer = f"; {PEER_PACKAGE} {said.stdout.strip() or '(version unknown)'}"
+    ask = f"from importlib.metadata import version; print(version('{PACKAGE}'))"
+    version = ""
+    if orbslam3_python is not None:
+        said = subprocess.run([orbslam3_python, "-c", ask], capture_output=True, text=True)
+        version = f"; {PACKAGE} {said.stdout.strip() or '(version unknown)'}"
     machine = report["machine"]
     ours = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
     return (
-        f"median (least - greatest) of {repeats} runs each, in turn, {time.strftime('%Y-%m-%d')}. "
-        f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. {ours}{peer}."
+        f"median (least - greatest) of {repeats} runs each, alternating, "
+        f"{time.strftime('%Y-%m-%d')}. "
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. {ours}{version}."
     )
 
 
@@ -225,13 +227,13 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--detector", default="none", help="loop detector of vslam")
     parser.add_argument("--sensor", default="stereo", choices=("stereo", "mono"))
     parser.add_argument("--vslam", default=str(Path(sys.executable).with_name("vslam")))
-    parser.add_argument("--peer-python", type=Path, required=True)
-    parser.add_argument("--peer-script", type=Path, required=True)
+    parser.add_argument("--orbslam3-python", type=Path, required=True)
+    parser.add_argument("--orbslam3-script", type=Path, required=True)
     parser.add_argument("--vocabulary", type=Path, required=True)
     options = parser.parse_args()
     # The runs have working folders of their own. A link to the interpreter is what makes an
     # environment: it is not followed.
-    for name in ("data", "peer_python", "peer_script", "vocabulary"):
+    for name in ("data", "orbslam3_python", "orbslam3_script", "vocabulary"):
         path = getattr(options, name).absolute()
         if not path.exists():
             parser.error(f"--{name.replace('_', '-')} {path}: not there")
@@ -242,18 +244,18 @@ def parse_options() -> argparse.Namespace:
 def main() -> None:
     options = parse_options()
     runs: dict[str, list[Run]] = {"vslam": [], "ORB-SLAM3": []}
-    with tempfile.TemporaryDirectory(prefix="vslam-peer-") as scratch:
+    with tempfile.TemporaryDirectory(prefix="vslam-orbslam3-") as scratch:
         for repeat in range(options.repeats + 1):
-            for name, start in (("vslam", run_vslam), ("ORB-SLAM3", run_peer)):
+            for name, start in (("vslam", run_vslam), ("ORB-SLAM3", run_orbslam3)):
                 run = start(options, Path(scratch))
                 counted = f"{repeat} of {options.repeats}" if repeat else "not counted"
                 print(f"{name}: {run.process.wall_s:.1f} s, {counted}", file=sys.stderr)
                 if repeat:
                     runs[name].append(run)
-    ours, peers = ([figures(run, options) for run in done] for done in runs.values())
+    ours, theirs = ([figures(run, options) for run in done] for done in runs.values())
     frames = f"KITTI {options.seq}, frames 0-{options.frames - 1}, --detector {options.detector}"
-    about = setting(runs["vslam"][0].report, options.peer_python, options.repeats)
-    print(f"{table(ours, peers)}\n\n{frames}, {about}")
+    about = setting(runs["vslam"][0].report, options.orbslam3_python, options.repeats)
+    print(f"{table(ours, theirs)}\n\n{frames}, {about}")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,90 @@
+"""Write docs/thresholds.md: every threshold of vslam/config.py with its unit and source.
+
+    python tools/threshold_table.py            # writes it
+    python tools/threshold_table.py --check    # exits 1 if the file differs
+
+A field's description ends with its source in brackets: paper, section and status of the value, as
+in "[OS1 V-D, customary]", or "[own]" where the rule has no paper either.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+from vslam.config import Config
+
+PAGE = Path(__file__).parents[1] / "docs" / "thresholds.md"
+DESCRIPTION = re.compile(
+    r"(?P<text>\S.*\.) "
+    r"\[(?P<source>(?:(?:OS1|OS2|ZS)(?: [IVX]+(?:-[A-F])?)?, (?:printed|customary|own))|own)\]"
+)
+HEAD = """# Thresholds
+
+Written by `python tools/threshold_table.py` from `vslam/config.py`; `tests/test_threshold_table.py` compares the two. `vslam run --config FILE` sets any of them: `{"orb": {"n_features": 1500}}`. [design.md](design.md) describes the methods.
+
+The source names the paper and section of the rule and says what the value is: *printed* in that section, *customary* in the programs and KITTI configurations of the ORB-SLAM family, or our *own*. OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS: Zhou and Sun, Sci Rep 15, 7644 (2025). Descriptor distances and ratios of best over second-best distance are upper bounds; a descriptor has 256 bits. A search radius at octave 0 grows with the scale of the pyramid level.
+
+These are in the code, because they are mathematics or depend on another constant: the chi-square quantiles, the viewing angle of 60 degrees and the search radius 1.6 times as wide for landmarks seen obliquely (OS1 V-D), the distance range of a landmark with 20 % slack, the 30 bins of the orientation check, 3 keyframes of probation for a landmark (OS1 VI-B).
+"""  # noqa: E501
+
+
+class Row(NamedTuple):
+    """One threshold: dotted name, default as JSON has it, meaning with unit, source."""
+
+    name: str
+    default: str
+    text: str
+    source: str
+
+
+def rows(config: Config, section: str) -> list[Row]:
+    """The thresholds of one section.
+
+    Raises:
+        ValueError: a description is missing or does not end with a source.
+    """
+    part = getattr(config, section)
+    found = []
+    for field, info in type(part).model_fields.items():
+        parsed = DESCRIPTION.fullmatch(info.description or "")
+        if parsed is None:
+            raise ValueError(f"{section}.{field}: no source in {info.description!r}")
+        default = str(getattr(part, field))
+        found.append(Row(f"{section}.{field}", default, parsed["text"][:-1], parsed["source"]))
+    return found
+
+
+def page(config: Config) -> str:
+    """The page for a configuration: one table for each section, its docstring above."""
+    lines = [HEAD]
+    for section in type(config).model_fields:
+        title, _, rest = (type(getattr(config, section)).__doc__ or "").partition(".")
+        lines += [f"## `{section}`: {title}\n"]
+        lines += [f"{' '.join(rest.split())}\n"] if rest.strip() else []
+        lines += ["| name | default | what it is | source |", "|---|---|---|---|"]
+        lines += [
+            f"| `{row.name}` | {row.default} | {row.text} | {row.source} |"
+            for row in rows(config, section)
+        ]
+        lines += [""]
+    return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="compare, do not write")
+    parser.add_argument("--out", type=Path, default=PAGE)
+    options = parser.parse_args()
+    text = page(Config())
+    if not options.check:
+        options.out.write_text(text)
+    elif not options.out.is_file() or options.out.read_text() != text:
+        sys.exit(f"{options.out} differs from vslam/config.py: python tools/threshold_table.py")
+
+
+if __name__ == "__main__":
+    main()

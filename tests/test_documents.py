@@ -1,0 +1,104 @@
+"""Documents stay short, name what exists, and hold no path of a machine."""
+
+from __future__ import annotations
+
+import ast
+import csv
+import json
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = sorted(
+    [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "loopclosure").glob("*.md")]
+)
+MOST_WORDS = {"README.md": 900, "docs/loops.md": 1500, "docs/training.md": 1500}
+LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)[^)]*\)")
+SOURCE = re.compile(
+    r"`((?:vslam|frontend|backend|loopclosure|tools|tests|docs)/[\w./-]+\.(?:py|md|csv|json|npy|npz|html))"
+)
+
+
+def name(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+@pytest.mark.parametrize(("document", "most"), MOST_WORDS.items())
+def test_documents_are_short(document, most):
+    assert len((ROOT / document).read_text().split()) <= most
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=name)
+def test_links_and_files_named_exist(document):
+    text = document.read_text()
+    missing = [link for link in LINK.findall(text) if not (document.parent / link).exists()]
+    missing += [file for file in SOURCE.findall(text) if not (ROOT / file).exists()]
+    assert missing == []
+
+
+def test_a_missing_file_would_be_seen():
+    text = "[a](docs/none.md) and `vslam/none.py`, not [b](https://x.org) or [c](#d)"
+    assert LINK.findall(text) == ["docs/none.md"]
+    assert SOURCE.findall(text) == ["vslam/none.py"]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=name)
+def test_no_path_of_a_machine(document):
+    assert re.findall(r"(?<![\w.}$~])/(?:home|root|work|Users)/\S+", document.read_text()) == []
+
+
+def test_tests_that_documents_name_exist():
+    defined = {
+        node.name
+        for path in (ROOT / "tests").glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef)
+    }
+    named = {
+        test
+        for document in DOCUMENTS
+        for test in re.findall(r"`(test_\w+)`", document.read_text())
+        if not (ROOT / "tests" / f"{test}.py").exists()
+    }
+    assert named - defined == set()
+
+
+def test_the_example_of_the_readme_runs():
+    """Its names are those of the package, and it tracks a frame."""
+    import numpy as np
+
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    grey = np.random.default_rng(0).integers(0, 256, (376, 1241), dtype=np.uint8)
+    values: dict[str, object] = {"frames": [(grey, np.roll(grey, -8, axis=1), 0.0)]}
+    exec(compile(example, "README.md", "exec"), values)
+    assert len(values["trajectory"]) == 1  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("table", sorted((ROOT / "docs").rglob("*.csv")), ids=name)
+def test_tables_are_rectangular(table):
+    rows = list(csv.reader(table.open(encoding="utf-8")))
+    assert len(rows) > 1
+    assert {len(row) for row in rows} == {len(rows[0])}
+
+
+def test_the_table_of_drives_is_made_from_its_figures(monkeypatch, tmp_path):
+    """docs/results/drives.csv is what tools/synth_table.py writes of the rows kept beside it."""
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    import synth_table
+
+    kept = ROOT / "docs" / "results" / "drives.json"
+    synth_table._write(tmp_path / "drives.csv", json.loads(kept.read_text()))
+    assert (tmp_path / "drives.csv").read_text() == kept.with_suffix(".csv").read_text()
+    assert (tmp_path / "drives.json").read_text() == kept.read_text()
+
+
+def test_citation_is_of_this_version():
+    from vslam import __version__
+
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == __version__
+    assert citation["license"] == "Apache-2.0"
+    assert len(citation["references"]) == 2

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from vslam.geometry import compose, orthonormalised, se3_exp
 from vslam.kernels import inner_kernel, kernel
-from vslam.reprojection import chi_square, residual
+from vslam.reprojection import chi_square, residual, unpacked
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,7 @@ def adjust(
         problem.n_free,
         problem.points,
         observations_of(problem, use),
+        empty_equations(problem.n_free, len(problem.points), len(problem.camera)),
         iterations,
         tolerance,
     )
@@ -138,13 +139,16 @@ def _in_camera(T, p, q):
 def robust_cost(T_cw, points, observations, inlier):
     """Half the sum of Huber losses; sets ``inlier`` by the chi-square test."""
     first, camera, uvr, inverse_sigma2, used, intrinsics = observations
+    pinhole = unpacked(intrinsics)
     cost = 0.0
-    r, q = np.empty(3), np.empty(3)
+    q = np.empty(3)
     for p in range(len(points)):
         for o in range(first[p], first[p + 1]):
             _in_camera(T_cw[camera[o]], points[p], q)
-            stereo = residual(q[0], q[1], q[2], uvr[o], intrinsics, r)
-            chi2, limit = chi_square(r, stereo, inverse_sigma2[o])
+            r_u, r_v, r_right, stereo = residual(
+                q[0], q[1], q[2], uvr[o, 0], uvr[o, 1], uvr[o, 2], pinhole
+            )
+            chi2, limit = chi_square(r_u, r_v, r_right, stereo, inverse_sigma2[o])
             inlier[o] = q[2] > 0.0 and chi2 <= limit
             if used[o]:
                 cost += 0.5 * chi2 if chi2 <= limit else np.sqrt(chi2 * limit) - 0.5 * limit
@@ -152,20 +156,13 @@ def robust_cost(T_cw, points, observations, inlier):
 
 
 @kernel
-def _adjust(T_start, n_free, points_start, observations, iterations, tolerance):
+def _adjust(T_start, n_free, points_start, observations, equations, iterations, tolerance):
     n_points, n_observations = len(points_start), len(observations.camera)
     size = 6 * n_free
     T_cw, points = T_start.copy(), points_start.copy()
     T_trial, points_trial = T_start.copy(), points_start.copy()
     inlier = np.ones(n_observations, np.bool_)
     cost = robust_cost(T_cw, points, observations, inlier)
-    equations = NormalEquations(
-        np.zeros((n_observations, 3, 6)),
-        np.empty((n_points, 3, 3)),
-        np.empty((n_points, 3)),
-        np.empty((n_free, 6, 6)),
-        np.empty((n_free, 6)),
-    )
     S, rhs = np.empty((size, size)), np.empty(size)
     V_inverse = np.empty((n_points, 3, 3))
     damping, growth = 1e-5, 2.0
@@ -202,10 +199,11 @@ def linearise(T_cw, n_free, points, observations, equations):
     """Normal equations at the current estimate, in blocks."""
     first, camera, uvr, inverse_sigma2, used, intrinsics = observations
     W, V, g, U, b = equations
-    fx, fy, bf = intrinsics[0], intrinsics[1], intrinsics[4]
+    pinhole = unpacked(intrinsics)
+    fx, fy, _, _, bf = intrinsics  # not shared: that would fuse other products, and change bits
     U[:] = 0.0
     b[:] = 0.0
-    r, q = np.empty(3), np.empty(3)
+    q = np.empty(3)
     C, P = np.empty((3, 6)), np.empty((3, 3))
     for p in range(len(points)):
         v00, v01, v02, v11, v12, v22 = 1e-9, 0.0, 0.0, 1e-9, 0.0, 1e-9
@@ -216,9 +214,11 @@ def linearise(T_cw, n_free, points, observations, equations):
             k = camera[o]
             T = T_cw[k]
             _in_camera(T, points[p], q)
-            stereo = residual(q[0], q[1], q[2], uvr[o], intrinsics, r)
+            r0, r1, r2, stereo = residual(
+                q[0], q[1], q[2], uvr[o, 0], uvr[o, 1], uvr[o, 2], pinhole
+            )
             weight = inverse_sigma2[o]
-            chi2, limit = chi_square(r, stereo, weight)
+            chi2, limit = chi_square(r0, r1, r2, stereo, weight)
             if chi2 > limit:
                 weight *= np.sqrt(limit / chi2)
             iz = 1.0 / q[2]
@@ -233,7 +233,7 @@ def linearise(T_cw, n_free, points, observations, equations):
                 P[0, i] = a * T[0, i] + c * T[2, i]
                 P[1, i] = e * T[1, i] + f * T[2, i]
                 P[2, i] = m * T[0, i] + h * T[2, i]
-            w0, w1, w2 = weight * r[0], weight * r[1], weight * r[2]
+            w0, w1, w2 = weight * r0, weight * r1, weight * r2
             g0 += P[0, 0] * w0 + P[1, 0] * w1 + P[2, 0] * w2
             g1 += P[0, 1] * w0 + P[1, 1] * w1 + P[2, 1] * w2
             g2 += P[0, 2] * w0 + P[1, 2] * w1 + P[2, 2] * w2
@@ -255,7 +255,7 @@ def linearise(T_cw, n_free, points, observations, equations):
             block, vector = U[k], b[k]
             for i in range(6):
                 c0, c1, c2 = weight * C[0, i], weight * C[1, i], weight * C[2, i]
-                vector[i] += c0 * r[0] + c1 * r[1] + c2 * r[2]
+                vector[i] += c0 * r0 + c1 * r1 + c2 * r2
                 for j in range(6):
                     block[i, j] += c0 * C[0, j] + c1 * C[1, j] + c2 * C[2, j]
                 for j in range(3):

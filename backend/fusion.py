@@ -12,7 +12,7 @@ from vslam.kernels import hamming, kernel
 from vslam.loops import LoopEdge
 from vslam.map import Map
 from vslam.map_kernels import collect_landmarks, link, merge_landmarks, observed_by, predict_octave
-from vslam.reprojection import chi_square_ratio
+from vslam.reprojection import chi_square_ratio, unpacked
 
 
 def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
@@ -128,13 +128,14 @@ def _fuse(
     window,
     max_distance,
 ):
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    pinhole = unpacked(intrinsics)
+    fx, fy, cx, cy, _ = pinhole
     start, items, columns = grid
     T = a.T_cw[keyframe]
     first_row = a.first_row[keyframe]
     grid_rows = (len(start) - 1) // columns
     log_scale = np.log(scales[1] / scales[0])
-    centre, uvr = np.empty(3), np.empty(3)
+    centre = np.empty(3)
     for i in range(3):
         centre[i] = -(T[0, i] * T[0, 3] + T[1, i] * T[1, 3] + T[2, i] * T[2, 3])
     fused = 0
@@ -179,8 +180,9 @@ def _fuse(
                 level = int(a.octave[row])
                 if level < octave - 1 or level > octave:
                     continue
-                uvr[0], uvr[1], uvr[2] = a.xy[row, 0], a.xy[row, 1], a.u_right[row]
-                if chi_square_ratio(x, y, z, uvr, scales[level] ** -2.0, intrinsics) > 1.0:
+                seen_u, seen_v = np.float64(a.xy[row, 0]), np.float64(a.xy[row, 1])
+                seen_right, weight = np.float64(a.u_right[row]), scales[level] ** -2.0
+                if chi_square_ratio(x, y, z, seen_u, seen_v, seen_right, weight, pinhole) > 1.0:
                     continue
                 bits = hamming(a.landmark_descriptor[landmark], a.descriptor[row])
                 if bits < best_distance:

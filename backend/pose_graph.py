@@ -51,7 +51,7 @@ class PoseGraph:
 
 
 @dataclass(frozen=True)
-class Consistency:
+class GraphCheck:
     """Whether the edges of an optimised graph agree.
 
     Attributes:
@@ -224,7 +224,7 @@ def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     """Poses ``T_cw`` ``(N, 4, 4)`` that agree best with the edges.
 
     Levenberg-Marquardt. Loop edges are under the Cauchy loss: one that contradicts the others
-    loses its influence, and shows in ``consistency``; all others are Gaussian.
+    loses its influence, and shows in ``check_pose_graph``; all others are Gaussian.
     """
     import gtsam
 
@@ -254,9 +254,9 @@ def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     return T_cw
 
 
-def consistency(
+def check_pose_graph(
     graph: PoseGraph, T_cw: NDArray[np.float64], config: PoseGraphConfig
-) -> Consistency:
+) -> GraphCheck:
     """Whether an optimised graph makes sense, or a loop was wrong and is to be undone.
 
     Two tests. A loop edge far from its measurement contradicts the others or more of the path than
@@ -270,16 +270,16 @@ def consistency(
     """
     before = edge_errors(graph.T_cw, graph.edges, graph.T_i_j, graph.sigmas)
     after = edge_errors(T_cw, graph.edges, graph.T_i_j, graph.sigmas)
-    return check_graph(graph, before, after, config)
+    return check_edge_errors(graph, before, after, config)
 
 
-def check_graph(
+def check_edge_errors(
     graph: PoseGraph,
     before: NDArray[np.float64],
     after: NDArray[np.float64],
     config: PoseGraphConfig,
-) -> Consistency:
-    """``consistency`` from the chi-square ``(E,)`` of each edge before and after optimisation."""
+) -> GraphCheck:
+    """``check_pose_graph`` from the chi-square ``(E,)`` of each edge before and after."""
     loop = graph.kind == LOOP
     loop_error = np.where(loop, after, np.nan)
     strain = float(after[~loop & (graph.kind != WEAK)].sum())
@@ -294,7 +294,7 @@ def check_graph(
         )
     elif strain > config.max_strain * max(1, closed):
         reason = f"the loop implies more drift than is plausible (chi-square {strain:.0f})"
-    return Consistency(reason == "consistent", reason, strain, closed, loop_error)
+    return GraphCheck(reason == "consistent", reason, strain, closed, loop_error)
 
 
 @kernel

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.loop_correction import carry_landmarks_by
-from vslam.backend.pose_graph import GAP, HOLD, LOOP, WEAK, Consistency, PoseGraph, check_graph
+from vslam.backend.pose_graph import GAP, HOLD, LOOP, WEAK, GraphCheck, PoseGraph, check_edge_errors
 from vslam.config import PoseGraphConfig
 from vslam.geometry import Matrix, inverses, se3_log
 from vslam.loops import LoopEdge
@@ -95,12 +95,12 @@ def sigmas(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     return np.column_stack([np.repeat(graph.sigmas[:, ::-1], 3, axis=1), scale])
 
 
-def similarity_consistency(
+def check_similarity_graph(
     graph: PoseGraph, S_wc_before: Matrix, S_wc: Matrix, config: PoseGraphConfig
-) -> Consistency:
-    """``pose_graph.consistency`` for similarities before and after optimisation."""
+) -> GraphCheck:
+    """``check_pose_graph`` for similarities before and after optimisation."""
     before, after = (edge_errors(graph, S, config) for S in (S_wc_before, S_wc))
-    return check_graph(graph, before, after, config)
+    return check_edge_errors(graph, before, after, config)
 
 
 def edge_errors(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> NDArray[np.float64]:
@@ -146,7 +146,7 @@ def move_keyframes_similarly(
     return growth
 
 
-def rescaled_loop(edge: LoopEdge, growth: NDArray[np.float64]) -> LoopEdge:
+def loop_in_new_units(edge: LoopEdge, growth: NDArray[np.float64]) -> LoopEdge:
     """A loop in the units after a correction that multiplied those of its ends by ``growth``."""
     assert edge.T_query_match is not None
     T = edge.T_query_match.copy()

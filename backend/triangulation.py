@@ -11,7 +11,7 @@ from vslam.geometry import inverse
 from vslam.kernels import hamming, inner_kernel, kernel
 from vslam.map import NONE, Map
 from vslam.map_kernels import link_many
-from vslam.reprojection import chi_square_ratio
+from vslam.reprojection import chi_square_ratio, unpacked
 
 EPIPOLAR_CHI2 = 3.84  # 95 % quantile with 1 degree of freedom
 MIN_CLOSE = 100  # stereo points mapped even if none is close (ORB-SLAM2, III-E)
@@ -247,6 +247,6 @@ def agrees(T, p, xy, u_right, scale, intrinsics):
         return False
     x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
     y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
-    uvr = np.empty(3)
-    uvr[0], uvr[1], uvr[2] = xy[0], xy[1], u_right
-    return chi_square_ratio(x, y, z, uvr, 1.0 / (scale * scale), intrinsics) <= 1.0
+    u, v, right = np.float64(xy[0]), np.float64(xy[1]), np.float64(u_right)
+    weight, pinhole = 1.0 / (scale * scale), unpacked(intrinsics)
+    return chi_square_ratio(x, y, z, u, v, right, weight, pinhole) <= 1.0

@@ -5,7 +5,7 @@ not explained by a homography. Both are fitted to the same draws and the score s
 believe. What follows is only accepted if one motion stands out: a map that began wrong cannot be
 mended.
 
-Draws are fitted and judged all at once, in batches: NumPy is as fast here as a kernel would be,
+Draws are fitted and scored all at once, in batches: NumPy is as fast here as a kernel would be,
 and has nothing to compile.
 """
 
@@ -140,7 +140,7 @@ def reconstruct(
 def select_model(
     xy_1: Matrix, xy_2: Matrix, sigma: Matrix, config: InitializationConfig, *, seed: int
 ) -> TwoViewModel:
-    """Homography or fundamental matrix, whichever the scores ask for (ORB-SLAM, IV, steps 2, 3).
+    """Homography or fundamental matrix, by their scores (ORB-SLAM, IV, steps 2, 3).
 
     Args:
         xy_1, xy_2: ``(N, 2)`` matched pixels, N at least 8; sigma: ``(N,)`` pixels.
@@ -159,15 +159,15 @@ def select_model(
         return N_2.T @ fit_fundamentals(x_1[chosen], x_2[chosen]) @ N_1
 
     found = []
-    for fit, judge in ((homographies, judge_homographies), (fundamentals, judge_fundamentals)):
+    for fit, score_all in ((homographies, score_homographies), (fundamentals, score_fundamentals)):
         models = fit(drawn)
-        scores, inlier = judge(models, xy_1, xy_2, sigma)
+        scores, inlier = score_all(models, xy_1, xy_2, sigma)
         best = int(np.argmax(scores))
         M, score, explained = models[best], float(scores[best]), inlier[best]
         # Fitted to all that it explains, a model explains more.
         while np.count_nonzero(explained) >= SAMPLE:
             refit = fit(np.flatnonzero(explained)[None])
-            scores, inlier = judge(refit, xy_1, xy_2, sigma)
+            scores, inlier = score_all(refit, xy_1, xy_2, sigma)
             if scores[0] <= score:
                 break
             M, score, explained = refit[0], float(scores[0]), inlier[0]
@@ -216,7 +216,7 @@ def _null_vectors(A: Matrix) -> Matrix:
     return vectors[:, :, 0].reshape(-1, 3, 3)
 
 
-def judge_homographies(
+def score_homographies(
     H: Matrix, xy_1: Matrix, xy_2: Matrix, sigma: Matrix
 ) -> tuple[Matrix, NDArray[np.bool_]]:
     """Score ``(B,)`` and inliers ``(B, N)`` by the symmetric transfer error (ORB-SLAM, IV)."""
@@ -226,7 +226,7 @@ def judge_homographies(
     return _score(there, back, CHI2_MONO)
 
 
-def judge_fundamentals(
+def score_fundamentals(
     F: Matrix, xy_1: Matrix, xy_2: Matrix, sigma: Matrix
 ) -> tuple[Matrix, NDArray[np.bool_]]:
     """Score ``(B,)`` and inliers ``(B, N)`` by the distances from the epipolar lines of both views.

@@ -11,7 +11,7 @@ import numpy as np
 from vslam.geometry import symmetric_eigen
 from vslam.kernels import inner_kernel, kernel
 from vslam.ransac import draw_three, draws_needed
-from vslam.reprojection import chi_square_ratio
+from vslam.reprojection import chi_square_ratio, unpacked
 
 
 @kernel
@@ -249,6 +249,7 @@ def _triad(points, axes):
 @inner_kernel
 def _score_pose(T, points, uvr, inverse_sigma2, intrinsics, to_beat, inlier):
     """MSAC score of a pose (Torr and Zisserman, CVIU 2000); sets ``inlier``, gives up early."""
+    pinhole = unpacked(intrinsics)
     n = len(points)
     score, count = 0.0, 0
     for i in range(n):
@@ -261,7 +262,9 @@ def _score_pose(T, points, uvr, inverse_sigma2, intrinsics, to_beat, inlier):
             continue
         x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
         y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
-        error = chi_square_ratio(x, y, z, uvr[i], inverse_sigma2[i], intrinsics)
+        error = chi_square_ratio(
+            x, y, z, uvr[i, 0], uvr[i, 1], uvr[i, 2], inverse_sigma2[i], pinhole
+        )
         if error <= 1.0:
             inlier[i] = True
             count += 1

@@ -6,7 +6,7 @@ import numpy as np
 
 from vslam.geometry import compose, orthonormalised, se3_exp, solve_positive
 from vslam.kernels import inner_kernel, kernel
-from vslam.reprojection import chi_square, chi_square_ratio, residual
+from vslam.reprojection import chi_square, chi_square_ratio, residual, unpacked
 
 ROUNDS = 4
 ITERATIONS = 10
@@ -30,7 +30,8 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
         ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers.
     """
     n = len(points)
-    fx, fy, bf = intrinsics[0], intrinsics[1], intrinsics[4]
+    pinhole = unpacked(intrinsics)
+    fx, fy, _, _, bf = intrinsics  # not shared: that would fuse other products, and change bits
     T = T_cw.copy()
     inlier = np.ones(n, np.bool_)
     for turn in range(ROUNDS):
@@ -50,8 +51,11 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
                 z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
                 if z <= 1e-6:
                     continue
-                stereo = residual(x, y, z, uvr[i], intrinsics, r)
-                chi2, limit = chi_square(r, stereo, inverse_sigma2[i])
+                r_u, r_v, r_right, stereo = residual(
+                    x, y, z, uvr[i, 0], uvr[i, 1], uvr[i, 2], pinhole
+                )
+                chi2, limit = chi_square(r_u, r_v, r_right, stereo, inverse_sigma2[i])
+                r[0], r[1], r[2] = r_u, r_v, r_right
                 weight = inverse_sigma2[i]
                 iz = 1.0 / z
                 if robust and chi2 > limit:
@@ -81,17 +85,19 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
                 moved |= not abs(step[k]) < 1e-7
             if not moved:
                 break
-        classify(T, points, uvr, inverse_sigma2, intrinsics, inlier)
+        classify(T, points, uvr, inverse_sigma2, pinhole, inlier)
     return T, inlier
 
 
 @inner_kernel
-def classify(T, points, uvr, inverse_sigma2, intrinsics, inlier):
+def classify(T, points, uvr, inverse_sigma2, pinhole, inlier):
     """Set ``inlier`` to those that pass the chi-square test at pose ``T``."""
     for i in range(len(points)):
         p = points[i]
         x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
         y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
         z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
-        ratio = chi_square_ratio(x, y, z, uvr[i], inverse_sigma2[i], intrinsics)
-        inlier[i] = z > 0.0 and ratio <= 1.0
+        inlier[i] = z > 0.0 and (
+            chi_square_ratio(x, y, z, uvr[i, 0], uvr[i, 1], uvr[i, 2], inverse_sigma2[i], pinhole)
+            <= 1.0
+        )

@@ -1,6 +1,4 @@
-"""Which keyframes have a word, and which features of an image lie under a node of the tree.
-
-The inverted and the direct index of Galvez-Lopez and Tardos (T-RO 2012, section IV).
+"""Which keyframes have a word: the inverted index of Galvez-Lopez and Tardos (T-RO 2012, IV).
 
 The L1 score of two bags is the sum of the lesser weights of the words they share (vocabulary.py).
 So one pass over the postings of a query's words gives the shared words and the score of *every*
@@ -15,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.kernels import hamming, kernel
+from vslam.kernels import kernel
 from vslam.loopclosure.vocabulary import BowVector
 
 FIRST_BLOCK = 8  # postings: one cache line
@@ -30,9 +28,6 @@ def grown(array: NDArray, needed: int) -> NDArray:
     bigger = np.empty((max(needed, len(array) * 3 // 2), *array.shape[1:]), array.dtype)
     bigger[: len(array)] = array
     return bigger
-
-
-# -- inverted index -------------------------------------------------------------------------------
 
 
 class Likeness(NamedTuple):
@@ -143,81 +138,3 @@ def compare_with_all(postings, n_keyframes, words, weights):
             posting = pool[j]
             sums[posting >> 32] += SHARED + min(weights[i], posting & 0xFFFFFFFF)
     return sums
-
-
-# -- direct index ---------------------------------------------------------------------------------
-
-
-class NodeIndex(NamedTuple):
-    """Direct index of an image: its features by the node of the tree under which their words lie.
-
-    ``node`` (N,) i4 ascending; ``feature`` (N,) i4, index within the image.
-    """
-
-    node: NDArray[np.int32]
-    feature: NDArray[np.int32]
-
-
-def index_nodes(node: NDArray[np.int32]) -> NodeIndex:
-    """Direct index of an image whose features lie under the nodes ``(N,)``."""
-    order = np.argsort(node, kind="stable").astype(np.int32)
-    return NodeIndex(node[order], order)
-
-
-@kernel
-def match_by_node(
-    node_a,
-    feature_a,
-    descriptors_a,
-    use_a,
-    node_b,
-    feature_b,
-    descriptors_b,
-    use_b,
-    max_distance,
-    ratio,
-):
-    """Match features of two images whose words lie under the same node of the vocabulary.
-
-    Args:
-        node_a, feature_a: direct index of image a (``NodeIndex``); likewise b.
-        descriptors_a, descriptors_b: ``(M, 4)`` and ``(N, 4)`` uint64, of all features.
-        use_a, use_b: ``(M,)`` and ``(N,)`` bool, features that may be matched.
-        max_distance: bits; ratio: best over second best under the node (1 switches it off).
-
-    Returns:
-        ``(M,)`` int32 feature of b or -1, none twice (the closest keeps it).
-    """
-    matches = np.full(len(descriptors_a), -1, np.int32)
-    distances = np.full(len(descriptors_a), 257, np.int64)
-    owner = np.full(len(descriptors_b), -1, np.int64)
-    first, n_a, n_b = 0, len(node_a), len(node_b)
-    for i in range(n_a):
-        while first < n_b and node_b[first] < node_a[i]:
-            first += 1
-        feature = feature_a[i]
-        if not use_a[feature]:
-            continue
-        best, least, second = -1, 257, 257
-        j = first
-        while j < n_b and node_b[j] == node_a[i]:
-            other = feature_b[j]
-            j += 1
-            if not use_b[other]:
-                continue
-            distance = hamming(descriptors_a[feature], descriptors_b[other])
-            if distance < least:
-                second = least
-                best, least = other, distance
-            elif distance < second:
-                second = distance
-        if best < 0 or least > max_distance or least > ratio * second:
-            continue
-        previous = owner[best]
-        if previous >= 0:
-            if distances[previous] <= least:
-                continue
-            matches[previous] = -1
-        owner[best] = feature
-        matches[feature], distances[feature] = best, least
-    return matches

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vslam.geometry import compose, orthonormalised, se3_exp, solve_positive, symmetric_eigen
 from vslam.kernels import inner_kernel, kernel
 from vslam.ransac import draw_three, draws_needed
-from vslam.reprojection import chi_square, chi_square_ratio, residual
+from vslam.reprojection import chi_square, chi_square_ratio, residual, unpacked
 
 REFITS = 4
 SAMPLE_ITERATIONS, REFIT_ITERATIONS = 3, 5
@@ -201,11 +201,11 @@ def _add_residual(p, motion, uvr, inverse_sigma2, intrinsics, H, b):
     """
     if p[2] <= 0.1:
         return
-    fx, fy, bf = intrinsics[0], intrinsics[1], intrinsics[4]
+    pinhole = unpacked(intrinsics)
+    fx, fy, _, _, bf = intrinsics  # not shared: that would fuse other products, and change bits
     iz = 1.0 / p[2]
-    r = np.empty(3)
-    stereo = residual(p[0], p[1], p[2], uvr, intrinsics, r)
-    chi2, limit = chi_square(r, stereo, inverse_sigma2)
+    r_u, r_v, r_right, stereo = residual(p[0], p[1], p[2], uvr[0], uvr[1], uvr[2], pinhole)
+    chi2, limit = chi_square(r_u, r_v, r_right, stereo, inverse_sigma2)
     weight = inverse_sigma2 * (np.sqrt(limit / chi2) if chi2 > limit else 1.0)
     J = np.zeros((3, 7))
     for k in range(7):
@@ -214,7 +214,7 @@ def _add_residual(p, motion, uvr, inverse_sigma2, intrinsics, H, b):
         if stereo:
             J[2, k] = J[0, k] + bf * iz * iz * motion[2, k]
     for k in range(7):
-        b[k] += weight * (J[0, k] * r[0] + J[1, k] * r[1] + J[2, k] * r[2])
+        b[k] += weight * (J[0, k] * r_u + J[1, k] * r_v + J[2, k] * r_right)
         for m in range(k + 1):
             H[k, m] += weight * (J[0, k] * J[0, m] + J[1, k] * J[1, m] + J[2, k] * J[2, m])
 
@@ -282,7 +282,11 @@ def _derivative(p, fix_scale, out):
 @inner_kernel
 def _error(x, y, z, uvr, inverse_sigma2, intrinsics):
     """``chi_square_ratio``; 2 for a point that is not in front of the camera."""
-    return 2.0 if z <= 0.1 else chi_square_ratio(x, y, z, uvr, inverse_sigma2, intrinsics)
+    if z <= 0.1:
+        return 2.0
+    fx, fy, cx, cy, bf = intrinsics
+    pinhole = (fx, fy, cx, cy, bf)
+    return chi_square_ratio(x, y, z, uvr[0], uvr[1], uvr[2], inverse_sigma2, pinhole)
 
 
 @inner_kernel

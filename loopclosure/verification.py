@@ -104,7 +104,7 @@ def verify(
     )
     if camera.monocular:
         edge = replace(edge, scale=relative_scale(map_, query, guided, default=scale))
-    reason = _objection(map_, edge, guided, T_query_match, camera, config)
+    reason = _rejection_reason(map_, edge, guided, T_query_match, camera, config)
     return replace(edge, accepted=not reason, reason=reason or "verified")
 
 
@@ -239,7 +239,7 @@ def guided_match(
     return GuidedMatches(landmarks[visible], feature[visible], uvr[visible, :2], len(hit), T_cw)
 
 
-def _objection(
+def _rejection_reason(
     map_: Map,
     edge: LoopEdge,
     guided: GuidedMatches,
@@ -287,7 +287,7 @@ def reverse_match(
 
 
 def seen_of(map_: Map, keyframe: int, guided: GuidedMatches) -> tuple[int, int]:
-    """How many of the landmarks of a keyframe a guided has, and how many it should have."""
+    """How many of the landmarks of a keyframe the camera sees, and how many it should see."""
     own = np.isin(guided.landmarks, map_.landmarks_of(keyframe))
     return int(np.count_nonzero(guided.seen & own)), int(np.count_nonzero(own))
 

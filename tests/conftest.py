@@ -109,10 +109,10 @@ def corridor() -> StereoSequence:
         yaw = 0.012 if 8 <= k < 20 else 0.0  # rad a frame
         T_wc.append(T_wc[-1] @ se3_exp(np.array([0.0, 0.0, 0.35, 0.0, yaw, 0.0])))
     poses = np.array(T_wc)
-    side = np.eye(4)
-    side[0, 3] = camera.baseline
+    T_left_right = np.eye(4)
+    T_left_right[0, 3] = camera.baseline
     left = [render(mipmaps, camera, T) for T in poses]
-    right = [render(mipmaps, camera, T @ side) for T in poses]
+    right = [render(mipmaps, camera, T @ T_left_right) for T in poses]
     return StereoSequence(camera, left, right, 100.0 + 0.1 * np.arange(frames), poses)
 
 

@@ -77,7 +77,7 @@ def test_both_ends_of_a_loop_see_the_same_landmarks_afterwards():
     assert shared[edge.match] >= 40
 
 
-def test_a_closure_says_where_the_keyframes_were():
+def test_a_correction_says_where_the_keyframes_were():
     correction = closed().corrections[0]
     query = int(np.flatnonzero(correction.keyframes == correction.edge.query)[0])
     match = int(np.flatnonzero(correction.keyframes == correction.edge.match)[0])
@@ -145,19 +145,19 @@ def test_two_seconds_of_darkness_lose_no_pose(check_map):
 
 
 @pytest.mark.parametrize(
-    ("ring", "frames", "dark", "stories"),
+    ("ring", "frames", "dark", "hypotheses"),
     [
         (DRIFTING, ROUND, range(60, 64), [True]),
         (EXACT, [*ROUND[:80], *ROUND[140:]], (), [True, False]),  # 90 m between two frames
     ],
 )
 def test_a_gap_is_driven_over_first_and_carried_over_if_that_cannot_be(
-    monkeypatch, ring, frames, dark, stories
+    monkeypatch, ring, frames, dark, hypotheses
 ):
-    solve, asked = LoopClosing._solve, []
+    solve, tried = LoopClosing._solve, []
 
     def noted(self, map_, edge, *, driven):
-        asked.append(driven)
+        tried.append(driven)
         return solve(self, map_, edge, driven=driven)
 
     monkeypatch.setattr(LoopClosing, "_solve", noted)
@@ -165,10 +165,10 @@ def test_a_gap_is_driven_over_first_and_carried_over_if_that_cannot_be(
     assert len(slam.map.restarts) == 1
     assert not slam.map.unpredicted_restarts
     assert slam.corrections
-    assert asked[: len(stories)] == stories
+    assert tried[: len(hypotheses)] == hypotheses
 
 
-def test_where_no_speed_was_known_a_restart_is_a_guess():
+def test_where_no_speed_was_known_a_restart_is_unpredicted():
     """Lost at once, the map has no velocity to predict the gap with."""
     frames = [0.0, *ROUND[30:60]]
     slam, results = run(EXACT, frames)
@@ -176,12 +176,12 @@ def test_where_no_speed_was_known_a_restart_is_a_guess():
     assert slam.map.restarts == slam.map.unpredicted_restarts == [1]
 
 
-def test_past_a_guess_the_second_story_is_asked_for_too(monkeypatch):
+def test_past_an_unpredicted_restart_the_second_hypothesis_is_tried_too(monkeypatch):
     """It alone moves a sub-map as a whole, and there is no GAP edge to tell that it is needed."""
-    solve, asked = LoopClosing._solve, []
+    solve, tried = LoopClosing._solve, []
 
     def first_contradicted(self, map_, edge, *, driven):
-        asked.append(driven)
+        tried.append(driven)
         solved = solve(self, map_, edge, driven=driven)
         assert not (solved.graph.kind == GAP).any()
         consistent = solved.verdict.consistent and not driven
@@ -191,5 +191,5 @@ def test_past_a_guess_the_second_story_is_asked_for_too(monkeypatch):
     frames = [0.0, *ROUND[30:]]
     slam, _ = run(EXACT, frames, Oracle(EXACT, frames))
     assert slam.map.unpredicted_restarts == [1]
-    assert asked == [True, False]
+    assert tried == [True, False]
     assert len(slam.corrections) == 1

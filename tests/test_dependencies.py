@@ -7,6 +7,7 @@ import each other in a circle. Beside that a few libraries belong to one place e
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from graphlib import CycleError, TopologicalSorter
@@ -44,6 +45,12 @@ LEVELS: tuple[tuple[str, ...], ...] = (
 SIBLINGS = {
     ("vslam.loopclosure.verification", "vslam.frontend.matching"),
     ("vslam.loopclosure.verification", "vslam.frontend.pose"),
+}
+# A benchmark starts the command line in processes of its own: nothing comes back but files.
+STARTED = {
+    ("vslam.bench.execute", "vslam.cli.child"),
+    ("vslam.loopbench.cost", "vslam.loopbench.cost"),
+    ("vslam.run.warmup", "vslam.run.warmup"),
 }
 ONLY_IN = {
     "torch": "vslam.loopclosure.siamese",
@@ -88,11 +95,15 @@ def imports_of(source: str, module: str = "", *, package: bool = False) -> set[s
 
 
 def modules_of(names: set[str], known: set[str]) -> set[str]:
-    """The modules among imported names: ``from a.b import c`` names the module a.b, or a.b.c."""
-    found = {name for name in names if name in known}
-    deeper = {name.rpartition(".")[0] for name in found} & found
-    # ``from vslam.bench import execute`` needs the package only to find the module in it.
-    return found - {name for name in deeper if f"{name}." in " ".join(found)}
+    """The modules among imported names: ``from a.b import c`` needs the module a.b, unless c is a
+    module itself: then a.b is only where it lies."""
+    found = names & known
+    parents = {
+        name
+        for name in found
+        if (inside := {n for n in names if n.rpartition(".")[0] == name}) and inside <= known
+    }
+    return found - parents
 
 
 SOURCES = sources()
@@ -138,7 +149,10 @@ def test_the_reader_of_imports_sees_every_form():
     )
     found = imports_of(source, "p.q.r")
     assert found == {"a.b", "c", "c.d", "p.q", "p.q.e", "p.f", "p.f.g", "i", "j.k", "j.k.l"}
-    assert modules_of({"a", "a.b", "c", "c.D"}, {"a", "a.b", "c"}) == {"a.b", "c"}
+    known = {"a", "a.b", "c"}
+    assert modules_of({"a", "a.b", "c", "c.D"}, known) == {"a.b", "c"}
+    assert modules_of({"a", "a.b", "a.D"}, known) == {"a", "a.b"}
+    assert modules_of({"a"}, known) == {"a"}
 
 
 def test_the_modules_and_their_imports_are_found():
@@ -168,6 +182,16 @@ def test_an_upward_import_and_a_circle_would_be_seen():
     assert upward({"vslam.backend.fusion": {"vslam.frontend.orb"}})
     assert upward({"vslam.bench.table": {"vslam.cli.progress"}})
     assert set(circle({"a": {"b"}, "b": {"c"}, "c": {"a"}})) == {"a", "b", "c"}
+
+
+def test_no_module_is_started_by_name_from_below():
+    """``python -m vslam.x`` is an import that no reader of imports sees."""
+    started = {
+        (module, name)
+        for module, path in SOURCES.items()
+        for name in re.findall(r'"-m", "([a-z_.]+)"', path.read_text())
+    }
+    assert started == STARTED
 
 
 def test_every_granted_sibling_is_used():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from test_mapping import CAMERA, World, make_world
+from test_local_mapping import CAMERA, World, make_world
 
 from vslam.backend.bundle_adjustment import BundleSolution
 from vslam.backend.global_bundle_adjustment import adjust_globally

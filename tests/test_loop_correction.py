@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_mapping import CAMERA, World, make_world
+from test_local_mapping import CAMERA, World, make_world
 
 from vslam.backend.loop_correction import move_keyframes
 from vslam.geometry import inverse, se3_exp, transform
@@ -39,14 +39,14 @@ def test_nothing_changes_as_seen_from_the_anchor():
     anchored = [np.flatnonzero(a.first_keyframe[: world.map.n_landmarks] == k) for k in range(5)]
     assert min(map(len, anchored)) > 30
     before = [reprojection(world, k, anchored[k]) for k in range(5)]
-    reach = a.distance_range.copy()
+    distances = a.distance_range.copy()
     new = moved_poses(range(5))
     move_keyframes(world.map, np.arange(5), new)
     np.testing.assert_array_equal(a.T_cw[:5], new)
     for k in range(5):
         after = reprojection(world, k, anchored[k])
         np.testing.assert_allclose(after, before[k], rtol=1e-9, atol=1e-9)
-    np.testing.assert_array_equal(a.distance_range, reach)
+    np.testing.assert_array_equal(a.distance_range, distances)
 
 
 def test_only_the_named_keyframes_and_what_is_anchored_in_them_move():
@@ -62,7 +62,7 @@ def test_only_the_named_keyframes_and_what_is_anchored_in_them_move():
 
 
 def test_a_common_motion_leaves_nothing_to_refresh():
-    """Normals and reach follow a rigid motion of the whole map exactly."""
+    """Normals and distance ranges follow a rigid motion of the whole map exactly."""
     world = world_of_five()
     a, n = world.map.arrays, world.map.n_landmarks
     motion = se3_exp(np.array([3.0, -1.0, 2.0, 0.3, -0.8, 0.5]))
@@ -70,10 +70,10 @@ def test_a_common_motion_leaves_nothing_to_refresh():
     xyz = transform(motion, a.xyz[:n])
     move_keyframes(world.map, np.arange(5), new)
     np.testing.assert_allclose(a.xyz[:n], xyz, atol=1e-12)
-    normal, reach = a.normal[:n].copy(), a.distance_range[:n].copy()
+    normal, distances = a.normal[:n].copy(), a.distance_range[:n].copy()
     refresh_landmarks(a, np.arange(n), world.map.scales)
     np.testing.assert_allclose(normal, a.normal[:n], atol=1e-12)
-    np.testing.assert_allclose(reach, a.distance_range[:n], rtol=1e-12)
+    np.testing.assert_allclose(distances, a.distance_range[:n], rtol=1e-12)
 
 
 def test_landmarks_of_a_culled_anchor_move_with_the_next_that_sees_them(check_map):

@@ -267,7 +267,7 @@ def test_refresh_takes_the_descriptor_of_least_median_distance():
     assert crowds > 10
 
 
-def test_refresh_computes_mean_direction_and_reach():
+def test_refresh_computes_mean_direction_and_distance_range():
     map_ = random_map(3, 500)
     a = map_.arrays
     landmarks = map_.living_landmarks().astype(np.int32)

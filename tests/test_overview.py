@@ -142,22 +142,22 @@ def test_external_trajectory_is_evaluated_like_a_run(written, run_folder: Path):
 
 def test_external_trajectory_with_frames_missing(runs: Path, run_folder: Path, tmp_path: Path):
     whole = read_trajectory(run_folder / "trajectory.tum")
-    write_tum(tmp_path / "peer.tum", whole.select(np.arange(10, 150)))
-    found = collect([runs], [f"peer@05@brightness:1={tmp_path / 'peer.tum'}"])
-    assert any("peer has a pose for 140 of 150 frames of 05" in note for note in found.notes)
+    write_tum(tmp_path / "other.tum", whole.select(np.arange(10, 150)))
+    found = collect([runs], [f"ORB-SLAM3@05@brightness:1={tmp_path / 'other.tum'}"])
+    assert any("ORB-SLAM3 has a pose for 140 of 150 frames of 05" in note for note in found.notes)
     write_kitti(tmp_path / "short.txt", whole.T_wc[:9])
     with pytest.raises(InputError, match="9 poses but 150 timestamps"):
-        collect([runs], [f"peer@05={tmp_path / 'short.txt'}"])
+        collect([runs], [f"ORB-SLAM3@05={tmp_path / 'short.txt'}"])
 
 
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ("peer=x.txt", "of which sequence.*one of 00, 05"),
-        ("peer@07=x.txt", "of which sequence"),
+        ("ORB-SLAM3=x.txt", "of which sequence.*one of 00, 05"),
+        ("ORB-SLAM3@07=x.txt", "of which sequence"),
         ("x.txt", "NAME=FILE"),
         ("=x.txt", "NAME=FILE"),
-        ("peer@00=none.txt", "none.txt: cannot read"),
+        ("ORB-SLAM3@00=none.txt", "none.txt: cannot read"),
     ],
 )
 def test_external_trajectories_refused(runs: Path, text: str, part: str):
@@ -339,6 +339,25 @@ def test_different_alignments_are_not_compared(run_folder: Path, monocular: Path
     }  # fmt: skip
 
 
+def test_one_monocular_drive_does_not_hide_the_others():
+    mono = {"alignment": "sim3"}
+    runs = [
+        entry("bow", "00", 1.0),
+        entry("X", "00", 2.0),
+        entry("bow, mono", "05", 1.0),
+        entry("X", "05", 3.0),
+    ]
+    runs = [*runs[:2], *(run.model_copy(update=mono) for run in runs[2:])]
+    rows = make_rows(runs)
+    light = "brightness:1"
+    stereo = compare(rows, "bow", "X", light, "ate_rmse_m")
+    assert stereo is not None
+    assert [pair.drive.sequence for pair in stereo.pairs] == ["00"]
+    alone = compare(rows, "bow, mono", "X", light, "ate_rmse_m")
+    assert alone is not None
+    assert [pair.drive.sequence for pair in alone.pairs] == ["05"]
+
+
 def test_csv_has_a_line_for_each_row(written):
     report, out = written
     lines = list(csv.DictReader((out / "table.csv").open()))
@@ -461,7 +480,7 @@ def test_report_in_a_browser_as_wide_as_a_phone(written, tmp_path: Path):
 def test_command_line(runs: Path, tmp_path: Path, monkeypatch, capsys):
     runs = runs / "05-0-bow-0", runs / "05-0-none-0", runs / "stopped"
     words = ["vslam", "report", *runs, "--out", tmp_path / "made", "--trajectory"]
-    words.append(f"peer={runs[0] / 'trajectory.tum'}")
+    words.append(f"ORB-SLAM3={runs[0] / 'trajectory.tum'}")
     monkeypatch.setattr(sys, "argv", list(map(str, words)))
     with pytest.raises(SystemExit) as stop:
         cli.main()

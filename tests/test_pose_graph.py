@@ -14,7 +14,7 @@ from vslam.backend.pose_graph import (
     TREE,
     WEAK,
     PoseGraph,
-    consistency,
+    check_pose_graph,
     edge_errors,
     edge_sigmas,
     essential_graph,
@@ -244,7 +244,7 @@ def test_a_drifted_covisibility_edge_would_hold_the_drift():
     """What de-duplication is for: the same loop with and without the drifted edge beside it."""
     T_wc, loops, true = simulate(3)
     graph = chain_graph(T_wc, loops, true, reach=3)
-    alone = consistency(graph, optimise(graph, CONFIG), CONFIG)
+    alone = check_pose_graph(graph, optimise(graph, CONFIG), CONFIG)
     assert alone.consistent
     drifted = inverse(T_wc[loops[0][0]]) @ T_wc[loops[0][1]]
     both = replace(
@@ -254,7 +254,7 @@ def test_a_drifted_covisibility_edge_would_hold_the_drift():
         kind=np.concatenate([graph.kind, [COVISIBLE]]).astype(np.uint8),
         sigmas=np.concatenate([graph.sigmas, graph.sigmas[:1]]),
     )
-    assert not consistency(both, optimise(both, CONFIG), CONFIG).consistent
+    assert not check_pose_graph(both, optimise(both, CONFIG), CONFIG).consistent
 
 
 def test_edges_that_fusing_would_add_are_not_in_the_graph_before_it():
@@ -367,7 +367,7 @@ def simulate(
 
 def judge(graph: PoseGraph):
     T_cw = optimise(graph, CONFIG)
-    return T_cw, consistency(graph, T_cw, CONFIG)
+    return T_cw, check_pose_graph(graph, T_cw, CONFIG)
 
 
 def position_error(T_cw: np.ndarray) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_mapping import CAMERA, World, make_world
+from test_local_mapping import CAMERA, World, make_world
 from test_verification import forward, in_strip, link_pass
 
 from vslam.config import Config, RelocalizationConfig
@@ -14,7 +14,7 @@ from vslam.frontend.tracking import Frame, TrackingContext
 from vslam.geometry import inverse, se3_exp, se3_log
 from vslam.map import local_map
 
-TRACKER = TrackingContext.create(CAMERA, Config())
+CONTEXT = TrackingContext.create(CAMERA, Config())
 KEYFRAMES = 4
 
 
@@ -47,7 +47,7 @@ def lost_frame(world: World, T_cw: np.ndarray, *, mono: bool = False, among=None
 
 def find(world: World, frame: Frame, seed: int = 0) -> int:
     place, surroundings = local_map(world.map, 1, 1), local_map(world.map, 1, 80)
-    return relocalise(frame, place, surroundings, TRACKER, seed)
+    return relocalise(frame, place, surroundings, CONTEXT, seed)
 
 
 @pytest.mark.parametrize("mono", [False, True])
@@ -98,7 +98,7 @@ def test_a_frame_that_is_not_found_is_left_untracked(case):
         world = mapped_street()
         nothing = local_map(world.map, 1, 1)
         nothing = type(nothing)(*(array[:0] for array in nothing))
-        inliers = relocalise(frame, nothing, nothing, TRACKER, 0)
+        inliers = relocalise(frame, nothing, nothing, CONTEXT, 0)
     else:
         frame.T_cw = se3_exp(np.ones(6))
         inliers = find(world, frame)

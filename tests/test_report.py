@@ -18,10 +18,10 @@ from vslam.evaluation.trajectories import evaluate_trajectory, read_pair
 from vslam.features import TrackingState, TrackResult
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.report.folder import write_results
-from vslam.report.maps import loop_closing, top_view
 from vslam.report.render import headlines
 from vslam.report.schema import ReportJson
 from vslam.report.summary import summarize
+from vslam.report.trajectory_figures import loop_closing, top_view
 from vslam.run.outcome import RunOutcome, RunSettings, matched_ground_truth
 from vslam.trajectory import Trajectory, read_trajectory
 

@@ -10,14 +10,14 @@ from ring import CAMERA
 
 from vslam.backend.pose_graph import GAP, LOOP, TREE, WEAK, PoseGraph, edge_sigmas
 from vslam.backend.similarity_graph import (
+    check_similarity_graph,
     edge_errors,
+    loop_in_new_units,
     move_keyframes_similarly,
     optimise_similarities,
-    rescaled_loop,
     rigid,
     scale_of,
     similarity,
-    similarity_consistency,
 )
 from vslam.config import PoseGraphConfig
 from vslam.features import Features
@@ -98,7 +98,7 @@ def test_a_lap_whose_scale_drifted_closes():
     assert after[-1] < 0.2
     assert after.max() < 2.0
     assert scale_of(found[-1]) == pytest.approx(growth ** -(n - 1), rel=0.03)
-    verdict = similarity_consistency(graph, start, found, CONFIG)
+    verdict = check_similarity_graph(graph, start, found, CONFIG)
     assert verdict.consistent
     assert verdict.closed == 1
 
@@ -118,7 +118,7 @@ def test_where_tracking_was_lost_the_error_of_a_lap_spreads_if_the_camera_drove_
         graph = chain(estimate, *loop, after=after, kind=kind)
         start = inverses(graph.T_cw)
         found = optimise_similarities(graph, start, CONFIG)
-        assert similarity_consistency(graph, start, found, CONFIG).consistent
+        assert check_similarity_graph(graph, start, found, CONFIG).consistent
         unit = np.linalg.norm(np.diff(found[:, :3, 3], axis=0), axis=1)
         unit /= np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)
         worst[kind] = np.abs(np.log(np.delete(unit, after))).max()
@@ -132,7 +132,7 @@ def test_a_scale_that_no_drift_explains_is_refused():
     graph = chain(truth, inverse(truth[0]) @ truth[-1], 8.0)
     start = inverses(graph.T_cw)
     found = optimise_similarities(graph, start, CONFIG)
-    assert not similarity_consistency(graph, start, found, CONFIG).consistent
+    assert not check_similarity_graph(graph, start, found, CONFIG).consistent
 
 
 def test_a_consistent_graph_stays_as_it_is():
@@ -205,7 +205,7 @@ def test_a_correction_leaves_every_keyframe_its_picture():
 def test_a_closed_loop_is_kept_in_the_units_of_today():
     T = se3_exp(np.array([0.4, 0.0, 1.0, 0.0, 0.1, 0.0]))
     edge = LoopEdge(2, 0, 1.0, True, "closed", T_query_match=T, scale=3.0)
-    new = rescaled_loop(edge, np.array([2.0, 1.0, 0.5]))
+    new = loop_in_new_units(edge, np.array([2.0, 1.0, 0.5]))
     np.testing.assert_allclose(new.T_query_match[:3, 3], 2.0 * T[:3, 3])
     assert new.scale == pytest.approx(3.0 * 0.5 / 2.0)
     assert replace(new, T_query_match=None, scale=3.0) == replace(edge, T_query_match=None)

@@ -146,6 +146,18 @@ def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, mon
     assert bytes_of(*run(corridor, config, threads=2)) == late
 
 
+def test_the_map_cannot_be_read_while_a_keyframe_is_mapped(corridor):
+    slam = Slam(corridor.camera, EAGER, threads=1)
+    for k in range(2):
+        slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
+    assert slam.is_mapping
+    with pytest.raises(RuntimeError, match=r"finish\(\) first"):
+        _ = slam.map
+    slam.finish()
+    assert not slam.is_mapping
+    assert slam.map.n_keyframes == 2
+
+
 def test_map_stays_sound_with_a_keyframe_each_frame(corridor, check_map):
     """Fusion merges landmarks that the frame in hand tracks both."""
     slam, results = run(corridor, EAGER)

@@ -12,7 +12,7 @@ import torch
 from siamese_worlds import SMALL, small_network, small_settings, views
 
 from vslam.errors import InputError, ResultsError
-from vslam.loopclosure.benchmark import average_precision, precision_recall
+from vslam.loopclosure.precision_recall import average_precision, precision_recall
 from vslam.loopclosure.siamese import training
 from vslam.loopclosure.siamese.augmentation import STRONG, Augmentation, augment
 from vslam.loopclosure.siamese.branches import Layout

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_mapping import CAMERA, World, make_world
+from test_local_mapping import CAMERA, World, make_world
 
 from vslam.config import VerificationConfig
 from vslam.geometry import inverse, se3_exp, se3_log

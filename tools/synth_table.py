@@ -84,8 +84,8 @@ def main() -> None:
             # Without loop closing vslam runs once for each drive.
             systems = [*OURS] if light == "clean" and "aliased" not in drive.title else ["vslam"]
             systems += [ORBSLAM3] if options.orbslam3_python else []
-            side = ", mono" if options.sensor == "mono" else ""
-            wanted = {f"{drive.title}, {light}, {system}{side}": system for system in systems}
+            sensor = ", mono" if options.sensor == "mono" else ""
+            wanted = {f"{drive.title}, {light}, {system}{sensor}": system for system in systems}
             missing = {key: system for key, system in wanted.items() if key not in kept}
             if not missing:
                 continue

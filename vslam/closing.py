@@ -25,18 +25,18 @@ from vslam.backend.loop_correction import move_keyframes
 from vslam.backend.pose_graph import (
     GAP,
     WEAK,
-    Consistency,
+    GraphCheck,
     PoseGraph,
-    consistency,
+    check_pose_graph,
     essential_graph,
     optimise,
 )
 from vslam.backend.similarity_graph import (
+    check_similarity_graph,
+    loop_in_new_units,
     move_keyframes_similarly,
     optimise_similarities,
-    rescaled_loop,
     rigid,
-    similarity_consistency,
 )
 from vslam.camera import Camera
 from vslam.config import Config
@@ -117,7 +117,7 @@ class LoopClosing:
         self._closed.append(edge)
         if self._camera.monocular:
             growth = move_keyframes_similarly(map_, keyframes, solved.S_wc)
-            self._closed = [rescaled_loop(closed, growth) for closed in self._closed]
+            self._closed = [loop_in_new_units(closed, growth) for closed in self._closed]
         else:
             move_keyframes(map_, keyframes, solved.T_cw)
         fuse_loop(map_, edge, query_side, match_side, self._camera, config)
@@ -148,12 +148,12 @@ class LoopClosing:
             start = inverses(now) if driven else self._similarly_aligned(map_, edge)
             start = start[graph.keyframes]
             S_wc = optimise_similarities(graph, start, config)
-            verdict = similarity_consistency(graph, start, S_wc, config)
+            verdict = check_similarity_graph(graph, start, S_wc, config)
             return _Solution(graph, inverses(rigid(S_wc)), S_wc, verdict)
         start = now if driven else self._aligned(map_, edge)
         graph = replace(graph, T_cw=start[graph.keyframes])
         T_cw = optimise(graph, config)
-        return _Solution(graph, T_cw, inverses(T_cw), consistency(graph, T_cw, config))
+        return _Solution(graph, T_cw, inverses(T_cw), check_pose_graph(graph, T_cw, config))
 
     def _aligned(self, map_: Map, edge: LoopEdge) -> Matrix:
         """Poses ``T_cw`` to start from: a sub-map that the loop joins is moved to where the loop
@@ -234,7 +234,7 @@ class _Solution:
     graph: PoseGraph
     T_cw: Matrix
     S_wc: Matrix
-    verdict: Consistency
+    verdict: GraphCheck
 
 
 @dataclass(frozen=True)

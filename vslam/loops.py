@@ -13,7 +13,7 @@ class LoopCandidate:
     """A keyframe that a detector takes for the place of another.
 
     Attributes:
-        query: keyframe that asks; -1 for a frame that is not in the map (relocalisation).
+        query: keyframe whose place is looked for; -1 for a frame that is not in the map.
         match: keyframe of the same place, alive in the map.
         score: the detector's own measure, greater is more alike.
     """

@@ -1,7 +1,8 @@
 """Local mapping beside tracking, with the same result on every machine.
 
 The mapping of a keyframe starts when it is inserted, in a thread of its own, and is merged at a
-fixed point that the caller chooses by counting frames, never by looking whether it is done.
+point that is found by counting frames, never by looking whether it is done; with one thread in all
+it runs where it is merged.
 Between the two the thread is the only one to touch the map; tracking sees the copies that the
 last merge left.
 """
@@ -122,7 +123,7 @@ class MappingThread:
             The keyframes that the two frames are.
         """
         self._write_counts()
-        map_, views = self._map, (start.first, start.second)
+        map_, frames = self._map, (start.first, start.second)
         one, two = map_two_views(
             map_,
             (start.first.features, start.second.features),
@@ -136,8 +137,8 @@ class MappingThread:
         if one > 0:
             map_.begin_submap(one, self.reference, predicted=start.predicted)
         map_.parents[two] = one
-        for keyframe, view in zip((one, two), views, strict=True):
-            self._closing.process(map_, keyframe, view.features, view.image)
+        for keyframe, frame in zip((one, two), frames, strict=True):
+            self._closing.process(map_, keyframe, frame.features, frame.image)
         self._set_newest(two, start.second)
         self._observe(start.second, two)
         return one, two
@@ -158,6 +159,11 @@ class MappingThread:
         self._closing.finish(self._map)
         if self.n_keyframes:
             self._copy_view()
+
+    def is_due(self, frame: int) -> bool:
+        """Whether pending mapping is to be merged at a frame, by counting frames alone."""
+        waited = frame - self.last_frame
+        return self.busy and waited >= self._config.keyframes.merge_after_frames
 
     def count(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
         """Remember which landmarks a frame should have seen and did, until the map is free."""

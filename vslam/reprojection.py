@@ -1,4 +1,7 @@
-"""Reprojection errors: how observations are laid out, and the one test that tells inliers.
+"""Reprojection errors: how observations are laid out, and the test that tells inliers.
+
+``chi_square_ratio`` is for those who only test; optimisers, which need the ``residual``, test that
+with ``chi_square``.
 
 An observation is a row ``u, v, u_right`` in pixels; ``u_right`` is NaN without a stereo match, and
 every kernel decides monocular or stereo by that alone.
@@ -26,41 +29,45 @@ def stack_uvr(xy: NDArray[np.floating], u_right: NDArray[np.floating]) -> Matrix
 
 
 @inner_kernel
-def chi_square_ratio(x, y, z, uvr, inverse_sigma2, intrinsics):
+def unpacked(intrinsics):
+    """``(5,)`` fx, fy, cx, cy, bf as a tuple: numbers stay in registers, an array is read anew."""
+    return intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3], intrinsics[4]
+
+
+@inner_kernel
+def chi_square_ratio(x, y, z, u, v, u_right, inverse_sigma2, pinhole):
     """Squared reprojection error of a point in the camera over its chi-square limit: at most 1 for
     an inlier. The point must lie in front of the camera.
 
     Args:
-        uvr: ``(3,)`` observation; inverse_sigma2: inverse variance of a pixel coordinate.
-        intrinsics: ``(5,)`` fx, fy, cx, cy, bf.
+        u, v, u_right: float64 observation; inverse_sigma2: inverse variance of a pixel coordinate.
+        pinhole: intrinsics as ``unpacked`` gives them.
     """
-    fx, fy, cx, cy, bf = intrinsics
-    u = fx * x / z + cx
-    chi2 = (uvr[0] - u) ** 2 + (uvr[1] - fy * y / z - cy) ** 2
+    fx, fy, cx, cy, bf = pinhole
+    predicted = fx * x / z + cx
+    chi2 = (u - predicted) ** 2 + (v - fy * y / z - cy) ** 2
     limit = CHI2_MONO
-    if not np.isnan(uvr[2]):
-        chi2 += (uvr[2] - u + bf / z) ** 2
+    if not np.isnan(u_right):
+        chi2 += (u_right - predicted + bf / z) ** 2
         limit = CHI2_STEREO
     return chi2 * inverse_sigma2 / limit
 
 
 @inner_kernel
-def residual(x, y, z, uvr, intrinsics, r):
-    """Reprojection error of a point in the camera into ``r`` (3,), 0 for a missing u_right;
-    returns whether the observation is stereo."""
-    fx, fy, cx, cy, bf = intrinsics
+def residual(x, y, z, u, v, u_right, pinhole):
+    """Reprojection error of a point in the camera in u, v and u_right, 0 for a missing one, and
+    whether the observation is stereo. Arguments as of ``chi_square_ratio``."""
+    fx, fy, cx, cy, bf = pinhole
     iz = 1.0 / z
-    u = fx * x * iz + cx
-    r[0] = uvr[0] - u
-    r[1] = uvr[1] - (fy * y * iz + cy)
-    stereo = not np.isnan(uvr[2])
-    r[2] = uvr[2] - (u - bf * iz) if stereo else 0.0
-    return stereo
+    predicted = fx * x * iz + cx
+    stereo = not np.isnan(u_right)
+    r_right = u_right - (predicted - bf * iz) if stereo else 0.0
+    return u - predicted, v - (fy * y * iz + cy), r_right, stereo
 
 
 @inner_kernel
-def chi_square(r, stereo, inverse_sigma2):
+def chi_square(r_u, r_v, r_right, stereo, inverse_sigma2):
     """Squared error of a ``residual`` in variances, and the limit of an inlier, which is where the
     Huber loss becomes linear, too."""
-    chi2 = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]) * inverse_sigma2
+    chi2 = (r_u * r_u + r_v * r_v + r_right * r_right) * inverse_sigma2
     return chi2, CHI2_STEREO if stereo else CHI2_MONO

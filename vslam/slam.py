@@ -88,8 +88,9 @@ class Slam:
         """Keyframes, landmarks and observations.
 
         Raises:
-            RuntimeError: a keyframe is being mapped (``is_mapping``).
+            RuntimeError: a keyframe is being mapped: look at ``is_mapping``, or call ``finish()``.
         """
+        self._check_finished()
         return self._mapping.map
 
     @property
@@ -138,7 +139,7 @@ class Slam:
         """
         clock = _Clock(dict(stage_ms or {}))
         frame = self._next_frame(features, timestamp, image)
-        if self._mapping_is_due(frame):
+        if self._mapping.is_due(frame.index):
             self._merge()
         clock.lap("wait_for_mapping")
         if self._mapping.n_keyframes == 0:
@@ -197,10 +198,10 @@ class Slam:
 
     def keyframe_trajectory(self) -> Trajectory:
         """Final pose of every keyframe that was not culled. Call ``finish()`` first."""
-        self._check_finished()
-        living = self.map.living_keyframes()
-        times = np.array([self.map.timestamps[k] for k in living], np.float64)
-        return Trajectory(times, inverses(self.map.arrays.T_cw[living]))
+        map_ = self.map
+        living = map_.living_keyframes()
+        times = np.array([map_.timestamps[k] for k in living], np.float64)
+        return Trajectory(times, inverses(map_.arrays.T_cw[living]))
 
     def _check_finished(self) -> None:
         if self._mapping.busy:
@@ -282,7 +283,7 @@ class Slam:
         if self._lost_frames < patience or not self._can_start(frame):
             return False
         frame.landmark[:] = -1
-        self._insert_keyframe(frame)
+        self._insert_keyframe(frame, predicted=self._velocity is not None)
         self._velocity = None
         self._lost_frames = 0
         self.frame = frame
@@ -313,8 +314,8 @@ class Slam:
         self._merge()
         start = start.at_speed(self._velocity, self.config.initialization.max_rescaling)
         keyframes = self._mapping.begin(start)
-        for keyframe, view in zip(keyframes, (start.first, frame), strict=True):
-            self._poses.replace(view.index, keyframe)
+        for keyframe, of in zip(keyframes, (start.first, frame), strict=True):
+            self._poses.replace(of.index, keyframe)
         frame.T_cw = self._poses.pose(frame.index)
         self._velocity = start.velocity
         self._lost_frames = 0
@@ -340,15 +341,11 @@ class Slam:
             return needs_monocular_keyframe(evidence, self.config.keyframes)
         return needs_keyframe(evidence, self.config.keyframes)
 
-    def _insert_keyframe(self, frame: Frame) -> None:
-        """Make a keyframe of the frame placed last."""
+    def _insert_keyframe(self, frame: Frame, *, predicted: bool = True) -> None:
+        """Make a keyframe of the frame placed last (``MappingThread.insert``)."""
         self._merge(frame)
-        self._mapping.insert(frame, predicted=self._velocity is not None)
+        self._mapping.insert(frame, predicted=predicted)
         self._poses.replace(frame.index, self._mapping.reference)
-
-    def _mapping_is_due(self, frame: Frame) -> bool:
-        waited = frame.index - self._mapping.last_frame
-        return self._mapping.busy and waited >= self.config.keyframes.merge_after_frames
 
     def _merge(self, current: Frame | None = None) -> None:
         """Show tracking what local mapping has done: poses, landmarks, merged identities.

@@ -34,7 +34,7 @@ class SiameseDetector:
         self._known = np.zeros(64, np.bool_)  # keyframes added with an image
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Embed and remember a keyframe. Without its image it can be neither asked nor found."""
+        """Embed and remember a keyframe. Without its image it can be neither query nor match."""
         while keyframe >= len(self._known):
             more = len(self._known) // 2
             self._descriptors = np.pad(self._descriptors, ((0, more), (0, 0)))

@@ -1,87 +1,119 @@
-"""Images of places, and which of them show the same one: what the networks learn from.
-
-A source is one set of images with a matrix that says for each pair: same place (1), another place
-(-1), or not known and never used (0). Images of different sources show different places, unless
-the sources are of one family (the same region photographed twice): then nothing is known.
-
-A source is named on the command line as ``KIND:PATH``, or ``KIND:PATH[option=value,...]``. The
-kinds and their options:
-
-``kitti:DIR``: left grey images of a KITTI sequence with ground-truth poses (`kitti_source`).
-    ``seq``: the sequence, 00 without it.
-    ``first``, ``last``: numbers of the first and the last image, all images without them.
-    ``every``: 2 for every second image.
-    ``frames``: ranges of numbers in place of first and last, ``frames=0-249+1500-1699``.
-    ``near``: metres within which two images show one place, 5 without it.
-    ``truth``: ``.mat`` file with a matrix of loops, which then says what is the same place.
-``fabmap:DIR``: Oxford CityCentre or NewCollege, Cummins and Newman 2008 (`fabmap_source`).
-    ``truth``: ``.mat`` file with the matrix of loops, the first one in the folder without it.
-    ``side``: ``left`` or ``right`` camera, where the matrix has one row for both; left without it.
-``pairs:DIR``: what ``vslam synth --pairs`` wrote (`pairs_source`); no options.
-``photos:DIR``: folders of photographs with a NOTES.txt (`photo_source`); no options.
-``pack:FILE.npz``: what ``vslam export places`` wrote of any of these (`pack`); no options.
-"""
+"""One source of images: the type that all readers return, and what several of them need."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.fabmap_source import read_fabmap
-from vslam.loopclosure.siamese.kitti_source import read_kitti
-from vslam.loopclosure.siamese.pack import read_pack, write_pack
-from vslam.loopclosure.siamese.pairs_source import read_pairs
-from vslam.loopclosure.siamese.photo_source import read_photos
-from vslam.loopclosure.siamese.source import DIFFERENT, SAME, UNKNOWN, ImageSource
+from vslam.loopclosure.siamese.images import Fit, Size, read_grey, to_size
 
-__all__ = [
-    "DIFFERENT",
-    "SAME",
-    "UNKNOWN",
-    "ImageSource",
-    "open_source",
-    "split_spec",
-    "write_pack",
-]
-
-# Of each kind: its reader and the names of its options.
-_READERS: dict[str, tuple[Callable[..., list[ImageSource]], tuple[str, ...]]] = {
-    "kitti": (read_kitti, ("seq", "first", "last", "every", "frames", "truth", "near")),
-    "fabmap": (read_fabmap, ("truth", "side")),
-    "pairs": (read_pairs, ()),
-    "photos": (read_photos, ()),
-    "pack": (read_pack, ()),
-}
+SAME, UNKNOWN, DIFFERENT = 1, 0, -1
+_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp"}
 
 
-def split_spec(spec: str) -> tuple[str, str, dict[str, str]]:
-    """``kind:path[key=value,...]`` in its parts; no path where it is spelled otherwise."""
-    kind, _, rest = spec.partition(":")
-    found = re.fullmatch(r"(.+?)(?:\[(.*)\])?", rest)
-    if found is None:
-        return kind, "", {}
-    items = (item.split("=", 1) for item in (found[2] or "").split(",") if "=" in item)
-    return kind, found[1], dict(items)
+@dataclass(frozen=True)
+class ImageSource:
+    """One source of N images.
+
+    Attributes:
+        name: of the source, part of every image's name.
+        family: sources of one family may show the same places.
+        names: of the N images, ``folder/file``.
+        images: N files, or their encoded bytes as ``(B,)`` uint8.
+        relation: ``(N, N)`` int8, symmetric, 1 same, -1 different, 0 unknown; the diagonal is 1:
+            an image and another augmentation of it.
+        unit: ``(N,)`` int32; images of one unit (a folder, a stretch of road) stay together when
+            training and validation are divided.
+        calibration: ``(8,)`` or ``(9,)`` fx fy cx cy k1 k2 p1 p2 [k3], None if rectified.
+        is_query: ``(N,)`` bool, the queries of a benchmark, which are searched for among the other
+            images; None for a drive, where each image is searched for among those long before it.
+    """
+
+    name: str
+    family: str
+    names: tuple[str, ...]
+    images: tuple[Path | NDArray[np.uint8], ...]
+    relation: NDArray[np.int8]
+    unit: NDArray[np.int32]
+    calibration: NDArray[np.float64] | None = None
+    is_query: NDArray[np.bool_] | None = None
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def read(self, index: int, size: Size, fit: Fit) -> NDArray[np.uint8]:
+        """The image, undistorted and of that size.
+
+        Raises:
+            UnreadableImageError: missing or damaged.
+        """
+        return to_size(self.grey(index), size, fit)
+
+    def grey(self, index: int) -> NDArray[np.uint8]:
+        """The image, undistorted, ``(H, W)``.
+
+        Raises:
+            UnreadableImageError: missing or damaged.
+        """
+        image = read_grey(self.images[index], self.names[index])
+        return image if self.calibration is None else undistorted(image, self.calibration)
+
+    def select(self, chosen: NDArray[np.int64]) -> ImageSource:
+        """The images ``chosen``, in their order."""
+        return replace(
+            self,
+            names=tuple(self.names[i] for i in chosen),
+            images=tuple(self.images[i] for i in chosen),
+            relation=self.relation[np.ix_(chosen, chosen)],
+            unit=self.unit[chosen],
+            is_query=None if self.is_query is None else self.is_query[chosen],
+        )
 
 
-def open_source(spec: str) -> list[ImageSource]:
-    """Open ``kind:path[options]``, see the module.
+def undistorted(image: NDArray[np.uint8], calibration: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Remove radial and tangential distortion (Brown's model), same size and camera matrix."""
+    import cv2
+
+    fx, fy, cx, cy = calibration[:4]
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    return np.asarray(cv2.undistort(image, K, calibration[4:]), np.uint8)
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The image files of a folder in the order of their names; none if there is no such folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
+
+
+def names_of(files: Iterable[Path]) -> tuple[str, ...]:
+    """Names of images in a source: ``folder/file``."""
+    return tuple(f"{file.parent.name}/{file.name}" for file in files)
+
+
+def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
+    """The first square matrix of a ``.mat`` file, ``(N, N)`` bool: which images close a loop.
 
     Raises:
-        InputError: unknown kind or option, or data that is missing or malformed.
+        InputError: no such file, or no such matrix in it.
     """
-    kind, path, options = split_spec(spec)
-    if kind not in _READERS or not path:
-        raise InputError(
-            f"--data {spec}: must be KIND:PATH, with one of the kinds {', '.join(_READERS)}."
-        )
-    reader, known = _READERS[kind]
-    if wrong := [key for key in options if key not in known]:
-        choice = f"choose from {', '.join(known)}" if known else "this kind takes none"
-        raise InputError(f"--data {spec}: unknown option '{wrong[0]}'; {choice}.")
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
     try:
-        return reader(Path(path).expanduser(), **options)
-    except ValueError as error:
-        raise InputError(f"--data {spec}: an option is not a number.") from error
+        content = loadmat(path)
+    except (OSError, ValueError, TypeError, NotImplementedError, MatReadError) as error:
+        raise InputError(f"{path}: not a readable .mat file; download it again.") from error
+    matrices = [m for key, m in content.items() if not key.startswith("__")]
+    matrices = [m for m in matrices if m.ndim == 2 and m.shape[0] == m.shape[1] and m.size > 1]
+    if not matrices:
+        raise InputError(f"{path}: no ground truth in it (no square matrix with a match).")
+    found = matrices[0].toarray() if hasattr(matrices[0], "toarray") else matrices[0]
+    if not found.any():
+        raise InputError(f"{path}: no ground truth in it (no square matrix with a match).")
+    return np.asarray(found != 0)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.source import (
+from vslam.loopclosure.siamese.image_sources import (
     DIFFERENT,
     SAME,
     UNKNOWN,

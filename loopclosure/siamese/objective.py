@@ -9,14 +9,14 @@ from scipy.optimize import minimize
 from torch import Tensor
 from torch.nn import functional
 
-from vslam.loopclosure.benchmark import balanced_accuracy, summary
+from vslam.loopclosure.precision_recall import balanced_accuracy, summary
 from vslam.loopclosure.siamese.augmentation import Augmentation, augment
 from vslam.loopclosure.siamese.data import Collection
 from vslam.loopclosure.siamese.image_sources import DIFFERENT, SAME, UNKNOWN
 from vslam.loopclosure.siamese.images import to_tensor
 from vslam.loopclosure.siamese.siamese import DistanceHead, SiameseNetwork
 
-_MOST_SAME = 5  # images of its place that a validation image asks for
+_MOST_SAME = 5  # images of its place that a validation image is to find
 
 
 def cross_entropy(logits: Tensor, same: Tensor) -> Tensor:
@@ -79,15 +79,15 @@ def validate(
     strength: Augmentation,
     device: torch.device,
 ) -> tuple[dict[str, float], NDArray[np.float32], NDArray[np.bool_]]:
-    """Retrieval among the validation images: each, augmented, asks for its place.
+    """Retrieval among the validation images: each, augmented, is a query.
 
     All pairs whose relation is known count, not a balanced choice: many more of two places than
     of one, as in a SLAM run; of its own place at most five. The augmentations and this choice are
     the same at every call.
 
     Returns:
-        Figures of :func:`vslam.loopclosure.benchmark.summary`, and the scores and labels of the
-        pairs behind them.
+        Figures of :func:`vslam.loopclosure.precision_recall.summary`, and the scores and labels
+        of the pairs behind them.
     """
     images = collection.images[chosen]
     changed = np.stack(

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError, ResultsError
+from vslam.loopclosure.siamese.image_sources import ImageSource
 from vslam.loopclosure.siamese.images import Fit, Size
-from vslam.loopclosure.siamese.source import ImageSource
 
 
 def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> None:

@@ -55,7 +55,7 @@ def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
     if views == 1:
         return a @ b.T
     a, b = _by_view(a, views), _by_view(b, views)
-    # In this order: b is a map of thousands of keyframes, a the one that asks for its place.
+    # In this order: b is a map of thousands of keyframes, a the query.
     alike = (b.flatten(0, 1) @ a.flatten(0, 1).T).view(len(b), views, len(a), views)
     most = torch.einsum("nv,mw->nmvw", _lengths(a), _lengths(b))
     return aligned(alike.permute(2, 0, 3, 1), most)

@@ -1,4 +1,4 @@
-"""The commands ``vslam bench`` and ``vslam report``."""
+"""The command ``vslam bench``."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.options import KITTI_ROOT, Data, Dataset, Thresholds, Weights
+from vslam.cli.report import write_overview_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from vslam.bench.execute import CellOutcome, RunOptions
     from vslam.bench.grid import Cell
 
-_BENCH_EXAMPLES = """
+_EXAMPLES = """
 [b]Examples[/b]
 
   vslam bench --data ~/kitti --seqs 00-05 --perturb none,brightness --detectors none,bow --runs 3
@@ -27,21 +28,11 @@ _BENCH_EXAMPLES = """
 
 The same command again goes on where it was stopped. docs/bench.md tells more.
 """
-_REPORT_EXAMPLES = """
-[b]Examples[/b]
-
-  vslam report bench
-
-  vslam report runs/20261121-1* other/bench --out comparison
-
-  vslam report bench --trajectory ORB-SLAM3@00=orbslam3/00.txt
-"""
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    app.command(epilog=_BENCH_EXAMPLES)(bench)
-    app.command(epilog=_REPORT_EXAMPLES)(report)
+    """Add the command to the application."""
+    app.command(epilog=_EXAMPLES)(bench)
 
 
 def bench(
@@ -128,7 +119,7 @@ def bench(
     for cell, why in progress.failed.items():
         typer.echo(f"failed: {cell.name}: {why}", err=True)
     if progress.reports and not stopped:
-        _write([out], [], out, quiet=quiet)
+        write_overview_of([out], [], out, quiet=quiet)
     counts = (
         f"{len(progress.reports)} of {len(cells)} cells finished, {len(progress.failed)} failed"
     )
@@ -137,33 +128,6 @@ def bench(
         typer.echo(f"{'stopped: ' if stopped else ''}{counts}{again}")
     if stopped or progress.failed:
         raise typer.Exit(1)
-
-
-def report(
-    runs: Annotated[list[Path], typer.Argument(help="Folders of runs, or folders of those.")],
-    trajectory: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME[@SEQ[@PERTURB]]=FILE",
-            help="Trajectory of another system, KITTI or TUM format, to compare with; aligned as "
-            "the runs of that sequence are.",
-        ),
-    ] = None,
-    out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("report"),
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing.")] = False,
-) -> None:
-    """Write one report of finished runs: medians, detectors compared, trajectories, curves."""
-    _write(runs, trajectory or [], out, quiet=quiet)
-
-
-def _write(runs: list[Path], trajectories: list[str], out: Path, *, quiet: bool) -> None:
-    from vslam.overview import write_overview
-
-    written = write_overview(runs, trajectories, out)
-    if not quiet:
-        for note in written.notes:
-            typer.echo(f"note: {note}", err=True)
-        typer.echo(f"{out / 'report.html'}: {len(written.runs)} runs")
 
 
 def _open_all(

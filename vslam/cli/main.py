@@ -9,8 +9,18 @@ from typing import Annotated
 
 import typer
 
-from vslam import __version__
-from vslam.cli import bench, evaluate, info, loops, perturb, run, synth, train, vocabulary
+from vslam.cli import (
+    bench,
+    evaluate,
+    info,
+    loops,
+    perturb,
+    report,
+    run,
+    synth,
+    train,
+    vocabulary,
+)
 from vslam.errors import InputError, ResultsError
 
 app = typer.Typer(
@@ -20,7 +30,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-for _group in (run, evaluate, perturb, info, bench, synth, train, vocabulary, loops):
+for _group in (run, evaluate, perturb, info, bench, report, synth, train, vocabulary, loops):
     _group.register(app)
 
 
@@ -29,7 +39,9 @@ def version(
     show: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
 ) -> None:
     if show:
-        typer.echo(__version__)
+        from importlib.metadata import version as installed
+
+        typer.echo(installed("vslam"))
         raise typer.Exit
 
 

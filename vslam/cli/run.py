@@ -102,16 +102,10 @@ def run(
         raise InputError("--compare-loops: two runs drop different frames; leave out --realtime.")
 
     from vslam.cli.progress import announce, progress_bar, render_bar
-    from vslam.cli.summary import print_summary
     from vslam.config import Config, load_config
     from vslam.datasets import open_sequence
     from vslam.datasets.perturbation import parse_perturbation
     from vslam.machine import available_cores
-    from vslam.report.folder import create_run_folder, write_results
-    from vslam.run.outcome import RunSettings
-    from vslam.run.pipeline import run_sequence, with_comparison
-    from vslam.run.recorder import NullRecorder, RerunRecorder
-    from vslam.run.warmup import compile_kernels, is_cold
 
     thresholds = Config() if config is None else load_config(config)
     with render_bar(shown=not quiet) as on_render:
@@ -121,6 +115,15 @@ def run(
             on_render=on_render,
         )  # fmt: skip
     perturbation = parse_perturbation(perturb, seed, sequence.timestamps)
+
+    # Bad input has been refused by now; what follows takes a second to import.
+    from vslam.cli.summary import print_summary
+    from vslam.report.folder import create_run_folder, write_results
+    from vslam.run.outcome import RunSettings
+    from vslam.run.pipeline import run_sequence, with_comparison
+    from vslam.run.recorder import NullRecorder, RerunRecorder
+    from vslam.run.warmup import compile_kernels, is_cold
+
     settings = RunSettings(
         dataset=dataset,
         sequence=seq,

@@ -54,7 +54,7 @@ def print_summary(report: ReportJson, folder: Path) -> None:
             *_latency(report),
             *(error_rows(report) if evaluated else [("evaluation", f"{report.evaluation_remark}")]),
             ("loops", _loops(report)),
-            ("speed", f"{report.fps:.1f} fps" if report.fps else "-"),
+            ("speed", f"{report.fps:.1f} fps"),
             ("map", f"{report.keyframes} keyframes, {report.landmarks} landmarks{submaps}"),
             ("folder", str(folder)),
             *((name, str(folder / file)) for name, file in _LOOK_AT if (folder / file).exists()),
@@ -77,11 +77,11 @@ def _scale(report: ReportJson) -> Rows:
 
 
 def _loops(report: ReportJson) -> str:
-    judged = report.revisit_stretches is not None
+    with_truth = report.revisit_stretches is not None
     if report.detector == "none":
-        return f"not looked for, {report.loops_missed} missed" if judged else "not looked for"
+        return f"not looked for, {report.loops_missed} missed" if with_truth else "not looked for"
     counts = [f"{report.loops_closed} closed"]
-    if judged:
+    if with_truth:
         counts += [f"{report.loops_missed} missed", f"{report.loops_wrong} wrong"]
     return ", ".join([*counts, f"{report.loops_rejected} candidates rejected"])
 

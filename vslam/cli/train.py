@@ -64,7 +64,7 @@ def train(
     data: DataSources,
     preset: Annotated[
         PresetName, typer.Option(help="Settings; [b]paper[/b]'s, or better ones.")
-    ] = ("paper"),
+    ] = "paper",
     settings: Annotated[
         Path | None, typer.Option(help="JSON with settings, instead of the preset's.")
     ] = None,
@@ -114,11 +114,11 @@ def train(
     """Train a loop detector; writes weights, log, pairs, checkpoints and a model card."""
     from vslam.loopclosure.siamese.branches import CapsuleBranch
     from vslam.loopclosure.siamese.data import load, refuse_test_data
-    from vslam.loopclosure.siamese.image_sources import open_source
     from vslam.loopclosure.siamese.images import parse_size
     from vslam.loopclosure.siamese.runtime import set_threads
     from vslam.loopclosure.siamese.settings import PRESETS, load_settings
     from vslam.loopclosure.siamese.siamese import load_network
+    from vslam.loopclosure.siamese.source_registry import open_source
     from vslam.machine import available_cores
 
     began = time.monotonic()
@@ -255,8 +255,9 @@ def places(
     out: Annotated[Path, typer.Option(help="File to write.")] = Path("places.npz"),
 ) -> None:
     """Write sources of images as one small file, for training on another machine."""
-    from vslam.loopclosure.siamese.image_sources import open_source, write_pack
     from vslam.loopclosure.siamese.images import parse_size
+    from vslam.loopclosure.siamese.pack import write_pack
+    from vslam.loopclosure.siamese.source_registry import open_source
 
     sources = [source for spec in data for source in open_source(spec)]
     write_pack(sources, out, parse_size(pixels), fit)

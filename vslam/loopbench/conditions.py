@@ -1,4 +1,4 @@
-"""What is done to the images that ask for their place; the images asked for stay as they are."""
+"""What is done to the query images; the gallery stays as it is."""
 
 from __future__ import annotations
 

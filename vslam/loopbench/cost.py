@@ -84,6 +84,6 @@ def _network(name: str, weights: Path | None) -> Cost:
 
 
 if __name__ == "__main__":
-    asked, file = sys.argv[1:3]
-    found = _bow() if asked == "bow" else _network(asked, Path(file) if file else None)
+    name, file = sys.argv[1:3]
+    found = _bow() if name == "bow" else _network(name, Path(file) if file else None)
     sys.stdout.write(found.model_dump_json())

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from vslam.config import OrbConfig
 from vslam.frontend.orb import extract
 from vslam.loopbench.conditions import Image
-from vslam.loopclosure.bow_index import InvertedIndex, NodeIndex, index_nodes
+from vslam.loopbench.node_matching import NodeIndex, index_nodes
+from vslam.loopclosure.bow_index import InvertedIndex
 from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
 
 if TYPE_CHECKING:  # torch is loaded for those who ask for a network
@@ -68,7 +69,7 @@ class Scorer(Protocol):
     """Whether scores are probabilities, with thresholds at 0.5 and 0.9."""
 
     def store(self, gallery: list[DescribedImage]) -> Any:
-        """What it keeps of the images asked for."""
+        """What it keeps of the gallery."""
 
     def scores(self, queries: list[DescribedImage], stored: Any) -> NDArray[np.float64]:
         """``(Q, G)``, greater is more alike."""
@@ -108,11 +109,11 @@ def open_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scor
     from vslam.config import SiameseConfig
     from vslam.loopclosure.siamese.scoring import NetworkScorer
 
-    return _NetworkScorer(NetworkScorer(name, weights, SiameseConfig().fit))
+    return _ImageScorer(NetworkScorer(name, weights, SiameseConfig().fit))
 
 
-class _NetworkScorer:
-    """Hands the images of described to a network."""
+class _ImageScorer:
+    """Hands the images themselves to a network."""
 
     probability = True
 
@@ -133,7 +134,7 @@ class _NetworkScorer:
 class DetectorSet:
     """The detectors of a benchmark, the first of which the others are compared with.
 
-    Most conditions ask for the same images: what was made of the last few galleries is kept.
+    Most conditions have the same gallery: what was made of the last few galleries is kept.
     """
 
     def __init__(self, scorers: list[Scorer], vocabulary: Vocabulary, threads: int) -> None:

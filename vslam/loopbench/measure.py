@@ -9,16 +9,16 @@ from vslam.config import VerificationConfig
 from vslam.geometry import Matrix
 from vslam.loopbench.conditions import Condition
 from vslam.loopbench.detectors import DescribedImage, DetectorSet, Scorer
+from vslam.loopbench.node_matching import match_by_node
 from vslam.loopbench.schema import Curve, Gain, Score
 from vslam.loopbench.sets import QuerySet, TestSet
-from vslam.loopclosure.benchmark import (
+from vslam.loopclosure.precision_recall import (
     PrecisionRecall,
     average_precision,
     balanced_accuracy,
     precision_recall,
     summary,
 )
-from vslam.loopclosure.bow_index import match_by_node
 from vslam.loopclosure.siamese.image_sources import DIFFERENT, SAME, UNKNOWN
 
 MIN_MATCHES = 20  # that obey one epipolar geometry (ORB-SLAM, VII-B, asks for 20 in 3D)
@@ -130,7 +130,7 @@ def _gain(
 
 
 class _Verification:
-    """Whether two images obey one epipolar geometry; each pair is asked for once."""
+    """Whether two images obey one epipolar geometry; each pair is matched once."""
 
     def __init__(self, queries: list[DescribedImage], gallery: list[DescribedImage]) -> None:
         self._queries, self._gallery = queries, gallery

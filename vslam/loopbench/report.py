@@ -30,7 +30,7 @@ from vslam.report.page import Table, markdown_table, render_page
 MEAN = "mean of all"
 _COLORS = [GREY, BLUE, VIOLET, AMBER, GREEN, RED]
 _ABOUT_AP = (
-    "Average precision over all pairs of a query and an image asked for whose relation is known, "
+    "Average precision over all pairs of a query and a gallery image whose relation is known, "
     "descriptors alone. Last column: AP of the detector minus that of the first, with the 95 % "
     "interval of a bootstrap over the queries; * where it does not hold 0."
 )
@@ -137,8 +137,8 @@ def tables(report: LoopsJson) -> list[Table]:
     return found
 
 
-def _accuracies(cell: Score) -> str:
-    return ", ".join("-" if a is None else f"{a:.3f}" for a in cell.accuracy.values())
+def _accuracies(score: Score) -> str:
+    return ", ".join("-" if a is None else f"{a:.3f}" for a in score.accuracy.values())
 
 
 def _gain_heads(report: LoopsJson) -> list[str]:
@@ -218,8 +218,8 @@ def draw(report: LoopsJson) -> list[ReportFigure]:
     return figures
 
 
-def _curves(cells: list[Score], detectors: list[str], data: str) -> Figure:
-    conditions = list(dict.fromkeys(c.condition for c in cells))
+def _curves(scores: list[Score], detectors: list[str], data: str) -> Figure:
+    conditions = list(dict.fromkeys(c.condition for c in scores))
     columns = min(3, len(conditions))
     rows = -(-len(conditions) // columns)
     figure = Figure(figsize=(6.6, 0.7 + 1.9 * rows), layout="constrained")
@@ -230,9 +230,9 @@ def _curves(cells: list[Score], detectors: list[str], data: str) -> Figure:
         axes.set_axis_off()
     for axes, condition in zip(grid.flat, conditions, strict=False):
         axes.set_title(condition, fontsize=9, color=INK)
-        for cell in (c for c in cells if c.condition == condition):
-            color = _COLORS[detectors.index(cell.detector) % len(_COLORS)]
-            axes.plot(cell.curve.recall, cell.curve.precision, color=color, label=cell.detector)
+        for score in (s for s in scores if s.condition == condition):
+            color = _COLORS[detectors.index(score.detector) % len(_COLORS)]
+            axes.plot(score.curve.recall, score.curve.precision, color=color, label=score.detector)
         axes.set(xlim=(0, 1), ylim=(0, 1.02))
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))

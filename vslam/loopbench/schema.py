@@ -22,9 +22,10 @@ class Curve(_Model):
 class Score(_Model):
     """One detector on one set of images under one condition.
 
-    ``figures`` are those of :func:`vslam.loopclosure.benchmark.summary`, of descriptors alone;
-    ``accuracy`` is balanced, at thresholds on p, None for detectors without. ``first_right``: share
-    of the ``queries`` that have a place in the gallery whose best image shows it;
+    ``figures`` are those of :func:`vslam.loopclosure.precision_recall.summary`, of descriptors
+    alone; ``accuracy`` is balanced, at thresholds on p, None for detectors without.
+    ``first_right``: share of the ``queries`` that have a place in the gallery whose best image
+    shows it;
     ``verified_right``: the same, and its matches obey one epipolar geometry; ``verified_wrong``:
     queries whose best image shows another place and passes, too.
     """

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError
 from vslam.loopbench.conditions import Condition, Image, apply
-from vslam.loopclosure.siamese.image_sources import UNKNOWN, ImageSource, open_source, split_spec
+from vslam.loopclosure.siamese.image_sources import UNKNOWN, ImageSource
+from vslam.loopclosure.siamese.source_registry import open_source, split_spec
 
 ProgressBar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
 """``(what, how many)`` opens a bar; what it yields is called after each of them."""
@@ -97,9 +98,9 @@ def _images(source: ImageSource) -> TestSet:
     def query_set(condition: Condition, seed: int) -> QuerySet | None:
         if condition.kind == "change":
             return None
-        asked = [source.grey(int(i)) for i in gallery]
-        asking = apply(condition, [source.grey(int(i)) for i in queries], seed, rendered=False)
-        return QuerySet(asking, asked, relation)
+        as_taken = [source.grey(int(i)) for i in gallery]
+        changed = apply(condition, [source.grey(int(i)) for i in queries], seed, rendered=False)
+        return QuerySet(changed, as_taken, relation)
 
     return TestSet(source.name, query_set)
 
@@ -133,8 +134,8 @@ def _town(
         (source,) = open_source(f"pairs:{folder}")
         assert source.is_query is not None
         queries, gallery = np.flatnonzero(source.is_query), np.flatnonzero(~source.is_query)
-        asking = apply(condition, [source.grey(int(i)) for i in queries], draw, rendered=True)
+        changed = apply(condition, [source.grey(int(i)) for i in queries], draw, rendered=True)
         relation = source.relation[np.ix_(queries, gallery)]
-        return QuerySet(asking, [source.grey(int(i)) for i in gallery], relation)
+        return QuerySet(changed, [source.grey(int(i)) for i in gallery], relation)
 
     return TestSet(f"{name} {'aliased ' if aliased else ''}town {seed}", query_set)

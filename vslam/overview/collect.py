@@ -37,7 +37,7 @@ class Found:
 def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
     """Read every run below ``folders`` and evaluate ``trajectories`` on the same sequences.
 
-    Interrupted runs and reports of another schema are left out, with a note.
+    Interrupted runs and reports that this version cannot read are left out, with a note.
 
     Raises:
         InputError: a folder is not there, none holds a finished run, or a trajectory cannot be

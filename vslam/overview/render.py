@@ -77,10 +77,11 @@ def render_csv(report: OverviewJson) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     names = [name for name, *_ in MEASURES]
-    head = ["dataset", "sequence", "excerpt", "perturb", "system", "runs", "frames"]
+    head = ["dataset", "sequence", "excerpt", "perturb", "system", "alignment", "runs", "frames"]
     writer.writerow([*head, *(f"{n}{end}" for n in names for end in ("", "_least", "_greatest"))])
     for row in report.rows:
-        cells: list[object] = [*row.drive.model_dump().values(), row.system, row.runs, row.frames]
+        cells: list[object] = [*row.drive.model_dump().values(), row.system, row.alignment]
+        cells += [row.runs, row.frames]
         for name in names:
             spread = row.measures[name]
             found = (spread.median, spread.least, spread.greatest) if spread else ("", "", "")

@@ -102,19 +102,18 @@ def compare(
     rows: list[Row], first: str, second: str, perturb: str, measure: str
 ) -> Comparison | None:
     """The second system against the first, by the medians of a measure of which less is better;
-    None where they share no drive, or where their errors are after different alignments."""
-    alignments = {row.alignment for row in rows if row.system in (first, second)}
-    if len(alignments) > 1:
-        return None
-    medians: dict[str, dict[Drive, float]] = {first: {}, second: {}}
+    None where they share no drive. Errors after different alignments are not compared."""
+    medians: dict[str, dict[tuple[Drive, str], float]] = {first: {}, second: {}}
     for row in rows:
         spread = row.measures[measure]
         if row.system in medians and row.drive.perturb == perturb and spread is not None:
-            medians[row.system][row.drive] = spread.median
+            medians[row.system][row.drive, row.alignment] = spread.median
     pairs = [
-        Pair(drive=d, first=a, second=medians[second][d], difference=medians[second][d] - a)
-        for d, a in medians[first].items()
-        if d in medians[second]
+        Pair(
+            drive=key[0], first=a, second=medians[second][key], difference=medians[second][key] - a
+        )
+        for key, a in medians[first].items()
+        if key in medians[second]
     ]
     if not pairs:
         return None

@@ -31,8 +31,8 @@ from vslam.report.drawing import (
     new_figure,
     save,
 )
-from vslam.report.maps import loop_closing, top_view
 from vslam.report.summary import stage_names
+from vslam.report.trajectory_figures import loop_closing, top_view
 from vslam.run.outcome import RunOutcome
 from vslam.trajectory import Trajectory
 

@@ -9,8 +9,13 @@ from itertools import count
 from pathlib import Path
 
 from vslam.errors import InputError, ResultsError
-from vslam.report.frames import write_frames
+from vslam.evaluation.loops import evaluate_loops
+from vslam.evaluation.trajectories import evo_command
+from vslam.maps.ply import save_ply
+from vslam.maps.storage import save_map
+from vslam.report.frame_table import write_frames
 from vslam.report.schema import ReportJson
+from vslam.report.summary import evaluate_run, summarize
 from vslam.run.outcome import RunOutcome, matched_ground_truth
 from vslam.trajectory import write_kitti, write_tum
 
@@ -64,9 +69,6 @@ def write_results(
     Raises:
         ResultsError: a file could not be written; those before it are complete.
     """
-    from vslam.maps.ply import save_ply
-    from vslam.maps.storage import save_map
-
     try:
         write_trajectories(folder, outcome)
         write_tum(folder / "keyframes.tum", outcome.keyframes)
@@ -99,10 +101,6 @@ def write_trajectories(folder: Path, outcome: RunOutcome) -> None:
 
 def _write_report(folder: Path, outcome: RunOutcome, config: str, *, pages: bool) -> ReportJson:
     """``report.json``, and with ``pages`` what people read."""
-    from vslam.evaluation.loops import evaluate_loops
-    from vslam.evaluation.trajectories import evo_command
-    from vslam.report.summary import evaluate_run, summarize
-
     evaluation, remark = evaluate_run(outcome)
     verdict = evaluate_loops(outcome)
     command = None

@@ -36,7 +36,7 @@ def summarize(
 ) -> ReportJson:
     """Reduce a run to what ``report.json`` holds.
 
-    The errors are None without an evaluation, the figures of loops are without a verdict.
+    Without an evaluation the errors are None, without a verdict the figures of loops.
 
     Args:
         remark: why there is no evaluation.

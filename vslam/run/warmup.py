@@ -44,7 +44,7 @@ from vslam.backend.fusion import fuse_loop
 from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.global_mapping import merge_solution, take_snapshot
 from vslam.backend.loop_correction import move_keyframes
-from vslam.backend.pose_graph import consistency, essential_graph
+from vslam.backend.pose_graph import check_pose_graph, essential_graph
 from vslam.camera import Camera
 from vslam.closing import LoopClosing
 from vslam.config import Config, KeyframeConfig, MappingConfig
@@ -245,7 +245,7 @@ def compile_correction() -> None:
         2, 0, 1.0, True, "", T_query_match=np.eye(4), features=nothing, landmarks=nothing
     )
     graph = essential_graph(map_, [edge], config.pose_graph)
-    consistency(graph, graph.T_cw, config.pose_graph)
+    check_pose_graph(graph, graph.T_cw, config.pose_graph)
     move_keyframes(map_, graph.keyframes, graph.T_cw)
     fuse_loop(map_, edge, [2], [0], CAMERA, config)
     snapshot = take_snapshot(map_, CAMERA)

@@ -123,11 +123,11 @@ def render_pairs(
             ratio = float(np.exp(rng.normal(0.0, _EXPOSURE)))
             names: list[str] = []
             cameras: list[float] = []
-            for side, (frame, when) in enumerate(zip((first, second), whens, strict=True)):
-                T = route.T_wc[frame] if side == 0 else _shifted(route.T_wc[frame], *shift)
-                image = _view(renderer, route, passes, T, when, 1.0 if side == 0 else ratio,
-                              key=(variation.seed, k, side))  # fmt: skip
-                names.append(f"images/{k:06d}_{'ab'[side]}.png")
+            for number, (frame, when) in enumerate(zip((first, second), whens, strict=True)):
+                T = route.T_wc[frame] if number == 0 else _shifted(route.T_wc[frame], *shift)
+                image = _view(renderer, route, passes, T, when, 1.0 if number == 0 else ratio,
+                              key=(variation.seed, k, number))  # fmt: skip
+                names.append(f"images/{k:06d}_{'ab'[number]}.png")
                 write_png(folder / names[-1], image, 1)
                 yaw = float(np.degrees(np.arctan2(T[0, 2], T[2, 2])))
                 cameras += [T[0, 3], T[2, 3], yaw]

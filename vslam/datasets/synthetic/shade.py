@@ -182,8 +182,8 @@ def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
 
     Args:
         visible: from `rasterise.find_visible`.
-        band: `rasterise.SampleBand`, from `rasterise.rasterise`.
-        atlas, light, camera: `rasterise.AtlasArrays`, `LightValues`, `PosedCamera`.
+        band: `kernel_arrays.SampleBand`, from `rasterise.rasterise`.
+        atlas, light, camera: `kernel_arrays.AtlasArrays`, `LightValues`, `PosedCamera`.
         sky: number of the sky's panorama in the atlas.
         shadows, pools: `shadows.ShadowMap`, `shadows.LampPools`.
         view: `render.RenderedView`, written.

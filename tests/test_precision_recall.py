@@ -7,7 +7,7 @@ import pytest
 from sklearn.metrics import average_precision_score, balanced_accuracy_score, precision_recall_curve
 
 from vslam.errors import InputError
-from vslam.loopclosure.benchmark import (
+from vslam.loopclosure.precision_recall import (
     average_precision,
     balanced_accuracy,
     max_f1,

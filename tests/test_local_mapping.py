@@ -340,7 +340,7 @@ def test_fusion_keeps_the_landmark_with_more_observations():
 
 
 @pytest.mark.parametrize(
-    "spoil", ["descriptor", "position", "direction", "reach"], ids=lambda name: name
+    "spoil", ["descriptor", "position", "direction", "distance range"], ids=lambda name: name
 )
 def test_fusion_leaves_strangers_alone(spoil):
     world = two_keyframes_with_landmarks_of_their_own()

@@ -1,0 +1,51 @@
+"""The command ``vslam report``: one report of many runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+_EXAMPLES = """
+[b]Examples[/b]
+
+  vslam report bench
+
+  vslam report runs/20261121-1* other/bench --out comparison
+
+  vslam report bench --trajectory ORB-SLAM3@00=orbslam3/00.txt
+"""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the application."""
+    app.command(epilog=_EXAMPLES)(report)
+
+
+def report(
+    runs: Annotated[list[Path], typer.Argument(help="Folders of runs, or folders of those.")],
+    trajectory: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME[@SEQ[@PERTURB]]=FILE",
+            help="Trajectory of another system, KITTI or TUM format, to compare with; aligned as "
+            "the runs of that sequence are, or with scale if its name ends in ', mono'.",
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("report"),
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing.")] = False,
+) -> None:
+    """Write one report of finished runs: medians, detectors compared, trajectories, curves."""
+    write_overview_of(runs, trajectory or [], out, quiet=quiet)
+
+
+def write_overview_of(runs: list[Path], trajectories: list[str], out: Path, *, quiet: bool) -> None:
+    """Write the report of finished runs, and say so unless ``quiet``."""
+    from vslam.overview import write_overview
+
+    written = write_overview(runs, trajectories, out)
+    if not quiet:
+        for note in written.notes:
+            typer.echo(f"note: {note}", err=True)
+        typer.echo(f"{out / 'report.html'}: {len(written.runs)} runs")

@@ -232,13 +232,13 @@ def test_interrupt_finishes_the_report_of_the_frames_done(kitti_tree, tmp_path):
 
 def test_full_disk_keeps_what_was_written(kitti_tree, tmp_path, monkeypatch, capsys):
     from vslam.cli import main as cli
-    from vslam.maps import storage
+    from vslam.report import folder as run_folder
 
     def full(path, *_):
         path.write_bytes(b"half a map")
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
-    monkeypatch.setattr(storage, "save_map", full)
+    monkeypatch.setattr(run_folder, "save_map", full)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         sys, "argv", ["vslam", "run", "--data", str(kitti_tree), "--max-frames", "5", "--no-record"]

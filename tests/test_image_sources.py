@@ -19,7 +19,7 @@ from vslam.loopclosure.siamese.data import (
     refuse_test_data,
     write_pairs,
 )
-from vslam.loopclosure.siamese.image_sources import undistorted
+from vslam.loopclosure.siamese.image_source import undistorted
 from vslam.loopclosure.siamese.kitti_source import relation_of_poses
 from vslam.loopclosure.siamese.pack import write_pack
 from vslam.loopclosure.siamese.source_registry import open_source

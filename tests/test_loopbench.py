@@ -24,7 +24,7 @@ from vslam.loopbench.measure import epipolar_inliers, measure, thinned
 from vslam.loopbench.schema import LoopsJson
 from vslam.loopbench.sets import QuerySet, TestSet, open_set
 from vslam.loopclosure.precision_recall import average_precision, precision_recall
-from vslam.loopclosure.siamese.image_sources import DIFFERENT, SAME, UNKNOWN
+from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
 from vslam.loopclosure.vocabulary import load
 
 

@@ -314,8 +314,8 @@ class Slam:
         self._merge()
         start = start.at_speed(self._velocity, self.config.initialization.max_rescaling)
         keyframes = self._mapping.begin(start)
-        for keyframe, of in zip(keyframes, (start.first, frame), strict=True):
-            self._poses.replace(of.index, keyframe)
+        for keyframe, each in zip(keyframes, (start.first, start.second), strict=True):
+            self._poses.replace(each.index, keyframe)
         frame.T_cw = self._poses.pose(frame.index)
         self._velocity = start.velocity
         self._lost_frames = 0

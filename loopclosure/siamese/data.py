@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError, ResultsError
-from vslam.loopclosure.siamese.image_sources import DIFFERENT, SAME, UNKNOWN, ImageSource
+from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.images import Fit, Size
 
 # Frames of each sequence that training may use; the others are what loop detectors are tested on.

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.image_sources import (
+from vslam.loopclosure.siamese.image_source import (
     DIFFERENT,
     SAME,
     UNKNOWN,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.image_sources import (
+from vslam.loopclosure.siamese.image_source import (
     DIFFERENT,
     SAME,
     UNKNOWN,

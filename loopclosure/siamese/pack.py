@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError, ResultsError
-from vslam.loopclosure.siamese.image_sources import ImageSource
+from vslam.loopclosure.siamese.image_source import ImageSource
 from vslam.loopclosure.siamese.images import Fit, Size
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.image_sources import DIFFERENT, SAME, ImageSource, names_of
+from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, ImageSource, names_of
 
 _VIEW = ("x_a", "z_a", "yaw_a", "x_b", "z_b", "yaw_b")
 _CELL = 80.0  # m, of a rendered town: stays together when training and validation are divided

@@ -30,7 +30,7 @@ from pathlib import Path
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.fabmap_source import read_fabmap
-from vslam.loopclosure.siamese.image_sources import ImageSource
+from vslam.loopclosure.siamese.image_source import ImageSource
 from vslam.loopclosure.siamese.kitti_source import read_kitti
 from vslam.loopclosure.siamese.pack import read_pack
 from vslam.loopclosure.siamese.pairs_source import read_pairs

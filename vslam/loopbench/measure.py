@@ -19,7 +19,7 @@ from vslam.loopclosure.precision_recall import (
     precision_recall,
     summary,
 )
-from vslam.loopclosure.siamese.image_sources import DIFFERENT, SAME, UNKNOWN
+from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
 
 MIN_MATCHES = 20  # that obey one epipolar geometry (ORB-SLAM, VII-B, asks for 20 in 3D)
 _EPIPOLAR_PIXELS = 2.0

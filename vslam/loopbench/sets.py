@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError
 from vslam.loopbench.conditions import Condition, Image, apply
-from vslam.loopclosure.siamese.image_sources import UNKNOWN, ImageSource
+from vslam.loopclosure.siamese.image_source import UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.source_registry import open_source, split_spec
 
 ProgressBar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]

@@ -284,7 +284,7 @@ def _error(x, y, z, uvr, inverse_sigma2, intrinsics):
     """``chi_square_ratio``; 2 for a point that is not in front of the camera."""
     if z <= 0.1:
         return 2.0
-    fx, fy, cx, cy, bf = intrinsics
+    fx, fy, cx, cy, bf = intrinsics  # not unpacked(): that would change bits
     pinhole = (fx, fy, cx, cy, bf)
     return chi_square_ratio(x, y, z, uvr[0], uvr[1], uvr[2], inverse_sigma2, pinhole)
 

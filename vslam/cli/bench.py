@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.options import KITTI_ROOT, Data, Dataset, Thresholds, Weights
+from vslam.cli.options import KITTI_ROOT, Data, Dataset, Thresholds, Weights, names_in
 from vslam.cli.report import write_overview_of
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def bench(
     quiet: Annotated[bool, typer.Option("--quiet", help="No table.")] = False,
 ) -> None:
     """Run sequences under perturbations with loop detectors, and report on all of them."""
-    chosen = list(dict.fromkeys(name.strip() for name in detectors.split(",") if name.strip()))
+    chosen = names_in(detectors)
     from vslam.bench import execute
     from vslam.bench.estimate import check_disk, duration, estimate, size
     from vslam.bench.grid import make_grid, parse_perturbations, parse_sequences

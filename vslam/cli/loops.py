@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from vslam.cli.options import Weights
+from vslam.cli.options import Weights, names_in
 from vslam.errors import InputError
 
 _EXAMPLES = """
@@ -68,7 +68,7 @@ def bench(
     from vslam.loopbench.conditions import parse_conditions
     from vslam.loopclosure.registry import parse_weights, require_detector
 
-    names = list(dict.fromkeys(n.strip() for n in detectors.split(",") if n.strip()))
+    names = names_in(detectors)
     files = parse_weights(weights or [], names)
     for name in names or [""]:
         if name == "none":

@@ -38,3 +38,8 @@ SensorName = Literal["stereo", "mono"]
 AlignmentName = Literal["se3", "sim3", "none"]
 
 KITTI_ROOT = Path("data/kitti")
+
+
+def names_in(text: str) -> list[str]:
+    """The names that commas separate, each once, in the order given."""
+    return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))

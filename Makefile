@@ -5,6 +5,8 @@
 VENV ?= .venv
 BIN := $(abspath $(VENV))/bin
 INSTALLED := $(VENV)/.installed
+# Where torch for the CPU is; empty: take what pip finds.
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 help:  ## show this list
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
@@ -51,7 +53,10 @@ $(INSTALLED): pyproject.toml constraints.txt
 	    echo "$$python has no venv module: install it (Debian, Ubuntu: python3-venv)" >&2; exit 1; }; \
 	fi
 	@# PyPI's torch for Linux brings gigabytes of CUDA; the CPU's build has an index of its own.
-	-$(BIN)/python -m pip install --quiet --no-deps --retries 0 --timeout 20 \
-	  torch -c constraints.txt --index-url https://download.pytorch.org/whl/cpu
+	@if [ -n "$(TORCH_INDEX)" ] && $(BIN)/python -m pip install --quiet --dry-run --no-deps \
+	    --report - torch -c constraints.txt | grep -qE '"(nvidia|cuda)-'; then \
+	  $(BIN)/python -m pip install --quiet --no-deps --retries 0 --timeout 20 \
+	    torch -c constraints.txt --index-url $(TORCH_INDEX) || true; \
+	fi
 	$(BIN)/python -m pip install --quiet -e '.[dev]' -c constraints.txt
 	@touch $@

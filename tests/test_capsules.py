@@ -18,7 +18,8 @@ from vslam.loopclosure.siamese.branches import (
     textured,
 )
 from vslam.loopclosure.siamese.extractors import LIGHT_BLOCKS, grid_side
-from vslam.loopclosure.siamese.images import to_size, to_tensor
+from vslam.loopclosure.siamese.images import to_size
+from vslam.loopclosure.siamese.preprocessing import to_tensor
 from vslam.loopclosure.siamese.pruning import lowest, masked, mean_couplings, pruned
 from vslam.loopclosure.siamese.siamese import (
     build_network,

@@ -55,6 +55,8 @@ STARTED = {
 ONLY_IN = {
     "torch": "vslam.loopclosure.siamese",
     "torchvision": "vslam.loopclosure.siamese",
+    "onnx": "vslam.loopclosure.siamese.export",
+    "onnxruntime": "vslam.loopclosure.siamese.inference",
     "gtsam": "vslam.backend",
     "rerun": "vslam.run.recorder",
     "evo": "vslam.evaluation.trajectories",

@@ -18,7 +18,6 @@ from vslam.loopclosure.siamese.augmentation import STRONG, Augmentation, augment
 from vslam.loopclosure.siamese.branches import Layout
 from vslam.loopclosure.siamese.checkpoint import CHECKPOINT
 from vslam.loopclosure.siamese.data import draw_pairs
-from vslam.loopclosure.siamese.images import to_tensor
 from vslam.loopclosure.siamese.initial_network import resized, starting_network
 from vslam.loopclosure.siamese.model_card import describe, write_card
 from vslam.loopclosure.siamese.objective import (
@@ -28,6 +27,7 @@ from vslam.loopclosure.siamese.objective import (
     embed_all,
     score_matrix,
 )
+from vslam.loopclosure.siamese.preprocessing import to_tensor
 from vslam.loopclosure.siamese.pruning import lowest, pruned
 from vslam.loopclosure.siamese.settings import PRESETS, load_settings
 from vslam.loopclosure.siamese.siamese import load_network, save_network

@@ -14,10 +14,10 @@ from siamese_worlds import SMALL, small_network, small_settings, views
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.augmentation import STRONG, augment
 from vslam.loopclosure.siamese.branches import CapsuleShape, Layout
+from vslam.loopclosure.siamese.export import export_onnx
 from vslam.loopclosure.siamese.images import parse_size, to_size
 from vslam.loopclosure.siamese.initial_network import resized, starting_network
 from vslam.loopclosure.siamese.lite import LiteExtractor
-from vslam.loopclosure.siamese.onnx import export_onnx
 from vslam.loopclosure.siamese.preprocessing import Unrolling
 from vslam.loopclosure.siamese.pruning import lowest, masked, mean_couplings, pruned
 from vslam.loopclosure.siamese.siamese import (
@@ -276,7 +276,6 @@ def test_flat_images_keep_their_height():
     ids=["light", "lite0", "unrolled"],
 )
 def test_views_are_exported(network, tmp_path):
-    pytest.importorskip("onnxscript")
     assert export_onnx(network, tmp_path / "capsule.onnx") < 1e-4
 
 

@@ -5,16 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from vslam.config import SiameseConfig
-from vslam.errors import InputError
 from vslam.features import Features
-from vslam.loopclosure.siamese.images import to_size, to_tensor
-from vslam.loopclosure.siamese.runtime import one_thread
-from vslam.loopclosure.siamese.siamese import SiameseNetwork, for_inference, load_network
-from vslam.loopclosure.siamese.weights import find_weights
+from vslam.loopclosure.siamese.images import to_size
+from vslam.loopclosure.siamese.inference import OnnxNetwork, open_network
 from vslam.loops import LoopCandidate
 from vslam.map import Map
 
@@ -25,10 +21,10 @@ class SiameseDetector:
     Descriptors are kept in one matrix that grows by half: a query is one product with it.
     """
 
-    def __init__(self, network: SiameseNetwork, config: SiameseConfig) -> None:
-        """``network`` is prepared for inference in place; its name becomes the detector's."""
+    def __init__(self, network: OnnxNetwork, config: SiameseConfig) -> None:
+        """The network's name becomes the detector's."""
         self.name = network.name
-        self._network = for_inference(network)
+        self._network = network
         self._config = config
         self._descriptors = np.zeros((64, network.dimensions), np.float32)
         self._known = np.zeros(64, np.bool_)  # keyframes added with an image
@@ -69,9 +65,7 @@ class SiameseDetector:
         return self._known[:n] & map_.arrays.keyframe_alive[:n]
 
     def _embed(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        small = to_size(image, self._network.size, self._config.fit)
-        with one_thread(), torch.no_grad():
-            return np.asarray(self._network.embed(to_tensor(small[None]))[0].numpy())
+        return self._network.embed(to_size(image, self._network.size, self._config.fit))
 
     def _best(
         self,
@@ -85,9 +79,7 @@ class SiameseDetector:
         n = len(eligible)
         if not eligible.any():
             return []
-        with one_thread(), torch.no_grad():
-            stored = torch.from_numpy(self._descriptors[:n])
-            p = self._network.compare(torch.from_numpy(descriptor), stored).numpy().copy()
+        p = self._network.compare(descriptor, self._descriptors[:n])
         p[~eligible] = -1.0
         found: list[LoopCandidate] = []
         # Neighbours of a good match match well, too: they would crowd out the other places.
@@ -108,18 +100,9 @@ def open_detector(name: str, config: SiameseConfig, weights: Path | None = None)
     Args:
         name: one of ``NETWORKS``.
         config: see there.
-        weights: safetensors file; None for the ones that vslam ships.
+        weights: ONNX file; None for the ones that vslam ships.
 
     Raises:
         InputError: unknown name, no weights, or weights of another network.
     """
-    return SiameseDetector(load_named(name, weights), config)
-
-
-def load_named(name: str, weights: Path | None = None) -> SiameseNetwork:
-    """The network of that name, arguments and errors as of :func:`open_detector`."""
-    path = find_weights(name, weights)
-    network, _ = load_network(path)
-    if network.name != name:
-        raise InputError(f"{path}: weights of {network.name}, not of {name}; name another file.")
-    return network
+    return SiameseDetector(open_network(name, weights), config)

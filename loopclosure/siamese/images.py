@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from vslam.errors import InputError, UnreadableImageError
 
@@ -53,12 +51,6 @@ def to_size(image: NDArray[np.uint8], size: Size, fit: Fit = "squash") -> NDArra
     shrinking = image.shape[0] > size[0] or image.shape[1] > size[1]
     way = cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(image, size[::-1], interpolation=way), np.uint8)
-
-
-def to_tensor(images: NDArray[np.uint8]) -> Tensor:
-    """``(N, H, W)`` grey images to ``(N, 3, H, W)`` float32 in [0, 1], the grey replicated."""
-    x = torch.from_numpy(np.ascontiguousarray(images)).float().div_(255.0)
-    return x[:, None].expand(-1, 3, -1, -1)
 
 
 def read_grey(source: Path | NDArray[np.uint8], name: str = "") -> NDArray[np.uint8]:

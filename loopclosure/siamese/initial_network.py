@@ -12,9 +12,9 @@ from torch.nn import functional
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.branches import CapsuleBranch, ConvolutionalBranch, Layout
 from vslam.loopclosure.siamese.data import Collection, divide, validation_images
-from vslam.loopclosure.siamese.images import to_tensor
 from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.objective import validate
+from vslam.loopclosure.siamese.preprocessing import to_tensor
 from vslam.loopclosure.siamese.pruning import (
     lowest,
     mean_couplings,

@@ -13,7 +13,7 @@ from vslam.loopclosure.precision_recall import balanced_accuracy, summary
 from vslam.loopclosure.siamese.augmentation import Augmentation, augment
 from vslam.loopclosure.siamese.data import Collection
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
-from vslam.loopclosure.siamese.images import to_tensor
+from vslam.loopclosure.siamese.preprocessing import to_tensor
 from vslam.loopclosure.siamese.siamese import DistanceHead, SiameseNetwork
 
 _MOST_SAME = 5  # images of its place that a validation image is to find

@@ -1,16 +1,24 @@
-"""What is done to a grey image before a network looks for features in it."""
+"""What is done to grey images before a network looks for features in them."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
 from vslam.loopclosure.siamese.images import Size
 
 _TEXTURE = 1.5 / 255.0  # between one grey level, which is noise, and two
+
+
+def to_tensor(images: NDArray[np.uint8]) -> Tensor:
+    """``(N, H, W)`` grey images to ``(N, 3, H, W)`` float32 in [0, 1], the grey replicated."""
+    x = torch.from_numpy(np.ascontiguousarray(images)).float().div_(255.0)
+    return x[:, None].expand(-1, 3, -1, -1)
 
 
 class Unrolling(nn.Module):

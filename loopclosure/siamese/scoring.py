@@ -6,16 +6,10 @@ from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from vslam.loopclosure.siamese.detector import load_named
 from vslam.loopclosure.siamese.images import Fit, to_size
-from vslam.loopclosure.siamese.objective import embed_all, score_matrix
-from vslam.loopclosure.siamese.runtime import one_thread
-from vslam.loopclosure.siamese.siamese import for_inference
-
-_CPU = torch.device("cpu")
+from vslam.loopclosure.siamese.inference import open_network
 
 
 class NetworkScorer:
@@ -32,28 +26,22 @@ class NetworkScorer:
         Raises:
             InputError: no weights, or those of another network.
         """
-        network = load_named(name, weights)
-        self.name, self.parameters = name, network.n_parameters()
-        self._network, self._fit = for_inference(network), fit
+        self._network, self._fit = open_network(name, weights), fit
+        self.name, self.parameters = name, int(self._network.about["parameters"])
 
     def scores(
         self, queries: NDArray[np.float32], gallery: NDArray[np.float32]
     ) -> NDArray[np.float64]:
         """p ``(Q, G)`` that two images show one place, from descriptors ``(Q, D)``, ``(G, D)``."""
-        with one_thread():
-            return score_matrix(self._network, queries, gallery, _CPU).astype(np.float64)
+        return np.stack([self.compare(query, gallery) for query in queries]).astype(np.float64)
 
     def embed(self, images: Collection[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """Descriptors ``(N, D)`` of images ``(H, W)``."""
-        small = [to_size(image, self._network.size, self._fit) for image in images]
-        with one_thread():
-            return embed_all(self._network, np.stack(small), _CPU)
+        size = self._network.size
+        return np.stack([self._network.embed(to_size(one, size, self._fit)) for one in images])
 
-    @torch.no_grad()
     def compare(
         self, descriptor: NDArray[np.float32], gallery: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         """p ``(N,)`` of one descriptor ``(D,)`` with each of ``(N, D)``."""
-        with one_thread():
-            p = self._network.compare(torch.from_numpy(descriptor), torch.from_numpy(gallery))
-            return np.asarray(p.numpy())
+        return self._network.compare(descriptor, gallery)

@@ -42,12 +42,12 @@ def aligned(alike: Tensor, most: Tensor) -> Tensor:
         alike: scalar products of the views.
         most: products of their lengths, ``(..., V, V)``.
     """
-    reach = alike.shape[-1] // 2
-    moved = [
-        alike.diagonal(s, -2, -1).sum(-1) / (most.diagonal(s, -2, -1).sum(-1) + TINY)
-        for s in range(-reach, reach + 1)
-    ]
-    return _SOFTNESS * torch.logsumexp(torch.stack(moved) / _SOFTNESS, 0)
+    views = alike.shape[-1]
+    v = torch.arange(views, device=alike.device)
+    moves = torch.arange(-(views // 2), views // 2 + 1, device=alike.device)
+    meet = (v[None, :] - v[:, None] == moves[:, None, None]).to(alike.dtype).flatten(1).T
+    moved = (alike.flatten(-2) @ meet) / (most.flatten(-2) @ meet + TINY)
+    return _SOFTNESS * torch.logsumexp(moved / _SOFTNESS, -1)
 
 
 def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
@@ -57,7 +57,7 @@ def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
     a, b = _by_view(a, views), _by_view(b, views)
     # In this order: b is a map of thousands of keyframes, a the query.
     alike = (b.flatten(0, 1) @ a.flatten(0, 1).T).view(len(b), views, len(a), views)
-    most = torch.einsum("nv,mw->nmvw", _lengths(a), _lengths(b))
+    most = _lengths(a)[:, None, :, None] * _lengths(b)[None, :, None, :]
     return aligned(alike.permute(2, 0, 3, 1), most)
 
 
@@ -95,9 +95,12 @@ class DistanceHead(nn.Module):
         d = torch.sqrt((2.0 - 2.0 * cosine).clamp_min(0.0) + TINY)
         return self.log_a.exp() - self.log_b.exp() * d
 
-    def compare(self, query: Tensor, gallery: Tensor) -> Tensor:
-        """Logits ``(M,)`` of one ``(D,)`` descriptor with each of ``(M, D)``, one product."""
-        return self.of_cosine(cosines(query[None], gallery, self.views)[0])
+    def compare(self, query: Tensor, gallery: Tensor, lengths: Tensor) -> Tensor:
+        """Logits ``(M,)`` of one ``(V, d)`` descriptor, by view, with each of ``(M, V, d)``, whose
+        views have the ``lengths`` ``(M, V)``: one product."""
+        alike = (gallery @ query.T).transpose(1, 2)
+        most = _lengths(query[None])[:, :, None] * lengths[:, None]
+        return self.of_cosine(aligned(alike, most))
 
 
 class ConcatenationHead(nn.Module):
@@ -120,8 +123,9 @@ class ConcatenationHead(nn.Module):
         both = torch.cat([torch.cat([a, b], 1), torch.cat([b, a], 1)])
         return self.layers(both).view(2, -1).mean(0)
 
-    def compare(self, query: Tensor, gallery: Tensor) -> Tensor:
-        """Logits ``(M,)`` of one ``(D,)`` descriptor with each of ``(M, D)``."""
+    def compare(self, query: Tensor, gallery: Tensor, lengths: Tensor) -> Tensor:
+        """Logits ``(M,)`` of one ``(1, D)`` descriptor with each of ``(M, 1, D)``."""
+        gallery = gallery[:, 0]
         return self.forward(query.expand_as(gallery), gallery)
 
 
@@ -162,7 +166,9 @@ class SiameseNetwork(nn.Module):
 
     def compare(self, query: Tensor, gallery: Tensor) -> Tensor:
         """Similarity ``(M,)`` of one ``(D,)`` descriptor with each of a ``(M, D)`` gallery."""
-        return torch.sigmoid(self.head.compare(query, gallery))
+        by_view = _by_view(gallery, self.branch.views)
+        query = _by_view(query[None], self.branch.views)[0]
+        return torch.sigmoid(self.head.compare(query, by_view, _lengths(by_view)))
 
     def forward(self, images: Tensor) -> Tensor:
         """As :meth:`embed`."""

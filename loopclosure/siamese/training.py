@@ -40,7 +40,6 @@ from vslam.loopclosure.siamese.data import (
     validation_images,
     write_pairs,
 )
-from vslam.loopclosure.siamese.images import to_tensor
 from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.objective import (
     blend,
@@ -50,6 +49,7 @@ from vslam.loopclosure.siamese.objective import (
     embed_all,
     validate,
 )
+from vslam.loopclosure.siamese.preprocessing import to_tensor
 from vslam.loopclosure.siamese.settings import TrainSettings
 from vslam.loopclosure.siamese.siamese import (
     SiameseNetwork,

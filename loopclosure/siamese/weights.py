@@ -12,7 +12,7 @@ SHIPPED = Path(__file__).parent / "weights"
 
 
 def find_weights(name: str, weights: Path | None = None) -> Path:
-    """The safetensors file of a detector.
+    """The ONNX file of a detector.
 
     Args:
         name: one of ``NETWORKS``.
@@ -23,15 +23,20 @@ def find_weights(name: str, weights: Path | None = None) -> Path:
     """
     if name not in NETWORKS:
         raise InputError(f"--detector {name}: unknown; choose one of {', '.join(NETWORKS)}.")
-    path = weights or SHIPPED / f"{name}.safetensors"
+    path = weights or SHIPPED / f"{name}.onnx"
+    if path.suffix == ".safetensors" and path.exists():
+        raise InputError(
+            f"--weights {path}: runs read ONNX files; write one with 'vslam export onnx --weights "
+            f"{path}'."
+        )
     if path.exists():
         return path
     if weights is None:
         raise InputError(
             f"--detector {name}: vslam ships no weights for it; train it with 'vslam train {name}' "
-            "and name the file with --weights."
+            "and name the .onnx file with --weights."
         )
-    raise InputError(f"--weights {path}: not there; name the .safetensors file of a training.")
+    raise InputError(f"--weights {path}: not there; name the .onnx file of a training.")
 
 
 def read_pth(path: Path, fix: str) -> Any:

@@ -177,14 +177,13 @@ def _train_command(
 
 
 def _export_commands(out: Path) -> list[list[str]]:
-    """Both networks in half precision, as they are shipped, and the whole one as ONNX."""
+    """Both networks in half precision and as ONNX, as they are shipped."""
     whole = str(out / STAGES[6].name / "capsule.safetensors")
     pruned = str(out / STAGES[7].name / "capsule-pruned.safetensors")
     return [
         ["export", "weights", "--weights", whole, "--out", str(out / "capsule.safetensors")],
         ["export", "weights", "--weights", pruned,
          "--out", str(out / "capsule-pruned.safetensors")],
-        ["export", "onnx", "--weights", whole, "--out", str(out / "capsule.onnx")],
     ]  # fmt: skip
 
 

@@ -29,7 +29,7 @@ _TRAIN_EXAMPLES = """
 _EXPORT_EXAMPLES = """
 [b]Example[/b]
 
-  vslam export onnx --weights training/capsule/capsule.safetensors --out capsule.onnx
+  vslam export onnx --weights training/capsule/capsule.safetensors
 """
 _PLACES_EXAMPLES = """
 [b]Example[/b]
@@ -111,7 +111,8 @@ def train(
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
 ) -> None:
-    """Train a loop detector; writes weights, log, pairs, checkpoints and a model card."""
+    """Train a loop detector; writes weights (.safetensors to go on from, .onnx for runs), log,
+    pairs, checkpoints and a model card."""
     from vslam.loopclosure.siamese.branches import CapsuleBranch
     from vslam.loopclosure.siamese.data import load, refuse_test_data
     from vslam.loopclosure.siamese.images import parse_size
@@ -176,6 +177,7 @@ def _train(
 ) -> TrainingOutcome:
     from vslam.cli.progress import training_bar
     from vslam.loopclosure.siamese.checkpoint import CHECKPOINT
+    from vslam.loopclosure.siamese.export import export_onnx
     from vslam.loopclosure.siamese.initial_network import starting_network
     from vslam.loopclosure.siamese.model_card import describe, write_card
     from vslam.loopclosure.siamese.siamese import load_network
@@ -193,7 +195,8 @@ def _train(
             should_stop=None if until is None else lambda: time.monotonic() > until,
         )  # fmt: skip
     if outcome.weights.exists():
-        network, _ = load_network(outcome.weights)
+        network, about = load_network(outcome.weights)
+        export_onnx(network, outcome.weights.with_suffix(".onnx"), about)
         card = describe(
             network, collection, settings, outcome, preset=preset, data=data, device=device
         )
@@ -204,18 +207,21 @@ def _train(
 @export.command("onnx", epilog=_EXPORT_EXAMPLES)
 def onnx(
     weights: Annotated[Path, typer.Option(help="Weights, .safetensors.")],
-    out: Annotated[Path, typer.Option(help="ONNX file to write.")] = Path("capsule.onnx"),
+    out: Annotated[
+        Path | None, typer.Option(help="File to write.", show_default="WEIGHTS as .onnx")
+    ] = None,
 ) -> None:
-    """Write the branch (image to descriptor) as ONNX, and check it against torch."""
-    from vslam.loopclosure.siamese.onnx import export_onnx
+    """Write the ONNX file that runs use, and check it against torch."""
+    from vslam.loopclosure.siamese.export import export_onnx
     from vslam.loopclosure.siamese.siamese import load_network
 
-    network, _ = load_network(weights)
-    difference = export_onnx(network, out)
+    network, about = load_network(weights)
+    path = out or weights.with_suffix(".onnx")
+    difference = export_onnx(network, path, about)
     typer.echo(
-        f"{out}: {out.stat().st_size / 1e6:.1f} MB, images (1, 3, {network.size[0]}, "
-        f"{network.size[1]}) to descriptor (1, {network.dimensions}); differs from torch by at "
-        f"most {difference:.1e}"
+        f"{path}: {path.stat().st_size / 1e6:.1f} MB, grey images of {network.size[0]}x"
+        f"{network.size[1]} pixels to descriptors of {network.dimensions} numbers; differs from "
+        f"torch by at most {difference:.1e}"
     )
 
 
@@ -224,14 +230,16 @@ def weights_(
     weights: Annotated[Path, typer.Option(help="Weights of a training, .safetensors.")],
     out: Annotated[Path, typer.Option(help="File to write, .safetensors.")],
 ) -> None:
-    """Write weights in half precision, with their model card, as vslam ships them."""
+    """Write weights in half precision, with model card and ONNX file, as vslam ships them."""
     import shutil
 
     from vslam.errors import ResultsError
+    from vslam.loopclosure.siamese.export import export_onnx
     from vslam.loopclosure.siamese.siamese import load_network, save_network
 
     network, about = load_network(weights)
     save_network(network, out, about, half=True)
+    export_onnx(load_network(out)[0], out.with_suffix(".onnx"), about)
     cards = [weights.with_suffix(end) for end in (".md", ".json")]
     try:
         for card in filter(Path.exists, cards):

@@ -1,0 +1,170 @@
+"""Export of a trained network as one ONNX file: what runs use, and programs in other languages."""
+
+from __future__ import annotations
+
+import base64
+import copy
+import json
+import logging
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from torch import Tensor, nn
+
+from vslam.errors import ResultsError
+from vslam.loopclosure.siamese.inference import (
+    ABOUT,
+    COMPARISON,
+    FORMAT,
+    NAME,
+    VERSION,
+    OnnxNetwork,
+)
+from vslam.loopclosure.siamese.siamese import SiameseNetwork, for_inference
+
+TOLERANCE = 1e-4  # of a descriptor of length 1
+SIMILARITY_TOLERANCE = 0.02  # at distance 0 the root in it magnifies the last bit
+_SMALL = 64  # numbers of a tensor that is not worth storing in half precision
+
+
+class _Embedding(nn.Module):
+    """Grey image ``(H, W)`` uint8 to descriptor ``(D,)``."""
+
+    def __init__(self, network: SiameseNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Tensor) -> Tensor:
+        grey = image.float() / 255.0
+        return self.network.embed(grey.expand(1, 3, -1, -1))[0]
+
+
+class _Comparison(nn.Module):
+    """Descriptors by view, ``(V, d)`` and ``(N, V, d)``, and the lengths of the latter's views,
+    ``(N, V)``, to similarities ``(N,)``."""
+
+    def __init__(self, network: SiameseNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, query: Tensor, gallery: Tensor, lengths: Tensor) -> Tensor:
+        return torch.sigmoid(self.network.head.compare(query, gallery, lengths))
+
+
+def export_onnx(network: SiameseNetwork, path: Path, about: dict[str, Any] | None = None) -> float:
+    """Write a network in the format that :class:`inference.OnnxNetwork` reads.
+
+    The graph takes ``image``, grey ``(H, W)`` uint8 of the network's size, to ``descriptor``
+    ``(D,)`` float32 of norm 1. A second graph lies in the metadata, base64: it takes ``query``
+    ``(V, d)`` and ``gallery`` ``(N, V, d)``, descriptors by view with ``V d = D``, and ``lengths``
+    ``(N, V)`` of the gallery's views, to ``similarity`` ``(N,)``.
+
+    Args:
+        about: what the weights were made of.
+
+    Returns:
+        The largest difference between descriptors of torch and onnxruntime, of random images.
+
+    Raises:
+        ResultsError: the file cannot be written, or says something else than torch.
+    """
+    parameters = network.n_parameters()
+    network = for_inference(copy.deepcopy(network).cpu())
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (3, *network.size), np.uint8)
+    examples = [torch.from_numpy(image) for image in images]
+    with torch.no_grad():
+        expected = torch.stack([_Embedding(network)(image) for image in examples])
+        alike = network.compare(expected[0], expected).numpy()
+    embedding = to_onnx(_Embedding(network), (examples[0],), ["image"], ["descriptor"])
+    any_number = torch.export.Dim("N")
+    by_view = expected.view(len(expected), network.branch.views, -1)
+    comparison = to_onnx(
+        _Comparison(network), (by_view[0], by_view, torch.linalg.vector_norm(by_view, dim=2)),
+        ["query", "gallery", "lengths"], ["similarity"],
+        dynamic_shapes={"query": None, "gallery": {0: any_number}, "lengths": {0: any_number}},
+    )  # fmt: skip
+    metadata = {
+        FORMAT: VERSION,
+        NAME: network.name,
+        ABOUT: json.dumps({**(about or {}), "parameters": parameters}),
+        COMPARISON: base64.b64encode(comparison.SerializeToString()).decode(),
+    }
+    write_onnx(embedding, path, metadata)
+    written = OnnxNetwork(path)
+    descriptors = np.stack([written.embed(image) for image in images])
+    difference = float(np.abs(descriptors - expected.numpy()).max())
+    apart = float(np.abs(written.compare(descriptors[0], descriptors) - alike).max())
+    if not (difference < TOLERANCE and apart < SIMILARITY_TOLERANCE):
+        raise ResultsError(f"{path}: differs from torch by {difference:.1e}; do not use it.")
+    return difference
+
+
+def to_onnx(
+    module: nn.Module, inputs: tuple[Tensor, ...], names: list[str], outputs: list[str],
+    dynamic_shapes: Any = None,
+) -> onnx.ModelProto:  # fmt: skip
+    """A module as an ONNX graph, without inputs that nothing reads; tensors that half precision
+    holds exactly are stored in it."""
+    log = logging.getLogger("torch.onnx")
+    level = log.level
+    log.setLevel(logging.ERROR)  # it misses torchvision, and renames what has one name only
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            program = torch.onnx.export(
+                module.eval(), inputs, input_names=names, output_names=outputs, dynamo=True,
+                dynamic_shapes=dynamic_shapes, external_data=False, verbose=False,
+            )  # fmt: skip
+    finally:
+        log.setLevel(level)
+    assert program is not None
+    model = program.model_proto
+    _halve(model.graph)
+    read = {name for node in model.graph.node for name in node.input}
+    used = [one for one in model.graph.input if one.name in read]
+    del model.graph.input[:]
+    model.graph.input.extend(used)
+    for node in model.graph.node:  # paths and lines of the sources of this machine
+        del node.metadata_props[:]
+    del model.graph.metadata_props[:]
+    return model
+
+
+def write_onnx(model: onnx.ModelProto, path: Path, metadata: dict[str, str]) -> None:
+    """Write a graph with its metadata, in one step.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
+    helper.set_model_props(model, metadata)
+    temporary = path.with_suffix(".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(model.SerializeToString())
+        temporary.replace(path)
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error
+
+
+def _halve(graph: onnx.GraphProto) -> None:
+    """Store tensors in half precision where that loses nothing; they are widened on loading."""
+    widened = []
+    for tensor in graph.initializer:
+        if tensor.data_type != TensorProto.FLOAT:
+            continue
+        values = numpy_helper.to_array(tensor)
+        half = values.astype(np.float16)
+        if values.size < _SMALL or not np.array_equal(half.astype(np.float32), values):
+            continue
+        name, stored = tensor.name, f"{tensor.name}.half"
+        tensor.CopyFrom(numpy_helper.from_array(half, stored))
+        widened.append(helper.make_node("Cast", [stored], [name], to=TensorProto.FLOAT))
+    nodes = [*widened, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)

@@ -1,0 +1,126 @@
+"""Trained networks in ONNX Runtime, on one thread: what runs use. torch is not imported."""
+
+from __future__ import annotations
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError
+from vslam.loopclosure.siamese.images import Size
+from vslam.loopclosure.siamese.weights import find_weights
+
+# Keys of the metadata.
+FORMAT, NAME, ABOUT, COMPARISON = "vslam", "name", "about", "comparison"
+VERSION = "1"  # of the format
+
+
+class OnnxNetwork:
+    """A network that ``vslam export onnx`` wrote: images to descriptors, and what compares them.
+
+    Attributes:
+        name: one of ``NETWORKS``.
+        size: height and width of the images it takes.
+        dimensions: D of its descriptors.
+        about: what the weights were made of; ``parameters``, numbers learned.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Load it.
+
+        Raises:
+            InputError: missing, damaged or foreign file, or no ONNX Runtime.
+        """
+        self._embedding = open_session(path, path, "image")
+        metadata = self._embedding.get_modelmeta().custom_metadata_map
+        if metadata.get(FORMAT) != VERSION or COMPARISON not in metadata:
+            raise InputError(
+                f"{path}: not a network of this version of vslam; write one with "
+                "'vslam export onnx', or name another file."
+            )
+        self._comparison = open_session(path, base64.b64decode(metadata[COMPARISON]), "query")
+        compared = self._comparison.get_inputs()
+        self._views = tuple(compared[0].shape)
+        self._compared = [one.name for one in compared]
+        self.name: str = metadata[NAME]
+        self.about: dict[str, Any] = json.loads(metadata[ABOUT])
+        height, width = self._embedding.get_inputs()[0].shape
+        self.size: Size = (height, width)
+        self.dimensions: int = self._embedding.get_outputs()[0].shape[0]
+
+    def embed(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Descriptor ``(D,)`` of norm 1 of a grey image ``(H, W)`` of the network's size."""
+        (descriptor,) = self._embedding.run(None, {"image": image})
+        return np.asarray(descriptor, np.float32)
+
+    def compare(
+        self, query: NDArray[np.float32], gallery: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Probability ``(N,)`` in (0, 1) that a descriptor ``(D,)`` and each of ``(N, D)`` show
+        one place."""
+        views = gallery.reshape(-1, *self._views)
+        # onnxruntime takes four times as long for the lengths as NumPy.
+        lengths = np.sqrt(np.einsum("nvd,nvd->nv", views, views))
+        given = {"query": query.reshape(self._views), "gallery": views, "lengths": lengths}
+        (similarity,) = self._comparison.run(None, {name: given[name] for name in self._compared})
+        return np.asarray(similarity, np.float32)
+
+
+def open_network(name: str, weights: Path | None = None) -> OnnxNetwork:
+    """The network of that name.
+
+    Args:
+        name: one of ``NETWORKS``.
+        weights: ONNX file; None for the one that vslam ships.
+
+    Raises:
+        InputError: unknown name, no weights, or weights of another network.
+    """
+    path = find_weights(name, weights)
+    network = OnnxNetwork(path)
+    if network.name != name:
+        raise InputError(f"{path}: weights of {network.name}, not of {name}; name another file.")
+    return network
+
+
+def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
+    """An ``onnxruntime.InferenceSession`` on one thread: its sums, and so its bits, do not depend
+    on the number of cores.
+
+    Args:
+        path: of the file, for the message.
+        model: the file, or its bytes.
+        first_input: name of the first input, without which it is no graph of ours.
+
+    Raises:
+        InputError: it cannot be read, is no such graph, or ONNX Runtime is not installed.
+    """
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise InputError(
+            "learned loop detectors need ONNX Runtime: pip install onnxruntime."
+        ) from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4  # what it says of damaged files is in the exception, too
+    # An arena keeps the peak of every shape that it has seen.
+    options.enable_cpu_mem_arena = False
+    try:
+        given = model if isinstance(model, bytes) else model.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: the weights cannot be read ({error.strerror}).") from error
+    try:
+        session = onnxruntime.InferenceSession(given, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime raises a dozen kinds
+        raise InputError(f"{path}: not a readable ONNX file; name another file.") from error
+    if session.get_inputs()[0].name != first_input:
+        raise InputError(
+            f"{path}: not a network of vslam; write one with 'vslam export onnx', or name another "
+            "file."
+        )
+    return session

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vslam.config import Config
 from vslam.errors import InputError
 from vslam.loopclosure.detector import LoopDetector, NoDetector
 from vslam.loopclosure.siamese.weights import NETWORKS, find_weights
 
-DETECTORS = ("none", "bow", *NETWORKS)
+if TYPE_CHECKING:
+    from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
+
+DETECTORS = ("none", "bow", "both", *NETWORKS)
 
 
 def require_detector(name: str, weights: Path | None = None, option: str = "--detector") -> None:
@@ -21,8 +25,8 @@ def require_detector(name: str, weights: Path | None = None, option: str = "--de
     """
     if name not in DETECTORS:
         raise InputError(f"{option} {name}: unknown; choose one of {', '.join(DETECTORS)}.")
-    if name in NETWORKS:
-        find_weights(name, weights)
+    if name in (*NETWORKS, "both"):
+        find_weights(_network_of(name), weights)
     elif weights is not None:
         raise InputError(f"--weights: the detector {name} has none; leave the option out.")
 
@@ -44,11 +48,38 @@ def create_detector(name: str, config: Config, weights: Path | None = None) -> L
         from vslam.loopclosure.vocabulary import load
 
         return BowDetector(load(), config.bow)
+    if name == "both":
+        from vslam.loopclosure.combined import CombinedDetector
+
+        detectors = [
+            create_detector("bow", config),
+            create_detector(_network_of(name), config, weights),
+        ]
+        return CombinedDetector(name, detectors, config.siamese.min_shared)
     if name in NETWORKS:
         from vslam.loopclosure.siamese.detector import open_detector
 
         return open_detector(name, config.siamese, weights)
     raise ValueError(f"no loop detector {name!r}")
+
+
+def create_images(name: str, config: Config) -> KeyframeImages | None:
+    """What keeps the images that learned descriptors verify a detector's candidates with; None for
+    a detector that does without a network, or where the configuration switches it off.
+
+    Raises:
+        InputError: the network cannot be read.
+    """
+    if name in ("none", "bow") or config.learned.max_candidates == 0:
+        return None
+    from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
+
+    return KeyframeImages(LocalDescriptors())
+
+
+def _network_of(name: str) -> str:
+    """The learned half of ``both``; a network itself."""
+    return "capsule" if name == "both" else name
 
 
 def parse_weights(given: Collection[str], detectors: Collection[str]) -> dict[str, Path]:

@@ -103,7 +103,7 @@ def verify(
         landmarks=guided.landmarks[guided.seen],
     )
     if camera.monocular:
-        edge = replace(edge, scale=relative_scale(map_, query, guided, default=scale))
+        edge = replace(edge, scale=relative_scale(map_, edge, guided.T_cw, default=scale))
     reason = _rejection_reason(map_, edge, guided, T_query_match, camera, config)
     return replace(edge, accepted=not reason, reason=reason or "verified")
 
@@ -154,17 +154,22 @@ def _consensus(
     return T_query_match, found.scale, int(np.count_nonzero(found.inlier))
 
 
-def relative_scale(map_: Map, query: int, guided: GuidedMatches, *, default: float) -> float:
+def relative_scale(map_: Map, edge: LoopEdge, T_cw: Matrix, *, default: float) -> float:
     """Units around the query for one around the match: the median ratio of the depths that the
-    query's own landmarks and those of the place give the same features."""
+    query's own landmarks and those of the place give the same features.
+
+    Args:
+        T_cw: pose of the query in the world of the place.
+    """
     a = map_.arrays
-    feature, landmarks = guided.feature[guided.seen], guided.landmarks[guided.seen]
-    own = a.landmark[map_.rows(query)][feature]
+    assert edge.features is not None
+    assert edge.landmarks is not None
+    own = a.landmark[map_.rows(edge.query)][edge.features]
     both = own >= 0
     if np.count_nonzero(both) < MIN_DEPTHS:
         return default
-    depth = transform(a.T_cw[query], a.xyz[own[both]])[:, 2]
-    depth_of_place = transform(guided.T_cw, a.xyz[landmarks[both]])[:, 2]
+    depth = transform(a.T_cw[edge.query], a.xyz[own[both]])[:, 2]
+    depth_of_place = transform(T_cw, a.xyz[edge.landmarks[both]])[:, 2]
     return float(np.median(depth / depth_of_place))
 
 
@@ -255,12 +260,8 @@ def _rejection_reason(
     distance = float(np.linalg.norm(inverse(T_query_match)[:3, 3]))
     if distance > config.max_distance:
         return f"{distance:.0f} m from the place"
-    expected, occupied = occupied_cells(guided, camera)
-    if occupied < max(config.min_cells, config.min_cell_ratio * expected):
-        return f"inliers in {occupied} of {expected} cells of the image only"
-    elsewhere = count_elsewhere(guided.uv[guided.seen, 0], camera.width)
-    if elsewhere < config.min_elsewhere:
-        return f"only {elsewhere} inliers outside one third of the image"
+    if reason := spread_reason(guided.uv, guided.seen, camera, config, config.min_elsewhere):
+        return reason
     seen, total = seen_of(map_, edge.match, guided)
     if seen < config.min_seen_ratio * total:
         return f"only {seen} of {total} landmarks of the place are seen"
@@ -269,6 +270,24 @@ def _rejection_reason(
     )
     if seen < config.min_seen_ratio * total:
         return f"the place saw only {seen} of {total} landmarks of the query"
+    return ""
+
+
+def spread_reason(
+    uv: Matrix,
+    seen: NDArray[np.bool_],
+    camera: Camera,
+    config: VerificationConfig,
+    min_elsewhere: int,
+) -> str:
+    """What speaks against a place of which the landmarks at ``uv`` ``(M, 2)`` should be visible
+    and some are ``seen``: that these lie together; "" if they do not."""
+    expected, occupied = occupied_cells(uv, camera), occupied_cells(uv[seen], camera)
+    if occupied < max(config.min_cells, config.min_cell_ratio * expected):
+        return f"inliers in {occupied} of {expected} cells of the image only"
+    elsewhere = count_elsewhere(uv[seen, 0], camera.width)
+    if elsewhere < min_elsewhere:
+        return f"only {elsewhere} inliers outside one third of the image"
     return ""
 
 
@@ -292,9 +311,8 @@ def seen_of(map_: Map, keyframe: int, guided: GuidedMatches) -> tuple[int, int]:
     return int(np.count_nonzero(guided.seen & own)), int(np.count_nonzero(own))
 
 
-def occupied_cells(guided: GuidedMatches, camera: Camera) -> tuple[int, int]:
-    """Cells of the image where landmarks should be, and cells where they are."""
-    column = (guided.uv[:, 0] * GRID_COLUMNS / camera.width).astype(np.int64)
-    row = (guided.uv[:, 1] * GRID_ROWS / camera.height).astype(np.int64)
-    cell = row * GRID_COLUMNS + column
-    return len(np.unique(cell)), len(np.unique(cell[guided.seen]))
+def occupied_cells(uv: Matrix, camera: Camera) -> int:
+    """Cells of the image in which ``(N, 2)`` pixels lie."""
+    column = (uv[:, 0] * GRID_COLUMNS / camera.width).astype(np.int64)
+    row = (uv[:, 1] * GRID_ROWS / camera.height).astype(np.int64)
+    return len(np.unique(row * GRID_COLUMNS + column))

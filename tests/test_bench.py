@@ -96,7 +96,7 @@ def test_a_cell_is_finished_only_by_a_whole_run_of_the_same_settings(run_folder:
     assert not grid.is_finished(cell, run_folder.parent, CONFIG)
 
 
-@pytest.mark.parametrize("change", ['"schema_version": 3|"schema_version": 2', "{|", "0|"])
+@pytest.mark.parametrize("change", ['"schema_version": 4|"schema_version": 3', "{|", "0|"])
 def test_a_report_of_another_schema_or_damaged_is_none(run_folder, tmp_path, change):
     old, new = change.split("|")
     text = (run_folder / "report.json").read_text()

@@ -260,7 +260,7 @@ def test_json_holds_the_numbers_of_the_run(written: tuple[RunOutcome, Path]) -> 
     assert report["keyframes"] == 40
     assert report["landmarks"] == 9600
     assert report["seed"] == 3
-    assert report["schema_version"] == 3
+    assert report["schema_version"] == 4
     assert (report["loops"], report["revisits"], report["without_loops"]) == ([], [], None)
     assert (report["loops_closed"], report["loops_missed"], report["revisit_stretches"]) == (
         0,

@@ -44,6 +44,8 @@ from vslam.features import Features
 from vslam.geometry import Matrix, compose, inverse, inverses, orthonormalised
 from vslam.loopclosure.consistency import LoopConsistency
 from vslam.loopclosure.detector import LoopDetector
+from vslam.loopclosure.learned_verification import verify_learned
+from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verification import verify
 from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map
@@ -54,14 +56,22 @@ class LoopClosing:
 
     Attributes:
         detector: what finds candidates.
+        images: of the keyframes, for verification by learned descriptors; None for ORB alone.
         edges: every candidate and what became of it, in order.
         corrections: the loops that were closed.
     """
 
     def __init__(
-        self, detector: LoopDetector, camera: Camera, config: Config, *, threads: int
+        self,
+        detector: LoopDetector,
+        camera: Camera,
+        config: Config,
+        *,
+        threads: int,
+        images: KeyframeImages | None = None,
     ) -> None:
         self.detector = detector
+        self.images = images
         self.edges: list[LoopEdge] = []
         self.corrections: list[LoopCorrection] = []
         self._closed: list[LoopEdge] = []  # corrections' edges, in the units of today
@@ -78,11 +88,15 @@ class LoopClosing:
         if self._global is not None and keyframe >= self._global.due:
             self.finish(map_)
         self.detector.add(keyframe, image, features)
+        if self.images is not None and image is not None:
+            self.images.add(keyframe, image)
         candidates = self.detector.query(keyframe, map_)
         consistent, rejected = self._consistency.update(keyframe, candidates, map_)
         self.edges += rejected
+        tries = self._config.learned.max_candidates
         for number, candidate in enumerate(consistent):
-            edge = verify(map_, candidate, self._camera, self._config.verification)
+            edge = self._verify(map_, candidate, learned=candidate.learned and tries > 0)
+            tries -= candidate.learned
             edge = self._consistency.confirm(edge, map_)
             if edge.accepted:
                 edge = self._close(map_, edge)
@@ -91,6 +105,19 @@ class LoopClosing:
                 self._consistency.reset()
                 self.edges += [_superseded(other) for other in consistent[number + 1 :]]
                 break
+
+    def _verify(self, map_: Map, candidate: LoopCandidate, *, learned: bool) -> LoopEdge:
+        """By ORB, and where that fails by learned descriptors, if they are to be asked."""
+        config = self._config
+        edge = verify(map_, candidate, self._camera, config.verification)
+        if edge.accepted or self.images is None or not learned:
+            return edge
+        other = verify_learned(
+            map_, candidate, self.images, self._camera, config.learned, config.verification
+        )
+        if other.T_query_match is not None:
+            return other
+        return replace(edge, reason=f"{edge.reason}; {other.reason}")
 
     def finish(self, map_: Map) -> None:
         """Merge the global bundle adjustment that is under way, if there is one."""

@@ -388,6 +388,53 @@ class VerificationConfig(_Section):
     )
 
 
+class LearnedMatchingConfig(_Section):
+    """Places matched by the network's local descriptors, where ORB fails."""
+
+    max_candidates: int = Field(
+        2, ge=0, description="Candidates tried of a keyframe or lost frame; 0: ORB alone. [own]"
+    )
+    views: int = Field(
+        3, ge=1, description="Keyframes of the place that are matched, at most. [own]"
+    )
+    coarse_alike: float = Field(
+        0.3, ge=-1, le=1, description="Cosine of coarse descriptors that match. [own]"
+    )
+    min_coarse: int = Field(40, ge=1, description="Coarse matches of two images. [own]")
+    alike: float = Field(
+        0.5, ge=-1, le=1, description="Cosine of fine descriptors that match. [own]"
+    )
+    reach: int = Field(
+        5, ge=1, description="Window about a coarse match, fine cells to either side. [own]"
+    )
+    guided_reach: int = Field(
+        3, ge=1, description="Window about a projected landmark, fine cells to either side. [own]"
+    )
+    sigma: float = Field(
+        1.5, gt=0, description="Deviation of a match, pixels of the network's image. [own]"
+    )
+    max_draws: int = Field(1000, ge=1, description="RANSAC draws, at most. [own]")
+    confidence: float = Field(
+        0.99, gt=0, lt=1, description="Probability of one draw without outliers. [own]"
+    )
+    min_consensus: int = Field(40, ge=4, description="Inliers of RANSAC. [own]")
+    min_consensus_ratio: float = Field(
+        0.15, ge=0, le=1, description="Of these, share of the landmarks looked for. [own]"
+    )
+    min_inliers: int = Field(80, ge=6, description="Inliers after guided search. [own]")
+    min_elsewhere: int = Field(
+        40, ge=0, description="Inliers outside the third of the image that has the most. [own]"
+    )
+    min_seen_ratio: float = Field(
+        0.3, ge=0, le=1, description="Landmarks of one side that the other sees, share. [own]"
+    )
+    fuse_pixels: float = Field(
+        2.0,
+        gt=0,
+        description="From a landmark to the keypoint that observes it, at octave 0, pixels. [own]",
+    )
+
+
 class ConsistencyConfig(_Section):
     """What makes verified candidates a loop [OS1, VII-A]."""
 
@@ -555,6 +602,7 @@ class Config(_Section):
     keyframes: KeyframeConfig = KeyframeConfig()
     mapping: MappingConfig = MappingConfig()
     verification: VerificationConfig = VerificationConfig()
+    learned: LearnedMatchingConfig = LearnedMatchingConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
     relocalization: RelocalizationConfig = RelocalizationConfig()
     loops: LoopConfig = LoopConfig()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,14 @@ class LoopCandidate:
         query: keyframe whose place is looked for; -1 for a frame that is not in the map.
         match: keyframe of the same place, alive in the map.
         score: the detector's own measure, greater is more alike.
+        learned: whether a network takes it for the place, so that its local descriptors may verify
+            what ORB's do not.
     """
 
     query: int
     match: int
     score: float
+    learned: bool = False
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,7 @@ class LoopEdge:
         landmarks: ``(N,)`` int32, the landmark of the place that each of them observes.
         scale: length around the query, in its unit, of what is 1 around the match: 1 in metric
             maps, whatever drift made of it in monocular ones.
+        matched_by: "orb" or "learned", the descriptors that the geometry comes from.
     """
 
     query: int
@@ -52,6 +57,7 @@ class LoopEdge:
     features: NDArray[np.int32] | None = None
     landmarks: NDArray[np.int32] | None = None
     scale: float = 1.0
+    matched_by: Literal["orb", "learned"] = "orb"
 
 
 @dataclass(frozen=True)

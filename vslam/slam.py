@@ -29,7 +29,9 @@ from vslam.frontend.tracking import (
 )
 from vslam.geometry import Matrix, inverse, inverses, orthonormalised, se3_exp, se3_log
 from vslam.loopclosure.detector import LoopDetector, NoDetector
-from vslam.loops import LoopCorrection, LoopEdge
+from vslam.loopclosure.learned_verification import recognise
+from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
+from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map, local_map
 from vslam.mapping import MappingThread
 from vslam.monocular import Initialiser
@@ -59,6 +61,7 @@ class Slam:
         detector: LoopDetector | None = None,
         *,
         threads: int = 2,
+        images: KeyframeImages | None = None,
     ) -> None:
         """
         Args:
@@ -66,6 +69,8 @@ class Slam:
             config: thresholds; the defaults are those of the papers.
             detector: finds loops and relocalises (``vslam.loopclosure.registry``); without one
                 there is odometry only.
+            images: keeps what learned descriptors verify loops with, where ORB's fail; None for
+                ORB alone.
             threads: with 1, mapping runs where it is merged instead of beside tracking. The
                 result is the same.
         """
@@ -74,7 +79,9 @@ class Slam:
         self.context = TrackingContext.create(camera, self.config)
         self.frame: Frame | None = None
         self._detector = detector or NoDetector()
-        self._closing = LoopClosing(self._detector, camera, self.config, threads=threads)
+        self._closing = LoopClosing(
+            self._detector, camera, self.config, threads=threads, images=images
+        )
         self._mapping = MappingThread(
             self.context.scales, camera, self.config, self._closing, threads=threads
         )
@@ -249,6 +256,25 @@ class Slam:
             if inliers:
                 self._mapping.set_reference(candidate.match)
                 return inliers
+        return self._relocalise_learned(frame, candidates)
+
+    def _relocalise_learned(self, frame: Frame, candidates: list[LoopCandidate]) -> int:
+        """By local descriptors of the network: where the light has changed ORB's find nothing."""
+        images, config = self._closing.images, self.config.learned
+        candidates = [one for one in candidates if one.learned][: config.max_candidates]
+        if images is None or frame.image is None or not candidates:
+            return 0
+        maps = images.network.describe(frame.image)
+        for candidate in candidates:
+            found = recognise(
+                self.map, maps, frame.features, candidate.match, images, self.camera, self.config
+            )
+            if found is not None:
+                frame.T_cw = found.T_cw
+                frame.landmark[found.feature] = found.landmark
+                frame.xyz[found.feature] = self.map.arrays.xyz[found.landmark]
+                self._mapping.set_reference(candidate.match)
+                return len(found.feature)
         return 0
 
     def _state_of(self, inliers: int) -> TrackingState:

@@ -87,7 +87,7 @@ class SiameseDetector:
             best = int(np.argmax(p))
             if p[best] < max(threshold, 0.0):
                 break
-            found.append(LoopCandidate(query, best, float(p[best])))
+            found.append(LoopCandidate(query, best, float(p[best]), learned=True))
             around, _ = map_.covisible(best, self._config.min_shared)
             p[around[around < n]] = -1.0
             p[best] = -1.0

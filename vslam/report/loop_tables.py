@@ -76,7 +76,10 @@ def _closed(report: ReportJson) -> Table:
         for loop in closed[:_MAX_CLOSED]
     ]
     head = (*_EVIDENCE, "pose", "moved", "time")
-    note = "Moved: the farthest way of a keyframe. Pose: against the ground truth's."
+    note = (
+        "By: descriptors that the geometry comes from. Moved: the farthest way of a keyframe. "
+        "Pose: against the ground truth's."
+    )
     if len(closed) > _MAX_CLOSED:
         note += f" {len(closed) - _MAX_CLOSED} more are in report.json."
     return Table("Loops closed", head, rows, ("pose",), note)
@@ -107,12 +110,15 @@ def _nearly(report: ReportJson) -> Table:
     return Table("Rejected with the most inliers", head, rows, ("pose", "reason"), folded=True)
 
 
-_EVIDENCE = ("frame", "earlier", "score", "matches", "inliers")
+_EVIDENCE = ("frame", "earlier", "score", "by", "matches", "inliers")
 
 
 def _evidence(loop: LoopEntry) -> Row:
     query = "lost" if loop.query_frame is None else str(loop.query_frame)
-    return query, str(loop.match_frame), f"{loop.score:.3f}", str(loop.matches), str(loop.inliers)
+    return (
+        query, str(loop.match_frame), f"{loop.score:.3f}", loop.matched_by, str(loop.matches),
+        str(loop.inliers),
+    )  # fmt: skip
 
 
 def _without_numbers(reason: str) -> str:

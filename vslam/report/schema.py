@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
@@ -27,6 +28,7 @@ class LoopEntry(_Model):
     ``query_frame`` is None for a frame that was not in the map. ``right`` says whether the relative
     pose found is the ground truth's, None where that cannot be said. ``moved_m`` is the farthest
     way that the correction moved a keyframe, ``correction_s`` its time; None if rejected.
+    ``matched_by`` names the descriptors that the relative pose comes from, ``orb`` or ``learned``.
     """
 
     query_frame: int | None
@@ -34,6 +36,7 @@ class LoopEntry(_Model):
     score: float
     matches: int
     inliers: int
+    matched_by: Literal["orb", "learned"] = "orb"
     accepted: bool
     right: bool | None
     reason: str
@@ -88,7 +91,7 @@ class ReportJson(_Model):
     are None without ground truth. See :mod:`vslam.evaluation.loops`.
     """
 
-    schema_version: int = 3
+    schema_version: int = 4
 
     lost_frames: int
     weak_frames: int

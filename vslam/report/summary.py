@@ -136,6 +136,7 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
                 score=edge.score,
                 matches=edge.n_matches,
                 inliers=edge.n_inliers,
+                matched_by=edge.matched_by,
                 accepted=edge.accepted,
                 right=is_right,
                 reason=edge.reason,

@@ -28,7 +28,7 @@ from vslam.datasets.sequence import Sequence
 from vslam.errors import UnreadableImageError
 from vslam.features import Features, TrackResult
 from vslam.frontend.tracking import TrackingContext, extract_features
-from vslam.loopclosure.registry import create_detector
+from vslam.loopclosure.registry import create_detector, create_images
 from vslam.machine import peak_memory_mb, process_age
 from vslam.run.outcome import RunOutcome, RunSettings
 from vslam.run.realtime import play
@@ -65,7 +65,8 @@ def run_sequence(
     """
     cv2.setNumThreads(1)  # the pool uses the cores
     detector = create_detector(settings.detector, settings.config, settings.weights)
-    slam = Slam(sequence.camera, settings.config, detector, threads=settings.threads)
+    images = create_images(settings.detector, settings.config)
+    slam = Slam(sequence.camera, settings.config, detector, threads=settings.threads, images=images)
     tracks: list[TrackResult] = []
     skipped: list[str] = []
     latency_ms: list[float] = []

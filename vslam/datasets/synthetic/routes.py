@@ -115,6 +115,13 @@ _BUILT_IN = {
         "town grid with four revisits", "town", "04-12",
         _Leg(((0, 0), (0, 180), (90, 180), (90, 90), (0, 90), (0, 180), (180, 180), (180, 0),
               (90, 0), (0, 0), (0, 90), (-80, 90), (-80, 0), (0, 0), (90, 0), (90, 160)))),
+    "block": _BuiltIn(
+        "a short loop, for many tests of loop closing", "town", "00-02",
+        _Leg(((0, 0), (0, 52), (46, 62), (56, 6), (0, -14), (0, 52)), speed=11.0)),
+    "lane": _BuiltIn(
+        "the same, the revisit on the other lane", "town", "00-02",
+        _Leg(((0, 0), (0, 52), (46, 62), (56, 6), (0, -14), (0, 52)), (1, 1, 1, 1, -1, -1),
+             speed=11.0)),
 }  # fmt: skip
 
 ROUTES = {name: route.about for name, route in _BUILT_IN.items()}

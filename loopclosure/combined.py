@@ -1,0 +1,59 @@
+"""Several loop detectors as one: what any of them finds is a candidate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import chain, zip_longest
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.features import Features
+from vslam.loopclosure.detector import LoopDetector
+from vslam.loops import LoopCandidate
+from vslam.map import Map
+
+
+class CombinedDetector:
+    """Implements :class:`vslam.loopclosure.detector.LoopDetector`.
+
+    Candidates of the detectors in turn, the best of each first, since their scores do not compare.
+    Those at one place are one candidate, that of the detector named first.
+    """
+
+    def __init__(self, name: str, detectors: list[LoopDetector], min_shared: int) -> None:
+        """``min_shared``: landmarks that put two keyframes at one place."""
+        self.name = name
+        self._detectors, self._min_shared = detectors, min_shared
+
+    def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
+        """See :class:`LoopDetector`."""
+        for one in self._detectors:
+            one.add(keyframe, image, features)
+
+    def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
+        """See :class:`LoopDetector`."""
+        return self._merged([one.query(keyframe, map_) for one in self._detectors], map_)
+
+    def locate(
+        self, image: NDArray[np.uint8] | None, features: Features, map_: Map
+    ) -> list[LoopCandidate]:
+        """See :class:`LoopDetector`."""
+        return self._merged([one.locate(image, features, map_) for one in self._detectors], map_)
+
+    def _merged(self, found: list[list[LoopCandidate]], map_: Map) -> list[LoopCandidate]:
+        merged: list[LoopCandidate] = []
+        place: dict[int, int] = {}  # keyframe to the candidate at whose place it lies
+        for candidate in chain.from_iterable(zip_longest(*found)):
+            if candidate is None:
+                continue
+            known = place.get(candidate.match)
+            if known is not None:
+                learned = merged[known].learned or candidate.learned
+                merged[known] = replace(merged[known], learned=learned)
+                continue
+            around, _ = map_.covisible(candidate.match, self._min_shared)
+            for keyframe in (candidate.match, *around.tolist()):
+                place.setdefault(keyframe, len(merged))
+            merged.append(candidate)
+        return merged

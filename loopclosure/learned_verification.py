@@ -1,0 +1,353 @@
+"""Places found again by learned local descriptors, where ORB's do not survive the change.
+
+As :mod:`vslam.loopclosure.verification`: matches, a motion by RANSAC, guided matching with all
+that the place knows, refinement, and the same evidence against look-alikes. But landmarks of the
+place are looked for anywhere in the query's image, not at its keypoints: by night, and from the
+other lane, corners are found elsewhere. Several keyframes of the place are matched where one does
+not suffice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from vslam.camera import Camera
+from vslam.config import Config, LearnedMatchingConfig, VerificationConfig
+from vslam.features import Features
+from vslam.frontend.pnp import ransac_pose
+from vslam.frontend.pose import optimise_pose
+from vslam.geometry import Matrix, inverse, orthonormalised, transform
+from vslam.loopclosure.local_matching import DescriptorMaps, locate, locate_near, match_coarse
+from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
+from vslam.loopclosure.verification import place_of, relative_scale, spread_reason
+from vslam.loops import LoopCandidate, LoopEdge
+from vslam.map import Map
+
+_DEPTHS_AGREE = 0.15  # a keypoint that observes a landmark has its depth, to this share
+
+
+class View(NamedTuple):
+    """A keyframe of the place: ``maps`` of its image, ``(N,)`` landmarks and the pixels ``(N, 2)``
+    where it sees them."""
+
+    maps: DescriptorMaps
+    landmarks: NDArray[np.int32]
+    xy: NDArray[np.float32]
+
+
+class Sight(NamedTuple):
+    """What a camera should see of M landmarks, and does see.
+
+    Attributes:
+        landmarks: ``(M,)`` int32, those that should be visible.
+        uv: ``(M, 2)`` float64, where they should appear.
+        seen: ``(M,)`` bool, those found there.
+        n_matches: found near the predictions, outliers included.
+        T_cw: ``(4, 4)`` pose of the camera in the world of the landmarks.
+    """
+
+    landmarks: NDArray[np.int32]
+    uv: Matrix
+    seen: NDArray[np.bool_]
+    n_matches: int
+    T_cw: Matrix
+
+
+class Recognised(NamedTuple):
+    """Pose ``T_cw`` ``(4, 4)`` of a frame, and ``(N,)`` of its features with the landmark that
+    each observes."""
+
+    T_cw: Matrix
+    feature: NDArray[np.int64]
+    landmark: NDArray[np.int32]
+
+
+def verify_learned(
+    map_: Map,
+    candidate: LoopCandidate,
+    images: KeyframeImages,
+    camera: Camera,
+    config: LearnedMatchingConfig,
+    gates: VerificationConfig,
+) -> LoopEdge:
+    """:func:`verification.verify` by local descriptors of the keyframes' images.
+
+    The edge's features and landmarks are the inliers at which the query has a keypoint.
+    """
+    query, match = candidate.query, candidate.match
+    edge = LoopEdge(query, match, candidate.score, False, "", matched_by="learned")
+    if not (query in images and match in images):
+        return replace(edge, reason="no image is kept")
+    keyframes = [k for k in place_of(map_, match, query, gates).tolist() if k in images]
+    sight = localise(
+        map_, images.maps(query), keyframes, images, camera, config, seed=query << 32 | match
+    )
+    if isinstance(sight, str):
+        return replace(edge, reason=sight)
+    T_query_match = orthonormalised(sight.T_cw @ inverse(map_.keyframe_pose(match)))
+    feature, landmark = observed_features(map_, query, sight, camera, config)
+    edge = replace(
+        edge,
+        n_matches=sight.n_matches,
+        n_inliers=int(np.count_nonzero(sight.seen)),
+        T_query_match=T_query_match,
+        features=feature,
+        landmarks=landmark,
+    )
+    if camera.monocular:
+        scale = relative_scale(map_, edge, sight.T_cw, default=np.nan)
+        if not np.isfinite(scale):
+            return replace(edge, reason="too few depths on both sides tell the scale")
+        edge = replace(edge, scale=scale)
+    reason = _rejection_reason(map_, edge, sight, images, camera, config, gates)
+    return replace(edge, accepted=not reason, reason=reason or "verified")
+
+
+def recognise(
+    map_: Map,
+    query: DescriptorMaps,
+    features: Features,
+    match: int,
+    images: KeyframeImages,
+    camera: Camera,
+    config: Config,
+) -> Recognised | None:
+    """Find the camera of a frame outside the map at the place of a keyframe.
+
+    Args:
+        query: descriptors of the frame's image.
+        features: of the frame.
+
+    Returns:
+        None unless it sees the place as a loop would have to, and enough keypoints lie where its
+        landmarks appear to go on tracking.
+    """
+    gates = config.verification
+    around = [match, *map_.covisible(match)[0].tolist()]
+    keyframes = [k for k in around if k in images]
+    sight = localise(map_, query, keyframes, images, camera, config.learned, seed=match)
+    if isinstance(sight, str) or _too_little(sight, camera, config.learned, gates):
+        return None
+    index = np.flatnonzero(sight.seen)
+    feature, near = nearest_features(
+        sight.uv[index], features.xy, features.octave, map_.scales, config.learned
+    )
+    if len(feature) < config.tracking.min_inliers:
+        return None
+    return Recognised(sight.T_cw, feature, sight.landmarks[index[near]])
+
+
+def localise(
+    map_: Map,
+    query: DescriptorMaps,
+    keyframes: list[int],
+    images: KeyframeImages,
+    camera: Camera,
+    config: LearnedMatchingConfig,
+    seed: int,
+) -> Sight | str:
+    """Find the camera of an image at a place.
+
+    Args:
+        keyframes: of the place, with images; the first is the best.
+
+    Returns:
+        What it sees of the place, or in a few words why it was not found.
+    """
+    views: list[View] = []
+    xyz, uv = np.empty((0, 3)), np.empty((0, 2))
+    sought, reason = 0, ""
+    for keyframe in keyframes[: config.views]:
+        view = view_of(map_, keyframe, images)
+        coarse = match_coarse(view.maps, query, config.coarse_alike)
+        if len(coarse.a) < config.min_coarse:
+            reason = reason or f"only {len(coarse.a)} cells of the images match"
+            continue
+        views.append(view)
+        sought += len(view.xy)
+        least = max(config.min_consensus, round(config.min_consensus_ratio * sought))
+        located = locate(view.xy, view.maps, query, coarse, config.reach, config.alike)
+        found = located.found
+        xyz = np.vstack([xyz, map_.arrays.xyz[view.landmarks[found]]])
+        uv = np.vstack([uv, located.xy[found]])
+        T_cw, inlier = ransac_pose(
+            xyz,
+            *_observed(uv, query, config),
+            camera.intrinsics,
+            np.uint64(seed),
+            least,
+            config.max_draws,
+            config.confidence,
+        )
+        if np.count_nonzero(inlier) >= least:
+            return guided_search(map_, views, T_cw, query, camera, config)
+        reason = f"no motion that {least} of {len(uv)} learned matches agree on"
+    return reason or "no image of the place is kept"
+
+
+def view_of(map_: Map, keyframe: int, images: KeyframeImages) -> View:
+    """A keyframe and the living landmarks that it observes."""
+    a, rows = map_.arrays, map_.rows(keyframe)
+    landmark = a.landmark[rows]
+    observing = np.flatnonzero(landmark >= 0)
+    return View(images.maps(keyframe), landmark[observing], a.xy[rows][observing])
+
+
+def guided_search(
+    map_: Map,
+    views: list[View],
+    T_cw: Matrix,
+    query: DescriptorMaps,
+    camera: Camera,
+    config: LearnedMatchingConfig,
+) -> Sight:
+    """Look for all landmarks of the views near where a pose puts them, refine the pose, and once
+    more."""
+    _, first = np.unique(np.concatenate([view.landmarks for view in views]), return_index=True)
+    landmarks = np.concatenate([view.landmarks for view in views])[first]
+    xyz = map_.arrays.xyz[landmarks]
+    for _ in range(2):
+        expected = project(xyz, T_cw, camera)
+        found = np.full((len(first), 2), np.nan)
+        start = 0
+        for view in views:
+            chosen = np.flatnonzero((first >= start) & (first < start + len(view.landmarks)))
+            xy = view.xy[first[chosen] - start]
+            found[chosen] = locate_near(
+                xy, expected[chosen], view.maps, query, config.guided_reach, config.alike
+            ).xy
+            start += len(view.landmarks)
+        hit = np.flatnonzero(np.isfinite(found[:, 0]))
+        T_cw, inlier = optimise_pose(
+            T_cw, xyz[hit], *_observed(found[hit], query, config), camera.intrinsics
+        )
+    expected = project(xyz, T_cw, camera)
+    seen = np.zeros(len(landmarks), np.bool_)
+    seen[hit[inlier]] = True
+    visible = np.flatnonzero(np.isfinite(expected[:, 0]))
+    return Sight(landmarks[visible], expected[visible], seen[visible], len(hit), T_cw)
+
+
+def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:
+    """``(N, 2)`` pixels of ``(N, 3)`` points, NaN for those out of view."""
+    p = transform(T_cw, xyz)
+    uv = np.full((len(p), 2), np.nan)
+    ahead = p[:, 2] > 0.1
+    fx, fy, cx, cy, _ = camera.intrinsics
+    uv[ahead] = p[ahead, :2] / p[ahead, 2:] * [fx, fy] + [cx, cy]
+    inside = (uv >= 0).all(1) & (uv <= [camera.width - 1, camera.height - 1]).all(1)
+    uv[~inside] = np.nan
+    return uv
+
+
+def observed_features(
+    map_: Map, query: int, sight: Sight, camera: Camera, config: LearnedMatchingConfig
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Features of the query at which it sees landmarks of the place, and these, ``(N,)`` each,
+    neither twice.
+
+    A feature that observes a landmark already must give it the depth of the other: a corner of a
+    car before a facade is no corner of the facade.
+    """
+    a, rows = map_.arrays, map_.rows(query)
+    landmarks, uv = sight.landmarks[sight.seen], sight.uv[sight.seen]
+    feature, index = nearest_features(uv, a.xy[rows], a.octave[rows], map_.scales, config)
+    own = a.landmark[rows][feature]
+    depth = transform(sight.T_cw, a.xyz[landmarks[index]])[:, 2]
+    ratio = np.where(own >= 0, transform(a.T_cw[query], a.xyz[own])[:, 2] / depth, np.nan)
+    known = np.isfinite(ratio)
+    usual = float(np.median(ratio[known])) if camera.monocular and known.any() else 1.0
+    keep = ~known | (np.abs(np.where(known, ratio, usual) / usual - 1.0) < _DEPTHS_AGREE)
+    return feature[keep].astype(np.int32), landmarks[index[keep]]
+
+
+def nearest_features(
+    uv: Matrix,
+    xy: NDArray[np.float32],
+    octave: NDArray[np.uint8],
+    scales: NDArray[np.float64],
+    config: LearnedMatchingConfig,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Features ``(K,)`` next to some of ``(N, 2)`` pixels, and which of these, the nearest pairs
+    first."""
+    if not len(uv) or not len(xy):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    distance, feature = cKDTree(xy).query(uv)
+    near = np.flatnonzero(distance <= config.fuse_pixels * scales[octave[feature]])
+    near = near[np.argsort(distance[near], kind="stable")]
+    _, first = np.unique(feature[near], return_index=True)
+    near = near[np.sort(first)]
+    return np.asarray(feature[near], np.int64), near
+
+
+def _observed(
+    uv: Matrix, query: DescriptorMaps, config: LearnedMatchingConfig
+) -> tuple[Matrix, Matrix]:
+    """``(N, 3)`` u, v, u_right of pixels, and ``(N,)`` their inverse variances."""
+    sigma = config.sigma / query.scale
+    return np.c_[uv, np.full(len(uv), np.nan)], np.full(len(uv), sigma**-2.0)
+
+
+def _rejection_reason(
+    map_: Map,
+    edge: LoopEdge,
+    sight: Sight,
+    images: KeyframeImages,
+    camera: Camera,
+    config: LearnedMatchingConfig,
+    gates: VerificationConfig,
+) -> str:
+    """What speaks against a refined loop, "" if nothing does."""
+    assert edge.T_query_match is not None
+    distance = float(np.linalg.norm(inverse(edge.T_query_match)[:3, 3]))
+    if distance > gates.max_distance:
+        return f"{distance:.0f} m from the place"
+    if reason := _too_little(sight, camera, config, gates):
+        return reason
+    seen, total = _seen_of_query(map_, edge, images, camera, config)
+    if seen < config.min_seen_ratio * total:
+        return f"the place saw only {seen} of {total} landmarks of the query"
+    return ""
+
+
+def _too_little(
+    sight: Sight, camera: Camera, config: LearnedMatchingConfig, gates: VerificationConfig
+) -> str:
+    """Why too little of a place is seen, "" if it is enough."""
+    seen, total = int(np.count_nonzero(sight.seen)), len(sight.seen)
+    if seen < config.min_inliers:
+        return f"only {seen} learned matches fit"
+    if seen < gates.min_inlier_ratio * sight.n_matches:
+        return f"only {seen} of {sight.n_matches} learned matches fit"
+    if reason := spread_reason(sight.uv, sight.seen, camera, gates, config.min_elsewhere):
+        return reason
+    if seen < config.min_seen_ratio * total:
+        return f"only {seen} of {total} landmarks of the place are seen"
+    return ""
+
+
+def _seen_of_query(
+    map_: Map,
+    edge: LoopEdge,
+    images: KeyframeImages,
+    camera: Camera,
+    config: LearnedMatchingConfig,
+) -> tuple[int, int]:
+    """How many of its landmarks the image of the match shows where the pose puts them, and how
+    many it should."""
+    assert edge.T_query_match is not None
+    T_match_query = inverse(edge.T_query_match)
+    T_match_query[:3, 3] *= edge.scale  # to the query's unit, which its landmarks are in
+    view = view_of(map_, edge.query, images)
+    T_mw = T_match_query @ map_.keyframe_pose(edge.query)
+    expected = project(map_.arrays.xyz[view.landmarks], T_mw, camera)
+    match = images.maps(edge.match)
+    found = locate_near(view.xy, expected, view.maps, match, config.guided_reach, config.alike)
+    off = np.linalg.norm(found.xy - expected, axis=1) * match.scale
+    # 95 % of the radii of a two-dimensional normal distribution are below 2.45 deviations.
+    return int(np.count_nonzero(off < 2.45 * config.sigma)), int(np.isfinite(expected[:, 0]).sum())

@@ -1,0 +1,275 @@
+"""Matching of learned local descriptors, coarse to fine (after LoFTR, Sun et al., CVPR 2021).
+
+Coarse: cells of two images that are each other's nearest. Fine: a keypoint of one image is
+searched in the other, anywhere and not only at keypoints, in windows about where the coarse
+matches around it say; the place is interpolated, and must lead back to the keypoint.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.kernels import inner_kernel, kernel
+
+COARSE_STRIDE, FINE_STRIDE = 16, 4  # pixels of the image that the network read
+
+
+class DescriptorMaps(NamedTuple):
+    """Local descriptors of an image, all of length 1.
+
+    Attributes:
+        coarse: ``(h, w, C)`` float32; cell (i, j) lies at pixel (16 j, 16 i) of the image that the
+            network read.
+        fine: ``(H, W, D)`` float32, likewise at (4 j, 4 i).
+        scale: pixels of that image for one of the camera's.
+    """
+
+    coarse: NDArray[np.float32]
+    fine: NDArray[np.float32]
+    scale: float
+
+
+class CoarseMatches(NamedTuple):
+    """Cells of two images that are each other's nearest.
+
+    Attributes:
+        a, b: ``(N,)`` int64 cells, row by row.
+        alike: ``(N,)`` float32 cosines.
+    """
+
+    a: NDArray[np.int64]
+    b: NDArray[np.int64]
+    alike: NDArray[np.float32]
+
+
+class Located(NamedTuple):
+    """Where keypoints of one image lie in another.
+
+    Attributes:
+        xy: ``(N, 2)`` float64 pixels of the camera, NaN where not found.
+        alike: ``(N,)`` float32 cosine there.
+    """
+
+    xy: NDArray[np.float64]
+    alike: NDArray[np.float32]
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """``(N,)``."""
+        return np.asarray(np.isfinite(self.xy[:, 0]))
+
+
+def match_coarse(a: DescriptorMaps, b: DescriptorMaps, least: float) -> CoarseMatches:
+    """Mutual nearest neighbours with a cosine of at least ``least``."""
+    cells = [np.ascontiguousarray(one.coarse.reshape(-1, one.coarse.shape[2])) for one in (a, b)]
+    best_a, best_b, alike = _nearest(cells[0], np.ascontiguousarray(cells[1].T))
+    mutual = (best_b[best_a] == np.arange(len(best_a))) & (alike >= least)
+    chosen = np.flatnonzero(mutual)
+    return CoarseMatches(chosen, best_a[chosen], alike[chosen])
+
+
+def positions(cells: NDArray[np.int64], maps: DescriptorMaps) -> NDArray[np.float64]:
+    """``(N, 2)`` pixels of the camera where coarse cells lie."""
+    columns = maps.coarse.shape[1]
+    return COARSE_STRIDE * np.stack([cells % columns, cells // columns], 1) / maps.scale
+
+
+def locate(
+    xy: NDArray[np.float32],
+    a: DescriptorMaps,
+    b: DescriptorMaps,
+    coarse: CoarseMatches,
+    reach: int,
+    least: float,
+) -> Located:
+    """Find keypoints of one image in another where coarse matches lead.
+
+    Args:
+        xy: ``(N, 2)`` pixels of camera a.
+        reach: cells of 4 pixels to either side that a window has.
+        least: cosine of a find.
+    """
+    towards = np.full(a.coarse.shape[:2], -1, np.int64).reshape(-1)
+    towards[coarse.a] = coarse.b
+    found, alike = _locate(
+        xy.astype(np.float64) * (a.scale / FINE_STRIDE), a.fine, b.fine,
+        towards.reshape(a.coarse.shape[:2]), b.coarse.shape[1], reach, least,
+    )  # fmt: skip
+    return Located(found * (FINE_STRIDE / b.scale), alike)
+
+
+def locate_near(
+    xy: NDArray[np.float32],
+    expected: NDArray[np.float64],
+    a: DescriptorMaps,
+    b: DescriptorMaps,
+    reach: int,
+    least: float,
+) -> Located:
+    """Find keypoints of one image in another about where ``expected`` ``(N, 2)`` puts them."""
+    found, alike = _locate_near(
+        xy.astype(np.float64) * (a.scale / FINE_STRIDE),
+        expected * (b.scale / FINE_STRIDE),
+        a.fine, b.fine, reach, least,
+    )  # fmt: skip
+    return Located(found * (FINE_STRIDE / b.scale), alike)
+
+
+@kernel
+def _nearest(a, b):
+    """Nearest of ``(N, C)`` and ``(C, M)``: for each of a, for each of b, cosines for a."""
+    n, channels = a.shape
+    m = b.shape[1]
+    best_a, best_b = np.zeros(n, np.int64), np.zeros(m, np.int64)
+    alike_a, alike_b = np.full(n, -2.0, np.float32), np.full(m, -2.0, np.float32)
+    row = np.empty(m, np.float32)
+    for i in range(n):
+        row[:] = 0.0
+        for c in range(channels):
+            x = a[i, c]
+            for j in range(m):
+                row[j] += x * b[c, j]
+        for j in range(m):
+            if row[j] > alike_a[i]:
+                alike_a[i], best_a[i] = row[j], j
+            if row[j] > alike_b[j]:
+                alike_b[j], best_b[j] = row[j], i
+    return best_a, best_b, alike_a
+
+
+@inner_kernel
+def _read(fine, x, y, out):
+    """Descriptor at a place between four cells, of length 1; False outside."""
+    rows, columns, channels = fine.shape
+    if not (x >= 0.0 and y >= 0.0 and x <= columns - 1 and y <= rows - 1):
+        return False
+    j, i = min(int(x), columns - 2), min(int(y), rows - 2)
+    u, v = np.float32(x - j), np.float32(y - i)
+    one = np.float32(1.0)
+    squared = np.float32(0.0)
+    for c in range(channels):
+        above = (one - u) * fine[i, j, c] + u * fine[i, j + 1, c]
+        below = (one - u) * fine[i + 1, j, c] + u * fine[i + 1, j + 1, c]
+        out[c] = (one - v) * above + v * below
+        squared += out[c] * out[c]
+    if squared <= 0.0:
+        return False
+    squared = one / np.sqrt(squared)
+    for c in range(channels):
+        out[c] *= squared
+    return True
+
+
+@inner_kernel
+def _alike(fine, i, j, descriptor):
+    # Four sums, since one would wait for itself.
+    s0, s1, s2, s3 = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for c in range(0, len(descriptor), 4):
+        s0 += fine[i, j, c] * descriptor[c]
+        s1 += fine[i, j, c + 1] * descriptor[c + 1]
+        s2 += fine[i, j, c + 2] * descriptor[c + 2]
+        s3 += fine[i, j, c + 3] * descriptor[c + 3]
+    return (s0 + s1) + (s2 + s3)
+
+
+@inner_kernel
+def _search(fine, descriptor, x, y, reach):
+    """Best cell within ``reach`` of a place; returns its column, row, cosine (-2: none)."""
+    rows, columns, _ = fine.shape
+    best_i, best_j, best = -1, -1, np.float32(-2.0)
+    middle_j, middle_i = int(np.rint(x)), int(np.rint(y))
+    for i in range(max(0, middle_i - reach), min(rows, middle_i + reach + 1)):
+        for j in range(max(0, middle_j - reach), min(columns, middle_j + reach + 1)):
+            alike = _alike(fine, i, j, descriptor)
+            if alike > best:
+                best_i, best_j, best = i, j, alike
+    return best_j, best_i, best
+
+
+@inner_kernel
+def _peak(fine, descriptor, j, i, best):
+    """The top of the parabolas through the cosines beside the best cell."""
+    rows, columns, _ = fine.shape
+    x, y = float(j), float(i)
+    if 0 < j < columns - 1:
+        before, after = _alike(fine, i, j - 1, descriptor), _alike(fine, i, j + 1, descriptor)
+        bend = 2.0 * best - before - after
+        if bend > 1e-6:
+            x += min(0.5, max(-0.5, 0.5 * (after - before) / bend))
+    if 0 < i < rows - 1:
+        before, after = _alike(fine, i - 1, j, descriptor), _alike(fine, i + 1, j, descriptor)
+        bend = 2.0 * best - before - after
+        if bend > 1e-6:
+            y += min(0.5, max(-0.5, 0.5 * (after - before) / bend))
+    return x, y
+
+
+@inner_kernel
+def _leads_back(fine, x, y, descriptor, from_x, from_y, reach):
+    """Whether the descriptor found at (x, y) is found again within 1.5 cells of where it came
+    from; ``descriptor`` holds it."""
+    j, i, _ = _search(fine, descriptor, from_x, from_y, reach)
+    return abs(j - from_x) <= 1.5 and abs(i - from_y) <= 1.5
+
+
+@kernel
+def _locate(xy, fine_a, fine_b, towards, columns_b, reach, least):
+    n, channels = len(xy), fine_a.shape[2]
+    rows_a, columns_a = towards.shape
+    found, similarity = np.full((n, 2), np.nan), np.zeros(n, np.float32)
+    descriptor, other = np.empty(channels, np.float32), np.empty(channels, np.float32)
+    ratio = 4  # fine cells for a coarse one
+    tried = np.empty((9, 2))
+    for k in range(n):
+        x, y = xy[k]
+        if not _read(fine_a, x, y, descriptor):
+            continue
+        cell_j, cell_i = int(np.rint(x / ratio)), int(np.rint(y / ratio))
+        best_j, best_i, best = -1, -1, np.float32(-2.0)
+        n_tried = 0
+        for i in range(max(0, cell_i - 1), min(rows_a, cell_i + 2)):
+            for j in range(max(0, cell_j - 1), min(columns_a, cell_j + 2)):
+                there = towards[i, j]
+                if there < 0:
+                    continue
+                guess_x = x + ratio * (there % columns_b - j)
+                guess_y = y + ratio * (there // columns_b - i)
+                known = False
+                for t in range(n_tried):
+                    known |= abs(tried[t, 0] - guess_x) < 2 and abs(tried[t, 1] - guess_y) < 2
+                if known:
+                    continue
+                tried[n_tried, 0], tried[n_tried, 1] = guess_x, guess_y
+                n_tried += 1
+                to_j, to_i, alike = _search(fine_b, descriptor, guess_x, guess_y, reach)
+                if alike > best:
+                    best_j, best_i, best = to_j, to_i, alike
+        if best < least:
+            continue
+        to_x, to_y = _peak(fine_b, descriptor, best_j, best_i, best)
+        if _read(fine_b, to_x, to_y, other) and _leads_back(fine_a, to_x, to_y, other, x, y, reach):
+            found[k, 0], found[k, 1] = to_x, to_y
+            similarity[k] = best
+    return found, similarity
+
+
+@kernel
+def _locate_near(xy, expected, fine_a, fine_b, reach, least):
+    n, channels = len(xy), fine_a.shape[2]
+    found, similarity = np.full((n, 2), np.nan), np.zeros(n, np.float32)
+    descriptor, other = np.empty(channels, np.float32), np.empty(channels, np.float32)
+    for k in range(n):
+        x, y = xy[k]
+        if not (np.isfinite(expected[k, 0]) and _read(fine_a, x, y, descriptor)):
+            continue
+        j, i, best = _search(fine_b, descriptor, expected[k, 0], expected[k, 1], reach)
+        if best < least:
+            continue
+        to_x, to_y = _peak(fine_b, descriptor, j, i, best)
+        if _read(fine_b, to_x, to_y, other) and _leads_back(fine_a, to_x, to_y, other, x, y, reach):
+            found[k, 0], found[k, 1] = to_x, to_y
+            similarity[k] = best
+    return found, similarity

@@ -21,7 +21,7 @@ from vslam.loopbench.conditions import Condition, apply, clipped, parse_conditio
 from vslam.loopbench.cost import cost
 from vslam.loopbench.detectors import BowScorer, DetectorSet, describe
 from vslam.loopbench.measure import epipolar_inliers, measure, thinned
-from vslam.loopbench.schema import LoopsJson
+from vslam.loopbench.schema import LoopsJson, Verified
 from vslam.loopbench.sets import QuerySet, TestSet, open_set
 from vslam.loopclosure.precision_recall import average_precision, precision_recall
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
@@ -192,11 +192,13 @@ def test_figures_of_detectors_that_know_and_that_err(vocabulary):
     assert sage.figures["average_precision"] == 1.0
     assert sage.figures["recall_at_100_precision"] == 1.0
     assert sage.accuracy == {"0.5": 1.0, "0.9": 1.0}
-    found = sage.queries, sage.first_right, sage.verified_right, sage.verified_wrong
-    assert found == (6, 1.0, 1.0, 0)
+    assert (sage.queries, sage.first_right) == (6, 1.0)
+    names = ("orb", "learned", "both")
+    assert sage.verified == {name: Verified(right=1.0, wrong=0) for name in names}
     assert liar.accuracy == {"0.5": 0.0, "0.9": 0.0}
     # The liar's best images show other walls, whose matches obey no one geometry.
-    assert (liar.first_right, liar.verified_right, liar.verified_wrong) == (0.0, 0.0, 0)
+    assert liar.first_right == 0.0
+    assert liar.verified == {name: Verified(right=0.0, wrong=0) for name in names}
     (gain,) = gains
     assert gain.low > 0.7
     assert gain.difference == pytest.approx(1.0 - liar.figures["average_precision"])

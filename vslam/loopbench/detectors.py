@@ -17,9 +17,11 @@ from vslam.frontend.orb import extract
 from vslam.loopbench.conditions import Image
 from vslam.loopbench.node_matching import NodeIndex, index_nodes
 from vslam.loopclosure.bow_index import InvertedIndex
+from vslam.loopclosure.local_matching import DescriptorMaps
 from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
 
-if TYPE_CHECKING:  # torch is loaded for those who ask for a network
+if TYPE_CHECKING:
+    from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
     from vslam.loopclosure.siamese.scoring import NetworkScorer
 
 
@@ -131,6 +133,30 @@ class _ImageScorer:
         return self._network.scores(self.store(queries), stored)
 
 
+class LocalDescriptorCache:
+    """Coarse local descriptors of images, computed once for each."""
+
+    def __init__(self, network: LocalDescriptors | None = None) -> None:
+        self._network = network
+        self._kept: dict[bytes, DescriptorMaps] = {}
+
+    def of(self, image: Image) -> DescriptorMaps:
+        """Those of a grey image ``(H, W)``; the fine ones are left out.
+
+        Raises:
+            InputError: the network cannot be read.
+        """
+        digest = hashlib.blake2b(image.tobytes()).digest()
+        if digest not in self._kept:
+            if self._network is None:
+                from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
+
+                self._network = LocalDescriptors()
+            maps = self._network.describe(image)
+            self._kept[digest] = maps._replace(fine=maps.fine[:0])
+        return self._kept[digest]
+
+
 class DetectorSet:
     """The detectors of a benchmark, the first of which the others are compared with.
 
@@ -140,6 +166,7 @@ class DetectorSet:
     def __init__(self, scorers: list[Scorer], vocabulary: Vocabulary, threads: int) -> None:
         self.scorers = tuple(scorers)
         self._vocabulary, self._threads = vocabulary, threads
+        self.local = LocalDescriptorCache()
         self._kept: OrderedDict[bytes, tuple[list[DescribedImage], dict[str, Any]]] = OrderedDict()
 
     def gallery(self, images: list[Image]) -> tuple[list[DescribedImage], dict[str, Any]]:

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from vslam.errors import ResultsError
-from vslam.loopbench.measure import MIN_MATCHES
+from vslam.loopbench.measure import MIN_MATCHES, MIN_SHARE
 from vslam.loopbench.schema import LoopsJson, Score
 from vslam.report.drawing import (
     AMBER,
@@ -36,10 +36,12 @@ _ABOUT_AP = (
 )
 _ABOUT_RECALL = "Highest recall without one wrong pair; at a recall of 70 %, the precision."
 _ABOUT_VERIFIED = (
-    "Of the queries that have a place to find: share whose best image shows it, and share where "
-    f"also at least {MIN_MATCHES} ORB matches obey one epipolar geometry. Wrong: queries whose "
-    "best image shows another place and passes that test, too."
+    "Of the queries that have a place to find: share whose best image shows it, and shares where "
+    f"also at least {MIN_MATCHES} ORB matches obey one epipolar geometry, where matches of learned "
+    f"local descriptors that obey one homography cover {100 * MIN_SHARE:.0f} % of the image, and "
+    "where one of both is so."
 )
+_ABOUT_WRONG = "Queries whose best image shows another place and passes those tests, too."
 _ABOUT_ACCURACY = "Balanced: mean of the shares of true and of false pairs judged rightly by p."
 _ABOUT_COST = (
     "Each in a process of its own, one thread, medians. An image: what is needed beyond the ORB "
@@ -118,9 +120,12 @@ def tables(report: LoopsJson) -> list[Table]:
         _table(report, "Recall at 100 % precision, precision at 70 % recall",
                lambda c: f"{c.figures['recall_at_100_precision']:.3f}, "
                f"{c.figures['precision_at_70_recall']:.3f}", _ABOUT_RECALL),
-        _table(report, "Places found: best image right, verified, wrong",
-               lambda c: f"{c.first_right:.3f}, {c.verified_right:.3f}, {c.verified_wrong}",
+        _table(report, "Best image right, also verified by ORB, learned descriptors, one of both",
+               lambda c: ", ".join(f"{share:.3f}" for share in
+                                   (c.first_right, *(v.right for v in c.verified.values()))),
                _ABOUT_VERIFIED),
+        _table(report, "Wrong images verified by ORB, learned descriptors, one of both",
+               lambda c: ", ".join(str(v.wrong) for v in c.verified.values()), _ABOUT_WRONG),
         _table(report, "Largest F1", lambda c: f"{c.figures['max_f1']:.3f}", ""),
         _table(report, "Accuracy at p = 0.5, 0.9", _accuracies, _ABOUT_ACCURACY),
     ]  # fmt: skip

@@ -19,15 +19,22 @@ class Curve(_Model):
     recall: list[float]
 
 
+class Verified(_Model):
+    """``right``: share of the queries that have a place in the gallery whose best image shows it
+    and passes verification; ``wrong``: queries whose best image shows another place and passes."""
+
+    right: float
+    wrong: int
+
+
 class Score(_Model):
     """One detector on one set of images under one condition.
 
     ``figures`` are those of :func:`vslam.loopclosure.precision_recall.summary`, of descriptors
     alone; ``accuracy`` is balanced, at thresholds on p, None for detectors without.
     ``first_right``: share of the ``queries`` that have a place in the gallery whose best image
-    shows it;
-    ``verified_right``: the same, and its matches obey one epipolar geometry; ``verified_wrong``:
-    queries whose best image shows another place and passes, too.
+    shows it. ``verified``: by ``orb``, by ``learned`` local descriptors, by ``both``, one of the
+    two.
     """
 
     data: str
@@ -37,8 +44,7 @@ class Score(_Model):
     accuracy: dict[str, float | None]
     queries: int
     first_right: float
-    verified_right: float
-    verified_wrong: int
+    verified: dict[str, Verified]
     curve: Curve
 
 
@@ -73,7 +79,7 @@ class LoopsJson(_Model):
     """``kind`` tells this file from those of runs."""
 
     kind: Literal["loops"] = "loops"
-    schema_version: int = 1
+    schema_version: int = 2
 
     seed: int
     cells: list[Score]

@@ -53,9 +53,10 @@ from vslam.frontend import pnp
 from vslam.frontend.orb import scale_factors
 from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracking import Frame, TrackingContext
-from vslam.loopclosure import bow, sim3_ransac
+from vslam.loopclosure import bow, local_matching, sim3_ransac
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.detector import NoDetector
+from vslam.loopclosure.local_matching import DescriptorMaps, locate, locate_near, match_coarse
 from vslam.loopclosure.verification import verify
 from vslam.loopclosure.vocabulary import Vocabulary, from_children
 from vslam.loops import LoopCandidate, LoopEdge
@@ -233,6 +234,16 @@ def compile_recognition() -> None:
     detector.query(0, map_)
 
 
+def compile_learned_matching() -> None:
+    """What learned descriptors are matched with; they are made up, no network is loaded."""
+    rng = np.random.default_rng(0)
+    coarse, fine = (rng.standard_normal((rows, 2 * rows, 4), np.float32) for rows in (4, 16))
+    maps = DescriptorMaps(coarse, fine, 1.0)
+    xy = np.full((2, 2), 20.0, np.float32)
+    locate(xy, maps, maps, match_coarse(maps, maps, -1.0), 1, -1.0)
+    locate_near(xy, np.full((2, 2), 20.0), maps, maps, 1, -1.0)
+
+
 def compile_correction() -> None:
     """Pose graph, loop fusion and global bundle adjustment: the steps of ``LoopClosing``.
 
@@ -279,11 +290,17 @@ def compile_bundle_adjustment() -> None:
 # that are in the cache, because the first starts with them.
 COMPILE_SHARES: dict[str, tuple[Callable[[], None], ...]] = {
     "first": (compile_insertion, compile_tracking, compile_recognition),
-    "second": (compile_bundle_adjustment, compile_local_mapping, compile_correction),
+    "second": (
+        compile_bundle_adjustment,
+        compile_local_mapping,
+        compile_correction,
+        compile_learned_matching,
+    ),
 }
 EVERYTHING: tuple[Callable[[], None], ...] = (
     run_everything,
     compile_recognition,
+    compile_learned_matching,
     compile_correction,
 )
 # Of each module with much to compile the kernel that is compiled last.
@@ -292,6 +309,7 @@ COLD_PROBES: tuple[tuple[ModuleType, str], ...] = (
     (sim3_ransac, "_ransac"),
     (pnp, "ransac_pose"),
     (bow, "choose_candidates"),
+    (local_matching, "_locate_near"),
     (global_bundle_adjustment, "_step_cameras"),
     (block_cholesky, "factor_solve"),
     (global_mapping, "remove_unchanged"),

@@ -1,0 +1,170 @@
+"""Loops verified by learned local descriptors: a wall again, from elsewhere, in another light."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from vslam.camera import Camera
+from vslam.config import Config
+from vslam.features import Features
+from vslam.geometry import inverse, se3_exp, transform
+from vslam.loopclosure.learned_verification import nearest_features, recognise, verify_learned
+from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
+from vslam.loops import LoopCandidate
+from vslam.map import Map
+from vslam.map_kernels import link_many
+
+CAMERA = Camera(400.0, 400.0, 320.0, 96.0, 0.5, 640, 192)
+DEPTH = 8.0
+CONFIG = Config()
+
+
+def wall(seed: int) -> np.ndarray:
+    """A painted wall of 40 by 16 metres, 80 pixels a metre: rectangles, lines, spots."""
+    rng = np.random.default_rng(seed)
+    image = np.full((1280, 3200), 128, np.uint8)
+    for _ in range(900):
+        x, y = rng.integers(0, 3200), rng.integers(0, 1280)
+        w, h = rng.integers(10, 160, 2)
+        grey = int(rng.integers(20, 236))
+        if rng.random() < 0.6:
+            cv2.rectangle(image, (x, y), (x + w, y + h), grey, -1)
+        else:
+            cv2.ellipse(image, (x, y), (int(w) // 2, int(h) // 2), 0, 0, 360, grey, -1)
+    return cv2.GaussianBlur(image, (0, 0), 1.2)
+
+
+def seen(painting: np.ndarray, T_cw: np.ndarray) -> np.ndarray:
+    """The wall, which stands at z = 8 around the axis, from a camera."""
+    K = np.array([[400.0, 0, 320], [0, 400, 96], [0, 0, 1]])
+    to_wall = np.array([[1 / 80, 0, -20], [0, 1 / 80, -8], [0, 0, 0], [0, 0, 1.0]])
+    to_wall[2, 2] = DEPTH
+    H = K @ T_cw[:3] @ to_wall
+    return np.asarray(cv2.warpPerspective(painting, H, (640, 192), flags=cv2.INTER_AREA), np.uint8)
+
+
+def by_night(image: np.ndarray) -> np.ndarray:
+    """Darker, a lamp at one side, more noise."""
+    rng = np.random.default_rng(0)
+    lamp = np.exp(-(((np.arange(640) - 150) / 200.0) ** 2))
+    dark = 20 + image * (0.12 + 0.4 * lamp) + rng.normal(0, 4, image.shape)
+    return np.clip(dark, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def network() -> LocalDescriptors:
+    return LocalDescriptors()
+
+
+class World:
+    """Keyframe 0 before a wall; keyframe 1 somewhere, with other landmarks and no ORB in common."""
+
+    def __init__(
+        self,
+        network: LocalDescriptors,
+        T_1_0: np.ndarray,
+        *,
+        same: bool = True,
+        unit: float = 1.0,
+    ) -> None:
+        painting = wall(1)
+        self.images = KeyframeImages(network)
+        self.night = by_night(seen(painting if same else wall(2), T_1_0))
+        self.images.add(0, seen(painting, np.eye(4)))
+        self.images.add(1, self.night)
+        self.map = Map(1.2 ** np.arange(8.0))
+        drift = se3_exp(np.array([3.0, 0.0, -2.0, 0.0, 0.1, 0.0]))  # the map is wrong at keyframe 1
+        rng = np.random.default_rng(0)
+        for keyframe, (T_cw, image) in enumerate(
+            [(np.eye(4), seen(painting, np.eye(4))), (T_1_0, self.night)]
+        ):
+            corners = cv2.goodFeaturesToTrack(image, 600, 0.01, 5)[:, 0]
+            n = len(corners)
+            features = Features(
+                corners.astype(np.float32), np.zeros(n, np.uint8), np.zeros(n, np.float32),
+                rng.integers(0, 256, (n, 32), np.uint8), np.full(n, np.nan, np.float32),
+            )  # fmt: skip
+            rays = np.c_[(corners - [320, 96]) / 400.0, np.ones(n)] @ T_cw[:3, :3]
+            centre = inverse(T_cw)[:3, 3]
+            xyz = centre + rays * ((DEPTH - centre[2]) / rays[:, 2])[:, None]
+            pose = T_cw
+            if keyframe == 1:
+                # Its own landmarks and pose, in another unit and moved by the drift.
+                local = transform(T_cw, xyz) * unit
+                pose = T_cw @ drift
+                pose[:3, 3] *= unit
+                xyz = transform(inverse(pose), local)
+            self.map.add_keyframe(features, pose, float(keyframe), keyframe)
+            ids = self.map.add_landmarks(xyz, features.descriptors.view(np.uint64), keyframe)
+            rows = self.map.rows(keyframe)
+            link_many(self.map.arrays, np.arange(rows.start, rows.stop), ids)
+
+    def verify(self, camera: Camera = CAMERA):
+        return verify_learned(
+            self.map, LoopCandidate(1, 0, 0.9, learned=True), self.images, camera,
+            CONFIG.learned, CONFIG.verification,
+        )  # fmt: skip
+
+
+T_1_0 = se3_exp(np.array([1.2, 0.1, 0.6, 0.0, 0.12, 0.01]))
+
+
+def test_a_place_by_night_from_the_side_is_found_to_centimetres(network):
+    edge = World(network, T_1_0).verify()
+    assert (edge.accepted, edge.reason, edge.matched_by) == (True, "verified", "learned")
+    error = inverse(edge.T_query_match) @ T_1_0
+    assert np.linalg.norm(error[:3, 3]) < 0.1
+    assert np.degrees(np.arccos((np.trace(error[:3, :3]) - 1) / 2)) < 0.5
+    assert edge.n_inliers >= CONFIG.learned.min_inliers
+    # Features of the query are paired with landmarks of the place where these appear.
+    assert len(edge.features) == len(set(edge.features)) == len(set(edge.landmarks)) > 30
+
+
+def test_a_monocular_loop_has_the_scale_of_its_depths(network):
+    world = World(network, T_1_0, unit=1.7)
+    edge = world.verify(CAMERA.left_camera())
+    assert edge.accepted, edge.reason
+    assert edge.scale == pytest.approx(1.7, rel=0.03)
+    assert np.linalg.norm((inverse(edge.T_query_match) @ T_1_0)[:3, 3]) < 0.1
+
+
+def test_another_wall_is_refused(network):
+    edge = World(network, T_1_0, same=False).verify()
+    assert not edge.accepted
+    assert edge.reason
+
+
+def test_without_an_image_nothing_is_verified(network):
+    world = World(network, T_1_0)
+    world.images = KeyframeImages(network)
+    edge = world.verify()
+    assert (edge.accepted, edge.reason) == (False, "no image is kept")
+
+
+def test_a_lost_frame_is_recognised(network):
+    world = World(network, T_1_0)
+    maps = network.describe(world.night)
+    features = Features.none()
+    given = (world.map, maps, features, 0, world.images, CAMERA, CONFIG)
+    assert recognise(*given) is None  # no keypoint to go on with
+    rows = world.map.rows(1)
+    a = world.map.arrays
+    features = Features(a.xy[rows], a.octave[rows], a.angle[rows], np.zeros(0), a.u_right[rows])
+    found = recognise(world.map, maps, features, 0, world.images, CAMERA, CONFIG)
+    assert np.linalg.norm((inverse(found.T_cw) @ T_1_0)[:3, 3]) < 0.1
+    expected = transform(T_1_0, a.xyz[found.landmark])
+    uv = expected[:, :2] / expected[:, 2:] * 400.0 + [320, 96]
+    assert np.abs(uv - features.xy[found.feature]).max() < 5.0
+    assert len(found.feature) >= CONFIG.tracking.min_inliers
+
+
+def test_each_feature_takes_the_nearest_pixel():
+    xy = np.array([[10.0, 10.0], [50.0, 10.0], [80.0, 10.0]], np.float32)
+    uv = np.array([[11.0, 10.0], [10.2, 10.0], [48.5, 10.0], [84.0, 10.0]])
+    octave = np.array([0, 0, 0], np.uint8)
+    feature, index = nearest_features(uv, xy, octave, 1.2 ** np.arange(8.0), CONFIG.learned)
+    assert sorted(zip(feature.tolist(), index.tolist(), strict=True)) == [(0, 1), (1, 2)]
+    none = nearest_features(uv[:0], xy, octave, np.ones(8), CONFIG.learned)
+    assert [len(x) for x in none] == [0, 0]

@@ -49,8 +49,8 @@ class CombinedDetector:
                 continue
             known = place.get(candidate.match)
             if known is not None:
-                learned = merged[known].learned or candidate.learned
-                merged[known] = replace(merged[known], learned=learned)
+                if merged[known].alike is None:
+                    merged[known] = replace(merged[known], alike=candidate.alike)
                 continue
             around, _ = map_.covisible(candidate.match, self._min_shared)
             for keyframe in (candidate.match, *around.tolist()):

@@ -9,6 +9,7 @@ not suffice.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,7 +23,13 @@ from vslam.features import Features
 from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.pose import optimise_pose
 from vslam.geometry import Matrix, inverse, orthonormalised, transform
-from vslam.loopclosure.local_matching import DescriptorMaps, locate, locate_near, match_coarse
+from vslam.loopclosure.local_matching import (
+    DescriptorMaps,
+    homography_share,
+    locate,
+    locate_near,
+    match_coarse,
+)
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verification import place_of, relative_scale, spread_reason
 from vslam.loops import LoopCandidate, LoopEdge
@@ -67,6 +74,36 @@ class Recognised(NamedTuple):
     landmark: NDArray[np.int32]
 
 
+class LearnedTrials:
+    """Which candidates learned descriptors are asked about: they take forty times as long as ORB's.
+
+    Those whose images local descriptors find most alike; and after a try in vain, for some
+    keyframes, only what is clearly more alike than that was.
+    """
+
+    def __init__(self, config: LearnedMatchingConfig) -> None:
+        self._config = config
+        self._keyframe = 0
+        self._resting_until, self._in_vain = 0, 0.0
+
+    def choose(self, keyframe: int, candidates: Collection[LoopCandidate]) -> set[int]:
+        """Keyframes that are matches to try; none of a detector without a network."""
+        self._keyframe = keyframe
+        config = self._config
+        least = config.more_alike * self._in_vain if keyframe < self._resting_until else 0.0
+        alike = [(one.alike, one.match) for one in candidates if one.alike is not None]
+        best = sorted(alike, reverse=True)[: config.max_candidates]
+        return {match for likeness, match in best if likeness > least}
+
+    def record(self, candidate: LoopCandidate, *, located: bool) -> None:
+        """Whether a try found a pose, be it refused later on."""
+        if located:
+            self._resting_until = 0
+        else:
+            self._resting_until = self._keyframe + 1 + self._config.rest
+            self._in_vain = candidate.alike or 0.0
+
+
 def verify_learned(
     map_: Map,
     candidate: LoopCandidate,
@@ -81,9 +118,9 @@ def verify_learned(
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge(query, match, candidate.score, False, "", matched_by="learned")
-    if not (query in images and match in images):
-        return replace(edge, reason="no image is kept")
     keyframes = [k for k in place_of(map_, match, query, gates).tolist() if k in images]
+    if query not in images or not keyframes:
+        return replace(edge, reason="no image is kept")
     sight = localise(
         map_, images.maps(query), keyframes, images, camera, config, seed=query << 32 | match
     )
@@ -104,7 +141,8 @@ def verify_learned(
         if not np.isfinite(scale):
             return replace(edge, reason="too few depths on both sides tell the scale")
         edge = replace(edge, scale=scale)
-    reason = _rejection_reason(map_, edge, sight, images, camera, config, gates)
+    seen = _seen_of_query(map_, edge, keyframes[0], images, camera, config)
+    reason = _rejection_reason(edge, sight, seen, camera, config, gates)
     return replace(edge, accepted=not reason, reason=reason or "verified")
 
 
@@ -164,11 +202,11 @@ def localise(
     sought, reason = 0, ""
     for keyframe in keyframes[: config.views]:
         view = view_of(map_, keyframe, images)
-        coarse = match_coarse(view.maps, query, config.coarse_alike)
-        if len(coarse.a) < config.min_coarse:
-            reason = reason or f"only {len(coarse.a)} cells of the images match"
-            continue
+        share = homography_share(view.maps, query, config.coarse_alike)
+        if share < config.min_share:
+            return reason or f"{100 * share:.0f} % of the image match"
         views.append(view)
+        coarse = match_coarse(view.maps, query, config.coarse_alike)
         sought += len(view.xy)
         least = max(config.min_consensus, round(config.min_consensus_ratio * sought))
         located = locate(view.xy, view.maps, query, coarse, config.reach, config.alike)
@@ -294,10 +332,9 @@ def _observed(
 
 
 def _rejection_reason(
-    map_: Map,
     edge: LoopEdge,
     sight: Sight,
-    images: KeyframeImages,
+    of_query: tuple[int, int],
     camera: Camera,
     config: LearnedMatchingConfig,
     gates: VerificationConfig,
@@ -309,7 +346,7 @@ def _rejection_reason(
         return f"{distance:.0f} m from the place"
     if reason := _too_little(sight, camera, config, gates):
         return reason
-    seen, total = _seen_of_query(map_, edge, images, camera, config)
+    seen, total = of_query
     if seen < config.min_seen_ratio * total:
         return f"the place saw only {seen} of {total} landmarks of the query"
     return ""
@@ -334,19 +371,24 @@ def _too_little(
 def _seen_of_query(
     map_: Map,
     edge: LoopEdge,
+    keyframe: int,
     images: KeyframeImages,
     camera: Camera,
     config: LearnedMatchingConfig,
 ) -> tuple[int, int]:
-    """How many of its landmarks the image of the match shows where the pose puts them, and how
-    many it should."""
+    """How many landmarks of the query the image of a keyframe at the place shows where the pose
+    puts them, and how many it should."""
     assert edge.T_query_match is not None
     T_match_query = inverse(edge.T_query_match)
     T_match_query[:3, 3] *= edge.scale  # to the query's unit, which its landmarks are in
     view = view_of(map_, edge.query, images)
-    T_mw = T_match_query @ map_.keyframe_pose(edge.query)
-    expected = project(map_.arrays.xyz[view.landmarks], T_mw, camera)
-    match = images.maps(edge.match)
+    T_wm = inverse(map_.keyframe_pose(edge.match))
+    T_wm[:3, 3] *= edge.scale
+    T_wk = inverse(map_.keyframe_pose(keyframe))
+    T_wk[:3, 3] *= edge.scale
+    T_kw = inverse(T_wk) @ T_wm @ T_match_query @ map_.keyframe_pose(edge.query)
+    expected = project(map_.arrays.xyz[view.landmarks], T_kw, camera)
+    match = images.maps(keyframe)
     found = locate_near(view.xy, expected, view.maps, match, config.guided_reach, config.alike)
     off = np.linalg.norm(found.xy - expected, axis=1) * match.scale
     # 95 % of the radii of a two-dimensional normal distribution are below 2.45 deviations.

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vslam.kernels import inner_kernel, kernel
 
 COARSE_STRIDE, FINE_STRIDE = 16, 4  # pixels of the image that the network read
+_HOMOGRAPHY_PIXELS, _HOMOGRAPHY_DRAWS = 12.0, 300
 
 
 class DescriptorMaps(NamedTuple):
@@ -116,6 +117,38 @@ def locate_near(
         a.fine, b.fine, reach, least,
     )  # fmt: skip
     return Located(found * (FINE_STRIDE / b.scale), alike)
+
+
+def likeness(a: DescriptorMaps, b: DescriptorMaps, least: float) -> float:
+    """Sum of the cosines of coarse matches over the cells of an image: 1 for the same image.
+
+    Args:
+        least: cosine of a match.
+    """
+    cells = min(one.coarse.shape[0] * one.coarse.shape[1] for one in (a, b))
+    return float(match_coarse(a, b, least).alike.sum() / cells)
+
+
+def homography_share(a: DescriptorMaps, b: DescriptorMaps, least: float) -> float:
+    """Coarse matches that one homography explains, roughly, over the cells of an image.
+
+    One homography is no model of a street. But what is far lies on one, and near things move by
+    less than a cell or two; in two images of different places no homography has as many.
+
+    Args:
+        least: cosine of a match.
+    """
+    import cv2
+
+    coarse = match_coarse(a, b, least)
+    if len(coarse.a) < 4:
+        return 0.0
+    _, inlier = cv2.findHomography(
+        a.scale * positions(coarse.a, a), b.scale * positions(coarse.b, b),
+        cv2.RANSAC, _HOMOGRAPHY_PIXELS, maxIters=_HOMOGRAPHY_DRAWS,
+    )  # fmt: skip
+    cells = min(one.coarse.shape[0] * one.coarse.shape[1] for one in (a, b))
+    return 0.0 if inlier is None else float(inlier.sum() / cells)
 
 
 @kernel

@@ -31,11 +31,17 @@ def require_detector(name: str, weights: Path | None = None, option: str = "--de
         raise InputError(f"--weights: the detector {name} has none; leave the option out.")
 
 
-def create_detector(name: str, config: Config, weights: Path | None = None) -> LoopDetector:
+def create_detector(
+    name: str,
+    config: Config,
+    weights: Path | None = None,
+    images: KeyframeImages | None = None,
+) -> LoopDetector:
     """A detector that remembers nothing yet. What it needs is imported here, not before.
 
     Args:
         weights: of a learned detector; None for those that vslam ships.
+        images: of the keyframes, from :func:`create_images`; given to ``LoopClosing``, too.
 
     Raises:
         InputError: its vocabulary or weights cannot be read.
@@ -53,13 +59,13 @@ def create_detector(name: str, config: Config, weights: Path | None = None) -> L
 
         detectors = [
             create_detector("bow", config),
-            create_detector(_network_of(name), config, weights),
+            create_detector(_network_of(name), config, weights, images),
         ]
         return CombinedDetector(name, detectors, config.siamese.min_shared)
     if name in NETWORKS:
         from vslam.loopclosure.siamese.detector import open_detector
 
-        return open_detector(name, config.siamese, weights)
+        return open_detector(name, config.siamese, weights, config.learned, images)
     raise ValueError(f"no loop detector {name!r}")
 
 

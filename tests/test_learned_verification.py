@@ -103,7 +103,7 @@ class World:
 
     def verify(self, camera: Camera = CAMERA):
         return verify_learned(
-            self.map, LoopCandidate(1, 0, 0.9, learned=True), self.images, camera,
+            self.map, LoopCandidate(1, 0, 0.9, alike=0.5), self.images, camera,
             CONFIG.learned, CONFIG.verification,
         )  # fmt: skip
 

@@ -44,7 +44,7 @@ from vslam.features import Features
 from vslam.geometry import Matrix, compose, inverse, inverses, orthonormalised
 from vslam.loopclosure.consistency import LoopConsistency
 from vslam.loopclosure.detector import LoopDetector
-from vslam.loopclosure.learned_verification import verify_learned
+from vslam.loopclosure.learned_verification import LearnedTrials, verify_learned
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verification import verify
 from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
@@ -74,6 +74,7 @@ class LoopClosing:
         self.images = images
         self.edges: list[LoopEdge] = []
         self.corrections: list[LoopCorrection] = []
+        self._trials = LearnedTrials(config.learned)
         self._closed: list[LoopEdge] = []  # corrections' edges, in the units of today
         self._camera = camera
         self._config = config
@@ -87,37 +88,43 @@ class LoopClosing:
         """Look for loops at a keyframe whose local mapping is done; close the first real one."""
         if self._global is not None and keyframe >= self._global.due:
             self.finish(map_)
+        if self.images is not None and keyframe % self._config.learned.every:
+            image = None
         self.detector.add(keyframe, image, features)
         if self.images is not None and image is not None:
             self.images.add(keyframe, image)
         candidates = self.detector.query(keyframe, map_)
         consistent, rejected = self._consistency.update(keyframe, candidates, map_)
-        self.edges += rejected
-        tries = self._config.learned.max_candidates
-        for number, candidate in enumerate(consistent):
-            edge = self._verify(map_, candidate, learned=candidate.learned and tries > 0)
-            tries -= candidate.learned
+        chosen = self._trials.choose(keyframe, candidates)
+        self.edges += [edge for edge in rejected if edge.match not in chosen]
+        refused = {edge.match: edge for edge in rejected}
+        verified = [one for one in candidates if one in consistent or one.match in chosen]
+        for number, candidate in enumerate(verified):
+            edge = refused.get(candidate.match)
+            if edge is None:
+                edge = verify(map_, candidate, self._camera, self._config.verification)
+            if not edge.accepted and candidate.match in chosen:
+                edge = self._verify_learned(map_, candidate, edge)
             edge = self._consistency.confirm(edge, map_)
             if edge.accepted:
                 edge = self._close(map_, edge)
             self.edges.append(edge)
             if edge.accepted:
                 self._consistency.reset()
-                self.edges += [_superseded(other) for other in consistent[number + 1 :]]
+                self.edges += [_superseded(other) for other in verified[number + 1 :]]
                 break
 
-    def _verify(self, map_: Map, candidate: LoopCandidate, *, learned: bool) -> LoopEdge:
-        """By ORB, and where that fails by learned descriptors, if they are to be asked."""
+    def _verify_learned(self, map_: Map, candidate: LoopCandidate, by_orb: LoopEdge) -> LoopEdge:
+        """What learned descriptors say of a candidate that ORB's did not verify."""
+        assert self.images is not None
         config = self._config
-        edge = verify(map_, candidate, self._camera, config.verification)
-        if edge.accepted or self.images is None or not learned:
-            return edge
-        other = verify_learned(
+        edge = verify_learned(
             map_, candidate, self.images, self._camera, config.learned, config.verification
         )
-        if other.T_query_match is not None:
-            return other
-        return replace(edge, reason=f"{edge.reason}; {other.reason}")
+        self._trials.record(candidate, located=edge.T_query_match is not None)
+        if edge.T_query_match is not None:
+            return edge
+        return replace(by_orb, reason=f"{by_orb.reason}; {edge.reason}")
 
     def finish(self, map_: Map) -> None:
         """Merge the global bundle adjustment that is under way, if there is one."""

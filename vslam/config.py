@@ -317,6 +317,12 @@ class SiameseConfig(_Section):
     """Learned loop detectors. [ZS]: Zhou and Sun, Sci Rep 15, 7644 (2025)."""
 
     threshold: float = Field(0.9, ge=0, le=1, description="Similarity of a loop. [ZS, printed]")
+    offered: float = Field(
+        0.1, ge=0, le=1, description="The same, where learned descriptors verify. [own]"
+    )
+    reranked: int = Field(
+        20, ge=1, description="Most similar keyframes that local descriptors put in order. [own]"
+    )
     max_candidates: int = Field(5, ge=1, description="Candidates of a query, best first. [own]")
     recent_keyframes: int = Field(
         10, ge=0, description="Newest keyframes that are no candidates. [own]"
@@ -395,12 +401,25 @@ class LearnedMatchingConfig(_Section):
         2, ge=0, description="Candidates tried of a keyframe or lost frame; 0: ORB alone. [own]"
     )
     views: int = Field(
-        3, ge=1, description="Keyframes of the place that are matched, at most. [own]"
+        2, ge=1, description="Keyframes of the place that are matched, at most. [own]"
+    )
+    every: int = Field(
+        2, ge=1, description="A network sees the image of one keyframe in so many. [own]"
+    )
+    rest: int = Field(
+        8,
+        ge=0,
+        description="Keyframes after a vain try at which nothing less alike is tried. [own]",
+    )
+    more_alike: float = Field(
+        1.1, ge=1, description="Ratio of likeness that makes a place worth a try before. [own]"
+    )
+    min_share: float = Field(
+        0.1, ge=0, le=1, description="Coarse cells that one homography explains. [own]"
     )
     coarse_alike: float = Field(
         0.3, ge=-1, le=1, description="Cosine of coarse descriptors that match. [own]"
     )
-    min_coarse: int = Field(40, ge=1, description="Coarse matches of two images. [own]")
     alike: float = Field(
         0.5, ge=-1, le=1, description="Cosine of fine descriptors that match. [own]"
     )
@@ -449,7 +468,7 @@ class ConsistencyConfig(_Section):
     )
     min_verified: int = Field(2, ge=1, description="Verified keyframes that must agree. [own]")
     verified_memory: int = Field(
-        5, ge=1, description="Keyframes during which a verified loop counts. [own]"
+        10, ge=1, description="Keyframes during which a verified loop counts. [own]"
     )
     max_apart: float = Field(
         0.5, gt=0, description="Distance between agreeing loops, metres. [own]"

@@ -17,14 +17,14 @@ class LoopCandidate:
         query: keyframe whose place is looked for; -1 for a frame that is not in the map.
         match: keyframe of the same place, alive in the map.
         score: the detector's own measure, greater is more alike.
-        learned: whether a network takes it for the place, so that its local descriptors may verify
-            what ORB's do not.
+        alike: how much of the two images local descriptors of a network find alike, so that they
+            may verify what ORB's do not; None for the candidate of a detector without.
     """
 
     query: int
     match: int
     score: float
-    learned: bool = False
+    alike: float | None = None
 
 
 @dataclass(frozen=True)

@@ -261,7 +261,8 @@ class Slam:
     def _relocalise_learned(self, frame: Frame, candidates: list[LoopCandidate]) -> int:
         """By local descriptors of the network: where the light has changed ORB's find nothing."""
         images, config = self._closing.images, self.config.learned
-        candidates = [one for one in candidates if one.learned][: config.max_candidates]
+        candidates = [one for one in candidates if one.alike is not None]
+        candidates = candidates[: config.max_candidates]
         if images is None or frame.image is None or not candidates:
             return 0
         maps = images.network.describe(frame.image)

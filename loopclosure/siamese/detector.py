@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import SiameseConfig
+from vslam.config import LearnedMatchingConfig, SiameseConfig
 from vslam.features import Features
+from vslam.loopclosure.local_matching import DescriptorMaps, likeness
 from vslam.loopclosure.siamese.images import to_size
 from vslam.loopclosure.siamese.inference import OnnxNetwork, open_network
+from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loops import LoopCandidate
 from vslam.map import Map
 
@@ -21,10 +23,25 @@ class SiameseDetector:
     Descriptors are kept in one matrix that grows by half: a query is one product with it.
     """
 
-    def __init__(self, network: OnnxNetwork, config: SiameseConfig) -> None:
-        """The network's name becomes the detector's."""
+    def __init__(
+        self,
+        network: OnnxNetwork,
+        config: SiameseConfig,
+        learned: LearnedMatchingConfig | None = None,
+        images: KeyframeImages | None = None,
+    ) -> None:
+        """The network's name becomes the detector's.
+
+        Args:
+            learned: how candidates are matched.
+            images: where they are kept, local descriptors put the most similar keyframes in order:
+                by night the place is among these more often than the first. Then the threshold is
+                ``offered``. None for the similarity alone.
+        """
         self.name = network.name
         self._network = network
+        self._learned = learned or LearnedMatchingConfig()
+        self._images = images
         self._config = config
         self._descriptors = np.zeros((64, network.dimensions), np.float32)
         self._known = np.zeros(64, np.bool_)  # keyframes added with an image
@@ -47,7 +64,13 @@ class SiameseDetector:
         eligible[max(0, keyframe - self._config.recent_keyframes) :] = False
         covisible, _ = map_.covisible(keyframe)
         eligible[covisible[covisible < len(eligible)]] = False
-        return self._best(keyframe, self._descriptors[keyframe], eligible, map_)
+        threshold = self._config.threshold if self._images is None else self._config.offered
+        p = self._similarities(self._descriptors[keyframe], eligible)
+        p[p < threshold] = -1.0
+        order = p
+        if self._images is not None and keyframe in self._images:
+            order = self._reranked(p, self._images.glance(keyframe))
+        return self._best(keyframe, p, order, map_)
 
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
@@ -58,7 +81,11 @@ class SiameseDetector:
         """
         if image is None:
             return []
-        return self._best(-1, self._embed(image), self._alive(map_), map_, threshold=0.0)
+        p = self._similarities(self._embed(image), self._alive(map_))
+        order = p
+        if self._images is not None:
+            order = self._reranked(p, self._images.glance_at(image))
+        return self._best(-1, p, order, map_)
 
     def _alive(self, map_: Map) -> NDArray[np.bool_]:
         n = min(map_.n_keyframes, len(self._known))
@@ -67,42 +94,68 @@ class SiameseDetector:
     def _embed(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         return self._network.embed(to_size(image, self._network.size, self._config.fit))
 
+    def _similarities(
+        self, descriptor: NDArray[np.float32], eligible: NDArray[np.bool_]
+    ) -> NDArray[np.float32]:
+        """``(N,)``, -1 for keyframes that are not eligible."""
+        if not eligible.any():
+            return np.full(len(eligible), -1.0, np.float32)
+        p = self._network.compare(descriptor, self._descriptors[: len(eligible)])
+        p[~eligible] = -1.0
+        return p
+
+    def _reranked(self, p: NDArray[np.float32], query: DescriptorMaps) -> NDArray[np.float32]:
+        """``(N,)``: how much of the image looks alike, of the most similar keyframes; -1 of the
+        others."""
+        assert self._images is not None
+        order = np.full(len(p), -1.0, np.float32)
+        for keyframe in np.argsort(-p, kind="stable")[: self._config.reranked].tolist():
+            if p[keyframe] >= 0 and keyframe in self._images:
+                glance = self._images.glance(keyframe)
+                order[keyframe] = likeness(query, glance, self._learned.coarse_alike)
+        return order
+
     def _best(
         self,
         query: int,
-        descriptor: NDArray[np.float32],
-        eligible: NDArray[np.bool_],
+        p: NDArray[np.float32],
+        order: NDArray[np.float32],
         map_: Map,
-        threshold: float | None = None,
     ) -> list[LoopCandidate]:
-        threshold = self._config.threshold if threshold is None else threshold
-        n = len(eligible)
-        if not eligible.any():
-            return []
-        p = self._network.compare(descriptor, self._descriptors[:n])
-        p[~eligible] = -1.0
+        """Candidates by descending ``order`` ``(N,)``, which is -1 for those that are none."""
+        order = order.copy()
         found: list[LoopCandidate] = []
         # Neighbours of a good match match well, too: they would crowd out the other places.
-        while len(found) < self._config.max_candidates:
-            best = int(np.argmax(p))
-            if p[best] < max(threshold, 0.0):
+        most = self._config.max_candidates
+        if self._images is not None:
+            most = min(most, self._learned.max_candidates)
+        while len(order) and len(found) < most:
+            best = int(np.argmax(order))
+            if order[best] < 0.0:
                 break
-            found.append(LoopCandidate(query, best, float(p[best]), learned=True))
+            alike = None if self._images is None else float(order[best])
+            found.append(LoopCandidate(query, best, float(p[best]), alike))
             around, _ = map_.covisible(best, self._config.min_shared)
-            p[around[around < n]] = -1.0
-            p[best] = -1.0
+            order[around[around < len(order)]] = -1.0
+            order[best] = -1.0
         return found
 
 
-def open_detector(name: str, config: SiameseConfig, weights: Path | None = None) -> SiameseDetector:
+def open_detector(
+    name: str,
+    config: SiameseConfig,
+    weights: Path | None = None,
+    learned: LearnedMatchingConfig | None = None,
+    images: KeyframeImages | None = None,
+) -> SiameseDetector:
     """A detector with its weights.
 
     Args:
         name: one of ``NETWORKS``.
-        config: see there.
         weights: ONNX file; None for the ones that vslam ships.
+        config, learned, images: as :class:`SiameseDetector` takes them.
 
     Raises:
         InputError: unknown name, no weights, or weights of another network.
     """
-    return SiameseDetector(open_network(name, weights), config)
+    return SiameseDetector(open_network(name, weights), config, learned, images)

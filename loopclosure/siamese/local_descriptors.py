@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,56 +17,67 @@ from vslam.loopclosure.siamese.inference import FORMAT, NAME, VERSION, open_sess
 from vslam.loopclosure.siamese.weights import SHIPPED
 
 WIDTH = 640  # pixels of the image that the network reads; docs/loops.md has other widths
+GLANCE_WIDTH = 320  # of a first look
 _QUALITY = 90  # of the JPEG files of keyframes in memory
-_KEPT = 12  # descriptor maps, the latest used
+_KEPT = 6  # descriptor maps, the latest used
 
 
 class LocalDescriptors:
-    """The network of local descriptors."""
+    """The network of local descriptors; it is loaded when the first image comes."""
 
     def __init__(self, path: Path = SHIPPED / "local.onnx") -> None:
         """
         Raises:
-            InputError: missing, damaged or foreign file, or no ONNX Runtime.
+            InputError: no such file.
         """
-        self._session = open_session(path, path, "image")
-        metadata = self._session.get_modelmeta().custom_metadata_map
+        if not path.exists():
+            raise InputError(f"{path}: the local descriptors are not there; install vslam again.")
+        self._path = path
+
+    @cached_property
+    def _session(self) -> Any:
+        session = open_session(self._path, self._path, "image", arena=True)
+        metadata = session.get_modelmeta().custom_metadata_map
         if metadata.get(FORMAT) != VERSION or metadata.get(NAME) != "local":
-            raise InputError(f"{path}: not the local descriptors of this version of vslam.")
+            raise InputError(f"{self._path}: not the local descriptors of this version of vslam.")
+        return session
 
-    def describe(self, image: NDArray[np.uint8]) -> DescriptorMaps:
-        """Descriptors of a grey image ``(H, W)`` of any size."""
-        small, scale = reduced(image)
-        return self.describe_reduced(small, scale)
+    def describe(self, image: NDArray[np.uint8], width: int = WIDTH) -> DescriptorMaps:
+        """Descriptors of a grey image ``(H, W)``, reduced to so many columns.
 
-    def describe_reduced(self, image: NDArray[np.uint8], scale: float) -> DescriptorMaps:
-        """Of an image that :func:`reduced` made."""
-        coarse, fine = self._session.run(None, {"image": image})
+        Raises:
+            InputError: damaged or foreign file, or no ONNX Runtime.
+        """
+        scale = width / image.shape[1]
+        coarse, fine = self._session.run(None, {"image": resized(image, width)})
         return DescriptorMaps(coarse, fine, scale)
 
 
-def reduced(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
-    """An image of the width that the network reads, and its pixels for one of the camera's."""
-    scale = WIDTH / image.shape[1]
-    size = WIDTH, max(64, round(image.shape[0] * scale))
+def resized(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+    """An image of so many columns, of at least 64 rows."""
+    scale = width / image.shape[1]
+    size = width, max(64, round(image.shape[0] * scale))
+    if size == image.shape[::-1]:
+        return image
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, size, interpolation=way), np.uint8), scale
+    return np.asarray(cv2.resize(image, size, interpolation=way), np.uint8)
 
 
 class KeyframeImages:
-    """Images of keyframes as JPEG files in memory, about 40 kB each: their descriptors take forty
+    """Images of keyframes as JPEG files in memory, about 40 kB each: their descriptors take thirty
     times as much, and few are ever asked for."""
 
     def __init__(self, network: LocalDescriptors) -> None:
         self.network = network
         self._files: dict[int, tuple[bytes, float]] = {}
         self._maps: OrderedDict[int, DescriptorMaps] = OrderedDict()
+        self._glances: dict[int, DescriptorMaps] = {}
 
     def add(self, keyframe: int, image: NDArray[np.uint8]) -> None:
         """Keep an image ``(H, W)``."""
-        small, scale = reduced(image)
+        small = resized(image, WIDTH)
         file = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-        self._files[keyframe] = file.tobytes(), scale
+        self._files[keyframe] = file.tobytes(), WIDTH / image.shape[1]
 
     def __contains__(self, keyframe: int) -> bool:
         return keyframe in self._files
@@ -72,10 +85,25 @@ class KeyframeImages:
     def maps(self, keyframe: int) -> DescriptorMaps:
         """Descriptors of a keyframe that was added."""
         if keyframe not in self._maps:
-            file, scale = self._files[keyframe]
-            image = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_GRAYSCALE)
-            self._maps[keyframe] = self.network.describe_reduced(np.asarray(image), scale)
+            self._maps[keyframe] = self._described(keyframe, WIDTH)
             while len(self._maps) > _KEPT:
                 self._maps.popitem(last=False)
         self._maps.move_to_end(keyframe)
         return self._maps[keyframe]
+
+    def glance(self, keyframe: int) -> DescriptorMaps:
+        """Coarse descriptors of its image at half the size, for a quarter of the time; kept."""
+        if keyframe not in self._glances:
+            maps = self._described(keyframe, GLANCE_WIDTH)
+            self._glances[keyframe] = DescriptorMaps(maps.coarse.copy(), maps.fine[:0], maps.scale)
+        return self._glances[keyframe]
+
+    def glance_at(self, image: NDArray[np.uint8]) -> DescriptorMaps:
+        """The same of an image that is not kept."""
+        return self.network.describe(image, GLANCE_WIDTH)
+
+    def _described(self, keyframe: int, width: int) -> DescriptorMaps:
+        file, scale = self._files[keyframe]
+        image = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_GRAYSCALE)
+        maps = self.network.describe(np.asarray(image, np.uint8), width)
+        return maps._replace(scale=maps.scale * scale)

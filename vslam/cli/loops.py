@@ -19,7 +19,7 @@ _EXAMPLES = """
 
   vslam loops bench --data "kitti:~/kitti\\[seq=00,frames=0-249+1500-1699,truth=kitti00.mat]"
 
-  vslam loops bench --detectors capsule,alexnet --weights alexnet=training/alexnet.safetensors
+  vslam loops bench --detectors capsule,alexnet --weights alexnet=training/alexnet.onnx
 """
 DATA = ("town:demo[seed=101]", "town:05[seed=102]", "town:demo[seed=103,aliased=1]")
 commands = typer.Typer(help="Compare loop detectors.", no_args_is_help=True)
@@ -73,6 +73,8 @@ def bench(
     for name in names or [""]:
         if name == "none":
             raise InputError("--detectors none: finds nothing; leave it out.")
+        if name == "both":
+            raise InputError("--detectors both: has no score of its own; name bow,capsule.")
         require_detector(name, files.get(name), "--detectors")
     conditions = parse_conditions(perturb, strengths)
 

@@ -17,7 +17,7 @@ from vslam.loopbench.detectors import (
 from vslam.loopbench.node_matching import match_by_node
 from vslam.loopbench.schema import Curve, Gain, Score, Verified
 from vslam.loopbench.sets import QuerySet, TestSet
-from vslam.loopclosure.local_matching import DescriptorMaps, match_coarse, positions
+from vslam.loopclosure.local_matching import homography_share
 from vslam.loopclosure.precision_recall import (
     PrecisionRecall,
     average_precision,
@@ -30,7 +30,6 @@ from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
 MIN_SHARE = 0.16  # of the coarse cells; pairs of different places: docs/loops.md
 MIN_MATCHES = 20  # that obey one epipolar geometry (ORB-SLAM, VII-B, asks for 20 in 3D)
 _EPIPOLAR_PIXELS = 2.0
-_HOMOGRAPHY_PIXELS = 12.0  # of the image that the network reads
 _CURVE_POINTS = 200
 _RESAMPLES = 200  # of the queries, for the interval of a difference
 
@@ -173,27 +172,11 @@ class _Verification:
             maps = [
                 self._local.of(one.image) for one in (self._queries[query], self._gallery[image])
             ]
-            self._by_learned[key] = homography_share(maps[0], maps[1]) >= MIN_SHARE
+            self._by_learned[key] = (
+                homography_share(maps[0], maps[1], LearnedMatchingConfig().coarse_alike)
+                >= MIN_SHARE
+            )
         return self._by_learned[key]
-
-
-def homography_share(a: DescriptorMaps, b: DescriptorMaps) -> float:
-    """Coarse matches that one homography explains within 12 pixels, over the cells of an image.
-
-    One homography is no model of a street. But what is far lies on one, and near things move by
-    less than a cell or two; in two images of different places no homography has as many.
-    """
-    import cv2
-
-    coarse = match_coarse(a, b, LearnedMatchingConfig().coarse_alike)
-    if len(coarse.a) < 4:
-        return 0.0
-    _, inlier = cv2.findHomography(
-        a.scale * positions(coarse.a, a), b.scale * positions(coarse.b, b),
-        cv2.RANSAC, _HOMOGRAPHY_PIXELS, maxIters=2000,
-    )  # fmt: skip
-    cells = min(one.coarse.shape[0] * one.coarse.shape[1] for one in (a, b))
-    return 0.0 if inlier is None else float(inlier.sum() / cells)
 
 
 def epipolar_inliers(

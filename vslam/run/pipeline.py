@@ -64,8 +64,8 @@ def run_sequence(
     the run after the current frame; all done so far is kept.
     """
     cv2.setNumThreads(1)  # the pool uses the cores
-    detector = create_detector(settings.detector, settings.config, settings.weights)
     images = create_images(settings.detector, settings.config)
+    detector = create_detector(settings.detector, settings.config, settings.weights, images)
     slam = Slam(sequence.camera, settings.config, detector, threads=settings.threads, images=images)
     tracks: list[TrackResult] = []
     skipped: list[str] = []

@@ -1,0 +1,63 @@
+"""Two detectors as one: candidates in turn, one for each place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_siamese_detector import a_map
+
+from vslam.config import Config, LearnedMatchingConfig
+from vslam.errors import InputError
+from vslam.features import Features
+from vslam.loopclosure.combined import CombinedDetector
+from vslam.loopclosure.registry import create_detector, create_images, require_detector
+from vslam.loops import LoopCandidate
+
+
+class Told:
+    """Finds what it is told to."""
+
+    def __init__(self, name: str, matches: list[int], *, alike: float | None) -> None:
+        self.name, self.added = name, []
+        self._found = [LoopCandidate(9, m, 1.0 / (1 + m), alike) for m in matches]
+
+    def add(self, keyframe, image, features):
+        self.added.append(keyframe)
+
+    def query(self, keyframe, map_):
+        return self._found
+
+    def locate(self, image, features, map_):
+        return self._found[:1]
+
+
+def test_candidates_come_in_turn_and_one_for_each_place():
+    words, network = Told("bow", [1, 4, 6], alike=None), Told("net", [2, 5], alike=0.5)
+    both = CombinedDetector("both", [words, network], 15)
+    map_ = a_map(10, covisible=((1, 2), (1, 6)))  # 1, 2 and 6 are one place
+    found = both.query(9, map_)
+    assert [(c.match, c.alike) for c in found] == [(1, 0.5), (4, None), (5, 0.5)]
+    assert [c.match for c in both.locate(None, Features.none(), map_)] == [1]
+    both.add(9, None, Features.none())
+    assert words.added == network.added == [9]
+
+
+def test_both_remembers_by_words_and_by_looks():
+    both = create_detector("both", Config())
+    image = np.random.default_rng(0).integers(0, 256, (96, 320), np.uint8)
+    both.add(0, image, Features.none())
+    (found,) = both.locate(image, Features.none(), a_map(1))
+    assert (found.match, found.score) == (0, pytest.approx(1.0, abs=0.1))
+
+
+def test_only_detectors_with_a_network_keep_images():
+    assert create_images("bow", Config()) is None
+    assert create_images("none", Config()) is None
+    assert create_images("capsule", Config(learned=LearnedMatchingConfig(max_candidates=0))) is None
+    assert create_images("both", Config()) is not None
+
+
+def test_weights_of_both_are_those_of_its_network(tmp_path):
+    require_detector("both")
+    with pytest.raises(InputError, match="not there"):
+        require_detector("both", tmp_path / "missing.onnx")

@@ -31,9 +31,15 @@ from vslam.loopclosure.local_matching import (
     match_coarse,
 )
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
-from vslam.loopclosure.verification import place_of, relative_scale, spread_reason
+from vslam.loopclosure.verification import (
+    guided_match,
+    place_of,
+    relative_scale,
+    spread_reason,
+)
 from vslam.loops import LoopCandidate, LoopEdge
 from vslam.map import Map
+from vslam.map_kernels import collect_landmarks
 
 _DEPTHS_AGREE = 0.15  # a keypoint that observes a landmark has its depth, to this share
 
@@ -126,8 +132,15 @@ def verify_learned(
     )
     if isinstance(sight, str):
         return replace(edge, reason=sight)
-    T_query_match = orthonormalised(sight.T_cw @ inverse(map_.keyframe_pose(match)))
     feature, landmark = observed_features(map_, query, sight, camera, config)
+    # Once the pose is known, ORB features may match again: they are at home to a tenth of a pixel.
+    place = collect_landmarks(map_.arrays, np.array(keyframes, np.int64), map_.n_landmarks)
+    guided = guided_match(map_, query, place, sight.T_cw, camera, gates)
+    if np.count_nonzero(guided.seen) >= gates.min_inliers:
+        sight = sight._replace(T_cw=guided.T_cw)
+        pairs = guided.feature[guided.seen], guided.landmarks[guided.seen]
+        feature, landmark = joined(pairs, (feature, landmark))
+    T_query_match = orthonormalised(sight.T_cw @ inverse(map_.keyframe_pose(match)))
     edge = replace(
         edge,
         n_matches=sight.n_matches,
@@ -302,6 +315,15 @@ def observed_features(
     usual = float(np.median(ratio[known])) if camera.monocular and known.any() else 1.0
     keep = ~known | (np.abs(np.where(known, ratio, usual) / usual - 1.0) < _DEPTHS_AGREE)
     return feature[keep].astype(np.int32), landmarks[index[keep]]
+
+
+def joined(
+    first: tuple[NDArray[np.int32], NDArray[np.int32]],
+    second: tuple[NDArray[np.int32], NDArray[np.int32]],
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Pairs of features and landmarks, and those of a second list that repeat neither."""
+    new = ~(np.isin(second[0], first[0]) | np.isin(second[1], first[1]))
+    return np.r_[first[0], second[0][new]], np.r_[first[1], second[1][new]]
 
 
 def nearest_features(

@@ -10,7 +10,12 @@ from vslam.camera import Camera
 from vslam.config import Config
 from vslam.features import Features
 from vslam.geometry import inverse, se3_exp, transform
-from vslam.loopclosure.learned_verification import nearest_features, recognise, verify_learned
+from vslam.loopclosure.learned_verification import (
+    joined,
+    nearest_features,
+    recognise,
+    verify_learned,
+)
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
 from vslam.loops import LoopCandidate
 from vslam.map import Map
@@ -158,6 +163,13 @@ def test_a_lost_frame_is_recognised(network):
     uv = expected[:, :2] / expected[:, 2:] * 400.0 + [320, 96]
     assert np.abs(uv - features.xy[found.feature]).max() < 5.0
     assert len(found.feature) >= CONFIG.tracking.min_inliers
+
+
+def test_pairs_join_without_repeating_a_feature_or_a_landmark():
+    first = np.array([1, 2], np.int32), np.array([10, 20], np.int32)
+    second = np.array([2, 3, 4], np.int32), np.array([30, 10, 40], np.int32)
+    feature, landmark = joined(first, second)
+    assert (feature.tolist(), landmark.tolist()) == ([1, 2, 4], [10, 20, 40])
 
 
 def test_each_feature_takes_the_nearest_pixel():

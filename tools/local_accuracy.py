@@ -28,12 +28,13 @@ from vslam.datasets.synthetic.passes import Passes
 from vslam.datasets.synthetic.render import Renderer
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.town import build_town
-from vslam.features import Features
-from vslam.frontend.matching import search_all
-from vslam.frontend.orb import extract
+from vslam.features import FeatureGrid
+from vslam.frontend.matching import Projections, Searchable, search_all, search_windows
+from vslam.frontend.orb import Extraction, extract, scale_factors
 from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.pose import optimise_pose
-from vslam.loopclosure.local_matching import locate, match_coarse
+from vslam.loopclosure.learned_verification import project
+from vslam.loopclosure.local_matching import locate, locate_near, match_coarse
 from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
 
 CONFIG = Config()
@@ -75,11 +76,11 @@ class Errors(NamedTuple):
 def judged(
     points: NDArray[np.float64], uv: NDArray[np.float64], sigma: float, camera: Camera,
     T_b_a: NDArray[np.float64],
-) -> Errors:  # fmt: skip
-    """What matches of points of the first view with pixels of the second are worth."""
+) -> tuple[Errors, NDArray[np.float64] | None]:  # fmt: skip
+    """What matches of points of the first view with pixels of the second are worth, and a pose."""
     n = len(points)
     if n < CONFIG.relocalization.min_matches:
-        return Errors(n, 0.0, np.inf, np.inf)
+        return Errors(n, 0.0, np.inf, np.inf), None
     p = points @ T_b_a[:3, :3].T + T_b_a[:3, 3]
     truth = p[:, :2] / p[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     within = float((np.linalg.norm(uv - truth, axis=1) < PIXELS).mean())
@@ -90,12 +91,17 @@ def judged(
         CONFIG.relocalization.min_consensus, config.max_draws, config.confidence,
     )  # fmt: skip
     if np.count_nonzero(inlier) < CONFIG.relocalization.min_consensus:
-        return Errors(n, within, np.inf, np.inf)
+        return Errors(n, within, np.inf, np.inf), None
     T, _ = optimise_pose(T, points, uvr, weight, camera.intrinsics)
-    turn = T[:3, :3].T @ T_b_a[:3, :3]
+    return Errors(n, within, **pose_errors(T, T_b_a)), T
+
+
+def pose_errors(T: NDArray[np.float64], truth: NDArray[np.float64]) -> dict[str, float]:
+    """Metres and degrees between two poses of a camera."""
+    turn = T[:3, :3].T @ truth[:3, :3]
     cosine = np.clip((np.trace(turn) - 1) / 2, -1, 1)
-    apart = T[:3, :3].T @ T[:3, 3] - T_b_a[:3, :3].T @ T_b_a[:3, 3]
-    return Errors(n, within, float(np.linalg.norm(apart)), float(np.degrees(np.arccos(cosine))))
+    apart = np.linalg.norm(T[:3, :3].T @ T[:3, 3] - truth[:3, :3].T @ truth[:3, 3])
+    return {"metres": float(apart), "degrees": float(np.degrees(np.arccos(cosine)))}
 
 
 def compare(
@@ -133,20 +139,63 @@ def compare(
             CONFIG.verification.match_distance, CONFIG.verification.match_ratio,
         )  # fmt: skip
         hit = np.flatnonzero(match >= 0)
-        orb = judged(points[hit], b.xy[match[hit]].astype(np.float64), 1.5, camera, T_b_a)
+        orb, _ = judged(points[hit], b.xy[match[hit]].astype(np.float64), 1.5, camera, T_b_a)
         maps_a, maps_b = network.describe(image_a), network.describe(image_b)
         config = CONFIG.learned
         coarse = match_coarse(maps_a, maps_b, config.coarse_alike)
         there = locate(a.xy[kept], maps_a, maps_b, coarse, config.reach, config.alike)
         seen = there.found
         sigma = config.sigma / maps_b.scale
-        found.append((orb, judged(points[seen], there.xy[seen], sigma, camera, T_b_a)))
+        learned, T = judged(points[seen], there.xy[seen], sigma, camera, T_b_a)
+        for _ in range(2 if T is not None else 0):  # as verification does
+            expected = project(points, T, camera)
+            near = locate_near(
+                a.xy[kept], expected, maps_a, maps_b, config.guided_reach, config.alike
+            )
+            n = np.count_nonzero(near.found)
+            uvr = np.c_[near.xy[near.found], np.full(n, np.nan)]
+            T, _ = optimise_pose(
+                T, points[near.found], uvr, np.full(n, sigma**-2.0), camera.intrinsics
+            )
+        if T is not None:
+            T = refined_by_orb(T, points, a, kept, b, camera)
+            learned = learned._replace(**pose_errors(T, T_b_a))
+        found.append((orb, learned))
     renderer.close()
     return found
 
 
+def refined_by_orb(
+    T: NDArray[np.float64], points: NDArray[np.float64], a: Extraction, kept: NDArray[np.int64],
+    b: Extraction, camera: Camera,
+) -> NDArray[np.float64]:  # fmt: skip
+    """A pose that enough ORB matches near its projections agree with, else as it was."""
+    gates = CONFIG.verification
+    uv = project(points, T, camera)
+    inside = np.flatnonzero(np.isfinite(uv[:, 0]))
+    scales = scale_factors(CONFIG.orb)
+    octave = a.octave[kept][inside].astype(np.int64)
+    grid = FeatureGrid.of_positions(b.xy, camera.width, camera.height)
+    mono = np.full(len(b.xy), np.nan, np.float32)
+    found, _ = search_windows(
+        Projections(
+            np.c_[uv[inside], np.full(len(inside), np.nan)],
+            gates.first_window * scales[octave], octave - 1, octave + 1,
+            a.descriptors.view(np.uint64)[kept][inside],
+        ),
+        Searchable(b.xy, b.octave, mono, b.descriptors.view(np.uint64), grid),
+        np.ones(len(b.xy), np.bool_), gates.guided_distance, 1.0,
+    )  # fmt: skip
+    hit = np.flatnonzero(found >= 0)
+    uvr = np.c_[b.xy[found[hit]], np.full(len(hit), np.nan)].astype(np.float64)
+    better, inlier = optimise_pose(
+        T, points[inside[hit]], uvr, scales[b.octave[found[hit]]] ** -2.0, camera.intrinsics
+    )
+    return better if np.count_nonzero(inlier) >= gates.min_inliers else T
+
+
 def lifted(
-    features: Features, depth: NDArray[np.float32], camera: Camera
+    features: Extraction, depth: NDArray[np.float32], camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Keypoints with a depth as points of the camera, and which they are."""
     z = depth[tuple(np.rint(features.xy).astype(int).T[::-1])].astype(np.float64)

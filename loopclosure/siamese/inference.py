@@ -87,7 +87,7 @@ def open_network(name: str, weights: Path | None = None) -> OnnxNetwork:
     return network
 
 
-def open_session(path: Path, model: Path | bytes, first_input: str, *, arena: bool = False) -> Any:
+def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
     """An ``onnxruntime.InferenceSession`` on one thread: its sums, and so its bits, do not depend
     on the number of cores.
 
@@ -95,8 +95,6 @@ def open_session(path: Path, model: Path | bytes, first_input: str, *, arena: bo
         path: of the file, for the message.
         model: the file, or its bytes.
         first_input: name of the first input, without which it is no graph of ours.
-        arena: keep the memory of a call for the next one: with large activations, half of the peak
-            and less that is lost between allocations; with small ones, only more memory.
 
     Raises:
         InputError: it cannot be read, is no such graph, or ONNX Runtime is not installed.
@@ -110,7 +108,7 @@ def open_session(path: Path, model: Path | bytes, first_input: str, *, arena: bo
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4  # what it says of damaged files is in the exception, too
-    options.enable_cpu_mem_arena = arena
+    options.enable_mem_pattern = False  # it saves no time here, and takes 10 MB
     try:
         given = model if isinstance(model, bytes) else model.read_bytes()
     except OSError as error:

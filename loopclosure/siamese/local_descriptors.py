@@ -36,7 +36,7 @@ class LocalDescriptors:
 
     @cached_property
     def _session(self) -> Any:
-        session = open_session(self._path, self._path, "image", arena=True)
+        session = open_session(self._path, self._path, "image")
         metadata = session.get_modelmeta().custom_metadata_map
         if metadata.get(FORMAT) != VERSION or metadata.get(NAME) != "local":
             raise InputError(f"{self._path}: not the local descriptors of this version of vslam.")

@@ -78,7 +78,11 @@ class LoopClosing:
         self._closed: list[LoopEdge] = []  # corrections' edges, in the units of today
         self._camera = camera
         self._config = config
-        self._consistency = LoopConsistency(config.consistency)
+        consistency = config.consistency
+        if images is not None:
+            memory = max(consistency.verified_memory, config.learned.verified_memory)
+            consistency = consistency.model_copy(update={"verified_memory": memory})
+        self._consistency = LoopConsistency(consistency)
         self._executor = ThreadPoolExecutor(1, "global-adjustment") if threads > 1 else None
         self._global: _PendingAdjustment | None = None
 

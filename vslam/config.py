@@ -452,6 +452,9 @@ class LearnedMatchingConfig(_Section):
         gt=0,
         description="From a landmark to the keypoint that observes it, at octave 0, pixels. [own]",
     )
+    verified_memory: int = Field(
+        10, ge=1, description="As of `consistency`, where fewer keyframes have an image. [own]"
+    )
 
 
 class ConsistencyConfig(_Section):
@@ -468,7 +471,7 @@ class ConsistencyConfig(_Section):
     )
     min_verified: int = Field(2, ge=1, description="Verified keyframes that must agree. [own]")
     verified_memory: int = Field(
-        10, ge=1, description="Keyframes during which a verified loop counts. [own]"
+        5, ge=1, description="Keyframes during which a verified loop counts. [own]"
     )
     max_apart: float = Field(
         0.5, gt=0, description="Distance between agreeing loops, metres. [own]"

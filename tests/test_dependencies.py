@@ -45,8 +45,8 @@ LEVELS: tuple[tuple[str, ...], ...] = (
 SIBLINGS = {
     ("vslam.loopclosure.verification", "vslam.frontend.matching"),
     ("vslam.loopclosure.verification", "vslam.frontend.pose"),
-    ("vslam.loopclosure.learned_verification", "vslam.frontend.pnp"),
-    ("vslam.loopclosure.learned_verification", "vslam.frontend.pose"),
+    ("vslam.loopclosure.learned_localisation", "vslam.frontend.pnp"),
+    ("vslam.loopclosure.learned_localisation", "vslam.frontend.pose"),
 }
 # A benchmark starts the command line in processes of its own: nothing comes back but files.
 STARTED = {

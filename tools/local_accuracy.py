@@ -33,7 +33,7 @@ from vslam.frontend.matching import Projections, Searchable, search_all, search_
 from vslam.frontend.orb import Extraction, extract, scale_factors
 from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.pose import optimise_pose
-from vslam.loopclosure.learned_verification import project
+from vslam.loopclosure.learned_localisation import project
 from vslam.loopclosure.local_matching import locate, locate_near, match_coarse
 from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
 

@@ -1,0 +1,166 @@
+"""Finding the camera of an image at a place, by learned local descriptors.
+
+Landmarks of the place are looked for anywhere in the image, not at its keypoints: by night, and
+from the other lane, corners are found elsewhere. Several keyframes of the place are matched where
+one does not suffice.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Camera
+from vslam.config import LearnedMatchingConfig
+from vslam.frontend.pnp import ransac_pose
+from vslam.frontend.pose import optimise_pose
+from vslam.geometry import Matrix, transform
+from vslam.loopclosure.local_matching import (
+    DescriptorMaps,
+    homography_share,
+    locate,
+    locate_near,
+    match_coarse,
+)
+from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
+from vslam.map import Map
+
+
+class View(NamedTuple):
+    """A keyframe of the place: ``maps`` of its image, ``(N,)`` landmarks and the pixels ``(N, 2)``
+    where it sees them."""
+
+    maps: DescriptorMaps
+    landmarks: NDArray[np.int32]
+    xy: NDArray[np.float32]
+
+
+class Sight(NamedTuple):
+    """What a camera should see of M landmarks, and does see.
+
+    Attributes:
+        landmarks: ``(M,)`` int32, those that should be visible.
+        uv: ``(M, 2)`` float64, where they should appear.
+        seen: ``(M,)`` bool, those found there.
+        n_matches: found near the predictions, outliers included.
+        T_cw: ``(4, 4)`` pose of the camera in the world of the landmarks.
+    """
+
+    landmarks: NDArray[np.int32]
+    uv: Matrix
+    seen: NDArray[np.bool_]
+    n_matches: int
+    T_cw: Matrix
+
+
+def localise(
+    map_: Map,
+    query: DescriptorMaps,
+    keyframes: list[int],
+    images: KeyframeImages,
+    camera: Camera,
+    config: LearnedMatchingConfig,
+    seed: int,
+) -> Sight | str:
+    """Find the camera of an image at a place.
+
+    Args:
+        keyframes: of the place, with images; the first is the best.
+
+    Returns:
+        What it sees of the place, or in a few words why it was not found.
+    """
+    views: list[View] = []
+    xyz, uv = np.empty((0, 3)), np.empty((0, 2))
+    sought, reason = 0, ""
+    for keyframe in keyframes[: config.views]:
+        view = view_of(map_, keyframe, images)
+        share = homography_share(view.maps, query, config.coarse_alike)
+        if share < config.min_share:
+            return reason or f"{100 * share:.0f} % of the image match"
+        views.append(view)
+        coarse = match_coarse(view.maps, query, config.coarse_alike)
+        sought += len(view.xy)
+        least = max(config.min_consensus, round(config.min_consensus_ratio * sought))
+        located = locate(view.xy, view.maps, query, coarse, config.reach, config.alike)
+        found = located.found
+        xyz = np.vstack([xyz, map_.arrays.xyz[view.landmarks[found]]])
+        uv = np.vstack([uv, located.xy[found]])
+        T_cw, inlier = ransac_pose(
+            xyz,
+            *_observed(uv, query, config),
+            camera.intrinsics,
+            np.uint64(seed),
+            least,
+            config.max_draws,
+            config.confidence,
+        )
+        if np.count_nonzero(inlier) >= least:
+            return guided_search(map_, views, T_cw, query, camera, config)
+        reason = f"no motion that {least} of {len(uv)} learned matches agree on"
+    return reason or "no image of the place is kept"
+
+
+def view_of(map_: Map, keyframe: int, images: KeyframeImages) -> View:
+    """A keyframe and the living landmarks that it observes."""
+    a, rows = map_.arrays, map_.rows(keyframe)
+    landmark = a.landmark[rows]
+    observing = np.flatnonzero(landmark >= 0)
+    return View(images.maps(keyframe), landmark[observing], a.xy[rows][observing])
+
+
+def guided_search(
+    map_: Map,
+    views: list[View],
+    T_cw: Matrix,
+    query: DescriptorMaps,
+    camera: Camera,
+    config: LearnedMatchingConfig,
+) -> Sight:
+    """Look for all landmarks of the views near where a pose puts them, refine the pose, and once
+    more."""
+    _, first = np.unique(np.concatenate([view.landmarks for view in views]), return_index=True)
+    landmarks = np.concatenate([view.landmarks for view in views])[first]
+    xyz = map_.arrays.xyz[landmarks]
+    for _ in range(2):
+        expected = project(xyz, T_cw, camera)
+        found = np.full((len(first), 2), np.nan)
+        start = 0
+        for view in views:
+            chosen = np.flatnonzero((first >= start) & (first < start + len(view.landmarks)))
+            xy = view.xy[first[chosen] - start]
+            found[chosen] = locate_near(
+                xy, expected[chosen], view.maps, query, config.guided_reach, config.alike
+            ).xy
+            start += len(view.landmarks)
+        hit = np.flatnonzero(np.isfinite(found[:, 0]))
+        T_cw, inlier = optimise_pose(
+            T_cw, xyz[hit], *_observed(found[hit], query, config), camera.intrinsics
+        )
+    expected = project(xyz, T_cw, camera)
+    seen = np.zeros(len(landmarks), np.bool_)
+    seen[hit[inlier]] = True
+    visible = np.flatnonzero(np.isfinite(expected[:, 0]))
+    return Sight(landmarks[visible], expected[visible], seen[visible], len(hit), T_cw)
+
+
+def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:
+    """``(N, 2)`` pixels of ``(N, 3)`` points, NaN for those out of view."""
+    p = transform(T_cw, xyz)
+    uv = np.full((len(p), 2), np.nan)
+    ahead = p[:, 2] > 0.1
+    fx, fy, cx, cy, _ = camera.intrinsics
+    uv[ahead] = p[ahead, :2] / p[ahead, 2:] * [fx, fy] + [cx, cy]
+    inside = (uv >= 0).all(1) & (uv <= [camera.width - 1, camera.height - 1]).all(1)
+    uv[~inside] = np.nan
+    return uv
+
+
+def _observed(
+    uv: Matrix, query: DescriptorMaps, config: LearnedMatchingConfig
+) -> tuple[Matrix, Matrix]:
+    """``(N, 3)`` u, v, u_right of pixels, and ``(N,)`` their inverse variances."""
+    sigma = config.sigma / query.scale
+    return np.c_[uv, np.full(len(uv), np.nan)], np.full(len(uv), sigma**-2.0)

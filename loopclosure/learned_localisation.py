@@ -26,6 +26,7 @@ from vslam.loopclosure.local_matching import (
 )
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.map import Map
+from vslam.reprojection import stack_uvr
 
 
 class View(NamedTuple):
@@ -77,11 +78,11 @@ def localise(
     sought, reason = 0, ""
     for keyframe in keyframes[: config.views]:
         view = view_of(map_, keyframe, images)
-        share = homography_share(view.maps, query, config.coarse_alike)
+        coarse = match_coarse(view.maps, query, config.coarse_alike)
+        share = homography_share(coarse, view.maps, query)
         if share < config.min_share:
             return reason or f"{100 * share:.0f} % of the image match"
         views.append(view)
-        coarse = match_coarse(view.maps, query, config.coarse_alike)
         sought += len(view.xy)
         least = max(config.min_consensus, round(config.min_consensus_ratio * sought))
         located = locate(view.xy, view.maps, query, coarse, config.reach, config.alike)
@@ -151,8 +152,7 @@ def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:
     p = transform(T_cw, xyz)
     uv = np.full((len(p), 2), np.nan)
     ahead = p[:, 2] > 0.1
-    fx, fy, cx, cy, _ = camera.intrinsics
-    uv[ahead] = p[ahead, :2] / p[ahead, 2:] * [fx, fy] + [cx, cy]
+    uv[ahead] = camera.project(p[ahead])[:, :2]
     inside = (uv >= 0).all(1) & (uv <= [camera.width - 1, camera.height - 1]).all(1)
     uv[~inside] = np.nan
     return uv
@@ -163,4 +163,4 @@ def _observed(
 ) -> tuple[Matrix, Matrix]:
     """``(N, 3)`` u, v, u_right of pixels, and ``(N,)`` their inverse variances."""
     sigma = config.sigma / query.scale
-    return np.c_[uv, np.full(len(uv), np.nan)], np.full(len(uv), sigma**-2.0)
+    return stack_uvr(uv, np.full(len(uv), np.nan)), np.full(len(uv), sigma**-2.0)

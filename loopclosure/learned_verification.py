@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from vslam.camera import Camera
 from vslam.config import Config, LearnedMatchingConfig, VerificationConfig
@@ -52,12 +51,10 @@ class LearnedTrials:
 
     def __init__(self, config: LearnedMatchingConfig) -> None:
         self._config = config
-        self._keyframe = 0
         self._resting_until, self._in_vain = 0, 0.0
 
     def choose(self, keyframe: int, candidates: Collection[LoopCandidate]) -> set[int]:
         """Keyframes that are matches to try; none of a detector without a network."""
-        self._keyframe = keyframe
         config = self._config
         least = config.more_alike * self._in_vain if keyframe < self._resting_until else 0.0
         alike = [(one.alike, one.match) for one in candidates if one.alike is not None]
@@ -69,7 +66,7 @@ class LearnedTrials:
         if located:
             self._resting_until = 0
         else:
-            self._resting_until = self._keyframe + 1 + self._config.rest
+            self._resting_until = candidate.query + 1 + self._config.rest
             self._in_vain = candidate.alike or 0.0
 
 
@@ -195,6 +192,8 @@ def nearest_features(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Features ``(K,)`` next to some of ``(N, 2)`` pixels, and which of these, the nearest pairs
     first."""
+    from scipy.spatial import cKDTree
+
     if not len(uv) or not len(xy):
         return np.empty(0, np.int64), np.empty(0, np.int64)
     distance, feature = cKDTree(xy).query(uv)

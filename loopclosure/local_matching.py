@@ -51,11 +51,9 @@ class Located(NamedTuple):
 
     Attributes:
         xy: ``(N, 2)`` float64 pixels of the camera, NaN where not found.
-        alike: ``(N,)`` float32 cosine there.
     """
 
     xy: NDArray[np.float64]
-    alike: NDArray[np.float32]
 
     @property
     def found(self) -> NDArray[np.bool_]:
@@ -95,11 +93,11 @@ def locate(
     """
     towards = np.full(a.coarse.shape[:2], -1, np.int64).reshape(-1)
     towards[coarse.a] = coarse.b
-    found, alike = _locate(
+    found = _locate(
         xy.astype(np.float64) * (a.scale / FINE_STRIDE), a.fine, b.fine,
         towards.reshape(a.coarse.shape[:2]), b.coarse.shape[1], reach, least,
     )  # fmt: skip
-    return Located(found * (FINE_STRIDE / b.scale), alike)
+    return Located(found * (FINE_STRIDE / b.scale))
 
 
 def locate_near(
@@ -111,12 +109,12 @@ def locate_near(
     least: float,
 ) -> Located:
     """Find keypoints of one image in another about where ``expected`` ``(N, 2)`` puts them."""
-    found, alike = _locate_near(
+    found = _locate_near(
         xy.astype(np.float64) * (a.scale / FINE_STRIDE),
         expected * (b.scale / FINE_STRIDE),
         a.fine, b.fine, reach, least,
     )  # fmt: skip
-    return Located(found * (FINE_STRIDE / b.scale), alike)
+    return Located(found * (FINE_STRIDE / b.scale))
 
 
 def likeness(a: DescriptorMaps, b: DescriptorMaps, least: float) -> float:
@@ -125,30 +123,29 @@ def likeness(a: DescriptorMaps, b: DescriptorMaps, least: float) -> float:
     Args:
         least: cosine of a match.
     """
-    cells = min(one.coarse.shape[0] * one.coarse.shape[1] for one in (a, b))
-    return float(match_coarse(a, b, least).alike.sum() / cells)
+    return float(match_coarse(a, b, least).alike.sum() / _fewest_cells(a, b))
 
 
-def homography_share(a: DescriptorMaps, b: DescriptorMaps, least: float) -> float:
+def homography_share(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMaps) -> float:
     """Coarse matches that one homography explains, roughly, over the cells of an image.
 
     One homography is no model of a street. But what is far lies on one, and near things move by
     less than a cell or two; in two images of different places no homography has as many.
-
-    Args:
-        least: cosine of a match.
     """
     import cv2
 
-    coarse = match_coarse(a, b, least)
     if len(coarse.a) < 4:
         return 0.0
     _, inlier = cv2.findHomography(
         a.scale * positions(coarse.a, a), b.scale * positions(coarse.b, b),
         cv2.RANSAC, _HOMOGRAPHY_PIXELS, maxIters=_HOMOGRAPHY_DRAWS,
     )  # fmt: skip
-    cells = min(one.coarse.shape[0] * one.coarse.shape[1] for one in (a, b))
-    return 0.0 if inlier is None else float(inlier.sum() / cells)
+    return 0.0 if inlier is None else float(inlier.sum() / _fewest_cells(a, b))
+
+
+def _fewest_cells(a: DescriptorMaps, b: DescriptorMaps) -> int:
+    """Coarse cells of the smaller image."""
+    return min(one.coarse.shape[0] * one.coarse.shape[1] for one in (a, b))
 
 
 @kernel
@@ -241,20 +238,23 @@ def _peak(fine, descriptor, j, i, best):
 
 
 @inner_kernel
-def _leads_back(fine, x, y, descriptor, from_x, from_y, reach):
-    """Whether the descriptor found at (x, y) is found again within 1.5 cells of where it came
-    from; ``descriptor`` holds it."""
-    j, i, _ = _search(fine, descriptor, from_x, from_y, reach)
-    return abs(j - from_x) <= 1.5 and abs(i - from_y) <= 1.5
+def _place(fine_a, fine_b, descriptor, x, y, j, i, best, reach, other, found):
+    """Set ``found`` to the peak about the best cell of b, if what lies there is found again within
+    1.5 cells of where the descriptor came from, (x, y) in a; ``other`` is scratch."""
+    to_x, to_y = _peak(fine_b, descriptor, j, i, best)
+    if _read(fine_b, to_x, to_y, other):
+        back_j, back_i, _ = _search(fine_a, other, x, y, reach)
+        if abs(back_j - x) <= 1.5 and abs(back_i - y) <= 1.5:
+            found[0], found[1] = to_x, to_y
 
 
 @kernel
 def _locate(xy, fine_a, fine_b, towards, columns_b, reach, least):
     n, channels = len(xy), fine_a.shape[2]
     rows_a, columns_a = towards.shape
-    found, similarity = np.full((n, 2), np.nan), np.zeros(n, np.float32)
+    found = np.full((n, 2), np.nan)
     descriptor, other = np.empty(channels, np.float32), np.empty(channels, np.float32)
-    ratio = 4  # fine cells for a coarse one
+    ratio = COARSE_STRIDE // FINE_STRIDE  # fine cells for a coarse one
     tried = np.empty((9, 2))
     for k in range(n):
         x, y = xy[k]
@@ -280,29 +280,21 @@ def _locate(xy, fine_a, fine_b, towards, columns_b, reach, least):
                 to_j, to_i, alike = _search(fine_b, descriptor, guess_x, guess_y, reach)
                 if alike > best:
                     best_j, best_i, best = to_j, to_i, alike
-        if best < least:
-            continue
-        to_x, to_y = _peak(fine_b, descriptor, best_j, best_i, best)
-        if _read(fine_b, to_x, to_y, other) and _leads_back(fine_a, to_x, to_y, other, x, y, reach):
-            found[k, 0], found[k, 1] = to_x, to_y
-            similarity[k] = best
-    return found, similarity
+        if best >= least:
+            _place(fine_a, fine_b, descriptor, x, y, best_j, best_i, best, reach, other, found[k])
+    return found
 
 
 @kernel
 def _locate_near(xy, expected, fine_a, fine_b, reach, least):
     n, channels = len(xy), fine_a.shape[2]
-    found, similarity = np.full((n, 2), np.nan), np.zeros(n, np.float32)
+    found = np.full((n, 2), np.nan)
     descriptor, other = np.empty(channels, np.float32), np.empty(channels, np.float32)
     for k in range(n):
         x, y = xy[k]
         if not (np.isfinite(expected[k, 0]) and _read(fine_a, x, y, descriptor)):
             continue
         j, i, best = _search(fine_b, descriptor, expected[k, 0], expected[k, 1], reach)
-        if best < least:
-            continue
-        to_x, to_y = _peak(fine_b, descriptor, j, i, best)
-        if _read(fine_b, to_x, to_y, other) and _leads_back(fine_a, to_x, to_y, other, x, y, reach):
-            found[k, 0], found[k, 1] = to_x, to_y
-            similarity[k] = best
-    return found, similarity
+        if best >= least:
+            _place(fine_a, fine_b, descriptor, x, y, j, i, best, reach, other, found[k])
+    return found

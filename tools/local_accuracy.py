@@ -36,6 +36,7 @@ from vslam.frontend.pose import optimise_pose
 from vslam.loopclosure.learned_localisation import project
 from vslam.loopclosure.local_matching import locate, locate_near, match_coarse
 from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
+from vslam.reprojection import stack_uvr
 
 CONFIG = Config()
 PIXELS = 3.0
@@ -82,9 +83,9 @@ def judged(
     if n < CONFIG.relocalization.min_matches:
         return Errors(n, 0.0, np.inf, np.inf), None
     p = points @ T_b_a[:3, :3].T + T_b_a[:3, 3]
-    truth = p[:, :2] / p[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    truth = camera.project(p)[:, :2]
     within = float((np.linalg.norm(uv - truth, axis=1) < PIXELS).mean())
-    uvr, weight = np.c_[uv, np.full(n, np.nan)], np.full(n, sigma**-2.0)
+    uvr, weight = stack_uvr(uv, np.full(n, np.nan)), np.full(n, sigma**-2.0)
     config = CONFIG.learned
     T, inlier = ransac_pose(
         points, uvr, weight, camera.intrinsics, np.uint64(1),
@@ -153,7 +154,7 @@ def compare(
                 a.xy[kept], expected, maps_a, maps_b, config.guided_reach, config.alike
             )
             n = np.count_nonzero(near.found)
-            uvr = np.c_[near.xy[near.found], np.full(n, np.nan)]
+            uvr = stack_uvr(near.xy[near.found], np.full(n, np.nan))
             T, _ = optimise_pose(
                 T, points[near.found], uvr, np.full(n, sigma**-2.0), camera.intrinsics
             )
@@ -200,8 +201,7 @@ def lifted(
     """Keypoints with a depth as points of the camera, and which they are."""
     z = depth[tuple(np.rint(features.xy).astype(int).T[::-1])].astype(np.float64)
     kept = np.flatnonzero((z > DEPTHS[0]) & (z < DEPTHS[1]))
-    ray = (features.xy[kept] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    return np.c_[ray, np.ones(len(kept))] * z[kept, None], kept
+    return camera.backproject(features.xy[kept], z[kept]), kept
 
 
 def main() -> None:

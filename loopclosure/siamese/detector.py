@@ -125,10 +125,10 @@ class SiameseDetector:
         """Candidates by descending ``order`` ``(N,)``, which is -1 for those that are none."""
         order = order.copy()
         found: list[LoopCandidate] = []
-        # Neighbours of a good match match well, too: they would crowd out the other places.
         most = self._config.max_candidates
         if self._images is not None:
             most = min(most, self._learned.max_candidates)
+        # Neighbours of a good match match well, too: they would crowd out the other places.
         while len(order) and len(found) < most:
             best = int(np.argmax(order))
             if order[best] < 0.0:

@@ -16,7 +16,6 @@ from torch.nn import functional
 from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.preprocessing import standardised, textured
 
-COARSE_STRIDE, FINE_STRIDE = 16, 4  # pixels
 COARSE_SIZE, FINE_SIZE = 64, 32  # numbers of a descriptor
 _QUARTER = 3  # blocks of the extractor to stride 4: 24 channels
 _HIDDEN, _FINE_HIDDEN = 128, 64

@@ -30,16 +30,12 @@ from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn import functional
 
+from vslam.loopclosure.local_matching import COARSE_STRIDE, FINE_STRIDE
 from vslam.loopclosure.siamese.branches import CapsuleBranch
 from vslam.loopclosure.siamese.export import export_local
 from vslam.loopclosure.siamese.images import read_grey
 from vslam.loopclosure.siamese.lite import LiteExtractor
-from vslam.loopclosure.siamese.local import (
-    COARSE_STRIDE,
-    FINE_STRIDE,
-    LocalHead,
-    LocalNetwork,
-)
+from vslam.loopclosure.siamese.local import LocalHead, LocalNetwork
 from vslam.loopclosure.siamese.siamese import load_network
 from vslam.loopclosure.siamese.weights import SHIPPED
 

@@ -17,7 +17,7 @@ from vslam.loopbench.detectors import (
 from vslam.loopbench.node_matching import match_by_node
 from vslam.loopbench.schema import Curve, Gain, Score, Verified
 from vslam.loopbench.sets import QuerySet, TestSet
-from vslam.loopclosure.local_matching import homography_share
+from vslam.loopclosure.local_matching import homography_share, match_coarse
 from vslam.loopclosure.precision_recall import (
     PrecisionRecall,
     average_precision,
@@ -169,13 +169,10 @@ class _Verification:
         """Whether enough cells of the coarse grid obey one homography, roughly."""
         key = query, image
         if key not in self._by_learned:
-            maps = [
-                self._local.of(one.image) for one in (self._queries[query], self._gallery[image])
-            ]
-            self._by_learned[key] = (
-                homography_share(maps[0], maps[1], LearnedMatchingConfig().coarse_alike)
-                >= MIN_SHARE
-            )
+            a = self._local.of(self._queries[query].image)
+            b = self._local.of(self._gallery[image].image)
+            coarse = match_coarse(a, b, LearnedMatchingConfig().coarse_alike)
+            self._by_learned[key] = homography_share(coarse, a, b) >= MIN_SHARE
         return self._by_learned[key]
 
 

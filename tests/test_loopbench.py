@@ -22,6 +22,7 @@ from vslam.loopbench.cost import cost
 from vslam.loopbench.detectors import BowScorer, DetectorSet, describe
 from vslam.loopbench.measure import epipolar_inliers, measure, thinned
 from vslam.loopbench.schema import LoopsJson, Verified
+from vslam.loopbench.sequences import LENGTH, log_odds, sequence_scores
 from vslam.loopbench.sets import QuerySet, TestSet, open_set
 from vslam.loopclosure.precision_recall import average_precision, precision_recall
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
@@ -128,6 +129,7 @@ def test_a_drive_asks_for_what_lies_long_before(tmp_path):
     assert (asked.relation[0, 1:] == UNKNOWN).all()  # image 50 does not ask for image 1 and later
     assert asked.relation[9, 0] == DIFFERENT
     assert found.query_set(Condition("change", 1.0), 0) is None
+    assert asked.in_order
 
 
 def test_of_pairs_the_second_images_ask(tmp_path):
@@ -203,6 +205,38 @@ def test_figures_of_detectors_that_know_and_that_err(vocabulary):
     assert gain.low > 0.7
     assert gain.difference == pytest.approx(1.0 - liar.figures["average_precision"])
     assert test_set.query_set(Condition("none"), 0).relation[0, 1] == UNKNOWN
+
+
+def test_a_sequence_is_the_mean_along_the_best_line():
+    """Three queries, three images: speeds 0.8 to 1.2 all step by one image over two queries."""
+    scores = np.array([[0.3, 0.0, 0.6], [0.0, 0.9, 0.0], [0.6, 0.0, 0.3]])
+    found = sequence_scores(scores)
+    np.testing.assert_allclose(found[0], scores[0])
+    # Image 0 has no way before it: the mean of query 0 stands for it.
+    np.testing.assert_allclose(found[1], [(0.0 + 0.3) / 2, (0.9 + 0.3) / 2, 0.0])
+    np.testing.assert_allclose(found[2, 2], (0.3 + 0.9 + 0.3) / 3)
+
+
+def test_a_sequence_outvotes_an_image_that_looks_like_all(vocabulary):
+    """The way is driven again, but one image of the gallery resembles every query most."""
+    n = 30
+    relation = np.where(np.eye(n) > 0, SAME, DIFFERENT).astype(np.int8)
+    p = np.full((n, n), 0.1) + 0.6 * np.eye(n)
+    p[:, 3] = 0.8
+    told = Told("misled", relation, 1.0)
+    told._p = p
+    images, found = [texture(0)] * n, {}
+    for in_order in (True, False):
+        query_set = QuerySet(images, images, relation, in_order)
+        test_set = TestSet("way", lambda condition, seed, found=query_set: found)
+        (cell,), _ = measure(test_set, Condition("none"), DetectorSet([told], vocabulary, 1), 0)
+        assert cell.first_right == pytest.approx(1 / n)
+        found[in_order] = cell.sequence_right
+    assert found[True] > 0.8
+    assert found[False] is None
+    # Driven the other way the images come in no such order.
+    backwards = sequence_scores(log_odds(p[::-1])).argmax(1)[LENGTH:]
+    assert (backwards == np.arange(n)[::-1][LENGTH:]).mean() < 0.2
 
 
 def test_what_is_made_of_images_asked_for_is_kept_while_they_are_asked_for(vocabulary):

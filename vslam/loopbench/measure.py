@@ -16,6 +16,7 @@ from vslam.loopbench.detectors import (
 )
 from vslam.loopbench.node_matching import match_by_node
 from vslam.loopbench.schema import Curve, Gain, Score, Verified
+from vslam.loopbench.sequences import log_odds, sequence_scores
 from vslam.loopbench.sets import QuerySet, TestSet
 from vslam.loopclosure.local_matching import homography_share, match_coarse
 from vslam.loopclosure.precision_recall import (
@@ -75,8 +76,12 @@ def _score(
         for threshold in (0.5, 0.9)
     }
     answerable = (query_set.relation == SAME).any(1)
-    best = np.where(known, scores, -np.inf).argmax(1)
-    truth = query_set.relation[np.arange(len(best)), best]
+    best, truth = _best_images(scores, query_set.relation)
+    sequence_right = None
+    if query_set.in_order:
+        over_sequences = sequence_scores(log_odds(scores) if scorer.probability else scores)
+        _, found = _best_images(over_sequences, query_set.relation)
+        sequence_right = float((found == SAME)[answerable].mean())
     right, wrong = (truth == SAME)[answerable], truth == DIFFERENT
     orb = np.array([verify.by_orb(q, int(g)) for q, g in enumerate(best)])
     learned = np.array([verify.by_learned(q, int(g)) for q, g in enumerate(best)])
@@ -95,9 +100,18 @@ def _score(
         accuracy=accuracy,
         queries=int(answerable.sum()),
         first_right=float(right.mean()),
+        sequence_right=sequence_right,
         verified=verified,
         curve=thinned(precision_recall(same, score)),
     )
+
+
+def _best_images(
+    scores: Matrix, relation: NDArray[np.int8]
+) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
+    """The best image of each query of which the truth is known, and its relation."""
+    best = np.where(relation != UNKNOWN, scores, -np.inf).argmax(1)
+    return best, relation[np.arange(len(best)), best]
 
 
 def thinned(curve: PrecisionRecall) -> Curve:

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from vslam.errors import ResultsError
 from vslam.loopbench.measure import MIN_MATCHES, MIN_SHARE
 from vslam.loopbench.schema import LoopsJson, Score
+from vslam.loopbench.sequences import LENGTH
 from vslam.report.drawing import (
     AMBER,
     BLUE,
@@ -40,6 +41,10 @@ _ABOUT_VERIFIED = (
     f"also at least {MIN_MATCHES} ORB matches obey one epipolar geometry, where matches of learned "
     f"local descriptors that obey one homography cover {100 * MIN_SHARE:.0f} % of the image, and "
     "where one of both is so."
+)
+_ABOUT_SEQUENCES = (
+    "Share of queries whose best image shows their place: by its score, and by the scores of a "
+    f"sequence of {LENGTH} queries (SeqSLAM). Images without order have no sequences."
 )
 _ABOUT_WRONG = "Queries whose best image shows another place and passes those tests, too."
 _ABOUT_ACCURACY = "Balanced: mean of the shares of true and of false pairs judged rightly by p."
@@ -124,6 +129,9 @@ def tables(report: LoopsJson) -> list[Table]:
                lambda c: ", ".join(f"{share:.3f}" for share in
                                    (c.first_right, *(v.right for v in c.verified.values()))),
                _ABOUT_VERIFIED),
+        _table(report, "Best image right, over a sequence",
+               lambda c: f"{c.first_right:.3f}, " +
+               ("-" if c.sequence_right is None else f"{c.sequence_right:.3f}"), _ABOUT_SEQUENCES),
         _table(report, "Wrong images verified by ORB, learned descriptors, one of both",
                lambda c: ", ".join(str(v.wrong) for v in c.verified.values()), _ABOUT_WRONG),
         _table(report, "Largest F1", lambda c: f"{c.figures['max_f1']:.3f}", ""),

@@ -33,8 +33,9 @@ class Score(_Model):
     ``figures`` are those of :func:`vslam.loopclosure.precision_recall.summary`, of descriptors
     alone; ``accuracy`` is balanced, at thresholds on p, None for detectors without.
     ``first_right``: share of the ``queries`` that have a place in the gallery whose best image
-    shows it. ``verified``: by ``orb``, by ``learned`` local descriptors, by ``both``, one of the
-    two.
+    shows it; ``sequence_right``: the same where scores are added along sequences, None of images
+    without order. ``verified``: by ``orb``, by ``learned`` local descriptors, by ``both``, one
+    of the two.
     """
 
     data: str
@@ -44,6 +45,7 @@ class Score(_Model):
     accuracy: dict[str, float | None]
     queries: int
     first_right: float
+    sequence_right: float | None
     verified: dict[str, Verified]
     curve: Curve
 
@@ -79,7 +81,7 @@ class LoopsJson(_Model):
     """``kind`` tells this file from those of runs."""
 
     kind: Literal["loops"] = "loops"
-    schema_version: int = 2
+    schema_version: int = 3
 
     seed: int
     cells: list[Score]

@@ -30,11 +30,13 @@ class QuerySet:
         queries: Q images ``(H, W)`` uint8, under the condition.
         gallery: G images as they were taken.
         relation: ``(Q, G)`` int8, 1 same place, -1 another, 0 not known: left out.
+        in_order: whether queries and gallery were taken one after the other on a way.
     """
 
     queries: list[Image]
     gallery: list[Image]
     relation: NDArray[np.int8]
+    in_order: bool = False
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ def _images(source: ImageSource) -> TestSet:
             return None
         as_taken = [source.grey(int(i)) for i in gallery]
         changed = apply(condition, [source.grey(int(i)) for i in queries], seed, rendered=False)
-        return QuerySet(changed, as_taken, relation)
+        return QuerySet(changed, as_taken, relation, in_order=is_query is None)
 
     return TestSet(source.name, query_set)
 

@@ -95,6 +95,20 @@ def test_keyframes_are_kept_small_and_described_when_asked_for(network, monkeypa
     assert (plain.coarse * first.coarse).sum(2).mean() > 0.98
 
 
+def test_images_of_culled_keyframes_are_forgotten(network):
+    images = KeyframeImages(network)
+    for k in range(3):
+        images.add(k, picture(k))
+        images.maps(k)
+        images.glance(k)
+    images.keep(np.array([True, False, True, False]))
+    assert [k in images for k in range(3)] == [True, False, True]
+    with pytest.raises(KeyError):
+        images.glance(1)
+    with pytest.raises(KeyError):
+        images.maps(1)
+
+
 def test_export_reads_any_size(tmp_path):
     torch.manual_seed(0)
     branch = build_network("capsule", load_network(SHIPPED / "capsule.safetensors")[0].branch.shape)

@@ -97,6 +97,7 @@ class LoopClosing:
         self.detector.add(keyframe, image, features)
         if self.images is not None and image is not None:
             self.images.add(keyframe, image)
+            self.images.keep(map_.arrays.keyframe_alive)
         candidates = self.detector.query(keyframe, map_)
         consistent, rejected = self._consistency.update(keyframe, candidates, map_)
         chosen = self._trials.choose(keyframe, candidates)

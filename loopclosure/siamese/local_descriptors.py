@@ -79,6 +79,16 @@ class KeyframeImages:
         file = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
         self._files[keyframe] = file.tobytes(), WIDTH / image.shape[1]
 
+    def keep(self, alive: NDArray[np.bool_]) -> None:
+        """Forget the images of keyframes that are gone from the map.
+
+        Args:
+            alive: ``(K,)`` of all keyframes up to the last one added.
+        """
+        for keyframe in [one for one in self._files if not alive[one]]:
+            for kept in (self._files, self._maps, self._glances):
+                kept.pop(keyframe, None)
+
     def __contains__(self, keyframe: int) -> bool:
         return keyframe in self._files
 

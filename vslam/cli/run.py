@@ -142,6 +142,7 @@ def run(
         config=thresholds,
         weights=weights,
         realtime=realtime,
+        calib=tuple(calib or ()),
     )
     folder = create_run_folder(out, dataset, sequence.name, perturbation.name, detector)
     recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()

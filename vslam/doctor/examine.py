@@ -111,7 +111,8 @@ def _pairs(sequence: Sequence, lefts: dict[int, Image], lag: int) -> list[_Pair]
 def _examine_stereo(
     sequence: Sequence, lefts: dict[int, Image], *, blind: bool
 ) -> tuple[list[Finding], list[Picture]]:
-    by_lag = {lag: _pairs(sequence, lefts, lag) for lag in _LAGS}
+    inner = dict(list(lefts.items())[1:-1:2])  # with frames before and behind
+    by_lag = {lag: _pairs(sequence, inner if lag else lefts, lag) for lag in _LAGS}
     pairs = by_lag[0]
     if not any(len(pair.matches) for pair in pairs):
         fix = "the two sides show nothing in common: check that they are one pair's, and calibrated"

@@ -27,7 +27,13 @@ FOLDERS = {
 LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.errors", "vslam.machine", "vslam.kernels"),
     ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.features", "vslam.camera"),
-    ("vslam.loops", "vslam.reprojection", "vslam.trajectory", "vslam.map_kernels"),
+    (
+        "vslam.loops",
+        "vslam.reprojection",
+        "vslam.trajectory",
+        "vslam.map_kernels",
+        "vslam.calibration",
+    ),
     ("vslam.map", "vslam.frame_poses"),
     ("vslam.frontend", "vslam.backend", "vslam.loopclosure", "vslam.datasets", "vslam.maps"),
     ("vslam.monocular", "vslam.closing"),
@@ -36,7 +42,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.run",),
     ("vslam.evaluation",),
     ("vslam.report",),
-    ("vslam.overview", "vslam.bench", "vslam.loopbench"),
+    ("vslam.overview", "vslam.bench", "vslam.loopbench", "vslam.doctor"),
     ("vslam.cli",),
     ("vslam.__main__", "vslam"),
 )

@@ -38,6 +38,7 @@ class RunSettings:
     config: Config
     weights: Path | None = None
     realtime: bool = False
+    calib: tuple[Path, ...] = ()
 
     @property
     def alignment(self) -> str:

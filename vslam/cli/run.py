@@ -114,7 +114,7 @@ def run(
             start=start, every=every, max_frames=max_frames, monocular=sensor == "mono",
             on_render=on_render,
         )  # fmt: skip
-    perturbation = parse_perturbation(perturb, seed, sequence.timestamps)
+    perturbation = parse_perturbation(perturb, seed)
 
     # Bad input has been refused by now; what follows takes a second to import.
     from vslam.cli.summary import print_summary

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from typing import Protocol, runtime_checkable
 
 from vslam.camera import Camera, ImageMap
@@ -27,6 +26,29 @@ class TimedFrame:
 
     timestamp: float
     read: Callable[[ImageMap], tuple[Image, Image | None]]
+
+
+class RawStream(Protocol):
+    """A `Stream` without its camera: the images need not be rectified.
+
+    Attributes:
+        sizes: width and height of the images of each side, one of a single camera.
+    """
+
+    @property
+    def dataset(self) -> str: ...
+    @property
+    def name(self) -> str: ...
+    @property
+    def live(self) -> bool: ...
+    @property
+    def n_expected(self) -> int | None: ...
+    @property
+    def sizes(self) -> tuple[tuple[int, int], ...]: ...
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """As `Stream.frames`, save that times need not increase."""
+        ...
 
 
 @runtime_checkable
@@ -56,7 +78,7 @@ class Stream(Protocol):
     def frames(self) -> Iterator[TimedFrame]:
         """All frames, times strictly increasing; from the first one on at every call, save live.
 
-        At most a few undecoded frames are held.
+        No images are held but those of the frame that is handed out.
 
         Raises:
             BrokenSourceError: after the last good frame of a file cut off or a device unplugged.
@@ -103,42 +125,3 @@ def increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]:
             continue
         last = frame.timestamp
         yield frame
-
-
-@dataclass(frozen=True)
-class SelectedStream:
-    """Every N-th frame of a stream from a first one on; see :class:`Stream`."""
-
-    stream: Stream
-    start: int
-    every: int
-    max_frames: int | None
-
-    @property
-    def dataset(self) -> str:
-        return self.stream.dataset
-
-    @property
-    def name(self) -> str:
-        return self.stream.name
-
-    @property
-    def camera(self) -> Camera:
-        return self.stream.camera
-
-    @property
-    def live(self) -> bool:
-        return self.stream.live
-
-    @property
-    def n_expected(self) -> int | None:
-        whole = self.stream.n_expected
-        if whole is None:
-            return self.max_frames
-        n = max(0, -(-(whole - self.start) // self.every))
-        return n if self.max_frames is None else min(n, self.max_frames)
-
-    def frames(self) -> Iterator[TimedFrame]:
-        """See :meth:`Stream.frames`."""
-        stop = None if self.max_frames is None else self.start + self.every * self.max_frames
-        return islice(self.stream.frames(), self.start, stop, self.every)

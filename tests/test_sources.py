@@ -35,6 +35,7 @@ from vslam.datasets.detection import detect_dataset
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.sources import SourceOptions, open_source
 from vslam.datasets.stream import count_expected, timed_frames
+from vslam.datasets.synthetic.video import write_side_by_side
 from vslam.errors import InputError
 from vslam.features import TrackingState
 from vslam.run.outcome import RunOutcome, RunSettings
@@ -278,3 +279,18 @@ def test_command_line_finds_out_what_it_is_given(folder, tmp_path):
     report = json.loads((run_folder / "report.json").read_text())
     assert (report["dataset"], report["sequence"], report["frames"]) == ("video", "pair", FRAMES)
     assert (run_folder / "report.html").exists()
+
+
+def test_a_sequence_written_side_by_side_comes_back(kitti_tree, tmp_path):
+    sequence = open_sequence("kitti", kitti_tree, "00", max_frames=5)
+    calib = write_side_by_side(sequence, tmp_path / "new" / "town.mkv")
+    assert calib == tmp_path / "new" / "town.yaml"
+    options = SourceOptions((calib,), side_by_side=True)
+    source = open_source("video", str(tmp_path / "new" / "town.mkv"), "", options)
+    assert source.camera == sequence.camera
+    frames = list(timed_frames(source))
+    assert [frame.timestamp for frame in frames] == sequence.timestamps.tolist()
+    for index, frame in enumerate(frames):
+        assert all(map(np.array_equal, frame.read(map), sequence.read(index)))
+    with pytest.raises(InputError, match="cannot be written as a video"):
+        write_side_by_side(sequence, tmp_path / "town.odd")

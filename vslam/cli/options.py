@@ -53,6 +53,7 @@ Weights = Annotated[
 ]
 DetectorName = Literal["none", "bow", "both", "capsule", "capsule-pruned", "alexnet", "vgg16"]
 SensorName = Literal["stereo", "mono"]
+ViewerName = Literal["native", "web"]
 AlignmentName = Literal["se3", "sim3", "none"]
 
 KITTI_ROOT = Path("data/kitti")

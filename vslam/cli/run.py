@@ -21,6 +21,7 @@ from vslam.cli.options import (
     SourceName,
     Start,
     Thresholds,
+    ViewerName,
     names_in,
 )
 from vslam.errors import InputError
@@ -104,6 +105,10 @@ def run(
         typer.Option("--realtime", help="Play frames at their times; drop overtaken ones."),
     ] = False,
     record: Annotated[bool, typer.Option(help="Write a Rerun recording.")] = True,
+    view: Annotated[
+        ViewerName | None,
+        typer.Option(help="Show the run live in Rerun, in a window or in the browser, too."),
+    ] = None,
     pages: Annotated[
         bool,
         typer.Option(
@@ -155,7 +160,13 @@ def run(
     from vslam.report.folder import create_run_folder, write_results
     from vslam.run.outcome import RunSettings
     from vslam.run.pipeline import run_sequence, with_comparison
-    from vslam.run.recorder import NullRecorder, RerunRecorder
+    from vslam.run.recorder import (
+        NullRecorder,
+        Recorder,
+        RerunRecorder,
+        SeveralRecorders,
+        open_viewer,
+    )
     from vslam.run.warmup import compile_kernels, is_cold
 
     settings = RunSettings(
@@ -173,8 +184,13 @@ def run(
         weights=weights,
         realtime=realtime,
     )
+    viewer = None if view is None else open_viewer(view)
     folder = create_run_folder(out, kind, source.name, perturbation.name, detector)
-    recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
+    recorder: Recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
+    if viewer is not None:
+        recorder = SeveralRecorders((recorder, RerunRecorder(viewer)))
+        if viewer.address:
+            announce(f"live at {viewer.address}", shown=not quiet)
     if is_cold():
         announce("first run: compiling the kernels, less than a minute ...", shown=not quiet)
     compile_kernels(processes=min(settings.threads, 2))

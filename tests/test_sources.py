@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -34,7 +35,7 @@ from vslam.datasets.bag_messages import grey_of
 from vslam.datasets.detection import detect_dataset
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.sources import SourceOptions, open_source
-from vslam.datasets.stream import count_expected, timed_frames
+from vslam.datasets.stream import TimedFrame, count_expected, timed_frames
 from vslam.datasets.synthetic.video import write_side_by_side
 from vslam.errors import InputError
 from vslam.features import TrackingState
@@ -294,3 +295,32 @@ def test_a_sequence_written_side_by_side_comes_back(kitti_tree, tmp_path):
         assert all(map(np.array_equal, frame.read(map), sequence.read(index)))
     with pytest.raises(InputError, match="cannot be written as a video"):
         write_side_by_side(sequence, tmp_path / "town.odd")
+
+
+class There:
+    """The corridor there and back as a stream; counts the images that somebody holds."""
+
+    dataset, name, live, n_expected = "video", "there", False, None
+
+    def __init__(self, corridor):
+        self.corridor, self.camera = corridor, corridor.camera
+        self.alive, self.most = 0, 0
+
+    def frames(self):
+        for k, index in enumerate([*range(28), *range(26, 0, -1)] * 2):
+            left, right = (side[index].copy() for side in (self.corridor.left, self.corridor.right))
+            self.alive += 1
+            weakref.finalize(left, self.gone)
+            self.most = max(self.most, self.alive)
+            yield TimedFrame(0.1 * k, lambda image_map, left=left, right=right: (left, right))
+
+    def gone(self):
+        self.alive -= 1
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_images_of_a_stream_are_let_go(corridor, threads):
+    stream = There(corridor)
+    outcome = run_source(stream, threads=threads)
+    assert len(outcome.tracks) == 108
+    assert stream.most <= 2 * threads + 4

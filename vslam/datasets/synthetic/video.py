@@ -38,7 +38,7 @@ def write_side_by_side(sequence: Sequence, path: Path) -> Path:
             f"{calibration}: cannot be written ({error.strerror}); name another file."
         ) from error
     size = (2 * camera.width, camera.height)
-    fourcc = cv2.VideoWriter_fourcc(*"FFV1")
+    fourcc = cv2.VideoWriter.fourcc(*"FFV1")
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, size, isColor=False)
     if not writer.isOpened():
         raise InputError(f"{path}: cannot be written as a video; name a file like town.mkv.")

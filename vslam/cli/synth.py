@@ -20,6 +20,8 @@ _EXAMPLES = """
 
   vslam synth block --side-by-side block.mkv
 
+  vslam synth block --fisheye --out fisheye
+
   vslam synth demo --pairs 1000 --aliased --change 0.8 --out pairs
 
   vslam synth 05 --pairs 500 --lateral=-3.2:1.4 --heading 0:30 --out pairs
@@ -63,6 +65,13 @@ def synth(
             help="Write both cameras' images as one video without loss, too, with its calibration.",
         ),
     ] = None,
+    fisheye: Annotated[
+        bool,
+        typer.Option(
+            "--fisheye",
+            help="Write an unrectified fisheye pair in EuRoC's layout with Kalibr's camchain.yaml.",
+        ),
+    ] = False,
     pairs: Annotated[
         int, typer.Option(min=0, help="Render so many labelled pairs for training instead.")
     ] = 0,
@@ -118,6 +127,8 @@ def synth(
         freed = store.clean(cache, route or None)
         typer.echo(f"{cache}: {freed / 1e6:.0f} MB removed")
         return
+    if side_by_side is not None and (pairs or fisheye):
+        raise InputError("--side-by-side: a video of a sequence; leave out --pairs and --fisheye.")
     if not route:
         raise InputError(f"vslam synth: name a route, one of {', '.join(ROUTES)}, or --list.")
     drive = (
@@ -125,6 +136,8 @@ def synth(
         if trajectory is None
         else route_of_poses(read_kitti_poses(trajectory), route, calibration)
     )
+    if fisheye and (depth or pairs or verify):
+        raise InputError("--fisheye: leave out --depth, --pairs and --verify.")
     variation = Variation(seed, aliased, change, dynamic)
     threads = threads or min(available_cores(), 4)
     with render_bar(shown=not quiet) as on_frame:
@@ -134,6 +147,17 @@ def synth(
             root = out or Path("pairs")
             moves = Moves(_range("--lateral", lateral, -4.0), _range("--heading", heading, 0.0))
             render_pairs(drive, variation, root, pairs, moves, threads=threads, on_frame=on_frame)
+        elif fisheye:
+            from vslam.datasets.synthetic.fisheye import render_fisheye
+
+            root = render_fisheye(
+                drive,
+                variation,
+                out or Path(f"{route}-fisheye"),
+                until=max_frames,
+                threads=threads,
+                on_frame=on_frame,
+            )
         else:
             root = store.render_sequence(
                 drive,
@@ -145,7 +169,7 @@ def synth(
                 threads=threads,
                 on_frame=on_frame,
             )
-    if side_by_side is not None and not pairs:
+    if side_by_side is not None:
         from vslam.datasets.kitti import open_kitti
         from vslam.datasets.synthetic.video import write_side_by_side
 

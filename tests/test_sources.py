@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -39,6 +40,7 @@ from vslam.datasets.stream import TimedFrame, count_expected, timed_frames
 from vslam.datasets.synthetic.video import write_side_by_side
 from vslam.errors import InputError
 from vslam.features import TrackingState
+from vslam.report.folder import create_run_folder
 from vslam.run.outcome import RunOutcome, RunSettings
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import NullRecorder
@@ -324,3 +326,25 @@ def test_images_of_a_stream_are_let_go(corridor, threads):
     outcome = run_source(stream, threads=threads)
     assert len(outcome.tracks) == 108
     assert stream.most <= 2 * threads + 4
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
+def test_a_viewer_is_refused_before_the_run(folder, tmp_path):
+    calib = str(folder / "stereo.yaml")
+    words = ["--data", str(folder / "pair.mkv"), "--side-by-side", "--calib", calib]
+    environment = {k: v for k, v in os.environ.items() if "DISPLAY" not in k}
+    done = subprocess.run(
+        [sys.executable, "-m", "vslam", "run", *words, "--view", "native"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=300, env=environment,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "there is no display here; use --view web" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_of_a_url_has_a_folder_with_a_plain_name(tmp_path):
+    name = "camera.local/live/" + 100 * "stream"
+    folder = create_run_folder(tmp_path, "camera", name, "none", "bow")
+    assert folder.parent == tmp_path
+    assert "camera-camera.local_live_stream" in folder.name
+    assert len(folder.name) < 120

@@ -183,6 +183,7 @@ def run(
         config=thresholds,
         weights=weights,
         realtime=realtime,
+        calib=tuple(calib or ()),
     )
     viewer = None if view is None else open_viewer(view)
     folder = create_run_folder(out, kind, source.name, perturbation.name, detector)

@@ -29,8 +29,8 @@ LAG_GAIN_PX = 0.25  # another lag must make rows better by so much, and by the f
 LAG_FACTOR = 0.6
 FEATURES = 0.5  # of those asked for
 # Contrast of pixels with their neighbours, to that with their wider surroundings: KITTI 0.43, TUM
-# 0.29, EuRoC 0.27; at most 0.17 after a Gaussian blur of 1.5 px.
-SHARP = 0.2
+# 0.25, EuRoC 0.27; at most 0.17 after a Gaussian blur of 1.5 px.
+SHARP = 0.18
 JITTER = 0.2  # of the interval, standard deviation
 GAP = 1.75  # of the interval: a frame is missing
 GAPS = 0.05  # share of intervals

@@ -157,7 +157,8 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
     limit = "all" if report.max_frames is None else str(report.max_frames)
     weights = [("weights", str(report.weights))] if report.weights else []
     realtime = [("realtime", "yes")] if report.realtime else []
-    return [*options, ("max-frames", limit), *weights, *realtime]
+    calib = [("calib", str(path)) for path in report.calib]
+    return [*options, ("max-frames", limit), *weights, *realtime, *calib]
 
 
 def machine_rows(report: ReportJson) -> list[tuple[str, str]]:

@@ -8,8 +8,9 @@ from functools import partial
 from itertools import islice
 
 from vslam.calibration.models import Calibration
-from vslam.calibration.rectification import Rectification, rectify
+from vslam.calibration.rectification import Rectification
 from vslam.camera import Camera, ImageMap
+from vslam.datasets.rectified import rectification_for, rectify_images
 from vslam.datasets.sequence import Image
 from vslam.datasets.stream import RawStream, TimedFrame, increasing
 from vslam.errors import InputError
@@ -67,35 +68,14 @@ def rectified_stream(
     """Every N-th frame of a stream from a first one on, rectified.
 
     Raises:
-        InputError: the images are not of the calibrated size, there is no calibration of the
-            right one, the stream ends before ``start``, or as
-            `vslam.calibration.rectification.rectify`.
+        InputError: the stream ends before ``start``, or as `vslam.datasets.rectified.rectified`.
     """
-    if len(raw.sizes) == 1 and calibration.right is not None:
-        calibration = calibration.left_alone()
-    if len(raw.sizes) == 2 and calibration.right is None:
-        raise InputError(
-            f"{calibration.source}: the calibration of the right camera is missing; give that of "
-            "both, or run on the left camera alone with --sensor mono."
-        )
-    models = [model for model in (calibration.left, calibration.right) if model is not None]
-    for model, (width, height) in zip(models, raw.sizes, strict=True):
-        if (model.width, model.height) != (width, height):
-            raise InputError(
-                f"{calibration.source}: made for {model.width}x{model.height} pixels but the "
-                f"images have {width}x{height}; take the calibration of these images."
-            )
     if raw.n_expected is not None and start >= raw.n_expected:
         raise InputError(f"--start {start}: {raw.name} has about {raw.n_expected} frames.")
-    return RectifiedStream(raw, rectify(calibration), start, every, max_frames)
+    return RectifiedStream(raw, rectification_for(calibration, raw.sizes), start, every, max_frames)
 
 
 def _read(
     frame: TimedFrame, rectification: Rectification, image_map: ImageMap
 ) -> tuple[Image, Image | None]:
-    left, right = frame.read(image_map)
-    sides = [partial(rectification.left, left)]
-    if right is not None:
-        sides.append(partial(rectification.right, right))
-    left, *rest = image_map(partial.__call__, sides)
-    return left, rest[0] if rest else None
+    return rectify_images(rectification, *frame.read(image_map), image_map)

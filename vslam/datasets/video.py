@@ -13,6 +13,7 @@ from vslam.datasets.sequence import Image
 from vslam.datasets.stream import TimedFrame
 from vslam.errors import BrokenSourceError, InputError
 
+_CONVERT = "convert the video, with ffmpeg -i VIDEO -c:v libx264 -crf 12 NEW.mp4 for example"
 _MISSING_SHARE = 0.05  # what the end may lack of the frames that the file speaks of: it estimates
 
 
@@ -84,9 +85,6 @@ def open_video(
         raise InputError(f"{path}: the video has no time stamps; give --fps.")
     sizes = sizes_of(first[0][1], side_by_side, monocular)
     return VideoStream(path, sizes, n, fps, side_by_side, monocular)
-
-
-_CONVERT = "convert the video, with ffmpeg -i VIDEO -c:v libx264 -crf 12 NEW.mp4 for example"
 
 
 def _open(path: Path) -> Capture:

@@ -34,6 +34,7 @@ def test_files_devices_and_urls(tmp_path, monkeypatch, data, dataset):
         ("mav0/cam0/data.csv", "euroc"),
         ("V1_01_easy/mav0/cam0/data.csv", "euroc"),
         ("rgb.txt", "tum"),
+        ("rgbd_dataset_freiburg1_desk/rgb.txt", "tum"),
         ("1.png", "images"),
         ("image_0/1.jpg", "images"),
         ("cam0/data/1.png", "images"),

@@ -13,6 +13,12 @@ from vslam.errors import InputError
 _BAG_SUFFIXES = {".bag", ".mcap", ".db3"}
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 
+
+def _within(folder: Path) -> tuple[Path, ...]:
+    """A folder and those in it: a data set may hold several sequences."""
+    return (folder, *(path for path in folder.glob("*") if path.is_dir()))
+
+
 # In this order: the folders of data sets hold images, too.
 _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
     (
@@ -23,9 +29,13 @@ _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
     (
         "euroc",
         "a folder 'mav0'",
-        lambda path: any(is_euroc(folder) for folder in (path, *path.glob("*/"))),
+        lambda path: any(is_euroc(folder) for folder in _within(path)),
     ),
-    ("tum", "a file rgb.txt", lambda path: (path / "rgb.txt").is_file()),
+    (
+        "tum",
+        "a file rgb.txt",
+        lambda path: any((folder / "rgb.txt").is_file() for folder in _within(path)),
+    ),
     (
         "bag",
         f"a file {', '.join(sorted(_BAG_SUFFIXES))} or metadata.yaml",
@@ -50,7 +60,9 @@ def detect_dataset(data: str) -> str:
             if holds(path):
                 return kind
         looked = "; ".join(f"{what} ({kind})" for kind, what, _ in _KINDS)
-        raise InputError(f"{data}: no data set that is known; looked for {looked}.")
+        raise InputError(
+            f"{data}: no data set that is known; name its kind with --dataset; looked for {looked}."
+        )
     if data.isdecimal():
         return "camera"
     raise InputError(

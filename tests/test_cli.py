@@ -118,6 +118,11 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
         ("--config nothing.json", ["nothing.json", "configuration"]),
         ("--compare-loops --detector none", ["--compare-loops", "--detector none"]),
+        ("--data nowhere", ["nowhere", "no such file or folder", "--data"]),
+        ("--data .", ["no data set that is known", "sequences", "mav0", "rgb.txt"]),
+        ("--data 77 --sensor mono", ["camera 77", "no such device"]),
+        ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
+        ("--topics /a,/b", ["--topics", "only for --dataset bag"]),
     ],
 )
 def test_run_refuses_without_data(call, words, parts):

@@ -69,6 +69,8 @@ ONLY_IN = {
     "rerun": "vslam.run.recorder",
     "evo": "vslam.evaluation.trajectories",
     "distributed": "vslam.bench.cluster",
+    "rosbags": "vslam.datasets.bag",
+    "PIL": "vslam.datasets.image_folders",
     "typer": "vslam.cli",
 }
 

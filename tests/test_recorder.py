@@ -15,10 +15,17 @@ import pytest
 from numpy.typing import NDArray
 
 from vslam.camera import Camera
+from vslam.errors import InputError
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.loops import LoopEdge
 from vslam.map import Map
-from vslam.run.recorder import NullRecorder, Recorder, RerunRecorder
+from vslam.run.recorder import (
+    NullRecorder,
+    Recorder,
+    RerunRecorder,
+    SeveralRecorders,
+    open_viewer,
+)
 from vslam.trajectory import Trajectory
 
 pytest.importorskip("rerun.chunk", reason="this rerun cannot read recordings in Python")
@@ -256,3 +263,85 @@ def test_failing_disk_neither_ends_nor_hangs_the_run(tmp_path: Path) -> None:
     assert done.returncode == 0
     assert done.stdout == "finished\n"
     assert "recording ends here" in done.stderr
+
+
+SERVER = """
+import sys, time, rerun as rr
+stream = rr.RecordingStream("viewer")
+stream.serve_grpc(grpc_port=int(sys.argv[1]))
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def window(monkeypatch):
+    """In place of the viewer's window: a process that receives what it is sent."""
+    import rerun
+
+    started = []
+
+    def spawn(*, port, **_):
+        started.append(subprocess.Popen([sys.executable, "-c", SERVER, str(port)]))
+
+    monkeypatch.setattr(rerun, "spawn", spawn)
+    monkeypatch.setenv("DISPLAY", ":0")
+    yield started
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+def both(path: Path, kind: str) -> SeveralRecorders:
+    return SeveralRecorders((RerunRecorder(path), RerunRecorder(open_viewer(kind))))
+
+
+def test_a_window_shows_the_run_and_the_recording_is_the_same(tmp_path, window, recording, caplog):
+    record(both(tmp_path / "recording.rrd", "native"))
+    assert not caplog.records
+    for entity in ("world/camera", "world/landmarks", "state"):
+        assert len(rows(tmp_path / "recording.rrd", entity)) == len(rows(recording, entity))
+
+
+def test_a_window_that_is_closed_does_not_end_the_recording(tmp_path, window, recording, caplog):
+    class Closing(NullRecorder):
+        def map(self, map_: Map) -> None:
+            if map_.n_keyframes == 10:
+                window[0].kill()
+                window[0].wait()
+
+    recorder = both(tmp_path / "recording.rrd", "native")
+    record(SeveralRecorders((*recorder.recorders, Closing())))
+    assert "the viewer: recording ends here" in caplog.text
+    entity = "world/camera"
+    assert len(rows(tmp_path / "recording.rrd", entity)) == len(rows(recording, entity))
+
+
+def test_a_page_shows_the_run(tmp_path, monkeypatch, caplog):
+    from urllib.request import urlopen
+
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    viewer = open_viewer("web")
+    assert b"<html" in urlopen(viewer.address).read().lower()
+    record(RerunRecorder(viewer), frames=20)
+    assert not caplog.records
+
+
+def test_a_window_without_a_display_is_refused(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    with pytest.raises(InputError, match="--view native: there is no display here"):
+        open_viewer("native")
+
+
+def test_a_viewer_that_cannot_be_started_is_refused(monkeypatch):
+    import rerun
+
+    def fail(**_):
+        raise RuntimeError("no such program")
+
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(rerun, "spawn", fail)
+    with pytest.raises(InputError, match=r"no viewer can be started \(no such program\)"):
+        open_viewer("native")

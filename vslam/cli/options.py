@@ -13,6 +13,16 @@ Data = Annotated[
 ]
 DatasetName = Literal["kitti", "euroc", "synthetic"]
 Dataset = Annotated[DatasetName, typer.Option(help="Data set.")]
+Source = Annotated[
+    str,
+    typer.Option(
+        "--data",
+        envvar="KITTI_ROOT",
+        help="Data set, folder of images, video, bag, number of a camera or URL, see "
+        "docs/sources.md.",
+    ),
+]
+SourceName = Literal[DatasetName, "images", "video", "bag", "camera"]
 Seq = Annotated[str, typer.Option(help="Sequence, 00 for example.")]
 Calib = Annotated[
     list[Path] | None,
@@ -43,6 +53,7 @@ Weights = Annotated[
 ]
 DetectorName = Literal["none", "bow", "both", "capsule", "capsule-pruned", "alexnet", "vgg16"]
 SensorName = Literal["stereo", "mono"]
+ViewerName = Literal["native", "web"]
 AlignmentName = Literal["se3", "sim3", "none"]
 
 KITTI_ROOT = Path("data/kitti")

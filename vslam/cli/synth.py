@@ -18,6 +18,8 @@ _EXAMPLES = """
 
   vslam synth mine --trajectory poses/07.txt --calibration 04-12
 
+  vslam synth block --side-by-side block.mkv
+
   vslam synth block --fisheye --out fisheye
 
   vslam synth demo --pairs 1000 --aliased --change 0.8 --out pairs
@@ -56,6 +58,13 @@ def synth(
         typer.Option(min=0, max=1, help="Change between passes; above 0.7 it grows dark."),
     ] = 0.0,
     depth: Annotated[bool, typer.Option("--depth", help="Write 16-bit depth (cm), too.")] = False,
+    side_by_side: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="VIDEO",
+            help="Write both cameras' images as one video without loss, too, with its calibration.",
+        ),
+    ] = None,
     fisheye: Annotated[
         bool,
         typer.Option(
@@ -118,6 +127,8 @@ def synth(
         freed = store.clean(cache, route or None)
         typer.echo(f"{cache}: {freed / 1e6:.0f} MB removed")
         return
+    if side_by_side is not None and (pairs or fisheye):
+        raise InputError("--side-by-side: a video of a sequence; leave out --pairs and --fisheye.")
     if not route:
         raise InputError(f"vslam synth: name a route, one of {', '.join(ROUTES)}, or --list.")
     drive = (
@@ -158,6 +169,13 @@ def synth(
                 threads=threads,
                 on_frame=on_frame,
             )
+    if side_by_side is not None:
+        from vslam.datasets.kitti import open_kitti
+        from vslam.datasets.synthetic.video import write_side_by_side
+
+        frames = open_kitti(root, drive.name, max_frames=max_frames)
+        calibration_file = write_side_by_side(frames, side_by_side)
+        typer.echo(f"{side_by_side}: {len(frames)} frames, calibration in {calibration_file}")
     typer.echo(f"{root}: " + (f"{pairs} pairs" if pairs else f"sequence {route}"))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence as Several
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
@@ -76,12 +77,7 @@ class RectifiedSequence:
 
     def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
         """Rectified left and right image; see `Sequence.read`."""
-        left, right = self.raw.read(index, image_map)
-        sides = [partial(self.rectification.left, left)]
-        if right is not None:
-            sides.append(partial(self.rectification.right, right))
-        left, *rest = image_map(partial.__call__, sides)
-        return left, rest[0] if rest else None
+        return rectify_images(self.rectification, *self.raw.read(index, image_map), image_map)
 
 
 def rectified(raw: RawSequence, calibration: Calibration) -> Sequence:
@@ -94,24 +90,39 @@ def rectified(raw: RawSequence, calibration: Calibration) -> Sequence:
             right one, or as `vslam.calibration.rectification.rectify`.
         UnreadableImageError: the first frame cannot be read.
     """
-    left, right = raw.read(0)
-    if right is None and calibration.right is not None:
+    sizes = [(image.shape[1], image.shape[0]) for image in raw.read(0) if image is not None]
+    return RectifiedSequence(raw, rectification_for(calibration, sizes))
+
+
+def rectification_for(calibration: Calibration, sizes: Several[tuple[int, int]]) -> Rectification:
+    """The rectification of images of one camera or two, by width and height of each one's.
+
+    Raises:
+        InputError: see `rectified`.
+    """
+    if len(sizes) == 1 and calibration.right is not None:
         calibration = calibration.left_alone()
-    if right is not None and calibration.right is None:
+    if len(sizes) == 2 and calibration.right is None:
         raise InputError(
             f"{calibration.source}: the calibration of the right camera is missing; give that of "
             "both, or run on the left camera alone with --sensor mono."
         )
-    for model, image in ((calibration.left, left), (calibration.right, right)):
-        if model is not None and image is not None:
-            _check_size(calibration.source, (model.width, model.height), image)
-    return RectifiedSequence(raw, rectify(calibration))
+    models = [model for model in (calibration.left, calibration.right) if model is not None]
+    for model, (width, height) in zip(models, sizes, strict=True):
+        if (model.width, model.height) != (width, height):
+            raise InputError(
+                f"{calibration.source}: made for {model.width}x{model.height} pixels but the "
+                f"images have {width}x{height}; take the calibration of these images."
+            )
+    return rectify(calibration)
 
 
-def _check_size(source: str, calibrated: tuple[int, int], image: Image) -> None:
-    width, height = calibrated
-    if image.shape != (height, width):
-        raise InputError(
-            f"{source}: made for {width}x{height} pixels but the images have "
-            f"{image.shape[1]}x{image.shape[0]}; take the calibration of these images."
-        )
+def rectify_images(
+    rectification: Rectification, left: Image, right: Image | None, image_map: ImageMap = map
+) -> tuple[Image, Image | None]:
+    """Both images rectified, or the left one where there is no right one."""
+    sides = [partial(rectification.left, left)]
+    if right is not None:
+        sides.append(partial(rectification.right, right))
+    left, *rest = image_map(partial.__call__, sides)
+    return left, rest[0] if rest else None

@@ -1,6 +1,8 @@
-"""The recording of a run, to be replayed offline in the Rerun viewer (``rerun recording.rrd``).
+"""The recording of a run, to be replayed offline in the Rerun viewer (``rerun recording.rrd``), and
+the same live in a viewer.
 
-The only module that imports rerun. A :class:`Recorder` is called from one thread.
+One file because it is the only one that imports rerun. A :class:`Recorder` is called from one
+thread.
 """
 
 from __future__ import annotations
@@ -8,8 +10,14 @@ from __future__ import annotations
 import ctypes
 import functools
 import logging
+import os
 import shutil
+import socket
+import sys
+import time
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Protocol
 
@@ -18,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera
+from vslam.errors import InputError
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.geometry import inverses
 from vslam.loops import LoopEdge
@@ -32,12 +41,11 @@ _P = ParamSpec("_P")
 # each loop, at most one in ten keyframes, can add 35 x 0.36 = 13 MB; loops themselves are lines.
 _IMAGE_SCALE = 0.5
 _JPEG_QUALITY = 75
-_KEYFRAMES_PER_MAP = 25
-_KEYFRAMES_PER_CORRECTED_MAP = 10
 _MAX_POINTS_PER_MAP = 30_000  # the last map is complete
 
 _REJECTED_SHOWN_FRAMES = 20  # then the lines of rejected loops vanish
-_FRAMES_PER_BATCH = 50
+_VIEWER_PORT, _WEB_PORT = 9876, 9090  # rerun's own, where they are free
+_VIEWER_STARTS_S = 20.0
 _FLUSH_TIMEOUT_S = 5.0
 _RESERVED_BYTES = 64 * 2**20  # left on the disk for the map, the trajectories and the report
 
@@ -46,6 +54,19 @@ _BLUE, _GREY = (59, 130, 246), (148, 163, 184)
 _FAINT_RED = (239, 68, 68, 80)
 _STATE_COLORS = {TrackingState.OK: _GREEN, TrackingState.WEAK: _AMBER, TrackingState.LOST: _RED}
 _POINT_SERIES = {"stereo": _GREY, "matches": _AMBER, "inliers": _BLUE}
+
+
+@dataclass(frozen=True)
+class _Pace:
+    """How often what is sent: frames at once, and keyframes between two maps, also corrected."""
+
+    frames: int
+    keyframes: int
+    corrected_keyframes: int
+
+
+_FILE_PACE = _Pace(50, 25, 10)
+_VIEWER_PACE = _Pace(5, 5, 2)  # nothing is kept for long there
 
 
 class Recorder(Protocol):
@@ -110,6 +131,117 @@ class NullRecorder:
     def finish(self, trajectory: Trajectory, map_: Map) -> None: ...
 
 
+@dataclass(frozen=True)
+class SeveralRecorders:
+    """Tells each of several recorders; one that ends does not end the others."""
+
+    recorders: tuple[Recorder, ...]
+
+    def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
+        for recorder in self.recorders:
+            recorder.begin(camera, ground_truth)
+
+    def frame(self, result: TrackResult, T_wc: NDArray[np.float64]) -> None:
+        for recorder in self.recorders:
+            recorder.frame(result, T_wc)
+
+    def keyframe(
+        self,
+        result: TrackResult,
+        image: NDArray[np.uint8],
+        features: Features,
+        tracked: NDArray[np.bool_],
+    ) -> None:
+        for recorder in self.recorders:
+            recorder.keyframe(result, image, features, tracked)
+
+    def map(self, map_: Map) -> None:
+        for recorder in self.recorders:
+            recorder.map(map_)
+
+    def loops(self, edges: Collection[LoopEdge], map_: Map) -> None:
+        for recorder in self.recorders:
+            recorder.loops(edges, map_)
+
+    def finish(self, trajectory: Trajectory, map_: Map) -> None:
+        for recorder in self.recorders:
+            recorder.finish(trajectory, map_)
+
+
+@dataclass(frozen=True)
+class Viewer:
+    """A viewer that has been started.
+
+    Attributes:
+        address: where a person finds it, empty for a window.
+        sink: of rerun, where a recording is sent to.
+    """
+
+    address: str
+    sink: Any
+
+
+def open_viewer(kind: str) -> Viewer:
+    """Start the Rerun viewer.
+
+    Args:
+        kind: ``native`` for a window, ``web`` for a page that this machine alone can open.
+
+    Raises:
+        InputError: it cannot be started here.
+    """
+    import rerun as rr
+
+    try:
+        if kind == "web":
+            sink = rr.GrpcServerSink("127.0.0.1", _free_port(_VIEWER_PORT))
+            page = _free_port(_WEB_PORT)
+            shown = _has_display()
+            rr.serve_web_viewer(web_port=page, open_browser=shown, connect_to=sink.uri)
+            return Viewer(f"http://localhost:{page}?url={sink.uri}", sink)
+        if not _has_display():
+            raise InputError("--view native: there is no display here; use --view web.")
+        port = _free_port(_VIEWER_PORT)
+        rr.spawn(port=port, connect=False, executable_path=_executable(), hide_welcome_screen=True)
+    except (OSError, RuntimeError) as error:
+        raise InputError(f"--view {kind}: no viewer can be started ({error}).") from error
+    until = time.monotonic() + _VIEWER_STARTS_S
+    while not _listens(port):
+        if time.monotonic() > until:
+            raise InputError("--view native: the viewer does not start here; use --view web.")
+        time.sleep(0.05)
+    return Viewer("", rr.GrpcSink(f"rerun+http://127.0.0.1:{port}/proxy"))
+
+
+def _has_display() -> bool:
+    return sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
+
+
+def _executable() -> str | None:
+    """The viewer of the package that is installed, not another one on the path."""
+    spec = find_spec("rerun_cli")
+    folder = Path(spec.origin).parent if spec and spec.origin else Path()
+    found = [path for name in ("rerun", "rerun.exe") if (path := folder / name).is_file()]
+    return str(found[0]) if found else None
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def _free_port(wanted: int) -> int:
+    """This port, or any other where it is taken."""
+    for port in (wanted, 0):
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return int(probe.getsockname()[1])
+    raise OSError("no port is free")
+
+
 def _guarded(
     method: Callable[Concatenate[RerunRecorder, _P], None],
 ) -> Callable[Concatenate[RerunRecorder, _P], None]:
@@ -128,7 +260,9 @@ def _guarded(
 
 
 class RerunRecorder:
-    """Writes a ``.rrd`` file; timelines ``frame`` (number) and ``time`` (seconds).
+    """Writes a ``.rrd`` file, or shows the same live.
+
+    Timelines: ``frame`` (number) and ``time`` (seconds).
 
     Entities: ``world/camera`` (every frame), ``world/camera/image`` with ``tracked`` and
     ``untracked`` keypoints (keyframes, half size), ``world/landmarks`` and ``world/keyframes``
@@ -142,26 +276,33 @@ class RerunRecorder:
     later flush reports, and after an error waiting for that thread can last forever. Therefore the
     recording ends, with a warning in the log, when the disk has less than 64 MB left: it is then
     complete up to there. When a flush fails or takes longer than 5 s, the recording is given up
-    with a warning: its file may be cut off within a message.
+    with a warning: its file may be cut off within a message. So is a viewer that has been closed.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Open ``path``, replacing an old recording; where that fails, warn and record nothing."""
+    def __init__(self, target: Path | Viewer) -> None:
+        """Open a file, replacing an old recording, or send to a viewer; where that fails, warn and
+        record nothing."""
         import rerun as rr
 
-        self._path = path
+        self._path = target if isinstance(target, Path) else None
+        self._name = str(self._path or "the viewer")
+        self._pace = _VIEWER_PACE if self._path is None else _FILE_PACE
         self._recording = rr.RecordingStream("vslam")
         self._open = True
         self._state: TrackingState | None = None
         self._index = 0  # of the last frame
         self._frames: list[tuple[TrackResult, NDArray[np.float64]]] = []
         self._keyframes = 0
-        self._mapped_keyframes = -_KEYFRAMES_PER_MAP
+        self._mapped_keyframes = -self._pace.keyframes
         self._accepted: list[LoopEdge] = []
         self._hide_rejected_at: int | None = None  # frame
         try:
             self._recording.set_log_time_enabled(False)  # would be the viewer's default timeline
-            self._recording.save(path)  # before the first log call, or that one is lost
+            # Before the first log call, or that one is lost.
+            if isinstance(target, Path):
+                self._recording.save(target)
+            else:
+                self._recording.set_sinks(target.sink)
         except (OSError, RuntimeError) as error:
             self._abandon(error)
 
@@ -199,7 +340,7 @@ class RerunRecorder:
         # Sent in columns: four times faster than one log call for each value.
         self._frames.append((result, T_wc.copy()))
         self._index = result.index
-        if len(self._frames) == _FRAMES_PER_BATCH:
+        if len(self._frames) >= self._pace.frames:
             self._send_frames()
         self._set_time(result)
         if result.state != self._state:
@@ -220,8 +361,8 @@ class RerunRecorder:
     ) -> None:
         import rerun as rr
 
-        if shutil.disk_usage(self._path.parent).free < _RESERVED_BYTES:
-            _log.warning("%s: the disk is almost full, recording ends here.", self._path)
+        if self._path and shutil.disk_usage(self._path.parent).free < _RESERVED_BYTES:
+            _log.warning("%s: the disk is almost full, recording ends here.", self._name)
             self._close()
             return
         self._keyframes += 1
@@ -238,7 +379,7 @@ class RerunRecorder:
 
     @_guarded
     def map(self, map_: Map) -> None:
-        if self._keyframes < self._mapped_keyframes + _KEYFRAMES_PER_MAP:
+        if self._keyframes < self._mapped_keyframes + self._pace.keyframes:
             return
         self._log_map(map_, _MAX_POINTS_PER_MAP)
         self._flush()
@@ -254,7 +395,7 @@ class RerunRecorder:
             self._hide_rejected_at = self._index + _REJECTED_SHOWN_FRAMES
         if accepted:
             self._accepted += accepted
-            if self._keyframes >= self._mapped_keyframes + _KEYFRAMES_PER_CORRECTED_MAP:
+            if self._keyframes >= self._mapped_keyframes + self._pace.corrected_keyframes:
                 self._log_map(map_, _MAX_POINTS_PER_MAP)
             else:
                 self._log_lines("accepted", self._accepted, map_, _GREEN)
@@ -329,7 +470,7 @@ class RerunRecorder:
     def _abandon(self, error: Exception) -> None:
         import rerun as rr
 
-        _log.warning("%s: recording ends here (%s).", self._path, error)
+        _log.warning("%s: recording ends here (%s).", self._name, error)
         # rerun 0.41 waits without a limit for its dead writer when a stream is deleted and at the
         # end of the process. A stream that never dies and no hook at the end avoid both.
         rr.unregister_shutdown()

@@ -1,0 +1,81 @@
+"""Streams of images as the cameras took them, rectified as they are decoded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+
+from vslam.calibration.models import Calibration
+from vslam.calibration.rectification import Rectification
+from vslam.camera import Camera, ImageMap
+from vslam.datasets.rectified import rectification_for, rectify_images
+from vslam.datasets.sequence import Image
+from vslam.datasets.stream import RawStream, TimedFrame, increasing
+from vslam.errors import InputError
+
+
+@dataclass(frozen=True)
+class RectifiedStream:
+    """See `rectified_stream`."""
+
+    raw: RawStream
+    rectification: Rectification
+    start: int
+    every: int
+    max_frames: int | None
+
+    @property
+    def dataset(self) -> str:
+        return self.raw.dataset
+
+    @property
+    def name(self) -> str:
+        return self.raw.name
+
+    @property
+    def camera(self) -> Camera:
+        return self.rectification.camera
+
+    @property
+    def live(self) -> bool:
+        return self.raw.live
+
+    @property
+    def n_expected(self) -> int | None:
+        whole = self.raw.n_expected
+        if whole is None:
+            return self.max_frames
+        n = len(range(self.start, whole, self.every))
+        return n if self.max_frames is None else min(n, self.max_frames)
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """See `vslam.datasets.stream.Stream.frames`."""
+        stop = None if self.max_frames is None else self.start + self.every * self.max_frames
+        for frame in islice(increasing(self.raw.frames(), self.name), self.start, stop, self.every):
+            yield TimedFrame(frame.timestamp, partial(_read, frame, self.rectification))
+
+
+def rectified_stream(
+    raw: RawStream,
+    calibration: Calibration,
+    *,
+    start: int = 0,
+    every: int = 1,
+    max_frames: int | None = None,
+) -> RectifiedStream:
+    """Every N-th frame of a stream from a first one on, rectified.
+
+    Raises:
+        InputError: the stream ends before ``start``, or as `vslam.datasets.rectified.rectified`.
+    """
+    if raw.n_expected is not None and start >= raw.n_expected:
+        raise InputError(f"--start {start}: {raw.name} has about {raw.n_expected} frames.")
+    return RectifiedStream(raw, rectification_for(calibration, raw.sizes), start, every, max_frames)
+
+
+def _read(
+    frame: TimedFrame, rectification: Rectification, image_map: ImageMap
+) -> tuple[Image, Image | None]:
+    return rectify_images(rectification, *frame.read(image_map), image_map)

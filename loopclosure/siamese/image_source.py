@@ -100,7 +100,10 @@ def names_of(files: Iterable[Path]) -> tuple[str, ...]:
 
 
 def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
-    """The first square matrix of a ``.mat`` file, ``(N, N)`` bool: which images close a loop.
+    """The largest square matrix of a ``.mat`` file, ``(N, N)`` bool: which images close a loop.
+
+    It may be dense or sparse, and of any name: Oxford's and Lip6's are called ``truth``, those for
+    KITTI after their sequence. Most mark a pair once, in the row of the later image.
 
     Raises:
         InputError: no such file, or no such matrix in it.
@@ -116,7 +119,8 @@ def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
     matrices = [m for m in matrices if m.ndim == 2 and m.shape[0] == m.shape[1] and m.size > 1]
     if not matrices:
         raise InputError(f"{path}: no ground truth in it (no square matrix with a match).")
-    found = matrices[0].toarray() if hasattr(matrices[0], "toarray") else matrices[0]
+    largest = max(matrices, key=lambda m: m.shape[0])
+    found = largest.toarray() if hasattr(largest, "toarray") else largest
     if not found.any():
         raise InputError(f"{path}: no ground truth in it (no square matrix with a match).")
     return np.asarray(found != 0)

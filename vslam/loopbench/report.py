@@ -192,7 +192,8 @@ def _table(report: LoopsJson, name: str, shown: Callable[[Score], str], note: st
 
 
 def _detectors(report: LoopsJson) -> list[str]:
-    return list(dict.fromkeys(c.detector for c in (*report.cells, *report.online)))
+    names = [c.detector for c in report.cells] + [c.detector for c in report.online]
+    return list(dict.fromkeys(names))
 
 
 def _conditions(report: LoopsJson) -> list[str]:

@@ -55,7 +55,9 @@ def _table(
     scores: Sequence[OnlineScore], title: str, shown: Callable[[OnlineScore], str], note: str
 ) -> Table:
     names = _in_order(s.detector for s in scores)
-    cells = {(s.data, s.verified_by, s.detector): s for s in scores}
+    cells: dict[tuple[str, str, str], OnlineScore] = {
+        (s.data, s.verified_by, s.detector): s for s in scores
+    }
     rows = []
     for data in _in_order(s.data for s in scores):
         first = cells[data, "nothing", names[0]]

@@ -95,7 +95,7 @@ def nearest_two(
     """
     return _nearest_two(
         trees.words, trees.centre, trees.child, trees.size, trees.members, descriptors
-    )  # type: ignore[no-any-return]
+    )
 
 
 @kernel

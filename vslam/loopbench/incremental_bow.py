@@ -21,9 +21,9 @@ from vslam.loopbench.detectors import DescribedImage
 from vslam.loopbench.online import Detection
 from vslam.loopbench.word_trees import empty_trees, insert, nearest_two, remove
 
-_RATIO = 0.8  # of the distances to the nearest and second nearest word (section III-A)
-_SEEN = 2  # images, among them the first, that keep a word; counted
-_AFTER = 2  # images after it was made (default of the authors' library, OBIndex2)
+_RATIO = 0.8  # of the distances to the nearest and second nearest word (section III)
+_SEEN = 2  # a word is kept that so many images see, the one that made it counted,
+_AFTER = 2  # until so many images later (both as in the authors' libraries)
 _MIN_SCORE = 0.3  # of the scores of a query stretched to 0..1, that an island is made of
 _REACH = 3  # images to either side: islands of 7 (default of the authors' library)
 
@@ -137,7 +137,7 @@ class IncrementalBow:
 
 
 def islands(score: NDArray[np.float64]) -> list[Island]:
-    """Stretches of images that are alike, from the best image down (section III-B).
+    """Stretches of images that are alike, from the best image down (section III).
 
     The scores ``(G,)`` of one query are stretched to 0..1. Each image from 0.3 on falls into an
     island or founds one, of seven images where others leave the room; its score is the mean of

@@ -19,14 +19,14 @@ from vslam.loopbench.thumbnail import ThumbnailScorer
 from vslam.loopclosure.registry import DETECTORS, require_detector
 from vslam.loopclosure.vocabulary import Vocabulary
 
-Protocol = Literal["retrieval", "online"]
+ProtocolName = Literal["retrieval", "online"]
 Start = Callable[[list[DescribedImage]], OnlineDetector]
 """An online detector that remembers nothing yet, for the drive of these images."""
 
 _BASELINES = (ThumbnailScorer.name, IncrementalBow.name)
 
 
-def require_comparable(name: str, weights: Path | None, protocol: Protocol) -> None:
+def require_comparable(name: str, weights: Path | None, protocol: ProtocolName) -> None:
     """Refuse what cannot be compared, before anything heavy is imported.
 
     Raises:

@@ -90,7 +90,8 @@ def draw_online(scores: Sequence[OnlineScore], colors: Sequence[str]) -> ReportF
         axes.set(xlim=(0, 1), ylim=(0, 1.02))
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-    figure.supxlabel("recall", fontsize=9.5)
+    for axes in grid[-1, : (len(drives) - 1) % columns + 1]:
+        axes.set_xlabel("recall", fontsize=9.5)
     figure.supylabel("precision", fontsize=9.5)
     caption = (
         "Precision and recall over images, along the decision threshold, a panel for each drive; "

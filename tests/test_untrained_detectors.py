@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from vslam.loopbench.cost import cost
 from vslam.loopbench.detectors import describe
 from vslam.loopbench.incremental_bow import IncrementalBow, Island, islands
-from vslam.loopbench.thumbnail import ThumbnailScorer, correlations, thumbnail
+from vslam.loopbench.thumbnail import ThumbnailScorer, correlations, remember, thumbnail
 from vslam.loopbench.word_trees import empty_trees, insert, nearest_two, remove
 from vslam.loopclosure.vocabulary import load
 
@@ -170,8 +171,8 @@ def test_thumbnails_do_not_mind_exposure_nor_a_small_shift(street):
     darker = (0.4 * image.astype(float) + 60).astype(np.uint8)
     shifted, too_far = np.roll(image, (8, 39), (0, 1)), np.roll(image, 120, 1)
     asked, *others = (thumbnail(seen)[None] for seen in (image, darker, shifted, too_far))
-    assert correlations(asked, asked) == pytest.approx(1.0)
-    same, near, far = (correlations(asked, other).item() for other in others)
+    assert correlations(asked, remember(asked)) == pytest.approx(1.0)
+    same, near, far = (correlations(asked, remember(other)).item() for other in others)
     assert min(same, near) > 0.95
     assert far < 0.6
 
@@ -189,3 +190,9 @@ def test_a_flat_image_is_like_no_other(street):
     flat = describe([np.full((188, 620), 90, np.uint8)], load(), 1)
     scorer = ThumbnailScorer()
     assert np.abs(scorer.scores(flat, scorer.store(street[:2]))).max() == 0.0
+
+
+def test_a_thumbnail_costs_more_the_more_there_are():
+    found = cost("thumbnail", None)
+    assert (found.detector, found.parameters) == ("thumbnail", 0)
+    assert 0 < found.query_ms["1000"] < found.query_ms["5000"]

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from vslam.camera import Camera
 from vslam.datasets import open_sequence
 from vslam.datasets.kitti import open_kitti
-from vslam.datasets.synthetic import houses, parse_drive, store, textures, vehicles
+from vslam.datasets.synthetic import houses, parse_drive, store, textures, vehicles, views
 from vslam.datasets.synthetic import town as town_module
 from vslam.datasets.synthetic.camera_effects import sensor_image
 from vslam.datasets.synthetic.pairs import render_pairs
@@ -325,6 +325,22 @@ def test_same_seed_same_bytes_on_any_number_of_threads(route, rendered, tmp_path
         route, Variation(seed=3), tmp_path, until=3, depth=True, threads=2
     )
     assert tree(again) == tree(rendered)
+
+
+def test_views_are_the_left_images_of_the_drive(route, town, rendered, tmp_path, monkeypatch):
+    monkeypatch.setattr(views, "build_town", lambda *_: town)
+    seen = []
+    for _ in range(2):
+        args = (route, Variation(seed=3), tmp_path, (0, 2))
+        views.render_views(*args, threads=1, on_frame=lambda *at: seen.append(at))
+        images = sorted(tmp_path.rglob("*.png"))
+        assert [image.name for image in images] == ["000000.png", "000002.png"]
+        for image in images:
+            assert image.read_bytes() == (rendered / image.relative_to(tmp_path)).read_bytes()
+        images[1].unlink()
+    assert seen == [(1, 2), (2, 2), (2, 2)]
+    for name in (f"poses/{route.name}.txt", f"sequences/{route.name}/times.txt"):
+        assert (tmp_path / name).read_bytes() == (rendered / name).read_bytes()
 
 
 def test_tree_is_kitti_with_depth(route, rendered):

@@ -13,7 +13,7 @@ from vslam.errors import InputError
 from vslam.loopclosure.siamese.images import Fit, Size, read_grey, to_size
 
 SAME, UNKNOWN, DIFFERENT = 1, 0, -1
-_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp"}
+_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".ppm", ".pgm"}
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ class ImageSource:
         calibration: ``(8,)`` or ``(9,)`` fx fy cx cy k1 k2 p1 p2 [k3], None if rectified.
         is_query: ``(N,)`` bool, the queries of a benchmark, which are searched for among the other
             images; None for a drive, where each image is searched for among those long before it.
+        times: ``(N,)`` seconds at which the images were taken, None if not known.
     """
 
     name: str
@@ -42,6 +43,7 @@ class ImageSource:
     unit: NDArray[np.int32]
     calibration: NDArray[np.float64] | None = None
     is_query: NDArray[np.bool_] | None = None
+    times: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -72,6 +74,7 @@ class ImageSource:
             relation=self.relation[np.ix_(chosen, chosen)],
             unit=self.unit[chosen],
             is_query=None if self.is_query is None else self.is_query[chosen],
+            times=None if self.times is None else self.times[chosen],
         )
 
 
@@ -97,7 +100,10 @@ def names_of(files: Iterable[Path]) -> tuple[str, ...]:
 
 
 def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
-    """The first square matrix of a ``.mat`` file, ``(N, N)`` bool: which images close a loop.
+    """The largest square matrix of a ``.mat`` file, ``(N, N)`` bool: which images close a loop.
+
+    It may be dense or sparse, and of any name: Oxford's and Lip6's are called ``truth``, those for
+    KITTI after their sequence. Most mark a pair once, in the row of the later image.
 
     Raises:
         InputError: no such file, or no such matrix in it.
@@ -113,7 +119,8 @@ def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
     matrices = [m for m in matrices if m.ndim == 2 and m.shape[0] == m.shape[1] and m.size > 1]
     if not matrices:
         raise InputError(f"{path}: no ground truth in it (no square matrix with a match).")
-    found = matrices[0].toarray() if hasattr(matrices[0], "toarray") else matrices[0]
+    largest = max(matrices, key=lambda m: m.shape[0])
+    found = largest.toarray() if hasattr(largest, "toarray") else largest
     if not found.any():
         raise InputError(f"{path}: no ground truth in it (no square matrix with a match).")
     return np.asarray(found != 0)

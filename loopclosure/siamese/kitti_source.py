@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from vslam.loopclosure.siamese.image_source import (
     names_of,
     read_loop_matrix,
 )
-from vslam.trajectory import read_kitti_poses
+from vslam.trajectory import read_kitti_poses, read_table
 
 _FAR = 25.0  # m, beyond which two images of a drive show different places
 
@@ -45,7 +46,7 @@ def read_kitti(
 
     Raises:
         InputError: no images in that range, no poses for them, no such matrix, or a ``near`` that
-            is out of range.
+            is out of range, or times that do not fit.
     """
     base = root if (root / "sequences").is_dir() else root / "dataset"
     folder = base / "sequences" / seq / "image_0"
@@ -82,7 +83,21 @@ def read_kitti(
         relation[marked | marked.T] = SAME
         np.fill_diagonal(relation, SAME)
     name = f"kitti{seq}"
-    return [ImageSource(name, name, names_of(files), tuple(files), relation, stretch)]
+    source = ImageSource(name, name, names_of(files), tuple(files), relation, stretch)
+    return [replace(source, times=_times(folder.parent / "times.txt", number))]
+
+
+def _times(path: Path, number: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """Times of the images of these numbers; None if the sequence comes without."""
+    if not path.exists():
+        return None
+    times = read_table(path, (1,), "a time")[:, 0]
+    if len(times) <= number[-1] or (np.diff(times) < 0).any():
+        raise InputError(
+            f"{path}: times must ascend and reach image {number[-1]:06d}; take the file of this "
+            "sequence."
+        )
+    return times[number]
 
 
 def relation_of_poses(

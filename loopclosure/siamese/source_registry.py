@@ -14,7 +14,8 @@ kinds and their options:
     ``frames``: ranges of numbers in place of first and last, ``frames=0-249+1500-1699``.
     ``near``: metres within which two images show one place, 5 without it.
     ``truth``: ``.mat`` file with a matrix of loops, which then says what is the same place.
-``fabmap:DIR``: Oxford CityCentre or NewCollege, Cummins and Newman 2008 (`fabmap_source`).
+``fabmap:DIR``: Oxford CityCentre or NewCollege, Cummins and Newman 2008, or other images in order
+    with a matrix, as Lip6's (`fabmap_source`).
     ``truth``: ``.mat`` file with the matrix of loops, the first one in the folder without it.
     ``side``: ``left`` or ``right`` camera, where the matrix has one row for both; left without it.
 ``pairs:DIR``: what ``vslam synth --pairs`` wrote (`pairs_source`); no options.

@@ -5,12 +5,15 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from vslam.cli.options import Weights, names_in
 from vslam.errors import InputError
+
+if TYPE_CHECKING:
+    from vslam.loopbench.schema import Gain, OnlineScore, Score
 
 _EXAMPLES = """
 [b]Examples[/b]
@@ -20,8 +23,13 @@ _EXAMPLES = """
   vslam loops bench --data "kitti:~/kitti\\[seq=00,frames=0-249+1500-1699,truth=kitti00.mat]"
 
   vslam loops bench --detectors capsule,alexnet --weights alexnet=training/alexnet.onnx
+
+  vslam loops bench --protocol online --detectors bow,capsule,ibow
 """
 DATA = ("town:demo[seed=101]", "town:05[seed=102]", "town:demo[seed=103,aliased=1]")
+DRIVES = ("drive:05[seed=102]", "drive:demo[seed=103,aliased=1,every=5]")
+PERTURB, STRENGTHS = "none,light,clipping,viewpoint,occlusion,noise,blur,change,all", "0.5,1"
+WINDOW = "20s"
 commands = typer.Typer(help="Compare loop detectors.", no_args_is_help=True)
 
 
@@ -37,12 +45,21 @@ def _group() -> None:
 
 @commands.command("bench", epilog=_EXAMPLES)
 def bench(
+    protocol: Annotated[
+        Literal["retrieval", "online"],
+        typer.Option(
+            help="retrieval: every query against a gallery; online: images of a drive in order, "
+            "one decision each against those before."
+        ),
+    ] = "retrieval",
     data: Annotated[
         list[str] | None,
         typer.Option(
             help="Images: [b]town:ROUTE\\[seed=101,aliased=1,places=150][/b], rendered, or a "
-            "source as of [b]vslam train[/b]; again for more.",
-            show_default="three towns",
+            "source as of [b]vslam train[/b]; with --protocol online "
+            "[b]drive:ROUTE\\[seed=101,aliased=1,change=0.5,every=10][/b], rendered, kitti:DIR or "
+            "fabmap:DIR; again for more.",
+            show_default="three towns, or two drives",
         ),
     ] = None,
     detectors: Annotated[
@@ -55,8 +72,15 @@ def bench(
             help="What is done to the query images: light, clipping, viewpoint, occlusion, "
             "noise, blur, change (rendered towns only), all; with commas."
         ),
-    ] = "none,light,clipping,viewpoint,occlusion,noise,blur,change,all",
-    strengths: Annotated[str, typer.Option(help="From 0 to 1, with commas.")] = "0.5,1",
+    ] = PERTURB,
+    strengths: Annotated[str, typer.Option(help="From 0 to 1, with commas.")] = STRENGTHS,
+    window: Annotated[
+        str,
+        typer.Option(
+            help="With --protocol online: the youngest images, which are not searched, in seconds "
+            "(20s) or images (200)."
+        ),
+    ] = WINDOW,
     seed: Annotated[int, typer.Option(min=0, help="Of what is drawn.")] = 0,
     threads: Annotated[int | None, typer.Option(min=1, help="Threads.", show_default="cores")] = (
         None
@@ -64,59 +88,95 @@ def bench(
     out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("loops-bench"),
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
-    """Precision and recall of loop detectors under changes of light, view and town."""
+    """Precision and recall of loop detectors, on places under changes or on drives."""
     from vslam.loopbench.conditions import parse_conditions
-    from vslam.loopclosure.registry import parse_weights, require_detector
+    from vslam.loopbench.online import parse_window
+    from vslam.loopbench.registry import require_comparable
+    from vslam.loopclosure.registry import parse_weights
 
     names = names_in(detectors)
     files = parse_weights(weights or [], names)
     for name in names or [""]:
-        if name == "none":
-            raise InputError("--detectors none: finds nothing; leave it out.")
-        if name == "both":
-            raise InputError("--detectors both: has no score of its own; name bow,capsule.")
-        require_detector(name, files.get(name), "--detectors")
-    conditions = parse_conditions(perturb, strengths)
+        require_comparable(name, files.get(name), protocol)
+    conditions, youngest = parse_conditions(perturb, strengths), parse_window(window)
+    if protocol == "online" and (perturb, strengths) != (PERTURB, STRENGTHS):
+        raise InputError(
+            "--perturb, --strengths: change the queries of --protocol retrieval; leave them out "
+            "with online."
+        )
+    if protocol == "retrieval" and window != WINDOW:
+        raise InputError("--window: is of --protocol online; add that or leave it out.")
 
     from vslam.cli.progress import announce, count_bar
     from vslam.datasets.synthetic import store
-    from vslam.loopbench.cost import cost
-    from vslam.loopbench.detectors import DetectorSet, open_scorer
-    from vslam.loopbench.measure import measure
     from vslam.loopbench.report import write_report
-    from vslam.loopbench.schema import Gain, LoopsJson, Score
-    from vslam.loopbench.sets import open_set
+    from vslam.loopbench.schema import LoopsJson
     from vslam.loopclosure.vocabulary import load
     from vslam.machine import available_cores, versions
     from vslam.report.summary import this_machine
 
     threads = threads or available_cores()
     here = this_machine()
-    machine = f"{here.cpu}, {here.cores} cores"
+    made = {"seed": seed, "machine": f"{here.cpu}, {here.cores} cores", "versions": versions()}
     vocabulary = load()
     bar = partial(count_bar, shown=not quiet)
-    scorers = [open_scorer(name, files.get(name), vocabulary) for name in names]
-    sets = [
-        found
-        for spec in data or DATA
-        for found in open_set(spec, store.cache_folder(), threads=threads, progress_bar=bar)
-    ]
-    announce("time and memory of each detector ...", shown=not quiet)
-    costs = [cost(name, files.get(name)) for name in names]
-    scores: list[Score] = []
-    gains: list[Gain] = []
-    for test_set in sets:
-        compared = DetectorSet(scorers, vocabulary, threads)
-        with bar(test_set.title, len(conditions)) as advance:
-            for condition in conditions:
-                more = measure(test_set, condition, compared, seed)
-                scores, gains = scores + more[0], gains + more[1]
-                advance()
-        # After every set, so that a run that is stopped has told what it found.
-        report = LoopsJson(
-            seed=seed, cells=scores, gains=gains, costs=costs, machine=machine,
-            versions=versions(), created=datetime.now(UTC),
-        )  # fmt: skip
-        write_report(report, out)
+    cache = store.cache_folder()
+
+    def write(**found: object) -> None:
+        report = {
+            "cells": [],
+            "gains": [],
+            "costs": [],
+            **found,
+            **made,
+            "created": datetime.now(UTC),
+        }
+        write_report(LoopsJson.model_validate(report), out)
+
+    # Both write after every set, so that a run that is stopped has told what it found.
+    if protocol == "online":
+        from vslam.loopbench.drives import open_drives
+        from vslam.loopbench.measure_online import measure_drive
+        from vslam.loopbench.registry import online_detector
+
+        starts = [online_detector(name, files.get(name), vocabulary) for name in names]
+        drives = [
+            drive
+            for spec in data or DRIVES
+            for drive in open_drives(spec, cache, threads=threads, progress_bar=bar)
+        ]
+        decided: list[OnlineScore] = []
+        for drive in drives:
+            decided += measure_drive(
+                drive, starts, youngest, vocabulary, threads=threads, progress_bar=bar
+            )
+            write(online=decided)
+        done = f"{len(drives)} drives"
+    else:
+        from vslam.loopbench.cost import cost
+        from vslam.loopbench.detectors import DetectorSet
+        from vslam.loopbench.measure import measure
+        from vslam.loopbench.registry import comparable_scorer
+        from vslam.loopbench.sets import open_set
+
+        scorers = [comparable_scorer(name, files.get(name), vocabulary) for name in names]
+        sets = [
+            found
+            for spec in data or DATA
+            for found in open_set(spec, cache, threads=threads, progress_bar=bar)
+        ]
+        announce("time and memory of each detector ...", shown=not quiet)
+        costs = [cost(name, files.get(name)) for name in names]
+        scores: list[Score] = []
+        gains: list[Gain] = []
+        for test_set in sets:
+            compared = DetectorSet(scorers, vocabulary, threads)
+            with bar(test_set.title, len(conditions)) as advance:
+                for condition in conditions:
+                    more = measure(test_set, condition, compared, seed)
+                    scores, gains = scores + more[0], gains + more[1]
+                    advance()
+            write(cells=scores, gains=gains, costs=costs)
+        done = f"{len(sets)} sets of images"
     if not quiet:
-        typer.echo(f"{out / 'loops.html'}: {len(names)} detectors on {len(sets)} sets of images")
+        typer.echo(f"{out / 'loops.html'}: {len(names)} detectors on {done}")

@@ -83,7 +83,27 @@ def _network(name: str, weights: Path | None) -> Cost:
     )  # fmt: skip
 
 
+def _thumbnail() -> Cost:
+    from vslam.machine import peak_memory_mb
+
+    began = time.perf_counter()
+    from vslam.loopbench.thumbnail import correlations, remember, thumbnail
+
+    loading = time.perf_counter() - began
+    image = np.random.default_rng(0).integers(0, 256, (376, 1241), dtype=np.uint8)
+    one = thumbnail(image)[None]
+    query = {
+        str(n): _median_ms(partial(correlations, one, remember(np.repeat(one, n, axis=0))))
+        for n in KEYFRAMES
+    }
+    return Cost(
+        detector="thumbnail", load_s=loading, image_ms=_median_ms(lambda: thumbnail(image)),
+        query_ms=query, parameters=0, memory_mb=peak_memory_mb(),
+    )  # fmt: skip
+
+
 if __name__ == "__main__":
     name, file = sys.argv[1:3]
-    found = _bow() if name == "bow" else _network(name, Path(file) if file else None)
+    untrained = {"bow": _bow, "thumbnail": _thumbnail}
+    found = untrained[name]() if name in untrained else _network(name, Path(file) if file else None)
     sys.stdout.write(found.model_dump_json())

@@ -47,7 +47,7 @@ def measure(
         return [], []
     queries = detectors.describe(query_set.queries)
     gallery, stored = detectors.gallery(query_set.gallery)
-    verify = _Verification(queries, gallery, detectors.local)
+    verify = Verification(queries, gallery, detectors.local)
     found = {one.name: one.scores(queries, stored[one.name]) for one in detectors.scorers}
     scores = [
         _score(test_set.title, condition, scorer, found[scorer.name], query_set, verify)
@@ -67,7 +67,7 @@ def _score(
     scorer: Scorer,
     scores: Matrix,
     query_set: QuerySet,
-    verify: _Verification,
+    verify: Verification,
 ) -> Score:
     known = query_set.relation != UNKNOWN
     same, score = query_set.relation[known] == SAME, scores[known]
@@ -120,13 +120,18 @@ def thinned(curve: PrecisionRecall) -> Curve:
     Equal steps of the pairs would have a good detector's curve in the first of them: of thousands
     of pairs it finds all true ones among the first few.
     """
-    wanted = np.linspace(0.0, 1.0, _CURVE_POINTS)
-    reached = len(curve.recall) - 1 - np.searchsorted(curve.recall[::-1], wanted)
-    points = np.unique(np.append(reached, 0))
+    points = drawn_points(curve)
     return Curve(
         precision=curve.precision[points].round(5).tolist(),
         recall=curve.recall[points].round(5).tolist(),
     )
+
+
+def drawn_points(curve: PrecisionRecall) -> NDArray[np.int64]:
+    """Points of a curve that are nearest to equal steps of recall, and the first."""
+    wanted = np.linspace(0.0, curve.recall[0], _CURVE_POINTS)
+    reached = len(curve.recall) - 1 - np.searchsorted(curve.recall[::-1], wanted)
+    return np.unique(np.append(reached, 0))
 
 
 def _gain(
@@ -158,7 +163,7 @@ def _gain(
     )  # fmt: skip
 
 
-class _Verification:
+class Verification:
     """Whether two images show one place by their local descriptors; each pair is matched once."""
 
     def __init__(

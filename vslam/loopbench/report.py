@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from vslam.errors import ResultsError
 from vslam.loopbench.measure import MIN_MATCHES, MIN_SHARE
+from vslam.loopbench.report_online import draw_online, online_tables, online_words
 from vslam.loopbench.schema import LoopsJson, Score
 from vslam.loopbench.sequences import LENGTH
 from vslam.report.drawing import (
@@ -96,8 +97,9 @@ def markdown(report: LoopsJson) -> str:
 
 
 def words(report: LoopsJson) -> list[str]:
-    """For each detector but the first and each condition, what the intervals say."""
-    sentences = []
+    """For each detector but the first and each condition, what the intervals say; for each drive,
+    which detector decides best."""
+    sentences = online_words(report.online)
     for first, second in dict.fromkeys((g.first, g.second) for g in report.gains):
         for condition in _conditions(report):
             gains = [g for g in report.gains
@@ -117,6 +119,8 @@ def words(report: LoopsJson) -> list[str]:
 
 def tables(report: LoopsJson) -> list[Table]:
     """Every table of the report."""
+    if not report.cells:
+        return online_tables(report.online)
     names = _detectors(report)
     texts = ("images", "condition")
     found = [
@@ -196,7 +200,8 @@ def _table(report: LoopsJson, name: str, shown: Callable[[Score], str], note: st
 
 
 def _detectors(report: LoopsJson) -> list[str]:
-    return list(dict.fromkeys(c.detector for c in report.cells))
+    names = [c.detector for c in report.cells] + [c.detector for c in report.online]
+    return list(dict.fromkeys(names))
 
 
 def _conditions(report: LoopsJson) -> list[str]:
@@ -217,9 +222,12 @@ def _made(report: LoopsJson) -> list[tuple[str, str]]:
 
 
 def draw(report: LoopsJson) -> list[ReportFigure]:
-    """Precision-recall curves: a figure for each set of images, a panel for each condition."""
+    """Precision-recall curves: a figure for each set of images, a panel for each condition; one
+    figure for all drives."""
     figures = []
     with style.context(STYLE, after_reset=True):
+        if report.online:
+            figures.append(draw_online(report.online, _COLORS))
         for number, data in enumerate(_data(report)):
             cells = [c for c in report.cells if c.data == data]
             figure = _curves(cells, _detectors(report), data)

@@ -50,6 +50,42 @@ class Score(_Model):
     curve: Curve
 
 
+class DecisionCurve(_Model):
+    """Precision and recall over images at thresholds on the score, ascending, thinned out."""
+
+    threshold: list[float]
+    precision: list[float]
+    recall: list[float]
+
+
+class OnlineScore(_Model):
+    """One detector on one drive, one decision an image (:mod:`vslam.loopbench.online`).
+
+    ``window``: the youngest images, which are not searched. ``verified_by``: ``nothing``, ``orb``,
+    ``learned`` local descriptors, ``both``, one of the two. Of the ``images``, ``answerable`` have
+    a true match before the window. At the lowest threshold ``right`` images have a true match,
+    ``near`` one that lies near the place but is not marked, ``far`` one of another place. Figures
+    count near as wrong, those that end in ``_far`` leave it out. ``max_f1_threshold`` is None
+    where nothing is found.
+    """
+
+    data: str
+    detector: str
+    window: str
+    verified_by: Literal["nothing", "orb", "learned", "both"]
+    images: int
+    answerable: int
+    right: int
+    near: int
+    far: int
+    recall_at_100_precision: float
+    recall_at_100_precision_far: float
+    max_f1: float
+    max_f1_far: float
+    max_f1_threshold: float | None
+    curve: DecisionCurve
+
+
 class Gain(_Model):
     """AP of ``second`` minus that of ``first``, with the 95 % interval over the queries."""
 
@@ -78,13 +114,17 @@ class Cost(_Model):
 
 
 class LoopsJson(_Model):
-    """``kind`` tells this file from those of runs."""
+    """``kind`` tells this file from those of runs.
+
+    ``cells``, ``gains`` and ``costs`` are of the protocol retrieval, ``online`` of the other one.
+    """
 
     kind: Literal["loops"] = "loops"
     schema_version: int = 3
 
     seed: int
     cells: list[Score]
+    online: list[OnlineScore] = []
     gains: list[Gain]
     costs: list[Cost]
 

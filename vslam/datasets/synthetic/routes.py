@@ -53,6 +53,13 @@ class Route:
         return np.arange(len(self.T_wc)) / RATE
 
     @property
+    def yaw_rate(self) -> Float:
+        """``(N,)`` float64, rad/s."""
+        heading = np.unwrap(np.arctan2(self.T_wc[:, 0, 2], self.T_wc[:, 2, 2]))
+        rate: Float = np.gradient(heading) * RATE
+        return rate
+
+    @property
     def ground_truth(self) -> Float:
         """``(N, 4, 4)`` float64 ``T_wc`` with the first left camera as the world, as in KITTI."""
         first: Float = np.linalg.inv(self.T_wc[0])

@@ -31,7 +31,7 @@ from vslam.datasets.synthetic.files import (
 )
 from vslam.datasets.synthetic.passes import Passes
 from vslam.datasets.synthetic.render import Renderer
-from vslam.datasets.synthetic.routes import RATE, Route
+from vslam.datasets.synthetic.routes import Route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.town import build_town
 from vslam.trajectory import write_kitti
@@ -209,8 +209,7 @@ def _render(
     town = build_town(route, variation)
     passes = Passes(route, town, variation)
     renderer = Renderer(route.camera, town.atlas, town.sky, threads)
-    heading = np.unwrap(np.arctan2(route.T_wc[:, 0, 2], route.T_wc[:, 2, 2]))
-    yaw_rate = np.gradient(heading) * RATE
+    yaw_rate = route.yaw_rate
 
     def frame(k: int) -> None:
         moment = passes.at(k)

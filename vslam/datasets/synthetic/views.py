@@ -1,0 +1,73 @@
+"""The left camera at some frames of a drive: what a test of loop detectors needs of a long one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from vslam.datasets.synthetic.camera_effects import sensor_image
+from vslam.datasets.synthetic.files import check_disk, frame_files, write, write_png, writing
+from vslam.datasets.synthetic.passes import Passes
+from vslam.datasets.synthetic.render import Renderer
+from vslam.datasets.synthetic.routes import Route
+from vslam.datasets.synthetic.site import Variation
+from vslam.datasets.synthetic.store import OnFrame
+from vslam.datasets.synthetic.town import build_town
+from vslam.trajectory import write_kitti
+
+
+def render_views(
+    route: Route,
+    variation: Variation,
+    root: Path,
+    frames: Sequence[int],
+    *,
+    threads: int = 2,
+    on_frame: OnFrame | None = None,
+) -> None:
+    """Render the left images of some frames into a KITTI tree, or what is missing of them there.
+
+    The bytes are those of `render_sequence`. Poses and times are those of the whole drive; the
+    file of poses is written last, so that it is there once all images are.
+
+    Args:
+        route: drive to take frames of.
+        variation: of the town.
+        root: of the tree, for this route and variation alone.
+        frames: numbers, ascending.
+        threads: of the renderer.
+        on_frame: called with frames done and in all.
+
+    Raises:
+        InputError: the folder cannot be written or the disk is too small.
+    """
+    folder = root / "sequences" / route.name
+    files = {k: frame_files(folder, k, depth=False)[0] for k in frames}
+    missing = [k for k in frames if not files[k].exists()]
+    check_disk(root, len(missing), depth=False)
+    with writing(root):
+        (folder / "image_0").mkdir(parents=True, exist_ok=True)
+        (root / "poses").mkdir(exist_ok=True)
+        if missing:
+            town = build_town(route, variation)
+            passes = Passes(route, town, variation)
+            renderer = Renderer(route.camera, town.atlas, town.sky, threads)
+            yaw_rate = route.yaw_rate
+            for done, k in enumerate(missing, len(files) - len(missing) + 1):
+                moment = passes.at(k)
+                (view,) = renderer.views(
+                    moment.surfaces, moment.shadows, moment.light, [route.T_wc[k]], moment.pools
+                )
+                image = sensor_image(
+                    view.image,
+                    route.camera,
+                    yaw_rate=float(yaw_rate[k]),
+                    night=moment.night,
+                    key=(variation.seed, k, 0),
+                )
+                write_png(files[k], image, 1)
+                if on_frame:
+                    on_frame(done, len(files))
+            renderer.close()
+        write(folder / "times.txt", "".join(f"{t:.6e}\n" for t in route.timestamps).encode())
+        write_kitti(root / "poses" / f"{route.name}.txt", route.ground_truth)

@@ -12,6 +12,7 @@ import typer
 from vslam.cli import (
     bench,
     evaluate,
+    export,
     info,
     loops,
     perturb,
@@ -21,6 +22,7 @@ from vslam.cli import (
     train,
     vocabulary,
 )
+from vslam.cli import map as map_
 from vslam.errors import InputError, ResultsError
 
 app = typer.Typer(
@@ -30,7 +32,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-for _group in (run, evaluate, perturb, info, bench, report, synth, train, vocabulary, loops):
+_GROUPS = (
+    run, evaluate, perturb, info, bench, report, synth, train, export, map_, vocabulary, loops,
+)  # fmt: skip
+for _group in _GROUPS:
     _group.register(app)
 
 

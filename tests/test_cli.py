@@ -76,7 +76,18 @@ def call(monkeypatch, capsys, tmp_path):
 
 @pytest.mark.parametrize(
     "command",
-    [[], ["run"], ["eval"], ["perturb"], ["info"], ["vocabulary", "train"], ["bench"], ["report"]],
+    [
+        [],
+        ["run"],
+        ["eval"],
+        ["perturb"],
+        ["info"],
+        ["vocabulary", "train"],
+        ["bench"],
+        ["report"],
+        ["export", "colmap"],
+        ["map", "info"],
+    ],
 )
 def test_help_loads_nothing_heavy(command):
     script = (

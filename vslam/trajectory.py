@@ -1,7 +1,8 @@
-"""Trajectories: one pose for each frame, read and written in the field's two text formats.
+"""Trajectories: one pose for each frame, read and written in the field's text formats.
 
 KITTI: the 12 numbers of the upper 3x4 part of ``T_wc`` a line, row by row, without time (Geiger et
 al., CVPR 2012). TUM: ``t x y z qx qy qz qw`` a line, seconds and metres (Sturm et al., IROS 2012).
+EuRoC, written only: ``t,x,y,z,qw,qx,qy,qz`` a line, nanoseconds (Burri et al., IJRR 2016).
 """
 
 from __future__ import annotations
@@ -189,6 +190,23 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
             for t, row in zip(trajectory.timestamps, rows, strict=True)
         )
     )
+
+
+def write_euroc(path: Path, trajectory: Trajectory) -> None:
+    """Write a trajectory as EuRoC's ground truth is written, without velocities and biases.
+
+    Times are whole nanoseconds, but no better than float64 seconds: 0.2 us in Unix time.
+    """
+    from scipy.spatial.transform import Rotation
+
+    names = ("x [m]", "y [m]", "z [m]"), ("w []", "x []", "y []", "z []")
+    columns = [*(f"p_RS_R_{name}" for name in names[0]), *(f"q_RS_{name}" for name in names[1])]
+    lines = [",".join(["#timestamp [ns]", *columns]) + "\n"]
+    quaternions = Rotation.from_matrix(trajectory.T_wc[:, :3, :3]).as_quat(canonical=True)
+    rows = np.column_stack([trajectory.T_wc[:, :3, 3], quaternions[:, 3], quaternions[:, :3]])
+    for seconds, row in zip(trajectory.timestamps.tolist(), rows.tolist(), strict=True):
+        lines.append(",".join([str(round(seconds * 1e9)), *(f"{x:.12f}" for x in row)]) + "\n")
+    path.write_text("".join(lines))
 
 
 def _poses_of_rows(path: Path, rows: NDArray[np.float64]) -> NDArray[np.float64]:

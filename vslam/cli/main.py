@@ -13,6 +13,7 @@ from vslam.cli import (
     bench,
     doctor,
     evaluate,
+    export,
     info,
     loops,
     perturb,
@@ -22,6 +23,7 @@ from vslam.cli import (
     train,
     vocabulary,
 )
+from vslam.cli import map as map_
 from vslam.errors import InputError, ResultsError
 
 app = typer.Typer(
@@ -31,9 +33,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-for _group in (
-    run, evaluate, perturb, info, doctor, bench, report, synth, train, vocabulary, loops
-):  # fmt: skip
+_GROUPS = (
+    run, evaluate, perturb, info, doctor, bench, report, synth, train, export, map_, vocabulary,
+    loops,
+)  # fmt: skip
+for _group in _GROUPS:
     _group.register(app)
 
 

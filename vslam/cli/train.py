@@ -1,4 +1,4 @@
-"""The commands ``vslam train`` and ``vslam export``. torch is imported inside them."""
+"""The commands ``vslam train`` and ``vslam export`` of networks. torch is imported inside them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from vslam.cli.export import commands as export
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -37,13 +38,10 @@ _PLACES_EXAMPLES = """
   vslam export places --data "kitti:~/kitti\\[first=250,last=1500]" --data photos:~/places
 """
 
-export = typer.Typer(help="Export a trained network, or images to train on.", no_args_is_help=True)
-
 
 def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
+    """Add the command to the application."""
     app.command(epilog=_TRAIN_EXAMPLES)(train)
-    app.add_typer(export, name="export")
 
 
 NetworkName = Literal["capsule", "capsule-pruned", "alexnet", "vgg16"]

@@ -1,0 +1,222 @@
+"""The commands ``vslam export ...`` of maps; ``train.py`` adds those of networks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vslam.cli.options import KITTI_ROOT, Data
+from vslam.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from vslam.datasets.sequence import Sequence
+    from vslam.maps.reconstruction import Reconstruction
+    from vslam.report.finished_run import FinishedRun
+
+commands = typer.Typer(
+    help="Export the map of a run for other programs (docs/exports.md), a trained network, or "
+    "images to train on.",
+    no_args_is_help=True,
+)
+
+Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, like runs/latest.")]
+Link = Annotated[
+    bool, typer.Option("--link", help="Link the image files of the data set, do not copy them.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the application."""
+    app.add_typer(commands, name="export")
+
+
+def _out(default: str) -> typer.models.OptionInfo:
+    return typer.Option("--out", help="Where to write.", show_default=f"RUN/{default}")
+
+
+@commands.command(epilog="[b]Example[/b]\n\n  vslam export colmap runs/latest --data ~/kitti")
+def colmap(
+    run: Run,
+    data: Data = KITTI_ROOT,
+    out: Annotated[Path | None, _out("colmap")] = None,
+    text: Annotated[bool, typer.Option("--text", help="Text files, not binary ones.")] = False,
+    link: Link = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write keyframe images, and a sparse model for COLMAP and what reads its models."""
+    from vslam.maps.colmap import save_colmap
+    from vslam.maps.new_output import new_folder
+
+    finished, reconstruction = _read(run)
+    target = out or run / "colmap"
+    with new_folder(target) as folder:
+        sequence = _open(finished, data, quiet=quiet)
+        names, colours = _write_images(
+            folder / "images", sequence, reconstruction, link=link, quiet=quiet
+        )
+        model = folder / "sparse" / "0"
+        model.mkdir(parents=True)
+        save_colmap(model, reconstruction, names, colours, text=text)
+    _say(target, reconstruction, quiet=quiet)
+
+
+@commands.command(epilog="[b]Example[/b]\n\n  vslam export nerfstudio runs/latest --data ~/kitti")
+def nerfstudio(
+    run: Run,
+    data: Data = KITTI_ROOT,
+    out: Annotated[Path | None, _out("nerfstudio")] = None,
+    link: Link = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write keyframe images, poses and landmarks for nerfstudio."""
+    from vslam.maps.nerfstudio import save_nerfstudio
+    from vslam.maps.new_output import new_folder
+
+    finished, reconstruction = _read(run)
+    target = out or run / "nerfstudio"
+    with new_folder(target) as folder:
+        sequence = _open(finished, data, quiet=quiet)
+        names, colours = _write_images(
+            folder / "images", sequence, reconstruction, link=link, quiet=quiet
+        )
+        save_nerfstudio(folder, reconstruction, [f"images/{name}" for name in names], colours)
+    _say(target, reconstruction, quiet=quiet)
+
+
+@commands.command(epilog="[b]Example[/b]\n\n  vslam export ply runs/latest --data ~/kitti")
+def ply(
+    run: Run,
+    data: Data = KITTI_ROOT,
+    out: Annotated[Path | None, _out("landmarks.ply")] = None,
+    colours: Annotated[
+        bool, typer.Option(help="Colours from the images; without, no image is needed.")
+    ] = True,
+    quiet: Quiet = False,
+) -> None:
+    """Write landmarks with the colours that they have in the images."""
+    from vslam.maps.keyframe_images import landmark_colours
+    from vslam.maps.new_output import new_file
+    from vslam.maps.ply import save_ply
+
+    finished, reconstruction = _read(run)
+    target = out or run / "landmarks.ply"
+    with new_file(target) as file:
+        seen = None
+        if colours:
+            sequence = _open(finished, data, quiet=quiet)
+            images = _left_images(sequence, reconstruction.frames.tolist(), quiet=quiet)
+            seen = landmark_colours(reconstruction, images)
+        save_ply(file, reconstruction.xyz, seen)
+    _say(target, reconstruction, quiet=quiet)
+
+
+@commands.command(epilog="[b]Example[/b]\n\n  vslam export g2o runs/latest")
+def g2o(
+    run: Run,
+    out: Annotated[Path | None, _out("pose_graph.g2o")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Write keyframe poses, odometry and loop edges with information."""
+    import numpy as np
+
+    from vslam.backend.pose_graph import LOOP
+    from vslam.geometry import inverses
+    from vslam.maps.g2o import save_g2o
+    from vslam.maps.new_output import new_file
+    from vslam.report.finished_run import pose_graph, read_run
+
+    finished = read_run(run)
+    graph = pose_graph(finished)
+    ids = np.array(finished.map.frames)[graph.keyframes]
+    target = out or run / "pose_graph.g2o"
+    with new_file(target) as file:
+        save_g2o(file, ids, inverses(graph.T_cw), graph.edges, graph.T_i_j, graph.sigmas)
+    if not quiet:
+        loops = np.count_nonzero(graph.kind == LOOP)
+        typer.echo(f"{target}: {len(ids)} vertices, {len(graph.edges)} edges, {loops} of loops")
+
+
+@commands.command(epilog="[b]Example[/b]\n\n  vslam export euroc runs/latest")
+def euroc(
+    run: Run,
+    out: Annotated[Path | None, _out("trajectory_euroc.csv")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Write the trajectory as EuRoC's csv; in the formats of TUM and KITTI every run writes it."""
+    from vslam.maps.new_output import new_file
+    from vslam.trajectory import read_trajectory, write_euroc
+
+    trajectory = read_trajectory(run / "trajectory.tum")
+    target = out or run / "trajectory_euroc.csv"
+    with new_file(target) as file:
+        write_euroc(file, trajectory)
+    if not quiet:
+        typer.echo(f"{target}: {len(trajectory)} poses")
+
+
+def _read(run: Path) -> tuple[FinishedRun, Reconstruction]:
+    from vslam.maps.reconstruction import reconstruction_of
+    from vslam.report.finished_run import read_run
+
+    finished = read_run(run)
+    return finished, reconstruction_of(finished.map, finished.camera)
+
+
+def _open(finished: FinishedRun, data: Path, *, quiet: bool) -> Sequence:
+    from vslam.cli.progress import render_bar
+    from vslam.report.finished_run import open_images
+
+    with render_bar(shown=not quiet) as on_render:
+        return open_images(finished, data, on_render)
+
+
+def _left_images(
+    sequence: Sequence, frames: list[int], *, quiet: bool
+) -> Iterator[NDArray[np.uint8]]:
+    from vslam.cli.progress import count_bar
+
+    with count_bar("images", len(frames), shown=not quiet) as advance:
+        for frame in frames:
+            yield sequence.read(frame)[0]
+            advance()
+
+
+def _write_images(
+    folder: Path, sequence: Sequence, reconstruction: Reconstruction, *, link: bool, quiet: bool
+) -> tuple[list[str], NDArray[np.uint8]]:
+    """Write the keyframe images; returns their names, and the colours of the landmarks."""
+    from vslam.datasets.kitti import KittiSequence
+    from vslam.maps.keyframe_images import landmark_colours, saved_images
+
+    folder.mkdir()
+    frames = reconstruction.frames.tolist()
+    images = _left_images(sequence, frames, quiet=quiet)
+    if not link:
+        names = [f"{frame:06d}.png" for frame in frames]
+        images = saved_images(images, [folder / name for name in names])
+    elif isinstance(sequence, KittiSequence):
+        files = [sequence.left[frame] for frame in frames]
+        names = [f"{frame:06d}{file.suffix}" for frame, file in zip(frames, files, strict=True)]
+        for name, file in zip(names, files, strict=True):
+            (folder / name).symlink_to(file.resolve())
+    else:
+        raise InputError(
+            f"--link: images of {sequence.dataset} are not used as they lie there; leave it out."
+        )
+    return names, landmark_colours(reconstruction, images)
+
+
+def _say(target: Path, reconstruction: Reconstruction, *, quiet: bool) -> None:
+    if not quiet:
+        typer.echo(
+            f"{target}: {len(reconstruction.frames)} keyframes, {len(reconstruction.xyz)} "
+            f"landmarks, {len(reconstruction.xy)} observations"
+        )

@@ -1,0 +1,74 @@
+"""Files and folders that are there as a whole or not at all, and never replace anything."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from vslam.errors import InputError, ResultsError
+
+
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Yield an empty folder that becomes ``path`` at the end, or is removed after an error.
+
+    Raises:
+        InputError: there is something at ``path`` already, other than an empty folder.
+        ResultsError: it cannot be written, on a full disk for example.
+    """
+    free = path.is_dir() and not path.is_symlink() and not any(path.iterdir())
+    if not free:
+        _refuse_existing(path)
+    part = _beside(path)
+    with _as_results_error(path):
+        try:
+            part.mkdir(parents=True)
+            yield part
+            part.rename(path)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Yield the name of a file to write; it becomes ``path`` at the end, or is removed after an
+    error.
+
+    Raises:
+        InputError: there is something at ``path`` already.
+        ResultsError: it cannot be written, on a full disk for example.
+    """
+    _refuse_existing(path)
+    part = _beside(path)
+    with _as_results_error(path):
+        try:
+            part.parent.mkdir(parents=True, exist_ok=True)
+            yield part
+            part.rename(path)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+def _refuse_existing(path: Path) -> None:
+    if os.path.lexists(path):
+        raise InputError(f"{path}: exists already; remove it, or name another place with --out.")
+
+
+def _beside(path: Path) -> Path:
+    """A hidden name on the same file system, so that renaming is one step."""
+    path = path.absolute()
+    return path.with_name(f".{path.name}.{os.getpid()}.part")
+
+
+@contextmanager
+def _as_results_error(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ResultsError(
+            f"{path}: cannot be written ({error.strerror or error}); free some space or name "
+            "another place with --out."
+        ) from error

@@ -1,0 +1,75 @@
+"""A map as other programs know it: posed images, points and what each image saw of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Camera
+from vslam.geometry import inverses
+from vslam.map import Map
+
+# Of the upper left pixel, where pixels are counted from the corner of the image. Here it is 0.
+PIXEL_CENTRE = 0.5
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Living keyframes and landmarks, numbered without gaps, and their observations.
+
+    K keyframes, L landmarks, N observations. Right cameras are left out.
+
+    Attributes:
+        camera: of all keyframes; the centre of the upper left pixel is (0, 0), as in OpenCV.
+        frames: ``(K,)`` int64, the frame of the run that each keyframe was.
+        timestamps: ``(K,)`` float64 seconds.
+        T_cw: ``(K, 4, 4)`` float64.
+        xyz: ``(L, 3)`` float64, world, each observed at least once.
+        keyframe, landmark: ``(N,)`` int64, by keyframe in ascending order.
+        xy: ``(N, 2)`` float64 pixels, where the keyframe observes the landmark.
+    """
+
+    camera: Camera
+    frames: NDArray[np.int64]
+    timestamps: NDArray[np.float64]
+    T_cw: NDArray[np.float64]
+    xyz: NDArray[np.float64]
+    keyframe: NDArray[np.int64]
+    landmark: NDArray[np.int64]
+    xy: NDArray[np.float64]
+
+    @property
+    def T_wc(self) -> NDArray[np.float64]:
+        """``(K, 4, 4)`` float64 poses, camera to world."""
+        return inverses(self.T_cw)
+
+    def observations_of(self, keyframe: int) -> slice:
+        """Where the observations of a keyframe are in ``landmark`` and ``xy``."""
+        first, last = np.searchsorted(self.keyframe, [keyframe, keyframe + 1])
+        return slice(int(first), int(last))
+
+    def reprojection_errors(self) -> NDArray[np.float64]:
+        """``(N,)`` pixels from each observation to the projection of its landmark."""
+        T_cw = self.T_cw[self.keyframe]
+        p_c = np.einsum("nij,nj->ni", T_cw[:, :3, :3], self.xyz[self.landmark]) + T_cw[:, :3, 3]
+        return np.linalg.norm(self.camera.project(p_c)[:, :2] - self.xy, axis=1)
+
+
+def reconstruction_of(map_: Map, camera: Camera) -> Reconstruction:
+    """The living part of a map; landmarks that no keyframe observes are left out."""
+    a = map_.arrays
+    keyframes = map_.living_keyframes()
+    rows = np.flatnonzero(a.landmark[: map_.n_rows] >= 0)
+    landmarks, landmark = np.unique(a.landmark[rows], return_inverse=True)
+    return Reconstruction(
+        camera=camera,
+        frames=np.array(map_.frames, np.int64)[keyframes],
+        timestamps=np.array(map_.timestamps, np.float64)[keyframes],
+        T_cw=a.T_cw[keyframes],
+        xyz=a.xyz[landmarks],
+        keyframe=np.searchsorted(keyframes, a.keyframe[rows]).astype(np.int64),
+        landmark=landmark.astype(np.int64),
+        xy=a.xy[rows].astype(np.float64),
+    )

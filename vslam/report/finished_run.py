@@ -1,0 +1,144 @@
+"""The folder of a finished run, read again: its map, its images and its pose graph."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
+
+from vslam.backend.pose_graph import PoseGraph, essential_graph
+from vslam.camera import Camera
+from vslam.config import load_config
+from vslam.datasets import open_sequence
+from vslam.datasets.sequence import Sequence
+from vslam.errors import InputError
+from vslam.geometry import compose, inverse
+from vslam.loops import LoopEdge
+from vslam.map import Map
+from vslam.maps.storage import load_map
+from vslam.report.schema import ReportJson
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """What the folder of a run holds; ``map`` has the living keyframes only."""
+
+    folder: Path
+    report: ReportJson
+    map: Map
+    camera: Camera
+
+
+def read_run(folder: Path) -> FinishedRun:
+    """Read the report and the map of a run.
+
+    Raises:
+        InputError: no folder of a run, a run without a map, or of another version of vslam.
+    """
+    if not (folder / "map.npz").is_file():
+        raise InputError(f"{folder}: no map.npz here; name the folder of a run, like runs/latest.")
+    map_, camera = load_map(folder / "map.npz")
+    if not map_.n_keyframes:
+        raise InputError(f"{folder / 'map.npz'}: the map is empty; name a run that has one.")
+    return FinishedRun(folder, read_report(folder), map_, camera)
+
+
+def read_report(folder: Path) -> ReportJson:
+    """Read ``report.json`` of a run.
+
+    Raises:
+        InputError: it is missing, damaged or of another version.
+    """
+    path = folder / "report.json"
+    try:
+        content = json.loads(path.read_bytes())
+        return ReportJson.model_validate(content)
+    except ValidationError as error:
+        known = ReportJson.model_fields["schema_version"].default
+        schema = content.get("schema_version") if isinstance(content, dict) else None
+        raise InputError(
+            f"{path}: report schema {schema}, this version reads {known}; run again with it."
+        ) from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: missing or damaged; name the folder of a run.") from error
+
+
+def open_images(
+    run: FinishedRun, root: Path, on_render: Callable[[int, int], None] | None = None
+) -> Sequence:
+    """Open the sequence of a run as far as its last keyframe; ``map.frames`` count its frames.
+
+    Args:
+        root: of the data set; runs do not say where their images were.
+        on_render: as in :func:`vslam.datasets.open_sequence`.
+
+    Raises:
+        InputError: the images are not there, or not those of the run.
+    """
+    report = run.report
+    sequence = open_sequence(
+        report.dataset,
+        root,
+        report.sequence,
+        start=report.start,
+        every=report.every,
+        max_frames=max(run.map.frames) + 1,
+        monocular=report.sensor == "mono",
+        on_render=on_render,
+    )
+    same = len(sequence) > max(run.map.frames) and np.allclose(
+        sequence.timestamps[run.map.frames], run.map.timestamps, rtol=0.0, atol=1e-6
+    )
+    if not same or not np.allclose(_numbers(run.camera), _numbers(sequence.camera)):
+        raise InputError(
+            f"{report.dataset} {report.sequence}: times or camera are not those of {run.folder}; "
+            "name the data that the run was made on with --data."
+        )
+    return sequence
+
+
+def _numbers(camera: Camera) -> list[float]:
+    return [*camera.intrinsics.tolist(), camera.width, camera.height]
+
+
+def pose_graph(run: FinishedRun) -> PoseGraph:
+    """The essential graph of a run's final map with its loops, weighed as by the run.
+
+    A report does not keep the relative poses that loops measured: their edges, as all others, have
+    those of the final map. An end that was culled is replaced by the keyframe nearest in time.
+    Where a keyframe shares no landmark with its parent, mapping began anew: that edge is a GAP.
+
+    Raises:
+        InputError: the run's thresholds cannot be read.
+    """
+    map_, loops = run.map, []
+    frames = np.array(map_.frames)
+    for entry in run.report.loops:
+        if entry.accepted and entry.query_frame is not None:
+            ends = (entry.query_frame, entry.match_frame)
+            query, match = (int(np.abs(frames - frame).argmin()) for frame in ends)
+            T_query_match = compose(map_.arrays.T_cw[query], inverse(map_.arrays.T_cw[match]))
+            loops.append(
+                LoopEdge(query, match, entry.score, True, entry.reason, T_query_match=T_query_match)
+            )
+    return essential_graph(
+        map_,
+        loops,
+        load_config(run.folder / "config.json").pose_graph,
+        weak={*map_.restarts, *_unmeasured(map_)},
+        unpredicted=map_.unpredicted_restarts,
+        driven=True,
+    )
+
+
+def _unmeasured(map_: Map) -> list[int]:
+    """Keyframes that nothing but a prediction connects with their parent."""
+    return [
+        keyframe
+        for keyframe, parent in enumerate(map_.parents)
+        if parent >= 0 and not np.isin(map_.landmarks_of(keyframe), map_.landmarks_of(parent)).any()
+    ]

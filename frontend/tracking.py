@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from vslam.camera import Camera, ImageMap
 from vslam.config import Config
 from vslam.features import FeatureGrid, Features
+from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.matching import (
     Projections,
     Searchable,
@@ -103,22 +104,29 @@ class TrackingContext:
 
 def extract_features(
     left: NDArray[np.uint8],
-    right: NDArray[np.uint8] | None,
+    second: NDArray[np.uint8] | NDArray[np.float32] | None,
     context: TrackingContext,
     image_map: ImageMap = map,
 ) -> Features:
-    """ORB features of the left image with their stereo matches, none without a right image.
+    """ORB features of the left image with their columns in the right one.
 
     A pure function, whatever ``image_map`` is.
+
+    Args:
+        second: right image; with ``camera.depth`` that of the depth in metres; or None, and no
+            feature has a column in a right image.
     """
-    config = context.config
-    images = [left] if right is None else [left, right]
-    in_left, *in_right = image_map(lambda image: extract(image, config.orb), images)
-    if in_right:
-        u_right = match_stereo(in_left, in_right[0], context.camera, config.stereo)
+    camera, config = context.camera, context.config
+    if second is None or camera.depth:
+        found = extract(left, config.orb)
+        if second is None:
+            u_right = np.full(len(found.xy), np.nan, np.float32)
+        else:
+            u_right = columns_of_depth(found.xy, second, camera, config.depth)
     else:
-        u_right = np.full(len(in_left.xy), np.nan, np.float32)
-    return Features(in_left.xy, in_left.octave, in_left.angle, in_left.descriptors, u_right)
+        found, right = image_map(lambda image: extract(image, config.orb), [left, second])
+        u_right = match_stereo(found, right, camera, config.stereo)
+    return Features(found.xy, found.octave, found.angle, found.descriptors, u_right)
 
 
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:

@@ -71,6 +71,17 @@ class StereoConfig(_Section):
     )
 
 
+class DepthConfig(_Section):
+    """Depth images [OS2, III-A]."""
+
+    min_metres: float = Field(
+        0.1, gt=0, description="Depth below which a pixel's is unknown, metres. [own]"
+    )
+    max_metres: float = Field(
+        100.0, gt=0, description="Depth above which a pixel's is unknown, metres. [own]"
+    )
+
+
 class TrackingConfig(_Section):
     """Frame-to-map tracking."""
 
@@ -619,6 +630,7 @@ class Config(_Section):
 
     orb: OrbConfig = OrbConfig()
     stereo: StereoConfig = StereoConfig()
+    depth: DepthConfig = DepthConfig()
     tracking: TrackingConfig = TrackingConfig()
     initialization: InitializationConfig = InitializationConfig()
     keyframes: KeyframeConfig = KeyframeConfig()

@@ -38,6 +38,7 @@ from vslam.monocular import Initialiser
 from vslam.trajectory import Trajectory
 
 Image = NDArray[np.uint8]
+DepthImage = NDArray[np.float32]
 
 
 class Slam:
@@ -115,20 +116,25 @@ class Slam:
         """What each closed loop did to the keyframes. Call ``finish()`` first."""
         return self._closing.corrections
 
-    def step(self, left: Image, right: Image | None, timestamp: float) -> TrackResult:
-        """Track one rectified stereo pair, or a monocular image, and map it if it is new.
+    def step(
+        self, left: Image, second: Image | DepthImage | None, timestamp: float
+    ) -> TrackResult:
+        """Track one rectified stereo pair, an image with its depth, or a monocular image, and map
+        it if it is new.
 
         Args:
-            left, right: ``(H, W)`` uint8; right is None for a monocular camera, and only then.
+            left: ``(H, W)`` uint8.
+            second: the right image, uint8; with ``camera.depth`` the depth of the left image's
+                pixels, ``(H, W)`` float32 metres, 0 where unknown; None for a monocular camera,
+                and only then.
             timestamp: seconds, later than that of the last call.
 
         Raises:
-            ValueError: images of another size than the camera's, not of bytes, or a timestamp that
-                goes back.
+            ValueError: images of another size or type, or a timestamp that goes back.
         """
-        _check_images(left, right, self.camera)
+        _check_images(left, second, self.camera)
         start = time.perf_counter()
-        features = extract_features(left, right, self.context)
+        features = extract_features(left, second, self.context)
         stage_ms = {"extract": 1e3 * (time.perf_counter() - start)}
         return self.step_features(features, timestamp, left, stage_ms)
 
@@ -430,14 +436,16 @@ def _result(
     )
 
 
-def _check_images(left: Image, right: Image | None, camera: Camera) -> None:
-    if (right is None) != camera.monocular:
-        raise ValueError("a right image belongs to a stereo camera, and to no monocular one")
+def _check_images(left: Image, second: Image | DepthImage | None, camera: Camera) -> None:
+    if (second is None) != camera.monocular:
+        what = "depth" if camera.depth else "right"
+        raise ValueError(f"a {what} image belongs to a camera of {camera.sensor}")
     expected = (camera.height, camera.width)
-    images = [left] if right is None else [left, right]
+    images = [left] if second is None else [left, second]
     if any(image.shape != expected for image in images):
         shapes = " and ".join(str(image.shape) for image in images)
         raise ValueError(f"images are {shapes}, the camera's {expected}")
-    if any(image.dtype != np.uint8 for image in images):
+    wanted = [np.uint8, np.float32 if camera.depth else np.uint8]
+    if any(image.dtype != dtype for image, dtype in zip(images, wanted, strict=False)):
         types = " and ".join(str(image.dtype) for image in images)
         raise ValueError(f"images are of {types}, not of uint8")

@@ -197,12 +197,15 @@ def prepare_frame(
     """Read, perturb and extract one frame."""
     start = time.perf_counter()
     try:
-        left, right = sequence.read(index, image_map)
+        left, second = sequence.read(index, image_map)
     except UnreadableImageError as error:
         return PreparedFrame(None, None, {}, str(error))
-    left, right = perturbation.apply(index, left, right)
+    if context.camera.depth:
+        left, _ = perturbation.apply(index, left, None)  # light and dirt leave the depth as it is
+    else:
+        left, second = perturbation.apply(index, left, second)
     read = time.perf_counter()
-    features = extract_features(left, right, context, image_map)
+    features = extract_features(left, second, context, image_map)
     done = time.perf_counter()
     stage_ms = {"read": 1e3 * (read - start), "extract": 1e3 * (done - read)}
     return PreparedFrame(left, features, stage_ms)

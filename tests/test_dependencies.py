@@ -27,7 +27,13 @@ FOLDERS = {
 LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.errors", "vslam.machine", "vslam.kernels"),
     ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.features", "vslam.camera"),
-    ("vslam.loops", "vslam.reprojection", "vslam.trajectory", "vslam.map_kernels"),
+    (
+        "vslam.loops",
+        "vslam.reprojection",
+        "vslam.trajectory",
+        "vslam.map_kernels",
+        "vslam.calibration",
+    ),
     ("vslam.map", "vslam.frame_poses"),
     ("vslam.frontend", "vslam.backend", "vslam.loopclosure", "vslam.datasets", "vslam.maps"),
     ("vslam.monocular", "vslam.closing"),

@@ -301,8 +301,8 @@ def test_bad_poses(root, line, part):
 
 
 def test_unknown_data_set(root):
-    with pytest.raises(InputError, match="--dataset euroc: unknown"):
-        open_sequence("euroc", root, "00")
+    with pytest.raises(InputError, match="--dataset nuscenes: unknown"):
+        open_sequence("nuscenes", root, "00")
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="KITTI sample absent")

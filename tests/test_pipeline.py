@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +22,8 @@ import pytest
 
 from vslam.config import Config
 from vslam.datasets import open_sequence
-from vslam.datasets.perturbation import parse_perturbation
+from vslam.datasets.perturbation import parse_perturbation, perturbed
+from vslam.datasets.stream import timed_frames
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.features import TrackingState
 from vslam.frontend.tracking import TrackingContext
@@ -41,7 +43,7 @@ needs_kitti = pytest.mark.skipif(not KITTI.is_dir(), reason="KITTI is not at ../
 def run(root: Path, sequence: str = "00", *, threads: int = 2, perturb: str = "none",
         seed: int = 0, max_frames: int | None = None) -> RunOutcome:  # fmt: skip
     frames = open_sequence("kitti", root, sequence, max_frames=max_frames)
-    perturbation = parse_perturbation(perturb, seed, frames.timestamps)
+    perturbation = parse_perturbation(perturb, seed)
     settings = RunSettings(
         "kitti", sequence, perturb, "none", "stereo", seed, threads, 0, 1, max_frames, Config()
     )
@@ -69,7 +71,7 @@ def test_same_bytes_with_any_number_of_threads(kitti_tree):
 @pytest.mark.parametrize("monocular", [False, True])
 def test_both_cameras_at_once_are_prepared_to_the_same_bytes(kitti_tree, monocular):
     sequence = open_sequence("kitti", kitti_tree, "00", monocular=monocular)
-    law = parse_perturbation("brightness:1", 0, sequence.timestamps)
+    law = parse_perturbation("brightness:1", 0)
     context = TrackingContext.create(sequence.camera, Config())
     met = threading.Barrier(1 if monocular else 2, timeout=60.0)
 
@@ -77,9 +79,9 @@ def test_both_cameras_at_once_are_prepared_to_the_same_bytes(kitti_tree, monocul
         return pool.map(lambda side: (met.wait(), function(side))[1], sides)
 
     with ThreadPoolExecutor(2) as pool:
-        for index in range(3):
-            one = prepare_frame(sequence, index, law, context)
-            other = prepare_frame(sequence, index, law, context, at_once)
+        for frame in islice(perturbed(timed_frames(sequence), law), 3):
+            one = prepare_frame(frame, context)
+            other = prepare_frame(frame, context, at_once)
             assert one.left.tobytes() == other.left.tobytes()
             for name, value in vars(one.features).items():
                 assert value.tobytes() == getattr(other.features, name).tobytes(), name
@@ -116,7 +118,7 @@ def test_recorder_is_told_of_each_loop_once():
 
 def test_comparison_runs_the_same_images_again(kitti_tree):
     outcome = run(kitti_tree, perturb="brightness:1", seed=3)
-    law = parse_perturbation("brightness:1", 3, outcome.sequence.timestamps)
+    law = parse_perturbation("brightness:1", 3)
     seen = []
     compared = with_comparison(outcome, law, on_frame=lambda result: seen.append(result.index))
     assert seen == list(range(28))

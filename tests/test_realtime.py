@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ import pytest
 from vslam.config import Config, OrbConfig
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import Perturbation
+from vslam.datasets.stream import TimedFrame
 from vslam.features import TrackingState
 from vslam.run.outcome import RunSettings
 from vslam.run.pipeline import run_sequence
@@ -24,31 +26,40 @@ from vslam.slam import Slam
 
 
 def cameras() -> list[str]:
-    return [thread.name for thread in threading.enumerate() if thread.name == "camera"]
+    return [thread.name for thread in threading.enumerate() if thread.name in ("camera", "handing")]
+
+
+def frames_at(times):
+    return (TimedFrame(t, lambda image_map: pytest.fail("never decoded")) for t in times.tolist())
 
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_no_frame_comes_before_its_time_and_the_last_one_always_comes(threads):
     times = 100.0 + 0.02 * np.arange(20)
     begin, seen = time.perf_counter(), []
-    for index, made, came in play(times, lambda k: (k, time.perf_counter()), threads):
-        assert made[0] == index
-        assert made[1] >= came >= begin + 0.02 * index
-        assert came == pytest.approx(begin + 0.02 * index, abs=0.5)
-        seen.append(index)
-    assert (seen[0], seen[-1]) == (0, 19)
-    assert seen == sorted(set(seen))
+    for played in play(frames_at(times), lambda f: (f.timestamp, time.perf_counter()), threads):
+        seen.append(played)
+        if played.made is not None:
+            index = round((played.timestamp - 100.0) / 0.02)
+            assert played.made[0] == played.timestamp
+            assert played.made[1] >= played.came >= begin + 0.02 * index
+            assert played.came == pytest.approx(begin + 0.02 * index, abs=0.5)
+    assert [played.timestamp for played in seen] == times.tolist()  # dropped ones too
+    assert seen[0].made is not None
+    assert seen[-1].made is not None
 
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_who_is_late_gets_the_newest_frame(threads):
     seen, waits = [], []
-    for index, _, came in play(0.01 * np.arange(60), lambda k: k, threads):
-        waits.append(time.perf_counter() - came)
-        time.sleep(0.05)
-        seen.append(index)
-    assert len(seen) <= 60 / 5 + 3  # five frames come while one is used
-    assert seen[-1] == 59
+    for played in play(frames_at(0.01 * np.arange(60)), lambda frame: frame, threads):
+        seen.append(played.made)
+        if played.made is not None:
+            waits.append(time.perf_counter() - played.came)
+            time.sleep(0.05)
+    assert len(seen) == 60
+    assert len(waits) <= 60 / 5 + 3  # five frames come while one is used
+    assert seen[-1] is not None
     # None queues: a frame waits while one other is used, not for all before it.
     assert np.median(waits) < 0.2
 
@@ -56,18 +67,19 @@ def test_who_is_late_gets_the_newest_frame(threads):
 def test_with_one_thread_a_frame_is_prepared_after_the_last_one_was_used():
     used, order = [], []
 
-    def prepare(k: int) -> int:
-        order.append((k, len(used)))
-        return k
+    def prepare(frame: TimedFrame) -> TimedFrame:
+        order.append(len(used))
+        return frame
 
-    for index, _, _ in play(0.005 * np.arange(10), prepare, 1):
-        time.sleep(0.002)
-        used.append(index)
-    assert [n for _, n in order] == list(range(len(order)))
+    for played in play(frames_at(0.005 * np.arange(10)), prepare, 1):
+        if played.made is not None:
+            time.sleep(0.002)
+            used.append(played)
+    assert order == list(range(len(order)))
 
 
 def test_who_stops_listening_stops_the_camera():
-    frames = play(10.0 * np.arange(5), lambda k: k, 2)
+    frames = play(frames_at(10.0 * np.arange(5)), lambda frame: frame, 2)
     next(frames)
     assert cameras()
     frames.close()
@@ -75,12 +87,46 @@ def test_who_stops_listening_stops_the_camera():
 
 
 def test_an_error_of_the_preparation_is_the_listeners():
-    def fail(k: int) -> int:
+    def fail(frame: TimedFrame) -> None:
         raise OSError("no such image")
 
     with pytest.raises(OSError, match="no such image"):
-        list(play(np.arange(3.0), fail, 2))
+        list(play(frames_at(np.arange(3.0)), fail, 2))
     assert not cameras()
+
+
+def test_an_error_of_the_camera_comes_after_its_frames():
+    def unplugged():
+        yield from frames_at(0.05 * np.arange(3))
+        raise OSError("unplugged")
+
+    frames = play(unplugged(), lambda frame: frame, 2)
+    assert [next(frames).timestamp for _ in range(3)] == [0.0, 0.05, 0.1]
+    with pytest.raises(OSError, match="unplugged"):
+        next(frames)
+    assert not cameras()
+
+
+def test_a_live_camera_sets_the_pace_and_dropped_frames_are_let_go():
+    """Times of a live camera do not matter, and only what waits or is used is held."""
+    alive, most = set(), []
+
+    def film():
+        for k in range(40):
+            frame = TimedFrame(1000.0 * k, lambda image_map: pytest.fail("never decoded"))
+            alive.add(k)
+            weakref.finalize(frame, alive.discard, k)
+            yield frame
+            most.append(len(alive))
+            del frame
+            time.sleep(0.005)
+
+    seen = []
+    for played in play(film(), lambda frame: True, 2, live=True):
+        seen.append(played.timestamp)
+        time.sleep(0.02)
+    assert seen == [1000.0 * k for k in range(40)]
+    assert max(most) <= 8
 
 
 def test_frames_that_were_dropped_are_not_lost(corridor, check_map):

@@ -136,7 +136,7 @@ def _in_light(drive: Drive, light: str) -> Iterator[Path]:
     sequence = open_sequence("kitti", drive.root, drive.name)
     kind, _, count = light.partition(":")
     gap = range(len(sequence) // 3, len(sequence) // 3 + int(count)) if kind in GAPS else range(0)
-    law = parse_perturbation("none" if gap else light, 0, sequence.timestamps)
+    law = parse_perturbation("none" if gap else light, 0)
     frames = [k for k in range(len(sequence)) if kind != "cut" or k not in gap]
     with tempfile.TemporaryDirectory(prefix="vslam-light-") as scratch:
         root = Path(scratch)
@@ -152,7 +152,8 @@ def _in_light(drive: Drive, light: str) -> Iterator[Path]:
 
         def write(number: int) -> None:
             k = frames[number]
-            images = law.apply(k, *sequence.read(k))
+            t = float(sequence.timestamps[k] - sequence.timestamps[0])
+            images = law.apply(k, t, *sequence.read(k))
             for side, image in zip(sides, images, strict=True):
                 image = np.zeros_like(image) if kind == "black" and k in gap else image
                 path = side / f"{number:06d}.png"

@@ -20,5 +20,12 @@ class UnreadableImageError(InputError):
         self.path = path
 
 
+class BrokenSourceError(InputError):
+    """A video, bag or camera ended before its time: a file cut off, a device unplugged.
+
+    During a run all frames before it count; before the first one it is an error.
+    """
+
+
 class ResultsError(Exception):
     """Results cannot be written, on a full disk for example. The CLI exits with 1."""

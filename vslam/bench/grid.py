@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-import numpy as np
-
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.errors import InputError
 from vslam.report.schema import ReportJson
@@ -88,7 +86,7 @@ def parse_perturbations(text: str) -> list[str]:
         InputError: an entry that ``vslam run --perturb`` would refuse.
     """
     specs = [part.strip().replace("+", ",") for part in text.split(",")]
-    return list(dict.fromkeys(parse_perturbation(spec, 0, np.zeros(1)).name for spec in specs))
+    return list(dict.fromkeys(parse_perturbation(spec, 0).name for spec in specs))
 
 
 def make_grid(

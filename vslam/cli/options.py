@@ -11,9 +11,17 @@ Data = Annotated[
     Path,
     typer.Option(envvar="KITTI_ROOT", help="Folder with the data set, see datasets.md."),
 ]
-DatasetName = Literal["kitti", "synthetic"]
+DatasetName = Literal["kitti", "euroc", "synthetic"]
 Dataset = Annotated[DatasetName, typer.Option(help="Data set.")]
 Seq = Annotated[str, typer.Option(help="Sequence, 00 for example.")]
+Calib = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--calib",
+        help="Calibration to rectify images with, see docs/cameras.md; twice for a file of each "
+        "camera, left first.",
+    ),
+]
 Perturb = Annotated[
     str,
     typer.Option(

@@ -38,7 +38,7 @@ def preview(
     from vslam.datasets.perturbation import contact_sheet, parse_perturbation
 
     sequence = open_sequence(dataset, data, seq, start=start, every=every, max_frames=max_frames)
-    law = parse_perturbation(perturb, seed, sequence.timestamps)
+    law = parse_perturbation(perturb, seed)
     shown = np.unique(np.linspace(0, len(sequence) - 1, frames).round().astype(int)).tolist()
     sheet = cv2.imencode(".png", contact_sheet(sequence, law, shown))[1]
     try:

@@ -9,6 +9,7 @@ import typer
 
 from vslam.cli.options import (
     KITTI_ROOT,
+    Calib,
     Data,
     Dataset,
     DetectorName,
@@ -32,6 +33,8 @@ _EXAMPLES = """
 
   vslam run --dataset synthetic --seq demo
 
+  vslam run --dataset euroc --data ~/euroc/V1_01_easy
+
   vslam run --seq 00 --max-frames 200 --no-record --quiet
 """
 
@@ -45,6 +48,7 @@ def run(
     data: Data = KITTI_ROOT,
     dataset: Dataset = "kitti",
     seq: Seq = "00",
+    calib: Calib = None,
     perturb: Perturb = "none",
     start: Start = 0,
     every: Every = 1,
@@ -112,9 +116,9 @@ def run(
         sequence = open_sequence(
             dataset, data, seq,
             start=start, every=every, max_frames=max_frames, monocular=sensor == "mono",
-            on_render=on_render,
+            calib=calib or (), on_render=on_render,
         )  # fmt: skip
-    perturbation = parse_perturbation(perturb, seed, sequence.timestamps)
+    perturbation = parse_perturbation(perturb, seed)
 
     # Bad input has been refused by now; what follows takes a second to import.
     from vslam.cli.summary import print_summary
@@ -126,7 +130,7 @@ def run(
 
     settings = RunSettings(
         dataset=dataset,
-        sequence=seq,
+        sequence=sequence.name,
         perturb=perturbation.name,
         detector=detector,
         sensor=sensor,
@@ -139,7 +143,7 @@ def run(
         weights=weights,
         realtime=realtime,
     )
-    folder = create_run_folder(out, dataset, seq, perturbation.name, detector)
+    folder = create_run_folder(out, dataset, sequence.name, perturbation.name, detector)
     recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
     if is_cold():
         announce("first run: compiling the kernels, less than a minute ...", shown=not quiet)

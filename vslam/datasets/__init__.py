@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from collections.abc import Sequence as Several
 from pathlib import Path
 
 from vslam.datasets.sequence import Sequence
@@ -18,11 +19,13 @@ def open_sequence(
     every: int = 1,
     max_frames: int | None = None,
     monocular: bool = False,
+    calib: Several[Path] = (),
     on_render: Callable[[int, int], None] | None = None,
 ) -> Sequence:
     """Open a sequence and check the frames that ``start``, ``every``, ``max_frames`` select.
 
-    With ``monocular`` the left camera is read alone.
+    With ``monocular`` the left camera is read alone. ``calib`` names calibration files
+    (docs/cameras.md) to be used instead of the data set's own; images are rectified by them.
 
     A synthetic sequence has no ``root``: it is rendered into the user's cache on first use, and
     ``on_render`` is told the frames done and in all.
@@ -33,9 +36,24 @@ def open_sequence(
     if dataset == "kitti":
         from vslam.datasets.kitti import open_kitti
 
-        return open_kitti(
+        sequence = open_kitti(
             root, name, start=start, every=every, max_frames=max_frames, monocular=monocular
         )
+        return recalibrated(sequence, calib) if calib else sequence
+    if dataset == "euroc":
+        from vslam.datasets.euroc import open_euroc
+
+        return open_euroc(
+            root,
+            name,
+            start=start,
+            every=every,
+            max_frames=max_frames,
+            monocular=monocular,
+            calib=calib,
+        )
+    if dataset == "synthetic" and calib:
+        raise InputError("--calib: a rendered town has its own cameras; leave it out.")
     if dataset == "synthetic":
         from vslam.datasets.synthetic import open_synthetic
 
@@ -48,5 +66,19 @@ def open_sequence(
             on_frame=on_render,
         )
     raise InputError(
-        f"--dataset {dataset}: unknown data set; this version reads kitti and synthetic."
+        f"--dataset {dataset}: unknown data set; this version reads kitti, euroc and synthetic."
     )
+
+
+def recalibrated(sequence: Sequence, calib: Several[Path]) -> Sequence:
+    """A sequence whose images are rectified by calibration files, whatever it says of its camera.
+
+    Raises:
+        InputError: as `vslam.calibration.files.read_calibration` and
+            `vslam.datasets.rectified.rectified`.
+    """
+    from vslam.calibration.files import read_calibration
+    from vslam.datasets.rectified import rectified
+
+    size = sequence.camera.width, sequence.camera.height
+    return rectified(sequence, read_calibration(calib, size))

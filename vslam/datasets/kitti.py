@@ -14,12 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, ImageMap
+from vslam.datasets.image_files import (
+    check_not_empty,
+    list_images,
+    read_grey,
+    read_grey_of_size,
+    select_frames,
+    size_text,
+)
 from vslam.datasets.sequence import Image
 from vslam.errors import InputError, UnreadableImageError
 from vslam.trajectory import read_kitti_poses, read_table
 
 _HOME = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php"
-_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp"}
 
 
 @dataclass(frozen=True)
@@ -61,15 +68,7 @@ class KittiSequence:
         return left, right[0] if right else None
 
     def _read(self, path: Path) -> Image:
-        image = _decode(path)
-        wanted = (self.camera.height, self.camera.width)
-        if image.shape != wanted:
-            raise UnreadableImageError(
-                path,
-                f"{_size(image.shape)} pixels where the first image has {_size(wanted)}; "
-                "replace it by the original.",
-            )
-        return image
+        return read_grey_of_size(path, self.camera.width, self.camera.height)
 
 
 def open_kitti(
@@ -102,17 +101,22 @@ def open_kitti(
     """
     base = _find_root(root)
     folder = _find_sequence(base, name)
-    sides = [_list_images(folder / f"image_{side}") for side in range(1 if monocular else 2)]
+    sides = [list_images(folder / f"image_{side}") for side in range(1 if monocular else 2)]
     stems = sorted(set().union(*sides), key=_by_number)
-    chosen = _select(folder, len(stems), start, every, max_frames)
+    if not stems:
+        raise InputError(
+            f"{folder}: no images in image_0 and image_1; "
+            f"download the grayscale images (22 GB) from {_HOME}."
+        )
+    chosen = select_frames(folder, len(stems), start, every, max_frames)
     rows = _check_frames(folder, sides, [stems[k] for k in chosen])
     left, *right = zip(*rows, strict=True)
 
-    sizes = [_decode(path).shape for path in rows[0]]
+    sizes = [read_grey(path).shape for path in rows[0]]
     if not monocular and sizes[0] != sizes[1]:
         raise UnreadableImageError(
             rows[0][1],
-            f"{_size(sizes[1])} pixels but the left image has {_size(sizes[0])}; "
+            f"{size_text(sizes[1])} pixels but the left image has {size_text(sizes[0])}; "
             "use the rectified images of both cameras.",
         )
     times = _read_times(folder / "times.txt")
@@ -136,8 +140,7 @@ def list_kitti(root: Path) -> list[tuple[str, int, int]]:
     """
     folders = sorted(p for p in (_find_root(root) / "sequences").iterdir() if p.is_dir())
     return [
-        (p.name, len(_list_images(p / "image_0")), len(_list_images(p / "image_1")))
-        for p in folders
+        (p.name, len(list_images(p / "image_0")), len(list_images(p / "image_1"))) for p in folders
     ]
 
 
@@ -203,33 +206,8 @@ def _find_sequence(base: Path, name: str) -> Path:
     return folder
 
 
-def _list_images(folder: Path) -> dict[str, Path]:
-    if not folder.is_dir():
-        return {}
-    return {
-        path.stem: path
-        for path in sorted(folder.iterdir())
-        if path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
-    }
-
-
 def _by_number(stem: str) -> tuple[int, str]:
     return (int(stem) if stem.isdecimal() else -1, stem)
-
-
-def _select(
-    folder: Path, n: int, start: int, every: int, max_frames: int | None
-) -> NDArray[np.int64]:
-    if start < 0 or every < 1 or (max_frames is not None and max_frames < 1):
-        raise InputError("--start must be at least 0, --every and --max-frames at least 1.")
-    if n == 0:
-        raise InputError(
-            f"{folder}: no images in image_0 and image_1; "
-            f"download the grayscale images (22 GB) from {_HOME}."
-        )
-    if start >= n:
-        raise InputError(f"--start {start}: {folder} has {n} frames; choose at most {n - 1}.")
-    return np.arange(start, n, every)[:max_frames]
 
 
 def _check_frames(
@@ -255,33 +233,8 @@ def _check_frames(
         )
     frames = [tuple(side[stem] for side in sides) for stem in stems]
     for path in (path for frame in frames for path in frame):
-        if _is_empty(path):
-            raise UnreadableImageError(path, "the file is empty; download it again.")
+        check_not_empty(path)
     return frames
-
-
-def _is_empty(path: Path) -> bool:
-    try:
-        return path.stat().st_size == 0
-    except OSError:  # a link to nowhere
-        return True
-
-
-def _decode(path: Path) -> Image:
-    import cv2
-
-    try:
-        data = np.fromfile(path, np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-    except (OSError, cv2.error):
-        image = None
-    if image is None:
-        raise UnreadableImageError(path, "cannot be decoded; download the file again.")
-    return np.asarray(image, np.uint8)
-
-
-def _size(shape: tuple[int, ...]) -> str:
-    return f"{shape[1]}x{shape[0]}"
 
 
 def _read_times(path: Path) -> NDArray[np.float64]:

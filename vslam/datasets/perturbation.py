@@ -19,24 +19,32 @@ occlusion   a grey rectangle, as of dirt on the glass, over min(0.15 s, 0.9) of 
 Each law rounds and clips to 8 bits, is the same for both cameras (noise alone is drawn for each)
 and draws from its own random stream: it does the same alone and in company, and what it does to
 frame k depends on the seed, k and the time of k only, not on the frames asked for before.
-Walks live on a fixed grid in time, so that dropping frames does not change the light.
+Walks live on a fixed grid in time, so that dropping frames does not change the light. They are
+drawn as far as frames have come: a stream may go on without end.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+import threading
+from array import array
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
-from math import exp, inf, isfinite
+from functools import partial
+from itertools import count, islice
+from math import exp, floor, inf, isfinite
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.camera import ImageMap
 from vslam.datasets.sequence import Image, Sequence
+from vslam.datasets.stream import TimedFrame
 from vslam.errors import InputError
 
-Law = Callable[[int, int, Image], Image]
-"""``(frame, side, image) -> image`` of the same shape; side 0 is left, 1 is right."""
+Law = Callable[[int, float, int, Image], Image]
+"""``(frame, t, side, image) -> image`` of the same shape; t is in seconds since the first frame,
+side 0 is left, 1 is right."""
 
 _STEP_S = 0.01
 _TIME_CONSTANT_S = 2.0
@@ -58,25 +66,28 @@ class Perturbation:
     name: str
     laws: tuple[Law, ...] = ()
 
-    def apply(self, index: int, left: Image, right: Image | None) -> tuple[Image, Image | None]:
-        """Perturb both ``(H, W)`` uint8 images of frame ``index``; safe in several threads.
+    def apply(
+        self, index: int, t: float, left: Image, second: Image | DepthImage | None
+    ) -> tuple[Image, Image | DepthImage | None]:
+        """Perturb both ``(H, W)`` uint8 images of frame ``index``, ``t`` seconds after the first
+        one; safe in several threads. A depth image stays as it is: it has its own light.
 
-        The left one becomes the same with and without a right one.
+        The left one becomes the same whatever the second one is.
         """
         for law in self.laws:
-            left = law(index, 0, left)
-            right = None if right is None else law(index, 1, right)
-        return left, right
+            left = law(index, t, 0, left)
+            if second is not None and second.dtype == np.uint8:
+                second = law(index, t, 1, second)
+        return left, second
 
 
-def parse_perturbation(spec: str, seed: int, timestamps: NDArray[np.float64]) -> Perturbation:
+def parse_perturbation(spec: str, seed: int) -> Perturbation:
     """Build the perturbation that ``--perturb`` names.
 
     Args:
         spec: ``law[:strength]``, several joined by commas, applied in this order; ``none`` or
             nothing for the identity.
         seed: not negative; equal seeds give equal images.
-        timestamps: ``(N,)`` seconds of the frames, increasing.
 
     Raises:
         InputError: unknown or repeated law, strength no number or not within 0 to 10, or a
@@ -86,7 +97,6 @@ def parse_perturbation(spec: str, seed: int, timestamps: NDArray[np.float64]) ->
         raise InputError(f"--seed {seed}: must not be negative.")
     if spec.strip() in ("", "none"):
         return Perturbation("none")
-    t = np.asarray(timestamps - timestamps[0], np.float64)
     strengths: dict[str, float] = {}
     for item in spec.split(","):
         law, _, strength = item.strip().partition(":")
@@ -100,10 +110,25 @@ def parse_perturbation(spec: str, seed: int, timestamps: NDArray[np.float64]) ->
     return Perturbation(
         ",".join(f"{law}:{strength:g}" for law, strength in strengths.items()),
         tuple(
-            _MAKERS[law](strength, (seed, crc32(law.encode())), t)
+            _MAKERS[law](strength, (seed, crc32(law.encode())))
             for law, strength in strengths.items()
         ),
     )
+
+
+def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Iterator[TimedFrame]:
+    """The same frames, perturbed as they are read; the first one's time is 0 to the laws."""
+    begin = None
+    for index, frame in enumerate(frames):
+        begin = frame.timestamp if begin is None else begin
+        t = frame.timestamp - begin
+        yield TimedFrame(frame.timestamp, partial(_read_perturbed, frame, perturbation, index, t))
+
+
+def _read_perturbed(
+    frame: TimedFrame, perturbation: Perturbation, index: int, t: float, image_map: ImageMap
+) -> tuple[Image, Image | None]:
+    return perturbation.apply(index, t, *frame.read(image_map))
 
 
 def contact_sheet(
@@ -118,13 +143,14 @@ def contact_sheet(
 
     rows = []
     for index in indices:
+        t = float(sequence.timestamps[index] - sequence.timestamps[0])
         left, right = sequence.read(index)
         width = 480
         height = round(width * left.shape[0] / left.shape[1])
         row = np.hstack(
             [
                 cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-                for image in (left, *perturbation.apply(index, left, right))
+                for image in (left, *perturbation.apply(index, t, left, right))
                 if image is not None
             ]
         )
@@ -136,32 +162,27 @@ def contact_sheet(
 
 
 def ou_walk(
-    duration: float,
-    deviation: float,
-    rng: np.random.Generator,
-    jumps: Collection[float] = (),
-) -> NDArray[np.float64]:
-    """An Ornstein-Uhlenbeck walk of time constant 2 s, exact on a grid of 10 ms.
+    deviation: float, rng: np.random.Generator, jumps: Iterable[float] = ()
+) -> Iterator[float]:
+    """An Ornstein-Uhlenbeck walk of time constant 2 s, exact on a grid of 10 ms, without end.
 
     Args:
-        duration: seconds to cover.
         deviation: stationary standard deviation; the walk begins in the stationary state.
-        rng: source of its normal numbers.
-        jumps: times in seconds at which the walk is drawn anew, 1.5 times as wide.
-
-    Returns:
-        ``(floor(duration / 0.01) + 1,)`` float64.
+        rng: source of its normal numbers, one for each step.
+        jumps: times in seconds, increasing, at which the walk is drawn anew, 1.5 times as wide.
     """
-    noise = rng.standard_normal(int(duration / _STEP_S) + 1)
-    jumped = {round(time / _STEP_S) for time in jumps}
     decay = exp(-_STEP_S / _TIME_CONSTANT_S)
     spread = (1.0 - decay**2) ** 0.5
-    walk = np.empty_like(noise)
-    x = walk[0] = noise[0]
-    for k in range(1, len(noise)):
-        x = _JUMP_WIDENING * noise[k] if k in jumped else decay * x + spread * noise[k]
-        walk[k] = x
-    return deviation * walk
+    steps = (round(time / _STEP_S) for time in jumps)
+    jump = next(steps, inf)
+    x = rng.standard_normal()
+    yield deviation * x
+    for k in count(1):
+        noise = rng.standard_normal()
+        x = _JUMP_WIDENING * noise if k == jump else decay * x + spread * noise
+        while jump <= k:
+            jump = next(steps, inf)
+        yield deviation * x
 
 
 def _parse_strength(spec: str, text: str) -> float:
@@ -177,50 +198,74 @@ def _parse_strength(spec: str, text: str) -> float:
     return strength
 
 
-def _on_grid(t: NDArray[np.float64]) -> NDArray[np.int64]:
+class _Drawn:
+    """Random numbers by their place in a stream, drawn up to the last one asked for; safe in
+    several threads."""
+
+    def __init__(self, numbers: Iterator[float]) -> None:
+        self._numbers = numbers
+        self._drawn = array("d")
+        self._lock = threading.Lock()
+
+    def __getitem__(self, k: int) -> float:
+        with self._lock:
+            self._drawn.extend(islice(self._numbers, max(0, k + 1 - len(self._drawn))))
+            return self._drawn[k]
+
+
+def _on_grid(t: float) -> int:
     # The small offset keeps a time that lies on the grid from rounding into the cell before it.
-    return np.floor(t / _STEP_S + 1e-6).astype(np.int64)
+    return floor(t / _STEP_S + 1e-6)
 
 
-def _pointwise(curves: NDArray[np.float64]) -> Law:
-    """A law that sends grey value v of frame k to ``curves[k, v]``."""
-    tables = np.clip(np.rint(curves), 0, 255).astype(np.uint8)
+def _jump_times(rng: np.random.Generator) -> Iterator[float]:
+    time = 0.0
+    while True:
+        time += rng.exponential(1.0 / _JUMPS_PER_S)
+        yield time
 
-    def law(frame: int, side: int, image: Image) -> Image:
+
+def _pointwise(curve: Callable[[int, float], NDArray[np.float64]]) -> Law:
+    """A law that sends grey value v of frame k at time t to ``curve(k, t)[v]``."""
+
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
         import cv2
 
-        return np.asarray(cv2.LUT(image, tables[frame]), np.uint8)
+        table = np.clip(np.rint(curve(frame, t)), 0, 255).astype(np.uint8)
+        return np.asarray(cv2.LUT(image, table), np.uint8)
 
     return law
 
 
-def _brightness(strength: float, stream: tuple[int, int], t: NDArray[np.float64]) -> Law:
-    rng_gain, rng_bias, rng_jumps = (np.random.default_rng([*stream, k]) for k in range(3))
-    jumps: list[float] = []
-    time = rng_jumps.exponential(1.0 / _JUMPS_PER_S)
-    while time < t[-1]:
-        jumps.append(time)
-        time += rng_jumps.exponential(1.0 / _JUMPS_PER_S)
-    at = _on_grid(t)
+def _brightness(strength: float, stream: tuple[int, int]) -> Law:
+    rng_gain, rng_bias = (np.random.default_rng([*stream, k]) for k in range(2))
+
+    def jumps() -> Iterator[float]:
+        return _jump_times(np.random.default_rng([*stream, 2]))
+
+    log_gain = _Drawn(ou_walk(0.35 * strength, rng_gain, jumps()))
+    bias = _Drawn(ou_walk(20.0 * strength, rng_bias, jumps()))
     limit = max(1.0, strength)
-    log_gain = ou_walk(t[-1] + _STEP_S, 0.35 * strength, rng_gain, jumps)[at]
-    gain = np.exp(np.clip(log_gain, -1.2 * limit, 0.7 * limit))
-    bias = ou_walk(t[-1] + _STEP_S, 20.0 * strength, rng_bias, jumps)[at]
-    return _pointwise(gain[:, None] * _GREYS + bias[:, None])
+
+    def curve(frame: int, t: float) -> NDArray[np.float64]:
+        at = _on_grid(t)
+        return np.exp(np.clip(log_gain[at], -1.2 * limit, 0.7 * limit)) * _GREYS + bias[at]
+
+    return _pointwise(curve)
 
 
-def _gamma(strength: float, stream: tuple[int, int], t: NDArray[np.float64]) -> Law:
-    walk = ou_walk(t[-1] + _STEP_S, 0.35 * strength, np.random.default_rng(stream))[_on_grid(t)]
-    return _pointwise(255.0 * (_GREYS / 255.0) ** np.exp(walk)[:, None])
+def _gamma(strength: float, stream: tuple[int, int]) -> Law:
+    walk = _Drawn(ou_walk(0.35 * strength, np.random.default_rng(stream)))
+    return _pointwise(lambda frame, t: 255.0 * (_GREYS / 255.0) ** np.exp(walk[_on_grid(t)]))
 
 
-def _flicker(strength: float, stream: tuple[int, int], t: NDArray[np.float64]) -> Law:
-    log_gain = 0.15 * strength * np.random.default_rng(stream).standard_normal(len(t))
-    return _pointwise(np.exp(log_gain)[:, None] * _GREYS)
+def _flicker(strength: float, stream: tuple[int, int]) -> Law:
+    numbers = _Drawn(iter(np.random.default_rng(stream).standard_normal, None))
+    return _pointwise(lambda frame, t: np.exp(0.15 * strength * numbers[frame]) * _GREYS)
 
 
-def _noise(strength: float, stream: tuple[int, int], t: NDArray[np.float64]) -> Law:
-    def law(frame: int, side: int, image: Image) -> Image:
+def _noise(strength: float, stream: tuple[int, int]) -> Law:
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
         rng = np.random.Generator(np.random.SFC64([*stream, frame, side]))
         grain = rng.standard_normal(image.shape, dtype=np.float32)
         return np.clip(np.rint(image + 8.0 * strength * grain), 0, 255).astype(np.uint8)
@@ -228,8 +273,8 @@ def _noise(strength: float, stream: tuple[int, int], t: NDArray[np.float64]) -> 
     return law
 
 
-def _blur(strength: float, stream: tuple[int, int], t: NDArray[np.float64]) -> Law:
-    def law(frame: int, side: int, image: Image) -> Image:
+def _blur(strength: float, stream: tuple[int, int]) -> Law:
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
         import cv2
 
         if strength == 0:
@@ -239,11 +284,11 @@ def _blur(strength: float, stream: tuple[int, int], t: NDArray[np.float64]) -> L
     return law
 
 
-def _occlusion(strength: float, stream: tuple[int, int], t: NDArray[np.float64]) -> Law:
+def _occlusion(strength: float, stream: tuple[int, int]) -> Law:
     area = min(0.15 * strength, 0.9)
 
-    def law(frame: int, side: int, image: Image) -> Image:
-        rng = np.random.default_rng([*stream, int(t[frame])])
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
+        rng = np.random.default_rng([*stream, int(t)])
         height, width = image.shape
         across = rng.uniform(area, 1.0)  # fraction of the width; the height follows from the area
         box_w, box_h = round(across * width), round(area / across * height)
@@ -255,7 +300,7 @@ def _occlusion(strength: float, stream: tuple[int, int], t: NDArray[np.float64])
     return law
 
 
-_MAKERS: dict[str, Callable[[float, tuple[int, int], NDArray[np.float64]], Law]] = {
+_MAKERS: dict[str, Callable[[float, tuple[int, int]], Law]] = {
     "brightness": _brightness,
     "gamma": _gamma,
     "flicker": _flicker,

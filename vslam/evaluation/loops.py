@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vslam.evaluation.trajectories import path_length
 from vslam.geometry import inverses
 from vslam.loops import LoopEdge
-from vslam.run.outcome import RunOutcome
+from vslam.run.outcome import RunOutcome, ground_truth_of
 
 _SAMPLE_M = 1.0  # the path is looked at once a metre, so that standing still costs nothing
 _UNIT_FRAMES = 20  # each way, to tell the unit of a monocular map
@@ -103,9 +103,10 @@ _DEFAULT_LIMITS = LoopLimits()
 
 def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
     """Judge the loops of a run over the frames that it has done; None without ground truth."""
-    T_wc, times = outcome.sequence.ground_truth, outcome.sequence.timestamps
-    if T_wc is None or not len(outcome.trajectory):
+    truth = ground_truth_of(outcome.sequence)
+    if truth is None or not len(outcome.trajectory):
         return None
+    T_wc, times = truth.T_wc, truth.timestamps
     done = int(np.searchsorted(times, outcome.trajectory.timestamps[-1], side="right"))
     loops = outcome.loops
     if outcome.settings.alignment == "sim3":

@@ -109,8 +109,8 @@ def apply(
         spec = ",".join(
             f"{law}:{strength * condition.strength:g}" for law, strength in laws.items()
         )
-        law = parse_perturbation(spec, seed, _APART_S * np.arange(len(out) + 1.0))
-        out = [law.apply(k, image, None)[0] for k, image in enumerate(out)]
+        law = parse_perturbation(spec, seed)
+        out = [law.apply(k, _APART_S * k, image, None)[0] for k, image in enumerate(out)]
     return out
 
 

@@ -135,7 +135,7 @@ def _lines(ends: Points) -> Collection[Points]:
 
 def _at_frames(outcome: RunOutcome, T_wc: NDArray[np.float64], frames: NDArray[np.int64]) -> Points:
     """``(F, 3)`` positions of frames of the run, from the poses of all frames done."""
-    times = outcome.sequence.timestamps[frames]
+    times = np.array([outcome.tracks[k].timestamp for k in frames])
     index = np.searchsorted(outcome.trajectory.timestamps, times)
     return T_wc[np.minimum(index, len(T_wc) - 1), :3, 3]
 

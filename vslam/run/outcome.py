@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from vslam.config import Config
 from vslam.datasets.sequence import Sequence
+from vslam.datasets.stream import Stream
 from vslam.features import TrackResult
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.map import Map
@@ -65,12 +66,12 @@ class RunOutcome:
         keyframe_frames: ``(K,)`` int64, the frame of this run that each keyframe was, culled ones
             included: loops speak of keyframes, people of frames.
         n_submaps: how often mapping began, the first time included; 0 before the first keyframe.
-        interrupted: why the run ended early ("Ctrl-C"), or None.
+        interrupted: why the run ended early ("Ctrl-C", a file cut off), or None.
         without_loops: the same run without a loop detector, if one was made to compare.
     """
 
     settings: RunSettings
-    sequence: Sequence
+    sequence: Sequence | Stream
     trajectory: Trajectory
     keyframes: Trajectory
     tracks: list[TrackResult]
@@ -91,10 +92,17 @@ class RunOutcome:
     without_loops: RunOutcome | None = None
 
 
+def ground_truth_of(source: Sequence | Stream) -> Trajectory | None:
+    """The ground truth of all frames of a source, None without any."""
+    if isinstance(source, Stream) or source.ground_truth is None:
+        return None
+    return Trajectory(source.timestamps, source.ground_truth)
+
+
 def matched_ground_truth(outcome: RunOutcome) -> Trajectory | None:
     """The ground truth of just the frames that ``outcome.trajectory`` has, None without any."""
-    poses = outcome.sequence.ground_truth
-    if poses is None:
+    truth = ground_truth_of(outcome.sequence)
+    if truth is None:
         return None
-    done = np.isin(outcome.sequence.timestamps, outcome.trajectory.timestamps)
-    return Trajectory(outcome.sequence.timestamps, poses).select(np.flatnonzero(done))
+    done = np.isin(truth.timestamps, outcome.trajectory.timestamps)
+    return truth.select(np.flatnonzero(done))

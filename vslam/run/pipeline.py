@@ -1,6 +1,6 @@
-"""From a sequence to an outcome: frames are prepared ahead, tracked in order, recorded.
+"""From a sequence or stream to an outcome: frames are prepared ahead, tracked in order, recorded.
 
-Reading, perturbing and extracting are pure functions of a frame, done by a small pool a few
+Decoding, perturbing and extracting are pure functions of a frame, done by a small pool a few
 frames ahead. Their order is kept, so that the result does not depend on the number of threads.
 In real time frames are prepared when they come, both images at once, and those that come too soon
 are dropped; then the result depends on the machine.
@@ -23,18 +23,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import ImageMap
-from vslam.datasets.perturbation import Perturbation
+from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.sequence import Sequence
-from vslam.errors import UnreadableImageError
+from vslam.datasets.stream import Stream, TimedFrame, is_live, timed_frames
+from vslam.errors import BrokenSourceError, UnreadableImageError
 from vslam.features import Features, TrackResult
 from vslam.frontend.tracking import TrackingContext, extract_features
 from vslam.loopclosure.registry import create_detector, create_images
 from vslam.machine import peak_memory_mb, process_age
-from vslam.run.outcome import RunOutcome, RunSettings
-from vslam.run.realtime import play
+from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
+from vslam.run.realtime import Played, play
 from vslam.run.recorder import NullRecorder, Recorder
 from vslam.slam import Slam
-from vslam.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
 
@@ -50,18 +50,19 @@ class PreparedFrame:
 
 
 def run_sequence(
-    sequence: Sequence,
+    sequence: Sequence | Stream,
     perturbation: Perturbation,
     settings: RunSettings,
     recorder: Recorder,
     *,
     on_frame: Callable[[TrackResult], None] = lambda result: None,
 ) -> RunOutcome:
-    """Run SLAM over a whole sequence.
+    """Run SLAM over a whole sequence, or over a stream until it ends.
 
     A frame that cannot be read is skipped: it gets a predicted pose, counts as lost and is listed
     in the outcome. One that is dropped in a real-time run gets an interpolated pose. Ctrl-C ends
-    the run after the current frame; all done so far is kept.
+    the run after the current frame, a source that breaks off after its last good one; all done so
+    far is kept.
     """
     cv2.setNumThreads(1)  # the pool uses the cores
     images = create_images(settings.detector, settings.config)
@@ -71,23 +72,26 @@ def run_sequence(
     skipped: list[str] = []
     latency_ms: list[float] = []
     n_told = 0  # loops that the recorder knows of
-    recorder.begin(sequence.camera, _ground_truth(sequence))
+    recorder.begin(sequence.camera, ground_truth_of(sequence))
     startup = process_age()
     wall, cpu = time.perf_counter(), time.process_time()
+    broken: list[str] = []
     with _stop_on_interrupt() as interrupted:
-        for index, frame, came in _frames(sequence, perturbation, slam.context, settings):
-            for missed in sequence.timestamps[len(tracks) : index].tolist():
-                tracks.append(slam.skip(missed, dropped=True))
+        frames = perturbed(_until_broken(timed_frames(sequence), broken), perturbation)
+        for played in _prepared(frames, slam.context, settings, live=is_live(sequence)):
+            timestamp, frame = played.timestamp, played.made
+            if frame is None:
+                tracks.append(slam.skip(timestamp, dropped=True))
                 on_frame(tracks[-1])
-            timestamp = float(sequence.timestamps[index])
+                continue
             if frame.features is None or frame.left is None:
-                skipped.append(f"frame {index}: {frame.problem}")
-                _log.warning("frame %d skipped: %s", index, frame.problem)
+                skipped.append(f"frame {len(tracks)}: {frame.problem}")
+                _log.warning("frame %d skipped: %s", len(tracks), frame.problem)
                 result = slam.skip(timestamp)
             else:
                 result = slam.step_features(frame.features, timestamp, frame.left, frame.stage_ms)
                 if settings.realtime:
-                    latency_ms.append(1e3 * (time.perf_counter() - came))
+                    latency_ms.append(1e3 * (time.perf_counter() - played.came))
             tracks.append(result)
             recorder.frame(result, result.T_wc)
             if result.is_keyframe and slam.frame is not None and frame.left is not None:
@@ -97,6 +101,8 @@ def run_sequence(
                 n_told = _tell_loops(recorder, slam, n_told)
             on_frame(result)
             if interrupted.is_set():
+                if not is_live(sequence):  # a camera has no other end
+                    broken.append("Ctrl-C")
                 break
         slam.finish()
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
@@ -122,7 +128,7 @@ def run_sequence(
         corrections=slam.corrections,
         keyframe_frames=np.array(slam.map.frames, np.int64),
         n_submaps=len({0, *slam.map.restarts}) if slam.map.n_keyframes else 0,
-        interrupted="Ctrl-C" if interrupted.is_set() else None,
+        interrupted=broken[0] if broken else None,
     )
 
 
@@ -146,64 +152,64 @@ def with_comparison(
     return replace(outcome, without_loops=replace(without, map=None))  # a map takes 100s of MB
 
 
-def _frames(
-    sequence: Sequence, perturbation: Perturbation, context: TrackingContext, settings: RunSettings
-) -> Iterator[tuple[int, PreparedFrame, float]]:
-    """Frames with their numbers and when they came: all of them now, or each in its time."""
+def _until_broken(frames: Iterator[TimedFrame], broken: list[str]) -> Iterator[TimedFrame]:
+    """The frames of a source; where it breaks off, they end, and ``broken`` is told why."""
+    try:
+        yield from frames
+    except BrokenSourceError as error:
+        broken.append(str(error).rstrip("."))
+
+
+def _prepared(
+    frames: Iterator[TimedFrame], context: TrackingContext, settings: RunSettings, *, live: bool
+) -> Iterator[Played[PreparedFrame]]:
+    """Prepared frames and when they came: all of them at the start, or each in its time."""
     if settings.realtime:
         with ThreadPoolExecutor(2, "side") as pool:
             image_map = map if settings.threads == 1 else pool.map
             yield from play(
-                sequence.timestamps,
-                lambda index: prepare_frame(sequence, index, perturbation, context, image_map),
+                frames,
+                lambda frame: prepare_frame(frame, context, image_map),
                 settings.threads,
+                live=live,
             )
         return
-    frames = prepared_frames(sequence, perturbation, context, settings.threads)
-    now = time.perf_counter()
-    for index, frame in enumerate(frames):
-        yield index, frame, now
+    start = time.perf_counter()
+    for timestamp, prepared in prepared_frames(frames, context, settings.threads):
+        yield Played(timestamp, prepared, start)
 
 
 def prepared_frames(
-    sequence: Sequence, perturbation: Perturbation, context: TrackingContext, threads: int
-) -> Iterator[PreparedFrame]:
-    """Frames in order; with more than one thread, prepared a few frames ahead."""
+    frames: Iterator[TimedFrame], context: TrackingContext, threads: int
+) -> Iterator[tuple[float, PreparedFrame]]:
+    """Frames in order with their times; with more than one thread, prepared a few frames ahead."""
     if threads == 1:
-        for index in range(len(sequence)):
-            yield prepare_frame(sequence, index, perturbation, context)
+        for frame in frames:
+            yield frame.timestamp, prepare_frame(frame, context)
         return
-    ahead: deque[Future[PreparedFrame]] = deque()
-    following = 0
+    ahead: deque[tuple[float, Future[PreparedFrame]]] = deque()
     with ThreadPoolExecutor(threads, "extraction") as pool:
         try:
-            while following < len(sequence) or ahead:
-                while following < len(sequence) and len(ahead) < 2 * threads:
-                    arguments = (sequence, following, perturbation, context)
-                    ahead.append(pool.submit(prepare_frame, *arguments))
-                    following += 1
-                yield ahead.popleft().result()
+            for frame in frames:
+                ahead.append((frame.timestamp, pool.submit(prepare_frame, frame, context)))
+                if len(ahead) == 2 * threads:
+                    timestamp, prepared = ahead.popleft()
+                    yield timestamp, prepared.result()
+            for timestamp, prepared in ahead:
+                yield timestamp, prepared.result()
         finally:
             pool.shutdown(cancel_futures=True)
 
 
 def prepare_frame(
-    sequence: Sequence,
-    index: int,
-    perturbation: Perturbation,
-    context: TrackingContext,
-    image_map: ImageMap = map,
+    frame: TimedFrame, context: TrackingContext, image_map: ImageMap = map
 ) -> PreparedFrame:
-    """Read, perturb and extract one frame."""
+    """Read one frame and extract its features."""
     start = time.perf_counter()
     try:
-        left, second = sequence.read(index, image_map)
+        left, second = frame.read(image_map)
     except UnreadableImageError as error:
         return PreparedFrame(None, None, {}, str(error))
-    if context.camera.depth:
-        left, _ = perturbation.apply(index, left, None)  # light and dirt leave the depth as it is
-    else:
-        left, second = perturbation.apply(index, left, second)
     read = time.perf_counter()
     features = extract_features(left, second, context, image_map)
     done = time.perf_counter()
@@ -216,11 +222,6 @@ def _tell_loops(recorder: Recorder, slam: Slam, n_told: int) -> int:
     if len(slam.loops) > n_told:
         recorder.loops(slam.loops[n_told:], slam.map)
     return len(slam.loops)
-
-
-def _ground_truth(sequence: Sequence) -> Trajectory | None:
-    poses = sequence.ground_truth
-    return None if poses is None else Trajectory(sequence.timestamps, poses)
 
 
 @contextmanager

@@ -1,5 +1,4 @@
-"""A recorded sequence played as a camera would send it: a frame that a newer one overtakes is
-dropped."""
+"""Frames as a camera sends them: one that a newer one overtakes is dropped."""
 
 from __future__ import annotations
 
@@ -7,64 +6,157 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from queue import SimpleQueue
-from typing import TypeVar
+from typing import Generic, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+from vslam.datasets.stream import TimedFrame
 
 T = TypeVar("T")
 
 
+@dataclass(frozen=True)
+class Played(Generic[T]):
+    """What became of a frame.
+
+    Attributes:
+        timestamp: seconds, of the frame.
+        made: what was prepared of it, or None: it was dropped.
+        came: when it came (``time.perf_counter``).
+    """
+
+    timestamp: float
+    made: T | None
+    came: float
+
+
+@dataclass(frozen=True)
+class _Arrival:
+    frame: TimedFrame
+    came: float
+
+
 def play(
-    timestamps: NDArray[np.float64], prepare: Callable[[int], T], threads: int
-) -> Iterator[tuple[int, T, float]]:
-    """Frames as they come, each from its time on; of several that wait only the newest is taken.
+    frames: Iterator[TimedFrame],
+    prepare: Callable[[TimedFrame], T],
+    threads: int,
+    *,
+    live: bool = False,
+) -> Iterator[Played[T]]:
+    """Frames as they come; of several that wait only the newest is prepared.
 
     One frame is prepared while the one before it is used, so that a frame waits for at most one
-    other. The first comes at once.
+    other. A frame that waits is held, one that was dropped is not.
 
     Args:
-        timestamps: ``(N,)`` seconds, increasing.
+        frames: waited for, each from its time on; the first comes at once.
         prepare: what is done to a frame when it has come, in a thread of its own.
         threads: with one, a frame is not prepared before the last one was used.
+        live: each frame comes when ``frames`` yields it.
 
     Yields:
-        Its number, what ``prepare`` made of it, and when it came (``time.perf_counter``).
+        Every frame in order, dropped ones just before the one that overtook them.
+
+    Raises:
+        Exception: of ``prepare`` or ``frames``, after all frames before it.
     """
-    begin = time.perf_counter()
-    arrivals = begin + timestamps - timestamps[0]
     free = threading.Semaphore(min(threads, 2))
-    coming: SimpleQueue[tuple[int, Future[T]] | None] = SimpleQueue()
-    stop = threading.Event()
+    mailbox = _Mailbox()
+    coming: SimpleQueue[tuple[list[Played[T]], _Arrival, Future[T]] | Exception | None] = (
+        SimpleQueue()
+    )
 
-    def film(pool: ThreadPoolExecutor) -> None:
+    def film() -> None:
         try:
-            shoot(pool)
-        finally:
-            coming.put(None)
+            begin = None
+            for frame in frames:
+                came = time.perf_counter()
+                if not live:
+                    begin = came - frame.timestamp if begin is None else begin
+                    came = begin + frame.timestamp
+                    mailbox.wait_until(came)
+                if mailbox.stopped:
+                    return
+                mailbox.put(_Arrival(frame, came))
+            mailbox.end(None)
+        except Exception as error:
+            mailbox.end(error)
 
-    def shoot(pool: ThreadPoolExecutor) -> None:
-        following = 0
-        while following < len(arrivals):
+    def hand_on(pool: ThreadPoolExecutor) -> None:
+        while True:
             free.acquire()
-            newest = int(np.searchsorted(arrivals, time.perf_counter(), "right")) - 1
-            taken = max(following, newest) if following else 0  # a run begins with the first one
-            if stop.wait(max(0.0, arrivals[taken] - time.perf_counter())):
-                break
-            coming.put((taken, pool.submit(prepare, taken)))
-            following = taken + 1
+            dropped, newest = mailbox.take()
+            if newest is None:
+                coming.put(mailbox.error)
+                return
+            missed = [Played[T](timestamp, None, newest.came) for timestamp in dropped]
+            coming.put((missed, newest, pool.submit(prepare, newest.frame)))
 
     with ThreadPoolExecutor(min(threads, 2), "extraction") as pool:
-        camera = threading.Thread(target=film, args=(pool,), name="camera", daemon=True)
+        camera = threading.Thread(target=film, name="camera", daemon=True)
+        handing = threading.Thread(target=hand_on, args=(pool,), name="handing", daemon=True)
         camera.start()
+        handing.start()
         try:
-            while (frame := coming.get()) is not None:
-                index, future = frame
-                yield index, future.result(), float(arrivals[index])
+            while (arrived := coming.get()) is not None:
+                if isinstance(arrived, Exception):
+                    raise arrived
+                missed, newest, future = arrived
+                yield from missed
+                yield Played(newest.frame.timestamp, future.result(), newest.came)
                 free.release()
         finally:
-            stop.set()
+            mailbox.stop()
             free.release()
             camera.join()
+            handing.join()
             pool.shutdown(cancel_futures=True)
+
+
+class _Mailbox:
+    """Between the thread that films and the one that hands on: holds the newest frame alone."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._newest: _Arrival | None = None
+        self._dropped: list[float] = []  # times of frames overtaken since the last one was taken
+        self._first = True
+        self._ended = False
+        self.stopped = False
+        self.error: Exception | None = None
+
+    def put(self, arrival: _Arrival) -> None:
+        """Replace the newest frame; the first of a run is always taken."""
+        with self._changed:
+            if self._newest is not None:
+                self._dropped.append(self._newest.frame.timestamp)
+            self._newest = arrival
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: not self._first or self.stopped)
+
+    def take(self) -> tuple[list[float], _Arrival | None]:
+        """The newest frame and the times of those it overtook; None after the last one."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._newest or self._ended or self.stopped)
+            newest, self._newest = (None if self.stopped else self._newest), None
+            dropped, self._dropped = self._dropped, []
+            self._first = False
+            self._changed.notify_all()
+            return dropped, newest
+
+    def wait_until(self, when: float) -> None:
+        """Sleep until a time of ``time.perf_counter``, or until stopped."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.stopped, max(0.0, when - time.perf_counter()))
+
+    def end(self, error: Exception | None) -> None:
+        """Say that there are no more frames, and why."""
+        with self._changed:
+            self._ended, self.error = True, error
+            self._changed.notify_all()
+
+    def stop(self) -> None:
+        """Say that nobody takes frames any more."""
+        with self._changed:
+            self.stopped = True
+            self._changed.notify_all()

@@ -1,0 +1,208 @@
+"""The reader of EuRoC's layout: pairs, ground truth, rectification, bad input."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import StereoSequence
+from scipy.spatial.transform import Rotation
+
+from vslam.config import Config
+from vslam.datasets import open_sequence
+from vslam.datasets.euroc import open_euroc
+from vslam.datasets.perturbation import Perturbation
+from vslam.errors import InputError, UnreadableImageError
+from vslam.geometry import se3_exp
+from vslam.run.outcome import RunSettings
+from vslam.run.pipeline import run_sequence
+from vslam.run.recorder import NullRecorder
+
+REAL = Path(__file__).parents[2] / "shared/data/euroc/V1_01_start"
+FRAMES = 6
+START = 1403715273262142976
+STEP = 100_000_000  # ns
+T_BODY_LEFT = se3_exp(np.array([0.3, -0.2, 0.1, 0.1, 0.2, 1.5]))
+
+
+def numbers(array) -> str:
+    return ", ".join(repr(float(x)) for x in np.ravel(array))
+
+
+def sensor(T: np.ndarray, camera) -> str:
+    return (
+        f"%YAML:1.0\nsensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n  data: [{numbers(T)}]\n"
+        f"resolution: [{camera.width}, {camera.height}]\ncamera_model: pinhole\n"
+        f"intrinsics: [{camera.fx}, {camera.fy}, {camera.cx}, {camera.cy}]\n"
+        "distortion_model: radial-tangential\ndistortion_coefficients: [0.0, 0.0, 0.0, 0.0]\n"
+    )
+
+
+@pytest.fixture
+def root(corridor: StereoSequence, tmp_path: Path) -> Path:
+    """The corridor's beginning, its right images 1 ms late, with ground truth of the body."""
+    base = tmp_path / "V9_01" / "mav0"
+    T_left_right = np.eye(4)
+    T_left_right[0, 3] = corridor.camera.baseline
+    for side, (images, T) in enumerate(
+        ((corridor.left, T_BODY_LEFT), (corridor.right, T_BODY_LEFT @ T_left_right))
+    ):
+        (base / f"cam{side}/data").mkdir(parents=True)
+        lines = ["#timestamp [ns],filename\r\n"]
+        for k in range(FRAMES):
+            stamp = START + k * STEP + side * 1_000_000
+            assert cv2.imwrite(str(base / f"cam{side}/data/{stamp}.png"), images[k])
+            lines.append(f"{stamp},{stamp}.png\r\n")
+        (base / f"cam{side}/data.csv").write_text("".join(lines))
+        (base / f"cam{side}/sensor.yaml").write_text(sensor(T, corridor.camera))
+    (base / "state_groundtruth_estimate0").mkdir()
+    rows = ["#timestamp, p_RS_R_x [m], ...\n"]
+    for k, T in enumerate(corridor.T_wc[:FRAMES]):
+        T_wb = T @ np.linalg.inv(T_BODY_LEFT)
+        q = Rotation.from_matrix(T_wb[:3, :3]).as_quat(scalar_first=True)
+        rows.append(f"{START + k * STEP},{numbers(T_wb[:3, 3])},{numbers(q)},0,0,0\n")
+    (base / "state_groundtruth_estimate0/data.csv").write_text("".join(rows))
+    return tmp_path
+
+
+def refused(root: Path, *parts: str, **options) -> None:
+    with pytest.raises(InputError) as caught:
+        open_euroc(root, "V9_01", **options)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.endswith(".")
+    for part in parts:
+        assert part in message
+
+
+def drop_lines(path: Path, keep) -> None:
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(line for k, line in enumerate(lines) if keep(k)))
+
+
+def test_reads_a_sequence(root, corridor):
+    sequence = open_sequence("euroc", root, "V9_01")
+    assert (sequence.dataset, sequence.name, len(sequence)) == ("euroc", "V9_01", FRAMES)
+    np.testing.assert_allclose(np.diff(sequence.timestamps), 0.1, atol=1e-6)
+    assert sequence.timestamps[0] == pytest.approx(START * 1e-9, abs=1e-6)
+    assert sequence.camera.baseline == pytest.approx(0.5)
+    left, right = sequence.read(3)
+    np.testing.assert_array_equal(left, corridor.left[3])
+    np.testing.assert_array_equal(right, corridor.right[3])
+    np.testing.assert_allclose(sequence.ground_truth, corridor.T_wc[:FRAMES], atol=1e-9)
+
+
+@pytest.mark.parametrize("inner", ["V9_01", "V9_01/mav0"])
+def test_the_folder_itself_can_be_named(root, inner):
+    assert len(open_euroc(root / inner, "00")) == FRAMES
+
+
+def test_selection_and_the_left_camera_alone(root, corridor):
+    sequence = open_euroc(root, "V9_01", start=1, every=2, max_frames=2, monocular=True)
+    assert len(sequence) == 2
+    assert sequence.camera.monocular
+    left, right = sequence.read(1)
+    np.testing.assert_array_equal(left, corridor.left[3])
+    assert right is None
+    np.testing.assert_allclose(sequence.ground_truth, corridor.T_wc[[1, 3]], atol=1e-9)
+
+
+def test_frames_without_a_partner_are_left_out(root, corridor):
+    drop_lines(root / "V9_01/mav0/cam1/data.csv", lambda k: k not in (1, 4, 6))
+    sequence = open_euroc(root, "V9_01")
+    assert len(sequence) == 3
+    np.testing.assert_array_equal(sequence.read(2)[0], corridor.left[4])
+    np.testing.assert_array_equal(sequence.read(2)[1], corridor.right[4])
+    np.testing.assert_allclose(sequence.ground_truth, corridor.T_wc[[1, 2, 4]], atol=1e-9)
+
+
+def test_no_partners_at_all(root):
+    path = root / "V9_01/mav0/cam1/data.csv"
+    path.write_text(path.read_text().replace("14037", "15037"))
+    refused(root, "none of its 6 images is of the time of one")
+
+
+def test_ground_truth_is_interpolated_and_must_cover_all(root, corridor, caplog):
+    path = root / "V9_01/mav0/state_groundtruth_estimate0/data.csv"
+    drop_lines(path, lambda k: k != 4)
+    found = open_euroc(root, "V9_01").ground_truth
+    np.testing.assert_allclose(found[3], corridor.T_wc[3], atol=1e-3)
+    drop_lines(path, lambda k: k not in (1, 2))
+    assert open_euroc(root, "V9_01").ground_truth is None
+    assert "--start 2 --max-frames 4" in caplog.text
+    assert open_euroc(root, "V9_01", start=2).ground_truth is not None
+    path.unlink()
+    assert open_euroc(root, "V9_01").ground_truth is None
+
+
+def test_a_calibration_of_ones_own(root, corridor):
+    c = corridor.camera
+    one = f"{{focal: [{c.fx}, {c.fy}], centre: [{c.cx}, {c.cy}], distortion: [-0.1, 0, 0, 0]}}"
+    path = root / "own.yaml"
+    path.write_text(f"left: {one}\nright: {one}\nbaseline: 0.4\n")
+    sequence = open_euroc(root, "V9_01", calib=[path])
+    assert sequence.camera.baseline == 0.4
+    assert not np.array_equal(sequence.read(0)[0], corridor.left[0])
+    path.write_text(f"left: {one[:-1]}, size: [640, 480]}}\nright: {one}\nbaseline: 0.4\n")
+    refused(root, "own.yaml", "made for 640x480 pixels but the images have 480x160", calib=[path])
+
+
+def test_swapped_cameras(root):
+    base = root / "V9_01/mav0"
+    left, right = base / "cam0/sensor.yaml", base / "cam1/sensor.yaml"
+    text = left.read_text()
+    left.write_text(right.read_text())
+    right.write_text(text)
+    refused(root, "to the left of the left one; swap")
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "words"),
+    [
+        ("cam0/data.csv", "#\n", "empty"),
+        ("cam0/data.csv", "5 6\n", "line 1 is not a time in nanoseconds and a file name"),
+        ("cam0/data.csv", "6,a.png\n6,b.png\n", "line 2 is not later"),
+        ("cam1/data.csv", None, "left camera alone with --sensor mono"),
+        ("cam0/sensor.yaml", None, "the calibration is missing"),
+        ("state_groundtruth_estimate0/data.csv", "5,1,2\n", "line 1 is not a time (ns)"),
+        ("state_groundtruth_estimate0/data.csv", "", "do not increase"),
+    ],
+)
+def test_damaged_files(root, file, text, words):
+    path = root / "V9_01/mav0" / file
+    path.unlink()
+    if text is not None:
+        path.write_text(text)
+    refused(root, path.name, words)
+
+
+def test_missing_data_and_images(root):
+    refused(root / "none", "no data in EuRoC's layout here", "--data")
+    with pytest.raises(InputError, match="choose --seq of V9_01"):
+        open_euroc(root, "V9_02")
+    images = sorted((root / "V9_01/mav0/cam1/data").iterdir())
+    images[2].write_bytes(b"no image")
+    sequence = open_euroc(root, "V9_01")
+    with pytest.raises(UnreadableImageError, match="cannot be decoded"):
+        sequence.read(2)
+    shutil.copy(images[2], images[0])
+    with pytest.raises(UnreadableImageError, match="cannot be decoded"):
+        open_euroc(root, "V9_01")
+    images[3].unlink()
+    refused(root, images[3].name, "empty")
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="EuRoC clip absent")
+def test_the_real_vehicle_stands_still():
+    sequence = open_euroc(REAL, "", start=21, max_frames=25)
+    assert sequence.ground_truth is not None
+    settings = RunSettings(
+        dataset="euroc", sequence=sequence.name, perturb="none", detector="none", sensor="stereo",
+        seed=0, threads=1, start=21, every=1, max_frames=25, config=Config(),
+    )  # fmt: skip
+    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    moved = np.linalg.norm(outcome.trajectory.T_wc[:, :3, 3], axis=1)
+    assert moved.max() < 0.005

@@ -1,0 +1,81 @@
+"""Calibration files; the format is found out from what they hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from vslam.calibration.documents import Document, read_document
+from vslam.calibration.formats import (
+    Size,
+    read_euroc,
+    read_kalibr,
+    read_opencv,
+    read_orbslam,
+    read_own,
+    read_ros,
+)
+from vslam.calibration.models import Calibration
+from vslam.errors import InputError
+
+_Reader = Callable[[Sequence[Document], Size | None], Calibration]
+# The first whose keys are all in one of the files decides.
+_FORMATS: tuple[tuple[set[str], _Reader, int], ...] = (
+    ({"left"}, read_own, 1),
+    ({"cam0"}, read_kalibr, 1),
+    ({"T_BS", "camera_model"}, read_euroc, 2),
+    ({"camera_matrix", "distortion_model"}, read_ros, 2),
+    ({"distortion_model", "K"}, read_ros, 2),
+    ({"distortion_model", "k"}, read_ros, 2),
+    ({"Camera.fx"}, read_orbslam, 1),
+    ({"Camera1.fx"}, read_orbslam, 1),
+    ({"camera_matrix"}, read_opencv, 1),
+    ({"M1"}, read_opencv, 2),
+    ({"K1"}, read_opencv, 2),
+)
+_PAIRS = (  # in a folder
+    ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml"),
+    ("cam0/sensor.yaml", "cam1/sensor.yaml"),
+    ("left.yaml", "right.yaml"),
+    ("intrinsics.yml", "extrinsics.yml"),
+    ("camchain.yaml",),
+)
+
+
+def read_calibration(files: Sequence[Path], size: Size | None = None) -> Calibration:
+    """Read a calibration in any of the formats of docs/cameras.md.
+
+    Args:
+        files: one file, or one of each camera, left first, or a folder that holds them.
+        size: width and height of the images, for files that do not say.
+
+    Raises:
+        InputError: missing files, unknown format or model, missing keys, numbers that no camera
+            can have.
+    """
+    paths = [
+        found for given in files for found in (_in_folder(given) if given.is_dir() else [given])
+    ]
+    documents = [read_document(path) for path in paths]
+    for keys, reader, most in _FORMATS:
+        if any(keys <= document.values.keys() for document in documents):
+            if len(documents) > most:
+                raise InputError(
+                    f"--calib {paths[most]}: a file too many; this format has "
+                    f"{'one' if most == 1 else 'at most two'}."
+                )
+            return reader(documents, size)
+    raise InputError(
+        f"{paths[0]}: no known calibration; it must be vslam's own (docs/cameras.md), Kalibr's "
+        "camchain, OpenCV's, EuRoC's sensor.yaml, ROS's camera_info or settings of ORB-SLAM."
+    )
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    for names in _PAIRS:
+        found = [folder / name for name in names if (folder / name).is_file()]
+        if found:
+            return found
+    raise InputError(
+        f"{folder}: no calibration in this folder; name the file, or the files of both cameras."
+    )

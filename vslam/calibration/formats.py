@@ -1,0 +1,333 @@
+"""What each calibration format says, as a `Calibration`; docs/cameras.md describes them.
+
+One file because each format is a few lines on the same helpers. The formats' own documentation:
+Kalibr's wiki (yaml formats), OpenCV's samples ``stereo_calib.cpp`` and ``camera_calibration.cpp``,
+the ASL dataset format of EuRoC (Burri et al., IJRR 2016), ROS's ``sensor_msgs/CameraInfo``, the
+settings files of ORB-SLAM2 and ``Calibration_Tutorial.pdf`` of ORB-SLAM3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vslam.calibration.documents import Document
+from vslam.calibration.models import (
+    N_COEFFICIENTS,
+    Array,
+    Calibration,
+    CameraModel,
+    Lens,
+    without_zeros,
+)
+from vslam.errors import InputError
+
+Size = tuple[int, int]
+_LENSES: dict[str, Lens] = {
+    "none": "pinhole",
+    "radtan": "pinhole",
+    "radial-tangential": "pinhole",
+    "plumb_bob": "pinhole",
+    "rational_polynomial": "pinhole",
+    "equidistant": "fisheye",
+}
+_OWN_KEYS = {"left", "right", "T_left_right", "baseline", "depth_scale", "virtual_baseline"}
+_OWN_CAMERA_KEYS = {"lens", "size", "focal", "centre", "distortion"}
+_ROUNDED = 1e-3  # rotations in files are rounded
+
+
+def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
+    """vslam's own: ``left``, ``right``, ``T_left_right`` or ``baseline``, ``depth_scale``."""
+    (document,) = documents
+    _refuse_unknown(document, _OWN_KEYS)
+    left, *rest = (
+        _own_camera(document.section(side), size) for side in ("left", "right") if side in document
+    )
+    depth_scale, virtual = (
+        document.number(key) if key in document else None
+        for key in ("depth_scale", "virtual_baseline")
+    )
+    if not rest:
+        return Calibration(
+            left, depth_scale=depth_scale, virtual_baseline=virtual, source=document.source
+        )
+    if "T_left_right" in document:
+        T_left_right = document.matrix("T_left_right", 4, 4)
+    else:
+        T_left_right = _shift(document.number("baseline"))
+    return _pair(document.source, left, rest[0], T_left_right)
+
+
+def read_kalibr(documents: Sequence[Document], size: Size | None) -> Calibration:
+    """``camchain.yaml`` of Kalibr: ``cam0`` and, to its right, ``cam1``."""
+    (document,) = documents
+    sections = [document.section(key) for key in ("cam0", "cam1") if key in document]
+    models = [_named_camera(section, "distortion_coeffs", size) for section in sections]
+    if len(sections) == 1:
+        return Calibration(models[0], source=document.source)
+    first, second = sections
+    if "T_cn_cnm1" not in second and "T_cam_imu" in first and "T_cam_imu" in second:
+        T_right_left = second.matrix("T_cam_imu", 4, 4) @ _inverse(first.matrix("T_cam_imu", 4, 4))
+    else:
+        T_right_left = second.matrix("T_cn_cnm1", 4, 4)
+    return _pair(document.source, models[0], models[1], _inverse(T_right_left))
+
+
+def read_euroc(documents: Sequence[Document], size: Size | None) -> Calibration:
+    """``sensor.yaml`` of one or two cameras, with ``T_BS`` from the camera to the body."""
+    models = [_named_camera(document, "distortion_coefficients", size) for document in documents]
+    if len(models) == 1:
+        return Calibration(models[0], source=documents[0].source)
+    T_body_left, T_body_right = (document.matrix("T_BS", 4, 4) for document in documents)
+    return _pair(_sources(documents), models[0], models[1], _inverse(T_body_left) @ T_body_right)
+
+
+def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
+    """``camera_info``, a file of ``camera_calibration`` or a printed message, of one or two."""
+    found = [_ros_names(document) for document in documents]
+    models = [_matrix_camera(d, d.source, "K", "D", _ros_lens(d), size) for d in found]
+    if len(models) == 1:
+        return Calibration(models[0], source=documents[0].source)
+    left, right = found
+    P = right.matrix("P", 3, 4)
+    T_left_right = _unrectified(left.matrix("R", 3, 3), right.matrix("R", 3, 3), P, right.source)
+    return _pair(_sources(documents), models[0], models[1], T_left_right)
+
+
+def read_opencv(documents: Sequence[Document], size: Size | None) -> Calibration:
+    """What OpenCV's samples write by ``FileStorage``: ``camera_matrix``, or ``M1 D1 M2 D2 R T`` in
+    one file or two."""
+    source = _sources(documents)
+    document = Document(source, {k: v for each in documents for k, v in each.values.items()})
+    lens: Lens = "fisheye" if _flag(document, "fisheye_model") else "pinhole"
+    if "camera_matrix" in document:
+        names = ("camera_matrix", "distortion_coefficients")
+        return Calibration(_matrix_camera(document, source, *names, lens, size), source=source)
+    left, right = (
+        _matrix_camera(
+            document, source, ("K" if f"K{n}" in document else "M") + n, "D" + n, lens, size
+        )
+        for n in "12"
+    )
+    T_right_left = _rigid(document.matrix("R", 3, 3), np.array(document.numbers("T", 3)))
+    return _pair(source, left, right, _inverse(T_right_left))
+
+
+def read_orbslam(documents: Sequence[Document], size: Size | None) -> Calibration:
+    """Settings of ORB-SLAM2 and ORB-SLAM3: monocular, stereo or RGB-D."""
+    (document,) = documents
+    source = document.source
+    if "LEFT.K" in document:
+        return _orbslam2_unrectified(document, size)
+    kind = document.text("Camera.type") if "Camera.type" in document else "PinHole"
+    if kind not in ("PinHole", "Rectified", "KannalaBrandt8"):
+        raise InputError(
+            f"{source}: Camera.type {kind} is unknown; known are PinHole, Rectified and "
+            "KannalaBrandt8."
+        )
+    lens: Lens = "fisheye" if kind == "KannalaBrandt8" else "pinhole"
+    first = "Camera1" if "Camera1.fx" in document else "Camera"
+    left = _orbslam_camera(document, first, lens, size)
+    factor = next((k for k in ("RGBD.DepthMapFactor", "DepthMapFactor") if k in document), None)
+    baseline = None
+    if "Stereo.b" in document:
+        baseline = document.number("Stereo.b")
+    elif "Camera.bf" in document:
+        baseline = document.number("Camera.bf") / left.fx
+    if factor is not None:
+        scale = document.number(factor)
+        return Calibration(left, depth_scale=scale, virtual_baseline=baseline, source=source)
+    if "Camera2.fx" in document:
+        right = _orbslam_camera(document, "Camera2", lens, size)
+        if "Stereo.T_c1_c2" in document:
+            return _pair(source, left, right, document.matrix("Stereo.T_c1_c2", 4, 4))
+        T = np.vstack([document.matrix("Tlr", 3, 4), [0.0, 0.0, 0.0, 1.0]])
+        return _pair(source, left, right, T)
+    if baseline is None:
+        return Calibration(left, source=source)
+    return _pair(source, left, left, _shift(baseline))
+
+
+def _own_camera(document: Document, size: Size | None) -> CameraModel:
+    _refuse_unknown(document, _OWN_CAMERA_KEYS)
+    lens = document.text("lens") if "lens" in document else "pinhole"
+    if lens not in ("pinhole", "fisheye"):
+        raise InputError(f"{document.source}: lens {lens} is unknown; write pinhole or fisheye.")
+    return _camera(
+        document.source,
+        "fisheye" if lens == "fisheye" else "pinhole",
+        document.numbers("focal", 2) + document.numbers("centre", 2),
+        document.numbers("distortion") if "distortion" in document else (),
+        _size_of(document, size, "size"),
+    )
+
+
+def _named_camera(document: Document, distortion: str, size: Size | None) -> CameraModel:
+    """Kalibr's and EuRoC's way: the names of the camera and distortion models as words."""
+    if (kind := document.text("camera_model")) != "pinhole":
+        raise InputError(
+            f"{document.source}: camera_model {kind} is unknown; known is pinhole, with one of "
+            f"the distortion models {', '.join(_LENSES)}."
+        )
+    word = document.text("distortion_model")
+    return _camera(
+        document.source,
+        _lens(document.source, word),
+        document.numbers("intrinsics", 4),
+        () if word == "none" else document.numbers(distortion),
+        _size_of(document, size, "resolution"),
+    )
+
+
+def _matrix_camera(
+    document: Document, source: str, K: str, D: str, lens: Lens, size: Size | None
+) -> CameraModel:
+    """OpenCV's way: a matrix and a vector."""
+    matrix = document.matrix(K, 3, 3)
+    numbers = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    if "image_width" in document or size is None:
+        size = int(document.number("image_width")), int(document.number("image_height"))
+    return _camera(source, lens, tuple(map(float, numbers)), document.numbers(D), size)
+
+
+def _orbslam_camera(document: Document, name: str, lens: Lens, size: Size | None) -> CameraModel:
+    order = ("k1", "k2", "k3", "k4") if lens == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
+    keys = [f"{name}.{key}" for key in order]
+    distortion = [document.number(key) if key in document else 0.0 for key in keys]
+    if "Camera.width" in document or size is None:
+        size = int(document.number("Camera.width")), int(document.number("Camera.height"))
+    numbers = tuple(document.number(f"{name}.{key}") for key in ("fx", "fy", "cx", "cy"))
+    return _camera(document.source, lens, numbers, tuple(distortion), size)
+
+
+def _orbslam2_unrectified(document: Document, size: Size | None) -> Calibration:
+    models, rotations = [], []
+    for side in ("LEFT", "RIGHT"):
+        found = size
+        if f"{side}.width" in document or size is None:
+            found = int(document.number(f"{side}.width")), int(document.number(f"{side}.height"))
+        models.append(
+            _matrix_camera(document, document.source, f"{side}.K", f"{side}.D", "pinhole", found)
+        )
+        rotations.append(document.matrix(f"{side}.R", 3, 3))
+    P = document.matrix("RIGHT.P", 3, 4)
+    T_left_right = _unrectified(rotations[0], rotations[1], P, f"{document.source}: RIGHT")
+    return _pair(document.source, models[0], models[1], T_left_right)
+
+
+def _ros_names(document: Document) -> Document:
+    """The names of a printed message, for a file of ``camera_calibration`` too."""
+    names = {
+        "camera_matrix": "K",
+        "distortion_coefficients": "D",
+        "rectification_matrix": "R",
+        "projection_matrix": "P",
+        "width": "image_width",
+        "height": "image_height",
+        "k": "K",
+        "d": "D",
+        "r": "R",
+        "p": "P",
+    }
+    values = {names.get(key, key): value for key, value in document.values.items()}
+    return Document(document.source, values)
+
+
+def _ros_lens(document: Document) -> Lens:
+    word = document.text("distortion_model")
+    return _lens(document.source, word or "none")
+
+
+def _lens(source: str, word: str) -> Lens:
+    if word not in _LENSES:
+        raise InputError(
+            f"{source}: distortion model {word} is unknown; known are {', '.join(_LENSES)}."
+        )
+    return _LENSES[word]
+
+
+def _size_of(document: Document, size: Size | None, key: str) -> Size:
+    if key not in document and size is not None:
+        return size
+    width, height = document.numbers(key, 2)
+    return int(width), int(height)
+
+
+def _flag(document: Document, key: str) -> bool:
+    return key in document and document.number(key) != 0.0
+
+
+def _camera(
+    source: str,
+    lens: Lens,
+    intrinsics: tuple[float, ...],
+    distortion: tuple[float, ...],
+    size: Size,
+) -> CameraModel:
+    fx, fy, cx, cy = intrinsics
+    width, height = size
+    distortion = without_zeros(lens, distortion)
+    if len(distortion) not in N_COEFFICIENTS[lens]:
+        known = " or ".join(map(str, N_COEFFICIENTS[lens]))
+        raise InputError(
+            f"{source}: {len(distortion)} distortion coefficients; a {lens} camera has {known}."
+        )
+    if width < 1 or height < 1:
+        raise InputError(f"{source}: the image size {width}x{height} must be positive.")
+    if fx <= 0 or fy <= 0:
+        raise InputError(f"{source}: the focal lengths {fx:g}, {fy:g} must be positive.")
+    if not (0 < cx < width and 0 < cy < height):
+        raise InputError(
+            f"{source}: the principal point ({cx:.1f}, {cy:.1f}) lies outside the "
+            f"{width}x{height} image; check the numbers and their order."
+        )
+    return CameraModel(fx, fy, cx, cy, width, height, lens, distortion)
+
+
+def _pair(source: str, left: CameraModel, right: CameraModel, T_left_right: Array) -> Calibration:
+    R = T_left_right[:3, :3]
+    if not np.allclose(R @ R.T, np.eye(3), atol=_ROUNDED) or np.linalg.det(R) < 0:
+        raise InputError(
+            f"{source}: the transformation between the cameras holds no rotation; "
+            "check its numbers and their order."
+        )
+    U, _, Vt = np.linalg.svd(R)  # the nearest rotation to the rounded one
+    return Calibration(left, right, _rigid(U @ Vt, T_left_right[:3, 3]), source=source)
+
+
+def _unrectified(R_left: Array, R_right: Array, P: Array, source: str) -> Array:
+    """``T_left_right`` from the rotations into the rectified frames and the right projection."""
+    if P[0, 0] <= 0 or P[0, 3] == 0:
+        raise InputError(
+            f"{source}: the projection matrix holds no baseline; the fourth number of the right "
+            "camera's is minus its distance times the focal length."
+        )
+    baseline = np.array([-P[0, 3] / P[0, 0], 0.0, 0.0])
+    return _rigid(R_left.T @ R_right, R_left.T @ baseline)
+
+
+def _rigid(R: Array, t: Array) -> Array:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return T
+
+
+def _shift(baseline: float) -> Array:
+    return _rigid(np.eye(3), np.array([baseline, 0.0, 0.0]))
+
+
+def _inverse(T: Array) -> Array:
+    return _rigid(T[:3, :3].T, -T[:3, :3].T @ T[:3, 3])
+
+
+def _sources(documents: Sequence[Document]) -> str:
+    return " and ".join(document.source for document in documents)
+
+
+def _refuse_unknown(document: Document, known: set[str]) -> None:
+    for key in document.values:
+        if key not in known:
+            raise InputError(
+                f"{document.source}: {key} is unknown; known are {', '.join(sorted(known))}."
+            )

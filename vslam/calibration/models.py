@@ -1,0 +1,181 @@
+"""Camera models: pinhole with radial-tangential distortion, and equidistant (Kannala-Brandt).
+
+Camera frame: x right, y down, z forward. Pixels count from the centre of the upper left one.
+Formulas: OpenCV's documentation of ``calib3d`` (radial-tangential) and of ``fisheye``, the latter
+after Kannala and Brandt, PAMI 2006, equation 6.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Lens = Literal["pinhole", "fisheye"]
+
+N_COEFFICIENTS: dict[Lens, tuple[int, ...]] = {"pinhole": (0, 4, 5, 8), "fisheye": (4,)}
+_NEWTON_STEPS = 30
+_OUTWARD = np.linspace(0.0, 1.0, 17)  # parts of the way from the axis to a ray
+_SOLVED_PX = 1e-3  # an unprojected pixel must come back this close
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """How one camera maps rays to pixels.
+
+    Attributes:
+        fx, fy: focal lengths in pixels.
+        cx, cy: principal point in pixels.
+        width, height: image size in pixels.
+        lens: ``pinhole`` or ``fisheye`` (equidistant).
+        distortion: pinhole: none, or ``k1 k2 p1 p2``, ``k3`` behind it, ``k4 k5 k6`` behind that
+            (OpenCV's order); fisheye: ``k1 k2 k3 k4``.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    lens: Lens = "pinhole"
+    distortion: tuple[float, ...] = ()
+
+    @property
+    def undistorted(self) -> bool:
+        """Whether straight lines are straight in the image."""
+        return self.lens == "pinhole" and not any(self.distortion)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """One camera or a stereo pair, as a calibration file tells.
+
+    Attributes:
+        left: the left camera, or the only one.
+        right: the right camera, or None.
+        T_left_right: ``(4, 4)`` float64, maps points of the right camera to the left one; None
+            without a right camera.
+        depth_scale: what a depth image counts in a metre, None where the file does not say.
+        virtual_baseline: metres, with which depth is turned into disparity, None likewise.
+        source: file or files that it was read from, for messages.
+    """
+
+    left: CameraModel
+    right: CameraModel | None = None
+    T_left_right: Array | None = None
+    depth_scale: float | None = None
+    virtual_baseline: float | None = None
+    source: str = field(default="the calibration", compare=False)
+
+    def left_alone(self) -> Calibration:
+        """The left camera without the right one."""
+        return replace(self, right=None, T_left_right=None)
+
+
+def project(model: CameraModel, rays: Array) -> Array:
+    """Pixels ``(N, 2)`` of ``(N, 3)`` points in the camera frame; NaN where the model has none.
+
+    That is behind a pinhole camera, and just behind a fisheye one.
+    """
+    x, y, z = rays.T
+    if model.lens == "fisheye":
+        across = np.hypot(x, y)
+        angle = np.arctan2(across, z)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = np.where(across > 0.0, _bent(model.distortion, angle) / across, 1.0)
+        scale[(across == 0.0) & (z <= 0.0)] = np.nan
+        plane = np.stack([x * scale, y * scale], axis=1)
+    else:
+        depth = np.where(z > 0.0, z, np.nan)
+        plane = _distorted(model.distortion, np.stack([x / depth, y / depth], axis=1))
+    return plane * (model.fx, model.fy) + (model.cx, model.cy)
+
+
+def unproject(model: CameraModel, xy: Array) -> Array:
+    """Unit rays ``(N, 3)`` float64 of ``(N, 2)`` pixels; NaN where the distortion has no inverse:
+    Newton's method finds none, or the image is folded on the way there."""
+    plane = (xy - (model.cx, model.cy)) / (model.fx, model.fy)
+    if model.lens == "fisheye":
+        radius = np.hypot(*plane.T)
+        angle = _unbent(model.distortion, radius)
+        with np.errstate(invalid="ignore"):
+            along = np.where(radius[:, None] > 0.0, plane / radius[:, None], 0.0)
+        rays = np.column_stack([np.sin(angle)[:, None] * along, np.cos(angle)])
+    else:
+        rays = np.column_stack([_undistorted(model.distortion, plane), np.ones(len(plane))])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    off = np.linalg.norm(project(model, rays) - xy, axis=1)
+    rays[~(off < _SOLVED_PX)] = np.nan
+    return rays
+
+
+def without_zeros(lens: Lens, distortion: tuple[float, ...]) -> tuple[float, ...]:
+    """The same distortion in as few coefficients as the model of the lens has forms for."""
+    for n in N_COEFFICIENTS[lens]:
+        if n <= len(distortion) and not any(distortion[n:]):
+            return distortion[:n]
+    return distortion
+
+
+def _distorted(distortion: tuple[float, ...], plane: Array) -> Array:
+    if not distortion:
+        return plane
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
+    x, y = plane.T
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=1,
+    )
+
+
+def _undistorted(distortion: tuple[float, ...], wanted: Array) -> Array:
+    """Newton's method with the Jacobian by central differences."""
+    if not distortion:
+        return wanted
+    plane = wanted.copy()
+    h = 1e-6
+    for _ in range(_NEWTON_STEPS):
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            (ax, ay), (bx, by) = (
+                (_distorted(distortion, plane + d) - _distorted(distortion, plane - d)).T / (2 * h)
+                for d in (np.array([h, 0.0]), np.array([0.0, h]))
+            )
+            ex, ey = (wanted - _distorted(distortion, plane)).T
+            step = np.stack([ex * by - ey * bx, ax * ey - ay * ex], axis=1)
+            plane = plane + step / (ax * by - ay * bx)[:, None]
+        reach = [np.linalg.norm(_distorted(distortion, k * plane), axis=1) for k in _OUTWARD]
+    plane[_folds(reach)] = np.nan
+    return plane
+
+
+def _bent(distortion: tuple[float, ...], angle: Array) -> Array:
+    """Distance from the principal point, in focal lengths, of rays at an angle to the axis."""
+    k1, k2, k3, k4 = distortion
+    a2 = angle * angle
+    return angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
+
+
+def _unbent(distortion: tuple[float, ...], radius: Array) -> Array:
+    k1, k2, k3, k4 = distortion
+    angle = np.minimum(radius, np.pi)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            a2 = angle * angle
+            slope = 1 + a2 * (3 * k1 + a2 * (5 * k2 + a2 * (7 * k3 + a2 * 9 * k4)))
+            angle = angle + (radius - _bent(distortion, angle)) / slope
+        reach = [_bent(distortion, k * angle) for k in _OUTWARD]
+    return np.where(_folds(reach), np.nan, angle)
+
+
+def _folds(reach: list[Array]) -> NDArray[np.bool_]:
+    """Whether the way outward in the world leads inward in the image somewhere."""
+    return np.any(~(np.diff(reach, axis=0) >= 0.0), axis=0)

@@ -1,0 +1,108 @@
+"""Images and calibrations out of ROS messages.
+
+Fields and encodings: ``sensor_msgs/Image``, ``CompressedImage``, ``CameraInfo`` and
+``sensor_msgs/image_encodings.hpp`` of ROS.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.calibration.documents import Document
+from vslam.datasets.sequence import Image
+
+Message = Any  # classes that rosbags makes out of the bag's definitions
+
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+# Channels, and the OpenCV conversion to grey by name.
+_ENCODINGS: dict[str, tuple[int, str | None]] = {
+    "mono": (1, None),
+    "bgr": (3, "COLOR_BGR2GRAY"),
+    "rgb": (3, "COLOR_RGB2GRAY"),
+    "bgra": (4, "COLOR_BGRA2GRAY"),
+    "rgba": (4, "COLOR_RGBA2GRAY"),
+    "bayer_rggb": (1, "COLOR_BayerRGGB2GRAY"),
+    "bayer_bggr": (1, "COLOR_BayerBGGR2GRAY"),
+    "bayer_gbrg": (1, "COLOR_BayerGBRG2GRAY"),
+    "bayer_grbg": (1, "COLOR_BayerGRBG2GRAY"),
+}
+_SAME = {"8UC1": "mono8", "16UC1": "mono16", "8UC3": "bgr8", "8UC4": "bgra8"}
+
+
+def stamp_of(message: Message) -> int:
+    """Nanoseconds of the header's stamp, 0 where nobody has set it."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def grey_of(message: Message) -> Image:
+    """``(H, W)`` uint8 image of an ``Image`` or ``CompressedImage``, of 16 bits the upper eight.
+
+    Raises:
+        ValueError: with the reason why it cannot be decoded.
+    """
+    import cv2
+
+    if not hasattr(message, "encoding"):
+        try:
+            image = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        except cv2.error:
+            image = None
+        if image is None:
+            raise ValueError(f"a compressed image of format '{message.format}' cannot be decoded")
+        return np.asarray(image, np.uint8)
+    encoding = _SAME.get(message.encoding, message.encoding)
+    name, bits = (encoding[:-2], 16) if encoding.endswith("16") else (encoding[:-1], 8)
+    if name not in _ENCODINGS or not encoding.endswith(str(bits)):
+        known = ", ".join(f"{known}8" for known in _ENCODINGS)
+        raise ValueError(f"encoding '{message.encoding}' is unknown; known are {known}")
+    channels, conversion = _ENCODINGS[name]
+    image = _pixels(message, channels, bits)
+    if bits == 16:
+        image = (image >> 8).astype(np.uint8)
+    if conversion is not None:
+        image = cv2.cvtColor(image, getattr(cv2, conversion))
+    return np.ascontiguousarray(image, np.uint8)
+
+
+def _pixels(message: Message, channels: int, bits: int) -> NDArray[Any]:
+    """The rows of an image without their padding."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = np.asarray(message.data, np.uint8)
+    row = width * channels * bits // 8
+    if step < row or data.size < height * step or not row * height:
+        raise ValueError(f"{data.size} bytes are no image of {width}x{height} {message.encoding}")
+    rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row])
+    order = ">" if message.is_bigendian else "<"
+    pixels = rows.view(f"{order}u{bits // 8}")
+    return pixels.reshape(height, width, channels) if channels > 1 else pixels
+
+
+def camera_info(message: Message, source: str, rectified: bool) -> Document:
+    """A ``CameraInfo`` as `vslam.calibration.formats.read_ros` takes it.
+
+    Args:
+        source: bag and topic, for messages.
+        rectified: the images are those that the projection matrix is of.
+    """
+    # ROS 1 has K, D, R and P, ROS 2 small letters.
+    K, D, R, P = (
+        np.asarray(getattr(message, name, getattr(message, name.lower(), None)), np.float64)
+        for name in "KDRP"
+    )
+    if rectified:
+        K, D, R = P.reshape(3, 4)[:, :3], np.zeros(0), np.eye(3)
+    numbers = {"K": K, "D": D, "R": R, "P": P}
+    return Document(
+        source,
+        {
+            "distortion_model": "plumb_bob" if rectified else message.distortion_model,
+            "image_width": str(message.width),
+            "image_height": str(message.height),
+            **{key: [repr(float(x)) for x in value.ravel()] for key, value in numbers.items()},
+        },
+    )

@@ -1,0 +1,69 @@
+"""What videos and cameras share: OpenCV's captures, and frames that hold both sides of a pair."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vslam.camera import ImageMap
+from vslam.datasets.sequence import Image
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Capture = Any  # cv2.VideoCapture, which has no types
+
+
+def open_capture(source: str | int, *parameters: int) -> Capture | None:
+    """A capture of a file, URL or device; None where OpenCV cannot open it.
+
+    Args:
+        parameters: properties and their values in turn.
+    """
+    import cv2
+
+    # FFmpeg and OpenCV would write to the terminal in the midst of the progress bar.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.getLogLevel()
+    cv2.setLogLevel(0)
+    try:
+        backend = cv2.CAP_ANY if isinstance(source, int) else cv2.CAP_FFMPEG
+        capture = cv2.VideoCapture(source, backend, list(parameters))
+    finally:
+        cv2.setLogLevel(level)
+    return capture if capture.isOpened() else None
+
+
+def sizes_of(
+    image: NDArray[np.uint8], side_by_side: bool, monocular: bool
+) -> tuple[tuple[int, int], ...]:
+    """Width and height of each image that `read_sides` makes of a frame."""
+    height, width = image.shape[:2]
+    if not side_by_side:
+        return ((width, height),)
+    return ((width // 2, height),) * (1 if monocular else 2)
+
+
+def read_sides(
+    image: NDArray[np.uint8], side_by_side: bool, monocular: bool, image_map: ImageMap
+) -> tuple[Image, Image | None]:
+    """Grey images out of a frame, the left and the right half of it with ``side_by_side``.
+
+    Args:
+        image: ``(H, W, 3)`` uint8 blue, green, red, or ``(H, W)`` grey.
+        monocular: of both halves the left one alone.
+    """
+    width = image.shape[1] // 2
+    halves = [image[:, :width], image[:, width : 2 * width]] if side_by_side else [image]
+    left, *rest = image_map(_grey, halves[:1] if monocular else halves)
+    return left, rest[0] if rest else None
+
+
+def _grey(image: NDArray[np.uint8]) -> Image:
+    import cv2
+
+    if image.ndim == 2:
+        return np.ascontiguousarray(image)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)

@@ -1,0 +1,255 @@
+"""EuRoC MAV data, and all data in its ASL layout [Burri et al., IJRR 2016].
+
+FOLDER/mav0/cam0/{data.csv,sensor.yaml,data/}    left camera: times (ns) and files, calibration
+FOLDER/mav0/cam1/...                             right camera
+FOLDER/mav0/state_groundtruth_estimate0/         ground truth of the body, if there is one
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence as Several
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.calibration.documents import read_document
+from vslam.calibration.files import read_calibration
+from vslam.camera import ImageMap
+from vslam.datasets.image_files import (
+    check_not_empty,
+    read_grey,
+    read_grey_of_size,
+    select_frames,
+)
+from vslam.datasets.rectified import rectified
+from vslam.datasets.sequence import Image, Sequence
+from vslam.errors import InputError
+
+_HOME = "https://projects.asl.ethz.ch/datasets/euroc-mav/"
+_SAME_NS = 5_000_000  # both cameras are triggered together; a pair's stamps may differ by so much
+_POSE_COLUMNS = 8  # time, position, quaternion; velocities and biases may follow
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class EurocImages:
+    """The selected frames as the cameras took them; see `vslam.datasets.rectified.RawSequence`.
+
+    Attributes:
+        name: of the folder, ``V1_01_easy`` for example.
+        timestamps: ``(N,)`` float64 seconds, as the left camera's file has them.
+        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera, in the world of the file,
+            or None.
+        left, right: N image files each; right is empty for the left camera alone.
+        sizes: width and height of the images of each side.
+    """
+
+    name: str
+    timestamps: NDArray[np.float64]
+    ground_truth: NDArray[np.float64] | None
+    left: tuple[Path, ...]
+    right: tuple[Path, ...]
+    sizes: tuple[tuple[int, int], ...]
+
+    @property
+    def dataset(self) -> str:
+        return "euroc"
+
+    def __len__(self) -> int:
+        return len(self.left)
+
+    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
+        """Left and right image; see `vslam.datasets.sequence.Sequence.read`."""
+        files = [side[index] for side in (self.left, self.right) if side]
+        left, *right = image_map(self._read, list(zip(files, self.sizes, strict=True)))
+        return left, right[0] if right else None
+
+    def _read(self, file: tuple[Path, tuple[int, int]]) -> Image:
+        path, (width, height) = file
+        return read_grey_of_size(path, width, height)
+
+
+def open_euroc(
+    root: Path,
+    name: str,
+    *,
+    start: int = 0,
+    every: int = 1,
+    max_frames: int | None = None,
+    monocular: bool = False,
+    calib: Several[Path] = (),
+) -> Sequence:
+    """Open a sequence; its images are rectified as they are read.
+
+    A frame is a left image with the right one of the same time, or the nearest within 5 ms; left
+    images without are left out. The ground truth is interpolated. Where it does not cover all
+    selected frames there is none, and the log says which ones it covers.
+
+    Args:
+        root: the sequence's folder, or one with several.
+        name: of the sequence in it, if there are several.
+        start: first frame, counted over the pairs.
+        every: take every N-th frame.
+        max_frames: at most so many, None for all.
+        monocular: read the left camera alone.
+        calib: files to be used instead of the cameras' ``sensor.yaml``.
+
+    Raises:
+        InputError: data missing or malformed, no pairs, calibration unusable.
+        UnreadableImageError: the first pair cannot be decoded.
+    """
+    base, found = _find(root, name)
+    cameras = [base / f"cam{side}" for side in range(1 if monocular else 2)]
+    listed = [_read_list(camera) for camera in cameras]
+    frames = _pair(cameras, listed)
+    chosen = frames[select_frames(base, len(frames), start, every, max_frames)]
+    files = [
+        tuple(camera / "data" / names[k] for k in rows)
+        for camera, (_, names), rows in zip(cameras, listed, chosen.T, strict=True)
+    ]
+    for path in (path for side in files for path in side):
+        check_not_empty(path)
+    stamps = listed[0][0][chosen[:, 0]]
+    shapes = [read_grey(side[0]).shape for side in files]
+    raw = EurocImages(
+        name=found,
+        timestamps=stamps.astype(np.float64) * 1e-9,
+        ground_truth=_read_ground_truth(base, stamps, start, every),
+        left=files[0],
+        right=() if monocular else files[1],
+        sizes=tuple((width, height) for height, width in shapes),
+    )
+    sensors = calib or [camera / "sensor.yaml" for camera in cameras]
+    return rectified(raw, read_calibration(sensors, raw.sizes[0]))
+
+
+def is_euroc(root: Path) -> bool:
+    """Whether a folder holds the left camera of a sequence in this layout."""
+    return any((base / "cam0" / "data.csv").is_file() for base in (root / "mav0", root))
+
+
+def _find(root: Path, name: str) -> tuple[Path, str]:
+    """Folder with ``cam0``, and the sequence's name."""
+    for folder in (root / name, root):
+        if is_euroc(folder):
+            base = folder / "mav0" if (folder / "mav0").is_dir() else folder
+            return base, folder.resolve().name
+    inside = sorted(p.name for p in root.iterdir() if is_euroc(p)) if root.is_dir() else []
+    if inside:
+        raise InputError(f"{root / name}: no such sequence; choose --seq of {', '.join(inside)}.")
+    raise InputError(
+        f"{root}: no data in EuRoC's layout here (no mav0/cam0/data.csv); download a sequence in "
+        f"ASL format from {_HOME}, unpack it and name its folder with --data."
+    )
+
+
+def _read_list(camera: Path) -> tuple[NDArray[np.int64], list[str]]:
+    """Times (ns, increasing) and file names of a camera's images."""
+    path = camera / "data.csv"
+    times, names = [], []
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        alone = ", or run on the left camera alone with --sensor mono"
+        raise InputError(
+            f"{path}: the list of images is missing or no text; unpack the sequence again"
+            f"{alone if camera.name == 'cam1' else ''}."
+        ) from error
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        stamp, _, name = line.partition(",")
+        if not stamp.strip().isdecimal() or not name.strip() or "/" in name:
+            raise InputError(
+                f"{path}: line {number} is not a time in nanoseconds and a file name; repair it."
+            )
+        times.append(int(stamp))
+        names.append(name.strip())
+        if len(times) > 1 and times[-1] <= times[-2]:
+            raise InputError(
+                f"{path}: line {number} is not later than the one before it; repair the list."
+            )
+    if not times:
+        raise InputError(f"{path}: the list of images is empty; unpack the sequence again.")
+    return np.array(times, np.int64), names
+
+
+def _pair(
+    cameras: list[Path], listed: list[tuple[NDArray[np.int64], list[str]]]
+) -> NDArray[np.int64]:
+    """``(N, sides)`` int64 rows of the lists that belong together."""
+    left, right = listed[0][0], listed[-1][0]
+    rows = np.arange(len(left))
+    if len(listed) == 1:
+        return rows[:, None]
+    after = np.searchsorted(right, left).clip(0, len(right) - 1)
+    before = (after - 1).clip(0)
+    nearest = np.where(left - right[before] <= abs(right[after] - left), before, after)
+    near = abs(right[nearest] - left) <= _SAME_NS
+    if not near.any():
+        raise InputError(
+            f"{cameras[1]}: none of its {len(right)} images is of the time of one in "
+            f"{cameras[0]}; take both cameras of one sequence."
+        )
+    return np.column_stack([rows, nearest])[near]
+
+
+def _read_ground_truth(
+    base: Path, stamps: NDArray[np.int64], start: int, every: int
+) -> NDArray[np.float64] | None:
+    from scipy.spatial.transform import Rotation, Slerp
+
+    folder = base / "state_groundtruth_estimate0"
+    path = folder / "data.csv"
+    if not path.is_file():
+        return None
+    times, rows = _read_states(path)
+    covered = np.flatnonzero((stamps >= times[0]) & (stamps <= times[-1]))
+    if len(covered) < len(stamps):
+        inside = "none of the frames"
+        if len(covered):
+            first, n = start + every * int(covered[0]), len(covered)
+            inside = f"a part of the frames; --start {first} --max-frames {n} takes them"
+        _log.warning("%s: the ground truth covers %s.", path, inside)
+        return None
+    seconds, at = (times - times[0]) * 1e-9, (stamps - times[0]) * 1e-9
+    T_w_sensor = np.tile(np.eye(4), (len(stamps), 1, 1))
+    turns = Rotation.from_quat(rows[:, 3:], scalar_first=True)
+    T_w_sensor[:, :3, :3] = Slerp(seconds, turns)(at).as_matrix()
+    for k in range(3):
+        T_w_sensor[:, k, 3] = np.interp(at, seconds, rows[:, k])
+    T_body_camera = read_document(base / "cam0" / "sensor.yaml").matrix("T_BS", 4, 4)
+    T_body_sensor = np.eye(4)
+    if (folder / "sensor.yaml").is_file():
+        T_body_sensor = read_document(folder / "sensor.yaml").matrix("T_BS", 4, 4)
+    return T_w_sensor @ np.linalg.inv(T_body_sensor) @ T_body_camera
+
+
+def _read_states(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Times (ns) and ``(N, 7)`` position and quaternion, w first."""
+    times, rows = [], []
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        words = line.split(",")
+        try:
+            times.append(int(words[0]))
+            row = [float(word) for word in words[1:_POSE_COLUMNS]]
+        except ValueError:
+            row = []
+        if len(row) != _POSE_COLUMNS - 1 or not np.isfinite(row).all() or not any(row[3:]):
+            raise InputError(
+                f"{path}: line {number} is not a time (ns), a position and a quaternion; "
+                "repair it, or remove the file to run without ground truth."
+            )
+        rows.append(row)
+    if len(rows) < 2 or (np.diff(times) <= 0).any():
+        raise InputError(
+            f"{path}: the times of the ground truth do not increase; repair it, or remove the "
+            "file to run without."
+        )
+    return np.array(times, np.int64), np.array(rows)

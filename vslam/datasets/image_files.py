@@ -1,0 +1,93 @@
+"""What readers of image files share: which files, which frames, and grey images out of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.datasets.sequence import Image
+from vslam.errors import InputError, UnreadableImageError
+
+_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
+
+
+def list_images(folder: Path) -> dict[str, Path]:
+    """Image files of a folder by stem, in the order of their names; empty without the folder."""
+    if not folder.is_dir():
+        return {}
+    return {
+        path.stem: path
+        for path in sorted(folder.iterdir())
+        if path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
+    }
+
+
+def select_frames(
+    source: Path, n: int, start: int, every: int, max_frames: int | None
+) -> NDArray[np.int64]:
+    """Numbers of the frames that ``start``, ``every`` and ``max_frames`` select of n > 0.
+
+    Raises:
+        InputError: options out of range, or a start beyond the last frame of ``source``.
+    """
+    if start < 0 or every < 1 or (max_frames is not None and max_frames < 1):
+        raise InputError("--start must be at least 0, --every and --max-frames at least 1.")
+    if start >= n:
+        raise InputError(f"--start {start}: {source} has {n} frames; choose at most {n - 1}.")
+    return np.arange(start, n, every)[:max_frames]
+
+
+def check_not_empty(path: Path) -> None:
+    """Refuse a file without contents.
+
+    Raises:
+        UnreadableImageError: the file is empty, or a link to nowhere.
+    """
+    try:
+        empty = path.stat().st_size == 0
+    except OSError:
+        empty = True
+    if empty:
+        raise UnreadableImageError(path, "the file is empty; download it again.")
+
+
+def read_grey(path: Path) -> Image:
+    """Decode an image file: ``(H, W)`` uint8, colour weighed to grey (ITU-R BT.601), of 16 bits
+    the upper eight.
+
+    Raises:
+        UnreadableImageError: missing or damaged.
+    """
+    import cv2
+
+    try:
+        data = np.fromfile(path, np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    except (OSError, cv2.error):
+        image = None
+    if image is None:
+        raise UnreadableImageError(path, "cannot be decoded; download the file again.")
+    return np.asarray(image, np.uint8)
+
+
+def read_grey_of_size(path: Path, width: int, height: int) -> Image:
+    """`read_grey`, for an image that must have the size of the first one.
+
+    Raises:
+        UnreadableImageError: missing, damaged or of another size.
+    """
+    image = read_grey(path)
+    if image.shape != (height, width):
+        raise UnreadableImageError(
+            path,
+            f"{size_text(image.shape)} pixels where the first image has {width}x{height}; "
+            "replace it by the original.",
+        )
+    return image
+
+
+def size_text(shape: tuple[int, ...]) -> str:
+    """``(H, W)`` as people write it: ``WxH``."""
+    return f"{shape[1]}x{shape[0]}"

@@ -1,0 +1,131 @@
+"""Cameras that film now: a device of this machine, or a URL, of one camera or a pair side by side.
+
+Time stamps are those of the machine's monotonic clock at the arrival of the image.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from vslam.datasets.capture import Capture, open_capture, read_sides, sizes_of
+from vslam.datasets.stream import TimedFrame
+from vslam.errors import BrokenSourceError, InputError
+
+_TIMEOUT_MS = 10_000
+_DEVICES = Path("/dev")
+
+
+@dataclass(frozen=True)
+class CameraStream:
+    """See `vslam.datasets.stream.RawStream`; its frames can be had once.
+
+    Attributes:
+        name: the device's number, or host and path of the URL: never user and password.
+        side_by_side: each frame holds the left image and, right of it, the right one.
+        monocular: the left images alone.
+    """
+
+    name: str
+    capture: Capture
+    sizes: tuple[tuple[int, int], ...]
+    side_by_side: bool
+    monocular: bool
+
+    @property
+    def dataset(self) -> str:
+        return "camera"
+
+    @property
+    def live(self) -> bool:
+        return True
+
+    @property
+    def n_expected(self) -> int | None:
+        return None
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """See `vslam.datasets.stream.RawStream.frames`."""
+        n = 0
+        try:
+            while True:
+                decoded, image = self.capture.read()
+                if not decoded:
+                    break
+                sides = partial(read_sides, image, self.side_by_side, self.monocular)
+                yield TimedFrame(time.monotonic(), sides)
+                n += 1
+        finally:
+            self.capture.release()
+        raise BrokenSourceError(
+            f"camera {self.name}: no image came after {n}; look at its cable or network."
+        )
+
+
+def open_camera(
+    device: str, *, side_by_side: bool = False, monocular: bool = False
+) -> CameraStream:
+    """Open a camera and take a first image.
+
+    Args:
+        device: a number, or a URL.
+
+    Raises:
+        InputError: there is no such device, it is busy, it gives no image, or one image a frame
+            where two are needed.
+    """
+    name = _name(device)
+    if not side_by_side and not monocular:
+        raise InputError(
+            f"camera {name}: a camera has one image a frame; say --side-by-side if it holds both "
+            "of a stereo pair, or run with --sensor mono."
+        )
+    capture = _open_device(int(device)) if device.isdecimal() else _open_url(device, name)
+    decoded, image = capture.read()
+    if not decoded:
+        capture.release()
+        raise InputError(
+            f"camera {name}: gives no image; end other programs that use it, or name another."
+        )
+    return CameraStream(
+        name, capture, sizes_of(image, side_by_side, monocular), side_by_side, monocular
+    )
+
+
+def _name(device: str) -> str:
+    if device.isdecimal():
+        return device
+    parts = urlsplit(device)
+    return f"{parts.hostname or ''}{parts.path}"
+
+
+def _open_device(number: int) -> Capture:
+    import cv2
+
+    capture = open_capture(number, cv2.CAP_PROP_BUFFERSIZE, 1)
+    if capture is not None:
+        return capture
+    if (_DEVICES / f"video{number}").exists():
+        raise InputError(
+            f"camera {number}: the device is busy, or no camera; end other programs that use it, "
+            "or name another number with --data."
+        )
+    there = sorted(path.name.removeprefix("video") for path in _DEVICES.glob("video*"))
+    choice = f"there are {', '.join(there)}" if there else "no camera is connected"
+    raise InputError(f"camera {number}: no such device; {choice}.")
+
+
+def _open_url(url: str, name: str) -> Capture:
+    import cv2
+
+    timeouts = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
+    capture = open_capture(url, *(number for key in timeouts for number in (key, _TIMEOUT_MS)))
+    if capture is None:
+        raise InputError(
+            f"camera {name}: cannot be opened; look whether the URL plays in another program."
+        )
+    return capture

@@ -1,0 +1,117 @@
+"""Sequences of images as the cameras took them, rectified on the way in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.calibration.models import Calibration
+from vslam.calibration.rectification import Rectification, rectify
+from vslam.camera import Camera, ImageMap
+from vslam.datasets.sequence import Image, Sequence
+from vslam.errors import InputError
+
+
+class RawSequence(Protocol):
+    """A `Sequence` without its camera: the images need not be rectified.
+
+    Attributes:
+        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera as it is, or None.
+    """
+
+    @property
+    def dataset(self) -> str: ...
+    @property
+    def name(self) -> str: ...
+    @property
+    def timestamps(self) -> NDArray[np.float64]: ...
+    @property
+    def ground_truth(self) -> NDArray[np.float64] | None: ...
+
+    def __len__(self) -> int: ...
+
+    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
+        """As `Sequence.read`, all images of one side of one size."""
+        ...
+
+
+@dataclass(frozen=True)
+class RectifiedSequence:
+    """See `rectified`."""
+
+    raw: RawSequence
+    rectification: Rectification
+
+    @property
+    def dataset(self) -> str:
+        return self.raw.dataset
+
+    @property
+    def name(self) -> str:
+        return self.raw.name
+
+    @property
+    def camera(self) -> Camera:
+        return self.rectification.camera
+
+    @property
+    def timestamps(self) -> NDArray[np.float64]:
+        return self.raw.timestamps
+
+    @property
+    def ground_truth(self) -> NDArray[np.float64] | None:
+        """Of the rectified left camera, which is turned but not moved."""
+        if self.raw.ground_truth is None:
+            return None
+        T_wc = self.raw.ground_truth.copy()
+        T_wc[:, :3, :3] = T_wc[:, :3, :3] @ self.rectification.R_left_rectified
+        return T_wc
+
+    def __len__(self) -> int:
+        return len(self.raw)
+
+    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
+        """Rectified left and right image; see `Sequence.read`."""
+        left, right = self.raw.read(index, image_map)
+        sides = [partial(self.rectification.left, left)]
+        if right is not None:
+            sides.append(partial(self.rectification.right, right))
+        left, *rest = image_map(partial.__call__, sides)
+        return left, rest[0] if rest else None
+
+
+def rectified(raw: RawSequence, calibration: Calibration) -> Sequence:
+    """A sequence whose images are rectified as they are read, the maps computed once.
+
+    Where the images are rectified already they are handed on as they are.
+
+    Raises:
+        InputError: the images are not of the calibrated size, there is no calibration of the
+            right one, or as `vslam.calibration.rectification.rectify`.
+        UnreadableImageError: the first frame cannot be read.
+    """
+    left, right = raw.read(0)
+    if right is None and calibration.right is not None:
+        calibration = calibration.left_alone()
+    if right is not None and calibration.right is None:
+        raise InputError(
+            f"{calibration.source}: the calibration of the right camera is missing; give that of "
+            "both, or run on the left camera alone with --sensor mono."
+        )
+    for model, image in ((calibration.left, left), (calibration.right, right)):
+        if model is not None and image is not None:
+            _check_size(calibration.source, (model.width, model.height), image)
+    return RectifiedSequence(raw, rectify(calibration))
+
+
+def _check_size(source: str, calibrated: tuple[int, int], image: Image) -> None:
+    width, height = calibrated
+    if image.shape != (height, width):
+        raise InputError(
+            f"{source}: made for {width}x{height} pixels but the images have "
+            f"{image.shape[1]}x{image.shape[0]}; take the calibration of these images."
+        )

@@ -1,0 +1,128 @@
+"""Any camera's images: folders, videos, bags and live cameras with the user's calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Several
+from dataclasses import dataclass
+from pathlib import Path
+
+from vslam.calibration.files import read_calibration
+from vslam.calibration.models import Calibration
+from vslam.datasets.rectified import rectified
+from vslam.datasets.rectified_stream import rectified_stream
+from vslam.datasets.sequence import Sequence
+from vslam.datasets.stream import RawStream, Stream
+from vslam.errors import InputError
+
+SOURCES = ("images", "video", "bag", "camera")
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """What some kinds of sources need to be told.
+
+    Attributes:
+        calibration: files, see `vslam.calibration.files.read_calibration`.
+        right: folder of the right images.
+        fps: frames a second, in place of time stamps.
+        side_by_side: each frame holds the left image and, right of it, the right one.
+        topics: of the left and of the right images in a bag.
+    """
+
+    calibration: Several[Path] = ()
+    right: Path | None = None
+    fps: float | None = None
+    side_by_side: bool = False
+    topics: tuple[str, ...] = ()
+
+
+_FOR = {
+    "right": ("images",),
+    "fps": ("images", "video"),
+    "side_by_side": ("video", "camera"),
+    "topics": ("bag",),
+}
+
+
+def open_source(
+    dataset: str,
+    data: str,
+    options: SourceOptions,
+    *,
+    start: int = 0,
+    every: int = 1,
+    max_frames: int | None = None,
+    monocular: bool = False,
+) -> Sequence | Stream:
+    """Open images of any camera and rectify them by its calibration.
+
+    Args:
+        dataset: one of `SOURCES`.
+        data: folder or file, number of a device, or URL.
+
+    Raises:
+        InputError: no calibration or one of other images, or as the reader says.
+    """
+    if dataset == "images":
+        from vslam.datasets.image_folders import open_images
+
+        images = open_images(
+            Path(data), options.right, fps=options.fps, start=start, every=every,
+            max_frames=max_frames, monocular=monocular,
+        )  # fmt: skip
+        return rectified(images, _calibration(dataset, options, images.sizes[0]))
+    stream: RawStream
+    own: Calibration | None = None
+    if dataset == "video":
+        from vslam.datasets.video import open_video
+
+        stream = open_video(
+            Path(data), fps=options.fps, side_by_side=options.side_by_side, monocular=monocular
+        )
+    elif dataset == "bag":
+        from vslam.datasets.bag import open_bag
+
+        stream = bag = open_bag(Path(data), topics=options.topics, monocular=monocular)
+        own = bag.calibration
+    else:
+        from vslam.datasets.live_camera import open_camera
+
+        stream = open_camera(data, side_by_side=options.side_by_side, monocular=monocular)
+    return rectified_stream(
+        stream,
+        _calibration(dataset, options, stream.sizes[0], own),
+        start=start,
+        every=every,
+        max_frames=max_frames,
+    )
+
+
+def check_options(dataset: str, options: SourceOptions) -> None:
+    """Refuse options that this kind of source has no use for.
+
+    Raises:
+        InputError: one of them is given.
+    """
+    for name, kinds in _FOR.items():
+        if getattr(options, name) and dataset not in kinds:
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(
+                f"{option}: only for --dataset {' or '.join(kinds)}, not {dataset}; leave it out."
+            )
+
+
+def _calibration(
+    dataset: str,
+    options: SourceOptions,
+    size: tuple[int, int],
+    own: Calibration | None = None,
+) -> Calibration:
+    if options.calibration:
+        return read_calibration(options.calibration, size)
+    if own is None:
+        where = " (nor camera_info in the bag)" if dataset == "bag" else ""
+        raise InputError(
+            f"--calib: no calibration{where}; name a file with the cameras' focal lengths, "
+            "centres, distortion and baseline, as docs/cameras.md describes it."
+        )
+    return own

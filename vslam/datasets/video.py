@@ -1,0 +1,123 @@
+"""Video files that FFmpeg decodes, of one camera or of a stereo pair side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+from vslam.datasets.capture import Capture, open_capture, read_sides, sizes_of
+from vslam.datasets.sequence import Image
+from vslam.datasets.stream import TimedFrame
+from vslam.errors import BrokenSourceError, InputError
+
+_MISSING_SHARE = 0.05  # what the end may lack of the frames that the file speaks of: it estimates
+
+
+@dataclass(frozen=True)
+class VideoStream:
+    """See `vslam.datasets.stream.RawStream`.
+
+    Attributes:
+        fps: frames a second, in place of the file's time stamps; None for these.
+        side_by_side: each frame holds the left image and, right of it, the right one.
+        monocular: the left images alone.
+    """
+
+    path: Path
+    sizes: tuple[tuple[int, int], ...]
+    n_expected: int | None
+    fps: float | None
+    side_by_side: bool
+    monocular: bool
+
+    @property
+    def dataset(self) -> str:
+        return "video"
+
+    @property
+    def name(self) -> str:
+        return self.path.stem
+
+    @property
+    def live(self) -> bool:
+        return False
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """See `vslam.datasets.stream.RawStream.frames`."""
+        n = 0
+        for timestamp, image in _images(_open(self.path)):
+            timestamp = timestamp if self.fps is None else n / self.fps
+            sides = partial(read_sides, image, self.side_by_side, self.monocular)
+            yield TimedFrame(timestamp, sides)
+            n += 1
+        if self.n_expected is not None and n + 1 < (1.0 - _MISSING_SHARE) * self.n_expected:
+            raise BrokenSourceError(
+                f"{self.path}: the video breaks off after {n} of about {self.n_expected} frames; "
+                "copy it again."
+            )
+
+
+def open_video(
+    path: Path, *, fps: float | None = None, side_by_side: bool = False, monocular: bool = False
+) -> VideoStream:
+    """Open a video and decode its first frames.
+
+    Raises:
+        InputError: no such file, no decoder for it, no time stamps and no ``fps``, or one image a
+            frame where two are needed.
+    """
+    if not side_by_side and not monocular:
+        raise InputError(
+            f"{path}: a video has one image a frame; say --side-by-side if it holds both of a "
+            "stereo pair, or run with --sensor mono."
+        )
+    capture = _open(path)
+    n = _count(capture)
+    first = list(islice(_images(capture), 2))
+    if not first:
+        raise InputError(f"{path}: holds no image that can be decoded; {_CONVERT}.")
+    times = [timestamp for timestamp, _ in first]
+    if fps is None and len(times) == 2 and times[1] <= times[0]:
+        raise InputError(f"{path}: the video has no time stamps; give --fps.")
+    sizes = sizes_of(first[0][1], side_by_side, monocular)
+    return VideoStream(path, sizes, n, fps, side_by_side, monocular)
+
+
+_CONVERT = "convert the video, with ffmpeg -i VIDEO -c:v libx264 -crf 12 NEW.mp4 for example"
+
+
+def _open(path: Path) -> Capture:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; name a video with --data.")
+    capture = open_capture(str(path))
+    if capture is None:
+        raise InputError(
+            f"{path}: no video, cut off, or of a codec that FFmpeg in OpenCV does not know; "
+            f"{_CONVERT}."
+        )
+    return capture
+
+
+def _count(capture: Capture) -> int | None:
+    import cv2
+
+    n = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    return n if n > 0 else None
+
+
+def _images(capture: Capture) -> Iterator[tuple[float, Image]]:
+    """Times in seconds and images as decoded; closes the capture."""
+    import cv2
+
+    try:
+        while capture.grab():
+            timestamp = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+            decoded, image = capture.retrieve()
+            if not decoded:
+                return
+            yield timestamp, image
+    finally:
+        capture.release()

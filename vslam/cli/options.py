@@ -13,6 +13,16 @@ Data = Annotated[
 ]
 DatasetName = Literal["kitti", "euroc", "synthetic"]
 Dataset = Annotated[DatasetName, typer.Option(help="Data set.")]
+Source = Annotated[
+    str,
+    typer.Option(
+        "--data",
+        envvar="KITTI_ROOT",
+        help="Data set, folder of images, video, bag, number of a camera or URL, see "
+        "docs/sources.md.",
+    ),
+]
+SourceName = Literal[DatasetName, "images", "video", "bag", "camera"]
 Seq = Annotated[str, typer.Option(help="Sequence, 00 for example.")]
 Calib = Annotated[
     list[Path] | None,

@@ -27,8 +27,10 @@ class _FramesPerSecond(ProgressColumn):
 
 
 @contextmanager
-def progress_bar(total: int, *, shown: bool) -> Iterator[Callable[[TrackResult], None]]:
+def progress_bar(total: int | None, *, shown: bool) -> Iterator[Callable[[TrackResult], None]]:
     """Yield the callable to give each tracked frame to: frames, fps, tracking state, time left.
+
+    ``total`` is about how many frames there are, None where nobody knows.
 
     The bar is drawn on stderr, so that stdout stays for results.
     """

@@ -10,8 +10,6 @@ import typer
 from vslam.cli.options import (
     KITTI_ROOT,
     Calib,
-    Data,
-    Dataset,
     DetectorName,
     Every,
     MaxFrames,
@@ -19,8 +17,11 @@ from vslam.cli.options import (
     Seed,
     SensorName,
     Seq,
+    Source,
+    SourceName,
     Start,
     Thresholds,
+    names_in,
 )
 from vslam.errors import InputError
 
@@ -36,6 +37,8 @@ _EXAMPLES = """
   vslam run --dataset euroc --data ~/euroc/V1_01_easy
 
   vslam run --seq 00 --max-frames 200 --no-record --quiet
+
+  vslam run --data drive.mp4 --side-by-side --calib stereo.yaml
 """
 
 
@@ -45,10 +48,26 @@ def register(app: typer.Typer) -> None:
 
 
 def run(
-    data: Data = KITTI_ROOT,
-    dataset: Dataset = "kitti",
+    data: Source = str(KITTI_ROOT),
+    dataset: Annotated[
+        SourceName | None,
+        typer.Option(help="What it is.", show_default="found out from what is there"),
+    ] = None,
     seq: Seq = "00",
     calib: Calib = None,
+    right: Annotated[
+        Path | None, typer.Option(help="Folder of the right images, --data has the left ones.")
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(help="Frames a second of images or a video without time stamps."),
+    ] = None,
+    side_by_side: Annotated[
+        bool, typer.Option("--side-by-side", help="Video or camera of both sides in one image.")
+    ] = False,
+    topics: Annotated[
+        str, typer.Option(metavar="LEFT,RIGHT", help="Image topics of a bag, one with mono.")
+    ] = "",
     perturb: Perturb = "none",
     start: Start = 0,
     every: Every = 1,
@@ -104,21 +123,32 @@ def run(
         raise InputError("--compare-loops: nothing to compare with --detector none; name another.")
     if compare_loops and realtime:
         raise InputError("--compare-loops: two runs drop different frames; leave out --realtime.")
+    if fps is not None and not 0.0 < fps < float("inf"):
+        raise InputError(f"--fps {fps}: must be a positive number.")
 
     from vslam.cli.progress import announce, progress_bar, render_bar
     from vslam.config import Config, load_config
-    from vslam.datasets import open_sequence
+    from vslam.datasets.detection import detect_dataset
     from vslam.datasets.perturbation import parse_perturbation
+    from vslam.datasets.sources import SourceOptions, open_source
+    from vslam.datasets.stream import count_expected, is_live
     from vslam.machine import available_cores
 
     thresholds = Config() if config is None else load_config(config)
-    with render_bar(shown=not quiet) as on_render:
-        sequence = open_sequence(
-            dataset, data, seq,
-            start=start, every=every, max_frames=max_frames, monocular=sensor == "mono",
-            calib=calib or (), on_render=on_render,
-        )  # fmt: skip
+    nothing_named = data == str(KITTI_ROOT)
+    kind: str = dataset or ("kitti" if nothing_named else detect_dataset(data))
     perturbation = parse_perturbation(perturb, seed)
+    options = SourceOptions(calib or (), right, fps, side_by_side, tuple(names_in(topics)))
+    with render_bar(shown=not quiet) as on_render:
+        source = open_source(
+            kind, data, seq, options,
+            start=start, every=every, max_frames=max_frames, monocular=sensor == "mono",
+            on_render=on_render,
+        )  # fmt: skip
+    if is_live(source):
+        if compare_loops:
+            raise InputError("--compare-loops: a camera cannot be seen twice; leave it out.")
+        realtime = True
 
     # Bad input has been refused by now; what follows takes a second to import.
     from vslam.cli.summary import print_summary
@@ -129,8 +159,8 @@ def run(
     from vslam.run.warmup import compile_kernels, is_cold
 
     settings = RunSettings(
-        dataset=dataset,
-        sequence=sequence.name,
+        dataset=kind,
+        sequence=source.name,
         perturb=perturbation.name,
         detector=detector,
         sensor=sensor,
@@ -143,15 +173,15 @@ def run(
         weights=weights,
         realtime=realtime,
     )
-    folder = create_run_folder(out, dataset, sequence.name, perturbation.name, detector)
+    folder = create_run_folder(out, kind, source.name, perturbation.name, detector)
     recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
     if is_cold():
         announce("first run: compiling the kernels, less than a minute ...", shown=not quiet)
     compile_kernels(processes=min(settings.threads, 2))
-    with progress_bar(len(sequence), shown=not quiet) as on_frame:
-        outcome = run_sequence(sequence, perturbation, settings, recorder, on_frame=on_frame)
+    with progress_bar(count_expected(source), shown=not quiet) as on_frame:
+        outcome = run_sequence(source, perturbation, settings, recorder, on_frame=on_frame)
     if compare_loops and not outcome.interrupted:
-        with progress_bar(len(sequence), shown=not quiet) as on_frame:
+        with progress_bar(count_expected(source), shown=not quiet) as on_frame:
             outcome = with_comparison(outcome, perturbation, on_frame=on_frame)
     report = write_results(folder, outcome, pages=pages, ply=ply)
     if not quiet:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,7 @@ def open_bag(path: Path, *, topics: tuple[str, ...] = (), monocular: bool = Fals
         path: ``.bag``, ``.mcap`` or ``.db3``, or the folder of a ROS 2 bag.
         topics: of the left and the right images; without any, the only image topics there are, in
             the order of their names.
-        monocular: one topic is enough, and of two the first one is taken.
+        monocular: one topic is enough, and of two given the first one is taken.
 
     Raises:
         InputError: rosbags is not installed, no bag, cut off, topics missing, or images that have
@@ -108,18 +109,18 @@ def open_bag(path: Path, *, topics: tuple[str, ...] = (), monocular: bool = Fals
     with _opened(path) as bag:
         chosen = _choose_topics(path, bag, topics, 1 if monocular else 2)
         pairs = _together(_messages(bag, path, chosen), chosen)
-        first = next(pairs, None)
-        if first is None:
+        begin = list(islice(pairs, 2))
+        if not begin:
             raise InputError(
                 f"{path}: {' and '.join(chosen)} have no images of one time (within "
                 f"{_TOLERANCE_NS / 1e6:g} ms); name topics of one camera with --topics."
             )
-        if stamp_of(first[0]) == 0:
+        if all(stamp_of(messages[0]) == 0 for messages in begin):
             raise InputError(
                 f"{path}: the images of {chosen[0]} have no time stamps (header.stamp is 0); "
                 "record them again with a driver that sets it."
             )
-        images = [_decoded(path, *side) for side in zip(chosen, first, strict=True)]
+        images = [_decoded(path, *side) for side in zip(chosen, begin[0], strict=True)]
         return BagStream(
             path=path,
             topics=chosen,

@@ -63,7 +63,7 @@ def grey_of(message: Message) -> Image:
     channels, conversion = _ENCODINGS[name]
     image = _pixels(message, channels, bits)
     if bits == 16:
-        image = (image >> 8).astype(np.uint8)
+        image = (image.astype(np.uint16) >> 8).astype(np.uint8)
     if conversion is not None:
         image = cv2.cvtColor(image, getattr(cv2, conversion))
     return np.ascontiguousarray(image, np.uint8)

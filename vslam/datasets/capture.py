@@ -26,13 +26,13 @@ def open_capture(source: str | int, *parameters: int) -> Capture | None:
 
     # FFmpeg and OpenCV would write to the terminal in the midst of the progress bar.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = cv2.getLogLevel()
-    cv2.setLogLevel(0)
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         backend = cv2.CAP_ANY if isinstance(source, int) else cv2.CAP_FFMPEG
         capture = cv2.VideoCapture(source, backend, list(parameters))
     finally:
-        cv2.setLogLevel(level)
+        cv2.utils.logging.setLogLevel(level)
     return capture if capture.isOpened() else None
 
 

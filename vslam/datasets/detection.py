@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+from vslam.datasets.euroc import is_euroc
 from vslam.datasets.image_folders import has_images
 from vslam.errors import InputError
 
@@ -19,7 +20,11 @@ _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
         "a folder 'sequences'",
         lambda path: any((path / name).is_dir() for name in ("sequences", "dataset/sequences")),
     ),
-    ("euroc", "a folder 'mav0'", lambda path: (path / "mav0").is_dir()),
+    (
+        "euroc",
+        "a folder 'mav0'",
+        lambda path: any(is_euroc(folder) for folder in (path, *path.glob("*/"))),
+    ),
     ("tum", "a file rgb.txt", lambda path: (path / "rgb.txt").is_file()),
     (
         "bag",

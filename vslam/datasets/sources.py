@@ -1,13 +1,15 @@
-"""Any camera's images: folders, videos, bags and live cameras with the user's calibration."""
+"""All that a run can be given: data sets, and folders, videos, bags and live cameras."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from collections.abc import Sequence as Several
 from dataclasses import dataclass
 from pathlib import Path
 
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration
+from vslam.datasets import open_sequence
 from vslam.datasets.rectified import rectified
 from vslam.datasets.rectified_stream import rectified_stream
 from vslam.datasets.sequence import Sequence
@@ -47,22 +49,33 @@ _FOR = {
 def open_source(
     dataset: str,
     data: str,
+    name: str,
     options: SourceOptions,
     *,
     start: int = 0,
     every: int = 1,
     max_frames: int | None = None,
     monocular: bool = False,
+    on_render: Callable[[int, int], None] | None = None,
 ) -> Sequence | Stream:
-    """Open images of any camera and rectify them by its calibration.
+    """Open a data set, or images of any camera, which are rectified by the user's calibration.
 
     Args:
-        dataset: one of `SOURCES`.
+        dataset: one of `SOURCES`, or as `vslam.datasets.open_sequence` takes it.
         data: folder or file, number of a device, or URL.
+        name: of the sequence of a data set.
+        on_render: see `vslam.datasets.open_sequence`.
 
     Raises:
-        InputError: no calibration or one of other images, or as the reader says.
+        InputError: an option that this source has no use for, no calibration or one of other
+            images, or as the reader says.
     """
+    _check_options(dataset, options)
+    if dataset not in SOURCES:
+        return open_sequence(
+            dataset, Path(data), name, start=start, every=every, max_frames=max_frames,
+            monocular=monocular, calib=options.calibration, on_render=on_render,
+        )  # fmt: skip
     if dataset == "images":
         from vslam.datasets.image_folders import open_images
 
@@ -97,12 +110,7 @@ def open_source(
     )
 
 
-def check_options(dataset: str, options: SourceOptions) -> None:
-    """Refuse options that this kind of source has no use for.
-
-    Raises:
-        InputError: one of them is given.
-    """
+def _check_options(dataset: str, options: SourceOptions) -> None:
     for name, kinds in _FOR.items():
         if getattr(options, name) and dataset not in kinds:
             option = f"--{name.replace('_', '-')}"

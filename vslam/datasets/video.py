@@ -114,7 +114,7 @@ def _images(capture: Capture) -> Iterator[tuple[float, Image]]:
 
     try:
         while capture.grab():
-            timestamp = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+            timestamp = round(1e3 * capture.get(cv2.CAP_PROP_POS_MSEC)) / 1e6  # to microseconds
             decoded, image = capture.retrieve()
             if not decoded:
                 return

@@ -19,6 +19,8 @@ from vslam.report.summary import evaluate_run, summarize
 from vslam.run.outcome import RunOutcome, matched_ground_truth
 from vslam.trajectory import write_kitti, write_tum
 
+_LONGEST_PART = 60  # characters: file systems take 255 for a name, and a URL may have more
+
 
 def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, detector: str) -> Path:
     """Create ``out/<YYYYmmdd-HHMMSS>-<dataset>-<sequence>-<perturb>-<detector>``.
@@ -30,7 +32,7 @@ def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, dete
         InputError: the folder cannot be created.
     """
     parts = [dataset, sequence, perturb.replace(":", "").replace(",", "+"), detector]
-    safe = [re.sub(r"[^A-Za-z0-9.+-]+", "_", part) for part in parts]
+    safe = [re.sub(r"[^A-Za-z0-9.+-]+", "_", part)[:_LONGEST_PART] for part in parts]
     name = "-".join([f"{datetime.now():%Y%m%d-%H%M%S}", *safe])
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,180 @@
+"""The same frames written as every kind of source."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from vslam.camera import Camera
+from vslam.config import Config
+from vslam.datasets.perturbation import parse_perturbation
+from vslam.run.outcome import RunOutcome, RunSettings
+from vslam.run.pipeline import run_sequence
+from vslam.run.recorder import NullRecorder
+
+LEFT, RIGHT = "/cam0/image_raw", "/cam1/image_raw"
+
+
+def write_calibration(
+    path: Path, camera: Camera, *, mono: bool = False, scale: float = 1.0
+) -> Path:
+    """vslam's own format; JSON is YAML."""
+    one = {
+        "size": [round(scale * camera.width), round(scale * camera.height)],
+        "focal": [camera.fx, camera.fy],
+        "centre": [camera.cx, camera.cy],
+    }
+    both = {"left": one, "right": one, "baseline": camera.baseline}
+    path.write_text(json.dumps({"left": one} if mono else both))
+    return path
+
+
+def write_images(folder: Path, sides: dict[str, list[np.ndarray]], names: list[str]) -> Path:
+    """``folder/SIDE/NAME`` for each side."""
+    for side, images in sides.items():
+        (folder / side).mkdir(parents=True, exist_ok=True)
+        for name, image in zip(names, images, strict=True):
+            assert cv2.imwrite(str(folder / side / name), image)
+    return folder
+
+
+def write_video(
+    path: Path, images: list[np.ndarray], fps: float = 10.0, codec: str = "FFV1"
+) -> Path:
+    """Without loss, by the codec FFV1."""
+    height, width = images[0].shape
+    fourcc = cv2.VideoWriter_fourcc(*codec)
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, (width, height), False)
+    assert writer.isOpened()
+    for image in images:
+        writer.write(image)
+    writer.release()
+    return path
+
+
+def encoded(image: np.ndarray, encoding: str) -> np.ndarray:
+    """Grey pixels ``(H, W)`` as those of a ROS image, with the same grey values."""
+    if encoding == "mono16":
+        return image.astype("<u2") << 8 | 77
+    if encoding in ("bgr8", "rgb8"):
+        return np.repeat(image[..., None], 3, axis=2)
+    assert encoding in ("mono8", "8UC1")
+    return image
+
+
+def write_bag(
+    path: Path,
+    kind: str,
+    sides: dict[str, list[np.ndarray]],
+    stamps: list[int],
+    *,
+    encoding: str = "mono8",
+    camera: Camera | None = None,
+    lag: int = 0,
+    padding: int = 0,
+) -> Path:
+    """A bag with one topic for each side; returns what to open.
+
+    Args:
+        kind: ``ros1``, ``ros2``, ``mcap``, or ``folder`` for a ROS 2 bag of MCAP files.
+        stamps: nanoseconds.
+        encoding: of the images, or ``png`` for compressed ones.
+        camera: write its camera_info.
+        lag: nanoseconds that the second side's stamps are late.
+        padding: bytes behind each row.
+    """
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    plugin = StoragePlugin.SQLITE3 if kind == "ros2" else StoragePlugin.MCAP
+    writer = Writer1(path) if kind == "ros1" else Writer2(path, version=8, storage_plugin=plugin)
+    serialize = store.serialize_ros1 if kind == "ros1" else store.serialize_cdr
+    wanted = ("builtin_interfaces/msg/", "std_msgs/msg/", "sensor_msgs/msg/")
+    types = {
+        name.rpartition("/")[2]: made
+        for package in reversed(wanted)
+        for name, made in store.types.items()
+        if name.startswith(package)
+    }
+
+    def header(stamp: int):
+        counter = {"seq": 0} if kind == "ros1" else {}
+        time = types["Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+        return types["Header"](stamp=time, frame_id="", **counter)
+
+    def message(image: np.ndarray, stamp: int):
+        if encoding == "png":
+            data = cv2.imencode(".png", image)[1].ravel()
+            return types["CompressedImage"](header(stamp), "png", data)
+        pixels = encoded(image, encoding)
+        rows = pixels.reshape(len(image), -1).view(np.uint8)
+        rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=99)
+        return types["Image"](header(stamp), *image.shape, encoding, 0, rows.shape[1], rows.ravel())
+
+    def info(side: int):
+        P = np.array([camera.fx, 0, camera.cx, -side * camera.bf,
+                      0, camera.fy, camera.cy, 0, 0, 0, 1, 0])  # fmt: skip
+        K, R = np.delete(P, [3, 7, 11]), np.eye(3).ravel()
+        region = types["RegionOfInterest"](0, 0, 0, 0, False)
+        shape = (camera.height, camera.width)
+        return types["CameraInfo"](
+            header(stamps[0]), *shape, "plumb_bob", np.zeros(5), K, R, P, 0, 0, region
+        )
+
+    with writer:
+        image_type = f"sensor_msgs/msg/{'CompressedImage' if encoding == 'png' else 'Image'}"
+        info_type = "sensor_msgs/msg/CameraInfo"
+        connections = []
+        for number, topic in enumerate(sides):
+            where = topic + "/compressed" * (encoding == "png")
+            connections.append(writer.add_connection(where, image_type, typestore=store))
+            if camera is not None:
+                where = topic.rpartition("/")[0] + "/camera_info"
+                connection = writer.add_connection(where, info_type, typestore=store)
+                writer.write(connection, stamps[0], serialize(info(number), info_type))
+        for stamp, *images in zip(stamps, *sides.values(), strict=True):
+            for number, (connection, image) in enumerate(zip(connections, images, strict=True)):
+                made = message(image, stamp + number * lag)
+                writer.write(connection, stamp + number, serialize(made, image_type))
+    return next(path.glob("*.mcap")) if kind == "mcap" else path
+
+
+def all_sources(root: Path, corridor, n: int) -> Path:
+    """Every kind of source of the corridor's first frames at 10 Hz, and calibrations of them."""
+    left, right = corridor.left[:n], corridor.right[:n]
+    stamps = [k * 10**8 for k in range(n)]
+    names = [f"{k}.png" for k in range(n)]  # 10 comes after 9
+    write_images(root / "images", {"left": left, "right": right}, names)
+    (root / "images" / "times.txt").write_text("".join(f"{k / 10}\n" for k in range(n)))
+    write_video(root / "pair.mkv", [np.hstack(pair) for pair in zip(left, right, strict=True)])
+    sides = {LEFT: left, RIGHT: right}
+    write_bag(root / "ros1.bag", "ros1", sides, stamps, encoding="bgr8", lag=1000)
+    write_bag(root / "ros2", "ros2", sides, stamps, encoding="mono16", padding=6)
+    write_bag(root / "mcap", "mcap", sides, stamps, encoding="png")
+    write_bag(root / "bag", "folder", sides, stamps, camera=corridor.camera)
+    write_calibration(root / "stereo.yaml", corridor.camera)
+    write_calibration(root / "mono.yaml", corridor.camera, mono=True)
+    write_calibration(root / "other.yaml", corridor.camera, scale=0.5)
+    return root
+
+
+def source_path(root: Path, kind: str) -> Path:
+    """Where `all_sources` has put a kind."""
+    files = {"images": "images", "video": "pair.mkv", "ros1": "ros1.bag", "ros2": "ros2",
+             "mcap": "mcap/mcap.mcap", "folder": "bag"}  # fmt: skip
+    return root / files[kind]
+
+
+def run_source(source, *, threads: int = 2, perturb: str = "none", **more) -> RunOutcome:
+    """Odometry over a whole source; ``more`` goes to the settings."""
+    settings = RunSettings(
+        source.dataset, source.name, perturb, "none", "stereo", 0, threads, 0, 1, None, Config(),
+        **more,
+    )  # fmt: skip
+    return run_sequence(source, parse_perturbation(perturb, 0), settings, NullRecorder())

@@ -1,0 +1,203 @@
+"""What cannot be read is refused in one sentence; what breaks off keeps the frames before."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import pytest
+from source_files import (
+    LEFT,
+    all_sources,
+    run_source,
+    source_path,
+    write_bag,
+    write_calibration,
+    write_images,
+)
+
+from vslam.datasets import live_camera, video
+from vslam.datasets.sources import SourceOptions, open_source
+from vslam.datasets.stream import timed_frames
+from vslam.errors import InputError
+
+FRAMES = 12
+
+
+@pytest.fixture(scope="module")
+def folder(corridor, tmp_path_factory) -> Path:
+    return all_sources(tmp_path_factory.mktemp("sources"), corridor, FRAMES)
+
+
+@pytest.fixture(scope="module")
+def side_by_side(folder) -> SourceOptions:
+    return SourceOptions((folder / "stereo.yaml",), side_by_side=True)
+
+
+def refused(match: str, dataset: str, data: Path | str, options: SourceOptions, **more):
+    with pytest.raises(InputError, match=match) as caught:
+        open_source(dataset, str(data), "", options, **more)
+    message = str(caught.value)
+    assert message.endswith(".")
+    assert "\n" not in message
+
+
+def test_topics(folder):
+    bag = folder / "ros1.bag"
+    listed = "image topics are /cam0/image_raw, /cam1/image_raw"
+    options = SourceOptions(topics=(LEFT, "/cam9"))
+    refused(f"--topics /cam9: not in .*ros1.bag; {listed}", "bag", bag, options)
+    refused("right ones, or run with --sensor mono", "bag", bag, SourceOptions(topics=(LEFT,)))
+    refused(f"choose with --topics TOPIC; {listed}", "bag", bag, SourceOptions(), monocular=True)
+
+
+def test_bags_without_what_is_needed(folder, corridor, tmp_path):
+    refused("no calibration .nor camera_info", "bag", folder / "ros1.bag", SourceOptions())
+    refused("no such file", "bag", tmp_path / "none.bag", SourceOptions())
+    one = {LEFT: corridor.left[:2]}
+    write_bag(tmp_path / "one.bag", "ros1", one, [0, 10**8])
+    listed = "image topics are /cam0/image_raw; run with --sensor mono"
+    refused(f"needs two image topics; {listed}", "bag", tmp_path / "one.bag", SourceOptions())
+    write_bag(tmp_path / "empty.bag", "ros1", {}, [])
+    refused("there are no image topics", "bag", tmp_path / "empty.bag", SourceOptions())
+    write_bag(tmp_path / "unstamped.bag", "ros1", one, [0, 0])
+    refused("no time stamps", "bag", tmp_path / "unstamped.bag", SourceOptions(), monocular=True)
+
+
+def test_bags_without_rosbags(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    refused(r"pip install 'vslam\[bag\]'", "bag", folder / "ros1.bag", SourceOptions())
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap", "ros2"])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.6])
+def test_bags_cut_off(folder, tmp_path, kind, share):
+    """Their index is gone: the sentence says what can bring it back."""
+    source = source_path(folder, kind)
+    source = next(source.glob("*.db3")) if source.is_dir() else source
+    data = source.read_bytes()
+    cut = tmp_path / source.name
+    cut.write_bytes(data[: int(share * len(data))])
+    refused("cut off", "bag", cut, SourceOptions((folder / "stereo.yaml",)))
+
+
+def test_a_bag_damaged_in_the_middle_keeps_the_frames_before(folder, tmp_path):
+    shutil.copytree(folder / "bag", tmp_path / "bag")
+    file = next((tmp_path / "bag").glob("*.mcap"))
+    data = bytearray(file.read_bytes())
+    middle = int(len(data) * 0.6)
+    data[middle : middle + len(data) // 10] = b"\xff" * (len(data) // 10)
+    file.write_bytes(data)
+    outcome = run_source(open_source("bag", str(tmp_path / "bag"), "", SourceOptions()))
+    assert 0 < len(outcome.trajectory) < FRAMES
+    assert "damaged or cut off" in outcome.interrupted
+
+
+def test_an_image_of_another_size_is_one_lost_frame(corridor, tmp_path):
+    images = [*corridor.left[:2], corridor.left[2][:80], *corridor.left[3:5]]
+    write_bag(tmp_path / "a.bag", "ros1", {LEFT: images}, [k * 10**8 for k in range(5)])
+    options = SourceOptions((write_calibration(tmp_path / "c.yaml", corridor.camera),))
+    outcome = run_source(open_source("bag", str(tmp_path / "a.bag"), "", options, monocular=True))
+    assert len(outcome.tracks) == 5
+    assert len(outcome.skipped) == 1
+    assert "480x80 pixels where the first image has 480x160" in outcome.skipped[0]
+
+
+def test_calibrations(folder):
+    path = folder / "pair.mkv"
+
+    def options(name):
+        return SourceOptions((folder / name,), side_by_side=True)
+
+    sizes = "made for 240x80 pixels but the images have 480x160"
+    refused(f"other.yaml: {sizes}", "video", path, options("other.yaml"))
+    refused(sizes, "images", folder / "images", SourceOptions((folder / "other.yaml",)))
+    refused("right camera is missing", "video", path, options("mono.yaml"))
+    refused("no calibration; .*docs/cameras.md", "video", path, SourceOptions(side_by_side=True))
+
+
+def test_videos(folder, tmp_path, side_by_side):
+    path = folder / "pair.mkv"
+    refused("--side-by-side .* or run with --sensor mono", "video", path, SourceOptions())
+    refused("no such file", "video", tmp_path / "none.mp4", side_by_side)
+    (tmp_path / "text.mp4").write_text("this is no video")
+    refused("codec that FFmpeg in OpenCV does not know", "video", tmp_path / "text.mp4",
+            side_by_side)  # fmt: skip
+
+
+def test_a_codec_that_nobody_knows(folder, tmp_path, side_by_side):
+    data = (folder / "pair.mkv").read_bytes()
+    assert b"FFV1" in data
+    (tmp_path / "odd.mkv").write_bytes(data.replace(b"FFV1", b"QQQQ"))
+    refused("codec|no image that can be decoded", "video", tmp_path / "odd.mkv", side_by_side)
+
+
+def test_a_video_cut_off_keeps_the_frames_before(folder, tmp_path, side_by_side):
+    data = (folder / "pair.mkv").read_bytes()
+    (tmp_path / "cut.mkv").write_bytes(data[: int(0.6 * len(data))])
+    outcome = run_source(open_source("video", str(tmp_path / "cut.mkv"), "", side_by_side))
+    assert 4 <= len(outcome.trajectory) <= 8
+    assert "breaks off after" in outcome.interrupted
+    assert not outcome.interrupted.endswith(".")
+
+
+def test_a_video_without_time_stamps(folder, monkeypatch, side_by_side):
+    def unstamped(path):
+        capture = cv2.VideoCapture(path)
+        return SimpleNamespace(
+            grab=capture.grab,
+            retrieve=capture.retrieve,
+            release=capture.release,
+            get=lambda key: 0.0 if key == cv2.CAP_PROP_POS_MSEC else capture.get(key),
+        )
+
+    monkeypatch.setattr(video, "open_capture", unstamped)
+    path = folder / "pair.mkv"
+    refused("no time stamps; give --fps", "video", path, side_by_side)
+    options = SourceOptions(side_by_side.calibration, side_by_side=True, fps=10.0)
+    assert len(list(timed_frames(open_source("video", str(path), "", options)))) == FRAMES
+
+
+def test_folders_of_images(folder, corridor, tmp_path):
+    options = SourceOptions((folder / "stereo.yaml",))
+    write_images(tmp_path, {"left": corridor.left[:3]}, ["0.png", "1.png", "2.png"])
+    refused("left and right, image_0 and image_1", "images", tmp_path, options)
+    write_images(tmp_path, {"right": corridor.right[:2]}, ["0.png", "1.png"])
+    refused("2 images but 3 in .* 2 on one side only", "images", tmp_path, options)
+    write_images(tmp_path, {"right": corridor.right[2:3]}, ["2.png"])
+    refused("no time stamps .* give --fps", "images", tmp_path, options)
+    times = tmp_path / "times.txt"
+    times.write_text("0.0\n0.1\n")
+    refused("times.txt: 2 times for 3 images", "images", tmp_path, options)
+    times.write_text("0.0\n0.2\n0.1\n")
+    refused("left/2.png: its time is not later", "images", tmp_path, options)
+    refused("no such folder", "images", tmp_path / "none", options)
+    options = SourceOptions((folder / "stereo.yaml",), right=tmp_path)
+    refused("no images in this folder", "images", tmp_path / "left", options)
+
+
+def test_cameras(folder, tmp_path, monkeypatch, side_by_side):
+    refused("camera 77: no such device", "camera", "77", side_by_side)
+    url = "http://me:word@127.0.0.1:9/a"
+    refused("camera 127.0.0.1/a: cannot be opened", "camera", url, side_by_side)
+    refused("--side-by-side .* or run with --sensor mono", "camera", "77", SourceOptions())
+    (tmp_path / "video77").touch()
+    monkeypatch.setattr(live_camera, "_DEVICES", tmp_path)
+    refused("the device is busy, or no camera; end other", "camera", "77", side_by_side)
+    refused("no such device; there are 77", "camera", "76", side_by_side)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "options", "part"),
+    [
+        ("kitti", {"topics": ("/a",)}, "--topics: only for --dataset bag, not kitti"),
+        ("bag", {"fps": 10.0}, "--fps: only for --dataset images or video"),
+        ("images", {"side_by_side": True}, "--side-by-side: only for --dataset video or camera"),
+        ("video", {"right": Path("r")}, "--right: only for --dataset images"),
+    ],
+)
+def test_options_of_other_sources(dataset, options, part):
+    refused(part, dataset, "nowhere", SourceOptions(**options))

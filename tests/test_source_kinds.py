@@ -1,0 +1,55 @@
+"""What a source is, is found out from what is there."""
+
+from __future__ import annotations
+
+import pytest
+
+from vslam.datasets.detection import detect_dataset
+from vslam.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("data", "dataset"),
+    [
+        ("drive.mp4", "video"),
+        ("drive.bag", "bag"),
+        ("drive.MCAP", "bag"),
+        ("drive_0.db3", "bag"),
+        ("0", "camera"),
+        ("rtsp://user:secret@host:554/stream/1", "camera"),
+    ],
+)
+def test_files_devices_and_urls(tmp_path, monkeypatch, data, dataset):
+    monkeypatch.chdir(tmp_path)
+    if dataset != "camera":
+        (tmp_path / data).touch()
+    assert detect_dataset(data) == dataset
+
+
+@pytest.mark.parametrize(
+    ("file", "dataset"),
+    [
+        ("sequences/00/image_0/000000.png", "kitti"),
+        ("dataset/sequences/00/times.txt", "kitti"),
+        ("mav0/cam0/data.csv", "euroc"),
+        ("V1_01_easy/mav0/cam0/data.csv", "euroc"),
+        ("rgb.txt", "tum"),
+        ("1.png", "images"),
+        ("image_0/1.jpg", "images"),
+        ("cam0/data/1.png", "images"),
+        ("metadata.yaml", "bag"),
+    ],
+)
+def test_folders(tmp_path, file, dataset):
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / file).touch()
+    assert detect_dataset(str(tmp_path)) == dataset
+
+
+def test_what_is_not_known_is_told_what_was_looked_for(tmp_path):
+    with pytest.raises(InputError) as caught:
+        detect_dataset(str(tmp_path))
+    for word in ("sequences", "mav0", "rgb.txt", "metadata.yaml", "left/", "video"):
+        assert word in str(caught.value)
+    with pytest.raises(InputError, match="no such file or folder"):
+        detect_dataset(str(tmp_path / "nothing.mp4"))

@@ -101,6 +101,18 @@ class TrackingContext:
         """Depth (m) below which a stereo point is close (ORB-SLAM2, III-A)."""
         return self.config.stereo.close_depth_baselines * self.camera.baseline
 
+    @property
+    def motion_window(self) -> float:
+        """Search radius at octave 0 around what the previous frame saw, pixels."""
+        config = self.config.tracking
+        return config.depth_motion_window if self.camera.depth else config.motion_window
+
+    @property
+    def local_window(self) -> float:
+        """Search radius at octave 0 around landmarks of the local map, pixels."""
+        config = self.config.tracking
+        return config.depth_local_window if self.camera.depth else config.local_window
+
 
 def extract_features(
     left: NDArray[np.uint8],
@@ -163,7 +175,7 @@ def track_motion(
         low, high = np.zeros_like(octave), octave
     matches, inliers = 0, 0
     for widening in (1.0, 2.0, 4.0):
-        radius = np.where(ahead, config.motion_window * widening * context.scales[octave], 0.0)
+        radius = np.where(ahead, context.motion_window * widening * context.scales[octave], 0.0)
         found = _search(
             frame,
             Projections(uvr, radius, low, high, before.descriptors[source].view(np.uint64)),
@@ -239,7 +251,7 @@ def track_local_map(
     """Match every local landmark that should be visible, then refine the pose with all matches.
 
     Args:
-        window: search radius at octave 0, pixels; None: ``tracking.local_window``.
+        window: search radius at octave 0, pixels; None: ``context.local_window``.
 
     Returns:
         Matches, inliers, and the ids of the landmarks that should be visible.
@@ -257,7 +269,7 @@ def track_local_map(
         camera.width,
         camera.height,
         context.scales,
-        config.local_window if window is None else window,
+        context.local_window if window is None else window,
     )
     visible = radius > 0
     radius[tracked] = 0.0

@@ -117,6 +117,12 @@ class TrackingConfig(_Section):
     local_window: float = Field(
         2.5, gt=0, description="Search radius at octave 0, local map, pixels. [OS1 V-D, customary]"
     )
+    depth_motion_window: float = Field(
+        15.0, gt=0, description="motion_window of an RGB-D camera. [OS1 V-B, customary]"
+    )
+    depth_local_window: float = Field(
+        5.0, gt=0, description="local_window of an RGB-D camera; ORB-SLAM2 has 7.5. [OS1 V-D, own]"
+    )
     local_keyframes: int = Field(
         80, ge=1, description="Keyframes of the local map, at most. [OS1 V-D, customary]"
     )
@@ -227,6 +233,9 @@ class KeyframeConfig(_Section):
 
     max_interval_s: float = Field(
         1.0, gt=0, description="Longest time without a keyframe, seconds. [OS1 V-E, customary]"
+    )
+    depth_max_interval_s: float = Field(
+        0.3, gt=0, description="max_interval_s of an RGB-D camera, held in a hand. [own]"
     )
     min_tracked_close: int = Field(
         100, ge=0, description="Tracked close points; fewer are too few. [OS2 III-E, printed]"

@@ -1,4 +1,4 @@
-"""SLAM on a stereo or monocular stream: ``Slam.step`` is the method section.
+"""SLAM on a stereo, RGB-D or monocular stream: ``Slam.step`` is the method section.
 
 One file because the step and the decisions that it calls are read together.
 """
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
+from vslam.camera import Camera, DepthImage, Image
 from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.features import Features, TrackingState, TrackResult
@@ -37,12 +37,10 @@ from vslam.mapping import MappingThread
 from vslam.monocular import Initialiser
 from vslam.trajectory import Trajectory
 
-Image = NDArray[np.uint8]
-DepthImage = NDArray[np.float32]
 
 
 class Slam:
-    """Stereo SLAM; monocular SLAM, in a unit of its own, with a camera without a baseline.
+    """Stereo or RGB-D SLAM; monocular SLAM, in a unit of its own, with a camera without a baseline.
 
     >>> slam = Slam(camera)
     >>> for left, right, timestamp in frames:
@@ -372,7 +370,7 @@ class Slam:
         )
         if self.camera.monocular:
             return needs_monocular_keyframe(evidence, self.config.keyframes)
-        return needs_keyframe(evidence, self.config.keyframes)
+        return needs_keyframe(evidence, self.config.keyframes, depth=self.camera.depth)
 
     def _insert_keyframe(self, frame: Frame, *, predicted: bool = True) -> None:
         """Make a keyframe of the frame placed last (``MappingThread.insert``)."""
@@ -448,4 +446,5 @@ def _check_images(left: Image, second: Image | DepthImage | None, camera: Camera
     wanted = [np.uint8, np.float32 if camera.depth else np.uint8]
     if any(image.dtype != dtype for image, dtype in zip(images, wanted, strict=False)):
         types = " and ".join(str(image.dtype) for image in images)
-        raise ValueError(f"images are of {types}, not of uint8")
+        expected_types = "uint8 and float32" if camera.depth else "uint8"
+        raise ValueError(f"images are of {types}, not of {expected_types}")

@@ -8,15 +8,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, ImageMap
+from vslam.camera import Camera, DepthImage, Image, ImageMap
 
-Image = NDArray[np.uint8]
-DepthImage = NDArray[np.float32]
+__all__ = ["DepthImage", "Image", "Sequence"]
 
 
 class Sequence(Protocol):
-    """A rectified stereo sequence, its left images, or images with depth. Readers check everything but pixels before
-    the first frame.
+    """A rectified stereo sequence, its left images, or images with depth. Readers check everything
+    but pixels before the first frame.
 
     Attributes:
         dataset: name of the data set, ``kitti`` for example.
@@ -39,7 +38,9 @@ class Sequence(Protocol):
 
     def __len__(self) -> int: ...
 
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | DepthImage | None]:
+    def read(
+        self, index: int, image_map: ImageMap = map
+    ) -> tuple[Image, Image | DepthImage | None]:
         """Left and second image of one frame. Safe to call from several threads.
 
         The left one is ``(H, W)`` uint8. The second one is the right image, alike; or the depth of

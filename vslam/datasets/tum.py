@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration, CameraModel
 from vslam.calibration.rectification import Rectification, rectify
-from vslam.camera import Camera, ImageMap
+from vslam.camera import Camera, DepthImage, Image, ImageMap
 from vslam.datasets.ground_truth import poses_at
 from vslam.datasets.image_files import (
     check_not_empty,
@@ -27,7 +27,6 @@ from vslam.datasets.image_files import (
     select_frames,
     size_text,
 )
-from vslam.datasets.sequence import DepthImage, Image
 from vslam.errors import InputError, UnreadableImageError
 from vslam.trajectory import read_trajectory
 

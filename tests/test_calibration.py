@@ -180,6 +180,18 @@ def test_a_distortion_that_folds_the_image():
         rectify(Calibration(replace(PINHOLE, distortion=(-2.0, 0.0, 0.0, 0.0))))
 
 
+def test_a_wide_lens_may_fold_its_corners():
+    """As fits of action cameras do, whose targets never reach the corners."""
+    wide = CameraModel(582.0, 582.0, 640, 360, 1280, 720, "pinhole", (-0.24, 0.05, 0, 0, -0.004))
+    corner, middle = np.array([[0.0, 0.0]]), np.array([[0.0, 360.0]])
+    assert np.isnan(unproject(wide, corner)).all()
+    assert np.isfinite(unproject(wide, middle)).all()
+    white = np.full((720, 1280), 255, np.uint8)
+    white[:2], white[-2:], white[:, :2], white[:, -2:] = 0, 0, 0, 0
+    found = rectify(Calibration(wide)).left(white)
+    assert (found[4:-4, 4:-4] == 255).all()
+
+
 @dataclass(frozen=True)
 class Raw:
     """Images in memory as a raw sequence."""

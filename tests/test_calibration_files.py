@@ -331,3 +331,12 @@ def test_one_camera_of_opencv(tmp_path):
     storage.release()
     found = read_calibration([path])
     assert (found.left, found.right) == (LEFT, None)
+
+
+def test_the_example_of_the_manual(tmp_path):
+    text = (Path(__file__).parents[1] / "docs/cameras.md").read_text()
+    (example,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "mine.yaml").write_text(example)
+    found = read_calibration([tmp_path / "mine.yaml"])
+    assert found.left.distortion[0] == -0.28340811
+    assert found.T_left_right[0, 3] == 0.1100741

@@ -130,9 +130,9 @@ def test_run_refuses_without_data(call, words, parts):
     [
         ("run --detector orb", ["--detector", "'orb'", "'bow'"]),
         ("run --sensor lidar", ["--sensor", "'lidar'", "'stereo'", "'mono'"]),
-        ("run --dataset euroc", ["--dataset", "'euroc'", "'kitti'"]),
-        ("bench --dataset euroc", ["--dataset", "'euroc'", "'kitti'"]),
-        ("perturb --dataset euroc", ["--dataset", "'euroc'", "'kitti'"]),
+        ("run --dataset nuscenes", ["--dataset", "'nuscenes'", "'kitti'"]),
+        ("bench --dataset nuscenes", ["--dataset", "'nuscenes'", "'kitti'"]),
+        ("perturb --dataset nuscenes", ["--dataset", "'nuscenes'", "'kitti'"]),
         ("eval gt.txt --gt gt.txt --align x", ["--align", "'x'", "'se3'", "'sim3'"]),
         ("train alexandria --data photos:x", ["'alexandria'", "'capsule'", "'alexnet'"]),
         ("train capsule --data photos:x --preset worst", ["--preset", "'worst'", "'paper'"]),

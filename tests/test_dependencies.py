@@ -42,7 +42,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.run",),
     ("vslam.evaluation",),
     ("vslam.report",),
-    ("vslam.overview", "vslam.bench", "vslam.loopbench"),
+    ("vslam.overview", "vslam.bench", "vslam.loopbench", "vslam.doctor"),
     ("vslam.cli",),
     ("vslam.__main__", "vslam"),
 )

@@ -300,6 +300,20 @@ def test_bad_poses(root, line, part):
     refused(root, "poses/00.txt", part)
 
 
+def test_another_calibration_than_its_own(root):
+    """``calib.txt`` is overridden, and images that its distortion bends are straightened."""
+    one = "{focal: [60, 60], centre: [31, 15], distortion: [-0.1, 0, 0, 0]}"
+    (root / "own.yaml").write_text(f"left: {one}\nright: {one}\nbaseline: 0.4\n")
+    sequence = open_sequence("kitti", root, "00", calib=[root / "own.yaml"])
+    assert sequence.camera.baseline == 0.4
+    assert (sequence.camera.width, sequence.camera.height) == (WIDTH, HEIGHT)
+    assert not np.array_equal(sequence.read(0)[0], open_kitti(root, "00").read(0)[0])
+    alone = open_sequence("kitti", root, "00", monocular=True, calib=[root / "own.yaml"])
+    assert alone.camera.monocular
+    with pytest.raises(InputError, match="--calib: a rendered town has its own cameras"):
+        open_sequence("synthetic", root, "demo", calib=[root / "own.yaml"])
+
+
 def test_unknown_data_set(root):
     with pytest.raises(InputError, match="--dataset nuscenes: unknown"):
         open_sequence("nuscenes", root, "00")

@@ -496,3 +496,18 @@ def test_interrupted_with_skipped_frames_and_no_keyframe(tmp_path: Path) -> None
     truth = read_trajectory(tmp_path / "ground_truth_kitti.txt")
     assert outcome.sequence.ground_truth is not None
     np.testing.assert_allclose(truth.T_wc, outcome.sequence.ground_truth[done], atol=1e-9)
+
+
+@pytest.mark.parametrize(("lost", "expected"), [(4, False), (5, True)])
+def test_many_lost_frames_send_the_reader_to_the_doctor(tmp_path, lost, expected):
+    report_of(make_outcome(40, lost=slice(20, 20 + lost)), tmp_path)
+    for name in ("report.md", "report.html"):
+        assert ("vslam doctor checks" in (tmp_path / name).read_text()) is expected
+
+
+def test_calibration_files_are_among_the_options(tmp_path):
+    outcome = make_outcome(40)
+    settings = replace(outcome.settings, calib=(Path("left.yaml"), Path("right.yaml")))
+    report = report_of(replace(outcome, settings=settings), tmp_path)
+    assert report.calib == settings.calib
+    assert "right.yaml" in (tmp_path / "report.md").read_text()

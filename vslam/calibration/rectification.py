@@ -163,33 +163,58 @@ def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline
     cx = (width - 1) / 2 - focal * (x0 + x1) / 2
     cy = (height - 1) / 2 - focal * (y0 + y1) / 2
     focal, cx, cy = float(focal), float(cx), float(cy)
-    return Camera(focal, focal, cx, cy, baseline, width, height)
+    camera = Camera(focal, focal, cx, cy, baseline, width, height)
+    for model, R_own_rectified in cameras:
+        _check_view(model, R_own_rectified, camera, source)
+    return camera
 
 
 def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) -> Array:
     """Corners ``[[x0, y0], [x1, y1]]``, on the plane z = 1 of the rectified camera, of a rectangle
-    that the image covers: it ends where its border comes nearest to the centre."""
-    across, down = np.arange(model.width), np.arange(model.height)
-    top, left = np.zeros(model.width), np.zeros(model.height)
-    borders = (
-        np.column_stack([left, down]),
-        np.column_stack([across, top]),
-        np.column_stack([left + model.width - 1, down]),
-        np.column_stack([across, top + model.height - 1]),
-    )
+    that the image covers: it ends where its border comes nearest to the centre.
+
+    The polynomial of a wide lens may fold corners of the image, which then bound nothing.
+    """
     found = []
-    for k, border in enumerate(borders):
-        rays = unproject(model, border.astype(np.float64)) @ R_own_rectified
-        if np.isnan(rays).any():
-            raise InputError(
-                f"{source}: the distortion folds the image within its border, so its coefficients "
-                "are wrong or in another order; calibrate again, or check the distortion model."
-            )
+    for k, border in enumerate(_borders(model.width, model.height)):
+        rays = unproject(model, border) @ R_own_rectified
+        rays = rays[~np.isnan(rays).any(axis=1)]
+        if 2 * len(rays) < len(border):
+            raise _folded(source)
         with np.errstate(divide="ignore"):
             at = rays[:, k % 2] / np.maximum(rays[:, 2], 0.0)
         inner = at.max() if k < 2 else at.min()
         found.append(float(np.clip(inner, -_MAX_HALF_VIEW, _MAX_HALF_VIEW)))
     return np.array(found).reshape(2, 2)
+
+
+def _check_view(model: CameraModel, R_own_rectified: Array, camera: Camera, source: str) -> None:
+    """Refuse a view of which an image shows a part twice or not at all."""
+    xy = np.concatenate(_borders(camera.width, camera.height))
+    rays = camera.backproject(xy, np.ones(len(xy))) @ R_own_rectified.T
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    back = unproject(model, project(model, rays))
+    if not np.allclose(back, rays, rtol=0.0, atol=_SAME):
+        raise _folded(source)
+
+
+def _borders(width: int, height: int) -> tuple[Array, ...]:
+    """Pixels ``(N, 2)`` of an image's left, upper, right and lower border."""
+    across, down = np.arange(float(width)), np.arange(float(height))
+    top, left = np.zeros(width), np.zeros(height)
+    return (
+        np.column_stack([left, down]),
+        np.column_stack([across, top]),
+        np.column_stack([left + width - 1, down]),
+        np.column_stack([across, top + height - 1]),
+    )
+
+
+def _folded(source: str) -> InputError:
+    return InputError(
+        f"{source}: the distortion folds the image within its border, so its coefficients are "
+        "wrong or in another order; calibrate again, or check the distortion model."
+    )
 
 
 def _maps(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray[np.float32]:

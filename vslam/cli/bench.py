@@ -85,7 +85,7 @@ def bench(
     sequences, laws = parse_sequences(seqs), parse_perturbations(perturb)
     thresholds = Config() if config is None else load_config(config)
     options = execute.RunOptions(
-        data=data.absolute() if dataset == "kitti" else None,
+        data=data.absolute() if dataset != "synthetic" else None,
         config=thresholds.model_dump_json(indent=2) + "\n",  # as a run writes it
         threads=threads or max(1, min(available_cores() // jobs, 4)),
         scratch=None if scheduler else execute.scratch_folder(out.absolute()),
@@ -146,7 +146,7 @@ def _open_all(
         with render_bar(shown=shown) as on_render:
             found = open_sequence(dataset, root, name, max_frames=max_frames, on_render=on_render)
         frames[name] = len(found)
-    if dataset == "kitti":
+    if dataset != "synthetic":
         return frames, str(root)
     from vslam.datasets.synthetic import Variation, store
 

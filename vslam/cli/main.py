@@ -11,6 +11,7 @@ import typer
 
 from vslam.cli import (
     bench,
+    doctor,
     evaluate,
     info,
     loops,
@@ -30,7 +31,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-for _group in (run, evaluate, perturb, info, bench, report, synth, train, vocabulary, loops):
+for _group in (
+    run, evaluate, perturb, info, doctor, bench, report, synth, train, vocabulary, loops
+):  # fmt: skip
     _group.register(app)
 
 

@@ -190,6 +190,7 @@ def run(
         config=thresholds,
         weights=weights,
         realtime=realtime,
+        calib=tuple(calib or ()),
     )
     folder = create_run_folder(out, kind, source.name, perturbation.name, detector)
     recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()

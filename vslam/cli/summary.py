@@ -40,6 +40,8 @@ def error_rows(errors: Evaluation | ReportJson) -> Rows:
 
 def print_summary(report: ReportJson, folder: Path) -> None:
     """Print what matters of a run that is over; ``folder`` holds its results."""
+    from vslam.report.render import advice
+
     evaluated = report.alignment is not None
     submaps = f" in {report.submaps} sub-maps" if report.submaps > 1 else ""
     print_rows(
@@ -56,6 +58,7 @@ def print_summary(report: ReportJson, folder: Path) -> None:
             ("loops", _loops(report)),
             ("speed", f"{report.fps:.1f} fps"),
             ("map", f"{report.keyframes} keyframes, {report.landmarks} landmarks{submaps}"),
+            *([("advice", advice(report))] if advice(report) else []),
             ("folder", str(folder)),
             *((name, str(folder / file)) for name, file in _LOOK_AT if (folder / file).exists()),
         ]

@@ -18,6 +18,8 @@ _EXAMPLES = """
 
   vslam synth mine --trajectory poses/07.txt --calibration 04-12
 
+  vslam synth block --fisheye --out fisheye
+
   vslam synth demo --pairs 1000 --aliased --change 0.8 --out pairs
 
   vslam synth 05 --pairs 500 --lateral=-3.2:1.4 --heading 0:30 --out pairs
@@ -54,6 +56,13 @@ def synth(
         typer.Option(min=0, max=1, help="Change between passes; above 0.7 it grows dark."),
     ] = 0.0,
     depth: Annotated[bool, typer.Option("--depth", help="Write 16-bit depth (cm), too.")] = False,
+    fisheye: Annotated[
+        bool,
+        typer.Option(
+            "--fisheye",
+            help="Write an unrectified fisheye pair in EuRoC's layout with Kalibr's camchain.yaml.",
+        ),
+    ] = False,
     pairs: Annotated[
         int, typer.Option(min=0, help="Render so many labelled pairs for training instead.")
     ] = 0,
@@ -116,6 +125,8 @@ def synth(
         if trajectory is None
         else route_of_poses(read_kitti_poses(trajectory), route, calibration)
     )
+    if fisheye and (depth or pairs or verify):
+        raise InputError("--fisheye: leave out --depth, --pairs and --verify.")
     variation = Variation(seed, aliased, change, dynamic)
     threads = threads or min(available_cores(), 4)
     with render_bar(shown=not quiet) as on_frame:
@@ -125,6 +136,17 @@ def synth(
             root = out or Path("pairs")
             moves = Moves(_range("--lateral", lateral, -4.0), _range("--heading", heading, 0.0))
             render_pairs(drive, variation, root, pairs, moves, threads=threads, on_frame=on_frame)
+        elif fisheye:
+            from vslam.datasets.synthetic.fisheye import render_fisheye
+
+            root = render_fisheye(
+                drive,
+                variation,
+                out or Path(f"{route}-fisheye"),
+                until=max_frames,
+                threads=threads,
+                on_frame=on_frame,
+            )
         else:
             root = store.render_sequence(
                 drive,

@@ -18,6 +18,7 @@ _ALIGNMENTS = {
     "sim3": "Sim3 alignment, since the scale is arbitrary",
     "none": "not aligned",
 }
+_MANY_LOST = 0.1  # share of the frames
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,13 @@ def headlines(report: ReportJson) -> list[Headline]:
     ]
 
 
+def advice(report: ReportJson) -> str:
+    """What to look at after a run that lost many frames; empty after others."""
+    if report.lost_frames <= _MANY_LOST * report.frames:
+        return ""
+    return "Many frames were lost: vslam doctor checks images, calibration and time stamps."
+
+
 def _latency(report: ReportJson) -> list[Headline]:
     """In real time the machine decides what becomes of a frame: that is said with a tone."""
     if report.latency_ms is None:
@@ -95,6 +103,7 @@ def render_markdown(report: ReportJson) -> str:
     if report.interrupted:
         lines += [f"**Interrupted: {report.interrupted}.** Numbers are of the frames done.", ""]
     lines += markdown_table(("", "", ""), [(h.label, h.value, h.note) for h in headlines(report)])
+    lines += ["", advice(report)] if advice(report) else []
     if report.skipped_messages:
         lines += ["", "## Skipped frames", "", *(f"- {text}" for text in report.skipped_messages)]
     if report.evo_command:
@@ -123,6 +132,7 @@ def render_html(report: ReportJson, config: str, figures: Collection[ReportFigur
         "report.html.jinja",
         report=report,
         headlines=headlines(report),
+        advice=advice(report),
         stages=stage_rows(report),
         loop_tables=loop_tables(report),
         options=option_rows(report),
@@ -147,7 +157,8 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
     limit = "all" if report.max_frames is None else str(report.max_frames)
     weights = [("weights", str(report.weights))] if report.weights else []
     realtime = [("realtime", "yes")] if report.realtime else []
-    return [*options, ("max-frames", limit), *weights, *realtime]
+    calib = [("calib", str(path)) for path in report.calib]
+    return [*options, ("max-frames", limit), *weights, *realtime, *calib]
 
 
 def machine_rows(report: ReportJson) -> list[tuple[str, str]]:

@@ -144,6 +144,7 @@ class ReportJson(_Model):
     max_frames: int | None
     weights: Path | None = None
     realtime: bool = False
+    calib: tuple[Path, ...] = ()
 
     machine: Machine
     versions: dict[str, str]

@@ -39,6 +39,7 @@ class RunSettings:
     config: Config
     weights: Path | None = None
     realtime: bool = False
+    calib: tuple[Path, ...] = ()
 
     @property
     def alignment(self) -> str:

@@ -1,0 +1,246 @@
+"""Each planted fault is found, and nothing else; clean sequences have none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import StereoSequence
+from typer.testing import CliRunner
+
+from vslam.camera import Camera
+from vslam.cli.main import app
+from vslam.config import OrbConfig
+from vslam.datasets.euroc import open_euroc
+from vslam.datasets.kitti import open_kitti
+from vslam.doctor.checks import check_times
+from vslam.doctor.examine import examine
+from vslam.errors import UnreadableImageError
+
+REAL = Path(__file__).parents[2] / "shared/data"
+FEW = OrbConfig(n_features=500)  # for images of 480x160
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Images in memory as a sequence; ``second``: right images or depth."""
+
+    camera: Camera
+    left: list
+    second: list
+    timestamps: np.ndarray
+    ground_truth: np.ndarray | None = None
+    dataset: str = "drawn"
+    name: str = "corridor"
+
+    def __len__(self):
+        return len(self.left)
+
+    def read(self, index, image_map=map):
+        if self.left[index] is None:
+            raise UnreadableImageError(Path("000.png"), "cannot be decoded; download it again.")
+        return self.left[index], self.second[index]
+
+
+@pytest.fixture(scope="module")
+def clean(corridor: StereoSequence) -> Seen:
+    return Seen(corridor.camera, corridor.left, corridor.right, corridor.timestamps)
+
+
+def both(seen: Seen, change) -> Seen:
+    return replace(
+        seen, left=[change(i) for i in seen.left], second=[change(i) for i in seen.second]
+    )
+
+
+def right(seen: Seen, change) -> Seen:
+    return replace(seen, second=[change(i) for i in seen.second])
+
+
+def turned(image: np.ndarray, degrees: float) -> np.ndarray:
+    height, width = image.shape
+    M = cv2.getRotationMatrix2D((width / 2, height / 2), degrees, 1.0)
+    return cv2.warpAffine(image, M, (width, height), borderMode=cv2.BORDER_REFLECT)
+
+
+def dimmed(image: np.ndarray, gain: float) -> np.ndarray:
+    return np.rint(image * gain).astype(np.uint8)
+
+
+def shifted(times: np.ndarray) -> np.ndarray:
+    return times + np.where(np.arange(len(times)) % 3 == 1, 0.06, 0.0)
+
+
+def timed(seen: Seen, times: np.ndarray) -> Seen:
+    """The left camera alone, at other times."""
+    return replace(seen, second=[None] * len(seen), timestamps=times)
+
+
+def broken(seen: Seen) -> Seen:
+    left = list(seen.left)
+    left[-1] = None
+    return replace(seen, left=left)
+
+
+def swapped_times(times: np.ndarray) -> np.ndarray:
+    order = np.arange(len(times))
+    order[[4, 5]] = 5, 4
+    return times[order]
+
+
+FAULTS = {
+    "right camera rolled": (lambda s: right(s, lambda i: turned(i, 1.5)), "rectification"),
+    "right image lower": (lambda s: right(s, lambda i: np.roll(i, 3, axis=0)), "rectification"),
+    "sides swapped": (lambda s: replace(s, left=s.second, second=s.left), "sides"),
+    "one side twice": (lambda s: replace(s, second=s.left), "sides"),
+    "right image darker": (lambda s: right(s, lambda i: dimmed(i, 0.6)), "exposure"),
+    "right image late": (
+        lambda s: replace(s, second=[s.second[0], *s.second[:-1]]),
+        "synchronisation",
+    ),
+    "out of focus": (lambda s: both(s, lambda i: cv2.GaussianBlur(i, (0, 0), 2)), "sharpness"),
+    "no texture": (lambda s: both(s, lambda i: dimmed(i, 0.04)), "features"),
+    "jittering times": (lambda s: timed(s, shifted(s.timestamps)), "jitter"),
+    "a gap": (
+        lambda s: timed(s, s.timestamps + 0.4 * (np.arange(len(s)) > 12)),
+        "gaps",
+    ),
+    "times that turn back": (
+        lambda s: timed(s, swapped_times(s.timestamps)),
+        "order of times",
+    ),
+    "a damaged file": (broken, "images"),
+}
+
+
+def faults(seen, config: OrbConfig = FEW) -> list[str]:
+    found = examine(seen, config).faults
+    assert all(finding.fix for finding in found)
+    return [finding.check for finding in found]
+
+
+def test_nothing_is_wrong_with_the_corridor(clean):
+    diagnosis = examine(clean, FEW)
+    assert [f for f in diagnosis.findings if f.verdict != "good"] == []
+    assert {f.check for f in diagnosis.findings} >= {check for _, check in FAULTS.values()}
+    assert len(diagnosis.pictures) == 2
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_planted_fault_is_found_alone(clean, fault):
+    plant, check = FAULTS[fault]
+    assert faults(plant(clean)) == [check]
+
+
+def test_how_late_the_right_side_is(clean):
+    late = replace(clean, second=[*clean.second[2:], *clean.second[:2]])
+    (finding,) = examine(late, FEW).faults
+    assert finding.check == "synchronisation"
+    assert "2 frames early" in finding.fix
+
+
+def test_a_camera_that_stands_still_says_nothing_of_synchronisation(clean):
+    still = replace(clean, left=clean.left[:1] * len(clean), second=clean.second[:1] * len(clean))
+    found = {f.check: f.verdict for f in examine(still, FEW).findings}
+    assert found["synchronisation"] == "unknown"
+    assert "fault" not in found.values()
+
+
+def test_sides_of_different_places(clean):
+    noise = np.random.default_rng(0).integers(0, 256, clean.left[0].shape).astype(np.uint8)
+    assert faults(right(clean, lambda i: noise)) == ["stereo"]
+
+
+def boxes(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Textured boxes of several depths, and their depth."""
+    rng = np.random.default_rng(seed)
+    image = rng.integers(90, 110, (240, 320)).astype(np.uint8)
+    depth = np.full(image.shape, 4.0, np.float32)
+    for z in (3.0, 2.2, 1.5):
+        x, y = rng.integers(30, 220), rng.integers(30, 150)
+        image[y : y + 60, x : x + 70] = rng.integers(20, 90, (60, 70)) + rng.integers(0, 120)
+        depth[y : y + 60, x : x + 70] = z
+    return cv2.GaussianBlur(image, (0, 0), 0.6), depth
+
+
+@pytest.fixture(scope="module")
+def depth_images(clean) -> Seen:
+    images, depths = zip(*(boxes(k) for k in range(8)), strict=True)
+    return replace(clean, left=list(images), second=list(depths), timestamps=0.1 * np.arange(8))
+
+
+def test_registered_depth(depth_images):
+    diagnosis = examine(depth_images, FEW)
+    assert diagnosis.faults == []
+    assert {"depth", "registration"} <= {f.check for f in diagnosis.findings}
+    assert len(diagnosis.pictures) == 1
+
+
+def test_depth_of_another_camera(depth_images):
+    assert faults(right(depth_images, lambda d: np.roll(d, 9, axis=1))) == ["registration"]
+
+
+def test_hardly_any_depth(depth_images):
+    def thinned(depth):
+        depth = depth.copy()
+        depth[:, 70:] = np.nan
+        return depth
+
+    assert faults(right(depth_images, thinned))[0] == "depth"
+
+
+def test_depth_without_edges_says_nothing(depth_images):
+    flat = right(depth_images, lambda d: np.full_like(d, 2.0))
+    found = {f.check: f.verdict for f in examine(flat, FEW).findings}
+    assert found["registration"] == "unknown"
+
+
+def test_one_camera_alone(clean):
+    alone = replace(clean, second=[None] * len(clean))
+    found = {f.check for f in examine(alone, FEW).findings}
+    assert found == {"images", "features", "sharpness", "order of times", "gaps", "jitter"}
+
+
+def test_few_frames_have_no_rhythm():
+    assert [f.verdict for f in check_times(np.array([0.0, 1.0]))] == ["unknown"]
+
+
+def test_the_command(kitti_tree, tmp_path):
+    page, config = tmp_path / "page.html", tmp_path / "config.json"
+    config.write_text('{"orb": {"n_features": 500}}')
+    options = ["--config", str(config), "--out", str(page)]
+    done = CliRunner().invoke(app, ["doctor", str(kitti_tree), *options])
+    assert done.exit_code == 0, done.output
+    assert "0 faults" in done.output
+    text = page.read_text()
+    assert text.count("data:image/jpeg") == 2
+    assert "median vertical error" in text
+
+
+def test_the_command_turns_bad_input_into_a_finding(kitti_tree, tmp_path):
+    page, own = tmp_path / "page.html", tmp_path / "own.yaml"
+    one = "{focal: [240, 240], centre: [320, 240], size: [640, 480]}"
+    own.write_text(f"left: {one}\nright: {one}\nbaseline: 0.5\n")
+    options = ["--calib", str(own), "--out", str(page)]
+    done = CliRunner().invoke(app, ["doctor", str(kitti_tree), *options])
+    assert done.exit_code == 1
+    assert "made for 640x480 pixels but the images have 480x160" in done.output
+    assert "fix: take the calibration of these images" in done.output
+    assert "made for 640x480" in page.read_text()
+
+
+@pytest.mark.skipif(not (REAL / "kitti").is_dir(), reason="KITTI sample absent")
+def test_nothing_is_wrong_with_kitti():
+    assert faults(open_kitti(REAL / "kitti", "06"), OrbConfig()) == []
+
+
+@pytest.mark.skipif(not (REAL / "euroc").is_dir(), reason="EuRoC clip absent")
+def test_nothing_is_wrong_with_euroc():
+    sequence = open_euroc(REAL / "euroc/V1_01_start", "")
+    diagnosis = examine(sequence, OrbConfig())
+    assert diagnosis.faults == []
+    (rows,) = [f.measured for f in diagnosis.findings if f.check == "rectification"]
+    assert float(rows.split()[3]) < 0.3

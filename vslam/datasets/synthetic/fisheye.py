@@ -1,0 +1,180 @@
+"""A rendered drive as an unrectified fisheye pair would have taken it, with its calibration.
+
+The town is rendered by a rectified pinhole pair that sees enough; its images are warped into two
+equidistant cameras, each with lens, rotation and noise of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from vslam.calibration.models import Array, CameraModel, unproject
+from vslam.camera import Camera
+from vslam.datasets.image_files import read_grey
+from vslam.datasets.synthetic.files import frame_files, write, write_png, writing
+from vslam.datasets.synthetic.routes import RATE, Route
+from vslam.datasets.synthetic.site import Variation
+from vslam.datasets.synthetic.store import OnFrame, render_sequence
+
+# Of each side: focal length to that of the pinhole camera, principal point off the middle (px),
+# k1 to k4, and rotation from the rectified camera (rad).
+_SIDES = (
+    (0.970, (6.3, -3.1), (0.012, -0.006, 0.002, -0.0004), (0.011, -0.014, 0.009)),
+    (0.962, (-4.7, 5.2), (0.009, -0.004, 0.001, -0.0002), (-0.008, 0.013, -0.012)),
+)
+_NS = 1_000_000_000
+
+Warp = Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
+
+
+@dataclass(frozen=True)
+class FisheyeRig:
+    """A pair that stands where a rectified pair stands.
+
+    Attributes:
+        models: left and right camera.
+        R_own_rectified: of each, ``(3, 3)`` float64.
+        T_left_right: ``(4, 4)`` float64.
+    """
+
+    models: tuple[CameraModel, CameraModel]
+    R_own_rectified: tuple[Array, Array]
+    T_left_right: Array
+
+
+def fisheye_rig(camera: Camera) -> FisheyeRig:
+    """The fisheye pair in the place of a rectified one."""
+    models, rotations = [], []
+    for scale, (dx, dy), distortion, turn in _SIDES:
+        focal = scale * camera.fx
+        centre = (camera.width - 1) / 2 + dx, (camera.height - 1) / 2 + dy
+        size = camera.width, camera.height
+        models.append(CameraModel(focal, focal, *centre, *size, "fisheye", distortion))
+        rotations.append(np.asarray(cv2.Rodrigues(np.array(turn))[0], np.float64))
+    T_left_right = np.eye(4)
+    T_left_right[:3, :3] = rotations[0] @ rotations[1].T
+    T_left_right[:3, 3] = rotations[0] @ [camera.baseline, 0.0, 0.0]
+    return FisheyeRig((models[0], models[1]), (rotations[0], rotations[1]), T_left_right)
+
+
+def wide_camera(camera: Camera) -> Camera:
+    """The rectified pair of the same focal length that sees all that the fisheye pair sees."""
+    rig = fisheye_rig(camera)
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for model, R_own_rectified in zip(rig.models, rig.R_own_rectified, strict=True):
+        at = _seen_at(model, R_own_rectified, replace(camera, cx=0.0, cy=0.0))
+        low = np.minimum(low, np.floor(at.min(axis=(0, 1))) - 2)
+        high = np.maximum(high, np.ceil(at.max(axis=(0, 1))) + 2)
+    width, height = (high - low + 1).astype(int).tolist()
+    cx, cy = (-low).tolist()
+    return replace(camera, cx=cx, cy=cy, width=width, height=height)
+
+
+def render_fisheye(
+    route: Route,
+    variation: Variation,
+    folder: Path,
+    *,
+    until: int | None = None,
+    threads: int = 2,
+    on_frame: OnFrame | None = None,
+) -> Path:
+    """Write a drive in EuRoC's layout, with the calibration in its format and in Kalibr's.
+
+    The rendered pinhole images stay in ``folder/pinhole``, from where another call goes on.
+
+    Args:
+        route, variation, until, threads, on_frame: as `render_sequence` takes them.
+        folder: for ``mav0``, ``camchain.yaml`` and ``pinhole``.
+
+    Returns:
+        ``folder``.
+
+    Raises:
+        InputError: as `render_sequence`.
+    """
+    rig = fisheye_rig(route.camera)
+    wide = replace(route, camera=wide_camera(route.camera))
+    tree = render_sequence(
+        wide, variation, folder / "pinhole", until=until, threads=threads, on_frame=on_frame
+    )
+    rendered = tree / "sequences" / route.name
+    n = min(until or len(route.T_wc), len(route.T_wc))
+    stamps = [round(k * _NS / RATE) for k in range(n)]
+    T_body = (np.eye(4), rig.T_left_right)
+    with writing(folder):
+        for side, model in enumerate(rig.models):
+            base = folder / "mav0" / f"cam{side}"
+            (base / "data").mkdir(parents=True, exist_ok=True)
+            warp = _warp(_seen_at(model, rig.R_own_rectified[side], wide.camera))
+            for k, stamp in enumerate(stamps):
+                image = read_grey(frame_files(rendered, k, depth=False)[side])
+                write_png(base / "data" / f"{stamp}.png", warp(image), 1)
+            listed = "".join(f"{stamp},{stamp}.png\n" for stamp in stamps)
+            write(base / "data.csv", f"#timestamp [ns],filename\n{listed}".encode())
+            write(base / "sensor.yaml", _sensor(model, T_body[side]).encode())
+        truth = folder / "mav0" / "state_groundtruth_estimate0"
+        truth.mkdir(exist_ok=True)
+        T_wc = route.ground_truth[:n].copy()
+        T_wc[:, :3, :3] = T_wc[:, :3, :3] @ rig.R_own_rectified[0].T
+        write(truth / "data.csv", _states(stamps, T_wc).encode())
+        write(folder / "camchain.yaml", _camchain(rig).encode())
+    return folder
+
+
+def _seen_at(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray[np.float32]:
+    """``(H, W, 2)`` pixels of the rectified pinhole image that the pixels of a camera see."""
+    u, v = np.meshgrid(np.arange(model.width), np.arange(model.height))
+    own = unproject(model, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
+    at = camera.project(own @ R_own_rectified)[:, :2]
+    return at.reshape(*u.shape, 2).astype(np.float32)
+
+
+def _warp(at: NDArray[np.float32]) -> Warp:
+    def warp(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        found = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LANCZOS4)
+        return np.asarray(found, np.uint8)
+
+    return warp
+
+
+def _sensor(model: CameraModel, T_body_camera: Array) -> str:
+    return (
+        "%YAML:1.0\nsensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n"
+        f"  data: [{_list(T_body_camera)}]\nrate_hz: {RATE:g}\n"
+        f"resolution: [{model.width}, {model.height}]\ncamera_model: pinhole\n"
+        f"intrinsics: [{_list([model.fx, model.fy, model.cx, model.cy])}]\n"
+        f"distortion_model: equidistant\ndistortion_coefficients: [{_list(model.distortion)}]\n"
+    )
+
+
+def _camchain(rig: FisheyeRig) -> str:
+    text = ""
+    for side, model in enumerate(rig.models):
+        text += (
+            f"cam{side}:\n  camera_model: pinhole\n"
+            f"  intrinsics: [{_list([model.fx, model.fy, model.cx, model.cy])}]\n"
+            "  distortion_model: equidistant\n"
+            f"  distortion_coeffs: [{_list(model.distortion)}]\n"
+            f"  resolution: [{model.width}, {model.height}]\n  rostopic: /cam{side}/image_raw\n"
+        )
+    rows = "".join(f"  - [{_list(row)}]\n" for row in np.linalg.inv(rig.T_left_right))
+    return f"{text}  T_cn_cnm1:\n{rows}"
+
+
+def _states(stamps: list[int], T_wc: Array) -> str:
+    turns = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True, scalar_first=True)
+    rows = np.column_stack([T_wc[:, :3, 3], turns])
+    lines = [f"{stamp},{_list(row, ',')}\n" for stamp, row in zip(stamps, rows, strict=True)]
+    return "#timestamp [ns],p_x [m],p_y,p_z,q_w,q_x,q_y,q_z\n" + "".join(lines)
+
+
+def _list(numbers: object, separator: str = ", ") -> str:
+    return separator.join(repr(float(x)) for x in np.ravel(np.asarray(numbers, np.float64)))

@@ -1,0 +1,1 @@
+"""What to look at before a run: images, calibration and times, each with a verdict and a fix."""

@@ -1,0 +1,243 @@
+"""The checks, as functions of images, matches and times. Thresholds are named at the top.
+
+One file because each check is a few lines, and their thresholds are read together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.config import OrbConfig
+from vslam.datasets.sequence import Image
+from vslam.doctor.findings import Finding, judge
+from vslam.doctor.matching import Matches
+from vslam.frontend.orb import extract
+
+Times = NDArray[np.float64]
+Depth = NDArray[Any]  # numbers, 0 or NaN where missing
+
+# Matches are looked for in the same rows, to 2 px; KITTI's own rectification is off by 0.3 to 0.5.
+ROWS_PX = 0.8
+IN_FRONT = 0.9  # share of matches with positive disparity; distant ones scatter about zero
+EXPOSURE = 0.25  # of the brightness; the window of the stereo match is compared grey by grey
+LAG_GAIN_PX = 0.25  # another lag must make rows better by so much, and by the factor below
+LAG_FACTOR = 0.6
+FEATURES = 0.5  # of those asked for
+# Contrast of pixels with their neighbours, to that with their wider surroundings: KITTI 0.43, TUM
+# 0.25, EuRoC 0.27; at most 0.17 after a Gaussian blur of 1.5 px.
+SHARP = 0.18
+JITTER = 0.2  # of the interval, standard deviation
+GAP = 1.75  # of the interval: a frame is missing
+GAPS = 0.05  # share of intervals
+LONG_GAP = 3.5  # of the interval: two or more frames are missing in a row
+DEPTH_PX = 4.0  # depth edges of structured light are off by 2 to 3 px
+DEPTH_SHARE = 0.3
+_REACH = 16  # px that depth edges are looked for
+
+
+def check_rectification(matches: Matches) -> Finding:
+    """Median distance of matching rows."""
+    rows = float(np.median(np.abs(matches.left[:, 1] - matches.right[:, 1])))
+    return judge(
+        "rectification",
+        rows > ROWS_PX,
+        f"median vertical error {rows:.2f} px of {len(matches)} matches",
+        "the pair is not rectified: give its calibration with --calib, or calibrate again",
+    )
+
+
+def check_sides(matches: Matches) -> Finding:
+    """Sign of the disparity."""
+    disparity = matches.left[:, 0] - matches.right[:, 0]
+    in_front = float(np.mean(disparity > -ROWS_PX))
+    middle = float(np.median(disparity))
+    measured = f"median disparity {middle:.1f} px, {100 * in_front:.0f} % not behind infinity"
+    if float(np.median(np.abs(disparity))) < 0.1:
+        return Finding(
+            "sides", "fault", measured, "both sides show the same image: name the right camera's"
+        )
+    return judge(
+        "sides",
+        in_front < IN_FRONT,
+        measured,
+        "left and right are swapped, or the baseline has the wrong sign: exchange the cameras"
+        if middle < 0
+        else "many matches lie behind infinity: the cameras are turned outwards; calibrate again",
+    )
+
+
+def check_exposure(pairs: Sequence[tuple[Image, Image]], several: Sequence[Matches]) -> Finding:
+    """Brightness of the same points in both images."""
+    ratios = []
+    for (left, right), matches in zip(pairs, several, strict=True):
+        greys = [
+            cv2.blur(image, (7, 7))[np.rint(xy[:, 1]).astype(int), np.rint(xy[:, 0]).astype(int)]
+            for image, xy in ((left, matches.left), (right, matches.right))
+        ]
+        ratios.append((greys[1] + 1.0) / (greys[0] + 1.0))
+    ratio = float(np.median(np.concatenate(ratios)))
+    return judge(
+        "exposure",
+        abs(np.log(ratio)) > np.log1p(EXPOSURE),
+        f"the right image is {ratio:.2f} times as bright as the left one",
+        "let one camera set the exposure and gain of both",
+    )
+
+
+def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, int]:
+    """Where a right image later or earlier fits better, the sides are not of one time.
+
+    Args:
+        rows_of_lag: median vertical error (px) by how many frames later the right image is; empty
+            where no frame has matches at all of them.
+
+    Returns:
+        The finding, and the best lag: 0 where the camera hardly moves.
+    """
+    if not rows_of_lag:
+        return Finding("synchronisation", "unknown", "too few frames with matches"), 0
+    errors = ", ".join(f"{lag:+d}: {error:.2f} px" for lag, error in sorted(rows_of_lag.items()))
+    measured = f"vertical error by lag in frames: {errors}"
+    spread = max(rows_of_lag.values()) - min(rows_of_lag.values())
+    if spread < LAG_GAIN_PX:
+        return Finding("synchronisation", "unknown", f"{measured}; the camera hardly moves"), 0
+    best = min(rows_of_lag, key=lambda lag: (rows_of_lag[lag], abs(lag)))
+    now, then = rows_of_lag[0], rows_of_lag[best]
+    wrong = now - then > LAG_GAIN_PX and then < LAG_FACTOR * now
+    finding = judge(
+        "synchronisation",
+        wrong,
+        measured,
+        f"the right image is {abs(best)} frame{'s' * (abs(best) > 1)} "
+        f"{'late' if best > 0 else 'early'}: trigger both together, or shift one side's times",
+    )
+    return finding, best if wrong else 0
+
+
+def check_features(images: Sequence[Image], config: OrbConfig) -> Finding:
+    """Number of features per image."""
+    counts = [len(extract(image, config).xy) for image in images]
+    middle = int(np.median(counts))
+    return judge(
+        "features",
+        middle < FEATURES * config.n_features,
+        f"median {middle}, least {min(counts)} of {config.n_features} asked for",
+        "too little texture or light: more light, longer exposure, or a lower threshold "
+        "(docs/thresholds.md)",
+    )
+
+
+def check_sharpness(images: Sequence[Image]) -> Finding:
+    """Contrast of pixels with their neighbours, as a share of that with wider surroundings."""
+    shares = [sharpness(image) for image in images]
+    middle = float(np.median(shares))
+    return judge(
+        "sharpness",
+        middle < SHARP,
+        f"median {middle:.2f}, least {min(shares):.2f}; below {SHARP} features blur",
+        "focus the lens, clean it, or expose shorter",
+    )
+
+
+def sharpness(image: Image) -> float:
+    """0 for an image without fine contrast, about 1 for white noise."""
+    grey = image.astype(np.float32)
+    fine, wide = (grey - cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1.0, 4.0))
+    return float(np.std(fine) / max(float(np.std(wide)), 1e-6))
+
+
+def check_times(timestamps: Times) -> list[Finding]:
+    """Order, gaps and jitter of time stamps (s), which need not increase."""
+    steps = np.diff(timestamps)
+    if len(steps) < 3:
+        return [Finding("times", "unknown", f"{len(timestamps)} frames are too few")]
+    back = np.flatnonzero(steps <= 0)
+    interval = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    order = judge(
+        "order of times",
+        len(back) > 0,
+        f"{len(back)} of {len(steps)} intervals are not positive"
+        + (f", the first after frame {back[0]}" if len(back) else f", {1 / interval:.1f} Hz"),
+        "sort the frames by time and drop repeated ones",
+    )
+    if len(back):
+        return [order]
+    gaps = steps > GAP * interval
+    longest = int(np.argmax(steps))
+    gap = judge(
+        "gaps",
+        bool(np.mean(gaps) > GAPS or steps[longest] > LONG_GAP * interval),
+        f"{int(gaps.sum())} intervals with frames missing, the longest {steps[longest]:.3f} s "
+        f"after frame {longest}",
+        "frames were lost on the way to the disk: record to a faster one, or at a lower rate",
+    )
+    jitter = float(np.std(steps[~gaps])) / interval
+    steady = judge(
+        "jitter",
+        jitter > JITTER,
+        f"standard deviation {100 * jitter:.1f} % of the interval of {1e3 * interval:.1f} ms",
+        "take the time of the exposure from the camera, not that of the arrival",
+    )
+    return [order, gap, steady]
+
+
+def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Finding]:
+    """Whether depth belongs to the images' pixels.
+
+    Edges of depth are edges of the image: the shift at which they fit best is 0 where the depth is
+    registered.
+    """
+    depths = [np.nan_to_num(depth.astype(np.float32)) for depth in depths]
+    share = float(np.mean([np.mean(depth > 0) for depth in depths]))
+    there = judge(
+        "depth",
+        share < DEPTH_SHARE,
+        f"{100 * share:.0f} % of the pixels have a depth",
+        "the sensor sees little within its range: check the depth factor, or move closer",
+    )
+    fit = np.zeros((2 * _REACH + 1, 2 * _REACH + 1))
+    for image, depth in zip(images, depths, strict=True):
+        fit += _edge_fit(image, depth)
+    dy, dx = (int(at) - _REACH for at in np.unravel_index(np.argmax(fit), fit.shape))
+    shift = float(np.hypot(dx, dy))
+    contrast = float((fit.max() - np.median(fit)) / max(float(np.std(fit)), 1e-12))
+    measured = f"depth edges fit best {shift:.0f} px off ({dx:+d}, {dy:+d})"
+    if not fit.any() or contrast < 2.0:
+        return [there, Finding("registration", "unknown", "no edges of depth in these images")]
+    return [
+        there,
+        judge(
+            "registration",
+            shift > DEPTH_PX,
+            measured,
+            "the depth is not registered to the image: switch registration on in the driver, or "
+            "register the files",
+        ),
+    ]
+
+
+def _edge_fit(image: Image, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Mean edge strength of the image at the edges of depth, by shift of these."""
+    grey = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
+    strength = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+    strength /= cv2.blur(strength, (65, 65)) + 1.0
+    inner = depth_edges(depth)[_REACH:-_REACH, _REACH:-_REACH].astype(np.float32)
+    if not inner.any():
+        return np.zeros((2 * _REACH + 1, 2 * _REACH + 1), np.float32)
+    fit = cv2.matchTemplate(strength, inner, cv2.TM_CCORR) / float(inner.sum())
+    return np.asarray(fit, np.float32)
+
+
+def depth_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """``(H, W)``: pixels whose depth (0 where missing) jumps by a tenth."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log = np.where(depth > 0, np.log(depth), np.nan)
+        jump = np.zeros(depth.shape, bool)
+        jump[:, 1:] |= np.abs(np.diff(log, axis=1)) > 0.1
+        jump[1:] |= np.abs(np.diff(log, axis=0)) > 0.1
+    return jump

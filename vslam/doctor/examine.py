@@ -1,0 +1,183 @@
+"""Look a sequence over: a few frames spread over it, and all its times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from vslam.config import OrbConfig
+from vslam.datasets.sequence import Image, Sequence
+from vslam.doctor import checks
+from vslam.doctor.findings import Finding, judge
+from vslam.doctor.matching import Matches, joined, match_images
+from vslam.errors import UnreadableImageError
+
+_FRAMES = 8  # looked at, spread over the sequence
+_LAGS = range(-2, 3)  # frames that the right side may be early or late
+_PICTURES = 2
+_DRAWN = 60  # matches in a picture
+_GREEN, _RED, _BLUE = (80, 200, 60), (60, 60, 230), (230, 150, 50)  # BGR
+
+
+@dataclass(frozen=True)
+class Picture:
+    """``image``: ``(H, W, 3)`` uint8, BGR."""
+
+    caption: str
+    image: Image
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found, in the order of the checks, and pictures that show it."""
+
+    findings: list[Finding]
+    pictures: list[Picture] = field(default_factory=list)
+
+    @property
+    def faults(self) -> list[Finding]:
+        """The findings that need repair."""
+        return [finding for finding in self.findings if finding.verdict == "fault"]
+
+
+def examine(sequence: Sequence, config: OrbConfig) -> Diagnosis:
+    """Run all checks that the sequence allows: stereo, depth or one camera.
+
+    Images are those that a run would see: rectified ones.
+    """
+    frames = np.unique(np.linspace(0, len(sequence) - 1, _FRAMES).round().astype(int)).tolist()
+    read: dict[int, tuple[Image, Image | None]] = {}
+    problems = []
+    for frame in frames:
+        try:
+            read[frame] = sequence.read(frame)
+        except UnreadableImageError as error:
+            problems.append(f"frame {frame}: {error}")
+    findings = [
+        judge(
+            "images",
+            bool(problems),
+            f"{len(frames) - len(problems)} of {len(frames)} frames looked at can be read"
+            + "".join(f"; {problem.rstrip('.')}" for problem in problems[:1]),
+            "replace the damaged files",
+        )
+    ]
+    lefts = {frame: left for frame, (left, _) in read.items()}
+    if lefts:
+        images = list(lefts.values())
+        findings += [checks.check_features(images, config), checks.check_sharpness(images)]
+    findings += checks.check_times(sequence.timestamps)
+    seconds = [second for _, second in read.values() if second is not None]
+    if not seconds:
+        return Diagnosis(findings)
+    if seconds[0].dtype == np.uint8:
+        blind = any(f.check == "features" and f.verdict == "fault" for f in findings)
+        found, pictures = _examine_stereo(sequence, lefts, blind=blind)
+    else:
+        found = checks.check_depth(images, seconds)
+        pictures = [_depth_picture(images[0], seconds[0])]
+    return Diagnosis(findings + found, pictures)
+
+
+@dataclass(frozen=True)
+class _Pair:
+    frame: int
+    lag: int
+    left: Image
+    right: Image
+    matches: Matches
+
+    @property
+    def rows(self) -> float:
+        """Median vertical error (px)."""
+        return float(np.median(np.abs(self.matches.left[:, 1] - self.matches.right[:, 1])))
+
+
+def _pairs(sequence: Sequence, lefts: dict[int, Image], lag: int) -> list[_Pair]:
+    """Left images with the right ones so many frames later, where both can be read."""
+    found = []
+    for frame, left in lefts.items():
+        try:
+            right = sequence.read(frame + lag)[1] if 0 <= frame + lag < len(sequence) else None
+        except UnreadableImageError:
+            continue
+        if right is not None:
+            found.append(_Pair(frame, lag, left, right, match_images(left, right)))
+    return found
+
+
+def _examine_stereo(
+    sequence: Sequence, lefts: dict[int, Image], *, blind: bool
+) -> tuple[list[Finding], list[Picture]]:
+    by_lag = {lag: _pairs(sequence, lefts, lag) for lag in _LAGS}
+    pairs = by_lag[0]
+    if not any(len(pair.matches) for pair in pairs):
+        fix = "the two sides show nothing in common: check that they are one pair's, and calibrated"
+        measured = "no pair of images has 12 matches"
+        finding = Finding("stereo", "fault", measured, fix)
+        if blind:
+            finding = Finding("stereo", "unknown", f"{measured}; they have few features")
+        return [finding], [_stereo_picture(pair) for pair in pairs[:1]]
+    synchronised, lag = checks.check_synchronisation(_rows_by_lag(by_lag))
+    pairs = by_lag[lag]  # what else is wrong shows at the right time only
+    matches = joined([pair.matches for pair in pairs])
+    findings = [
+        synchronised,
+        checks.check_rectification(matches),
+        checks.check_sides(matches),
+        checks.check_exposure(
+            [(pair.left, pair.right) for pair in pairs], [pair.matches for pair in pairs]
+        ),
+    ]
+    shown = sorted(pairs, key=lambda pair: -len(pair.matches))[:_PICTURES]
+    return findings, [_stereo_picture(pair) for pair in shown]
+
+
+def _rows_by_lag(by_lag: dict[int, list[_Pair]]) -> dict[int, float]:
+    """Median vertical error by lag, over the frames that have matches at all of them."""
+    rows = {
+        lag: {pair.frame: pair.rows for pair in pairs if len(pair.matches)}
+        for lag, pairs in by_lag.items()
+    }
+    frames = set.intersection(*(set(found) for found in rows.values()))
+    return {
+        lag: float(np.median([found[frame] for frame in frames]))
+        for lag, found in rows.items()
+        if frames
+    }
+
+
+def _stereo_picture(pair: _Pair) -> Picture:
+    """Both images beside each other with the rows, and matches in green where rows agree."""
+    left, right, matches = pair.left, pair.right, pair.matches
+    height = max(left.shape[0], right.shape[0])
+    canvas = np.zeros((height, left.shape[1] + right.shape[1]), np.uint8)
+    canvas[: left.shape[0], : left.shape[1]] = left
+    canvas[: right.shape[0], left.shape[1] :] = right
+    drawn = cv2.cvtColor(canvas, cv2.COLOR_GRAY2BGR)
+    for row in range(height // 12, height, height // 6):
+        cv2.line(drawn, (0, row), (drawn.shape[1] - 1, row), _BLUE, 1)
+    off = np.abs(matches.left[:, 1] - matches.right[:, 1])
+    for k in np.linspace(0, len(matches) - 1, min(_DRAWN, len(matches))).astype(int):
+        color = _GREEN if off[k] <= checks.ROWS_PX else _RED
+        a = np.rint(matches.left[k]).astype(int).tolist()
+        b = np.rint(matches.right[k] + (left.shape[1], 0)).astype(int).tolist()
+        cv2.circle(drawn, a, 4, color, 1, cv2.LINE_AA)
+        cv2.circle(drawn, b, 4, color, 1, cv2.LINE_AA)
+        cv2.line(drawn, a, b, color, 1, cv2.LINE_AA)
+    other = f" with the right image of frame {pair.frame + pair.lag}" if pair.lag else ""
+    caption = (
+        f"Frame {pair.frame}{other}: rows in blue; matches in green where their rows agree to "
+        f"{checks.ROWS_PX} px, else in red. In a rectified pair all are level."
+    )
+    return Picture(caption, np.asarray(drawn, np.uint8))
+
+
+def _depth_picture(image: Image, depth: checks.Depth) -> Picture:
+    """Edges of depth over the image."""
+    drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    drawn[checks.depth_edges(np.nan_to_num(depth.astype(np.float32)))] = _RED
+    caption = "Edges of depth in red over the image: registered depth has them on the objects."
+    return Picture(caption, np.asarray(drawn, np.uint8))

@@ -1,0 +1,77 @@
+"""Matches between two images that presume nothing of how the cameras stand.
+
+A run looks for the right image's features in the left one's rows only; whoever wants to know
+whether that is right must look everywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.datasets.sequence import Image
+
+_FEATURES = 2000
+_MAX_DISTANCE = 64  # bits of 256, as ORB-SLAM2's TH_LOW is 50
+_EPIPOLAR_PX = 1.5
+_REFINED_PX = 3.0  # a keypoint of a coarse octave is off by so much
+_WINDOW = (15, 15)
+_MIN_MATCHES = 12
+
+
+@dataclass(frozen=True)
+class Matches:
+    """``left`` and ``right``: ``(N, 2)`` float32 pixels of the same points, to a tenth of one."""
+
+    left: NDArray[np.float32]
+    right: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.left)
+
+
+def match_images(left: Image, right: Image) -> Matches:
+    """ORB matches that obey one epipolar geometry, refined by optical flow; none below twelve."""
+    orb = cv2.ORB.create(_FEATURES)
+    kp_left, d_left = orb.detectAndCompute(left, None)
+    kp_right, d_right = orb.detectAndCompute(right, None)
+    none = Matches(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
+    if len(kp_left) < _MIN_MATCHES or len(kp_right) < _MIN_MATCHES:
+        return none
+    found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(d_left, d_right)
+    found = [match for match in found if match.distance <= _MAX_DISTANCE]
+    if len(found) < _MIN_MATCHES:
+        return none
+    a = np.array([kp_left[match.queryIdx].pt for match in found], np.float32)
+    b = np.array([kp_right[match.trainIdx].pt for match in found], np.float32)
+    refined, tracked, _ = cv2.calcOpticalFlowPyrLK(
+        left, _like(right, left), a, b.copy(), winSize=_WINDOW, maxLevel=0,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # fmt: skip
+    near = (tracked.ravel() == 1) & (np.linalg.norm(refined - b, axis=1) < _REFINED_PX)
+    a, b = a[near], refined[near]
+    if len(a) < _MIN_MATCHES:
+        return none
+    _, obeys = cv2.findFundamentalMat(a, b, cv2.FM_RANSAC, _EPIPOLAR_PX, 0.999)
+    if obeys is None or obeys.sum() < _MIN_MATCHES:
+        return none
+    kept = obeys.ravel() == 1
+    return Matches(a[kept], b[kept])
+
+
+def joined(several: list[Matches]) -> Matches:
+    """All matches of several pairs; at least one pair."""
+    return Matches(
+        np.concatenate([matches.left for matches in several]),
+        np.concatenate([matches.right for matches in several]),
+    )
+
+
+def _like(image: Image, model: Image) -> Image:
+    """An image in the brightness and contrast of another one, which optical flow presumes."""
+    gain = float(model.std()) / max(float(image.std()), 1.0)
+    shifted = (image.astype(np.float32) - image.mean()) * gain + model.mean()
+    return np.clip(np.rint(shifted), 0, 255).astype(np.uint8)

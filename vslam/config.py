@@ -151,6 +151,12 @@ class TrackingConfig(_Section):
     min_inliers_lost: int = Field(
         15, ge=3, description="Inliers; with fewer, the frame is LOST. [own]"
     )
+    depth_min_inlier_ratio: float = Field(
+        0.2,
+        ge=0,
+        le=1,
+        description="RGB-D: inliers over matches; below, the frame is LOST. [own]",
+    )
     lost_frames_before_restart: int = Field(
         3, ge=1, description="Stereo: lost frames until a sub-map starts at the prediction. [own]"
     )

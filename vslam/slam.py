@@ -161,10 +161,10 @@ class Slam:
         clock.lap("track_frame")
         matches, inliers, visible = self._track_local_map(frame, inliers)
         clock.lap("track_local_map")
-        state, relocalised = self._state_of(inliers), False
+        state, relocalised = self._state_of(inliers, matches), False
         if state == TrackingState.LOST:
             matches = inliers = self._relocalise(frame)
-            state = self._state_of(inliers)
+            state = self._state_of(inliers, matches)
             relocalised = state != TrackingState.LOST
             clock.lap("relocalise")
         if state == TrackingState.LOST:
@@ -282,10 +282,13 @@ class Slam:
                 return len(found.feature)
         return 0
 
-    def _state_of(self, inliers: int) -> TrackingState:
-        if inliers < self.config.tracking.min_inliers_lost:
+    def _state_of(self, inliers: int, matches: int) -> TrackingState:
+        config = self.config.tracking
+        # In the wide windows of an RGB-D camera, a wrong pose too finds some inliers.
+        too_few = self.camera.depth and inliers < config.depth_min_inlier_ratio * matches
+        if inliers < config.min_inliers_lost or too_few:
             return TrackingState.LOST
-        if inliers < self.config.tracking.min_inliers:
+        if inliers < config.min_inliers:
             return TrackingState.WEAK
         return TrackingState.OK
 

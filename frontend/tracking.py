@@ -134,9 +134,12 @@ def extract_features(
         if second is None:
             u_right = np.full(len(found.xy), np.nan, np.float32)
         else:
-            u_right = columns_of_depth(found.xy, second, camera, config.depth)
+            u_right = columns_of_depth(
+                found.xy, np.asarray(second, np.float32), camera, config.depth
+            )
     else:
-        found, right = image_map(lambda image: extract(image, config.orb), [left, second])
+        pair = [left, np.asarray(second, np.uint8)]
+        found, right = image_map(lambda image: extract(image, config.orb), pair)
         u_right = match_stereo(found, right, camera, config.stereo)
     return Features(found.xy, found.octave, found.angle, found.descriptors, u_right)
 

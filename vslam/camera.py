@@ -12,7 +12,6 @@ from typing import Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-
 Image = NDArray[np.uint8]  # (H, W) grey
 DepthImage = NDArray[np.float32]  # (H, W) metres along z, 0 where unknown
 Sensor = Literal["stereo", "mono", "rgbd"]

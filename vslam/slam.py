@@ -38,7 +38,6 @@ from vslam.monocular import Initialiser
 from vslam.trajectory import Trajectory
 
 
-
 class Slam:
     """Stereo or RGB-D SLAM; monocular SLAM, in a unit of its own, with a camera without a baseline.
 
@@ -114,9 +113,7 @@ class Slam:
         """What each closed loop did to the keyframes. Call ``finish()`` first."""
         return self._closing.corrections
 
-    def step(
-        self, left: Image, second: Image | DepthImage | None, timestamp: float
-    ) -> TrackResult:
+    def step(self, left: Image, second: Image | DepthImage | None, timestamp: float) -> TrackResult:
         """Track one rectified stereo pair, an image with its depth, or a monocular image, and map
         it if it is new.
 

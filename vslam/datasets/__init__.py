@@ -81,7 +81,8 @@ def open_sequence(
             on_frame=on_render,
         )
     raise InputError(
-        f"--dataset {dataset}: unknown data set; this version reads kitti, euroc, tum and synthetic."
+        f"--dataset {dataset}: unknown data set; this version reads kitti, euroc, tum and "
+        "synthetic."
     )
 
 

@@ -77,7 +77,7 @@ class Perturbation:
         for law in self.laws:
             left = law(index, t, 0, left)
             if second is not None and second.dtype == np.uint8:
-                second = law(index, t, 1, second)
+                second = law(index, t, 1, np.asarray(second, np.uint8))
         return left, second
 
 

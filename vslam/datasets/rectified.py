@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vslam.calibration.models import Calibration
 from vslam.calibration.rectification import Rectification, rectify
 from vslam.camera import Camera, ImageMap
-from vslam.datasets.sequence import Image, Sequence
+from vslam.datasets.sequence import DepthImage, Image, Sequence
 from vslam.errors import InputError
 
 
@@ -34,7 +34,9 @@ class RawSequence(Protocol):
 
     def __len__(self) -> int: ...
 
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
+    def read(
+        self, index: int, image_map: ImageMap = map
+    ) -> tuple[Image, Image | DepthImage | None]:
         """As `Sequence.read`, all images of one side of one size."""
         ...
 
@@ -79,7 +81,7 @@ class RectifiedSequence:
         left, right = self.raw.read(index, image_map)
         sides = [partial(self.rectification.left, left)]
         if right is not None:
-            sides.append(partial(self.rectification.right, right))
+            sides.append(partial(self.rectification.right, np.asarray(right, np.uint8)))
         left, *rest = image_map(partial.__call__, sides)
         return left, rest[0] if rest else None
 
@@ -108,7 +110,7 @@ def rectified(raw: RawSequence, calibration: Calibration) -> Sequence:
     return RectifiedSequence(raw, rectify(calibration))
 
 
-def _check_size(source: str, calibrated: tuple[int, int], image: Image) -> None:
+def _check_size(source: str, calibrated: tuple[int, int], image: Image | DepthImage) -> None:
     width, height = calibrated
     if image.shape != (height, width):
         raise InputError(

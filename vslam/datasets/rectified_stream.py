@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 
+import numpy as np
+
 from vslam.calibration.models import Calibration
 from vslam.calibration.rectification import Rectification, rectify
 from vslam.camera import Camera, ImageMap
@@ -96,6 +98,6 @@ def _read(
     left, right = frame.read(image_map)
     sides = [partial(rectification.left, left)]
     if right is not None:
-        sides.append(partial(rectification.right, right))
+        sides.append(partial(rectification.right, np.asarray(right, np.uint8)))
     left, *rest = image_map(partial.__call__, sides)
     return left, rest[0] if rest else None

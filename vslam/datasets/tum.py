@@ -126,10 +126,11 @@ def open_tum(
         UnreadableImageError: a file is empty, the first pair cannot be decoded or does not fit.
     """
     folder = _find(root, name)
-    times, colour = _read_list(folder / "rgb.txt")
-    frames, depth = np.arange(len(times)), ()
+    times, colour_files = _read_list(folder / "rgb.txt")
+    frames = partners = np.arange(len(times))
+    depth_files: list[Path] = []
     if not monocular:
-        depth_times, depth = _read_list(folder / "depth.txt")
+        depth_times, depth_files = _read_list(folder / "depth.txt")
         frames, partners = associate(times, depth_times, _NEAR_S)
         if not len(frames):
             raise InputError(
@@ -137,8 +138,9 @@ def open_tum(
                 "depth.txt of one recording, or run on the colour images with --sensor mono."
             )
     chosen = select_frames(folder, len(frames), start, every, max_frames)
-    times, colour = times[frames[chosen]], tuple(colour[k] for k in frames[chosen])
-    depth = () if monocular else tuple(depth[k] for k in partners[chosen])
+    times = times[frames[chosen]]
+    colour = tuple(colour_files[k] for k in frames[chosen])
+    depth = () if monocular else tuple(depth_files[k] for k in partners[chosen])
     for path in (*colour, *depth):
         check_not_empty(path)
     height, width = read_grey(colour[0]).shape
@@ -230,7 +232,9 @@ def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
         except ValueError:
             name = ""
         if not name or not np.isfinite(times[-1]):
-            raise InputError(f"{path}: line {number} is not a time in seconds and a file; repair it.")
+            raise InputError(
+                f"{path}: line {number} is not a time in seconds and a file; repair it."
+            )
         if len(times) > 1 and times[-1] <= times[-2]:
             raise InputError(
                 f"{path}: line {number} is not later than the one before it; sort the list by time."

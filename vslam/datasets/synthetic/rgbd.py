@@ -27,9 +27,10 @@ def render_rgbd(
 ) -> Path:
     """Render a route, or what is missing of it, into a folder and return the folder.
 
-    ``out/stereo`` has the same drive as a KITTI tree. The left image is the colour one; the depth, which sees as far as the town goes, is in
-    centimetres, 0 where there is sky. The virtual baseline of ``calibration.yaml`` is that of the
-    rendered pair, so that both sensors are as sure of far points.
+    ``out/stereo`` has the same drive as a KITTI tree. The left image is the colour one; the depth,
+    which sees as far as the town goes, is in centimetres, 0 where there is sky. The virtual
+    baseline of ``calibration.yaml`` is that of the rendered pair, so that both sensors are as sure
+    of far points.
 
     Args:
         until: write the frames before this one only.
@@ -38,7 +39,13 @@ def render_rgbd(
         InputError: as `render_sequence`; the folder cannot be written.
     """
     root = render_sequence(
-        route, variation, out / "stereo", depth=True, until=until, threads=threads, on_frame=on_frame
+        route,
+        variation,
+        out / "stereo",
+        depth=True,
+        until=until,
+        threads=threads,
+        on_frame=on_frame,
     )
     n = min(until or len(route.T_wc), len(route.T_wc))
     source = root / "sequences" / route.name

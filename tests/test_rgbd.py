@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import AXES, CEILING, PLANES, StereoSequence
+from conftest import CEILING, PLANES, StereoSequence
 
 from vslam.camera import Camera
 from vslam.cli.main import app
@@ -44,7 +44,7 @@ def corridor_depth(camera: Camera, T_wc: np.ndarray) -> np.ndarray:
     )
     rays, centre = rays @ T_wc[:3, :3].T, T_wc[:3, 3]
     depth = np.full(u.shape, np.inf)
-    for (normal, offset), _ in zip(PLANES, AXES, strict=True):
+    for normal, offset in PLANES:
         with np.errstate(divide="ignore", invalid="ignore"):
             along = (offset - normal @ centre) / (rays @ normal)
         hit = centre + along[..., None] * rays

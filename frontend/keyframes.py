@@ -29,14 +29,22 @@ class KeyframeEvidence:
     mapping_idle: bool
 
 
-def needs_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig) -> bool:
-    """Decide. Enough new must be visible, and either mapping is free or it is urgent."""
+def needs_keyframe(
+    evidence: KeyframeEvidence, config: KeyframeConfig, *, depth: bool = False
+) -> bool:
+    """Decide. Enough new must be visible, and either mapping is free or it is urgent.
+
+    Args:
+        depth: of an RGB-D camera. Nearly all it sees is close and mapped at once, so that the
+            counts ask for few keyframes; a hand turns it faster than a car turns.
+    """
+    max_interval_s = config.depth_max_interval_s if depth else config.max_interval_s
     starved = (
         evidence.tracked_close < config.min_tracked_close
         and evidence.untracked_close > config.min_new_close
     )
     moved_on = evidence.n_inliers < config.max_tracked_ratio * evidence.n_reference
-    if evidence.seconds_since_keyframe >= config.max_interval_s:
+    if evidence.seconds_since_keyframe >= max_interval_s:
         return True
     if not (moved_on or starved):
         return False

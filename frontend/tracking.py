@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from vslam.camera import Camera, ImageMap
 from vslam.config import Config
 from vslam.features import FeatureGrid, Features
+from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.matching import (
     Projections,
     Searchable,
@@ -100,25 +101,47 @@ class TrackingContext:
         """Depth (m) below which a stereo point is close (ORB-SLAM2, III-A)."""
         return self.config.stereo.close_depth_baselines * self.camera.baseline
 
+    @property
+    def motion_window(self) -> float:
+        """Search radius at octave 0 around what the previous frame saw, pixels."""
+        config = self.config.tracking
+        return config.depth_motion_window if self.camera.depth else config.motion_window
+
+    @property
+    def local_window(self) -> float:
+        """Search radius at octave 0 around landmarks of the local map, pixels."""
+        config = self.config.tracking
+        return config.depth_local_window if self.camera.depth else config.local_window
+
 
 def extract_features(
     left: NDArray[np.uint8],
-    right: NDArray[np.uint8] | None,
+    second: NDArray[np.uint8] | NDArray[np.float32] | None,
     context: TrackingContext,
     image_map: ImageMap = map,
 ) -> Features:
-    """ORB features of the left image with their stereo matches, none without a right image.
+    """ORB features of the left image with their columns in the right one.
 
     A pure function, whatever ``image_map`` is.
+
+    Args:
+        second: right image; with ``camera.depth`` that of the depth in metres; or None, and no
+            feature has a column in a right image.
     """
-    config = context.config
-    images = [left] if right is None else [left, right]
-    in_left, *in_right = image_map(lambda image: extract(image, config.orb), images)
-    if in_right:
-        u_right = match_stereo(in_left, in_right[0], context.camera, config.stereo)
+    camera, config = context.camera, context.config
+    if second is None or camera.depth:
+        found = extract(left, config.orb)
+        if second is None:
+            u_right = np.full(len(found.xy), np.nan, np.float32)
+        else:
+            u_right = columns_of_depth(
+                found.xy, np.asarray(second, np.float32), camera, config.depth
+            )
     else:
-        u_right = np.full(len(in_left.xy), np.nan, np.float32)
-    return Features(in_left.xy, in_left.octave, in_left.angle, in_left.descriptors, u_right)
+        pair = [left, np.asarray(second, np.uint8)]
+        found, right = image_map(lambda image: extract(image, config.orb), pair)
+        u_right = match_stereo(found, right, camera, config.stereo)
+    return Features(found.xy, found.octave, found.angle, found.descriptors, u_right)
 
 
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
@@ -155,7 +178,7 @@ def track_motion(
         low, high = np.zeros_like(octave), octave
     matches, inliers = 0, 0
     for widening in (1.0, 2.0, 4.0):
-        radius = np.where(ahead, config.motion_window * widening * context.scales[octave], 0.0)
+        radius = np.where(ahead, context.motion_window * widening * context.scales[octave], 0.0)
         found = _search(
             frame,
             Projections(uvr, radius, low, high, before.descriptors[source].view(np.uint64)),
@@ -231,7 +254,7 @@ def track_local_map(
     """Match every local landmark that should be visible, then refine the pose with all matches.
 
     Args:
-        window: search radius at octave 0, pixels; None: ``tracking.local_window``.
+        window: search radius at octave 0, pixels; None: ``context.local_window``.
 
     Returns:
         Matches, inliers, and the ids of the landmarks that should be visible.
@@ -249,7 +272,7 @@ def track_local_map(
         camera.width,
         camera.height,
         context.scales,
-        config.local_window if window is None else window,
+        context.local_window if window is None else window,
     )
     visible = radius > 0
     radius[tracked] = 0.0

@@ -7,22 +7,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+Image = NDArray[np.uint8]  # (H, W) grey
+DepthImage = NDArray[np.float32]  # (H, W) metres along z, 0 where unknown
+Sensor = Literal["stereo", "mono", "rgbd"]
+
 
 @dataclass(frozen=True)
 class Camera:
-    """A rectified stereo pair: both cameras share one focal length, rows correspond.
+    """A rectified stereo pair: both cameras share one focal length, rows correspond. Or a camera
+    with a depth image, or one camera alone.
 
     Attributes:
         fx, fy: focal lengths in pixels.
         cx, cy: principal point of the left camera in pixels.
         baseline: distance from the left to the right camera in metres; 0 says that there is no
             right camera, and a map has no metres but a unit of its own (``backend/two_views.py``).
+            With a depth image it is virtual: it says how sure depths are (``frontend/depth.py``).
         width, height: image size in pixels.
+        depth: whether the second image is not that of a right camera but the depth of the left
+            one's pixels.
     """
 
     fx: float
@@ -32,6 +40,14 @@ class Camera:
     baseline: float
     width: int
     height: int
+    depth: bool = False
+
+    @property
+    def sensor(self) -> Sensor:
+        """What the images are, in the word of ``--sensor``."""
+        if self.monocular:
+            return "mono"
+        return "rgbd" if self.depth else "stereo"
 
     @property
     def monocular(self) -> bool:
@@ -40,7 +56,7 @@ class Camera:
 
     def left_camera(self) -> Camera:
         """The left camera alone."""
-        return replace(self, baseline=0.0)
+        return replace(self, baseline=0.0, depth=False)
 
     @property
     def bf(self) -> float:

@@ -71,6 +71,17 @@ class StereoConfig(_Section):
     )
 
 
+class DepthConfig(_Section):
+    """Depth images [OS2, III-A]."""
+
+    min_metres: float = Field(
+        0.1, gt=0, description="Depth below which a pixel's is unknown, metres. [own]"
+    )
+    max_metres: float = Field(
+        100.0, gt=0, description="Depth above which a pixel's is unknown, metres. [own]"
+    )
+
+
 class TrackingConfig(_Section):
     """Frame-to-map tracking."""
 
@@ -106,6 +117,12 @@ class TrackingConfig(_Section):
     local_window: float = Field(
         2.5, gt=0, description="Search radius at octave 0, local map, pixels. [OS1 V-D, customary]"
     )
+    depth_motion_window: float = Field(
+        15.0, gt=0, description="motion_window of an RGB-D camera. [OS1 V-B, customary]"
+    )
+    depth_local_window: float = Field(
+        5.0, gt=0, description="local_window of an RGB-D camera; ORB-SLAM2 has 7.5. [OS1 V-D, own]"
+    )
     local_keyframes: int = Field(
         80, ge=1, description="Keyframes of the local map, at most. [OS1 V-D, customary]"
     )
@@ -133,6 +150,12 @@ class TrackingConfig(_Section):
     )
     min_inliers_lost: int = Field(
         15, ge=3, description="Inliers; with fewer, the frame is LOST. [own]"
+    )
+    depth_min_inlier_ratio: float = Field(
+        0.2,
+        ge=0,
+        le=1,
+        description="RGB-D: inliers over matches; below, the frame is LOST. [own]",
     )
     lost_frames_before_restart: int = Field(
         3, ge=1, description="Stereo: lost frames until a sub-map starts at the prediction. [own]"
@@ -216,6 +239,9 @@ class KeyframeConfig(_Section):
 
     max_interval_s: float = Field(
         1.0, gt=0, description="Longest time without a keyframe, seconds. [OS1 V-E, customary]"
+    )
+    depth_max_interval_s: float = Field(
+        0.3, gt=0, description="max_interval_s of an RGB-D camera, held in a hand. [own]"
     )
     min_tracked_close: int = Field(
         100, ge=0, description="Tracked close points; fewer are too few. [OS2 III-E, printed]"
@@ -619,6 +645,7 @@ class Config(_Section):
 
     orb: OrbConfig = OrbConfig()
     stereo: StereoConfig = StereoConfig()
+    depth: DepthConfig = DepthConfig()
     tracking: TrackingConfig = TrackingConfig()
     initialization: InitializationConfig = InitializationConfig()
     keyframes: KeyframeConfig = KeyframeConfig()

@@ -1,4 +1,4 @@
-"""SLAM on a stereo or monocular stream: ``Slam.step`` is the method section.
+"""SLAM on a stereo, RGB-D or monocular stream: ``Slam.step`` is the method section.
 
 One file because the step and the decisions that it calls are read together.
 """
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
+from vslam.camera import Camera, DepthImage, Image
 from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.features import Features, TrackingState, TrackResult
@@ -37,11 +37,9 @@ from vslam.mapping import MappingThread
 from vslam.monocular import Initialiser
 from vslam.trajectory import Trajectory
 
-Image = NDArray[np.uint8]
-
 
 class Slam:
-    """Stereo SLAM; monocular SLAM, in a unit of its own, with a camera without a baseline.
+    """Stereo or RGB-D SLAM; monocular SLAM, in a unit of its own, with a camera without a baseline.
 
     >>> slam = Slam(camera)
     >>> for left, right, timestamp in frames:
@@ -115,20 +113,23 @@ class Slam:
         """What each closed loop did to the keyframes. Call ``finish()`` first."""
         return self._closing.corrections
 
-    def step(self, left: Image, right: Image | None, timestamp: float) -> TrackResult:
-        """Track one rectified stereo pair, or a monocular image, and map it if it is new.
+    def step(self, left: Image, second: Image | DepthImage | None, timestamp: float) -> TrackResult:
+        """Track one rectified stereo pair, an image with its depth, or a monocular image, and map
+        it if it is new.
 
         Args:
-            left, right: ``(H, W)`` uint8; right is None for a monocular camera, and only then.
+            left: ``(H, W)`` uint8.
+            second: the right image, uint8; with ``camera.depth`` the depth of the left image's
+                pixels, ``(H, W)`` float32 metres, 0 where unknown; None for a monocular camera,
+                and only then.
             timestamp: seconds, later than that of the last call.
 
         Raises:
-            ValueError: images of another size than the camera's, not of bytes, or a timestamp that
-                goes back.
+            ValueError: images of another size or type, or a timestamp that goes back.
         """
-        _check_images(left, right, self.camera)
+        _check_images(left, second, self.camera)
         start = time.perf_counter()
-        features = extract_features(left, right, self.context)
+        features = extract_features(left, second, self.context)
         stage_ms = {"extract": 1e3 * (time.perf_counter() - start)}
         return self.step_features(features, timestamp, left, stage_ms)
 
@@ -157,10 +158,10 @@ class Slam:
         clock.lap("track_frame")
         matches, inliers, visible = self._track_local_map(frame, inliers)
         clock.lap("track_local_map")
-        state, relocalised = self._state_of(inliers), False
+        state, relocalised = self._state_of(inliers, matches), False
         if state == TrackingState.LOST:
             matches = inliers = self._relocalise(frame)
-            state = self._state_of(inliers)
+            state = self._state_of(inliers, matches)
             relocalised = state != TrackingState.LOST
             clock.lap("relocalise")
         if state == TrackingState.LOST:
@@ -278,10 +279,13 @@ class Slam:
                 return len(found.feature)
         return 0
 
-    def _state_of(self, inliers: int) -> TrackingState:
-        if inliers < self.config.tracking.min_inliers_lost:
+    def _state_of(self, inliers: int, matches: int) -> TrackingState:
+        config = self.config.tracking
+        # In the wide windows of an RGB-D camera, a wrong pose too finds some inliers.
+        too_few = self.camera.depth and inliers < config.depth_min_inlier_ratio * matches
+        if inliers < config.min_inliers_lost or too_few:
             return TrackingState.LOST
-        if inliers < self.config.tracking.min_inliers:
+        if inliers < config.min_inliers:
             return TrackingState.WEAK
         return TrackingState.OK
 
@@ -366,7 +370,7 @@ class Slam:
         )
         if self.camera.monocular:
             return needs_monocular_keyframe(evidence, self.config.keyframes)
-        return needs_keyframe(evidence, self.config.keyframes)
+        return needs_keyframe(evidence, self.config.keyframes, depth=self.camera.depth)
 
     def _insert_keyframe(self, frame: Frame, *, predicted: bool = True) -> None:
         """Make a keyframe of the frame placed last (``MappingThread.insert``)."""
@@ -430,14 +434,17 @@ def _result(
     )
 
 
-def _check_images(left: Image, right: Image | None, camera: Camera) -> None:
-    if (right is None) != camera.monocular:
-        raise ValueError("a right image belongs to a stereo camera, and to no monocular one")
+def _check_images(left: Image, second: Image | DepthImage | None, camera: Camera) -> None:
+    if (second is None) != camera.monocular:
+        what = "depth" if camera.depth else "right"
+        raise ValueError(f"a {what} image belongs to a camera of {camera.sensor}")
     expected = (camera.height, camera.width)
-    images = [left] if right is None else [left, right]
+    images = [left] if second is None else [left, second]
     if any(image.shape != expected for image in images):
         shapes = " and ".join(str(image.shape) for image in images)
         raise ValueError(f"images are {shapes}, the camera's {expected}")
-    if any(image.dtype != np.uint8 for image in images):
+    wanted = [np.uint8, np.float32 if camera.depth else np.uint8]
+    if any(image.dtype != dtype for image, dtype in zip(images, wanted, strict=False)):
         types = " and ".join(str(image.dtype) for image in images)
-        raise ValueError(f"images are of {types}, not of uint8")
+        expected_types = "uint8 and float32" if camera.depth else "uint8"
+        raise ValueError(f"images are of {types}, not of {expected_types}")

@@ -11,7 +11,7 @@ Data = Annotated[
     Path,
     typer.Option(envvar="KITTI_ROOT", help="Folder with the data set, see datasets.md."),
 ]
-DatasetName = Literal["kitti", "euroc", "synthetic"]
+DatasetName = Literal["kitti", "euroc", "tum", "synthetic"]
 Dataset = Annotated[DatasetName, typer.Option(help="Data set.")]
 Source = Annotated[
     str,
@@ -52,7 +52,7 @@ Weights = Annotated[
     typer.Option(metavar="NAME=FILE", help="Weights of a detector, not the shipped ones."),
 ]
 DetectorName = Literal["none", "bow", "both", "capsule", "capsule-pruned", "alexnet", "vgg16"]
-SensorName = Literal["stereo", "mono"]
+SensorName = Literal["stereo", "mono", "rgbd"]
 ViewerName = Literal["native", "web"]
 AlignmentName = Literal["se3", "sim3", "none"]
 

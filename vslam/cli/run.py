@@ -69,6 +69,12 @@ def run(
     topics: Annotated[
         str, typer.Option(metavar="LEFT,RIGHT", help="Image topics of a bag, one with mono.")
     ] = "",
+    depth_scale: Annotated[
+        float | None,
+        typer.Option(
+            help="What depth images count in a metre.", show_default="the calibration's, or 5000"
+        ),
+    ] = None,
     perturb: Perturb = "none",
     start: Start = 0,
     every: Every = 1,
@@ -91,9 +97,12 @@ def run(
         Path | None, typer.Option(help="Safetensors file of a learned detector (vslam train).")
     ] = None,
     sensor: Annotated[
-        SensorName,
-        typer.Option(help="[b]mono[/b] reads the left camera alone; its scale is arbitrary."),
-    ] = "stereo",
+        SensorName | None,
+        typer.Option(
+            help="[b]mono[/b] reads the left camera alone; its scale is arbitrary.",
+            show_default="all that the data has",
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Where the folders of the runs go.")] = Path("runs"),
     config: Thresholds = None,
     compare_loops: Annotated[
@@ -130,6 +139,8 @@ def run(
         raise InputError("--compare-loops: two runs drop different frames; leave out --realtime.")
     if fps is not None and not 0.0 < fps < float("inf"):
         raise InputError(f"--fps {fps}: must be a positive number.")
+    if depth_scale is not None and not 0.0 < depth_scale < float("inf"):
+        raise InputError(f"--depth-scale {depth_scale}: must be a positive number.")
 
     from vslam.cli.progress import announce, progress_bar, render_bar
     from vslam.config import Config, load_config
@@ -143,13 +154,20 @@ def run(
     nothing_named = data == str(KITTI_ROOT)
     kind: str = dataset or ("kitti" if nothing_named else detect_dataset(data))
     perturbation = parse_perturbation(perturb, seed)
-    options = SourceOptions(calib or (), right, fps, side_by_side, tuple(names_in(topics)))
+    options = SourceOptions(
+        calib or (), right, fps, side_by_side, tuple(names_in(topics)), depth_scale
+    )
     with render_bar(shown=not quiet) as on_render:
         source = open_source(
             kind, data, seq, options,
             start=start, every=every, max_frames=max_frames, monocular=sensor == "mono",
             on_render=on_render,
         )  # fmt: skip
+    if sensor not in (None, source.camera.sensor):
+        raise InputError(
+            f"--sensor {sensor}: {data} is of sensor {source.camera.sensor}; leave it out, or take "
+            "mono."
+        )
     if is_live(source):
         if compare_loops:
             raise InputError("--compare-loops: a camera cannot be seen twice; leave it out.")
@@ -174,7 +192,7 @@ def run(
         sequence=source.name,
         perturb=perturbation.name,
         detector=detector,
-        sensor=sensor,
+        sensor=source.camera.sensor,
         seed=seed,
         threads=threads or min(available_cores(), 4),
         start=start,

@@ -22,6 +22,8 @@ _EXAMPLES = """
 
   vslam synth block --fisheye --out fisheye
 
+  vslam synth demo --rgbd --out rgbd
+
   vslam synth demo --pairs 1000 --aliased --change 0.8 --out pairs
 
   vslam synth 05 --pairs 500 --lateral=-3.2:1.4 --heading 0:30 --out pairs
@@ -71,6 +73,10 @@ def synth(
             "--fisheye",
             help="Write an unrectified fisheye pair in EuRoC's layout with Kalibr's camchain.yaml.",
         ),
+    ] = False,
+    rgbd: Annotated[
+        bool,
+        typer.Option("--rgbd", help="Write images with depth in TUM's layout; stereo/ beside."),
     ] = False,
     pairs: Annotated[
         int, typer.Option(min=0, help="Render so many labelled pairs for training instead.")
@@ -136,8 +142,11 @@ def synth(
         if trajectory is None
         else route_of_poses(read_kitti_poses(trajectory), route, calibration)
     )
-    if fisheye and (depth or pairs or verify):
-        raise InputError("--fisheye: leave out --depth, --pairs and --verify.")
+    for option, given in (("--fisheye", fisheye), ("--rgbd", rgbd)):
+        if given and (depth or pairs or verify or fisheye == rgbd):
+            raise InputError(
+                f"{option}: leave out --depth, --pairs, --verify and every other form."
+            )
     variation = Variation(seed, aliased, change, dynamic)
     threads = threads or min(available_cores(), 4)
     with render_bar(shown=not quiet) as on_frame:
@@ -154,6 +163,17 @@ def synth(
                 drive,
                 variation,
                 out or Path(f"{route}-fisheye"),
+                until=max_frames,
+                threads=threads,
+                on_frame=on_frame,
+            )
+        elif rgbd:
+            from vslam.datasets.synthetic.rgbd import render_rgbd
+
+            root = render_rgbd(
+                drive,
+                variation,
+                out or Path(f"{route}-rgbd"),
                 until=max_frames,
                 threads=threads,
                 on_frame=on_frame,

@@ -20,12 +20,14 @@ def open_sequence(
     max_frames: int | None = None,
     monocular: bool = False,
     calib: Several[Path] = (),
+    depth_scale: float | None = None,
     on_render: Callable[[int, int], None] | None = None,
 ) -> Sequence:
     """Open a sequence and check the frames that ``start``, ``every``, ``max_frames`` select.
 
     With ``monocular`` the left camera is read alone. ``calib`` names calibration files
     (docs/cameras.md) to be used instead of the data set's own; images are rectified by them.
+    ``depth_scale``, what depth images count in a metre, is for RGB-D data alone.
 
     A synthetic sequence has no ``root``: it is rendered into the user's cache on first use, and
     ``on_render`` is told the frames done and in all.
@@ -52,6 +54,19 @@ def open_sequence(
             monocular=monocular,
             calib=calib,
         )
+    if dataset == "tum":
+        from vslam.datasets.tum import open_tum
+
+        return open_tum(
+            root,
+            name,
+            start=start,
+            every=every,
+            max_frames=max_frames,
+            monocular=monocular,
+            calib=calib,
+            depth_scale=depth_scale,
+        )
     if dataset == "synthetic" and calib:
         raise InputError("--calib: a rendered town has its own cameras; leave it out.")
     if dataset == "synthetic":
@@ -66,7 +81,8 @@ def open_sequence(
             on_frame=on_render,
         )
     raise InputError(
-        f"--dataset {dataset}: unknown data set; this version reads kitti, euroc and synthetic."
+        f"--dataset {dataset}: unknown data set; this version reads kitti, euroc, tum and "
+        "synthetic."
     )
 
 

@@ -7,7 +7,6 @@ FOLDER/mav0/state_groundtruth_estimate0/         ground truth of the body, if th
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence as Several
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
 from vslam.camera import ImageMap
+from vslam.datasets.ground_truth import poses_at
 from vslam.datasets.image_files import (
     check_not_empty,
     read_grey,
@@ -27,12 +27,11 @@ from vslam.datasets.image_files import (
 from vslam.datasets.rectified import rectified
 from vslam.datasets.sequence import Image, Sequence
 from vslam.errors import InputError
+from vslam.trajectory import Trajectory
 
 _HOME = "https://projects.asl.ethz.ch/datasets/euroc-mav/"
 _SAME_NS = 5_000_000  # both cameras are triggered together; a pair's stamps may differ by so much
 _POSE_COLUMNS = 8  # time, position, quaternion; velocities and biases may follow
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -201,27 +200,20 @@ def _pair(
 def _read_ground_truth(
     base: Path, stamps: NDArray[np.int64], start: int, every: int
 ) -> NDArray[np.float64] | None:
-    from scipy.spatial.transform import Rotation, Slerp
+    from scipy.spatial.transform import Rotation
 
     folder = base / "state_groundtruth_estimate0"
     path = folder / "data.csv"
     if not path.is_file():
         return None
     times, rows = _read_states(path)
-    covered = np.flatnonzero((stamps >= times[0]) & (stamps <= times[-1]))
-    if len(covered) < len(stamps):
-        inside = "none of the frames"
-        if len(covered):
-            first, n = start + every * int(covered[0]), len(covered)
-            inside = f"a part of the frames; --start {first} --max-frames {n} takes them"
-        _log.warning("%s: the ground truth covers %s.", path, inside)
+    T_w_measured = np.tile(np.eye(4), (len(times), 1, 1))
+    T_w_measured[:, :3, :3] = Rotation.from_quat(rows[:, 3:], scalar_first=True).as_matrix()
+    T_w_measured[:, :3, 3] = rows[:, :3]
+    measured = Trajectory((times - times[0]) * 1e-9, T_w_measured)
+    T_w_sensor = poses_at(path, measured, (stamps - times[0]) * 1e-9, start, every)
+    if T_w_sensor is None:
         return None
-    seconds, at = (times - times[0]) * 1e-9, (stamps - times[0]) * 1e-9
-    T_w_sensor = np.tile(np.eye(4), (len(stamps), 1, 1))
-    turns = Rotation.from_quat(rows[:, 3:], scalar_first=True)
-    T_w_sensor[:, :3, :3] = Slerp(seconds, turns)(at).as_matrix()
-    for k in range(3):
-        T_w_sensor[:, k, 3] = np.interp(at, seconds, rows[:, k])
     T_body_camera = read_document(base / "cam0" / "sensor.yaml").matrix("T_BS", 4, 4)
     T_body_sensor = np.eye(4)
     if (folder / "sensor.yaml").is_file():

@@ -37,8 +37,8 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import ImageMap
-from vslam.datasets.sequence import Image, Sequence
+from vslam.camera import DepthImage, Image, ImageMap
+from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import TimedFrame
 from vslam.errors import InputError
 
@@ -67,17 +67,18 @@ class Perturbation:
     laws: tuple[Law, ...] = ()
 
     def apply(
-        self, index: int, t: float, left: Image, right: Image | None
-    ) -> tuple[Image, Image | None]:
+        self, index: int, t: float, left: Image, second: Image | DepthImage | None
+    ) -> tuple[Image, Image | DepthImage | None]:
         """Perturb both ``(H, W)`` uint8 images of frame ``index``, ``t`` seconds after the first
-        one; safe in several threads.
+        one; safe in several threads. A depth image stays as it is: it has its own light.
 
-        The left one becomes the same with and without a right one.
+        The left one becomes the same whatever the second one is.
         """
         for law in self.laws:
             left = law(index, t, 0, left)
-            right = None if right is None else law(index, t, 1, right)
-        return left, right
+            if second is not None and second.dtype == np.uint8:
+                second = law(index, t, 1, np.asarray(second, np.uint8))
+        return left, second
 
 
 def parse_perturbation(spec: str, seed: int) -> Perturbation:
@@ -126,7 +127,7 @@ def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Itera
 
 def _read_perturbed(
     frame: TimedFrame, perturbation: Perturbation, index: int, t: float, image_map: ImageMap
-) -> tuple[Image, Image | None]:
+) -> tuple[Image, Image | DepthImage | None]:
     return perturbation.apply(index, t, *frame.read(image_map))
 
 
@@ -143,14 +144,14 @@ def contact_sheet(
     rows = []
     for index in indices:
         t = float(sequence.timestamps[index] - sequence.timestamps[0])
-        left, right = sequence.read(index)
+        left, second = sequence.read(index)
         width = 480
         height = round(width * left.shape[0] / left.shape[1])
         row = np.hstack(
             [
                 cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-                for image in (left, *perturbation.apply(index, t, left, right))
-                if image is not None
+                for image in (left, *perturbation.apply(index, t, left, second))
+                if image is not None and image.dtype == np.uint8
             ]
         )
         label = f"frame {index}, {sequence.timestamps[index]:.1f} s"

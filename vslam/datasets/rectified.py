@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vslam.calibration.models import Calibration
 from vslam.calibration.rectification import Rectification, rectify
 from vslam.camera import Camera, ImageMap
-from vslam.datasets.sequence import Image, Sequence
+from vslam.datasets.sequence import DepthImage, Image, Sequence
 from vslam.errors import InputError
 
 
@@ -35,7 +35,9 @@ class RawSequence(Protocol):
 
     def __len__(self) -> int: ...
 
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
+    def read(
+        self, index: int, image_map: ImageMap = map
+    ) -> tuple[Image, Image | DepthImage | None]:
         """As `Sequence.read`, all images of one side of one size."""
         ...
 
@@ -118,11 +120,15 @@ def rectification_for(calibration: Calibration, sizes: Several[tuple[int, int]])
 
 
 def rectify_images(
-    rectification: Rectification, left: Image, right: Image | None, image_map: ImageMap = map
+    rectification: Rectification,
+    left: Image,
+    right: Image | DepthImage | None,
+    image_map: ImageMap = map,
 ) -> tuple[Image, Image | None]:
-    """Both images rectified, or the left one where there is no right one."""
+    """Both images rectified, or the left one where there is no right one. Readers of depth
+    undistort it themselves."""
     sides = [partial(rectification.left, left)]
     if right is not None:
-        sides.append(partial(rectification.right, right))
+        sides.append(partial(rectification.right, np.asarray(right, np.uint8)))
     left, *rest = image_map(partial.__call__, sides)
     return left, rest[0] if rest else None

@@ -1,4 +1,5 @@
-"""What the pipeline needs of a data set: calibrated, timed stereo pairs or left images alone."""
+"""What the pipeline needs of a data set: calibrated, timed stereo pairs, images with their depth,
+or left images alone."""
 
 from __future__ import annotations
 
@@ -7,19 +8,19 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, ImageMap
+from vslam.camera import Camera, DepthImage, Image, ImageMap
 
-Image = NDArray[np.uint8]
+__all__ = ["DepthImage", "Image", "Sequence"]
 
 
 class Sequence(Protocol):
-    """A rectified stereo sequence, or its left images. Readers check everything but pixels before
-    the first frame.
+    """A rectified stereo sequence, its left images, or images with depth. Readers check everything
+    but pixels before the first frame.
 
     Attributes:
         dataset: name of the data set, ``kitti`` for example.
         name: name of the sequence in it, ``00`` for example.
-        camera: calibration of this sequence; ``camera.monocular`` without right images.
+        camera: calibration of this sequence; ``camera.sensor`` tells what ``read`` gives.
         timestamps: ``(N,)`` float64 seconds, strictly increasing.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` or None.
     """
@@ -37,9 +38,13 @@ class Sequence(Protocol):
 
     def __len__(self) -> int: ...
 
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
-        """Left and right image ``(H, W)`` uint8 of one frame, None for a monocular camera's right
-        one. Safe to call from several threads.
+    def read(
+        self, index: int, image_map: ImageMap = map
+    ) -> tuple[Image, Image | DepthImage | None]:
+        """Left and second image of one frame. Safe to call from several threads.
+
+        The left one is ``(H, W)`` uint8. The second one is the right image, alike; or the depth of
+        the left one's pixels, ``(H, W)`` float32 metres, 0 where unknown; or None (monocular).
 
         Args:
             index: of the frame.

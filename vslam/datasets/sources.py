@@ -29,6 +29,7 @@ class SourceOptions:
         fps: frames a second, in place of time stamps.
         side_by_side: each frame holds the left image and, right of it, the right one.
         topics: of the left and of the right images in a bag.
+        depth_scale: what depth images count in a metre.
     """
 
     calibration: Several[Path] = ()
@@ -36,6 +37,7 @@ class SourceOptions:
     fps: float | None = None
     side_by_side: bool = False
     topics: tuple[str, ...] = ()
+    depth_scale: float | None = None
 
 
 _FOR = {
@@ -43,6 +45,7 @@ _FOR = {
     "fps": ("images", "video"),
     "side_by_side": ("video", "camera"),
     "topics": ("bag",),
+    "depth_scale": ("tum",),
 }
 
 
@@ -74,7 +77,8 @@ def open_source(
     if dataset not in SOURCES:
         return open_sequence(
             dataset, Path(data), name, start=start, every=every, max_frames=max_frames,
-            monocular=monocular, calib=options.calibration, on_render=on_render,
+            monocular=monocular, calib=options.calibration, depth_scale=options.depth_scale,
+            on_render=on_render,
         )  # fmt: skip
     if dataset == "images":
         from vslam.datasets.image_folders import open_images

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Protocol, runtime_checkable
 
-from vslam.camera import Camera, ImageMap
-from vslam.datasets.sequence import Image, Sequence
+from vslam.camera import Camera, DepthImage, Image, ImageMap
+from vslam.datasets.sequence import Sequence
 
 _log = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ class TimedFrame:
     """
 
     timestamp: float
-    read: Callable[[ImageMap], tuple[Image, Image | None]]
+    read: Callable[[ImageMap], tuple[Image, Image | DepthImage | None]]
 
 
 class RawStream(Protocol):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from vslam.config import OrbConfig
-from vslam.datasets.sequence import Image, Sequence
+from vslam.datasets.sequence import DepthImage, Image, Sequence
 from vslam.doctor import checks
 from vslam.doctor.findings import Finding, judge
 from vslam.doctor.matching import Matches, joined, match_images
@@ -48,7 +48,7 @@ def examine(sequence: Sequence, config: OrbConfig) -> Diagnosis:
     Images are those that a run would see: rectified ones.
     """
     frames = np.unique(np.linspace(0, len(sequence) - 1, _FRAMES).round().astype(int)).tolist()
-    read: dict[int, tuple[Image, Image | None]] = {}
+    read: dict[int, tuple[Image, Image | DepthImage | None]] = {}
     problems = []
     for frame in frames:
         try:
@@ -104,6 +104,7 @@ def _pairs(sequence: Sequence, lefts: dict[int, Image], lag: int) -> list[_Pair]
         except UnreadableImageError:
             continue
         if right is not None:
+            right = np.asarray(right, np.uint8)
             found.append(_Pair(frame, lag, left, right, match_images(left, right)))
     return found
 

@@ -21,7 +21,8 @@ def save_map(path: Path, map_: Map, camera: Camera) -> None:
     """Write the living part of a map, renumbered without gaps.
 
     Arrays of the file (K keyframes, L landmarks, R keypoints):
-        ``schema``; ``camera`` (7,) fx, fy, cx, cy, baseline, width, height; ``scales``;
+        ``schema``; ``camera`` (8,) fx, fy, cx, cy, baseline, width, height, depth;
+        ``scales``;
         ``keyframe_T_cw`` (K, 4, 4), ``keyframe_timestamp``, ``keyframe_frame``,
         ``keyframe_parent`` (K,), ``keyframe_first_row`` (K + 1,);
         ``landmark_xyz`` (L, 3), ``landmark_descriptor`` (L, 32);
@@ -74,7 +75,7 @@ def load_map(path: Path) -> tuple[Map, Camera]:
         raise InputError(f"{path}: not a map of vslam ({error}); name a map.npz.") from error
     if schema != SCHEMA:
         raise InputError(f"{path}: map schema {schema}, this version reads {SCHEMA}.")
-    camera = Camera(*values[:5], *map(int, values[5:]))
+    camera = Camera(*values[:5], *map(int, values[5:7]), *map(bool, values[7:]))
     map_ = Map(data["scales"])
     first = data["keyframe_first_row"]
     for k, T_cw in enumerate(data["keyframe_T_cw"]):

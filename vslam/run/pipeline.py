@@ -207,11 +207,11 @@ def prepare_frame(
     """Read one frame and extract its features."""
     start = time.perf_counter()
     try:
-        left, right = frame.read(image_map)
+        left, second = frame.read(image_map)
     except UnreadableImageError as error:
         return PreparedFrame(None, None, {}, str(error))
     read = time.perf_counter()
-    features = extract_features(left, right, context, image_map)
+    features = extract_features(left, second, context, image_map)
     done = time.perf_counter()
     stage_ms = {"read": 1e3 * (read - start), "extract": 1e3 * (done - read)}
     return PreparedFrame(left, features, stage_ms)

@@ -37,7 +37,7 @@ from vslam.datasets.synthetic.town import build_town
 from vslam.trajectory import write_kitti
 
 VERSION = 2  # raise it whenever the same seed gives other bytes
-_DEPTH_SCALE = 100.0  # 16-bit depth counts centimetres
+DEPTH_SCALE = 100.0  # 16-bit depth counts centimetres
 _RECORD = "manifest.json"
 
 _log = logging.getLogger(__name__)
@@ -227,7 +227,7 @@ def _render(
             )
             write_png(path, image, 1)
         if depth:
-            steps = np.clip(np.rint(views[0].depth * _DEPTH_SCALE), 0, 65535).astype(np.uint16)
+            steps = np.clip(np.rint(views[0].depth * DEPTH_SCALE), 0, 65535).astype(np.uint16)
             write_png(paths[2], steps, 1)
 
     total = missing[-1] + 1

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import StereoSequence
+from source_files import write_calibration, write_video
 from typer.testing import CliRunner
 
 from vslam.camera import Camera
@@ -218,6 +219,22 @@ def test_the_command(kitti_tree, tmp_path):
     text = page.read_text()
     assert text.count("data:image/jpeg") == 2
     assert "median vertical error" in text
+
+
+def test_the_command_looks_at_the_beginning_of_a_video(corridor, tmp_path, monkeypatch):
+    """Frames of a stream cannot be had again: the first ones are kept."""
+    monkeypatch.setattr("vslam.doctor.first_frames._FRAMES", 9)
+    pairs = [np.hstack(pair) for pair in zip(corridor.left, corridor.right, strict=True)]
+    video = write_video(tmp_path / "drive.mkv", pairs)
+    calibration = write_calibration(tmp_path / "stereo.yaml", corridor.camera)
+    config = tmp_path / "config.json"
+    config.write_text('{"orb": {"n_features": 500}}')
+    options = ["--side-by-side", "--calib", str(calibration), "--config", str(config)]
+    page = ["--out", str(tmp_path / "page.html")]
+    done = CliRunner().invoke(app, ["doctor", str(video), *options, *page])
+    assert done.exit_code == 0, done.output
+    assert "0 of 8 intervals are not positive, 10.0 Hz" in done.output
+    assert "median vertical error" in done.output
 
 
 def test_the_command_turns_bad_input_into_a_finding(kitti_tree, tmp_path):

@@ -9,20 +9,29 @@ import typer
 
 from vslam.cli.options import (
     Calib,
-    Dataset,
+    DepthScale,
     Every,
+    FramesPerSecond,
     MaxFrames,
-    SensorName,
+    Right,
+    Sensor,
     Seq,
+    SideBySide,
+    SourceKind,
     Start,
     Thresholds,
+    Topics,
+    kind_of_source,
+    source_options,
 )
 from vslam.errors import InputError
 
 _EXAMPLES = """
 [b]Examples[/b]
 
-  vslam doctor ~/euroc/V1_01_easy --dataset euroc
+  vslam doctor ~/euroc/V1_01_easy
+
+  vslam doctor drive.mp4 --side-by-side --calib stereo.yaml
 
   vslam doctor ~/kitti --seq 06 --calib camchain.yaml --out doctor.html
 """
@@ -34,33 +43,39 @@ def register(app: typer.Typer) -> None:
 
 
 def doctor(
-    source: Annotated[Path, typer.Argument(help="Folder with the data set, as --data of a run.")],
-    dataset: Dataset = "kitti",
+    source: Annotated[str, typer.Argument(help="What to look at, as --data of a run.")],
+    dataset: SourceKind = None,
     seq: Seq = "00",
     calib: Calib = None,
+    right: Right = None,
+    fps: FramesPerSecond = None,
+    side_by_side: SideBySide = False,
+    topics: Topics = "",
+    depth_scale: DepthScale = None,
     start: Start = 0,
     every: Every = 1,
     max_frames: MaxFrames = None,
-    sensor: Annotated[
-        SensorName, typer.Option(help="[b]mono[/b] looks at the left camera alone.")
-    ] = "stereo",
+    sensor: Sensor = None,
     config: Thresholds = None,
     out: Annotated[Path, typer.Option(help="HTML page to write.")] = Path("doctor.html"),
 ) -> None:
     """Check images, calibration and times before a run; exit code 1 if there is a fault."""
     from vslam.config import Config, load_config
-    from vslam.datasets import open_sequence
+    from vslam.datasets.sources import open_source
+    from vslam.datasets.stream import Stream
     from vslam.doctor.examine import Diagnosis, examine
     from vslam.doctor.findings import Finding
+    from vslam.doctor.first_frames import first_frames
     from vslam.doctor.page import write_page
 
     thresholds = Config() if config is None else load_config(config)
     try:
-        sequence = open_sequence(
-            dataset, source, seq,
+        options = source_options(calib, right, fps, side_by_side, topics, depth_scale)
+        found = open_source(
+            kind_of_source(dataset, source), source, seq, options,
             start=start, every=every, max_frames=max_frames, monocular=sensor == "mono",
-            calib=calib or (),
         )  # fmt: skip
+        sequence = first_frames(found) if isinstance(found, Stream) else found
         diagnosis = examine(sequence, thresholds.orb)
     except InputError as error:
         measured, _, fix = str(error).rstrip(".").rpartition("; ")

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+
+from vslam.errors import InputError
+
+if TYPE_CHECKING:
+    from vslam.datasets.sources import SourceOptions
 
 Data = Annotated[
     Path,
@@ -23,6 +28,10 @@ Source = Annotated[
     ),
 ]
 SourceName = Literal[DatasetName, "images", "video", "bag", "camera"]
+SourceKind = Annotated[
+    SourceName | None,
+    typer.Option("--dataset", help="What it is.", show_default="found out from what is there"),
+]
 Seq = Annotated[str, typer.Option(help="Sequence, 00 for example.")]
 Calib = Annotated[
     list[Path] | None,
@@ -30,6 +39,25 @@ Calib = Annotated[
         "--calib",
         help="Calibration to rectify images with, see docs/cameras.md; twice for a file of each "
         "camera, left first.",
+    ),
+]
+Right = Annotated[
+    Path | None, typer.Option(help="Folder of the right images, --data has the left ones.")
+]
+FramesPerSecond = Annotated[
+    float | None,
+    typer.Option("--fps", help="Frames a second of images or a video without time stamps."),
+]
+SideBySide = Annotated[
+    bool, typer.Option("--side-by-side", help="Video or camera of both sides in one image.")
+]
+Topics = Annotated[
+    str, typer.Option(metavar="LEFT,RIGHT", help="Image topics of a bag, one with mono.")
+]
+DepthScale = Annotated[
+    float | None,
+    typer.Option(
+        help="What depth images count in a metre.", show_default="the calibration's, or 5000"
     ),
 ]
 Perturb = Annotated[
@@ -54,6 +82,13 @@ Weights = Annotated[
 DetectorName = Literal["none", "bow", "both", "capsule", "capsule-pruned", "alexnet", "vgg16"]
 SensorName = Literal["stereo", "mono", "rgbd"]
 ViewerName = Literal["native", "web"]
+Sensor = Annotated[
+    SensorName | None,
+    typer.Option(
+        help="[b]mono[/b] reads the left camera alone; its scale is arbitrary.",
+        show_default="all that the data has",
+    ),
+]
 AlignmentName = Literal["se3", "sim3", "none"]
 
 KITTI_ROOT = Path("data/kitti")
@@ -62,3 +97,39 @@ KITTI_ROOT = Path("data/kitti")
 def names_in(text: str) -> list[str]:
     """The names that commas separate, each once, in the order given."""
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+
+
+def kind_of_source(named: SourceName | None, data: str) -> str:
+    """What ``--dataset`` says, or what is found at ``--data``; KITTI where neither was given.
+
+    Raises:
+        InputError: nothing there, or nothing known.
+    """
+    from vslam.datasets.detection import detect_dataset
+
+    if named is not None:
+        return named
+    return "kitti" if data == str(KITTI_ROOT) else detect_dataset(data)
+
+
+def source_options(
+    calib: list[Path] | None,
+    right: Path | None,
+    fps: float | None,
+    side_by_side: bool,
+    topics: str,
+    depth_scale: float | None,
+) -> SourceOptions:
+    """What some kinds of sources need to be told.
+
+    Raises:
+        InputError: a rate or scale that is no positive number.
+    """
+    from vslam.datasets.sources import SourceOptions
+
+    for option, value in (("--fps", fps), ("--depth-scale", depth_scale)):
+        if value is not None and not 0.0 < value < float("inf"):
+            raise InputError(f"{option} {value}: must be a positive number.")
+    return SourceOptions(
+        calib or (), right, fps, side_by_side, tuple(names_in(topics)), depth_scale
+    )

@@ -10,19 +10,25 @@ import typer
 from vslam.cli.options import (
     KITTI_ROOT,
     Calib,
+    DepthScale,
     DetectorName,
     Every,
+    FramesPerSecond,
     MaxFrames,
     Perturb,
+    Right,
     Seed,
-    SensorName,
+    Sensor,
     Seq,
+    SideBySide,
     Source,
-    SourceName,
+    SourceKind,
     Start,
     Thresholds,
+    Topics,
     ViewerName,
-    names_in,
+    kind_of_source,
+    source_options,
 )
 from vslam.errors import InputError
 
@@ -50,31 +56,14 @@ def register(app: typer.Typer) -> None:
 
 def run(
     data: Source = str(KITTI_ROOT),
-    dataset: Annotated[
-        SourceName | None,
-        typer.Option(help="What it is.", show_default="found out from what is there"),
-    ] = None,
+    dataset: SourceKind = None,
     seq: Seq = "00",
     calib: Calib = None,
-    right: Annotated[
-        Path | None, typer.Option(help="Folder of the right images, --data has the left ones.")
-    ] = None,
-    fps: Annotated[
-        float | None,
-        typer.Option(help="Frames a second of images or a video without time stamps."),
-    ] = None,
-    side_by_side: Annotated[
-        bool, typer.Option("--side-by-side", help="Video or camera of both sides in one image.")
-    ] = False,
-    topics: Annotated[
-        str, typer.Option(metavar="LEFT,RIGHT", help="Image topics of a bag, one with mono.")
-    ] = "",
-    depth_scale: Annotated[
-        float | None,
-        typer.Option(
-            help="What depth images count in a metre.", show_default="the calibration's, or 5000"
-        ),
-    ] = None,
+    right: Right = None,
+    fps: FramesPerSecond = None,
+    side_by_side: SideBySide = False,
+    topics: Topics = "",
+    depth_scale: DepthScale = None,
     perturb: Perturb = "none",
     start: Start = 0,
     every: Every = 1,
@@ -96,13 +85,7 @@ def run(
     weights: Annotated[
         Path | None, typer.Option(help="Safetensors file of a learned detector (vslam train).")
     ] = None,
-    sensor: Annotated[
-        SensorName | None,
-        typer.Option(
-            help="[b]mono[/b] reads the left camera alone; its scale is arbitrary.",
-            show_default="all that the data has",
-        ),
-    ] = None,
+    sensor: Sensor = None,
     out: Annotated[Path, typer.Option(help="Where the folders of the runs go.")] = Path("runs"),
     config: Thresholds = None,
     compare_loops: Annotated[
@@ -137,26 +120,18 @@ def run(
         raise InputError("--compare-loops: nothing to compare with --detector none; name another.")
     if compare_loops and realtime:
         raise InputError("--compare-loops: two runs drop different frames; leave out --realtime.")
-    if fps is not None and not 0.0 < fps < float("inf"):
-        raise InputError(f"--fps {fps}: must be a positive number.")
-    if depth_scale is not None and not 0.0 < depth_scale < float("inf"):
-        raise InputError(f"--depth-scale {depth_scale}: must be a positive number.")
 
     from vslam.cli.progress import announce, progress_bar, render_bar
     from vslam.config import Config, load_config
-    from vslam.datasets.detection import detect_dataset
     from vslam.datasets.perturbation import parse_perturbation
-    from vslam.datasets.sources import SourceOptions, open_source
+    from vslam.datasets.sources import open_source
     from vslam.datasets.stream import count_expected, is_live
     from vslam.machine import available_cores
 
     thresholds = Config() if config is None else load_config(config)
-    nothing_named = data == str(KITTI_ROOT)
-    kind: str = dataset or ("kitti" if nothing_named else detect_dataset(data))
+    kind = kind_of_source(dataset, data)
     perturbation = parse_perturbation(perturb, seed)
-    options = SourceOptions(
-        calib or (), right, fps, side_by_side, tuple(names_in(topics)), depth_scale
-    )
+    options = source_options(calib, right, fps, side_by_side, topics, depth_scale)
     with render_bar(shown=not quiet) as on_render:
         source = open_source(
             kind, data, seq, options,

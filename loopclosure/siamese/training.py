@@ -49,6 +49,7 @@ from vslam.loopclosure.siamese.objective import (
     embed_all,
     validate,
 )
+from vslam.loopclosure.siamese.pcanet import PcaNetBranch
 from vslam.loopclosure.siamese.preprocessing import to_tensor
 from vslam.loopclosure.siamese.settings import TrainSettings
 from vslam.loopclosure.siamese.siamese import (
@@ -62,6 +63,7 @@ OnStep = Callable[[int, int, int, float], None]
 """``(epoch, step, steps of the epoch, loss)``"""
 
 _CHECKPOINT_EVERY_S = 300.0
+_LEARNED_IMAGES = 1500  # that principal components are learned from, at most: 200 MB
 _HEAD_RATE = 30.0  # a and b are logarithms of single numbers: Adam's steps are small for them
 
 
@@ -124,7 +126,8 @@ def train(
     train_images, validation = divide(collection, settings.seed, settings.validation_share)
     validation = validation_images(validation, settings.validation_images, settings.seed)
     torch.manual_seed(settings.seed)
-    network = (start or build_network(settings.network, settings.shape)).to(where)
+    network = start or build_network(settings.network, settings.shape, settings.head)
+    network = network.to(where)
     before = copy.deepcopy(network.state_dict()) if settings.learned_share < 1 else None
     optimiser = _optimiser(network, settings)
     progress, pairs = TrainingProgress(), None
@@ -184,11 +187,55 @@ def train(
     if before is not None and "learned_share" not in about:  # resumed after its end
         blend(best, before, settings.learned_share)
         about["learned_share"] = settings.learned_share
-    figures, score, same = validate(best, collection, validation, settings.augmentation, where)
-    calibrate(best, score, same)
-    figures = validate(best, collection, validation, settings.augmentation, where)[0]
-    save_network(best, weights, {**about, "validation": figures})
+    figures = _calibrated(best, about, collection, validation, settings, weights, where)
     return TrainingOutcome(True, figures, progress, weights, train_images, validation)
+
+
+def learn_components(
+    collection: Collection, settings: TrainSettings, folder: Path, *, device: str = "cpu"
+) -> TrainingOutcome:
+    """Learn PCANet from the training images, as :func:`train` without gradients and epochs.
+
+    Raises:
+        InputError: too little data, or an unknown device.
+        ResultsError: a full disk.
+    """
+    where = _open_device(device)
+    train_images, validation = divide(collection, settings.seed, settings.validation_share)
+    validation = validation_images(validation, settings.validation_images, settings.seed)
+    learned = train_images[:: -(-len(train_images) // _LEARNED_IMAGES)]
+    network = build_network(settings.network, settings.shape, settings.head)
+    assert isinstance(network.branch, PcaNetBranch)
+    began = time.monotonic()
+    network.branch.learn(collection.images[learned])
+    network.to(where)
+    weights = folder / f"{settings.network}.safetensors"
+    figures = _calibrated(network, {}, collection, validation, settings, weights, where)
+    seconds = time.monotonic() - began
+    row = {"epoch": 0.0, "loss": math.nan, **figures, "seconds": seconds}
+    progress = TrainingProgress(
+        epoch=1, best=figures["average_precision"], seconds=seconds, images=len(learned),
+        history=[row],
+    )  # fmt: skip
+    _write_log(folder / "log.csv", progress.history)
+    return TrainingOutcome(True, figures, progress, weights, train_images, validation)
+
+
+def _calibrated(
+    network: SiameseNetwork,
+    about: dict[str, Any],
+    collection: Collection,
+    validation: NDArray[np.int64],
+    settings: TrainSettings,
+    weights: Path,
+    device: torch.device,
+) -> dict[str, float]:
+    """Calibrate a network and write it; its figures."""
+    _, score, same = validate(network, collection, validation, settings.augmentation, device)
+    calibrate(network, score, same)
+    figures = validate(network, collection, validation, settings.augmentation, device)[0]
+    save_network(network, weights, {**about, "validation": figures})
+    return figures
 
 
 def _step(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
+from datetime import UTC, datetime
 from pathlib import Path
 from types import ModuleType
 
@@ -17,6 +19,7 @@ from vslam.cli.main import app
 from vslam.cli.options import DetectorName
 from vslam.cli.train import NetworkName, PresetName
 from vslam.errors import InputError
+from vslam.loopbench.schema import Cost, Curve, LoopsJson, Score
 from vslam.loopclosure.registry import DETECTORS
 from vslam.loopclosure.siamese.branches import CapsuleShape
 from vslam.loopclosure.siamese.convolutional import (
@@ -26,7 +29,7 @@ from vslam.loopclosure.siamese.convolutional import (
     alexnet,
     googlenet,
 )
-from vslam.loopclosure.siamese.export import TOLERANCE, export_onnx
+from vslam.loopclosure.siamese.export import HASHED_TOLERANCE, TOLERANCE, export_onnx
 from vslam.loopclosure.siamese.inference import open_network
 from vslam.loopclosure.siamese.initial_network import starting_network
 from vslam.loopclosure.siamese.pcanet import COMPONENTS, FILTERS, KERNEL, PcaNetBranch
@@ -52,6 +55,7 @@ def script(path: str) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look for it there
     spec.loader.exec_module(module)
     return module
 
@@ -205,28 +209,24 @@ def test_pcanet_learns_without_gradients_and_knows_a_place_again(tmp_path):
     assert network.n_parameters() == 2 * 8 * 49 + 32768 * (COMPONENTS + 1) + 2
     assert not any(p.requires_grad for p in network.branch.parameters())
     path = tmp_path / "pcanet.onnx"
-    assert export_onnx(network, path) < TOLERANCE
+    assert export_onnx(network, path) < HASHED_TOLERANCE
     assert open_network("pcanet", path).dimensions == COMPONENTS
     with pytest.raises(InputError, match="learns from images alone"):
         starting_network(settings, views(3), path, "cpu")
 
 
-@pytest.mark.parametrize("name", ["squeezenet", "mobilenet", "darknet19", "googlenet"])
-def test_size_and_head_are_stored_with_the_weights(name, tmp_path):
+def test_size_is_stored_with_the_weights_and_onnx_says_what_torch_says(tmp_path):
+    """GoogLeNet: the one whose layers (paths side by side, responses normalised) others lack."""
     torch.manual_seed(0)
-    shape = CapsuleShape(pixels=64, width=80)
-    network = build_network(name, shape).eval()
-    with torch.no_grad():
-        network.head.log_a.fill_(0.5)
+    network = build_network("googlenet", CapsuleShape(pixels=64, width=80)).eval()
     save_network(network, tmp_path / "w.safetensors", {})
     again, _ = load_network(tmp_path / "w.safetensors")
     assert again.size == (64, 80)
     x = to_tensor(np.random.default_rng(0).integers(0, 256, (2, 64, 80), np.uint8))
     with torch.no_grad():
         assert torch.equal(network.embed(x), again.embed(x))
-    if name in ("squeezenet", "googlenet"):  # fire modules; inceptions and their normalisation
-        assert export_onnx(network, tmp_path / "w.onnx") < TOLERANCE
-        assert open_network(name, tmp_path / "w.onnx").size == (64, 80)
+    assert export_onnx(again, tmp_path / "w.onnx") < TOLERANCE
+    assert open_network("googlenet", tmp_path / "w.onnx").size == (64, 80)
 
 
 def test_alexnet_has_the_head_of_the_paper_unless_told_otherwise(tmp_path):
@@ -245,8 +245,8 @@ def test_every_network_can_be_named_on_the_command_line():
     assert set(DetectorName.__args__) == set(DETECTORS)
     assert set(PresetName.__args__) == set(PRESETS)
     done = CliRunner().invoke(app, ["run", "--detector", "darknet19"])
-    assert done.exit_code == 2
-    assert "vslam train darknet19" in done.output
+    assert isinstance(done.exception, InputError)
+    assert "vslam train darknet19" in str(done.exception)
 
 
 def test_the_script_plans_trains_and_goes_on(tmp_path, monkeypatch):
@@ -266,3 +266,67 @@ def test_the_script_plans_trains_and_goes_on(tmp_path, monkeypatch):
     assert all((tmp_path / result.weights).exists() for result in results)
     tool.write_results(tmp_path / "rivals.csv", results)
     assert tool.read_results(tmp_path / "rivals.csv") == results
+
+
+def loops_report(*detectors: str) -> LoopsJson:
+    """Two sets of images; each figure is the number of the detector plus that of the set."""
+    cells, conditions = [], ("none", "light:1", "viewpoint:1", "occlusion:1")
+    for place, data in enumerate(("kitti00", "town")):
+        for condition in conditions:
+            for number, name in enumerate(detectors):
+                value = 0.1 * number + 0.5 * place
+                cells.append(Score(
+                    data=data, condition=condition, detector=name,
+                    figures={"average_precision": value, "precision_at_70_recall": value + 0.1},
+                    accuracy={"0.5": None if name == "bow" else value + 0.2}, queries=1,
+                    first_right=1.0, verified={}, curve=Curve(precision=[], recall=[]),
+                ))  # fmt: skip
+    costs = [
+        Cost(detector=name, load_s=1.0, image_ms=2.0, query_ms={"5000": 3.0}, parameters=4_000_000,
+             memory_mb=5.0)
+        for name in detectors
+    ]  # fmt: skip
+    return LoopsJson(
+        seed=0, cells=cells, gains=[], costs=costs, machine="", versions={},
+        created=datetime(2026, 1, 1, tzinfo=UTC),
+    )  # fmt: skip
+
+
+def test_the_tables_of_the_page(tmp_path, monkeypatch):
+    tool = script("tools/rivals_table.py")
+    names = {"images": ("capsule", "pcanet"), "minutes": ("capsule", "pcanet"),
+             "shipped": ("bow", "capsule")}  # fmt: skip
+    for way, detectors in names.items():
+        folder = tmp_path / "bench" / way
+        folder.mkdir(parents=True)
+        (folder / "loops.json").write_text(loops_report(*detectors).model_dump_json())
+    (tmp_path / "rivals.csv").write_text(
+        "way,network,images_shown,core_seconds,first_loss,last_loss,ap_before_last,ap_last,weights\n"
+        "images,capsule,4096,90.0,2.5,1.5,0.4,0.5,images/c.onnx\n"
+        "minutes,capsule,1024,60.0,2.5,1.5,0.4,0.5,minutes/c.onnx\n"
+        "images,pcanet,1500,30.0,nan,nan,0.3,0.3,images/p.onnx\n"
+    )
+    page = tmp_path / "page.md"
+    page.write_text("before <!-- tables --> old <!-- end of tables --> after")
+    words = ["rivals_table.py", "--trained", str(tmp_path), "--data", "x", "--page", str(page)]
+    monkeypatch.setattr("sys.argv", words)
+    tool.main()
+    text = page.read_text()
+    assert text.startswith("before <!-- tables -->")
+    assert text.endswith("<!-- end of tables --> after")
+    assert " old " not in text
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
+    # Means of the two sets: 0.25 and 0.1 more for the second detector.
+    assert ["pcanet", "0.550", "0.450", "0.350", "2.0", "3.0", "4.00"] in lines
+    assert ["bow", "-", "0.350", "0.250", "2.0", "3.0", "4.00"] in lines
+    assert ["FLCNN", "no definition found", *"-----"] in lines
+    assert ["pcanet", *["0.350, 0.450"] * 4] in lines
+    assert ["-", "pcanet", "1,500", "0.50", "-", "0.300, 0.300"] in lines
+    rows = (tmp_path / "page" / "conditions.csv").read_text().splitlines()
+    assert "images,pcanet,town,light:1,0.8000,0.7000,0.6000,1.0000" in rows
+    assert len(rows) == 1 + 3 * 2 * 4 * 2
+    training = tool.read_training(tmp_path / "rivals.csv")
+    assert tool.weights_of("minutes", training, Path("d")) == {
+        "capsule": Path("d/minutes/c.onnx"), "pcanet": Path("d/images/p.onnx")
+    }  # fmt: skip
+    assert tool.weights_of("shipped", training, Path("d")) == dict.fromkeys(tool.SHIPPED)

@@ -1,28 +1,38 @@
 """Write Table 6 of the paper and its companions, for all networks of docs/rivals.md.
 
 python tools/rivals_table.py --trained DIR --data SOURCE [--data SOURCE ...]
-        [--page docs/rivals.md] [--threads N]
+        [--page docs/rivals.md] [--retime]
 
-DIR is what tools/training/train_rivals.py wrote, SOURCE as of ``vslam loops bench``. That command
-runs three times, for the networks that were shown the same images, those that computed for the
-same time, and what vslam ships, into DIR/bench. What is there is not run again: remove the folder
-to do so. Tables take the place of what is between the marks in the page, their numbers are written
-as CSV to a folder beside the page, of its name.
+DIR is what tools/training/train_rivals.py wrote, SOURCE as of ``vslam loops bench``. Measured are,
+as that command does, descriptors alone: of the networks that were shown the same images, of those
+that computed for the same time, and of what vslam ships. DIR/bench keeps what is measured, a file
+for each of the three; a network that is there is not measured again, save its times with --retime.
+Tables take the place of what is between the marks in the page, their numbers are written as CSV to
+a folder beside the page, of its name.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
-import shlex
 import statistics
-import subprocess
-import sys
 from collections.abc import Callable, Iterable, Sequence
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
+from vslam.cli.progress import count_bar
+from vslam.datasets.synthetic import store
+from vslam.loopbench.conditions import parse_conditions
+from vslam.loopbench.cost import cost
+from vslam.loopbench.detectors import DetectorSet, open_scorer
+from vslam.loopbench.measure import measure
 from vslam.loopbench.schema import LoopsJson, Score
+from vslam.loopbench.sets import open_set
+from vslam.loopclosure.vocabulary import load
+from vslam.machine import versions
 from vslam.report.page import markdown_table
+from vslam.report.summary import this_machine
 
 CONDITIONS = ("light", "viewpoint", "occlusion")
 KEYFRAMES = "5000"
@@ -44,19 +54,17 @@ def main() -> None:
     parser.add_argument("--trained", type=Path, required=True, help="folder with rivals.csv")
     parser.add_argument("--data", action="append", required=True, help="images to test on")
     parser.add_argument("--page", type=Path, default=Path("docs/rivals.md"))
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--way", choices=WAYS, action="append", help="run the bench of this only")
+    parser.add_argument("--retime", action="store_true", help="measure all times again")
     args = parser.parse_args()
 
     training = read_training(args.trained / "rivals.csv")
-    reports = {}
-    for way in args.way or WAYS:
-        out = args.trained / "bench" / way
-        if not (out / "loops.json").exists():
-            bench(weights_of(way, training, args.trained), args.data, out, args.threads)
-        reports[way] = LoopsJson.model_validate_json((out / "loops.json").read_bytes())
-    if args.way:
-        return
+    reports = {
+        way: report(
+            args.trained / "bench" / f"{way}.json", weights_of(way, training, args.trained),
+            args.data, args.retime,
+        )
+        for way in WAYS
+    }  # fmt: skip
     folder = args.page.with_suffix("")
     folder.mkdir(exist_ok=True)
     write_csv(folder / "table6.csv", table_6(reports, digits=4))
@@ -85,19 +93,40 @@ def weights_of(way: str, training: list[dict[str, str]], folder: Path) -> dict[s
     }
 
 
-def bench(detectors: dict[str, Path | None], data: list[str], out: Path, threads: int) -> None:
-    """Run ``vslam loops bench``; exit with its code where it fails."""
-    command = ["loops", "bench", "--detectors", ",".join(detectors), "--strengths", "1",
-               "--perturb", ",".join(CONDITIONS), "--threads", str(threads)]  # fmt: skip
-    for name, file in detectors.items():
-        command += ["--weights", f"{name}={file}"] if file else []
-    for source in data:
-        command += ["--data", source]
-    command += ["--out", str(out)]
-    print(shlex.join(["vslam", *command]), flush=True)
-    done = subprocess.run([sys.executable, "-m", "vslam", *command])
-    if done.returncode:
-        sys.exit(done.returncode)
+def report(
+    path: Path, detectors: dict[str, Path | None], data: list[str], retime: bool
+) -> LoopsJson:
+    """What a file holds of the detectors, and what it lacks measured and added to it."""
+    here = this_machine()
+    empty = LoopsJson(
+        seed=0, cells=[], gains=[], costs=[], machine=f"{here.cpu}, {here.cores} cores",
+        versions=versions(), created=datetime.now(UTC),
+    )  # fmt: skip
+    known = LoopsJson.model_validate_json(path.read_bytes()) if path.exists() else empty
+    costs = {one.detector: one for one in known.costs}
+    missing = {name: file for name, file in detectors.items() if name not in costs}
+    cells = known.cells + (measured(missing, data) if missing else [])
+    again = detectors if retime else missing
+    costs |= {name: cost(name, file) for name, file in again.items()}
+    added = {"cells": cells, "costs": [costs[name] for name in detectors]}
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(known.model_copy(update=added).model_dump_json(indent=1) + "\n")
+    return known.model_copy(update=added)
+
+
+def measured(detectors: dict[str, Path | None], data: list[str]) -> list[Score]:
+    """All detectors on all sets, under all conditions at full strength."""
+    vocabulary = load()
+    scorers = [open_scorer(name, file, vocabulary) for name, file in detectors.items()]
+    features = vocabulary if "bow" in detectors else None
+    bar = partial(count_bar, shown=True)
+    cells = []
+    for spec in data:
+        for test_set in open_set(spec, store.cache_folder(), threads=1, progress_bar=bar):
+            compared = DetectorSet(scorers, features, 1)
+            for condition in parse_conditions(",".join(CONDITIONS), "1"):
+                cells += measure(test_set, condition, compared, 0, descriptors_only=True)[0]
+    return cells
 
 
 def tables(reports: dict[str, LoopsJson], training: list[dict[str, str]]) -> str:
@@ -123,15 +152,15 @@ def table_6(reports: dict[str, LoopsJson], digits: int) -> list[Row]:
             f"query of {KEYFRAMES} (ms)", "parameters (M)")  # fmt: skip
     rows = [head]
     for way, report in reports.items():
-        for cost in report.costs:
+        for one in report.costs:
             figures = [
-                mean(report, cost.detector, "none", value)
+                mean(report, one.detector, "none", value)
                 for value in (accuracy, precision_at_70, average_precision)
             ]
             rows.append((
-                way, cost.detector, *(rounded(figure, digits) for figure in figures),
-                f"{cost.image_ms:.1f}", f"{cost.query_ms[KEYFRAMES]:.1f}",
-                f"{cost.parameters / 1e6:.2f}",
+                way, one.detector, *(rounded(figure, digits) for figure in figures),
+                f"{one.image_ms:.1f}", f"{one.query_ms[KEYFRAMES]:.1f}",
+                f"{one.parameters / 1e6:.2f}",
             ))  # fmt: skip
     return rows
 
@@ -141,13 +170,13 @@ def condition_table(reports: dict[str, LoopsJson]) -> list[Row]:
     conditions = ("none", *(f"{kind}:1" for kind in CONDITIONS))
     rows: list[Row] = [("way", "network", *("none", *CONDITIONS))]
     for way, report in reports.items():
-        for cost in report.costs:
+        for one in report.costs:
             cells = [
-                ", ".join(rounded(mean(report, cost.detector, condition, value), 3)
+                ", ".join(rounded(mean(report, one.detector, condition, value), 3)
                           for value in (average_precision, precision_at_70))
                 for condition in conditions
             ]  # fmt: skip
-            rows.append((way, cost.detector, *cells))
+            rows.append((way, one.detector, *cells))
     return rows
 
 

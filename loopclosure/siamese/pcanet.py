@@ -42,13 +42,10 @@ class PcaNetBranch(nn.Module):
         self.size, self.views = size, self.layout.views
         self.dimensions = COMPONENTS
         features = _BLOCKS * _BLOCKS * FILTERS * _BINS
-        for name, shape in (
-            ("first", (FILTERS, 1, KERNEL, KERNEL)),
-            ("second", (FILTERS, 1, KERNEL, KERNEL)),
-            ("mean", (features,)),
-            ("components", (COMPONENTS, features)),
-        ):
-            self.register_parameter(name, nn.Parameter(torch.zeros(shape), requires_grad=False))
+        self.first = _constant(FILTERS, 1, KERNEL, KERNEL)
+        self.second = _constant(FILTERS, 1, KERNEL, KERNEL)
+        self.mean = _constant(features)
+        self.components = _constant(COMPONENTS, features)
         row, column = (torch.arange(side) * _BLOCKS // side for side in size)
         block = (row[:, None] * _BLOCKS + column).flatten() * _BINS
         self.register_buffer("block", block, persistent=False)
@@ -108,6 +105,10 @@ def principal_filters(batches: Iterator[Tensor]) -> Tensor:
     filters = vectors.flip(1)[:, :FILTERS].T
     largest = filters.gather(1, filters.abs().argmax(1, keepdim=True))
     return (filters * largest.sign()).float().view(FILTERS, 1, KERNEL, KERNEL)
+
+
+def _constant(*shape: int) -> nn.Parameter:
+    return nn.Parameter(torch.zeros(shape), requires_grad=False)
 
 
 def _filtered(images: Tensor, filters: Tensor) -> Tensor:

@@ -39,19 +39,27 @@ def measure(
     condition: Condition,
     detectors: DetectorSet,
     seed: int,
+    *,
+    descriptors_only: bool = False,
 ) -> tuple[list[Score], list[Gain]]:
-    """All detectors on one set under one condition; nothing where that is not to be had."""
+    """All detectors on one set under one condition; nothing where that is not to be had.
+
+    Args:
+        descriptors_only: nothing is verified, and there are no intervals of differences.
+    """
     query_set = test_set.query_set(condition, seed)
     if query_set is None:
         return [], []
     queries = detectors.describe(query_set.queries)
     gallery, stored = detectors.gallery(query_set.gallery)
-    verify = _Verification(queries, gallery, detectors.local)
+    verify = None if descriptors_only else _Verification(queries, gallery, detectors.local)
     found = {one.name: one.scores(queries, stored[one.name]) for one in detectors.scorers}
     scores = [
         _score(test_set.title, condition, scorer, found[scorer.name], query_set, verify)
         for scorer in detectors.scorers
     ]
+    if descriptors_only:
+        return scores, []
     first, *others = found
     gains = [
         _gain(test_set.title, condition, first, other, found, query_set.relation)
@@ -66,7 +74,7 @@ def _score(
     scorer: Scorer,
     scores: Matrix,
     query_set: QuerySet,
-    verify: _Verification,
+    verify: _Verification | None,
 ) -> Score:
     known = query_set.relation != UNKNOWN
     same, score = query_set.relation[known] == SAME, scores[known]
@@ -78,15 +86,17 @@ def _score(
     best = np.where(known, scores, -np.inf).argmax(1)
     truth = query_set.relation[np.arange(len(best)), best]
     right, wrong = (truth == SAME)[answerable], truth == DIFFERENT
-    orb = np.array([verify.by_orb(q, int(g)) for q, g in enumerate(best)])
-    learned = np.array([verify.by_learned(q, int(g)) for q, g in enumerate(best)])
-    verified = {
-        name: Verified(
-            right=float((accepted[answerable] & right).mean()),
-            wrong=int((accepted & wrong).sum()),
-        )
-        for name, accepted in (("orb", orb), ("learned", learned), ("both", orb | learned))
-    }
+    verified = {}
+    if verify is not None:
+        orb = np.array([verify.by_orb(q, int(g)) for q, g in enumerate(best)])
+        learned = np.array([verify.by_learned(q, int(g)) for q, g in enumerate(best)])
+        verified = {
+            name: Verified(
+                right=float((accepted[answerable] & right).mean()),
+                wrong=int((accepted & wrong).sum()),
+            )
+            for name, accepted in (("orb", orb), ("learned", learned), ("both", orb | learned))
+        }
     return Score(
         data=title,
         condition=condition.name,

@@ -34,7 +34,7 @@ class Score(_Model):
     alone; ``accuracy`` is balanced, at thresholds on p, None for detectors without.
     ``first_right``: share of the ``queries`` that have a place in the gallery whose best image
     shows it. ``verified``: by ``orb``, by ``learned`` local descriptors, by ``both``, one of the
-    two.
+    two; empty where only descriptors are measured.
     """
 
     data: str

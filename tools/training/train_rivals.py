@@ -64,8 +64,9 @@ class Job:
 class Result:
     """A row of rivals.csv; ``weights`` are relative to it.
 
-    ``core_seconds`` are of the steps alone. Losses are means of the first and the last epoch,
-    validation APs are of the last two and of the best epoch, that of the weights.
+    ``core_seconds`` are of the steps alone, of PCANet all that it takes. Losses are means of the
+    first and the last epoch, validation APs are of the last two and of the best epoch, that of the
+    weights.
     """
 
     way: str
@@ -188,7 +189,7 @@ def run(
     """Train, export and judge one network."""
     folder = out / job.way / job.network
     settings = settings.model_copy(update={"network": job.network})
-    clock = StepClock()
+    clock, began = StepClock(), time.process_time()
     if job.network == "pcanet":
         outcome = learn_components(collection, settings, folder, device=device)
     else:
@@ -202,11 +203,12 @@ def run(
             collection, settings, folder, device=device, threads=1, resume=True, start=start,
             on_step=clock,
         )  # fmt: skip
+    all_seconds = time.process_time() - began
     network, about = load_network(outcome.weights)
     onnx = outcome.weights.with_suffix(".onnx")
     export_onnx(network, onnx, about)
     steps = job.pairs // settings.batch * settings.epochs
-    seconds = outcome.progress.seconds if job.network == "pcanet" else clock.median() * steps
+    seconds = all_seconds if job.network == "pcanet" else clock.median() * steps
     return result(job, outcome, network.n_parameters(), seconds, onnx.relative_to(out))
 
 

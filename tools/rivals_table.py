@@ -29,6 +29,7 @@ from vslam.loopbench.detectors import DetectorSet, open_scorer
 from vslam.loopbench.measure import measure
 from vslam.loopbench.schema import LoopsJson, Score
 from vslam.loopbench.sets import open_set
+from vslam.loopclosure.siamese.weights import NETWORKS
 from vslam.loopclosure.vocabulary import load
 from vslam.machine import versions
 from vslam.report.page import markdown_table
@@ -42,8 +43,7 @@ WAYS = {
     "shipped": "Other training, not to be compared with the others: what vslam ships",
 }
 SHIPPED = ("bow", "capsule", "capsule-pruned")
-# Of Table 6; nothing was found that says what they are.
-UNDEFINED = ("FLCNN", "LSGD")
+UNDEFINED = dict.fromkeys(("FLCNN", "LSGD"), "no definition found")  # of Table 6
 _BEGIN, _END = "<!-- tables -->", "<!-- end of tables -->"
 Row = tuple[str, ...]
 
@@ -137,8 +137,12 @@ def tables(reports: dict[str, LoopsJson], training: list[dict[str, str]]) -> str
     for way, title in WAYS.items():
         mine = [row[1:] for row in rows if row[0] == way]
         if way != "shipped":
-            nothing = ("no definition found", *["-"] * (len(head) - 3))
-            mine += [(name, *nothing) for name in UNDEFINED]
+            without = dict.fromkeys(NETWORKS, "not trained") | UNDEFINED
+            known = {row[0] for row in mine}
+            mine += [
+                (name, why, *["-"] * (len(head) - 3))
+                for name, why in without.items() if name not in known
+            ]  # fmt: skip
         lines += [f"### {title}", "", *markdown_table(head[1:], mine), ""]
         mine = [row[1:] for row in lost if row[0] == way]
         lines += ["AP, precision at 70 % recall:", "", *markdown_table(lost_head[1:], mine), ""]

@@ -22,6 +22,7 @@ from vslam.errors import InputError
 from vslam.loopbench.schema import Cost, Curve, LoopsJson, Score
 from vslam.loopclosure.registry import DETECTORS
 from vslam.loopclosure.siamese.branches import CapsuleShape
+from vslam.loopclosure.siamese.component_training import learn_components
 from vslam.loopclosure.siamese.convolutional import (
     CONVOLUTIONAL,
     INCEPTIONS,
@@ -43,7 +44,6 @@ from vslam.loopclosure.siamese.siamese import (
     load_network,
     save_network,
 )
-from vslam.loopclosure.siamese.training import learn_components
 from vslam.loopclosure.siamese.weights import NETWORKS
 
 ROOT = Path(__file__).parents[1]

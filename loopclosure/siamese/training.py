@@ -49,7 +49,6 @@ from vslam.loopclosure.siamese.objective import (
     embed_all,
     validate,
 )
-from vslam.loopclosure.siamese.pcanet import PcaNetBranch
 from vslam.loopclosure.siamese.preprocessing import to_tensor
 from vslam.loopclosure.siamese.settings import TrainSettings
 from vslam.loopclosure.siamese.siamese import (
@@ -63,7 +62,6 @@ OnStep = Callable[[int, int, int, float], None]
 """``(epoch, step, steps of the epoch, loss)``"""
 
 _CHECKPOINT_EVERY_S = 300.0
-_LEARNED_IMAGES = 1500  # that principal components are learned from, at most: 200 MB
 _HEAD_RATE = 30.0  # a and b are logarithms of single numbers: Adam's steps are small for them
 
 
@@ -120,7 +118,7 @@ def train(
     """
     if settings.learned_share < 1 and start is None:
         raise InputError("learned_share: there is no network to go back towards; give --weights.")
-    where = _open_device(device)
+    where = open_device(device)
     half = _mixed_precision(settings, where)
     check_emphasis(collection, settings.emphasis)
     train_images, validation = divide(collection, settings.seed, settings.validation_share)
@@ -181,47 +179,17 @@ def train(
             pairs = None
             save_checkpoint(folder / CHECKPOINT, settings, network, optimiser, progress, None)
             saved = time.monotonic()
-            _write_log(folder / "log.csv", progress.history)
+            write_log(folder / "log.csv", progress.history)
     best, about = load_network(weights)
     best.to(where)
     if before is not None and "learned_share" not in about:  # resumed after its end
         blend(best, before, settings.learned_share)
         about["learned_share"] = settings.learned_share
-    figures = _calibrated(best, about, collection, validation, settings, weights, where)
+    figures = calibrated(best, about, collection, validation, settings, weights, where)
     return TrainingOutcome(True, figures, progress, weights, train_images, validation)
 
 
-def learn_components(
-    collection: Collection, settings: TrainSettings, folder: Path, *, device: str = "cpu"
-) -> TrainingOutcome:
-    """Learn PCANet from the training images, as :func:`train` without gradients and epochs.
-
-    Raises:
-        InputError: too little data, or an unknown device.
-        ResultsError: a full disk.
-    """
-    where = _open_device(device)
-    train_images, validation = divide(collection, settings.seed, settings.validation_share)
-    validation = validation_images(validation, settings.validation_images, settings.seed)
-    learned = train_images[:: -(-len(train_images) // _LEARNED_IMAGES)]
-    network = build_network(settings.network, settings.shape, settings.head)
-    assert isinstance(network.branch, PcaNetBranch)
-    began = time.monotonic()
-    network.branch.learn(collection.images[learned])
-    network.to(where)
-    weights = folder / f"{settings.network}.safetensors"
-    figures = _calibrated(network, {}, collection, validation, settings, weights, where)
-    seconds = time.monotonic() - began
-    row = {"epoch": 0.0, "loss": math.nan, **figures, "seconds": seconds}
-    progress = TrainingProgress(
-        epoch=1, best=figures["average_precision"], seconds=seconds, images=len(learned),
-        history=[row],
-    )  # fmt: skip
-    _write_log(folder / "log.csv", progress.history)
-    return TrainingOutcome(True, figures, progress, weights, train_images, validation)
-
-
-def _calibrated(
+def calibrated(
     network: SiameseNetwork,
     about: dict[str, Any],
     collection: Collection,
@@ -230,7 +198,14 @@ def _calibrated(
     weights: Path,
     device: torch.device,
 ) -> dict[str, float]:
-    """Calibrate a network and write it; its figures."""
+    """Calibrate a network and write it.
+
+    Returns:
+        Its validation figures.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
     _, score, same = validate(network, collection, validation, settings.augmentation, device)
     calibrate(network, score, same)
     figures = validate(network, collection, validation, settings.augmentation, device)[0]
@@ -361,7 +336,12 @@ def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.
     return torch.optim.Adam(groups, lr=settings.learning_rate)
 
 
-def _open_device(name: str) -> torch.device:
+def open_device(name: str) -> torch.device:
+    """The device of that name.
+
+    Raises:
+        InputError: it is unknown, or not there.
+    """
     if name not in ("cpu", "cuda"):
         raise InputError(f"--device {name}: must be cpu or cuda.")
     if name == "cuda" and not torch.cuda.is_available():
@@ -379,7 +359,12 @@ def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
     return settings.mixed_precision
 
 
-def _write_log(path: Path, history: list[dict[str, float]]) -> None:
+def write_log(path: Path, history: list[dict[str, float]]) -> None:
+    """Write the figures of each epoch as CSV.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
     table = io.StringIO()
     rows = csv.DictWriter(table, list(history[0]), lineterminator="\n")
     rows.writeheader()

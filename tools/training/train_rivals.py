@@ -26,6 +26,7 @@ from pathlib import Path
 
 import torch
 
+from vslam.loopclosure.siamese.component_training import learn_components
 from vslam.loopclosure.siamese.data import Collection, load, refuse_test_data
 from vslam.loopclosure.siamese.export import export_onnx
 from vslam.loopclosure.siamese.images import parse_size
@@ -34,7 +35,7 @@ from vslam.loopclosure.siamese.runtime import set_threads
 from vslam.loopclosure.siamese.settings import PRESETS, TrainSettings
 from vslam.loopclosure.siamese.siamese import build_network, load_network
 from vslam.loopclosure.siamese.source_registry import open_source
-from vslam.loopclosure.siamese.training import TrainingOutcome, learn_components, train
+from vslam.loopclosure.siamese.training import TrainingOutcome, train
 
 TRAINED = (
     "capsule", "capsule-pruned", "squeezenet", "mobilenet", "alexnet", "googlenet", "darknet19",

@@ -179,11 +179,11 @@ def _train(
 ) -> TrainingOutcome:
     from vslam.cli.progress import training_bar
     from vslam.loopclosure.siamese.checkpoint import CHECKPOINT
+    from vslam.loopclosure.siamese.component_training import learn_components
     from vslam.loopclosure.siamese.export import export_onnx
     from vslam.loopclosure.siamese.initial_network import starting_network
     from vslam.loopclosure.siamese.model_card import describe, write_card
     from vslam.loopclosure.siamese.siamese import load_network
-    from vslam.loopclosure.siamese.training import learn_components
     from vslam.loopclosure.siamese.training import train as run
 
     start, settings, report = starting_network(

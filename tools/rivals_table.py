@@ -86,11 +86,12 @@ def weights_of(way: str, training: list[dict[str, str]], folder: Path) -> dict[s
     """Detectors of a way and their files, None for shipped ones. PCANet is the same in both."""
     if way == "shipped":
         return dict.fromkeys(SHIPPED)
-    return {
+    files: dict[str, Path | None] = {
         row["network"]: folder / row["weights"]
         for row in training
         if row["way"] == way or row["network"] == "pcanet"
     }
+    return {name: files[name] for name in NETWORKS if name in files}
 
 
 def report(

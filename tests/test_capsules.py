@@ -13,10 +13,10 @@ from vslam.loopclosure.siamese import capsules
 from vslam.loopclosure.siamese.branches import (
     CapsuleBranch,
     CapsuleShape,
-    alexnet,
     standardised,
     textured,
 )
+from vslam.loopclosure.siamese.convolutional import alexnet
 from vslam.loopclosure.siamese.extractors import LIGHT_BLOCKS, grid_side
 from vslam.loopclosure.siamese.images import to_size
 from vslam.loopclosure.siamese.preprocessing import to_tensor
@@ -281,9 +281,9 @@ def test_bad_weights_are_named(tmp_path, content):
 def test_a_torchvision_file_of_another_network_is_refused(tmp_path):
     torch.save({"features.0.weight": torch.zeros(1)}, tmp_path / "x.pth")
     with pytest.raises(InputError, match="another network"):
-        alexnet().load_torchvision(tmp_path / "x.pth")
+        alexnet((227, 227)).load_torchvision(tmp_path / "x.pth")
     with pytest.raises(InputError, match="not a readable weight file"):
-        alexnet().load_torchvision(tmp_path / "none.pth")
+        alexnet((227, 227)).load_torchvision(tmp_path / "none.pth")
 
 
 @torch.no_grad()

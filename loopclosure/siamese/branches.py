@@ -1,9 +1,8 @@
-"""The branches of the Siamese networks: what turns an image into a descriptor."""
+"""How networks read images, and the capsule branch: what turns an image into a descriptor."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple
 
 import torch
 from pydantic import (
@@ -32,11 +31,7 @@ from vslam.loopclosure.siamese.lite import (
     lite_grid_side,
 )
 from vslam.loopclosure.siamese.preprocessing import Unrolling, standardised, textured
-from vslam.loopclosure.siamese.weights import read_pth
 
-# ImageNet's statistics, which torchvision's weight files expect.
-_IMAGENET_MEAN = (0.485, 0.456, 0.406)
-_IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 _LEAST_SHARE = 0.02  # of texture in a view: where no view shows any, all still count alike
 
 
@@ -279,91 +274,3 @@ def _first(error: ValidationError) -> str:
     first = error.errors()[0]
     said = first["msg"].removeprefix("Value error, ")
     return ": ".join([*map(str, first["loc"]), said])
-
-
-class ConvolutionalBranch(nn.Module):
-    """AlexNet or VGG16 up to the second fully connected layer, then one to the descriptor.
-
-    Modules are laid out and named as in torchvision, whose weight files can be loaded into
-    ``features`` and ``classifier``, with nothing in place of its dropout: before training, dropout
-    moves a descriptor farther (cosine 0.5) than another image does (0.97), and nothing is learned.
-    Random weights are drawn as in He et al., ICCV 2015; with torch's own, images differ by 0.003.
-    """
-
-    mean: Tensor
-    deviation: Tensor
-
-    def __init__(
-        self, name: str, features: nn.Sequential, classifier: nn.Sequential, side: int
-    ) -> None:
-        super().__init__()
-        self.name = name
-        self.layout = Layout((227, 227))
-        self.size, self.views = self.layout.size, self.layout.views
-        self.dimensions = 1024
-        self.features = features
-        self.pool = nn.AdaptiveAvgPool2d(side)
-        self.classifier = classifier
-        self.descriptor = nn.Linear(4096, self.dimensions)
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d | nn.Linear):
-                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
-                nn.init.zeros_(cast(Tensor, module.bias))
-        self.register_buffer("mean", torch.tensor(_IMAGENET_MEAN).view(3, 1, 1), persistent=False)
-        deviation = torch.tensor(_IMAGENET_DEVIATION).view(3, 1, 1)
-        self.register_buffer("deviation", deviation, persistent=False)
-
-    def forward(self, images: Tensor) -> Tensor:
-        """``(N, 3, 227, 227)`` float32 in [0, 1] to ``(N, 1024)``, not yet normalised."""
-        x: Tensor = self.features((images - self.mean) / self.deviation)
-        x = self.classifier(self.pool(x).flatten(1))
-        return self.descriptor(x)
-
-    def load_torchvision(self, path: Path) -> None:
-        """Take over the weights of a torchvision file (``alexnet-*.pth``, ``vgg16-*.pth``).
-
-        The last layer, which names ImageNet's classes, is left out.
-
-        Raises:
-            InputError: no such file, not a weight file, or one of another network.
-        """
-        fix = f"name torchvision's weight file of {self.name}"
-        state = read_pth(path, fix)
-        own = {key: value for key, value in self.state_dict().items() if "descriptor" not in key}
-        if not isinstance(state, dict) or any(
-            key not in state or state[key].shape != value.shape for key, value in own.items()
-        ):
-            raise InputError(f"{path}: layers of another network; {fix}.")
-        self.load_state_dict({key: state[key] for key in own}, strict=False)
-
-
-def alexnet() -> ConvolutionalBranch:
-    """Krizhevsky et al., NIPS 2012, in torchvision's one-tower form (Krizhevsky 2014)."""
-    features = nn.Sequential(
-        nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2),
-        nn.Conv2d(64, 192, 5, 1, 2), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2),
-        nn.Conv2d(192, 384, 3, 1, 1), nn.ReLU(inplace=True),
-        nn.Conv2d(384, 256, 3, 1, 1), nn.ReLU(inplace=True),
-        nn.Conv2d(256, 256, 3, 1, 1), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2),
-    )  # fmt: skip
-    classifier = nn.Sequential(
-        nn.Identity(), nn.Linear(256 * 36, 4096), nn.ReLU(inplace=True),
-        nn.Identity(), nn.Linear(4096, 4096), nn.ReLU(inplace=True),
-    )  # fmt: skip
-    return ConvolutionalBranch("alexnet", features, classifier, 6)
-
-
-def vgg16() -> ConvolutionalBranch:
-    """Simonyan and Zisserman, ICLR 2015, configuration D."""
-    layers: list[nn.Module] = []
-    inputs = 3
-    for outputs, repeats in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
-        for _ in range(repeats):
-            layers += [nn.Conv2d(inputs, outputs, 3, padding=1), nn.ReLU(inplace=True)]
-            inputs = outputs
-        layers.append(nn.MaxPool2d(2, 2))
-    classifier = nn.Sequential(
-        nn.Linear(512 * 49, 4096), nn.ReLU(inplace=True), nn.Identity(),
-        nn.Linear(4096, 4096), nn.ReLU(inplace=True), nn.Identity(),
-    )  # fmt: skip
-    return ConvolutionalBranch("vgg16", nn.Sequential(*layers), classifier, 7)

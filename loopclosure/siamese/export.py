@@ -26,9 +26,11 @@ from vslam.loopclosure.siamese.inference import (
     OnnxNetwork,
 )
 from vslam.loopclosure.siamese.local import LocalNetwork
+from vslam.loopclosure.siamese.pcanet import PcaNetBranch
 from vslam.loopclosure.siamese.siamese import SiameseNetwork, for_inference
 
 TOLERANCE = 1e-4  # of a descriptor of length 1
+HASHED_TOLERANCE = 0.01  # of PCANet: a bit of a code flips where a response is 0 but for rounding
 SIMILARITY_TOLERANCE = 0.02  # at distance 0 the root in it magnifies the last bit
 _SMALL = 64  # numbers of a tensor that is not worth storing in half precision
 
@@ -101,7 +103,9 @@ def export_onnx(network: SiameseNetwork, path: Path, about: dict[str, Any] | Non
     descriptors = np.stack([written.embed(image) for image in images])
     difference = float(np.abs(descriptors - expected.numpy()).max())
     apart = float(np.abs(written.compare(descriptors[0], descriptors) - alike).max())
-    if not (difference < TOLERANCE and apart < SIMILARITY_TOLERANCE):
+    hashed = isinstance(network.branch, PcaNetBranch)
+    allowed = HASHED_TOLERANCE if hashed else TOLERANCE
+    if not (difference < allowed and apart < SIMILARITY_TOLERANCE):
         raise ResultsError(f"{path}: differs from torch by {difference:.1e}; do not use it.")
     return difference
 

@@ -10,7 +10,8 @@ import torch
 from torch.nn import functional
 
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.branches import CapsuleBranch, ConvolutionalBranch, Layout
+from vslam.loopclosure.siamese.branches import CapsuleBranch, Layout
+from vslam.loopclosure.siamese.convolutional import ConvolutionalBranch
 from vslam.loopclosure.siamese.data import Collection, divide, validation_images
 from vslam.loopclosure.siamese.lite import LiteExtractor
 from vslam.loopclosure.siamese.objective import validate
@@ -55,6 +56,8 @@ def starting_network(
         if weights is None:
             raise InputError("vslam train capsule-pruned: name the network to prune, --weights.")
         return _prune(settings, collection, weights, torch.device(device))
+    if settings.network == "pcanet" and weights is not None:
+        raise InputError("vslam train pcanet: learns from images alone; leave out --weights.")
     if weights is None:
         from_imagenet = settings.network == "capsule" and settings.shape.extractor == "lite0"
         if from_imagenet and not resuming:
@@ -66,11 +69,12 @@ def starting_network(
     about: dict[str, Any] = {"started_from": weights.name}
     if weights.suffix != ".safetensors":
         torch.manual_seed(settings.seed)
-        network = build_network(settings.network, settings.shape)
+        network = build_network(settings.network, settings.shape, settings.head)
         branch = network.branch
-        if isinstance(branch, ConvolutionalBranch):
+        if settings.network in ("alexnet", "vgg16"):
+            assert isinstance(branch, ConvolutionalBranch)
             branch.load_torchvision(weights)
-        elif isinstance(branch.extractor, LiteExtractor):
+        elif isinstance(branch, CapsuleBranch) and isinstance(branch.extractor, LiteExtractor):
             branch.extractor.load_imagenet(weights)
         else:
             raise InputError(f"{weights}: {settings.network} starts from .safetensors only.")

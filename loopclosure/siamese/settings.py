@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.augmentation import STRONG, Augmentation
 from vslam.loopclosure.siamese.branches import CapsuleShape
+from vslam.loopclosure.siamese.siamese import Head
 
 
 class TrainSettings(BaseModel):
@@ -18,7 +19,10 @@ class TrainSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     network: str = Field("capsule", description="Network to train.")
-    shape: CapsuleShape = Field(CapsuleShape(), description="Of a capsule branch.")
+    shape: CapsuleShape = Field(
+        CapsuleShape(), description="Of a capsule branch; others take its size of images only."
+    )
+    head: Head | None = Field(None, description="Compares descriptors; null: the network's own.")
     fit: Literal["squash", "crop"] = Field(
         "squash", description="Whole view, or its middle in the aspect of the input."
     )
@@ -57,6 +61,11 @@ class TrainSettings(BaseModel):
     )
 
 
+# Small networks need mild changes to learn anything in so short a time, see docs/training.md.
+_MILD = Augmentation(
+    homography=0.05, shift=0.05, log_gain=0.2, bias=10.0, log_gamma=0.2, masks=1, noise=3.0,
+    blur=0.5,
+)  # fmt: skip
 _BEST = TrainSettings(
     loss="bce+contrast",
     schedule="cosine",
@@ -88,6 +97,22 @@ PRESETS = {
             "pairs": 4096,
             "epochs": 16,
             "augmentation": STRONG.model_copy(update={"turn": 30.0}),
+        }
+    ),
+    # One recipe for all architectures, from random weights and with one head: docs/rivals.md. No
+    # pairs are mined and few images validate, since that would cost slow networks the most.
+    "rivals": _BEST.model_copy(
+        update={
+            "shape": CapsuleShape(pixels=129),
+            "head": "distance",
+            "learning_rate": 3e-4,
+            "mixed_precision": True,
+            "batch": 16,
+            "epochs": 16,
+            "together": 1,
+            "hard_share": 0.0,
+            "validation_images": 150,
+            "augmentation": _MILD,
         }
     ),
 }

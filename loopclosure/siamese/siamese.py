@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from pydantic import ValidationError
@@ -14,17 +14,17 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vslam.errors import InputError, ResultsError
-from vslam.loopclosure.siamese.branches import (
-    CapsuleBranch,
-    CapsuleShape,
-    ConvolutionalBranch,
-    alexnet,
-    vgg16,
-)
+from vslam.loopclosure.siamese.branches import CapsuleBranch, CapsuleShape, Layout
 from vslam.loopclosure.siamese.capsules import TINY
+from vslam.loopclosure.siamese.convolutional import CONVOLUTIONAL, ConvolutionalBranch
 from vslam.loopclosure.siamese.extractors import fold_batch_norms
+from vslam.loopclosure.siamese.pcanet import PcaNetBranch
 from vslam.loopclosure.siamese.weights import NETWORKS
 
+Head = Literal["distance", "concatenation"]
+"""What compares two descriptors: :class:`DistanceHead` or :class:`ConcatenationHead`."""
+
+_OWN_HEAD: dict[str, Head] = {"alexnet": "concatenation", "vgg16": "concatenation"}  # Eq. 1
 _SOFTNESS = 0.04  # of the maximum over alignments, in cosines
 
 
@@ -141,7 +141,7 @@ class SiameseNetwork(nn.Module):
     def __init__(
         self,
         name: str,
-        branch: CapsuleBranch | ConvolutionalBranch,
+        branch: CapsuleBranch | ConvolutionalBranch | PcaNetBranch,
         head: DistanceHead | ConcatenationHead,
     ) -> None:
         super().__init__()
@@ -179,23 +179,32 @@ class SiameseNetwork(nn.Module):
         return sum(p.numel() for p in self.parameters())
 
 
-def build_network(name: str, shape: CapsuleShape | None = None) -> SiameseNetwork:
+def build_network(
+    name: str, shape: CapsuleShape | None = None, head: Head | None = None
+) -> SiameseNetwork:
     """A network with random weights, drawn from torch's global generator.
 
     Args:
         name: one of ``NETWORKS``.
-        shape: of a capsule branch.
+        shape: of a capsule branch; others take its size of images only.
+        head: None for the paper's: concatenation for AlexNet and VGG16, else distance.
 
     Raises:
-        InputError: unknown name.
+        InputError: unknown name, or images that are too small.
     """
+    shape = shape or CapsuleShape()
+    branch: CapsuleBranch | ConvolutionalBranch | PcaNetBranch
     if name in ("capsule", "capsule-pruned"):
-        branch = CapsuleBranch(shape or CapsuleShape())
-        return SiameseNetwork(name, branch, DistanceHead(branch.views))
-    if name not in NETWORKS:
+        branch = CapsuleBranch(shape)
+    elif name == "pcanet":
+        branch = PcaNetBranch(shape.input)
+    elif name in CONVOLUTIONAL:
+        branch = CONVOLUTIONAL[name](shape.input)
+    else:
         raise InputError(f"{name}: no such network; choose one of {', '.join(NETWORKS)}.")
-    other = alexnet() if name == "alexnet" else vgg16()
-    return SiameseNetwork(name, other, ConcatenationHead(other.dimensions))
+    if (head or _OWN_HEAD.get(name)) == "concatenation":
+        return SiameseNetwork(name, branch, ConcatenationHead(branch.dimensions))
+    return SiameseNetwork(name, branch, DistanceHead(branch.views))
 
 
 def save_network(
@@ -217,6 +226,8 @@ def save_network(
     metadata = {
         "name": network.name,
         "shape": shape.model_dump_json() if shape else "",
+        "size": json.dumps(network.size),
+        "head": "distance" if isinstance(network.head, DistanceHead) else "concatenation",
         "about": json.dumps(about),
     }
     try:
@@ -240,10 +251,13 @@ def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        shape = metadata["shape"]
-        network = build_network(
-            metadata["name"], CapsuleShape.model_validate_json(shape) if shape else None
-        )
+        if metadata["shape"]:
+            shape = CapsuleShape.model_validate_json(metadata["shape"])
+        else:
+            height, width = json.loads(metadata["size"])
+            shape = CapsuleShape().with_layout(Layout((height, width)))
+        head: Any = metadata.get("head")
+        network = build_network(metadata["name"], shape, head)
         wanted = network.state_dict()
         network.load_state_dict({k: v.to(wanted[k].dtype) for k, v in tensors.items()})
         about: dict[str, Any] = json.loads(metadata["about"])

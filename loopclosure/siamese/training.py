@@ -118,13 +118,14 @@ def train(
     """
     if settings.learned_share < 1 and start is None:
         raise InputError("learned_share: there is no network to go back towards; give --weights.")
-    where = _open_device(device)
+    where = open_device(device)
     half = _mixed_precision(settings, where)
     check_emphasis(collection, settings.emphasis)
     train_images, validation = divide(collection, settings.seed, settings.validation_share)
     validation = validation_images(validation, settings.validation_images, settings.seed)
     torch.manual_seed(settings.seed)
-    network = (start or build_network(settings.network, settings.shape)).to(where)
+    network = start or build_network(settings.network, settings.shape, settings.head)
+    network = network.to(where)
     before = copy.deepcopy(network.state_dict()) if settings.learned_share < 1 else None
     optimiser = _optimiser(network, settings)
     progress, pairs = TrainingProgress(), None
@@ -178,17 +179,38 @@ def train(
             pairs = None
             save_checkpoint(folder / CHECKPOINT, settings, network, optimiser, progress, None)
             saved = time.monotonic()
-            _write_log(folder / "log.csv", progress.history)
+            write_log(folder / "log.csv", progress.history)
     best, about = load_network(weights)
     best.to(where)
     if before is not None and "learned_share" not in about:  # resumed after its end
         blend(best, before, settings.learned_share)
         about["learned_share"] = settings.learned_share
-    figures, score, same = validate(best, collection, validation, settings.augmentation, where)
-    calibrate(best, score, same)
-    figures = validate(best, collection, validation, settings.augmentation, where)[0]
-    save_network(best, weights, {**about, "validation": figures})
+    figures = calibrated(best, about, collection, validation, settings, weights, where)
     return TrainingOutcome(True, figures, progress, weights, train_images, validation)
+
+
+def calibrated(
+    network: SiameseNetwork,
+    about: dict[str, Any],
+    collection: Collection,
+    validation: NDArray[np.int64],
+    settings: TrainSettings,
+    weights: Path,
+    device: torch.device,
+) -> dict[str, float]:
+    """Calibrate a network and write it.
+
+    Returns:
+        Its validation figures.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
+    _, score, same = validate(network, collection, validation, settings.augmentation, device)
+    calibrate(network, score, same)
+    figures = validate(network, collection, validation, settings.augmentation, device)[0]
+    save_network(network, weights, {**about, "validation": figures})
+    return figures
 
 
 def _step(
@@ -314,7 +336,12 @@ def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.
     return torch.optim.Adam(groups, lr=settings.learning_rate)
 
 
-def _open_device(name: str) -> torch.device:
+def open_device(name: str) -> torch.device:
+    """The device of that name.
+
+    Raises:
+        InputError: it is unknown, or not there.
+    """
     if name not in ("cpu", "cuda"):
         raise InputError(f"--device {name}: must be cpu or cuda.")
     if name == "cuda" and not torch.cuda.is_available():
@@ -332,7 +359,12 @@ def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
     return settings.mixed_precision
 
 
-def _write_log(path: Path, history: list[dict[str, float]]) -> None:
+def write_log(path: Path, history: list[dict[str, float]]) -> None:
+    """Write the figures of each epoch as CSV.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
     table = io.StringIO()
     rows = csv.DictWriter(table, list(history[0]), lineterminator="\n")
     rows.writeheader()

@@ -7,7 +7,10 @@ from typing import Any
 
 from vslam.errors import InputError
 
-NETWORKS = ("capsule", "capsule-pruned", "alexnet", "vgg16")
+NETWORKS = (
+    "capsule", "capsule-pruned", "alexnet", "vgg16", "darknet19", "googlenet", "mobilenet",
+    "squeezenet", "pcanet",
+)  # fmt: skip
 SHIPPED = Path(__file__).parent / "weights"
 
 

@@ -79,7 +79,10 @@ Weights = Annotated[
     list[str] | None,
     typer.Option(metavar="NAME=FILE", help="Weights of a detector, not the shipped ones."),
 ]
-DetectorName = Literal["none", "bow", "both", "capsule", "capsule-pruned", "alexnet", "vgg16"]
+DetectorName = Literal[
+    "none", "bow", "both", "capsule", "capsule-pruned", "alexnet", "vgg16", "darknet19",
+    "googlenet", "mobilenet", "squeezenet", "pcanet",
+]  # fmt: skip
 SensorName = Literal["stereo", "mono", "rgbd"]
 ViewerName = Literal["native", "web"]
 Sensor = Annotated[

@@ -78,7 +78,7 @@ def run(
     detector: Annotated[
         DetectorName,
         typer.Option(
-            help="Loop detector; [b]none[/b] for odometry only; alexnet and vgg16 need "
+            help="Loop detector; [b]none[/b] for odometry only; those after capsule-pruned need "
             "[b]--weights[/b]."
         ),
     ] = "bow",

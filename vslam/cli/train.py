@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from vslam.cli.export import commands as export
-from vslam.errors import InputError
 
 if TYPE_CHECKING:
     from vslam.loopclosure.siamese.data import Collection
@@ -44,8 +43,11 @@ def register(app: typer.Typer) -> None:
     app.command(epilog=_TRAIN_EXAMPLES)(train)
 
 
-NetworkName = Literal["capsule", "capsule-pruned", "alexnet", "vgg16"]
-PresetName = Literal["paper", "best", "pretrained"]
+NetworkName = Literal[
+    "capsule", "capsule-pruned", "alexnet", "vgg16", "darknet19", "googlenet", "mobilenet",
+    "squeezenet", "pcanet",
+]  # fmt: skip
+PresetName = Literal["paper", "best", "pretrained", "rivals"]
 DeviceName = Literal["cpu", "cuda"]
 FitName = Literal["squash", "crop"]
 DataSources = Annotated[
@@ -61,7 +63,10 @@ def train(
     network: Annotated[NetworkName, typer.Argument(help="What to train.", show_default=False)],
     data: DataSources,
     preset: Annotated[
-        PresetName, typer.Option(help="Settings; [b]paper[/b]'s, or better ones.")
+        PresetName,
+        typer.Option(
+            help="Settings; [b]paper[/b]'s, better ones, or one recipe for all (docs/rivals.md)."
+        ),
     ] = "paper",
     settings: Annotated[
         Path | None, typer.Option(help="JSON with settings, instead of the preset's.")
@@ -87,7 +92,7 @@ def train(
         str | None,
         typer.Option(
             metavar="SIDE|HEIGHTxWIDTH",
-            help="Size of the images of a capsule network; smaller ones train faster.",
+            help="Size of the images; smaller ones train faster.",
         ),
     ] = None,
     prune_share: Annotated[
@@ -139,8 +144,6 @@ def train(
     if pixels is not None:
         shape = shape.for_images_of(parse_size(pixels))
     chosen = chosen.model_copy(update={"shape": shape})
-    if network in ("alexnet", "vgg16") and chosen.shape.input != (227, 227):
-        raise InputError(f"vslam train {network}: takes images of 227 pixels; add --pixels 227.")
     folder = out or Path("training") / f"{network}-{preset}"
     threads = threads or available_cores()
     set_threads(threads)
@@ -175,6 +178,7 @@ def _train(
 ) -> TrainingOutcome:
     from vslam.cli.progress import training_bar
     from vslam.loopclosure.siamese.checkpoint import CHECKPOINT
+    from vslam.loopclosure.siamese.component_training import learn_components
     from vslam.loopclosure.siamese.export import export_onnx
     from vslam.loopclosure.siamese.initial_network import starting_network
     from vslam.loopclosure.siamese.model_card import describe, write_card
@@ -186,12 +190,15 @@ def _train(
     )
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "settings.json").write_text(settings.model_dump_json(indent=1) + "\n")
-    with training_bar(shown=not quiet) as on_step:
-        outcome = run(
-            collection, settings, folder, device=device, threads=threads, resume=resume,
-            start=start, on_step=on_step,
-            should_stop=None if until is None else lambda: time.monotonic() > until,
-        )  # fmt: skip
+    if settings.network == "pcanet":
+        outcome = learn_components(collection, settings, folder, device=device)
+    else:
+        with training_bar(shown=not quiet) as on_step:
+            outcome = run(
+                collection, settings, folder, device=device, threads=threads, resume=resume,
+                start=start, on_step=on_step,
+                should_stop=None if until is None else lambda: time.monotonic() > until,
+            )  # fmt: skip
     if outcome.weights.exists():
         network, about = load_network(outcome.weights)
         export_onnx(network, outcome.weights.with_suffix(".onnx"), about)

@@ -163,7 +163,13 @@ class DetectorSet:
     Most conditions have the same gallery: what was made of the last few galleries is kept.
     """
 
-    def __init__(self, scorers: list[Scorer], vocabulary: Vocabulary, threads: int) -> None:
+    def __init__(self, scorers: list[Scorer], vocabulary: Vocabulary | None, threads: int) -> None:
+        """Keep nothing yet.
+
+        Args:
+            vocabulary: None where all scorers look at images alone: no features are extracted.
+            threads: that extract them.
+        """
         self.scorers = tuple(scorers)
         self._vocabulary, self._threads = vocabulary, threads
         self.local = LocalDescriptorCache()
@@ -186,4 +192,13 @@ class DetectorSet:
 
     def describe(self, images: list[Image]) -> list[DescribedImage]:
         """See :func:`describe`."""
+        if self._vocabulary is None:
+            return [_without_features(image) for image in images]
         return describe(images, self._vocabulary, self._threads)
+
+
+def _without_features(image: Image) -> DescribedImage:
+    words = np.empty(0, np.int32)
+    return DescribedImage(
+        image, np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8), words, index_nodes(words)
+    )

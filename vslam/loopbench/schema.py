@@ -35,7 +35,7 @@ class Score(_Model):
     ``first_right``: share of the ``queries`` that have a place in the gallery whose best image
     shows it; ``sequence_right``: the same where scores are added along sequences, None of images
     without order. ``verified``: by ``orb``, by ``learned`` local descriptors, by ``both``, one
-    of the two.
+    of the two; empty where only descriptors are measured.
     """
 
     data: str

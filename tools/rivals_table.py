@@ -1,0 +1,254 @@
+"""Write Table 6 of the paper and its companions, for all networks of docs/rivals.md.
+
+python tools/rivals_table.py --trained DIR --data SOURCE [--data SOURCE ...]
+        [--page docs/rivals.md] [--retime]
+
+DIR is what tools/training/train_rivals.py wrote, SOURCE as of ``vslam loops bench``. Measured are,
+as that command does, descriptors alone: of the networks that were shown the same images, of those
+that computed for the same time, and of what vslam ships. DIR/bench keeps what is measured, a file
+for each of the three; a network that is there is not measured again, save its times with --retime.
+Tables take the place of what is between the marks in the page, their numbers are written as CSV to
+a folder beside the page, of its name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import statistics
+from collections.abc import Callable, Iterable, Sequence
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+from vslam.cli.progress import count_bar
+from vslam.datasets.synthetic import store
+from vslam.loopbench.conditions import parse_conditions
+from vslam.loopbench.cost import cost
+from vslam.loopbench.detectors import DetectorSet, open_scorer
+from vslam.loopbench.measure import measure
+from vslam.loopbench.schema import LoopsJson, Score
+from vslam.loopbench.sets import open_set
+from vslam.loopclosure.siamese.weights import NETWORKS
+from vslam.loopclosure.vocabulary import load
+from vslam.machine import versions
+from vslam.report.page import markdown_table
+from vslam.report.summary import this_machine
+
+CONDITIONS = ("light", "viewpoint", "occlusion")
+KEYFRAMES = "5000"
+WAYS = {
+    "images": "Same number of images shown",
+    "minutes": "Same time of a core",
+    "shipped": "Other training, not to be compared with the others: what vslam ships",
+}
+SHIPPED = ("bow", "capsule", "capsule-pruned")
+UNDEFINED = dict.fromkeys(("FLCNN", "LSGD"), "no definition found")  # of Table 6
+_BEGIN, _END = "<!-- tables -->", "<!-- end of tables -->"
+Row = tuple[str, ...]
+
+
+def main() -> None:
+    """Parse the command line, run what is missing and write the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--trained", type=Path, required=True, help="folder with rivals.csv")
+    parser.add_argument("--data", action="append", required=True, help="images to test on")
+    parser.add_argument("--page", type=Path, default=Path("docs/rivals.md"))
+    parser.add_argument("--retime", action="store_true", help="measure all times again")
+    args = parser.parse_args()
+
+    training = read_training(args.trained / "rivals.csv")
+    reports = {
+        way: report(
+            args.trained / "bench" / f"{way}.json", weights_of(way, training, args.trained),
+            args.data, args.retime,
+        )
+        for way in WAYS
+    }  # fmt: skip
+    folder = args.page.with_suffix("")
+    folder.mkdir(exist_ok=True)
+    write_csv(folder / "table6.csv", table_6(reports, digits=4))
+    write_csv(folder / "conditions.csv", every_score(reports))
+    write_csv(folder / "training.csv", [tuple(training[0]), *(tuple(r.values()) for r in training)])
+    text = args.page.read_text()
+    before, _, rest = text.partition(_BEGIN)
+    after = rest.partition(_END)[2]
+    args.page.write_text(f"{before}{_BEGIN}\n\n{tables(reports, training)}\n{_END}{after}")
+
+
+def read_training(path: Path) -> list[dict[str, str]]:
+    """Rows of rivals.csv."""
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def weights_of(way: str, training: list[dict[str, str]], folder: Path) -> dict[str, Path | None]:
+    """Detectors of a way and their files, None for shipped ones. PCANet is the same in both."""
+    if way == "shipped":
+        return dict.fromkeys(SHIPPED)
+    files: dict[str, Path | None] = {
+        row["network"]: folder / row["weights"]
+        for row in training
+        if row["way"] == way or row["network"] == "pcanet"
+    }
+    return {name: files[name] for name in NETWORKS if name in files}
+
+
+def report(
+    path: Path, detectors: dict[str, Path | None], data: list[str], retime: bool
+) -> LoopsJson:
+    """What a file holds of the detectors, and what it lacks measured and added to it."""
+    here = this_machine()
+    empty = LoopsJson(
+        seed=0, cells=[], gains=[], costs=[], machine=f"{here.cpu}, {here.cores} cores",
+        versions=versions(), created=datetime.now(UTC),
+    )  # fmt: skip
+    known = LoopsJson.model_validate_json(path.read_bytes()) if path.exists() else empty
+    costs = {one.detector: one for one in known.costs}
+    missing = {name: file for name, file in detectors.items() if name not in costs}
+    cells = known.cells + (measured(missing, data) if missing else [])
+    again = detectors if retime else missing
+    costs |= {name: cost(name, file) for name, file in again.items()}
+    added = {"cells": cells, "costs": [costs[name] for name in detectors]}
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(known.model_copy(update=added).model_dump_json(indent=1) + "\n")
+    return known.model_copy(update=added)
+
+
+def measured(detectors: dict[str, Path | None], data: list[str]) -> list[Score]:
+    """All detectors on all sets, under all conditions at full strength."""
+    vocabulary = load()
+    scorers = [open_scorer(name, file, vocabulary) for name, file in detectors.items()]
+    features = vocabulary if "bow" in detectors else None
+    bar = partial(count_bar, shown=True)
+    cells = []
+    for spec in data:
+        for test_set in open_set(spec, store.cache_folder(), threads=1, progress_bar=bar):
+            compared = DetectorSet(scorers, features, 1)
+            for condition in parse_conditions(",".join(CONDITIONS), "1"):
+                cells += measure(test_set, condition, compared, 0, descriptors_only=True)[0]
+    return cells
+
+
+def tables(reports: dict[str, LoopsJson], training: list[dict[str, str]]) -> str:
+    """All tables in Markdown."""
+    lines: list[str] = []
+    head, *rows = table_6(reports, digits=3)
+    lost_head, *lost = condition_table(reports)
+    for way, title in WAYS.items():
+        mine = [row[1:] for row in rows if row[0] == way]
+        if way != "shipped":
+            without = dict.fromkeys(NETWORKS, "not trained") | UNDEFINED
+            known = {row[0] for row in mine}
+            mine += [
+                (name, why, *["-"] * (len(head) - 3))
+                for name, why in without.items() if name not in known
+            ]  # fmt: skip
+        lines += [f"### {title}", "", *markdown_table(head[1:], mine), ""]
+        mine = [row[1:] for row in lost if row[0] == way]
+        lines += ["AP, precision at 70 % recall:", "", *markdown_table(lost_head[1:], mine), ""]
+    lines += ["### Training", "", *markdown_table(*training_table(training)), ""]
+    return "\n".join(lines)
+
+
+def table_6(reports: dict[str, LoopsJson], digits: int) -> list[Row]:
+    """Head and rows: unchanged images, means of the sets."""
+    head = ("way", "network", "accuracy", "precision at 70 % recall", "AP", "image (ms)",
+            f"query of {KEYFRAMES} (ms)", "parameters (M)")  # fmt: skip
+    rows = [head]
+    for way, report in reports.items():
+        for one in report.costs:
+            figures = [
+                mean(report, one.detector, "none", value)
+                for value in (accuracy, precision_at_70, average_precision)
+            ]
+            rows.append((
+                way, one.detector, *(rounded(figure, digits) for figure in figures),
+                f"{one.image_ms:.1f}", f"{one.query_ms[KEYFRAMES]:.1f}",
+                f"{one.parameters / 1e6:.2f}",
+            ))  # fmt: skip
+    return rows
+
+
+def condition_table(reports: dict[str, LoopsJson]) -> list[Row]:
+    """Head and rows: what is left under each condition, means of the sets."""
+    conditions = ("none", *(f"{kind}:1" for kind in CONDITIONS))
+    rows: list[Row] = [("way", "network", *("none", *CONDITIONS))]
+    for way, report in reports.items():
+        for one in report.costs:
+            cells = [
+                ", ".join(rounded(mean(report, one.detector, condition, value), 3)
+                          for value in (average_precision, precision_at_70))
+                for condition in conditions
+            ]  # fmt: skip
+            rows.append((way, one.detector, *cells))
+    return rows
+
+
+def training_table(training: list[dict[str, str]]) -> tuple[Row, list[Row]]:
+    """Head and rows: how far each network is."""
+    head = ("equal", "network", "images shown", "core minutes", "loss, first and last epoch",
+            "validation AP, last two epochs")  # fmt: skip
+    rows = []
+    for row in training:
+        learned = row["network"] == "pcanet"
+        rows.append((
+            "-" if learned else row["way"], row["network"], f"{int(row['images_shown']):,}",
+            f"{float(row['core_seconds']) / 60:.2f}",
+            "-" if learned else f"{float(row['first_loss']):.2f}, {float(row['last_loss']):.2f}",
+            ", ".join(f"{float(row[key]):.3f}" for key in ("ap_before_last", "ap_last")),
+        ))  # fmt: skip
+    return head, rows
+
+
+def every_score(reports: dict[str, LoopsJson]) -> list[Row]:
+    """Head and rows of conditions.csv: nothing is averaged."""
+    rows: list[Row] = [
+        ("way", "network", "images", "condition", "accuracy", "precision_at_70_recall",
+         "average_precision", "first_right")
+    ]  # fmt: skip
+    for way, report in reports.items():
+        rows += [
+            (way, cell.detector, cell.data, cell.condition,
+             *(rounded(value(cell), 4) for value in
+               (accuracy, precision_at_70, average_precision)), f"{cell.first_right:.4f}")
+            for cell in report.cells
+        ]  # fmt: skip
+    return rows
+
+
+def accuracy(score: Score) -> float | None:
+    """Balanced, where a pair counts as one of one place at p of 0.5; none for bag of words."""
+    return score.accuracy["0.5"]
+
+
+def precision_at_70(score: Score) -> float | None:
+    return score.figures["precision_at_70_recall"]
+
+
+def average_precision(score: Score) -> float | None:
+    return score.figures["average_precision"]
+
+
+def mean(
+    report: LoopsJson, detector: str, condition: str, value: Callable[[Score], float | None]
+) -> float | None:
+    """Mean over the sets of images; None where a set has no value."""
+    found = [value(cell) for cell in report.cells
+             if (cell.detector, cell.condition) == (detector, condition)]  # fmt: skip
+    known = [one for one in found if one is not None]
+    return statistics.mean(known) if known and len(known) == len(found) else None
+
+
+def rounded(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def write_csv(path: Path, rows: Iterable[Sequence[str]]) -> None:
+    """Write head and rows."""
+    with path.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
+
+
+if __name__ == "__main__":
+    main()

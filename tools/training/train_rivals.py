@@ -1,0 +1,253 @@
+"""Train every architecture of docs/rivals.md under equal conditions, in both of its ways.
+
+python tools/training/train_rivals.py --data SOURCE [--data SOURCE ...] --out DIR
+        [--pixels N] [--images N] [--core-minutes M] [--epochs N] [--device cuda] [--dry-run]
+
+SOURCE is as of ``vslam train``. All networks have the preset ``rivals``: random weights, the same
+pairs in the same order, augmentation, loss, head and learning rate. In DIR/images each is shown the
+same number of images, in DIR/minutes each computes for the same time of a core: validation and
+export come on top. DIR/rivals.csv has a row for each. ``capsule-pruned`` begins with the weights of
+``capsule`` beside it and trains for one epoch more. PCANet learns once, without gradients.
+
+How long a step takes is measured first and kept in DIR/plan.json. ``--dry-run`` only does that and
+prints what would follow. What is finished is skipped, a killed training goes on from its
+checkpoint: the same command resumes everything.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import statistics
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+from vslam.loopclosure.siamese.component_training import learn_components
+from vslam.loopclosure.siamese.data import Collection, load, refuse_test_data
+from vslam.loopclosure.siamese.export import export_onnx
+from vslam.loopclosure.siamese.images import parse_size
+from vslam.loopclosure.siamese.initial_network import starting_network
+from vslam.loopclosure.siamese.runtime import set_threads
+from vslam.loopclosure.siamese.settings import PRESETS, TrainSettings
+from vslam.loopclosure.siamese.siamese import build_network, load_network
+from vslam.loopclosure.siamese.source_registry import open_source
+from vslam.loopclosure.siamese.training import TrainingOutcome, train
+
+TRAINED = (
+    "capsule", "capsule-pruned", "squeezenet", "mobilenet", "alexnet", "googlenet", "darknet19",
+    "vgg16",
+)  # fmt: skip
+_TIMED_STEPS = 3
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training.
+
+    Attributes:
+        way: ``images`` or ``minutes``: what is equal.
+        network: that is trained.
+        pairs: of an epoch; 0 for PCANet.
+        core_seconds: that its steps should take.
+    """
+
+    way: str
+    network: str
+    pairs: int
+    core_seconds: float
+
+
+@dataclass(frozen=True)
+class Result:
+    """A row of rivals.csv; ``weights`` are relative to it.
+
+    ``core_seconds`` are of the steps alone, of PCANet all that it takes. Losses are means of the
+    first and the last epoch, validation APs are of the last two and of the best epoch, that of the
+    weights.
+    """
+
+    way: str
+    network: str
+    parameters: int
+    images_shown: int
+    epochs: int
+    core_seconds: float
+    first_loss: float
+    last_loss: float
+    ap_before_last: float
+    ap_last: float
+    ap_best: float
+    weights: str
+
+
+class StepClock:
+    """Core seconds of a step: the median, since what runs beside it on the machine only adds."""
+
+    def __init__(self) -> None:
+        self._last, self._epoch = time.process_time(), -1
+        self._taken: list[float] = []
+
+    def __call__(self, epoch: int, step: int, steps: int, loss: float) -> None:
+        """Called after each step; the first of an epoch has mining and validation before it."""
+        present = time.process_time()
+        if epoch == self._epoch:
+            self._taken.append(present - self._last)
+        self._last, self._epoch = present, epoch
+
+    def median(self) -> float:
+        return statistics.median(self._taken) if self._taken else float("nan")
+
+
+def main() -> None:
+    """Parse the command line and run what is left to do."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--data", action="append", required=True, help="source of images")
+    parser.add_argument("--out", type=Path, default=Path("training/rivals"))
+    parser.add_argument("--pixels", help="of the images; without: the preset's")
+    parser.add_argument("--images", type=int, default=65536, help="shown to each network")
+    parser.add_argument("--core-minutes", type=float, default=60.0, help="for each network")
+    parser.add_argument("--epochs", type=int, help="that these are divided into")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--dry-run", action="store_true", help="print the plan only")
+    args = parser.parse_args()
+
+    set_threads(1)
+    settings = PRESETS["rivals"]
+    if args.pixels:
+        shape = settings.shape.for_images_of(parse_size(args.pixels))
+        settings = settings.model_copy(update={"shape": shape})
+    if args.epochs:
+        settings = settings.model_copy(update={"epochs": args.epochs})
+    args.out.mkdir(parents=True, exist_ok=True)
+    jobs = plan(args.out / "plan.json", settings, args.images, args.core_minutes, args.device)
+    for job in jobs:
+        epochs = 1 if job.network == "capsule-pruned" else settings.epochs
+        print(
+            f"{job.way:8}{job.network:16}{job.pairs * 2 * epochs:8} images"
+            f"{job.core_seconds / 60:8.1f} core minutes"
+        )
+    if args.dry_run:
+        return
+    sources = [source for spec in args.data for source in open_source(spec)]
+    refuse_test_data(sources)
+    collection = load(sources, settings.shape.input, settings.fit, 1)
+    table = args.out / "rivals.csv"
+    results = read_results(table)
+    for job in jobs:
+        if (job.way, job.network) in {(r.way, r.network) for r in results}:
+            continue
+        results.append(run(job, collection, settings, args.out, args.device))
+        print(results[-1], flush=True)
+        write_results(table, results)
+
+
+def plan(
+    path: Path, settings: TrainSettings, images: int, minutes: float, device: str
+) -> list[Job]:
+    """The jobs of a file, or those that follow from the time of a step, written to it."""
+    if path.exists():
+        return [Job(**job) for job in json.loads(path.read_text())]
+    step = {name: seconds_of_a_step(name, settings, device) for name in TRAINED}
+    fewest = settings.batch
+    jobs = []
+    for way in ("images", "minutes"):
+        for name in TRAINED:
+            shown = images if way == "images" else 60 * minutes / step[name] * 2 * settings.batch
+            batches = max(1, round(shown / 2 / settings.epochs / fewest))
+            steps = batches * (1 if name == "capsule-pruned" else settings.epochs)
+            jobs.append(Job(way, name, batches * fewest, step[name] * steps))
+    jobs.append(Job("images", "pcanet", 0, 0.0))
+    path.write_text(json.dumps([asdict(job) for job in jobs], indent=1) + "\n")
+    return jobs
+
+
+def seconds_of_a_step(name: str, settings: TrainSettings, device: str) -> float:
+    """Core seconds of a step of training, without reading and augmenting its images."""
+    torch.manual_seed(0)
+    network = build_network(name, settings.shape, settings.head).to(device).train()
+    optimiser = torch.optim.Adam(network.parameters())
+    images = torch.rand(2 * settings.batch, 3, *settings.shape.input, device=device)
+    taken = []
+    for _ in range(_TIMED_STEPS):
+        began = time.process_time()
+        with torch.autocast(device, torch.bfloat16, enabled=bool(settings.mixed_precision)):
+            descriptors = network.embed(images)
+        loss = network.cosines(descriptors, descriptors).square().mean()
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        taken.append(time.process_time() - began)
+    return min(taken)
+
+
+def run(
+    job: Job, collection: Collection, settings: TrainSettings, out: Path, device: str
+) -> Result:
+    """Train, export and judge one network."""
+    folder = out / job.way / job.network
+    settings = settings.model_copy(update={"network": job.network})
+    clock, began = StepClock(), time.process_time()
+    if job.network == "pcanet":
+        outcome = learn_components(collection, settings, folder, device=device)
+    else:
+        settings = settings.model_copy(update={"pairs": job.pairs})
+        start = None
+        if job.network == "capsule-pruned":
+            settings = settings.model_copy(update={"epochs": 1})
+            whole = out / job.way / "capsule" / "capsule.safetensors"
+            start, settings, _ = starting_network(settings, collection, whole, device)
+        outcome = train(
+            collection, settings, folder, device=device, threads=1, resume=True, start=start,
+            on_step=clock,
+        )  # fmt: skip
+    all_seconds = time.process_time() - began
+    network, about = load_network(outcome.weights)
+    onnx = outcome.weights.with_suffix(".onnx")
+    export_onnx(network, onnx, about)
+    steps = job.pairs // settings.batch * settings.epochs
+    seconds = all_seconds if job.network == "pcanet" else clock.median() * steps
+    return result(job, outcome, network.n_parameters(), seconds, onnx.relative_to(out))
+
+
+def result(
+    job: Job, outcome: TrainingOutcome, parameters: int, seconds: float, weights: Path
+) -> Result:
+    """The row of a finished training."""
+    history = outcome.progress.history
+    ap = [row["average_precision"] for row in history]
+    return Result(
+        way=job.way, network=job.network, parameters=parameters,
+        images_shown=outcome.progress.images, epochs=outcome.progress.epoch,
+        core_seconds=round(seconds, 1), first_loss=round(history[0]["loss"], 4),
+        last_loss=round(history[-1]["loss"], 4), ap_before_last=round(ap[-2:][0], 4),
+        ap_last=round(ap[-1], 4), ap_best=round(max(ap), 4), weights=str(weights),
+    )  # fmt: skip
+
+
+def read_results(path: Path) -> list[Result]:
+    """Rows of rivals.csv; none where it is not there."""
+    if not path.exists():
+        return []
+    types = {"parameters": int, "images_shown": int, "epochs": int,
+             "way": str, "network": str, "weights": str}  # fmt: skip
+    with path.open() as file:
+        return [
+            Result(**{key: types.get(key, float)(value) for key, value in row.items()})
+            for row in csv.DictReader(file)
+        ]
+
+
+def write_results(path: Path, results: list[Result]) -> None:
+    """Write rivals.csv."""
+    with path.open("w", newline="") as file:
+        rows = csv.DictWriter(file, list(asdict(results[0])), lineterminator="\n")
+        rows.writeheader()
+        rows.writerows(asdict(one) for one in results)
+
+
+if __name__ == "__main__":
+    main()

@@ -74,7 +74,7 @@ def draw_online(scores: Sequence[OnlineScore], colors: Sequence[str]) -> ReportF
     drives, names = (_in_order(getattr(s, key) for s in scores) for key in ("data", "detector"))
     columns = min(2, len(drives))
     rows = -(-len(drives) // columns)
-    figure = Figure(figsize=(3.4 * columns, 0.7 + 2.3 * rows), layout="constrained")
+    figure = Figure(figsize=(6.8, 0.7 + 2.3 * rows), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axes in grid.flat[len(drives) :]:

@@ -45,7 +45,7 @@ class Score(_Model):
     accuracy: dict[str, float | None]
     queries: int
     first_right: float
-    sequence_right: float | None
+    sequence_right: float | None = None
     verified: dict[str, Verified]
     curve: Curve
 

@@ -336,7 +336,8 @@ def test_a_drive_is_measured_before_and_after_verification_and_reported(tmp_path
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--protocol", "online", "--perturb", "light"], "--perturb, --strengths: change the"),
+        (["--protocol", "online", "--perturb", "light"], "--perturb, --strengths, --seed: change"),
+        (["--protocol", "online", "--seed", "1"], "--perturb, --strengths, --seed: change"),
         (["--protocol", "online", "--window", "x"], "--window x: must be above 0"),
         (["--protocol", "online", "--detectors", "magic"], "--detectors magic: unknown"),
         (["--protocol", "online", "--data", "town:demo"], "--protocol online takes drives"),

@@ -77,8 +77,8 @@ def bench(
     window: Annotated[
         str,
         typer.Option(
-            help="With --protocol online: the youngest images, which are not searched, in seconds "
-            "(20s) or images (200)."
+            help="With --protocol online: how much older than its query an image must be to be "
+            "searched, in seconds (20s) or images (200)."
         ),
     ] = WINDOW,
     seed: Annotated[int, typer.Option(min=0, help="Of what is drawn.")] = 0,
@@ -99,10 +99,10 @@ def bench(
     for name in names or [""]:
         require_comparable(name, files.get(name), protocol)
     conditions, youngest = parse_conditions(perturb, strengths), parse_window(window)
-    if protocol == "online" and (perturb, strengths) != (PERTURB, STRENGTHS):
+    if protocol == "online" and (perturb, strengths, seed) != (PERTURB, STRENGTHS, 0):
         raise InputError(
-            "--perturb, --strengths: change the queries of --protocol retrieval; leave them out "
-            "with online."
+            "--perturb, --strengths, --seed: change the queries of --protocol retrieval; leave "
+            "them out with online."
         )
     if protocol == "retrieval" and window != WINDOW:
         raise InputError("--window: is of --protocol online; add that or leave it out.")

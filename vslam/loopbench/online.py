@@ -93,7 +93,8 @@ class Window:
                 default.
         """
         clock = np.arange(n, dtype=np.float64) if times is None or not self.timed else times
-        return np.searchsorted(clock, clock - self.amount, side="right")
+        # Times are multiples of an interval that binary fractions do not hold.
+        return np.searchsorted(clock, clock - self.amount + 1e-6, side="right")
 
 
 def parse_window(text: str) -> Window:

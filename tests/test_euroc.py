@@ -14,12 +14,14 @@ from scipy.spatial.transform import Rotation
 from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.euroc import open_euroc
+from vslam.datasets.ground_truth import poses_at
 from vslam.datasets.perturbation import Perturbation
 from vslam.errors import InputError, UnreadableImageError
 from vslam.geometry import se3_exp
 from vslam.run.outcome import RunSettings
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import NullRecorder
+from vslam.trajectory import Trajectory
 
 REAL = Path(__file__).parents[2] / "shared/data/euroc/V1_01_start"
 FRAMES = 6
@@ -125,17 +127,29 @@ def test_no_partners_at_all(root):
     refused(root, "none of its 6 images is of the time of one")
 
 
-def test_ground_truth_is_interpolated_and_must_cover_all(root, corridor, caplog):
+def test_ground_truth_of_some_frames(root, corridor, caplog):
     path = root / "V9_01/mav0/state_groundtruth_estimate0/data.csv"
-    drop_lines(path, lambda k: k != 4)
-    found = open_euroc(root, "V9_01").ground_truth
-    np.testing.assert_allclose(found[3], corridor.T_wc[3], atol=1e-3)
     drop_lines(path, lambda k: k not in (1, 2))
+    found = open_euroc(root, "V9_01").ground_truth
+    assert np.isnan(found[:2]).all()
+    np.testing.assert_allclose(found[2:], corridor.T_wc[2:FRAMES], atol=1e-9)
+    path.write_text(path.read_text().replace("14037", "15037"))
     assert open_euroc(root, "V9_01").ground_truth is None
-    assert "--start 2 --max-frames 4" in caplog.text
-    assert open_euroc(root, "V9_01", start=2).ground_truth is not None
+    assert "covers none of the frames" in caplog.text
     path.unlink()
     assert open_euroc(root, "V9_01").ground_truth is None
+
+
+def test_ground_truth_between_measurements():
+    """Half-way between two poses; not across a gap, nor beyond the ends."""
+    T_wc = np.tile(np.eye(4), (4, 1, 1))
+    T_wc[:, 0, 3] = 0.0, 1.0, 2.0, 3.0
+    T_wc[1, :3, :3] = Rotation.from_rotvec([0.0, 0.2, 0.0]).as_matrix()
+    measured = Trajectory(np.array([0.0, 0.1, 0.2, 0.6]), T_wc)
+    found = poses_at(Path("truth"), measured, np.array([-0.01, 0.0, 0.05, 0.2, 0.3, 0.6, 0.7]))
+    assert np.isnan(found).all((1, 2)).tolist() == [True, False, False, False, True, True, True]
+    np.testing.assert_allclose(found[2, :3, 3], [0.5, 0.0, 0.0])
+    np.testing.assert_allclose(Rotation.from_matrix(found[2, :3, :3]).as_rotvec(), [0.0, 0.1, 0.0])
 
 
 def test_a_calibration_of_ones_own(root, corridor):

@@ -455,6 +455,24 @@ def test_without_ground_truth(tmp_path: Path) -> None:
     assert "n/a" in (tmp_path / "report.md").read_text()
 
 
+def test_ground_truth_of_some_frames(tmp_path: Path) -> None:
+    """Errors are of these frames; of loops nobody can say where the drive comes back."""
+    whole = make_outcome(60, lost=slice(20, 21))
+    known = whole.sequence.ground_truth.copy()
+    known[:15] = np.nan
+    partly = replace(whole, sequence=replace(whole.sequence, ground_truth=known))
+    report = report_of(partly, tmp_path)
+    assert report.ate_rmse_m is not None
+    assert report.evaluation_remark == "45 of 60 frames have a ground truth"
+    assert "45 of 60 frames have a ground truth" in (tmp_path / "report.md").read_text()
+    assert report.loops_found is None
+    assert "error_along_path" in figures_of(tmp_path)
+    truth, estimate = (
+        read_trajectory(tmp_path / name) for name in ("ground_truth.tum", "trajectory.tum")
+    )
+    assert evaluate_trajectory(estimate, truth).ate_rmse_m == pytest.approx(report.ate_rmse_m)
+
+
 def test_of_one_frame(tmp_path: Path) -> None:
     report = report_of(make_outcome(1, lost=slice(0, 0)), tmp_path)
     assert (report.frames, report.keyframes, report.ate_rmse_m) == (1, 1, None)

@@ -69,6 +69,20 @@ def test_ground_truth_of_just_the_frames_done(tmp_path):
     )
 
 
+def test_ground_truth_of_some_frames_keeps_their_times(tmp_path):
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 2, 3] = np.arange(5)
+    known = poses.copy()
+    known[[0, 3]] = np.nan
+    sequence = _Sequence(ground_truth=known)
+    outcome = SimpleNamespace(sequence=sequence, trajectory=Trajectory(sequence.timestamps, poses))
+    write_trajectories(tmp_path, outcome)
+    assert not (tmp_path / "ground_truth_kitti.txt").exists()
+    truth = read_trajectory(tmp_path / "ground_truth.tum")
+    np.testing.assert_allclose(truth.timestamps, [0.1, 0.2, 0.4])
+    np.testing.assert_allclose(truth.T_wc[:, 2, 3], [1.0, 2.0, 4.0])
+
+
 def test_no_ground_truth(tmp_path):
     sequence = _Sequence()
     outcome = SimpleNamespace(

@@ -117,7 +117,7 @@ def open_euroc(
     raw = EurocImages(
         name=found,
         timestamps=stamps.astype(np.float64) * 1e-9,
-        ground_truth=_read_ground_truth(base, stamps, start, every),
+        ground_truth=_read_ground_truth(base, stamps),
         left=files[0],
         right=() if monocular else files[1],
         sizes=tuple((width, height) for height, width in shapes),
@@ -197,9 +197,7 @@ def _pair(
     return np.column_stack([rows, nearest])[near]
 
 
-def _read_ground_truth(
-    base: Path, stamps: NDArray[np.int64], start: int, every: int
-) -> NDArray[np.float64] | None:
+def _read_ground_truth(base: Path, stamps: NDArray[np.int64]) -> NDArray[np.float64] | None:
     from scipy.spatial.transform import Rotation
 
     folder = base / "state_groundtruth_estimate0"
@@ -211,7 +209,7 @@ def _read_ground_truth(
     T_w_measured[:, :3, :3] = Rotation.from_quat(rows[:, 3:], scalar_first=True).as_matrix()
     T_w_measured[:, :3, 3] = rows[:, :3]
     measured = Trajectory((times - times[0]) * 1e-9, T_w_measured)
-    T_w_sensor = poses_at(path, measured, (stamps - times[0]) * 1e-9, start, every)
+    T_w_sensor = poses_at(path, measured, (stamps - times[0]) * 1e-9)
     if T_w_sensor is None:
         return None
     T_body_camera = read_document(base / "cam0" / "sensor.yaml").matrix("T_BS", 4, 4)

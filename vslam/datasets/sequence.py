@@ -22,7 +22,7 @@ class Sequence(Protocol):
         name: name of the sequence in it, ``00`` for example.
         camera: calibration of this sequence; ``camera.sensor`` tells what ``read`` gives.
         timestamps: ``(N,)`` float64 seconds, strictly increasing.
-        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` or None.
+        ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without one, or None.
     """
 
     @property

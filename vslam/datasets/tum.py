@@ -156,11 +156,7 @@ def open_tum(
         name=folder.resolve().name,
         camera=camera,
         timestamps=times,
-        ground_truth=(
-            poses_at(truth, read_trajectory(truth), times, start, every)
-            if truth.is_file()
-            else None
-        ),
+        ground_truth=(poses_at(truth, read_trajectory(truth), times) if truth.is_file() else None),
         colour=colour,
         depth=depth,
         depth_scale=depth_scale or calibration.depth_scale or _DEPTH_SCALE,

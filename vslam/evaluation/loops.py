@@ -102,9 +102,12 @@ _DEFAULT_LIMITS = LoopLimits()
 
 
 def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
-    """Judge the loops of a run over the frames that it has done; None without ground truth."""
+    """Judge the loops of a run over the frames that it has done; None unless all of them have a
+    ground truth: a path with holes does not say where it was driven twice."""
     truth = ground_truth_of(outcome.sequence)
     if truth is None or not len(outcome.trajectory):
+        return None
+    if not np.isin(outcome.trajectory.timestamps, truth.timestamps).all():
         return None
     T_wc, times = truth.T_wc, truth.timestamps
     done = int(np.searchsorted(times, outcome.trajectory.timestamps[-1], side="right"))

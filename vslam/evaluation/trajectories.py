@@ -30,6 +30,7 @@ class Evaluation:
     Attributes:
         frames: N, the frames compared.
         alignment: ``se3``, ``sim3`` or ``none``: what was fitted before comparing.
+        timestamps: ``(N,)`` seconds, of the estimate.
         ate_rmse_m, ate_mean_m, ate_max_m: of ``errors_m``.
         errors_m: ``(N,)`` distance of each aligned position from the ground truth.
         T_wc_aligned: ``(N, 4, 4)`` the estimate, aligned to the ground truth.
@@ -41,6 +42,7 @@ class Evaluation:
 
     frames: int
     alignment: str
+    timestamps: NDArray[np.float64]
     ate_rmse_m: float
     ate_mean_m: float
     ate_max_m: float
@@ -106,6 +108,7 @@ def evaluate_trajectory(
     return Evaluation(
         frames=len(errors),
         alignment=alignment,
+        timestamps=estimate.timestamps,
         ate_rmse_m=_rmse(errors),
         ate_mean_m=float(errors.mean()),
         ate_max_m=float(errors.max()),

@@ -113,7 +113,7 @@ def _error_along_path(outcome: RunOutcome, evaluation: Evaluation) -> Figure:
     figure, axes = new_figure("Error along the path", "distance travelled (m)", "error (m)", LOW)
     distances, errors = evaluation.distances_m, evaluation.errors_m
     lost = [track.timestamp for track in outcome.tracks if track.state == TrackingState.LOST]
-    at = np.isin(outcome.trajectory.timestamps, lost)
+    at = np.isin(evaluation.timestamps, lost)
     axes.fill_between(distances, errors, color=BLUE, alpha=0.14, linewidth=0)
     axes.plot(distances, errors, color=BLUE)
     axes.axhline(

@@ -94,11 +94,17 @@ def write_results(
 
 
 def write_trajectories(folder: Path, outcome: RunOutcome) -> None:
-    """Write the final trajectory in both formats and the ground truth of the same frames."""
+    """Write the final trajectory in both formats and the ground truth of the same frames; in TUM's
+    alone, which has times, where not all of them have one."""
     write_kitti(folder / "trajectory_kitti.txt", outcome.trajectory.T_wc)
     write_tum(folder / "trajectory.tum", outcome.trajectory)
-    if (ground_truth := matched_ground_truth(outcome)) is not None:
+    ground_truth = matched_ground_truth(outcome)
+    if ground_truth is None:
+        return
+    if len(ground_truth) == len(outcome.trajectory):
         write_kitti(folder / "ground_truth_kitti.txt", ground_truth.T_wc)
+    else:
+        write_tum(folder / "ground_truth.tum", ground_truth)
 
 
 def _write_report(folder: Path, outcome: RunOutcome, config: str, *, pages: bool) -> ReportJson:
@@ -108,7 +114,11 @@ def _write_report(folder: Path, outcome: RunOutcome, config: str, *, pages: bool
     command = None
     if evaluation is not None:
         estimate, truth = folder / "trajectory_kitti.txt", folder / "ground_truth_kitti.txt"
-        command = evo_command(estimate, truth, evaluation.alignment, "kitti")
+        if evaluation.frames == len(outcome.trajectory):
+            command = evo_command(estimate, truth, evaluation.alignment, "kitti")
+        else:
+            estimate, truth = folder / "trajectory.tum", folder / "ground_truth.tum"
+            command = evo_command(estimate, truth, evaluation.alignment, "tum")
     report = summarize(outcome, evaluation, verdict, command, remark)
     (folder / "report.json").write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
     if pages:

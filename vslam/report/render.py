@@ -35,7 +35,8 @@ def headlines(report: ReportJson) -> list[Headline]:
     """The summary. Lost frames come first: an ATE says little of a run that was lost for half."""
     lost = report.lost_frames
     share = f"{100.0 * lost / report.frames:.1f} % of" if lost else "of"
-    alignment = _ALIGNMENTS[report.alignment] if report.alignment else report.evaluation_remark
+    alignment = _ALIGNMENTS[report.alignment] if report.alignment else ""
+    evaluated = "; ".join(filter(None, (alignment, report.evaluation_remark)))
     rotation = _number(report.rpe_deg, "°")
     return [
         Headline(
@@ -44,7 +45,7 @@ def headlines(report: ReportJson) -> list[Headline]:
             f"{share} {report.frames}; {report.weak_frames} weak, {report.skipped_frames} skipped",
             "bad" if lost else "good",
         ),
-        Headline("ATE RMSE", _number(report.ate_rmse_m, "m"), alignment or ""),
+        Headline("ATE RMSE", _number(report.ate_rmse_m, "m"), evaluated),
         Headline("RPE", _number(report.rpe_m, "m"), f"a frame; rotation {rotation}"),
         Headline("t_rel", _number(report.t_rel_percent, "%"), "KITTI drift over 100-800 m"),
         Headline("r_rel", _number(report.r_rel_deg_per_100m, "°"), "every 100 m"),

@@ -81,8 +81,8 @@ class ReportJson(_Model):
     """One run in numbers.
 
     Errors are None without ground truth, and KITTI's drift also on paths shorter than 100 m;
-    ``evaluation_remark`` says why there are none. ``without_loops`` is of the same run with the
-    detector ``none`` (``--compare-loops``).
+    ``evaluation_remark`` says why there are none, or of how many frames they are.
+    ``without_loops`` is of the same run with the detector ``none`` (``--compare-loops``).
     ``frames`` counts the frames done; of them ``skipped_frames`` had an unreadable image and
     ``dropped_frames`` were overtaken by a newer one in a real-time run, whose ``latency_ms`` is
     from the time of an image to its pose (None in any other run).

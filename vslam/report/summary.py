@@ -92,15 +92,18 @@ def summarize(
 
 
 def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
-    """Errors of a run's final trajectory, or None and the reason why there are none."""
+    """Errors of a run's final trajectory, or None, and why they are not of all frames."""
     ground_truth = matched_ground_truth(outcome)
     if ground_truth is None:
         return None, "no ground truth"
     try:
         alignment = outcome.settings.alignment
-        return evaluate_trajectory(outcome.trajectory, ground_truth, alignment), None
+        found = evaluate_trajectory(outcome.trajectory, ground_truth, alignment)
     except InputError as error:  # a clip too short to align is no reason to lose the run
         return None, str(error)
+    if found.frames == len(outcome.trajectory):
+        return found, None
+    return found, f"{found.frames} of {len(outcome.trajectory)} frames have a ground truth"
 
 
 def _figures_without_loops(outcome: RunOutcome) -> LoopFigures | None:

@@ -38,8 +38,8 @@ def top_view(
 ) -> Figure:
     """Estimate and truth, doubtful frames, closed loops, and revisits that were missed."""
     figure, axes = new_figure("Top view", "x (m)", "z (m)", SQUARE)
-    T_wc = outcome.trajectory.T_wc if evaluation is None else evaluation.T_wc_aligned
-    x, z = T_wc[:, 0, 3], T_wc[:, 2, 3]
+    path = _aligned(outcome, evaluation, outcome.trajectory.T_wc[:, :3, 3])
+    x, z = path[:, 0], path[:, 2]
     if evaluation is not None and ground_truth is not None:
         truth = ground_truth.T_wc[:, :3, 3]
         axes.plot(truth[:, 0], truth[:, 2], color=GREY, linewidth=3.4, alpha=0.65, label="truth")
@@ -54,14 +54,14 @@ def top_view(
     if verdict is not None and verdict.n_missed:
         missed = verdict.loop_frame < 0
         stretches = [
-            np.append(_at_frames(outcome, T_wc, np.arange(first, last + 1)), [[np.nan] * 3], axis=0)
+            np.append(_at_frames(outcome, path, np.arange(first, last + 1)), [[np.nan] * 3], axis=0)
             for first, last in zip(
                 verdict.revisits.first[missed], verdict.revisits.last[missed], strict=True
             )
         ]
-        path = np.concatenate(stretches)
+        driven = np.concatenate(stretches)
         label = f"revisit missed ({missed.sum()})"
-        axes.plot(path[:, 0], path[:, 2], color=VIOLET, linewidth=6, alpha=0.45, label=label)
+        axes.plot(driven[:, 0], driven[:, 2], color=VIOLET, linewidth=6, alpha=0.45, label=label)
     right = verdict.right if verdict else (None,) * len(outcome.loops)
     for wrong, color, name in ((False, GREEN, "loop"), (True, RED, "wrong loop")):
         chosen = [
@@ -71,7 +71,7 @@ def top_view(
         ]
         if chosen:
             frames = outcome.keyframe_frames[np.array(chosen)]
-            lines = _lines(_at_frames(outcome, T_wc, frames.ravel()).reshape(-1, 2, 3))
+            lines = _lines(_at_frames(outcome, path, frames.ravel()).reshape(-1, 2, 3))
             label = f"{name} ({len(chosen)})"
             axes.plot(*lines, "o-", color=color, linewidth=1.2, markersize=4, label=label, zorder=5)
     axes.set_aspect("equal", adjustable="datalim")
@@ -133,18 +133,19 @@ def _lines(ends: Points) -> Collection[Points]:
     return points[:, 0], points[:, 2]
 
 
-def _at_frames(outcome: RunOutcome, T_wc: NDArray[np.float64], frames: NDArray[np.int64]) -> Points:
-    """``(F, 3)`` positions of frames of the run, from the poses of all frames done."""
+def _at_frames(outcome: RunOutcome, path: Points, frames: NDArray[np.int64]) -> Points:
+    """``(F, 3)`` positions of frames of the run, from those of all frames done."""
     times = np.array([outcome.tracks[k].timestamp for k in frames])
     index = np.searchsorted(outcome.trajectory.timestamps, times)
-    return T_wc[np.minimum(index, len(T_wc) - 1), :3, 3]
+    return path[np.minimum(index, len(path) - 1)]
 
 
 def _aligned(outcome: RunOutcome, evaluation: Evaluation | None, points: Points) -> Points:
     """Take ``(N, 3)`` points of the estimate's world to where the evaluation has put it."""
     if evaluation is None:
         return points
-    estimate, aligned = outcome.trajectory.T_wc, evaluation.T_wc_aligned
+    compared = np.isin(outcome.trajectory.timestamps, evaluation.timestamps)
+    estimate, aligned = outcome.trajectory.T_wc[compared], evaluation.T_wc_aligned
     R = aligned[0, :3, :3] @ estimate[0, :3, :3].T
     p, q = estimate[:, :3, 3], aligned[:, :3, 3]
     scale = 1.0

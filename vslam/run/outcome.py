@@ -94,10 +94,11 @@ class RunOutcome:
 
 
 def ground_truth_of(source: Sequence | Stream) -> Trajectory | None:
-    """The ground truth of all frames of a source, None without any."""
+    """The ground truth of all frames that have one, None without any."""
     if isinstance(source, Stream) or source.ground_truth is None:
         return None
-    return Trajectory(source.timestamps, source.ground_truth)
+    known = np.flatnonzero(np.isfinite(source.ground_truth).all((1, 2)))
+    return Trajectory(source.timestamps, source.ground_truth).select(known)
 
 
 def matched_ground_truth(outcome: RunOutcome) -> Trajectory | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+import time
 from datetime import UTC, datetime
 from pathlib import Path
 from types import ModuleType
@@ -252,20 +253,43 @@ def test_every_network_can_be_named_on_the_command_line():
 def test_the_script_plans_trains_and_goes_on(tmp_path, monkeypatch):
     tool = script("tools/training/train_rivals.py")
     monkeypatch.setattr(tool, "TRAINED", ("capsule", "capsule-pruned"))
+    seconds = {"capsule": 0.5, "capsule-pruned": 0.25}
+    monkeypatch.setattr(tool, "seconds_of_a_step", lambda name, *_: seconds[name])
     settings = small_settings(epochs=2)
-    jobs = tool.plan(tmp_path / "plan.json", settings, 64, 0.001, "cpu")
+    jobs = tool.plan(tmp_path / "plan.json", settings, 64, 0.1, "cpu")
     assert [(job.way, job.network) for job in jobs] == [
         ("images", "capsule"), ("images", "capsule-pruned"), ("minutes", "capsule"),
         ("minutes", "capsule-pruned"), ("images", "pcanet"),
     ]  # fmt: skip
-    assert [job.pairs for job in jobs[:2]] == [16, 16]
-    assert jobs[0].core_seconds == pytest.approx(2 * jobs[1].core_seconds, rel=0.9)
-    assert tool.plan(tmp_path / "plan.json", settings, 999, 9.0, "cpu") == jobs
+    steps = 16 // settings.batch  # of an epoch that shows 32 images; the pruned one has one epoch
+    assert [job.pairs for job in jobs] == [16, 16, 6 * settings.batch, 12 * settings.batch, 0]
+    assert [job.core_seconds for job in jobs] == [2 * steps * 0.5, steps * 0.25, 6.0, 3.0, 0.0]
+    assert tool.plan(tmp_path / "plan.json", settings, 64, 0.1, "cpu") == jobs
     results = [tool.run(jobs[0], views(20), settings, tmp_path, "cpu")]
     assert results[0].images_shown == 64
     assert (tmp_path / results[0].weights).exists()
     tool.write_results(tmp_path / "rivals.csv", results)
     assert tool.read_results(tmp_path / "rivals.csv") == results
+
+
+def test_a_folder_of_rivals_keeps_to_its_options(tmp_path, monkeypatch):
+    tool = script("tools/training/train_rivals.py")
+    monkeypatch.setattr(tool, "TRAINED", ("capsule",))
+    monkeypatch.setattr(tool, "seconds_of_a_step", lambda *_: 0.5)
+    words = ["train_rivals.py", "--data", "photos:x", "--out", str(tmp_path), "--dry-run"]
+    monkeypatch.setattr("sys.argv", words)
+    tool.main()
+    tool.main()
+    monkeypatch.setattr("sys.argv", [*words, "--images", "999"])
+    with pytest.raises(SystemExit, match=r"was made with --images 65536, not 999; name another"):
+        tool.main()
+
+
+@pytest.mark.parametrize("option", ["--resume", "--epochs=2", "--pairs=8", "--max-minutes=1"])
+def test_pcanet_refuses_options_of_epochs(option):
+    done = CliRunner().invoke(app, ["train", "pcanet", "--data", "photos:x", option])
+    assert isinstance(done.exception, InputError)
+    assert str(done.exception).endswith(f"leave out {option.partition('=')[0]}.")
 
 
 def loops_report(*detectors: str) -> LoopsJson:
@@ -292,9 +316,21 @@ def loops_report(*detectors: str) -> LoopsJson:
     )  # fmt: skip
 
 
+class Sleeper:
+    """A network that takes 4 ms for an image, 2 ms if it is pruned."""
+
+    size = (8, 8)
+
+    def __init__(self, name: str) -> None:
+        self._seconds = 0.002 if name == "capsule-pruned" else 0.004
+
+    def embed(self, image: np.ndarray) -> None:
+        time.sleep(self._seconds)
+
+
 def test_the_tables_of_the_page(tmp_path, monkeypatch):
     tool = script("tools/rivals_table.py")
-    names = {"images": ("capsule", "pcanet"), "minutes": ("capsule", "pcanet"),
+    names = {"images": ("capsule", "capsule-pruned", "pcanet"), "minutes": ("capsule", "pcanet"),
              "shipped": ("bow", "capsule", "capsule-pruned")}  # fmt: skip
     for way, detectors in names.items():
         (tmp_path / "bench").mkdir(exist_ok=True)
@@ -302,9 +338,16 @@ def test_the_tables_of_the_page(tmp_path, monkeypatch):
     (tmp_path / "rivals.csv").write_text(
         "way,network,images_shown,core_seconds,first_loss,last_loss,ap_before_last,ap_last,weights\n"
         "images,capsule,4096,90.0,2.5,1.5,0.4,0.5,images/c.onnx\n"
+        "images,capsule-pruned,1024,30.0,1.5,1.5,0.4,0.4,images/q.onnx\n"
         "minutes,capsule,1024,60.0,2.5,1.5,0.4,0.5,minutes/c.onnx\n"
         "images,pcanet,1500,30.0,nan,nan,0.3,0.3,images/p.onnx\n"
     )
+    for way in ("images", "minutes"):
+        (tmp_path / way).mkdir()
+        for file in "cqp":
+            (tmp_path / way / f"{file}.onnx").write_text(f"{way} {file}")
+    monkeypatch.setattr(tool, "_REPEATS", 20)
+    monkeypatch.setattr(tool, "open_network", lambda name, file: Sleeper(name))
     page = tmp_path / "page.md"
     page.write_text("before <!-- tables --> old <!-- end of tables --> after")
     words = ["rivals_table.py", "--trained", str(tmp_path), "--data", "x", "--page", str(page)]
@@ -315,18 +358,33 @@ def test_the_tables_of_the_page(tmp_path, monkeypatch):
     assert text.endswith("<!-- end of tables --> after")
     assert " old " not in text
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
-    # Means of the two sets: 0.25 and 0.1 more for the second detector.
+    # Means of the two sets: 0.25 and 0.1 more for each further detector.
     assert ["pcanet", "0.550", "0.450", "0.350", "2.0", "3.0", "4.00"] in lines
     assert ["bow", "-", "0.350", "0.250", "2.0", "3.0", "4.00"] in lines
     assert ["FLCNN", "no definition found", *"-----"] in lines
+    assert ["LSGD", "hand-crafted (arXiv:2304.03872), not implemented", *"-----"] in lines
     assert lines.count(["vgg16", "not trained", *"-----"]) == 2
-    assert ["pcanet", *["0.350, 0.450"] * 4] in lines
-    assert ["-", "pcanet", "1,500", "0.50", "-", "0.300, 0.300"] in lines
+    assert ["pcanet", *["0.550, 0.450, 0.350"] * 4] in lines
+    assert ["nothing", "pcanet", "1,500", "0.50", "-", "0.300, 0.300"] in lines
+    # What it continues is added: 4,096 images and 90 s.
+    assert ["images", "capsule-pruned", "5,120", "2.00", "1.50, 1.50", "0.400, 0.400"] in lines
+    (saved,) = (line[3] for line in lines if line[:1] == ["Same number of images shown"])
+    assert 25 <= int(saved.removesuffix(" %")) <= 60
+    for number, data in enumerate(("kitti00", "town")):
+        assert f"recall on {data}" in text
+        assert f"(page/precision_recall_{number}.png)" in text
+        picture = (tmp_path / "page" / f"precision_recall_{number}.png").read_bytes()
+        assert 10_000 < len(picture) < 150_000
     rows = (tmp_path / "page" / "conditions.csv").read_text().splitlines()
-    assert "images,pcanet,town,light:1,0.8000,0.7000,0.6000,1.0000" in rows
-    assert len(rows) == 1 + 7 * 4 * 2
+    assert "minutes,pcanet,town,light:1,0.8000,0.7000,0.6000,1.0000" in rows
+    assert len(rows) == 1 + 8 * 4 * 2
     training = tool.read_training(tmp_path / "rivals.csv")
     assert tool.weights_of("minutes", training, Path("d")) == {
         "capsule": Path("d/minutes/c.onnx"), "pcanet": Path("d/images/p.onnx")
     }  # fmt: skip
     assert tool.weights_of("shipped", training, Path("d")) == dict.fromkeys(tool.SHIPPED)
+    (tmp_path / "minutes" / "c.onnx").write_text("trained again")
+    with pytest.raises(
+        SystemExit, match=r"bench: was made with weights of minutes/capsule \w+, not"
+    ):
+        tool.main()

@@ -7,29 +7,40 @@ DIR is what tools/training/train_rivals.py wrote, SOURCE as of ``vslam loops ben
 as that command does, descriptors alone: of the networks that were shown the same images, of those
 that computed for the same time, and of what vslam ships. DIR/bench keeps what is measured, a file
 for each of the three; a network that is there is not measured again, save its times with --retime.
-Tables take the place of what is between the marks in the page, their numbers are written as CSV to
-a folder beside the page, of its name.
+It also keeps --data and digests of the weights, and is refused with others. Tables take the place
+of what is between the marks in the page, their numbers are written as CSV, precision-recall curves
+as PNG to a folder beside the page, of its name.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import json
 import statistics
+import sys
+import time
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from vslam.cli.progress import count_bar
 from vslam.datasets.synthetic import store
+from vslam.errors import InputError
 from vslam.loopbench.conditions import parse_conditions
 from vslam.loopbench.cost import cost
 from vslam.loopbench.detectors import DetectorSet, open_scorer
+from vslam.loopbench.kept import digest, keep_conditions
 from vslam.loopbench.measure import measure
+from vslam.loopbench.report import draw
 from vslam.loopbench.schema import LoopsJson, Score
 from vslam.loopbench.sets import open_set
-from vslam.loopclosure.siamese.weights import NETWORKS
+from vslam.loopclosure.siamese.inference import OnnxNetwork, open_network
+from vslam.loopclosure.siamese.weights import NETWORKS, find_weights
 from vslam.loopclosure.vocabulary import load
 from vslam.machine import versions
 from vslam.report.page import markdown_table
@@ -43,7 +54,18 @@ WAYS = {
     "shipped": "Other training, not to be compared with the others: what vslam ships",
 }
 SHIPPED = ("bow", "capsule", "capsule-pruned")
-UNDEFINED = dict.fromkeys(("FLCNN", "LSGD"), "no definition found")  # of Table 6
+ABSENT = {  # of Table 6
+    "FLCNN": "no definition found",
+    "LSGD": "hand-crafted (arXiv:2304.03872), not implemented",
+}
+NOTES = {
+    "images": "`pcanet` is outside the equal budget, `capsule-pruned` continues from `capsule`.",
+    "shipped": "Of the parameters of `bow`, 0.10 M are weights of words; its time of an image "
+    "excludes the extraction of ORB features, which tracking needs anyway.",
+}
+NOTES["minutes"] = NOTES["images"]
+PAIR = ("capsule", "capsule-pruned")
+_REPEATS = 200
 _BEGIN, _END = "<!-- tables -->", "<!-- end of tables -->"
 Row = tuple[str, ...]
 
@@ -57,23 +79,31 @@ def main() -> None:
     parser.add_argument("--retime", action="store_true", help="measure all times again")
     args = parser.parse_args()
 
-    training = read_training(args.trained / "rivals.csv")
+    training, bench = read_training(args.trained / "rivals.csv"), args.trained / "bench"
+    detectors = {way: weights_of(way, training, args.trained) for way in WAYS}
+    try:
+        keep_conditions(bench / "conditions.json", conditions(detectors, args.data))
+    except InputError as error:
+        sys.exit(str(error))
     reports = {
-        way: report(
-            args.trained / "bench" / f"{way}.json", weights_of(way, training, args.trained),
-            args.data, args.retime,
-        )
-        for way in WAYS
-    }  # fmt: skip
+        way: report(bench / f"{way}.json", files, args.data, args.retime)
+        for way, files in detectors.items()
+    }
+    pruned = pruning(bench / "pruning.json", detectors, args.retime)
     folder = args.page.with_suffix("")
     folder.mkdir(exist_ok=True)
+    images = []
+    for figure in draw(reports["images"]):
+        (folder / f"{figure.name}.png").write_bytes(figure.png)
+        images.append(f"![{figure.caption}]({folder.name}/{figure.name}.png)")
     write_csv(folder / "table6.csv", table_6(reports, digits=4))
     write_csv(folder / "conditions.csv", every_score(reports))
     write_csv(folder / "training.csv", [tuple(training[0]), *(tuple(r.values()) for r in training)])
     text = args.page.read_text()
     before, _, rest = text.partition(_BEGIN)
     after = rest.partition(_END)[2]
-    args.page.write_text(f"{before}{_BEGIN}\n\n{tables(reports, training)}\n{_END}{after}")
+    found = tables(reports, training, pruned, images)
+    args.page.write_text(f"{before}{_BEGIN}\n\n{found}\n{_END}{after}")
 
 
 def read_training(path: Path) -> list[dict[str, str]]:
@@ -92,6 +122,15 @@ def weights_of(way: str, training: list[dict[str, str]], folder: Path) -> dict[s
         if row["way"] == way or row["network"] == "pcanet"
     }
     return {name: files[name] for name in NETWORKS if name in files}
+
+
+def conditions(detectors: dict[str, dict[str, Path | None]], data: list[str]) -> dict[str, Any]:
+    """What decides what is measured: images, and the weights of all networks there are."""
+    files = {
+        f"weights of {way}/{name}": digest(find_weights(name, path))
+        for way, named in detectors.items() for name, path in named.items() if name in NETWORKS
+    }  # fmt: skip
+    return {"--data": data, **files}
 
 
 def report(
@@ -130,23 +169,60 @@ def measured(detectors: dict[str, Path | None], data: list[str]) -> list[Score]:
     return cells
 
 
-def tables(reports: dict[str, LoopsJson], training: list[dict[str, str]]) -> str:
-    """All tables in Markdown."""
+def pruning(
+    path: Path, detectors: dict[str, dict[str, Path | None]], retime: bool
+) -> dict[str, list[float]]:
+    """What ``timed_in_turn`` says of ``PAIR`` in each way that has both; a file keeps it."""
+    known = json.loads(path.read_text()) if path.exists() and not retime else {}
+    for way, files in detectors.items():
+        if way not in known and set(PAIR) <= set(files):
+            known[way] = timed_in_turn([open_network(name, files[name]) for name in PAIR])
+    path.write_text(json.dumps(known, indent=1) + "\n")
+    return known
+
+
+def timed_in_turn(networks: list[OnnxNetwork]) -> list[float]:
+    """Milliseconds of two networks for an image, medians, and the median of the second's share of
+    the first's time. They take turns, so that what else the machine does slows both."""
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 256, network.size, np.uint8) for network in networks]
+    taken = np.empty((_REPEATS, 2))
+    for repeat in range(_REPEATS):
+        for k, (network, image) in enumerate(zip(networks, images, strict=True)):
+            began = time.perf_counter()
+            network.embed(image)
+            taken[repeat, k] = time.perf_counter() - began
+    found = (*(1e3 * np.median(taken, axis=0)), np.median(taken[:, 1] / taken[:, 0]))
+    return [round(float(one), 3) for one in found]
+
+
+def tables(
+    reports: dict[str, LoopsJson],
+    training: list[dict[str, str]],
+    pruned: dict[str, list[float]],
+    images: list[str],
+) -> str:
+    """All tables in Markdown; ``images`` are lines that show the curves of the first way."""
     lines: list[str] = []
     head, *rows = table_6(reports, digits=3)
     lost_head, *lost = condition_table(reports)
     for way, title in WAYS.items():
         mine = [row[1:] for row in rows if row[0] == way]
         if way != "shipped":
-            without = dict.fromkeys(NETWORKS, "not trained") | UNDEFINED
+            without = dict.fromkeys(NETWORKS, "not trained") | ABSENT
             known = {row[0] for row in mine}
             mine += [
                 (name, why, *["-"] * (len(head) - 3))
                 for name, why in without.items() if name not in known
             ]  # fmt: skip
-        lines += [f"### {title}", "", *markdown_table(head[1:], mine), ""]
+        lines += [f"### {title}", "", *markdown_table(head[1:], mine), "", NOTES[way], ""]
         mine = [row[1:] for row in lost if row[0] == way]
-        lines += ["AP, precision at 70 % recall:", "", *markdown_table(lost_head[1:], mine), ""]
+        lines += ["Accuracy, precision at 70 % recall, AP:", ""]
+        lines += [*markdown_table(lost_head[1:], mine), ""]
+        if way == "images":
+            lines += [line for image in images for line in (image, "")]
+    lines += ["### Time of the network alone", "", *markdown_table(*pruning_table(pruned)), ""]
+    lines += [f"Medians of {_REPEATS} turns; less time: median of what each turn saves.", ""]
     lines += ["### Training", "", *markdown_table(*training_table(training)), ""]
     return "\n".join(lines)
 
@@ -178,7 +254,7 @@ def condition_table(reports: dict[str, LoopsJson]) -> list[Row]:
         for one in report.costs:
             cells = [
                 ", ".join(rounded(mean(report, one.detector, condition, value), 3)
-                          for value in (average_precision, precision_at_70))
+                          for value in (accuracy, precision_at_70, average_precision))
                 for condition in conditions
             ]  # fmt: skip
             rows.append((way, one.detector, *cells))
@@ -186,19 +262,32 @@ def condition_table(reports: dict[str, LoopsJson]) -> list[Row]:
 
 
 def training_table(training: list[dict[str, str]]) -> tuple[Row, list[Row]]:
-    """Head and rows: how far each network is."""
+    """Head and rows: how far each network is; of a pruned one, what it continues is added."""
     head = ("equal", "network", "images shown", "core minutes", "loss, first and last epoch",
             "validation AP, last two epochs")  # fmt: skip
     rows = []
+    whole = {row["way"]: row for row in training if row["network"] == "capsule"}
     for row in training:
         learned = row["network"] == "pcanet"
+        parts = [row, whole[row["way"]]] if row["network"] == "capsule-pruned" else [row]
         rows.append((
-            "-" if learned else row["way"], row["network"], f"{int(row['images_shown']):,}",
-            f"{float(row['core_seconds']) / 60:.2f}",
+            "nothing" if learned else row["way"], row["network"],
+            f"{sum(int(part['images_shown']) for part in parts):,}",
+            f"{sum(float(part['core_seconds']) for part in parts) / 60:.2f}",
             "-" if learned else f"{float(row['first_loss']):.2f}, {float(row['last_loss']):.2f}",
             ", ".join(f"{float(row[key]):.3f}" for key in ("ap_before_last", "ap_last")),
         ))  # fmt: skip
     return head, rows
+
+
+def pruning_table(pruned: dict[str, list[float]]) -> tuple[Row, list[Row]]:
+    """Head and rows: what pruning saves."""
+    rows = [
+        (WAYS[way].rpartition(": ")[2], f"{whole:.2f}", f"{less:.2f}",
+         f"{100 * (1 - share):.0f} %")
+        for way, (whole, less, share) in pruned.items()
+    ]  # fmt: skip
+    return ("training", *(f"{name} (ms)" for name in PAIR), "less time"), rows
 
 
 def every_score(reports: dict[str, LoopsJson]) -> list[Row]:

@@ -84,7 +84,8 @@ class ConvolutionalBranch(nn.Module):
     def load_torchvision(self, path: Path) -> None:
         """Take over the weights of a torchvision file (``alexnet-*.pth``, ``vgg16-*.pth``).
 
-        The last layer, which names ImageNet's classes, is left out.
+        The last layer, which names ImageNet's classes, is left out. The branch standardises each
+        image instead of normalising it as for ImageNet: they only serve as a start for training.
 
         Raises:
             InputError: no such file, not a weight file, or one of another network.

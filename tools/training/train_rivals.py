@@ -7,11 +7,13 @@ SOURCE is as of ``vslam train``. All networks have the preset ``rivals``: random
 pairs in the same order, augmentation, loss, head and learning rate. In DIR/images each is shown the
 same number of images, in DIR/minutes each computes for the same time of a core: validation and
 export come on top. DIR/rivals.csv has a row for each. ``capsule-pruned`` begins with the weights of
-``capsule`` beside it and trains for one epoch more. PCANet learns once, without gradients.
+``capsule`` beside it and trains for one epoch more;
+its row counts that one alone. PCANet learns once, without gradients.
 
 How long a step takes is measured first and kept in DIR/plan.json. ``--dry-run`` only does that and
 prints what would follow. What is finished is skipped, a killed training goes on from its
-checkpoint: the same command resumes everything.
+checkpoint: the same command resumes everything. DIR/conditions.json keeps its options; with others
+DIR is refused.
 """
 
 from __future__ import annotations
@@ -20,12 +22,16 @@ import argparse
 import csv
 import json
 import statistics
+import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
+from vslam.errors import InputError
+from vslam.loopbench.kept import keep_conditions
 from vslam.loopclosure.siamese.component_training import learn_components
 from vslam.loopclosure.siamese.data import Collection, load, refuse_test_data
 from vslam.loopclosure.siamese.export import export_onnx
@@ -122,7 +128,10 @@ def main() -> None:
         settings = settings.model_copy(update={"shape": shape})
     if args.epochs:
         settings = settings.model_copy(update={"epochs": args.epochs})
-    args.out.mkdir(parents=True, exist_ok=True)
+    try:
+        keep_conditions(args.out / "conditions.json", conditions(args))
+    except InputError as error:
+        sys.exit(str(error))
     jobs = plan(args.out / "plan.json", settings, args.images, args.core_minutes, args.device)
     for job in jobs:
         epochs = 1 if job.network == "capsule-pruned" else settings.epochs
@@ -143,6 +152,12 @@ def main() -> None:
         results.append(run(job, collection, settings, args.out, args.device))
         print(results[-1], flush=True)
         write_results(table, results)
+
+
+def conditions(args: argparse.Namespace) -> dict[str, Any]:
+    """The options that decide what a training comes to."""
+    named = ("data", "pixels", "images", "core_minutes", "epochs", "device")
+    return {f"--{name.replace('_', '-')}": getattr(args, name) for name in named}
 
 
 def plan(

@@ -125,6 +125,9 @@ def train(
     from vslam.loopclosure.siamese.source_registry import open_source
     from vslam.machine import available_cores
 
+    if network == "pcanet":
+        _refuse_of_pcanet({"--epochs": epochs, "--pairs": pairs, "--max-minutes": max_minutes,
+                           "--resume": resume or None})  # fmt: skip
     began = time.monotonic()
     sources = [source for spec in data for source in open_source(spec)]
     if not allow_test_data:
@@ -161,6 +164,14 @@ def train(
     for name, value in outcome.figures.items():
         typer.echo(f"{name:<28}{value:.4f}")
     typer.echo(f"{'weights':<28}{outcome.weights}")
+
+
+def _refuse_of_pcanet(given: dict[str, object]) -> None:
+    """Refuse options of a training in steps; ``given`` are their values, None where not given."""
+    from vslam.errors import InputError
+
+    for option in (name for name, value in given.items() if value is not None):
+        raise InputError(f"vslam train pcanet: learns once, not in epochs; leave out {option}.")
 
 
 def _train(

@@ -31,6 +31,7 @@ from vslam.report.page import Table, markdown_table, render_page
 
 MEAN = "mean of all"
 _COLORS = [GREY, BLUE, VIOLET, AMBER, GREEN, RED]
+_DASHES = ["-", "--", ":"]  # of the first six detectors, of the next six, of the rest
 _ABOUT_AP = (
     "Average precision over all pairs of a query and a gallery image whose relation is known, "
     "descriptors alone. Last column: AP of the detector minus that of the first, with the 95 % "
@@ -241,7 +242,7 @@ def draw(report: LoopsJson) -> list[ReportFigure]:
 
 def _curves(scores: list[Score], detectors: list[str], data: str) -> Figure:
     conditions = list(dict.fromkeys(c.condition for c in scores))
-    columns = min(3, len(conditions))
+    columns = 2 if len(conditions) == 4 else min(3, len(conditions))
     rows = -(-len(conditions) // columns)
     figure = Figure(figsize=(6.6, 0.7 + 1.9 * rows), layout="constrained")
     FigureCanvasAgg(figure)
@@ -252,11 +253,12 @@ def _curves(scores: list[Score], detectors: list[str], data: str) -> Figure:
     for axes, condition in zip(grid.flat, conditions, strict=False):
         axes.set_title(condition, fontsize=9, color=INK)
         for score in (s for s in scores if s.condition == condition):
-            color = _COLORS[detectors.index(score.detector) % len(_COLORS)]
-            axes.plot(score.curve.recall, score.curve.precision, color=color, label=score.detector)
+            dash, color = divmod(detectors.index(score.detector), len(_COLORS))
+            axes.plot(score.curve.recall, score.curve.precision, label=score.detector,
+                      color=_COLORS[color], linestyle=_DASHES[dash % len(_DASHES)])  # fmt: skip
         axes.set(xlim=(0, 1), ylim=(0, 1.02))
     handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)))
     for axes in grid[-1, : (len(conditions) - 1) % columns + 1]:
         axes.set_xlabel("recall", fontsize=9.5)
     figure.supylabel("precision", fontsize=9.5)

@@ -167,6 +167,9 @@ def test_folders_of_images(folder, corridor, tmp_path):
     refused("left and right, image_0 and image_1", "images", tmp_path, options)
     write_images(tmp_path, {"right": corridor.right[:2]}, ["0.png", "1.png"])
     refused("2 images but 3 in .* 2 on one side only", "images", tmp_path, options)
+    write_images(tmp_path, {"right": corridor.right[2:3]}, ["3.png"])
+    refused("3 images but 3 in .* 2 on one side only", "images", tmp_path, options)
+    (tmp_path / "right/3.png").unlink()
     write_images(tmp_path, {"right": corridor.right[2:3]}, ["2.png"])
     refused("no time stamps .* give --fps", "images", tmp_path, options)
     times = tmp_path / "times.txt"

@@ -34,6 +34,7 @@ from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.bag_messages import grey_of
 from vslam.datasets.detection import detect_dataset
+from vslam.datasets.image_folders import open_images
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.sources import SourceOptions, open_source
 from vslam.datasets.stream import TimedFrame, count_expected, timed_frames
@@ -173,6 +174,29 @@ def test_times_in_names(corridor, tmp_path, names, times):
     found = open_source("images", str(tmp_path), "", SourceOptions((calib,)), monocular=True)
     assert found.timestamps[0] == pytest.approx(times[0], abs=1e-6)
     assert np.diff(found.timestamps)[0] == pytest.approx(times[1], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["1403636102.1753", "1403636102.2", "1403636102.25", "1403636102.31"],
+        ["a2", "a10", "b1", "b2"],
+        ["9", "10", "99", "100"],
+        ["left_9_x", "left_10_a", "left_10_b", "left_11"],
+    ],
+)
+def test_images_come_in_the_order_of_times_or_numbers(corridor, tmp_path, names):
+    write_images(tmp_path, {"": corridor.left[:4]}, [f"{name}.png" for name in names])
+    found = open_images(tmp_path, fps=10.0, monocular=True)
+    assert [path.stem for path in found.left] == names
+
+
+def test_sides_without_a_common_name_belong_together_by_order(corridor, tmp_path):
+    write_images(tmp_path, {"left": corridor.left[:3]}, ["l8.png", "l9.png", "l10.png"])
+    write_images(tmp_path, {"right": corridor.right[:3]}, ["r8.png", "r9.png", "r10.png"])
+    found = open_images(tmp_path, fps=10.0)
+    assert [path.stem for path in found.left] == ["l8", "l9", "l10"]
+    assert [path.stem for path in found.right] == ["r8", "r9", "r10"]
 
 
 def test_times_in_exif(corridor, tmp_path):

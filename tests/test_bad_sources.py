@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ import cv2
 import pytest
 from source_files import (
     LEFT,
+    RIGHT,
     all_sources,
     run_source,
     source_path,
@@ -65,6 +67,30 @@ def test_bags_without_what_is_needed(folder, corridor, tmp_path):
     refused("there are no image topics", "bag", tmp_path / "empty.bag", SourceOptions())
     write_bag(tmp_path / "unstamped.bag", "ros1", one, [0, 0])
     refused("no time stamps", "bag", tmp_path / "unstamped.bag", SourceOptions(), monocular=True)
+
+
+@pytest.mark.parametrize(
+    ("flaw", "part"),
+    [("calibrated", "no calibration .nor camera_info"), ("baseline", "camera_info.*baseline")],
+)
+def test_a_useless_camera_info_is_not_read_where_there_is_a_calibration(
+    folder, corridor, tmp_path, flaw, part
+):
+    pair = {LEFT: corridor.left[:2], RIGHT: corridor.right[:2]}
+    flaws = {"camera": corridor.camera, flaw: False}
+    write_bag(tmp_path / "a.bag", "ros1", pair, [0, 10**8], **flaws)
+    refused(part, "bag", tmp_path / "a.bag", SourceOptions())
+    options = SourceOptions((folder / "stereo.yaml",))
+    source = open_source("bag", str(tmp_path / "a.bag"), "", options)
+    assert source.camera == corridor.camera
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_a_stream_that_ends_before_its_first_frame(folder, side_by_side, realtime):
+    whole = open_source("video", str(folder / "pair.mkv"), "", side_by_side)
+    source = replace(whole, raw=replace(whole.raw, n_expected=None), start=FRAMES)
+    with pytest.raises(InputError, match=f"--start {FRAMES}: pair has no frame there"):
+        run_source(source, realtime=realtime)
 
 
 def test_bags_without_rosbags(folder, monkeypatch):

@@ -97,10 +97,10 @@ def open_source(
             Path(data), fps=options.fps, side_by_side=options.side_by_side, monocular=monocular
         )
     elif dataset == "bag":
-        from vslam.datasets.bag import open_bag
+        from vslam.datasets.bag import find_calibration, open_bag
 
         stream = bag = open_bag(Path(data), topics=options.topics, monocular=monocular)
-        own = bag.calibration
+        own = None if options.calibration else find_calibration(bag)
     else:
         from vslam.datasets.live_camera import open_camera
 

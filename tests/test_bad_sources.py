@@ -53,7 +53,7 @@ def test_topics(folder):
     options = SourceOptions(topics=(LEFT, "/cam9"))
     refused(f"--topics /cam9: not in .*ros1.bag; {listed}", "bag", bag, options)
     refused("right ones, or run with --sensor mono", "bag", bag, SourceOptions(topics=(LEFT,)))
-    refused(f"choose with --topics TOPIC; {listed}", "bag", bag, SourceOptions(), monocular=True)
+    refused(f"choose with --topics TOPIC; {listed}", "bag", bag, SourceOptions(), sensor="mono")
 
 
 def test_bags_without_what_is_needed(folder, corridor, tmp_path):
@@ -66,7 +66,7 @@ def test_bags_without_what_is_needed(folder, corridor, tmp_path):
     write_bag(tmp_path / "empty.bag", "ros1", {}, [])
     refused("there are no image topics", "bag", tmp_path / "empty.bag", SourceOptions())
     write_bag(tmp_path / "unstamped.bag", "ros1", one, [0, 0])
-    refused("no time stamps", "bag", tmp_path / "unstamped.bag", SourceOptions(), monocular=True)
+    refused("no time stamps", "bag", tmp_path / "unstamped.bag", SourceOptions(), sensor="mono")
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_an_image_of_another_size_is_one_lost_frame(corridor, tmp_path):
     images = [*corridor.left[:2], corridor.left[2][:80], *corridor.left[3:5]]
     write_bag(tmp_path / "a.bag", "ros1", {LEFT: images}, [k * 10**8 for k in range(5)])
     options = SourceOptions((write_calibration(tmp_path / "c.yaml", corridor.camera),))
-    outcome = run_source(open_source("bag", str(tmp_path / "a.bag"), "", options, monocular=True))
+    outcome = run_source(open_source("bag", str(tmp_path / "a.bag"), "", options, sensor="mono"))
     assert len(outcome.tracks) == 5
     assert len(outcome.skipped) == 1
     assert "480x80 pixels where the first image has 480x160" in outcome.skipped[0]
@@ -230,3 +230,23 @@ def test_cameras(folder, tmp_path, monkeypatch, side_by_side):
 )
 def test_options_of_other_sources(dataset, options, part):
     refused(part, dataset, "nowhere", SourceOptions(**options))
+
+
+def test_options_of_a_second_image_with_the_left_camera_alone():
+    nowhere, scale = SourceOptions(right=Path("r")), SourceOptions(depth_scale=1000.0)
+    refused("--right: of no use with --sensor mono", "images", "nowhere", nowhere, sensor="mono")
+    refused("--depth-scale: of no use with --sensor", "tum", "nowhere", scale, sensor="mono")
+
+
+def test_another_sensor(folder, kitti_tree):
+    options = SourceOptions((folder / "stereo.yaml",))
+    images = folder / "images"
+    refused("--sensor rgbd: images is of sensor stereo", "images", images, options, sensor="rgbd")
+    with pytest.raises(InputError, match="--sensor rgbd: 00 is of sensor stereo"):
+        open_source("kitti", str(kitti_tree), None, SourceOptions(), sensor="rgbd")
+
+
+@pytest.mark.parametrize("dataset", ["images", "video", "bag", "camera"])
+def test_only_data_sets_have_sequences(dataset):
+    with pytest.raises(InputError, match=f"--seq 05: only for data sets, not {dataset}; leave it"):
+        open_source(dataset, "nowhere", "05", SourceOptions())

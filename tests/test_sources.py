@@ -63,7 +63,7 @@ def opened(folder: Path, kind: str, **options):
     given = () if kind == "folder" else (folder / "stereo.yaml",)
     topics = (LEFT, RIGHT) if kind == "ros1" else ()
     chosen = SourceOptions(given, side_by_side=dataset == "video", topics=topics)
-    return open_source(dataset, path, "00", chosen, **options)
+    return open_source(dataset, path, None, chosen, **options)
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def test_selected_frames(folder, corridor, kind):
 
 @pytest.mark.parametrize("kind", ["images", "video", "ros1"])
 def test_the_left_camera_alone(folder, corridor, kind):
-    source = opened(folder, kind, monocular=True)
+    source = opened(folder, kind, sensor="mono")
     assert source.camera.monocular
     left, right = next(timed_frames(source)).read(map)
     assert np.array_equal(left, corridor.left[0])
@@ -171,7 +171,7 @@ def test_bayer_patterns_are_told_apart(pattern):
 def test_times_in_names(corridor, tmp_path, names, times):
     write_images(tmp_path, {"cam0": corridor.left[:2]}, names)
     calib = write_calibration(tmp_path / "c.yaml", corridor.camera)
-    found = open_source("images", str(tmp_path), "", SourceOptions((calib,)), monocular=True)
+    found = open_source("images", str(tmp_path), "", SourceOptions((calib,)), sensor="mono")
     assert found.timestamps[0] == pytest.approx(times[0], abs=1e-6)
     assert np.diff(found.timestamps)[0] == pytest.approx(times[1], abs=1e-6)
 
@@ -207,7 +207,7 @@ def test_times_in_exif(corridor, tmp_path):
         exif.get_ifd(0x8769).update({0x9003: "2024:05:17 10:20:30", 0x9291: subsec})
         Image.fromarray(corridor.left[k]).save(tmp_path / f"IMG_{k}.jpg", exif=exif)
     calib = write_calibration(tmp_path / "c.yaml", corridor.camera)
-    found = open_source("images", str(tmp_path), "", SourceOptions((calib,)), monocular=True)
+    found = open_source("images", str(tmp_path), "", SourceOptions((calib,)), sensor="mono")
     assert np.diff(found.timestamps)[0] == pytest.approx(0.5, abs=1e-6)
 
 

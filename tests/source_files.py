@@ -73,6 +73,8 @@ def write_bag(
     *,
     encoding: str = "mono8",
     camera: Camera | None = None,
+    baseline: bool = True,
+    calibrated: bool = True,
     lag: int = 0,
     padding: int = 0,
 ) -> Path:
@@ -83,6 +85,8 @@ def write_bag(
         stamps: nanoseconds.
         encoding: of the images, or ``png`` for compressed ones.
         camera: write its camera_info.
+        baseline: it has the baseline, in the right P.
+        calibrated: it is not all zero.
         lag: nanoseconds that the second side's stamps are late.
         padding: bytes behind each row.
     """
@@ -118,8 +122,8 @@ def write_bag(
         return types["Image"](header(stamp), *image.shape, encoding, 0, rows.shape[1], rows.ravel())
 
     def info(side: int):
-        P = np.array([camera.fx, 0, camera.cx, -side * camera.bf,
-                      0, camera.fy, camera.cy, 0, 0, 0, 1, 0])  # fmt: skip
+        P = np.array([camera.fx, 0, camera.cx, -side * camera.bf * baseline,
+                      0, camera.fy, camera.cy, 0, 0, 0, 1, 0]) * calibrated  # fmt: skip
         K, R = np.delete(P, [3, 7, 11]), np.eye(3).ravel()
         region = types["RegionOfInterest"](0, 0, 0, 0, False)
         shape = (camera.height, camera.width)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ import cv2
 import pytest
 from source_files import (
     LEFT,
+    RIGHT,
     all_sources,
     run_source,
     source_path,
@@ -51,7 +53,7 @@ def test_topics(folder):
     options = SourceOptions(topics=(LEFT, "/cam9"))
     refused(f"--topics /cam9: not in .*ros1.bag; {listed}", "bag", bag, options)
     refused("right ones, or run with --sensor mono", "bag", bag, SourceOptions(topics=(LEFT,)))
-    refused(f"choose with --topics TOPIC; {listed}", "bag", bag, SourceOptions(), monocular=True)
+    refused(f"choose with --topics TOPIC; {listed}", "bag", bag, SourceOptions(), sensor="mono")
 
 
 def test_bags_without_what_is_needed(folder, corridor, tmp_path):
@@ -64,7 +66,31 @@ def test_bags_without_what_is_needed(folder, corridor, tmp_path):
     write_bag(tmp_path / "empty.bag", "ros1", {}, [])
     refused("there are no image topics", "bag", tmp_path / "empty.bag", SourceOptions())
     write_bag(tmp_path / "unstamped.bag", "ros1", one, [0, 0])
-    refused("no time stamps", "bag", tmp_path / "unstamped.bag", SourceOptions(), monocular=True)
+    refused("no time stamps", "bag", tmp_path / "unstamped.bag", SourceOptions(), sensor="mono")
+
+
+@pytest.mark.parametrize(
+    ("flaw", "part"),
+    [("calibrated", "no calibration .nor camera_info"), ("baseline", "camera_info.*baseline")],
+)
+def test_a_useless_camera_info_is_not_read_where_there_is_a_calibration(
+    folder, corridor, tmp_path, flaw, part
+):
+    pair = {LEFT: corridor.left[:2], RIGHT: corridor.right[:2]}
+    flaws = {"camera": corridor.camera, flaw: False}
+    write_bag(tmp_path / "a.bag", "ros1", pair, [0, 10**8], **flaws)
+    refused(part, "bag", tmp_path / "a.bag", SourceOptions())
+    options = SourceOptions((folder / "stereo.yaml",))
+    source = open_source("bag", str(tmp_path / "a.bag"), "", options)
+    assert source.camera == corridor.camera
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_a_stream_that_ends_before_its_first_frame(folder, side_by_side, realtime):
+    whole = open_source("video", str(folder / "pair.mkv"), "", side_by_side)
+    source = replace(whole, raw=replace(whole.raw, n_expected=None), start=FRAMES)
+    with pytest.raises(InputError, match=f"--start {FRAMES}: pair has no frame there"):
+        run_source(source, realtime=realtime)
 
 
 def test_bags_without_rosbags(folder, monkeypatch):
@@ -100,7 +126,7 @@ def test_an_image_of_another_size_is_one_lost_frame(corridor, tmp_path):
     images = [*corridor.left[:2], corridor.left[2][:80], *corridor.left[3:5]]
     write_bag(tmp_path / "a.bag", "ros1", {LEFT: images}, [k * 10**8 for k in range(5)])
     options = SourceOptions((write_calibration(tmp_path / "c.yaml", corridor.camera),))
-    outcome = run_source(open_source("bag", str(tmp_path / "a.bag"), "", options, monocular=True))
+    outcome = run_source(open_source("bag", str(tmp_path / "a.bag"), "", options, sensor="mono"))
     assert len(outcome.tracks) == 5
     assert len(outcome.skipped) == 1
     assert "480x80 pixels where the first image has 480x160" in outcome.skipped[0]
@@ -167,6 +193,9 @@ def test_folders_of_images(folder, corridor, tmp_path):
     refused("left and right, image_0 and image_1", "images", tmp_path, options)
     write_images(tmp_path, {"right": corridor.right[:2]}, ["0.png", "1.png"])
     refused("2 images but 3 in .* 2 on one side only", "images", tmp_path, options)
+    write_images(tmp_path, {"right": corridor.right[2:3]}, ["3.png"])
+    refused("3 images but 3 in .* 2 on one side only", "images", tmp_path, options)
+    (tmp_path / "right/3.png").unlink()
     write_images(tmp_path, {"right": corridor.right[2:3]}, ["2.png"])
     refused("no time stamps .* give --fps", "images", tmp_path, options)
     times = tmp_path / "times.txt"
@@ -201,3 +230,23 @@ def test_cameras(folder, tmp_path, monkeypatch, side_by_side):
 )
 def test_options_of_other_sources(dataset, options, part):
     refused(part, dataset, "nowhere", SourceOptions(**options))
+
+
+def test_options_of_a_second_image_with_the_left_camera_alone():
+    nowhere, scale = SourceOptions(right=Path("r")), SourceOptions(depth_scale=1000.0)
+    refused("--right: of no use with --sensor mono", "images", "nowhere", nowhere, sensor="mono")
+    refused("--depth-scale: of no use with --sensor", "tum", "nowhere", scale, sensor="mono")
+
+
+def test_another_sensor(folder, kitti_tree):
+    options = SourceOptions((folder / "stereo.yaml",))
+    images = folder / "images"
+    refused("--sensor rgbd: images is of sensor stereo", "images", images, options, sensor="rgbd")
+    with pytest.raises(InputError, match="--sensor rgbd: 00 is of sensor stereo"):
+        open_source("kitti", str(kitti_tree), None, SourceOptions(), sensor="rgbd")
+
+
+@pytest.mark.parametrize("dataset", ["images", "video", "bag", "camera"])
+def test_only_data_sets_have_sequences(dataset):
+    with pytest.raises(InputError, match=f"--seq 05: only for data sets, not {dataset}; leave it"):
+        open_source(dataset, "nowhere", "05", SourceOptions())

@@ -237,6 +237,21 @@ def test_the_command_looks_at_the_beginning_of_a_video(corridor, tmp_path, monke
     assert "median vertical error" in done.output
 
 
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ("--sensor rgbd", "--sensor rgbd: 00 is of sensor stereo"),
+        ("--depth-scale 9", "--depth-scale: only for --dataset tum, not kitti"),
+        ("--dataset images --seq 00", "--seq 00: only for data sets, not images"),
+    ],
+)
+def test_the_command_refuses_the_options_that_a_run_refuses(kitti_tree, tmp_path, words, part):
+    words = [*words.split(), "--out", str(tmp_path / "page.html")]
+    done = CliRunner().invoke(app, ["doctor", str(kitti_tree), *words])
+    assert done.exit_code == 1
+    assert part in done.output
+
+
 def test_the_command_turns_bad_input_into_a_finding(kitti_tree, tmp_path):
     page, own = tmp_path / "page.html", tmp_path / "own.yaml"
     one = "{focal: [240, 240], centre: [320, 240], size: [640, 480]}"

@@ -97,9 +97,23 @@ def test_reads_a_sequence(root, corridor):
     np.testing.assert_allclose(sequence.ground_truth, corridor.T_wc[:FRAMES], atol=1e-9)
 
 
+@pytest.mark.parametrize("name", [None, "V9_01"])
+@pytest.mark.parametrize("inner", ["", "V9_01", "V9_01/mav0"])
+def test_the_folder_itself_can_be_named(root, inner, name):
+    sequence = open_euroc(root / inner, name)
+    assert (sequence.name, len(sequence)) == ("V9_01", FRAMES)
+
+
 @pytest.mark.parametrize("inner", ["V9_01", "V9_01/mav0"])
-def test_the_folder_itself_can_be_named(root, inner):
-    assert len(open_euroc(root / inner, "00")) == FRAMES
+def test_the_folder_of_another_sequence_is_refused(root, inner):
+    with pytest.raises(InputError, match=r"--seq MH_05: .* is the sequence V9_01 itself; leave"):
+        open_euroc(root / inner, "MH_05")
+
+
+def test_one_of_several_sequences_must_be_named(root):
+    (root / "V9_02").symlink_to(root / "V9_01")
+    with pytest.raises(InputError, match="several sequences; choose --seq of V9_01, V9_02"):
+        open_euroc(root)
 
 
 def test_selection_and_the_left_camera_alone(root, corridor):

@@ -221,6 +221,15 @@ def test_tums_cameras_are_known_by_the_folder(copy):
     refused(known, "TUM's camera freiburg3", "640x480", "480x160")
 
 
+def test_sequences_are_found_by_name(tree):
+    for root in (tree, tree.parent):
+        assert open_tum(root).name == open_tum(root, "corridor").name == "corridor"
+    with pytest.raises(InputError, match=r"--seq desk: .* is the sequence corridor itself"):
+        open_tum(tree, "desk")
+    with pytest.raises(InputError, match="desk: no such sequence; choose --seq of corridor"):
+        open_tum(tree.parent, "desk")
+
+
 def test_bad_input_of_tum(copy, tmp_path):
     refused(tmp_path / "nowhere", "no rgb.txt", "download")
     refused(copy, "--start 16", start=FRAMES)

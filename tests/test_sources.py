@@ -34,6 +34,7 @@ from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.bag_messages import grey_of
 from vslam.datasets.detection import detect_dataset
+from vslam.datasets.image_folders import open_images
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.sources import SourceOptions, open_source
 from vslam.datasets.stream import TimedFrame, count_expected, timed_frames
@@ -62,7 +63,7 @@ def opened(folder: Path, kind: str, **options):
     given = () if kind == "folder" else (folder / "stereo.yaml",)
     topics = (LEFT, RIGHT) if kind == "ros1" else ()
     chosen = SourceOptions(given, side_by_side=dataset == "video", topics=topics)
-    return open_source(dataset, path, "00", chosen, **options)
+    return open_source(dataset, path, None, chosen, **options)
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +104,7 @@ def test_selected_frames(folder, corridor, kind):
 
 @pytest.mark.parametrize("kind", ["images", "video", "ros1"])
 def test_the_left_camera_alone(folder, corridor, kind):
-    source = opened(folder, kind, monocular=True)
+    source = opened(folder, kind, sensor="mono")
     assert source.camera.monocular
     left, right = next(timed_frames(source)).read(map)
     assert np.array_equal(left, corridor.left[0])
@@ -170,9 +171,32 @@ def test_bayer_patterns_are_told_apart(pattern):
 def test_times_in_names(corridor, tmp_path, names, times):
     write_images(tmp_path, {"cam0": corridor.left[:2]}, names)
     calib = write_calibration(tmp_path / "c.yaml", corridor.camera)
-    found = open_source("images", str(tmp_path), "", SourceOptions((calib,)), monocular=True)
+    found = open_source("images", str(tmp_path), "", SourceOptions((calib,)), sensor="mono")
     assert found.timestamps[0] == pytest.approx(times[0], abs=1e-6)
     assert np.diff(found.timestamps)[0] == pytest.approx(times[1], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["1403636102.1753", "1403636102.2", "1403636102.25", "1403636102.31"],
+        ["a2", "a10", "b1", "b2"],
+        ["9", "10", "99", "100"],
+        ["left_9_x", "left_10_a", "left_10_b", "left_11"],
+    ],
+)
+def test_images_come_in_the_order_of_times_or_numbers(corridor, tmp_path, names):
+    write_images(tmp_path, {"": corridor.left[:4]}, [f"{name}.png" for name in names])
+    found = open_images(tmp_path, fps=10.0, monocular=True)
+    assert [path.stem for path in found.left] == names
+
+
+def test_sides_without_a_common_name_belong_together_by_order(corridor, tmp_path):
+    write_images(tmp_path, {"left": corridor.left[:3]}, ["l8.png", "l9.png", "l10.png"])
+    write_images(tmp_path, {"right": corridor.right[:3]}, ["r8.png", "r9.png", "r10.png"])
+    found = open_images(tmp_path, fps=10.0)
+    assert [path.stem for path in found.left] == ["l8", "l9", "l10"]
+    assert [path.stem for path in found.right] == ["r8", "r9", "r10"]
 
 
 def test_times_in_exif(corridor, tmp_path):
@@ -183,7 +207,7 @@ def test_times_in_exif(corridor, tmp_path):
         exif.get_ifd(0x8769).update({0x9003: "2024:05:17 10:20:30", 0x9291: subsec})
         Image.fromarray(corridor.left[k]).save(tmp_path / f"IMG_{k}.jpg", exif=exif)
     calib = write_calibration(tmp_path / "c.yaml", corridor.camera)
-    found = open_source("images", str(tmp_path), "", SourceOptions((calib,)), monocular=True)
+    found = open_source("images", str(tmp_path), "", SourceOptions((calib,)), sensor="mono")
     assert np.diff(found.timestamps)[0] == pytest.approx(0.5, abs=1e-6)
 
 

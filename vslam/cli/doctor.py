@@ -45,7 +45,7 @@ def register(app: typer.Typer) -> None:
 def doctor(
     source: Annotated[str, typer.Argument(help="What to look at, as --data of a run.")],
     dataset: SourceKind = None,
-    seq: Seq = "00",
+    seq: Seq = None,
     calib: Calib = None,
     right: Right = None,
     fps: FramesPerSecond = None,
@@ -73,7 +73,7 @@ def doctor(
         options = source_options(calib, right, fps, side_by_side, topics, depth_scale)
         found = open_source(
             kind_of_source(dataset, source), source, seq, options,
-            start=start, every=every, max_frames=max_frames, monocular=sensor == "mono",
+            start=start, every=every, max_frames=max_frames, sensor=sensor,
         )  # fmt: skip
         sequence = first_frames(found) if isinstance(found, Stream) else found
         diagnosis = examine(sequence, thresholds.orb)

@@ -32,7 +32,13 @@ SourceKind = Annotated[
     SourceName | None,
     typer.Option("--dataset", help="What it is.", show_default="found out from what is there"),
 ]
-Seq = Annotated[str, typer.Option(help="Sequence, 00 for example.")]
+Seq = Annotated[
+    str | None,
+    typer.Option(
+        help="Sequence of a data set, 00 for example.",
+        show_default="00; of euroc and tum the only one there",
+    ),
+]
 Calib = Annotated[
     list[Path] | None,
     typer.Option(

@@ -21,7 +21,7 @@ def register(app: typer.Typer) -> None:
 def preview(
     data: Data = KITTI_ROOT,
     dataset: Dataset = "kitti",
-    seq: Seq = "00",
+    seq: Seq = None,
     perturb: Perturb = "brightness",
     start: Start = 0,
     every: Every = 1,

@@ -57,7 +57,7 @@ def register(app: typer.Typer) -> None:
 def run(
     data: Source = str(KITTI_ROOT),
     dataset: SourceKind = None,
-    seq: Seq = "00",
+    seq: Seq = None,
     calib: Calib = None,
     right: Right = None,
     fps: FramesPerSecond = None,
@@ -135,14 +135,9 @@ def run(
     with render_bar(shown=not quiet) as on_render:
         source = open_source(
             kind, data, seq, options,
-            start=start, every=every, max_frames=max_frames, monocular=sensor == "mono",
+            start=start, every=every, max_frames=max_frames, sensor=sensor,
             on_render=on_render,
         )  # fmt: skip
-    if sensor not in (None, source.camera.sensor):
-        raise InputError(
-            f"--sensor {sensor}: {data} is of sensor {source.camera.sensor}; leave it out, or take "
-            "mono."
-        )
     if is_live(source):
         if compare_loops:
             raise InputError("--compare-loops: a camera cannot be seen twice; leave it out.")

@@ -9,11 +9,13 @@ from pathlib import Path
 from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError
 
+_FIRST = "00"  # KITTI's, and the town rendered after it
+
 
 def open_sequence(
     dataset: str,
     root: Path,
-    name: str,
+    name: str | None = None,
     *,
     start: int = 0,
     every: int = 1,
@@ -24,6 +26,9 @@ def open_sequence(
     on_render: Callable[[int, int], None] | None = None,
 ) -> Sequence:
     """Open a sequence and check the frames that ``start``, ``every``, ``max_frames`` select.
+
+    Without a ``name`` it is 00 of KITTI and of the rendered towns, and of EuRoC and TUM the one at
+    ``root``, which must be the only one.
 
     With ``monocular`` the left camera is read alone. ``calib`` names calibration files
     (docs/cameras.md) to be used instead of the data set's own; images are rectified by them.
@@ -39,7 +44,12 @@ def open_sequence(
         from vslam.datasets.kitti import open_kitti
 
         sequence = open_kitti(
-            root, name, start=start, every=every, max_frames=max_frames, monocular=monocular
+            root,
+            _FIRST if name is None else name,
+            start=start,
+            every=every,
+            max_frames=max_frames,
+            monocular=monocular,
         )
         return recalibrated(sequence, calib) if calib else sequence
     if dataset == "euroc":
@@ -73,7 +83,7 @@ def open_sequence(
         from vslam.datasets.synthetic import open_synthetic
 
         return open_synthetic(
-            name,
+            _FIRST if name is None else name,
             start=start,
             every=every,
             max_frames=max_frames,

@@ -44,14 +44,12 @@ class BagStream:
 
     Attributes:
         topics: of the left images, and of the right ones.
-        calibration: by the bag's own ``camera_info``, None without it.
     """
 
     path: Path
     topics: tuple[str, ...]
     sizes: tuple[tuple[int, int], ...]
     n_expected: int | None
-    calibration: Calibration | None
 
     @property
     def dataset(self) -> str:
@@ -126,8 +124,34 @@ def open_bag(path: Path, *, topics: tuple[str, ...] = (), monocular: bool = Fals
             topics=chosen,
             sizes=tuple((image.shape[1], image.shape[0]) for image in images),
             n_expected=min(bag.topics[topic].msgcount for topic in chosen) or None,
-            calibration=_find_calibration(path, bag, chosen),
         )
+
+
+def find_calibration(stream: BagStream) -> Calibration | None:
+    """By the ``camera_info`` beside the image topics, as ROS's drivers name it.
+
+    None where one is missing or has no focal length, as drivers of uncalibrated cameras fill it.
+
+    Raises:
+        InputError: a ``camera_info`` cannot be read, or is no calibration.
+    """
+    path = stream.path
+    documents = []
+    with _opened(path) as bag:
+        for topic in stream.topics:
+            namespace, _, image = topic.removesuffix("/compressed").rpartition("/")
+            info = f"{namespace}/camera_info"
+            if not any(c.topic == info and c.msgtype == CAMERA_INFO_TYPE for c in bag.connections):
+                return None
+            _, message = next(_messages(bag, path, (info,)), (info, None))
+            if message is None:
+                return None
+            rectified = image.startswith("image_rect")
+            found = camera_info(message, f"{path}: {info}", rectified)
+            if found is None:
+                return None
+            documents.append(found)
+    return read_ros(documents, None)
 
 
 @contextmanager
@@ -218,19 +242,3 @@ def _decoded(path: Path, topic: str, message: Message) -> Image:
         return grey_of(message)
     except ValueError as error:
         raise UnreadableImageError(path, f"{topic}: {error}.") from error
-
-
-def _find_calibration(path: Path, bag: Bag, topics: tuple[str, ...]) -> Calibration | None:
-    """By the ``camera_info`` beside the image topics, as ROS's drivers name it."""
-    documents = []
-    for topic in topics:
-        namespace, _, image = topic.removesuffix("/compressed").rpartition("/")
-        info = f"{namespace}/camera_info"
-        if not any(c.topic == info and c.msgtype == CAMERA_INFO_TYPE for c in bag.connections):
-            return None
-        _, message = next(_messages(bag, path, (info,)), (info, None))
-        if message is None:
-            return None
-        rectified = image.startswith("image_rect")
-        documents.append(camera_info(message, f"{path}: {info}", rectified))
-    return read_ros(documents, None)

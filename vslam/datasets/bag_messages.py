@@ -82,8 +82,10 @@ def _pixels(message: Message, channels: int, bits: int) -> NDArray[Any]:
     return pixels.reshape(height, width, channels) if channels > 1 else pixels
 
 
-def camera_info(message: Message, source: str, rectified: bool) -> Document:
+def camera_info(message: Message, source: str, rectified: bool) -> Document | None:
     """A ``CameraInfo`` as `vslam.calibration.formats.read_ros` takes it.
+
+    None of an uncalibrated camera: its K is all zero, as the definition of ``CameraInfo`` says.
 
     Args:
         source: bag and topic, for messages.
@@ -96,6 +98,8 @@ def camera_info(message: Message, source: str, rectified: bool) -> Document:
     )
     if rectified:
         K, D, R = P.reshape(3, 4)[:, :3], np.zeros(0), np.eye(3)
+    if not K.any():
+        return None
     numbers = {"K": K, "D": D, "R": R, "P": P}
     return Document(
         source,

@@ -20,6 +20,7 @@ from vslam.camera import ImageMap
 from vslam.datasets.ground_truth import poses_at
 from vslam.datasets.image_files import (
     check_not_empty,
+    find_sequence,
     read_grey,
     read_grey_of_size,
     select_frames,
@@ -74,7 +75,7 @@ class EurocImages:
 
 def open_euroc(
     root: Path,
-    name: str,
+    name: str | None = None,
     *,
     start: int = 0,
     every: int = 1,
@@ -90,7 +91,7 @@ def open_euroc(
 
     Args:
         root: the sequence's folder, or one with several.
-        name: of the sequence in it, if there are several.
+        name: of the sequence in it; None for the folder itself, or the only one in it.
         start: first frame, counted over the pairs.
         every: take every N-th frame.
         max_frames: at most so many, None for all.
@@ -131,19 +132,18 @@ def is_euroc(root: Path) -> bool:
     return any((base / "cam0" / "data.csv").is_file() for base in (root / "mav0", root))
 
 
-def _find(root: Path, name: str) -> tuple[Path, str]:
+def _find(root: Path, name: str | None) -> tuple[Path, str]:
     """Folder with ``cam0``, and the sequence's name."""
-    for folder in (root / name, root):
-        if is_euroc(folder):
-            base = folder / "mav0" if (folder / "mav0").is_dir() else folder
-            return base, folder.resolve().name
-    inside = sorted(p.name for p in root.iterdir() if is_euroc(p)) if root.is_dir() else []
-    if inside:
-        raise InputError(f"{root / name}: no such sequence; choose --seq of {', '.join(inside)}.")
-    raise InputError(
-        f"{root}: no data in EuRoC's layout here (no mav0/cam0/data.csv); download a sequence in "
-        f"ASL format from {_HOME}, unpack it and name its folder with --data."
-    )
+    if root.resolve().name == "mav0":  # the sequence's name is that of the folder around it
+        root = root.resolve().parent
+    folder = find_sequence(root, name, is_euroc)
+    if folder is None:
+        raise InputError(
+            f"{root}: no data in EuRoC's layout here (no mav0/cam0/data.csv); download a sequence "
+            f"in ASL format from {_HOME}, unpack it and name its folder with --data."
+        )
+    base = folder / "mav0" if (folder / "mav0").is_dir() else folder
+    return base, folder.resolve().name
 
 
 def _read_list(camera: Path) -> tuple[NDArray[np.int64], list[str]]:

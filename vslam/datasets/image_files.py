@@ -1,7 +1,8 @@
-"""What readers of image files share: which files, which frames, and grey images out of them."""
+"""What readers of image files share: which folder, which files and frames, and grey images."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,34 @@ def list_images(folder: Path) -> dict[str, Path]:
         for path in sorted(folder.iterdir())
         if path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
     }
+
+
+def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bool]) -> Path | None:
+    """Folder of a sequence: one in ``root``, or ``root`` itself; None where there is none at all.
+
+    Args:
+        name: of the folder; None for ``root`` itself, or the only one in it.
+
+    Raises:
+        InputError: no sequence of this name, or several and no name.
+    """
+    if name is not None and is_sequence(root / name):
+        return root / name
+    if is_sequence(root):
+        own = root.resolve().name
+        if name not in (None, own):
+            raise InputError(
+                f"--seq {name}: {root} is the sequence {own} itself; leave it out, or name another "
+                "folder with --data."
+            )
+        return root
+    inside = sorted(p.name for p in root.iterdir() if is_sequence(p)) if root.is_dir() else []
+    if name is None and len(inside) == 1:
+        return root / inside[0]
+    if inside:
+        wrong = f"{root}: several sequences" if name is None else f"{root / name}: no such sequence"
+        raise InputError(f"{wrong}; choose --seq of {', '.join(inside)}.")
+    return None
 
 
 def select_frames(

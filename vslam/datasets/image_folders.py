@@ -1,8 +1,8 @@
 """Folders of images: one of a single camera, two of a stereo pair.
 
 A pair is two folders beside each other (`PAIRS` of names), or one named with ``--right``. Its
-images belong together by their names, or by their order where the names differ and both sides have
-equally many. Times are taken from the first of these that is there:
+images belong together by their names, or by their order where no name is on both sides and both
+have equally many. Times are taken from the first of these that is there:
 
 1. ``--fps``;
 2. ``times.txt`` or ``timestamps.txt``, in the folder of the images or the one above: a time in
@@ -155,29 +155,32 @@ def _find_sides(folder: Path, right: Path | None, monocular: bool) -> list[Path]
 
 
 def _sorted_images(folder: Path) -> dict[str, Path]:
-    """By stem, numbers in names by their value: 2 comes before 10."""
+    """By stem: in the order of time where all names are times, else of the words and numbers in
+    the names, 2 before 10."""
     images = list_images(folder)
     if not images:
         raise InputError(f"{folder}: no images in this folder; name another.")
 
-    def by_number(stem: str) -> list[tuple[int, str]]:
-        return [(int(digits or 0), text) for text, digits in re.findall(r"(\D*)(\d*)", stem)]
+    def by_number(stem: str) -> list[tuple[str, int]]:
+        return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", stem)]
 
-    return {stem: images[stem] for stem in sorted(images, key=by_number)}
+    times = {stem: _time_of_name(path) for stem, path in images.items()}
+    timed = {stem: time for stem, time in times.items() if time is not None}
+    ordered = sorted(timed, key=timed.__getitem__) if timed.keys() == times.keys() else None
+    return {stem: images[stem] for stem in ordered or sorted(images, key=by_number)}
 
 
 def _matched(sides: list[dict[str, Path]], folders: list[Path]) -> list[list[Path]]:
     """The files of each side in order, as many of one as of the other."""
     first, *rest = sides
     for other in rest:
-        if len(other) != len(first):
-            only = next(iter(first.keys() ^ other.keys()))
-            raise InputError(
-                f"{folders[1]}: {len(other)} images but {len(first)} in {folders[0]}, {only} on "
-                "one side only; remove what has no partner."
-            )
         if first.keys() == other.keys():
             return [[side[stem] for stem in first] for side in sides]
+        if len(other) != len(first) or first.keys() & other.keys():
+            raise InputError(
+                f"{folders[1]}: {len(other)} images but {len(first)} in {folders[0]}, "
+                f"{min(first.keys() ^ other.keys())} on one side only; remove what has no partner."
+            )
     return [list(side.values()) for side in sides]
 
 

@@ -51,10 +51,19 @@ class RectifiedStream:
         return n if self.max_frames is None else min(n, self.max_frames)
 
     def frames(self) -> Iterator[TimedFrame]:
-        """See `vslam.datasets.stream.Stream.frames`."""
+        """See `vslam.datasets.stream.Stream.frames`.
+
+        Raises:
+            InputError: the stream ends before ``start``.
+        """
+        frame = None
         stop = None if self.max_frames is None else self.start + self.every * self.max_frames
         for frame in islice(increasing(self.raw.frames(), self.name), self.start, stop, self.every):
             yield TimedFrame(frame.timestamp, partial(_read, frame, self.rectification))
+        if frame is None:
+            raise InputError(
+                f"--start {self.start}: {self.name} has no frame there; choose a smaller one."
+            )
 
 
 def rectified_stream(
@@ -71,7 +80,9 @@ def rectified_stream(
         InputError: the stream ends before ``start``, or as `vslam.datasets.rectified.rectified`.
     """
     if raw.n_expected is not None and start >= raw.n_expected:
-        raise InputError(f"--start {start}: {raw.name} has about {raw.n_expected} frames.")
+        raise InputError(
+            f"--start {start}: {raw.name} has about {raw.n_expected} frames; choose a smaller one."
+        )
     return RectifiedStream(raw, rectification_for(calibration, raw.sizes), start, every, max_frames)
 
 

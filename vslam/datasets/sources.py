@@ -47,18 +47,19 @@ _FOR = {
     "topics": ("bag",),
     "depth_scale": ("tum",),
 }
+_NOT_MONOCULAR = ("right", "depth_scale")
 
 
 def open_source(
     dataset: str,
     data: str,
-    name: str,
+    name: str | None,
     options: SourceOptions,
     *,
     start: int = 0,
     every: int = 1,
     max_frames: int | None = None,
-    monocular: bool = False,
+    sensor: str | None = None,
     on_render: Callable[[int, int], None] | None = None,
 ) -> Sequence | Stream:
     """Open a data set, or images of any camera, which are rectified by the user's calibration.
@@ -66,20 +67,42 @@ def open_source(
     Args:
         dataset: one of `SOURCES`, or as `vslam.datasets.open_sequence` takes it.
         data: folder or file, number of a device, or URL.
-        name: of the sequence of a data set.
+        name: of the sequence of a data set, None as for `vslam.datasets.open_sequence`.
+        sensor: that the source must be of; ``mono`` reads left images alone, None all there are.
         on_render: see `vslam.datasets.open_sequence`.
 
     Raises:
-        InputError: an option that this source has no use for, no calibration or one of other
-            images, or as the reader says.
+        InputError: an option that this source has no use for, another sensor, no calibration or
+            one of other images, or as the reader says.
     """
-    _check_options(dataset, options)
-    if dataset not in SOURCES:
-        return open_sequence(
+    monocular = sensor == "mono"
+    _check_options(dataset, name, options, monocular)
+    source: Sequence | Stream
+    if dataset in SOURCES:
+        source = _open_images(dataset, data, options, start, every, max_frames, monocular)
+    else:
+        source = open_sequence(
             dataset, Path(data), name, start=start, every=every, max_frames=max_frames,
             monocular=monocular, calib=options.calibration, depth_scale=options.depth_scale,
             on_render=on_render,
         )  # fmt: skip
+    if sensor not in (None, source.camera.sensor):
+        raise InputError(
+            f"--sensor {sensor}: {source.name} is of sensor {source.camera.sensor}; leave it out, "
+            "or take mono."
+        )
+    return source
+
+
+def _open_images(
+    dataset: str,
+    data: str,
+    options: SourceOptions,
+    start: int,
+    every: int,
+    max_frames: int | None,
+    monocular: bool,
+) -> Sequence | Stream:
     if dataset == "images":
         from vslam.datasets.image_folders import open_images
 
@@ -97,10 +120,10 @@ def open_source(
             Path(data), fps=options.fps, side_by_side=options.side_by_side, monocular=monocular
         )
     elif dataset == "bag":
-        from vslam.datasets.bag import open_bag
+        from vslam.datasets.bag import find_calibration, open_bag
 
         stream = bag = open_bag(Path(data), topics=options.topics, monocular=monocular)
-        own = bag.calibration
+        own = None if options.calibration else find_calibration(bag)
     else:
         from vslam.datasets.live_camera import open_camera
 
@@ -114,13 +137,21 @@ def open_source(
     )
 
 
-def _check_options(dataset: str, options: SourceOptions) -> None:
+def _check_options(
+    dataset: str, sequence: str | None, options: SourceOptions, monocular: bool
+) -> None:
+    if sequence and dataset in SOURCES:
+        raise InputError(f"--seq {sequence}: only for data sets, not {dataset}; leave it out.")
     for name, kinds in _FOR.items():
-        if getattr(options, name) and dataset not in kinds:
-            option = f"--{name.replace('_', '-')}"
+        if not getattr(options, name):
+            continue
+        option = f"--{name.replace('_', '-')}"
+        if dataset not in kinds:
             raise InputError(
                 f"{option}: only for --dataset {' or '.join(kinds)}, not {dataset}; leave it out."
             )
+        if monocular and name in _NOT_MONOCULAR:
+            raise InputError(f"{option}: of no use with --sensor mono; leave one of them out.")
 
 
 def _calibration(

@@ -22,6 +22,7 @@ from vslam.camera import Camera, DepthImage, Image, ImageMap
 from vslam.datasets.ground_truth import poses_at
 from vslam.datasets.image_files import (
     check_not_empty,
+    find_sequence,
     read_grey,
     read_grey_of_size,
     select_frames,
@@ -96,7 +97,7 @@ class TumSequence:
 
 def open_tum(
     root: Path,
-    name: str,
+    name: str | None = None,
     *,
     start: int = 0,
     every: int = 1,
@@ -113,7 +114,7 @@ def open_tum(
 
     Args:
         root: the sequence's folder, or one with several.
-        name: of the sequence in it, if there are several.
+        name: of the sequence in it; None for the folder itself, or the only one in it.
         start: first frame, counted over the pairs.
         every: take every N-th frame.
         max_frames: at most so many, None for all.
@@ -125,7 +126,12 @@ def open_tum(
         InputError: data missing or malformed, no pairs, calibration or ground truth unusable.
         UnreadableImageError: a file is empty, the first pair cannot be decoded or does not fit.
     """
-    folder = _find(root, name)
+    folder = find_sequence(root, name, is_tum)
+    if folder is None:
+        raise InputError(
+            f"{root}: no data in TUM's RGB-D layout here (no rgb.txt); download a sequence from "
+            f"{_HOME}, unpack it and name its folder with --data."
+        )
     times, colour_files = _read_list(folder / "rgb.txt")
     frames = partners = np.arange(len(times))
     depth_files: list[Path] = []
@@ -192,19 +198,6 @@ def associate(
             taken.add(j)
     pairs = np.array(sorted(partner.items()), np.int64).reshape(-1, 2)
     return pairs[:, 0], pairs[:, 1]
-
-
-def _find(root: Path, name: str) -> Path:
-    for folder in (root / name, root):
-        if is_tum(folder):
-            return folder
-    inside = sorted(p.name for p in root.iterdir() if is_tum(p)) if root.is_dir() else []
-    if inside:
-        raise InputError(f"{root / name}: no such sequence; choose --seq of {', '.join(inside)}.")
-    raise InputError(
-        f"{root}: no data in TUM's RGB-D layout here (no rgb.txt); download a sequence from "
-        f"{_HOME}, unpack it and name its folder with --data."
-    )
 
 
 def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:

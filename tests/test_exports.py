@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -467,6 +467,11 @@ def test_map_info(corridor_run, tmp_path):
     lone = tmp_path / "map.npz"
     lone.write_bytes((corridor_run / "map.npz").read_bytes())
     assert "sub-maps" not in vslam("map", "info", lone)
+
+
+def test_map_info_tells_depth_from_a_pair(tmp_path):
+    save_map(tmp_path / "map.npz", small_map(), replace(CAMERA, depth=True))
+    assert "rgbd, " in vslam("map", "info", tmp_path)
 
 
 def refusal(*words: object) -> str:

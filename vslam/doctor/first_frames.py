@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, ImageMap
-from vslam.datasets.sequence import Image
+from vslam.datasets.sequence import DepthImage, Image
 from vslam.datasets.stream import Stream
 from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 
@@ -25,13 +25,15 @@ class FirstFrames:
     name: str
     camera: Camera
     timestamps: NDArray[np.float64]
-    frames: tuple[tuple[Image, Image | None] | UnreadableImageError, ...]
+    frames: tuple[tuple[Image, Image | DepthImage | None] | UnreadableImageError, ...]
     ground_truth: None = None
 
     def __len__(self) -> int:
         return len(self.frames)
 
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
+    def read(
+        self, index: int, image_map: ImageMap = map
+    ) -> tuple[Image, Image | DepthImage | None]:
         """See :meth:`vslam.datasets.sequence.Sequence.read`."""
         frame = self.frames[index]
         if isinstance(frame, UnreadableImageError):
@@ -46,7 +48,7 @@ def first_frames(stream: Stream) -> FirstFrames:
         InputError: there is no frame.
     """
     times: list[float] = []
-    frames: list[tuple[Image, Image | None] | UnreadableImageError] = []
+    frames: list[tuple[Image, Image | DepthImage | None] | UnreadableImageError] = []
     problem = "there are no frames in it"
     try:
         for frame in islice(stream.frames(), _FRAMES):

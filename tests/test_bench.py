@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
+import json
 import subprocess
 import sys
 from contextlib import closing
@@ -94,6 +95,16 @@ def test_a_cell_is_finished_only_by_a_whole_run_of_the_same_settings(run_folder:
     assert not grid.is_finished(Cell("kitti", "00", "brightness:1", "none", 3), run_folder, CONFIG)
     assert not grid.is_finished(Cell("kitti", "00", "none", "none", 3, 150), run_folder, CONFIG)
     assert not grid.is_finished(cell, run_folder.parent, CONFIG)
+
+
+@pytest.mark.parametrize(("sensor", "finished"), [("rgbd", True), ("mono", False)])
+def test_runs_with_depth_count_and_those_of_one_camera_do_not(stub, tmp_path, sensor, finished):
+    report = json.loads((stub / "report.json").read_text())
+    (stub / "report.json").write_text(json.dumps(report | {"sensor": sensor}))
+    cell = Cell("tum", "desk", "none", "none", 0)
+    out = tmp_path / "bench"
+    list(execute.run_here([cell], options_for(out), 1, out))
+    assert execute.finished_cells([cell], out, CONFIG) == [cell] * finished
 
 
 @pytest.mark.parametrize("change", ['"schema_version": 4|"schema_version": 3', "{|", "0|"])

@@ -303,6 +303,34 @@ def test_settings_of_an_rgbd_camera(tmp_path):
     assert (found.left.width, found.left.height) == (640, 480)
 
 
+ONE = "{focal: [458, 457], centre: [367, 248], size: [752, 480]}"
+PAIR = f"left: {ONE}\nright: {ONE}\n"
+SETTINGS = "Camera.fx: 517\nCamera.fy: 516\nCamera.cx: 318\nCamera.cy: 255\n"
+IDENTITY = "T_left_right: [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (f"left: {ONE}\ndepth_scale: 0\n", "depth_scale is 0 but must be positive"),
+        (f"left: {ONE}\nvirtual_baseline: -0.1\n", "virtual_baseline is -0.1 but must be"),
+        (f"{PAIR}{IDENTITY}baseline: 0.1\n", "T_left_right and baseline say the same thing"),
+        (f"left: {ONE}\nbaseline: 0.1\n", "baseline leads to a right camera, which is missing"),
+        (f"left: {ONE}\n{IDENTITY}", "T_left_right leads to a right camera, which is missing"),
+        (f"{PAIR}baseline: 0.1\ndepth_scale: 5000\n", "depth_scale is of a camera with depth"),
+        (f"{SETTINGS}DepthMapFactor: 0\n", "DepthMapFactor is 0 but must be positive"),
+        (f"{SETTINGS}Camera.bf: -40\nDepthMapFactor: 5000\n", "Camera.bf is -40 but must be"),
+        (f"{SETTINGS}Camera.bf: 0\n", "Camera.bf is 0 but must be positive"),
+    ],
+)
+def test_contradictions_and_numbers_that_cannot_be(tmp_path, text, words):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        read_calibration([path], SIZE)
+    assert "\n" not in str(caught.value)
+
+
 def test_a_rectified_pair_by_its_baseline(tmp_path):
     path = tmp_path / "kitti.yaml"
     path.write_text(

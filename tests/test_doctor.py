@@ -17,7 +17,8 @@ from vslam.cli.main import app
 from vslam.config import OrbConfig
 from vslam.datasets.euroc import open_euroc
 from vslam.datasets.kitti import open_kitti
-from vslam.doctor.checks import check_times
+from vslam.datasets.tum import open_tum
+from vslam.doctor.checks import check_depth, check_times
 from vslam.doctor.examine import examine
 from vslam.errors import UnreadableImageError
 
@@ -182,6 +183,35 @@ def test_registered_depth(depth_images):
 
 def test_depth_of_another_camera(depth_images):
     assert faults(right(depth_images, lambda d: np.roll(d, 9, axis=1))) == ["registration"]
+
+
+def windows_of_desk() -> list[tuple[list, list]]:
+    """Images and depth of eight frames each, from nine windows of 60."""
+    desk = open_tum(REAL / "tum", "rgbd_dataset_freiburg1_desk")
+    starts = range(0, 9 * 60, 60)
+    frames = [np.linspace(k, k + 59, 8).round().astype(int).tolist() for k in starts]
+    return [tuple(zip(*map(desk.read, window), strict=True)) for window in frames]
+
+
+@pytest.mark.skipif(not (REAL / "tum").is_dir(), reason="TUM sequence absent")
+def test_depth_of_fr1_desk_is_no_fault_but_moved_it_is():
+    windows = windows_of_desk()
+    found = [check_depth(*window)[1].verdict for window in windows]
+    assert "fault" not in found
+    assert found.count("good") >= 3
+    moved = [
+        check_depth(images, [np.roll(depth, 25, axis=1) for depth in depths])[1].verdict
+        for images, depths in windows
+    ]
+    assert "good" not in moved
+    assert moved.count("fault") >= 4
+
+
+@pytest.mark.parametrize("shifts", [(14, 38), (47, 47)], ids=["two peaks", "end of the search"])
+def test_no_fault_where_no_shift_of_depth_is_clearly_best(depth_images, shifts):
+    moved = [np.roll(depth, shifts[k % 2], axis=1) for k, depth in enumerate(depth_images.second)]
+    found = {f.check: f.verdict for f in examine(replace(depth_images, second=moved), FEW).findings}
+    assert found["registration"] == "unknown"
 
 
 def test_hardly_any_depth(depth_images):

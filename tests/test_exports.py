@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from source_files import write_calibration
 from test_pipeline import KITTI, needs_kitti
 from test_pipeline import run as run_pipeline
 from typer.testing import CliRunner
@@ -469,6 +470,11 @@ def test_map_info(corridor_run, tmp_path):
     assert "sub-maps" not in vslam("map", "info", lone)
 
 
+def test_map_info_tells_depth_from_a_pair(tmp_path):
+    save_map(tmp_path / "map.npz", small_map(), replace(CAMERA, depth=True))
+    assert "rgbd, " in vslam("map", "info", tmp_path)
+
+
 def refusal(*words: object) -> str:
     result = CliRunner().invoke(app, list(map(str, words)))
     assert isinstance(result.exception, InputError), result.output
@@ -505,6 +511,38 @@ def test_refusals(corridor_run, kitti_tree, tmp_path):
     np.savez(tmp_path / "new.npz", schema=99, camera=np.zeros(7))
     assert "map schema 99" in refusal("map", "info", tmp_path / "new.npz")
     assert not (tmp_path / "out").exists()
+
+
+def rerun(folder: Path, original: Path, **changes: object) -> Path:
+    """A run with another report."""
+    folder.mkdir()
+    for name in ("map.npz", "config.json"):
+        (folder / name).symlink_to(original / name)
+    report = json.loads((original / "report.json").read_text())
+    (folder / "report.json").write_text(json.dumps({**report, **changes}))
+    return folder
+
+
+@pytest.mark.parametrize("source", ["images", "video", "bag", "camera"])
+def test_what_can_be_exported_of_images_that_are_of_no_data_set(corridor_run, tmp_path, source):
+    run = rerun(tmp_path / "run", corridor_run, dataset=source)
+    for kind in ("colmap", "nerfstudio", "ply"):
+        message = refusal("export", kind, run, "--data", tmp_path)
+        assert f"images of {source} cannot be opened again" in message
+        assert "export g2o, euroc or ply --no-colours" in message
+    vslam("export", "ply", run, "--no-colours")
+    vslam("export", "g2o", run)
+
+
+def test_images_are_opened_by_the_calibration_of_the_run(corridor_run, kitti_tree, tmp_path):
+    sequence = tmp_path / "kitti/sequences/00"
+    sequence.mkdir(parents=True)
+    for name in ("image_0", "image_1", "times.txt"):
+        (sequence / name).symlink_to(kitti_tree / "sequences/00" / name)
+    calib = write_calibration(tmp_path / "own.yaml", read_run(corridor_run).camera)
+    run = rerun(tmp_path / "run", corridor_run, calib=[str(calib)])
+    vslam("export", "ply", run, "--data", tmp_path / "kitti")
+    assert read_ply(run / "landmarks.ply")[1] is not None
 
 
 @needs_kitti

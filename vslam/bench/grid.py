@@ -165,5 +165,5 @@ def is_finished(cell: Cell, folder: Path, config: str) -> bool:
         str(report.weights) if report.weights else None,
         cell.digest,  # the folder is named after it
     )
-    whole = (report.sensor, report.start, report.every, report.calib) == ("stereo", 0, 1, ())
+    whole = report.sensor != "mono" and (report.start, report.every, report.calib) == (0, 1, ())
     return same_config and whole and found == cell

@@ -41,11 +41,12 @@ def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
     """vslam's own: ``left``, ``right``, ``T_left_right`` or ``baseline``, ``depth_scale``."""
     (document,) = documents
     _refuse_unknown(document, _OWN_KEYS)
+    _refuse_contradictions(document)
     left, *rest = (
         _own_camera(document.section(side), size) for side in ("left", "right") if side in document
     )
     depth_scale, virtual = (
-        document.number(key) if key in document else None
+        _positive(document, key) if key in document else None
         for key in ("depth_scale", "virtual_baseline")
     )
     if not rest:
@@ -57,6 +58,26 @@ def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
     else:
         T_left_right = _shift(document.number("baseline"))
     return _pair(document.source, left, rest[0], T_left_right)
+
+
+def _refuse_contradictions(document: Document) -> None:
+    """A pair has one transformation and no depth, one camera has no transformation."""
+    transformations = [key for key in ("T_left_right", "baseline") if key in document]
+    of_depth = [key for key in ("depth_scale", "virtual_baseline") if key in document]
+    if len(transformations) == 2:
+        raise InputError(
+            f"{document.source}: T_left_right and baseline say the same thing; leave one out."
+        )
+    if transformations and "right" not in document:
+        raise InputError(
+            f"{document.source}: {transformations[0]} leads to a right camera, which is missing; "
+            "add right or leave it out."
+        )
+    if of_depth and "right" in document:
+        raise InputError(
+            f"{document.source}: {of_depth[0]} is of a camera with depth, right is of a stereo "
+            "pair; leave one of them out."
+        )
 
 
 def read_kalibr(documents: Sequence[Document], size: Size | None) -> Calibration:
@@ -132,11 +153,11 @@ def read_orbslam(documents: Sequence[Document], size: Size | None) -> Calibratio
     factor = next((k for k in ("RGBD.DepthMapFactor", "DepthMapFactor") if k in document), None)
     baseline = None
     if "Stereo.b" in document:
-        baseline = document.number("Stereo.b")
+        baseline = _positive(document, "Stereo.b")
     elif "Camera.bf" in document:
-        baseline = document.number("Camera.bf") / left.fx
+        baseline = _positive(document, "Camera.bf") / left.fx
     if factor is not None:
-        scale = document.number(factor)
+        scale = _positive(document, factor)
         return Calibration(left, depth_scale=scale, virtual_baseline=baseline, source=source)
     if "Camera2.fx" in document:
         right = _orbslam_camera(document, "Camera2", lens, size)
@@ -252,6 +273,13 @@ def _size_of(document: Document, size: Size | None, key: str) -> Size:
         return size
     width, height = document.numbers(key, 2)
     return int(width), int(height)
+
+
+def _positive(document: Document, key: str) -> float:
+    number = document.number(key)
+    if number <= 0.0:
+        raise InputError(f"{document.source}: {key} is {number:g} but must be positive.")
+    return number
 
 
 def _flag(document: Document, key: str) -> bool:

@@ -39,7 +39,7 @@ def info(
             ("file", f"{file}: {file.stat().st_size / 1e6:.1f} MB"),
             (
                 "camera",
-                f"{'mono' if camera.monocular else 'stereo'}, {camera.width}x{camera.height}, "
+                f"{camera.sensor}, {camera.width}x{camera.height}, "
                 f"fx {camera.fx:.1f}, fy {camera.fy:.1f}, cx {camera.cx:.1f}, cy {camera.cy:.1f}",
             ),
             *(_contents(map_, reconstruction) if map_.n_keyframes else [("keyframes", "none")]),

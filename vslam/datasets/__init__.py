@@ -10,6 +10,7 @@ from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError
 
 _FIRST = "00"  # KITTI's, and the town rendered after it
+DATASETS = ("kitti", "euroc", "tum", "synthetic")  # those that `open_sequence` knows
 
 
 def open_sequence(
@@ -41,17 +42,20 @@ def open_sequence(
         InputError: unknown data set, or bad input as the reader of the data set says.
     """
     if dataset == "kitti":
-        from vslam.datasets.kitti import open_kitti
+        from vslam.datasets.kitti import open_kitti, open_kitti_images
 
-        sequence = open_kitti(
-            root,
-            _FIRST if name is None else name,
-            start=start,
-            every=every,
-            max_frames=max_frames,
-            monocular=monocular,
+        name = _FIRST if name is None else name
+        if not calib:
+            return open_kitti(
+                root, name, start=start, every=every, max_frames=max_frames, monocular=monocular
+            )
+        from vslam.calibration.files import read_calibration
+        from vslam.datasets.rectified import rectified
+
+        images = open_kitti_images(
+            root, name, start=start, every=every, max_frames=max_frames, monocular=monocular
         )
-        return recalibrated(sequence, calib) if calib else sequence
+        return rectified(images, read_calibration(calib, images.size))
     if dataset == "euroc":
         from vslam.datasets.euroc import open_euroc
 
@@ -91,20 +95,5 @@ def open_sequence(
             on_frame=on_render,
         )
     raise InputError(
-        f"--dataset {dataset}: unknown data set; this version reads kitti, euroc, tum and "
-        "synthetic."
+        f"--dataset {dataset}: unknown data set; this version reads {', '.join(DATASETS)}."
     )
-
-
-def recalibrated(sequence: Sequence, calib: Several[Path]) -> Sequence:
-    """A sequence whose images are rectified by calibration files, whatever it says of its camera.
-
-    Raises:
-        InputError: as `vslam.calibration.files.read_calibration` and
-            `vslam.datasets.rectified.rectified`.
-    """
-    from vslam.calibration.files import read_calibration
-    from vslam.datasets.rectified import rectified
-
-    size = sequence.camera.width, sequence.camera.height
-    return rectified(sequence, read_calibration(calib, size))

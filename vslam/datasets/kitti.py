@@ -30,12 +30,12 @@ _HOME = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php"
 
 
 @dataclass(frozen=True)
-class KittiSequence:
-    """The selected frames of one sequence; see :class:`vslam.datasets.sequence.Sequence`.
+class KittiImages:
+    """The selected frames of one sequence; see `vslam.datasets.rectified.RawSequence`.
 
     Attributes:
         name: ``00`` for example.
-        camera: from P0 and P1 of the sequence's own ``calib.txt``.
+        size: width and height of the images.
         timestamps: ``(N,)`` float64 seconds since the first frame of the whole sequence.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` or None; the world is the first left camera
             of the whole sequence.
@@ -43,7 +43,7 @@ class KittiSequence:
     """
 
     name: str
-    camera: Camera
+    size: tuple[int, int]
     timestamps: NDArray[np.float64]
     ground_truth: NDArray[np.float64] | None
     left: tuple[Path, ...]
@@ -61,14 +61,22 @@ class KittiSequence:
         camera is read alone. Safe to call from several threads.
 
         Raises:
-            UnreadableImageError: a file is missing, damaged or not of the calibrated size.
+            UnreadableImageError: a file is missing, damaged or not of the size of the others.
         """
         files = [side[index] for side in (self.left, self.right) if side]
         left, *right = image_map(self._read, files)
         return left, right[0] if right else None
 
     def _read(self, path: Path) -> Image:
-        return read_grey_of_size(path, self.camera.width, self.camera.height)
+        return read_grey_of_size(path, *self.size)
+
+
+@dataclass(frozen=True)
+class KittiSequence(KittiImages):
+    """See :class:`vslam.datasets.sequence.Sequence`; ``camera`` is from P0 and P1 of the sequence's
+    own ``calib.txt``."""
+
+    camera: Camera
 
 
 def open_kitti(
@@ -80,7 +88,32 @@ def open_kitti(
     max_frames: int | None = None,
     monocular: bool = False,
 ) -> KittiSequence:
-    """Open a sequence; only the selected frames must be complete.
+    """Open a sequence with its own calibration; see `open_kitti_images`.
+
+    Raises:
+        InputError: as `open_kitti_images`, or the calibration is unusable.
+        UnreadableImageError: the first pair cannot be decoded.
+    """
+    images = open_kitti_images(
+        root, name, start=start, every=every, max_frames=max_frames, monocular=monocular
+    )
+    folder = _find_sequence(_find_root(root), name)
+    width, height = images.size
+    camera = read_calibration(folder / "calib.txt", width=width, height=height)
+    return KittiSequence(**vars(images), camera=camera.left_camera() if monocular else camera)
+
+
+def open_kitti_images(
+    root: Path,
+    name: str,
+    *,
+    start: int = 0,
+    every: int = 1,
+    max_frames: int | None = None,
+    monocular: bool = False,
+) -> KittiImages:
+    """Open the images of a sequence, not its calibration; only the selected frames must be
+    complete.
 
     Frame k belongs to row k of ``times.txt`` and of the poses. Where those files have more rows
     than there are images, k is the number in the file name, so that an excerpt of a sequence
@@ -96,7 +129,7 @@ def open_kitti(
         monocular: read the left camera alone; the right one's images need not be there.
 
     Raises:
-        InputError: data missing, images unequal or empty, calibration, times or poses unusable.
+        InputError: data missing, images unequal or empty, times or poses unusable.
         UnreadableImageError: the first pair cannot be decoded.
     """
     base = _find_root(root)
@@ -121,10 +154,9 @@ def open_kitti(
         )
     times = _read_times(folder / "times.txt")
     frames = _row_numbers(folder / "times.txt", stems, len(times))[chosen]
-    camera = read_calibration(folder / "calib.txt", width=sizes[0][1], height=sizes[0][0])
-    return KittiSequence(
+    return KittiImages(
         name=name,
-        camera=camera.left_camera() if monocular else camera,
+        size=(sizes[0][1], sizes[0][0]),
         timestamps=times[frames],
         ground_truth=_read_ground_truth(base / "poses" / f"{name}.txt", stems, len(times), chosen),
         left=left,

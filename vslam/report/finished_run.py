@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from vslam.backend.pose_graph import PoseGraph, essential_graph
 from vslam.camera import Camera
 from vslam.config import load_config
-from vslam.datasets import open_sequence
+from vslam.datasets import DATASETS, open_sequence
 from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError
 from vslam.geometry import compose, inverse
@@ -73,13 +73,19 @@ def open_images(
     """Open the sequence of a run as far as its last keyframe; ``map.frames`` count its frames.
 
     Args:
-        root: of the data set; runs do not say where their images were.
+        root: of the data set; runs do not say where their images were. Where the run was made with
+            ``--calib``, its calibration files are read again.
         on_render: as in :func:`vslam.datasets.open_sequence`.
 
     Raises:
-        InputError: the images are not there, or not those of the run.
+        InputError: the images are not there, not those of the run, or of no data set.
     """
     report = run.report
+    if report.dataset not in DATASETS:
+        raise InputError(
+            f"{run.folder}: images of {report.dataset} cannot be opened again, only those of "
+            f"{', '.join(DATASETS)}; export g2o, euroc or ply --no-colours, which need none."
+        )
     sequence = open_sequence(
         report.dataset,
         root,
@@ -88,6 +94,7 @@ def open_images(
         every=report.every,
         max_frames=max(run.map.frames) + 1,
         monocular=report.sensor == "mono",
+        calib=report.calib,
         on_render=on_render,
     )
     same = len(sequence) > max(run.map.frames) and np.allclose(

@@ -8,7 +8,6 @@ FOLDER/mav0/state_groundtruth_estimate0/         ground truth of the body, if th
 from __future__ import annotations
 
 from collections.abc import Sequence as Several
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,61 +15,16 @@ from numpy.typing import NDArray
 
 from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
-from vslam.camera import ImageMap
 from vslam.datasets.ground_truth import poses_at
-from vslam.datasets.image_files import (
-    check_not_empty,
-    find_sequence,
-    read_grey,
-    read_grey_of_size,
-    select_frames,
-)
+from vslam.datasets.image_files import checked_files, find_sequence, select_frames
 from vslam.datasets.rectified import rectified
-from vslam.datasets.sequence import Image, Sequence
+from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError
 from vslam.trajectory import Trajectory
 
 _HOME = "https://projects.asl.ethz.ch/datasets/euroc-mav/"
 _SAME_NS = 5_000_000  # both cameras are triggered together; a pair's stamps may differ by so much
 _POSE_COLUMNS = 8  # time, position, quaternion; velocities and biases may follow
-
-
-@dataclass(frozen=True)
-class EurocImages:
-    """The selected frames as the cameras took them; see `vslam.datasets.rectified.RawSequence`.
-
-    Attributes:
-        name: of the folder, ``V1_01_easy`` for example.
-        timestamps: ``(N,)`` float64 seconds, as the left camera's file has them.
-        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera, in the world of the file,
-            or None.
-        left, right: N image files each; right is empty for the left camera alone.
-        sizes: width and height of the images of each side.
-    """
-
-    name: str
-    timestamps: NDArray[np.float64]
-    ground_truth: NDArray[np.float64] | None
-    left: tuple[Path, ...]
-    right: tuple[Path, ...]
-    sizes: tuple[tuple[int, int], ...]
-
-    @property
-    def dataset(self) -> str:
-        return "euroc"
-
-    def __len__(self) -> int:
-        return len(self.left)
-
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
-        """Left and right image; see `vslam.datasets.sequence.Sequence.read`."""
-        files = [side[index] for side in (self.left, self.right) if side]
-        left, *right = image_map(self._read, list(zip(files, self.sizes, strict=True)))
-        return left, right[0] if right else None
-
-    def _read(self, file: tuple[Path, tuple[int, int]]) -> Image:
-        path, (width, height) = file
-        return read_grey_of_size(path, width, height)
 
 
 def open_euroc(
@@ -111,18 +65,9 @@ def open_euroc(
         tuple(camera / "data" / names[k] for k in rows)
         for camera, (_, names), rows in zip(cameras, listed, chosen.T, strict=True)
     ]
-    for path in (path for side in files for path in side):
-        check_not_empty(path)
     stamps = listed[0][0][chosen[:, 0]]
-    shapes = [read_grey(side[0]).shape for side in files]
-    raw = EurocImages(
-        name=found,
-        timestamps=stamps.astype(np.float64) * 1e-9,
-        ground_truth=_read_ground_truth(base, stamps),
-        left=files[0],
-        right=() if monocular else files[1],
-        sizes=tuple((width, height) for height, width in shapes),
-    )
+    truth = _read_ground_truth(base, stamps)
+    raw = checked_files("euroc", found, stamps.astype(np.float64) * 1e-9, truth, files)
     sensors = calib or [camera / "sensor.yaml" for camera in cameras]
     return rectified(raw, read_calibration(sensors, raw.sizes[0]))
 

@@ -16,22 +16,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import ImageMap
-from vslam.datasets.image_files import (
-    check_not_empty,
-    list_images,
-    read_grey,
-    read_grey_of_size,
-    select_frames,
-)
-from vslam.datasets.sequence import Image
+from vslam.datasets.image_files import ImageFiles, checked_files, list_images, select_frames
 from vslam.errors import InputError
 from vslam.trajectory import read_table
 
@@ -50,43 +41,6 @@ _FIRST_TIME = 1e9
 _UNITS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3), (_FIRST_TIME, 1))
 
 
-@dataclass(frozen=True)
-class ImageFolders:
-    """The selected frames; see `vslam.datasets.rectified.RawSequence`.
-
-    Attributes:
-        left, right: image files of N frames each; right is empty for a single camera.
-        sizes: width and height of the images of each side.
-    """
-
-    name: str
-    timestamps: NDArray[np.float64]
-    left: tuple[Path, ...]
-    right: tuple[Path, ...]
-    sizes: tuple[tuple[int, int], ...]
-
-    @property
-    def dataset(self) -> str:
-        return "images"
-
-    @property
-    def ground_truth(self) -> None:
-        return None
-
-    def __len__(self) -> int:
-        return len(self.left)
-
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
-        """See `vslam.datasets.sequence.Sequence.read`."""
-        files = [side[index] for side in (self.left, self.right) if side]
-        left, *right = image_map(self._read, list(zip(files, self.sizes, strict=True)))
-        return left, right[0] if right else None
-
-    def _read(self, file: tuple[Path, tuple[int, int]]) -> Image:
-        path, (width, height) = file
-        return read_grey_of_size(path, width, height)
-
-
 def has_images(folder: Path) -> bool:
     """Whether a folder holds images, or a pair of folders with some."""
     return any(list_images(place) for place in (folder, *(folder / left for left, _ in PAIRS)))
@@ -101,7 +55,7 @@ def open_images(
     every: int = 1,
     max_frames: int | None = None,
     monocular: bool = False,
-) -> ImageFolders:
+) -> ImageFiles:
     """Open a folder of images, or a pair of folders.
 
     Args:
@@ -124,16 +78,7 @@ def open_images(
         )
     chosen = select_frames(folder, n, start, every, max_frames)
     selected = [tuple(side[k] for k in chosen) for side in files]
-    for path in (path for side in selected for path in side):
-        check_not_empty(path)
-    shapes = [read_grey(side[0]).shape for side in selected]
-    return ImageFolders(
-        name=folder.resolve().name,
-        timestamps=times[chosen],
-        left=selected[0],
-        right=selected[1] if len(selected) == 2 else (),
-        sizes=tuple((width, height) for height, width in shapes),
-    )
+    return checked_files("images", folder.resolve().name, times[chosen], None, selected)
 
 
 def _find_sides(folder: Path, right: Path | None, monocular: bool) -> list[Path]:

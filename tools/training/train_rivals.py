@@ -4,11 +4,11 @@ python tools/training/train_rivals.py --data SOURCE [--data SOURCE ...] --out DI
         [--pixels N] [--images N] [--core-minutes M] [--epochs N] [--device cuda] [--dry-run]
 
 SOURCE is as of ``vslam train``. All networks have the preset ``rivals``: random weights, the same
-pairs in the same order, augmentation, loss, head and learning rate. In DIR/images each is shown the
-same number of images, in DIR/minutes each computes for the same time of a core: validation and
-export come on top. DIR/rivals.csv has a row for each. ``capsule-pruned`` begins with the weights of
-``capsule`` beside it and trains for one epoch more;
-its row counts that one alone. PCANet learns once, without gradients.
+augmentation, loss, head and learning rate. In DIR/images each is shown the same number of images,
+as the same pairs in the same order, in DIR/minutes each computes for the same time of a core:
+validation and export come on top. DIR/rivals.csv has a row for each. ``capsule-pruned`` begins with
+the weights of ``capsule`` beside it and trains for one epoch more; its row counts that one alone.
+PCANet learns once, without gradients.
 
 How long a step takes is measured first and kept in DIR/plan.json. ``--dry-run`` only does that and
 prints what would follow. What is finished is skipped, a killed training goes on from its

@@ -45,8 +45,8 @@ class Recognised(NamedTuple):
 class LearnedTrials:
     """Which candidates learned descriptors are asked about: they take forty times as long as ORB's.
 
-    Those whose images local descriptors find most alike; and after a try in vain, for some
-    keyframes, only what is clearly more alike than that was.
+    Those whose images local descriptors find most alike, and alike enough; and after a try in
+    vain, for some keyframes, only what is clearly more alike than that was.
     """
 
     def __init__(self, config: LearnedMatchingConfig) -> None:
@@ -56,10 +56,12 @@ class LearnedTrials:
     def choose(self, keyframe: int, candidates: Collection[LoopCandidate]) -> set[int]:
         """Keyframes that are matches to try; none of a detector without a network."""
         config = self._config
-        least = config.more_alike * self._in_vain if keyframe < self._resting_until else 0.0
+        least = config.min_alike
+        if keyframe < self._resting_until:
+            least = max(least, config.more_alike * self._in_vain)
         alike = [(one.alike, one.match) for one in candidates if one.alike is not None]
         best = sorted(alike, reverse=True)[: config.max_candidates]
-        return {match for likeness, match in best if likeness > least}
+        return {match for likeness, match in best if likeness >= least}
 
     def record(self, candidate: LoopCandidate, *, located: bool) -> None:
         """Whether a try found a pose, be it refused later on."""
@@ -68,6 +70,19 @@ class LearnedTrials:
         else:
             self._resting_until = candidate.query + 1 + self._config.rest
             self._in_vain = candidate.alike or 0.0
+
+
+def shows_known(
+    map_: Map, keyframe: int, images: KeyframeImages, config: LearnedMatchingConfig
+) -> bool:
+    """Whether a keyframe shows mostly what a keyframe with an image shows: no network need see it.
+
+    A camera that moves slowly, one that turns, and one that drives through a mapped place again
+    are told from one that sees something new in the same way, whatever makes keyframes.
+    """
+    observed = np.count_nonzero(map_.arrays.landmark[map_.rows(keyframe)] >= 0)
+    known, _ = map_.covisible(keyframe, int(np.ceil(config.most_shared * observed)))
+    return any(one in images for one in known.tolist())
 
 
 def verify_learned(

@@ -44,7 +44,7 @@ from vslam.features import Features
 from vslam.geometry import Matrix, compose, inverse, inverses, orthonormalised
 from vslam.loopclosure.consistency import LoopConsistency
 from vslam.loopclosure.detector import LoopDetector
-from vslam.loopclosure.learned_verification import LearnedTrials, verify_learned
+from vslam.loopclosure.learned_verification import LearnedTrials, shows_known, verify_learned
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verification import verify
 from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
@@ -92,7 +92,7 @@ class LoopClosing:
         """Look for loops at a keyframe whose local mapping is done; close the first real one."""
         if self._global is not None and keyframe >= self._global.due:
             self.finish(map_)
-        if self.images is not None and keyframe % self._config.learned.every:
+        if self.images is not None and shows_known(map_, keyframe, self.images, self._config.learned):
             image = None
         self.detector.add(keyframe, image, features)
         if self.images is not None and image is not None:

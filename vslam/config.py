@@ -429,8 +429,15 @@ class LearnedMatchingConfig(_Section):
     views: int = Field(
         2, ge=1, description="Keyframes of the place that are matched, at most. [own]"
     )
-    every: int = Field(
-        2, ge=1, description="A network sees the image of one keyframe in so many. [own]"
+    most_shared: float = Field(
+        0.4,
+        gt=0,
+        le=1,
+        description="Landmarks that a keyframe shares with one whose image is kept, of its own, "
+        "from which on no network sees it. [own]",
+    )
+    min_alike: float = Field(
+        0.35, ge=0, le=1, description="Likeness of two images that makes a try worth it. [own]"
     )
     rest: int = Field(
         8,

@@ -32,6 +32,11 @@ class DescriptorMaps(NamedTuple):
     fine: NDArray[np.float32]
     scale: float
 
+    def coarse_alone(self) -> DescriptorMaps:
+        """Without the fine ones, of which no view keeps the memory."""
+        none = np.empty((0, *self.fine.shape[1:]), np.float32)
+        return self._replace(coarse=self.coarse.copy(), fine=none)
+
 
 class CoarseMatches(NamedTuple):
     """Cells of two images that are each other's nearest.

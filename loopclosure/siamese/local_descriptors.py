@@ -105,7 +105,7 @@ class KeyframeImages:
         """Coarse descriptors of its image at half the size, for a quarter of the time; kept."""
         if keyframe not in self._glances:
             maps = self._described(keyframe, GLANCE_WIDTH)
-            self._glances[keyframe] = DescriptorMaps(maps.coarse.copy(), maps.fine[:0], maps.scale)
+            self._glances[keyframe] = maps.coarse_alone()
         return self._glances[keyframe]
 
     def glance_at(self, image: NDArray[np.uint8]) -> DescriptorMaps:

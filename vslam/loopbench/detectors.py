@@ -152,8 +152,7 @@ class LocalDescriptorCache:
                 from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
 
                 self._network = LocalDescriptors()
-            maps = self._network.describe(image)
-            self._kept[digest] = maps._replace(fine=maps.fine[:0])
+            self._kept[digest] = self._network.describe(image).coarse_alone()
         return self._kept[digest]
 
 

@@ -14,6 +14,7 @@ from typing import Literal
 from vslam.errors import InputError
 from vslam.loopbench.detectors import DescribedImage, Scorer, open_scorer
 from vslam.loopbench.incremental_bow import IncrementalBow
+from vslam.loopbench.lsgd import LsgdScorer
 from vslam.loopbench.online import OnlineDetector, ScoredDetector
 from vslam.loopbench.thumbnail import ThumbnailScorer
 from vslam.loopclosure.registry import DETECTORS, require_detector
@@ -23,7 +24,11 @@ ProtocolName = Literal["retrieval", "online"]
 Start = Callable[[list[DescribedImage]], OnlineDetector]
 """An online detector that remembers nothing yet, for the drive of these images."""
 
-_BASELINES = (ThumbnailScorer.name, IncrementalBow.name)
+_UNTRAINED: dict[str, Callable[[], Scorer]] = {
+    ThumbnailScorer.name: ThumbnailScorer,
+    LsgdScorer.name: LsgdScorer,
+}
+_BASELINES = (*_UNTRAINED, IncrementalBow.name)
 
 
 def require_comparable(name: str, weights: Path | None, protocol: ProtocolName) -> None:
@@ -53,8 +58,8 @@ def comparable_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -
     Raises:
         InputError: no weights for it, or those of another network.
     """
-    if name == ThumbnailScorer.name:
-        return ThumbnailScorer()
+    if name in _UNTRAINED:
+        return _UNTRAINED[name]()
     return open_scorer(name, weights, vocabulary)
 
 

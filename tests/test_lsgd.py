@@ -78,7 +78,7 @@ def test_superpixels_follow_an_edge():
     found = superpixels(image, 10)
     assert (found[:, :55] == 0).all()
     assert (found[:, 100:] == 1).all()
-    # A pixel at column 75 is 200 levels from the left centre (131 pixels' worth), 67 from the right.
+    # Column 75 is 200 levels, worth 131 pixels, from the left centre, and 67 pixels from the right.
     assert found[45, 75] == 1
 
 

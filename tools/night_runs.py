@@ -129,7 +129,9 @@ def write(rows: list[dict[str, Any]], out: Path) -> None:
     if out.exists():
         with out.open(newline="") as file:
             rows += [
-                one for one in csv.DictReader(file) if (one["drive"], one["perturb"]) not in measured
+                one
+                for one in csv.DictReader(file)
+                if (one["drive"], one["perturb"]) not in measured
             ]
     rows.sort(key=lambda one: (one["drive"], one["perturb"], one["detector"]))
     with out.open("w", newline="") as file:
@@ -143,19 +145,20 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, required=True)
     parser.add_argument("--seeds", type=seeds_of, default=seeds_of("401-416"))
     parser.add_argument("--detectors", default="bow,both")
-    parser.add_argument("--drives", default="", help="of the table, with commas; default: all")
+    parser.add_argument("--drives", default=",".join("/".join(one) for one in ROWS),
+                        help="DRIVE/PERTURBATION, with commas; default: %(default)s")  # fmt: skip
     parser.add_argument("--collect", action="store_true", help="run nothing, write the table")
     parser.add_argument("--out", type=Path, default=OUT)
     given = parser.parse_args()
     given.runs.mkdir(parents=True, exist_ok=True)
-    chosen = given.drives.split(",") if given.drives else [drive for drive, _ in ROWS]
+    chosen = [tuple(one.split("/")) for one in given.drives.split(",")]
     done: dict[Cell, dict[str, Any]] = {}
     for seed in given.seeds:
         for drive, perturb in ROWS:
             for detector in given.detectors.split(","):
                 cell = Cell(drive, perturb, detector, seed)
                 there = any(cell.folder(given.runs).glob("*/report.json"))
-                wanted = not given.collect and drive in chosen and rendered(drive, seed)
+                wanted = (drive, perturb) in chosen and not given.collect and rendered(drive, seed)
                 if there or wanted:
                     done[cell] = run(cell, given.runs)
     rows = list(rows_of(done))

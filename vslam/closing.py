@@ -92,7 +92,9 @@ class LoopClosing:
         """Look for loops at a keyframe whose local mapping is done; close the first real one."""
         if self._global is not None and keyframe >= self._global.due:
             self.finish(map_)
-        if self.images is not None and shows_known(map_, keyframe, self.images, self._config.learned):
+        if self.images is not None and shows_known(
+            map_, keyframe, self.images, self._config.learned
+        ):
             image = None
         self.detector.add(keyframe, image, features)
         if self.images is not None and image is not None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
 
@@ -13,7 +14,11 @@ from vslam.cli.options import Weights, names_in
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
+    from vslam.loopbench.conditions import Condition
+    from vslam.loopbench.online import Window
     from vslam.loopbench.schema import Gain, OnlineScore, Score
+    from vslam.loopbench.sets import ProgressBar
+    from vslam.loopclosure.vocabulary import Vocabulary
 
 _EXAMPLES = """
 [b]Examples[/b]
@@ -107,76 +112,116 @@ def bench(
     if protocol == "retrieval" and window != WINDOW:
         raise InputError("--window: is of --protocol online; add that or leave it out.")
 
-    from vslam.cli.progress import announce, count_bar
-    from vslam.datasets.synthetic import store
-    from vslam.loopbench.report import write_report
-    from vslam.loopbench.schema import LoopsJson
+    from vslam.cli.progress import count_bar
     from vslam.loopclosure.vocabulary import load
-    from vslam.machine import available_cores, versions
-    from vslam.report.summary import this_machine
+    from vslam.machine import available_cores
 
-    threads = threads or available_cores()
-    here = this_machine()
-    made = {"seed": seed, "machine": f"{here.cpu}, {here.cores} cores", "versions": versions()}
-    vocabulary = load()
-    bar = partial(count_bar, shown=not quiet)
-    cache = store.cache_folder()
-
-    def write(**found: object) -> None:
-        report = {
-            "cells": [],
-            "gains": [],
-            "costs": [],
-            **found,
-            **made,
-            "created": datetime.now(UTC),
-        }
-        write_report(LoopsJson.model_validate(report), out)
-
+    asked = _Asked(
+        names,
+        files,
+        load(),
+        seed,
+        threads or available_cores(),
+        partial(count_bar, shown=not quiet),
+    )
+    write = partial(_write, out, seed)
     # Both write after every set, so that a run that is stopped has told what it found.
     if protocol == "online":
-        from vslam.loopbench.drives import open_drives
-        from vslam.loopbench.measure_online import measure_drive
-        from vslam.loopbench.registry import online_detector
-
-        starts = [online_detector(name, files.get(name), vocabulary) for name in names]
-        drives = [
-            drive
-            for spec in data or DRIVES
-            for drive in open_drives(spec, cache, threads=threads, progress_bar=bar)
-        ]
-        decided: list[OnlineScore] = []
-        for drive in drives:
-            decided += measure_drive(
-                drive, starts, youngest, vocabulary, threads=threads, progress_bar=bar
-            )
-            write(online=decided)
-        done = f"{len(drives)} drives"
+        done = _on_drives(asked, data or DRIVES, youngest, write)
     else:
-        from vslam.loopbench.cost import cost
-        from vslam.loopbench.detectors import DetectorSet
-        from vslam.loopbench.measure import measure
-        from vslam.loopbench.registry import comparable_scorer
-        from vslam.loopbench.sets import open_set
-
-        scorers = [comparable_scorer(name, files.get(name), vocabulary) for name in names]
-        sets = [
-            found
-            for spec in data or DATA
-            for found in open_set(spec, cache, threads=threads, progress_bar=bar)
-        ]
-        announce("time and memory of each detector ...", shown=not quiet)
-        costs = [cost(name, files.get(name)) for name in names]
-        scores: list[Score] = []
-        gains: list[Gain] = []
-        for test_set in sets:
-            compared = DetectorSet(scorers, vocabulary, threads)
-            with bar(test_set.title, len(conditions)) as advance:
-                for condition in conditions:
-                    more = measure(test_set, condition, compared, seed)
-                    scores, gains = scores + more[0], gains + more[1]
-                    advance()
-            write(cells=scores, gains=gains, costs=costs)
-        done = f"{len(sets)} sets of images"
+        done = _on_sets(asked, data or DATA, conditions, write, quiet=quiet)
     if not quiet:
         typer.echo(f"{out / 'loops.html'}: {len(names)} detectors on {done}")
+
+
+class _Asked(NamedTuple):
+    """What both protocols need: detectors and their weights, the vocabulary, threads, progress."""
+
+    names: list[str]
+    files: dict[str, Path]
+    vocabulary: Vocabulary
+    seed: int
+    threads: int
+    progress_bar: ProgressBar
+
+
+def _on_drives(
+    asked: _Asked, data: Sequence[str], window: Window, write: Callable[..., None]
+) -> str:
+    """Measure in the protocol of the literature; says on what."""
+    from vslam.datasets.synthetic import store
+    from vslam.loopbench.drives import open_drives
+    from vslam.loopbench.measure_online import measure_drive
+    from vslam.loopbench.registry import online_detector
+
+    starts = [online_detector(one, asked.files.get(one), asked.vocabulary) for one in asked.names]
+    rendering = {"threads": asked.threads, "progress_bar": asked.progress_bar}
+    drives = [
+        drive for spec in data for drive in open_drives(spec, store.cache_folder(), **rendering)
+    ]
+    scores: list[OnlineScore] = []
+    for drive in drives:
+        scores += measure_drive(
+            drive, starts, window, asked.vocabulary,
+            threads=asked.threads, progress_bar=asked.progress_bar,
+        )  # fmt: skip
+        write(online=scores)
+    return f"{len(drives)} drives"
+
+
+def _on_sets(
+    asked: _Asked,
+    data: Sequence[str],
+    conditions: list[Condition],
+    write: Callable[..., None],
+    *,
+    quiet: bool,
+) -> str:
+    """Measure queries against galleries; says on what."""
+    from vslam.cli.progress import announce
+    from vslam.datasets.synthetic import store
+    from vslam.loopbench.cost import cost
+    from vslam.loopbench.detectors import DetectorSet
+    from vslam.loopbench.measure import measure
+    from vslam.loopbench.registry import comparable_scorer
+    from vslam.loopbench.sets import open_set
+
+    scorers = [
+        comparable_scorer(one, asked.files.get(one), asked.vocabulary) for one in asked.names
+    ]
+    rendering = {"threads": asked.threads, "progress_bar": asked.progress_bar}
+    sets = [found for spec in data for found in open_set(spec, store.cache_folder(), **rendering)]
+    announce("time and memory of each detector ...", shown=not quiet)
+    costs = [cost(name, asked.files.get(name)) for name in asked.names]
+    scores: list[Score] = []
+    gains: list[Gain] = []
+    for test_set in sets:
+        compared = DetectorSet(scorers, asked.vocabulary, asked.threads)
+        with asked.progress_bar(test_set.title, len(conditions)) as advance:
+            for condition in conditions:
+                more = measure(test_set, condition, compared, asked.seed)
+                scores, gains = scores + more[0], gains + more[1]
+                advance()
+        write(cells=scores, gains=gains, costs=costs)
+    return f"{len(sets)} sets of images"
+
+
+def _write(out: Path, seed: int, **found: object) -> None:
+    """Write the report of what was found so far."""
+    from vslam.loopbench.report import write_report
+    from vslam.loopbench.schema import LoopsJson
+    from vslam.machine import versions
+    from vslam.report.summary import this_machine
+
+    here = this_machine()
+    report = {
+        "cells": [],
+        "gains": [],
+        "costs": [],
+        **found,
+        "seed": seed,
+        "machine": f"{here.cpu}, {here.cores} cores",
+        "versions": versions(),
+        "created": datetime.now(UTC),
+    }
+    write_report(LoopsJson.model_validate(report), out)

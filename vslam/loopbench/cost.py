@@ -116,7 +116,9 @@ def _lsgd() -> Cost:
     loading = time.perf_counter() - began
     image = np.random.default_rng(0).integers(0, 256, (376, 1241), dtype=np.uint8)
     one = lsgd(image)[None]
-    query = {str(n): _median_ms(partial(similarities, one, np.repeat(one, n, 0))) for n in KEYFRAMES}
+    query = {
+        str(n): _median_ms(partial(similarities, one, np.repeat(one, n, 0))) for n in KEYFRAMES
+    }
     return Cost(
         detector="lsgd", load_s=loading, image_ms=_median_ms(lambda: lsgd(image)),
         query_ms=query, parameters=0, memory_mb=peak_memory_mb(),

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from itertools import combinations
 
+from vslam.loopclosure.siamese.weights import NETWORKS
 from vslam.machine import versions
 from vslam.overview.collect import Found
 from vslam.overview.schema import (
@@ -26,7 +27,7 @@ from vslam.overview.schema import (
 )
 
 ALPHA = 0.05
-_KNOWN = ("none", "bow", "alexnet", "vgg16", "capsule", "capsule-pruned")
+_KNOWN = ("none", "bow", *NETWORKS, "both")
 # Differences below this are ties: the last digit that is printed.
 _TIES = {"ate_rmse_m": 0.0005}
 

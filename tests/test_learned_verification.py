@@ -11,9 +11,11 @@ from vslam.config import Config
 from vslam.features import Features
 from vslam.geometry import inverse, se3_exp, transform
 from vslam.loopclosure.learned_verification import (
+    LearnedTrials,
     joined,
     nearest_features,
     recognise,
+    shows_known,
     verify_learned,
 )
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
@@ -180,3 +182,46 @@ def test_each_feature_takes_the_nearest_pixel():
     assert sorted(zip(feature.tolist(), index.tolist(), strict=True)) == [(0, 1), (1, 2)]
     none = nearest_features(uv[:0], xy, octave, np.ones(8), CONFIG.learned)
     assert [len(x) for x in none] == [0, 0]
+
+
+def test_only_what_looks_alike_is_tried_and_less_after_a_try_in_vain():
+    config = CONFIG.learned.model_copy(
+        update={"min_alike": 0.35, "more_alike": 1.1, "rest": 8, "max_candidates": 2}
+    )
+    trials = LearnedTrials(config)
+
+    def candidates(*alike: float | None) -> list[LoopCandidate]:
+        return [LoopCandidate(50, match, 0.9, one) for match, one in enumerate(alike)]
+
+    assert trials.choose(50, candidates(0.34, None, 0.1)) == set()
+    assert trials.choose(50, candidates(0.35, None, 0.5, 0.6)) == {2, 3}
+    trials.record(candidates(0.4)[0], located=False)
+    assert trials.choose(58, candidates(0.43)) == set()
+    assert trials.choose(58, candidates(0.45)) == {0}
+    assert trials.choose(59, candidates(0.43)) == {0}
+    trials.record(candidates(0.4)[0], located=True)
+    assert trials.choose(51, candidates(0.36)) == {0}
+    # However little alike the last one was, the least that is tried stays.
+    trials.record(candidates(0.1)[0], located=False)
+    assert trials.choose(52, candidates(0.3)) == set()
+
+
+def test_no_network_sees_what_an_image_shows_already(network):
+    """Keyframe 1 shares 40 of its 100 landmarks with keyframe 0."""
+    map_ = Map(1.2 ** np.arange(8.0))
+    features = Features(
+        np.zeros((100, 2), np.float32), np.zeros(100, np.uint8), np.zeros(100, np.float32),
+        np.zeros((100, 32), np.uint8), np.full(100, np.nan, np.float32),
+    )  # fmt: skip
+    for keyframe in (0, 1):
+        map_.add_keyframe(features, np.eye(4), float(keyframe), keyframe)
+    ids = map_.add_landmarks(np.ones((160, 3)), np.zeros((160, 4), np.uint64), 0)
+    for keyframe, seen_there in enumerate((ids[:100], ids[60:])):
+        rows = map_.rows(keyframe)
+        link_many(map_.arrays, np.arange(rows.start, rows.stop), seen_there)
+    images = KeyframeImages(network)
+    config = CONFIG.learned.model_copy(update={"most_shared": 0.4})
+    assert not shows_known(map_, 1, images, config)  # no image is kept
+    images.add(0, np.zeros((192, 640), np.uint8))
+    assert shows_known(map_, 1, images, config)
+    assert not shows_known(map_, 1, images, config.model_copy(update={"most_shared": 0.41}))

@@ -95,6 +95,16 @@ def test_keyframes_are_kept_small_and_described_when_asked_for(network, monkeypa
     assert (plain.coarse * first.coarse).sum(2).mean() > 0.98
 
 
+def test_a_glance_keeps_no_memory_of_fine_descriptors(network):
+    images = KeyframeImages(network)
+    images.add(0, picture(0))
+    glance = images.glance(0)
+    assert glance.coarse.shape == (7, 20, 64)
+    assert glance.fine.shape[0] == 0
+    assert glance.fine.base is None
+    assert glance.coarse.base is None
+
+
 def test_images_of_culled_keyframes_are_forgotten(network):
     images = KeyframeImages(network)
     for k in range(3):

@@ -5,8 +5,8 @@ python tools/rivals_table.py --trained DIR --data SOURCE [--data SOURCE ...]
 
 DIR is what tools/training/train_rivals.py wrote, SOURCE as of ``vslam loops bench``. Measured are,
 as that command does, descriptors alone: of the networks that were shown the same images, of those
-that computed for the same time, and of what vslam ships. DIR/bench keeps what is measured, a file
-for each of the three; a network that is there is not measured again, save its times with --retime.
+that computed for the same time, of what is trained on nothing, and of what vslam ships. DIR/bench
+keeps what is measured, a file for each of the four; a network that is there is not measured again, save its times with --retime.
 It also keeps --data and digests of the weights, and is refused with others. Tables take the place
 of what is between the marks in the page, their numbers are written as CSV, precision-recall curves
 as PNG to a folder beside the page, of its name.
@@ -33,9 +33,10 @@ from vslam.datasets.synthetic import store
 from vslam.errors import InputError
 from vslam.loopbench.conditions import parse_conditions
 from vslam.loopbench.cost import cost
-from vslam.loopbench.detectors import DetectorSet, open_scorer
+from vslam.loopbench.detectors import DetectorSet
 from vslam.loopbench.kept import digest, keep_conditions
 from vslam.loopbench.measure import measure
+from vslam.loopbench.registry import comparable_scorer
 from vslam.loopbench.report import draw
 from vslam.loopbench.schema import LoopsJson, Score
 from vslam.loopbench.sets import open_set
@@ -51,15 +52,15 @@ KEYFRAMES = "5000"
 WAYS = {
     "images": "Same number of images shown",
     "minutes": "Same time of a core",
+    "untrained": "Hand-crafted, trained on nothing",
     "shipped": "Other training, not to be compared with the others: what vslam ships",
 }
 SHIPPED = ("bow", "capsule", "capsule-pruned")
-ABSENT = {  # of Table 6
-    "FLCNN": "no definition found",
-    "LSGD": "hand-crafted (arXiv:2304.03872), not implemented",
-}
+UNTRAINED = ("lsgd",)
+ABSENT = {"FLCNN": "no definition found"}  # of Table 6
 NOTES = {
     "images": "`pcanet` is outside the equal budget, `capsule-pruned` continues from `capsule`.",
+    "untrained": "A score is no probability: there is no accuracy at p = 0.5.",
     "shipped": "Of the parameters of `bow`, 0.10 M are weights of words; its time of an image "
     "excludes the extraction of ORB features, which tracking needs anyway.",
 }
@@ -114,8 +115,8 @@ def read_training(path: Path) -> list[dict[str, str]]:
 
 def weights_of(way: str, training: list[dict[str, str]], folder: Path) -> dict[str, Path | None]:
     """Detectors of a way and their files, None for shipped ones. PCANet is the same in both."""
-    if way == "shipped":
-        return dict.fromkeys(SHIPPED)
+    if way in ("shipped", "untrained"):
+        return dict.fromkeys(SHIPPED if way == "shipped" else UNTRAINED)
     files: dict[str, Path | None] = {
         row["network"]: folder / row["weights"]
         for row in training
@@ -157,7 +158,7 @@ def report(
 def measured(detectors: dict[str, Path | None], data: list[str]) -> list[Score]:
     """All detectors on all sets, under all conditions at full strength."""
     vocabulary = load()
-    scorers = [open_scorer(name, file, vocabulary) for name, file in detectors.items()]
+    scorers = [comparable_scorer(name, file, vocabulary) for name, file in detectors.items()]
     features = vocabulary if "bow" in detectors else None
     bar = partial(count_bar, shown=True)
     cells = []
@@ -208,7 +209,7 @@ def tables(
     lost_head, *lost = condition_table(reports)
     for way, title in WAYS.items():
         mine = [row[1:] for row in rows if row[0] == way]
-        if way != "shipped":
+        if way in ("images", "minutes"):
             without = dict.fromkeys(NETWORKS, "not trained") | ABSENT
             known = {row[0] for row in mine}
             mine += [

@@ -6,10 +6,10 @@ python tools/rivals_table.py --trained DIR --data SOURCE [--data SOURCE ...]
 DIR is what tools/training/train_rivals.py wrote, SOURCE as of ``vslam loops bench``. Measured are,
 as that command does, descriptors alone: of the networks that were shown the same images, of those
 that computed for the same time, of what is trained on nothing, and of what vslam ships. DIR/bench
-keeps what is measured, a file for each of the four; a network that is there is not measured again, save its times with --retime.
-It also keeps --data and digests of the weights, and is refused with others. Tables take the place
-of what is between the marks in the page, their numbers are written as CSV, precision-recall curves
-as PNG to a folder beside the page, of its name.
+keeps what is measured, a file for each of the four; a network that is there is not measured again,
+save its times with --retime. It also keeps --data and digests of the weights, and is refused with
+others. Tables take the place of what is between the marks in the page, their numbers are written as
+CSV, precision-recall curves as PNG to a folder beside the page, of its name.
 """
 
 from __future__ import annotations

@@ -18,7 +18,8 @@ occlusion   a grey rectangle, as of dirt on the glass, over min(0.15 s, 0.9) of 
 
 Each law rounds and clips to 8 bits, is the same for both cameras (noise alone is drawn for each)
 and draws from its own random stream: it does the same alone and in company, and what it does to
-frame k depends on the seed, k and the time of k only, not on the frames asked for before.
+frame k depends on the seed, k and the time of k only, not on the frames asked for before. Laws of
+other packages (docs/plugins.md) are held to that, too.
 Walks live on a fixed grid in time, so that dropping frames does not change the light. They are
 drawn as far as frames have come: a stream may go on without end.
 """
@@ -38,6 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import DepthImage, Image, ImageMap
+from vslam.datasets.plugin_laws import plugin_laws
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import TimedFrame
 from vslam.errors import InputError
@@ -90,19 +92,20 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
         seed: not negative; equal seeds give equal images.
 
     Raises:
-        InputError: unknown or repeated law, strength no number or not within 0 to 10, or a
-            negative seed.
+        InputError: unknown or repeated law, strength no number or not within 0 to 10, a negative
+            seed, or a broken package.
     """
     if seed < 0:
         raise InputError(f"--seed {seed}: must not be negative.")
     if spec.strip() in ("", "none"):
         return Perturbation("none")
     strengths: dict[str, float] = {}
+    makers = {**_MAKERS, **plugin_laws(), **_MAKERS}  # vslam's own names come first and win
     for item in spec.split(","):
         law, _, strength = item.strip().partition(":")
-        if law not in _MAKERS:
+        if law not in makers:
             raise InputError(
-                f"--perturb {spec}: unknown law '{law}'; choose from none, {', '.join(_MAKERS)}."
+                f"--perturb {spec}: unknown law '{law}'; choose from none, {', '.join(makers)}."
             )
         if law in strengths:
             raise InputError(f"--perturb {spec}: {law} is given twice; add up its strengths.")
@@ -110,7 +113,7 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
     return Perturbation(
         ",".join(f"{law}:{strength:g}" for law, strength in strengths.items()),
         tuple(
-            _MAKERS[law](strength, (seed, crc32(law.encode())))
+            makers[law](strength, (seed, crc32(law.encode())))
             for law, strength in strengths.items()
         ),
     )

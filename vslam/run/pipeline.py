@@ -29,7 +29,7 @@ from vslam.datasets.stream import Stream, TimedFrame, is_live, timed_frames
 from vslam.errors import BrokenSourceError, UnreadableImageError
 from vslam.features import Features, TrackResult
 from vslam.frontend.tracking import TrackingContext, extract_features
-from vslam.loopclosure.registry import create_detector, create_images
+from vslam.loopclosure.registry import create_detector, create_images, problem_of
 from vslam.machine import peak_memory_mb, process_age
 from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
 from vslam.run.realtime import Played, play
@@ -61,8 +61,8 @@ def run_sequence(
 
     A frame that cannot be read is skipped: it gets a predicted pose, counts as lost and is listed
     in the outcome. One that is dropped in a real-time run gets an interpolated pose. Ctrl-C ends
-    the run after the current frame, a source that breaks off after its last good one; all done so
-    far is kept.
+    the run after the current frame, a source that breaks off after its last good one, a detector of
+    another package where it fails; all done so far is kept.
     """
     cv2.setNumThreads(1)  # the pool uses the cores
     images = create_images(settings.detector, settings.config)
@@ -100,11 +100,16 @@ def run_sequence(
                 recorder.map(slam.map)
                 n_told = _tell_loops(recorder, slam, n_told)
             on_frame(result)
+            if problem := problem_of(detector):
+                broken.append(problem)
+                break
             if interrupted.is_set():
                 if not is_live(sequence):  # a camera has no other end
                     broken.append("Ctrl-C")
                 break
         slam.finish()
+    if not broken and (problem := problem_of(detector)):
+        broken.append(problem)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     _tell_loops(recorder, slam, n_told)
     trajectory = slam.trajectory()

@@ -155,9 +155,13 @@ def read_grey(path: Path) -> Image:
     """
     import cv2
 
+    from vslam.datasets.png import decode_png
+
     try:
-        data = np.fromfile(path, np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+        data = path.read_bytes()
+        image: Image | None = decode_png(data)
+        if image is None:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     except (OSError, cv2.error):
         image = None
     if image is None:

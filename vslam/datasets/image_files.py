@@ -159,14 +159,14 @@ def read_grey(path: Path) -> Image:
 
     try:
         data = path.read_bytes()
-        image: Image | None = decode_png(data)
-        if image is None:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        if (image := decode_png(data)) is not None:
+            return image
+        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     except (OSError, cv2.error):
-        image = None
-    if image is None:
+        decoded = None
+    if decoded is None:
         raise UnreadableImageError(path, "cannot be decoded; download the file again.")
-    return np.asarray(image, np.uint8)
+    return np.asarray(decoded, np.uint8)
 
 
 def read_grey_of_size(path: Path, width: int, height: int) -> Image:

@@ -72,6 +72,7 @@ ONLY_IN = {
     "distributed": "vslam.bench.cluster",
     "rosbags": "vslam.datasets.bag",
     "PIL": "vslam.datasets.image_folders",
+    "deflate": "vslam.datasets.png",
     "typer": "vslam.cli",
 }
 

@@ -69,8 +69,9 @@ DepthScale = Annotated[
 Perturb = Annotated[
     str,
     typer.Option(
-        help="Photometric laws, each with a strength, joined by commas: brightness, gamma, "
-        "flicker, noise, blur, occlusion. Example: [b]brightness:1.5,blur:0.5[/b]"
+        help="Laws of light, weather, glass, sensor and stereo rig, each with a strength in its "
+        "unit, joined by commas; docs/stress.md lists them. Example: "
+        "[b]brightness:1.5,fog:60[/b]"
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all that is random.")]

@@ -1,1 +1,1 @@
-"""x."""
+"""At which strength does a run fail: bisection over laws, systems and seeds, and its report."""

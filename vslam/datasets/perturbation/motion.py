@@ -18,10 +18,10 @@ def optical_flow(first: Image, second: Image) -> NDArray[np.float32]:
 
     height, width = first.shape
     size = max(16, width // _SHRINK), max(16, height // _SHRINK)
-    pair = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (first, second)]
+    one, two = (cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (first, second))
     matcher = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     flow = cv2.resize(
-        matcher.calc(*pair, np.zeros((*pair[0].shape, 2), np.float32)), (width, height)
+        matcher.calc(one, two, np.zeros((*one.shape, 2), np.float32)), (width, height)
     )
     scale = np.array([width / size[0], height / size[1]], np.float32)
     return np.asarray(flow * scale, np.float32)

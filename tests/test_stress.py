@@ -400,7 +400,7 @@ def test_a_template_must_hold_both_places(template):
 
 
 def test_from_the_command_line_with_another_system(tmp_path):
-    """The clean run is perfect; darkness turns the ruler's path to a wrong one beyond a strength."""
+    """The clean run is perfect; darkness turns the ruler's path to a wrong one."""
     root = make_kitti(tmp_path / "data")
     script = tmp_path / "ruler.py"
     measured = """

@@ -211,7 +211,7 @@ def _poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> P
         found = read_trajectory(path, times[kept] - times[0])
     except InputError as error:
         if path.read_text().strip():
-            raise InputError(f"{path.name}: {error}") from error
+            raise InputError(str(error).replace(str(path), path.name)) from error
         return Poses(T_wc, known)
     for t, pose in zip(found.timestamps, found.T_wc, strict=True):
         k = int(np.abs(times - times[0] - t).argmin())

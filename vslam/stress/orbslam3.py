@@ -80,8 +80,17 @@ def main(vocabulary: str, folder: Path, out: Path, *, mono: bool) -> None:
     slam.shutdown()
     tum = out / "trajectory.txt"
     (slam.save_keyframe_trajectory_tum if mono else slam.save_trajectory_tum)(str(tum))
+    _keep_first_of_each_time(tum)
     (out / "causal.txt").write_text("".join(_tum(t, T) for t, T in causal))
     (out / "states.txt").write_text("\n".join(states))
+
+
+def _keep_first_of_each_time(path: Path) -> None:
+    """After a loss ORB-SLAM3 writes some frames twice."""
+    by_time: dict[float, str] = {}
+    for line in path.read_text().splitlines():
+        by_time.setdefault(float(line.split()[0]), line)
+    path.write_text("".join(f"{by_time[t]}\n" for t in sorted(by_time)))
 
 
 def _tum(t: float, T_wc: np.ndarray) -> str:

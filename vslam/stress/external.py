@@ -96,9 +96,10 @@ def export_kitti(sequence: Sequence, perturbation: Perturbation, folder: Path) -
     """Write the frames as the perturbation leaves them; returns which frames there are."""
     import cv2
 
-    times, kept = [], []
-    for side in ("image_0", "image_1"):
-        (folder / side).mkdir(parents=True)
+    times: list[float] = []
+    kept: list[int] = []
+    for name in ("image_0", "image_1"):
+        (folder / name).mkdir(parents=True)
     frames = perturbed(timed_frames(sequence), perturbation.bound_to(sequence))
     for index, frame in enumerate(frames):
         try:

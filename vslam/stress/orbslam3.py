@@ -59,7 +59,7 @@ def main(vocabulary: str, folder: Path, out: Path, *, mono: bool) -> None:
     times = np.loadtxt(folder / "times.txt", ndmin=1)
     rows = (folder / "calib.txt").read_text().splitlines()
     P0, P1 = (np.array(row.split()[1:], float).reshape(3, 4) for row in rows[:2])
-    height, width = cv2.imread(str(left[0]), 0).shape
+    height, width = np.asarray(cv2.imread(str(left[0]), 0)).shape
     settings = out / "settings.yaml"
     settings.write_text(
         _SETTINGS.format(

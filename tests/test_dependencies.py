@@ -26,6 +26,7 @@ FOLDERS = {
 # together on one level may not import each other, save where SIBLINGS says so.
 LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.errors", "vslam.machine", "vslam.kernels"),
+    ("vslam.plugins",),
     ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.features", "vslam.camera"),
     (
         "vslam.loops",
@@ -74,6 +75,7 @@ ONLY_IN = {
     "rosbags": "vslam.datasets.bag",
     "PIL": "vslam.datasets.image_folders",
     "pyorbslam3": "vslam.stress.orbslam3",
+    "deflate": "vslam.datasets.png",
     "typer": "vslam.cli",
 }
 

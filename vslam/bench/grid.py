@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from vslam.datasets.perturbation import LAWS, parse_perturbation
+from vslam.datasets.perturbation import law_kind, parse_perturbation
 from vslam.errors import InputError
 from vslam.report.schema import ReportJson
 
@@ -125,7 +125,7 @@ def _digest(path: Path) -> str:
 def draws(perturb: str) -> bool:
     """Whether the images depend on the seed."""
     laws = {law.partition(":")[0] for law in perturb.split(",")} - {"none"}
-    return any(LAWS[law].drawn for law in laws)
+    return any(law_kind(law).drawn for law in laws)
 
 
 def read_report(folder: Path) -> ReportJson | None:

@@ -45,8 +45,8 @@ def preview(
 
     from vslam.datasets import open_sequence
     from vslam.datasets.perturbation import (
-        LAWS,
         contact_sheet,
+        law_kind,
         laws_for,
         parse_perturbation,
         sheet_of_laws,
@@ -59,7 +59,7 @@ def preview(
         for why in unfit:
             typer.echo(f"left out: {why}", err=True)
         shown = [min(10, len(sequence) - 1)]
-        specs = [f"{law}:{LAWS[law].default:g}" for law in fit]
+        specs = [f"{law}:{law_kind(law).default:g}" for law in fit]
         image = sheet_of_laws(sequence, specs, shown[0], seed)
     else:
         shown = np.unique(np.linspace(0, len(sequence) - 1, frames).round().astype(int)).tolist()

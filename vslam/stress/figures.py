@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from matplotlib import style
 from matplotlib.ticker import MaxNLocator
 
-from vslam.datasets.perturbation import LAWS
+from vslam.datasets.perturbation import law_kind
 from vslam.report.drawing import (
     AMBER,
     BLUE,
@@ -68,7 +68,7 @@ def _curves(
                     markersize=4,
                 )  # fmt: skip
         named.add(entry.system)
-    kind = LAWS[law]
+    kind = law_kind(law)
     for panel, (_, title) in zip(panels, _PANELS, strict=True):
         panel.set_ylabel(title)
         panel.set_ylim(bottom=0)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from vslam.bench.grid import Cell, draws
-from vslam.datasets.perturbation import LAWS, parse_perturbation
+from vslam.datasets.perturbation import all_laws, law_kind, parse_perturbation
 from vslam.errors import InputError
 from vslam.report.schema import ReportJson
 from vslam.stress.criterion import Criterion
@@ -38,7 +38,7 @@ class Search:
 
     def cell(self, position: float) -> Cell:
         """The run at a position from 0, weakest, to 1, strongest."""
-        strength = strength_at(LAWS[self.law], position)
+        strength = strength_at(law_kind(self.law), position)
         name = parse_perturbation(f"{self.law}:{strength:g}", self.seed).name
         return replace(self.clean, perturb=name, seed=self.seed)
 
@@ -68,7 +68,7 @@ class Search:
     @property
     def boundary(self) -> Boundary:
         """What was found, when the search has ended."""
-        return boundary(self.verdicts, LAWS[self.law], self.steps)
+        return boundary(self.verdicts, law_kind(self.law), self.steps)
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class Plan:
             for seed in range(self.seeds)
             for law in self.laws
             for clean in self.clean_cells()
-            if seed == 0 or LAWS[law].drawn or clean.detector in self.repeated
+            if seed == 0 or law_kind(law).drawn or clean.detector in self.repeated
         ]
 
     def preset_cells(self) -> list[Cell]:
@@ -136,11 +136,11 @@ def parse_laws(text: str) -> list[str]:
     """
     names = list(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
     if names == ["all"]:
-        return list(LAWS)
+        return list(all_laws())
     for name in names:
-        if name not in LAWS:
+        if name not in all_laws():
             raise InputError(
-                f"--laws {text}: unknown law '{name}'; choose from all, {', '.join(LAWS)}; "
+                f"--laws {text}: unknown law '{name}'; choose from all, {', '.join(all_laws())}; "
                 "their strengths are searched for."
             )
     if not names:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from vslam.camera import Image
-from vslam.datasets.perturbation import LAWS, sheet_of_laws
+from vslam.datasets.perturbation import law_kind, sheet_of_laws
 from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError, ResultsError
 from vslam.report.page import Row, Table, markdown_table, render_page
@@ -134,7 +134,7 @@ def cell(entries: Collection[BoundaryEntry]) -> str:
     """``60 (50-75), 12 % lost``: where the seeds fail."""
     if not entries:
         return ""
-    law = LAWS[next(iter(entries)).law]
+    law = law_kind(next(iter(entries)).law)
     values = [law.strongest if e.fails_at is None else e.fails_at for e in entries]
     holds = [entry.fails_at is None for entry in entries]
     middle, least, greatest = statistics.median(values), min(values), max(values)
@@ -152,9 +152,9 @@ def _boundaries(report: StressJson) -> list[Table]:
         rows: list[Row] = []
         for law in dict.fromkeys(entry.law for entry in report.boundaries):
             cells = [cell(by.get((sequence, law, system), ())) for system in systems]
-            unit = "" if LAWS[law].unit == "x" else LAWS[law].unit
+            unit = "" if law_kind(law).unit == "x" else law_kind(law).unit
             if any(cells):
-                rows.append((law, unit, f"{LAWS[law].strongest:g}", *cells))
+                rows.append((law, unit, f"{law_kind(law).strongest:g}", *cells))
         head = ("law", "unit", "strongest", *systems)
         found.append(Table(f"Boundaries, {sequence}", head, rows, ("law", "unit"), _ABOUT))
     return found
@@ -248,7 +248,7 @@ def _sheet(report: StressJson, sequences: Mapping[str, Sequence]) -> Image | Non
     first = next(iter(sequences), None)
     for entry in report.boundaries:
         if entry.sequence == first and entry.law not in specs:
-            strength = LAWS[entry.law].strongest if entry.fails_at is None else entry.fails_at
+            strength = law_kind(entry.law).strongest if entry.fails_at is None else entry.fails_at
             specs[entry.law] = f"{entry.law}:{strength:g}"
     if first is None or not specs:
         return None

@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Collection, Mapping
 
 from vslam.bench.grid import Cell
-from vslam.datasets.perturbation import LAWS
+from vslam.datasets.perturbation import law_kind
 from vslam.report.schema import ReportJson
 from vslam.stress.criterion import Criterion
 from vslam.stress.kitti_c import CORRUPTIONS, Corruption
@@ -62,7 +62,7 @@ def clean_entries(
 
 def boundary_entry(search: Search, reports: Reports) -> BoundaryEntry:
     """What a search that has ended has found."""
-    found, kind = search.boundary, LAWS[search.law]
+    found, kind = search.boundary, law_kind(search.law)
     return BoundaryEntry(
         dataset=search.clean.dataset,
         sequence=search.clean.sequence,

@@ -44,7 +44,8 @@ black_right, black_left   % of the seconds in which that side is black.
 Each law rounds and clips to 8 bits, is the same for both cameras (noise, night, shot, impulse, dirt
 and drops on the glass are drawn for each; the last six lines are faults of one side) and draws from
 its own random stream: it does the same alone and in company, and what it does to frame k depends on
-the seed, k and the time of k only, not on the frames asked for before. Walks live on a fixed grid
+the seed, k and the time of k only, not on the frames asked for before. Laws of other packages
+(docs/plugins.md) are held to that, too. Walks live on a fixed grid
 in time, so that dropping frames does not change the light. They are drawn as far as frames have
 come: a stream may go on without end.
 """
@@ -60,7 +61,7 @@ from vslam.datasets.perturbation.laws import (
     perturbed,
     sheet_of_laws,
 )
-from vslam.datasets.perturbation.registry import LAWS
+from vslam.datasets.perturbation.registry import LAWS, all_laws, law_kind
 from vslam.datasets.perturbation.streams import ou_walk
 
 __all__ = [
@@ -71,7 +72,9 @@ __all__ = [
     "PairLaw",
     "Perturbation",
     "Scene",
+    "all_laws",
     "contact_sheet",
+    "law_kind",
     "laws_for",
     "ou_walk",
     "parse_perturbation",

@@ -11,8 +11,8 @@ from zlib import crc32
 import numpy as np
 
 from vslam.camera import DepthImage, Image, ImageMap
-from vslam.datasets.perturbation.kinds import Pair, PairLaw, Scene, SceneLaw
-from vslam.datasets.perturbation.registry import LAWS
+from vslam.datasets.perturbation.kinds import LawKind, Pair, PairLaw, Scene, SceneLaw
+from vslam.datasets.perturbation.registry import LAWS, all_laws
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import Stream, TimedFrame
 from vslam.errors import DroppedFrameError, InputError
@@ -70,28 +70,30 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
         seed: not negative; equal seeds give equal images.
 
     Raises:
-        InputError: unknown or repeated law, strength no number or not within the law's range, or a
-            negative seed.
+        InputError: unknown or repeated law, strength no number or not within the law's range, a
+            negative seed, or a broken package.
     """
     if seed < 0:
         raise InputError(f"--seed {seed}: must not be negative.")
     if spec.strip() in ("", "none"):
         return Perturbation("none")
     strengths: dict[str, float] = {}
+    names = {law.strip().partition(":")[0] for law in spec.split(",")}
+    known = LAWS if names <= set(LAWS) else all_laws()
     for item in spec.split(","):
         law, _, strength = item.strip().partition(":")
-        if law not in LAWS:
+        if law not in known:
             raise InputError(
-                f"--perturb {spec}: unknown law '{law}'; choose from none, {', '.join(LAWS)}."
+                f"--perturb {spec}: unknown law '{law}'; choose from none, {', '.join(known)}."
             )
         if law in strengths:
             raise InputError(f"--perturb {spec}: {law} is given twice; add up its strengths.")
-        default = LAWS[law].default
-        strengths[law] = _parse_strength(spec, law, strength) if ":" in item else default
+        default = known[law].default
+        strengths[law] = _parse_strength(spec, known[law], strength) if ":" in item else default
     return Perturbation(
         ",".join(f"{law}:{strength:g}" for law, strength in strengths.items()),
         tuple(
-            LAWS[law].law(law, strength, (seed, crc32(law.encode())))
+            known[law].law(law, strength, (seed, crc32(law.encode())))
             for law, strength in strengths.items()
         ),
     )
@@ -148,7 +150,7 @@ def sheet_of_laws(sequence: Sequence, specs: Collection[str], index: int, seed: 
 def laws_for(sequence: Sequence | Stream) -> tuple[list[str], list[str]]:
     """Names of the laws that a source has the data for, and why the others do not apply."""
     fit, unfit = [], []
-    for name in LAWS:
+    for name in all_laws():
         try:
             parse_perturbation(name, 0).bound_to(sequence)
         except InputError as error:
@@ -182,8 +184,7 @@ def _row(
     return np.asarray(row, np.uint8)
 
 
-def _parse_strength(spec: str, law: str, text: str) -> float:
-    kind = LAWS[law]
+def _parse_strength(spec: str, kind: LawKind, text: str) -> float:
     try:
         strength = float(text)
     except ValueError:

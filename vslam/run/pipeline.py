@@ -107,7 +107,7 @@ def run_sequence(
                 recorder.map(slam.map)
                 n_told = _tell_loops(recorder, slam, n_told)
             on_frame(result)
-            if problem := problem_of(detector):
+            if problem := problem_of(slam.detector):
                 broken.append(problem)
                 break
             if interrupted.is_set():
@@ -115,7 +115,7 @@ def run_sequence(
                     broken.append("Ctrl-C")
                 break
         slam.finish()
-    if not broken and (problem := problem_of(detector)):
+    if not broken and (problem := problem_of(slam.detector)):
         broken.append(problem)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     _tell_loops(recorder, slam, n_told)

@@ -44,6 +44,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.evaluation",),
     ("vslam.report",),
     ("vslam.overview", "vslam.bench", "vslam.loopbench", "vslam.doctor"),
+    ("vslam.stress",),
     ("vslam.cli",),
     ("vslam.__main__", "vslam"),
 )
@@ -58,6 +59,7 @@ SIBLINGS = {
 # A benchmark starts the command line in processes of its own: nothing comes back but files.
 STARTED = {
     ("vslam.bench.execute", "vslam.cli.child"),
+    ("vslam.cli.stress", "vslam.cli.child"),
     ("vslam.loopbench.cost", "vslam.loopbench.cost"),
     ("vslam.run.warmup", "vslam.run.warmup"),
 }
@@ -72,6 +74,7 @@ ONLY_IN = {
     "distributed": "vslam.bench.cluster",
     "rosbags": "vslam.datasets.bag",
     "PIL": "vslam.datasets.image_folders",
+    "pyorbslam3": "vslam.stress.orbslam3",
     "deflate": "vslam.datasets.png",
     "typer": "vslam.cli",
 }

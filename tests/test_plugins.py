@@ -175,7 +175,7 @@ def test_vslam_selects_frames_of_a_reader(installed, corridor, tmp_path: Path):
         open_sequence("frames", data, "elsewhere")
 
 
-def test_fog_is_the_same_for_one_seed(installed, corridor):
+def test_haze_is_the_same_for_one_seed(installed, corridor):
     image = corridor.left[0]
     once, again, other = (
         parse_perturbation("haze:2", seed).apply(3, 0.3, image, image) for seed in (0, 0, 1)

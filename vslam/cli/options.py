@@ -29,8 +29,14 @@ _DETECTORS = _with_plugins(
     plugins.DETECTORS,
 )  # fmt: skip
 _LAWS = _with_plugins(
-    ("brightness", "gamma", "flicker", "noise", "blur", "occlusion"), plugins.PERTURBATIONS
-)
+    (
+        "brightness", "gamma", "flicker", "noise", "blur", "occlusion", "fog", "rain", "night",
+        "exposure", "motion", "flare", "vignetting", "dirt", "jpeg", "resolution", "drop",
+        "outage", "bias", "contrast", "shot", "impulse", "bits", "stereo_gain", "desync",
+        "baseline", "yaw", "pitch", "black_right", "black_left",
+    ),
+    plugins.PERTURBATIONS,
+)  # fmt: skip
 
 Data = Annotated[
     Path,
@@ -95,8 +101,9 @@ DepthScale = Annotated[
 Perturb = Annotated[
     str,
     typer.Option(
-        help="Photometric laws, each with a strength, joined by commas: "
-        f"{', '.join(_LAWS)}. Example: [b]brightness:1.5,blur:0.5[/b]"
+        help="Laws of light, weather, glass, sensor and stereo rig, each with a strength in its "
+        f"unit (docs/stress.md), joined by commas: {', '.join(_LAWS)}. Example: "
+        "[b]brightness:1.5,fog:60[/b]"
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all that is random.")]

@@ -27,7 +27,12 @@ from vslam.camera import Camera, ImageMap, same_camera
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import Stream, TimedFrame, is_live, timed_frames
-from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
+from vslam.errors import (
+    BrokenSourceError,
+    DroppedFrameError,
+    InputError,
+    UnreadableImageError,
+)
 from vslam.features import Features, TrackResult
 from vslam.frontend.tracking import TrackingContext, extract_features
 from vslam.loopclosure.registry import create_detector, create_images, problem_of
@@ -44,12 +49,14 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame ready to be tracked, or the reason why it cannot be read."""
+    """A frame ready to be tracked, or the reason why it cannot be read; ``dropped`` by a
+    perturbation."""
 
     left: NDArray[np.uint8] | None
     features: Features | None
     stage_ms: dict[str, float]
     problem: str | None = None
+    dropped: bool = False
 
 
 def run_sequence(
@@ -73,6 +80,7 @@ def run_sequence(
     skipped: list[str] = []
     latency_ms: list[float] = []
     n_told = 0  # loops that the recorder knows of
+    perturbation = perturbation.bound_to(sequence)
     recorder.begin(sequence.camera, ground_truth_of(sequence))
     startup = process_age()
     wall, cpu = time.perf_counter(), time.process_time()
@@ -81,7 +89,7 @@ def run_sequence(
         frames = perturbed(_until_broken(timed_frames(sequence), broken), perturbation)
         for played in _prepared(frames, slam.context, settings, live=is_live(sequence)):
             timestamp, frame = played.timestamp, played.made
-            if frame is None:
+            if frame is None or frame.dropped:
                 tracks.append(slam.skip(timestamp, dropped=True))
                 on_frame(tracks[-1])
                 continue
@@ -257,7 +265,8 @@ def prepare_frame(
     try:
         left, second = frame.read(image_map)
     except UnreadableImageError as error:
-        return PreparedFrame(None, None, {}, str(error))
+        dropped = isinstance(error, DroppedFrameError)
+        return PreparedFrame(None, None, {}, str(error), dropped)
     read = time.perf_counter()
     features = extract_features(left, second, context, image_map)
     done = time.perf_counter()

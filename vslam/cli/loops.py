@@ -155,15 +155,17 @@ def _on_drives(
     from vslam.loopbench.registry import online_detector
 
     starts = [online_detector(one, asked.files.get(one), asked.vocabulary) for one in asked.names]
-    rendering = {"threads": asked.threads, "progress_bar": asked.progress_bar}
+    threads, bar = asked.threads, asked.progress_bar
     drives = [
-        drive for spec in data for drive in open_drives(spec, store.cache_folder(), **rendering)
+        drive
+        for spec in data
+        for drive in open_drives(spec, store.cache_folder(), threads=threads, progress_bar=bar)
     ]
     scores: list[OnlineScore] = []
     for drive in drives:
         scores += measure_drive(
             drive, starts, window, asked.vocabulary,
-            threads=asked.threads, progress_bar=asked.progress_bar,
+            threads=threads, progress_bar=bar,
         )  # fmt: skip
         write(online=scores)
     return f"{len(drives)} drives"
@@ -189,15 +191,19 @@ def _on_sets(
     scorers = [
         comparable_scorer(one, asked.files.get(one), asked.vocabulary) for one in asked.names
     ]
-    rendering = {"threads": asked.threads, "progress_bar": asked.progress_bar}
-    sets = [found for spec in data for found in open_set(spec, store.cache_folder(), **rendering)]
+    threads, bar = asked.threads, asked.progress_bar
+    sets = [
+        found
+        for spec in data
+        for found in open_set(spec, store.cache_folder(), threads=threads, progress_bar=bar)
+    ]
     announce("time and memory of each detector ...", shown=not quiet)
     costs = [cost(name, asked.files.get(name)) for name in asked.names]
     scores: list[Score] = []
     gains: list[Gain] = []
     for test_set in sets:
-        compared = DetectorSet(scorers, asked.vocabulary, asked.threads)
-        with asked.progress_bar(test_set.title, len(conditions)) as advance:
+        compared = DetectorSet(scorers, asked.vocabulary, threads)
+        with bar(test_set.title, len(conditions)) as advance:
             for condition in conditions:
                 more = measure(test_set, condition, compared, asked.seed)
                 scores, gains = scores + more[0], gains + more[1]

@@ -1,12 +1,12 @@
 """How alike right and wrong best images are: what a threshold of the learned image test costs.
 
-    python tools/image_test_shares.py block+change:1+seed:18:4 05:8 ...
+    python tools/image_test_shares.py block+change:1+seed:18:4:6 05:8:20 ...
 
-Each drive, every so many frames, is asked as ``vslam loops bench --protocol online`` asks: of the
-images older than 20 s, the one most like by `capsule`, once among those of the same place (within
-5 m and 30 degrees), once among those elsewhere (25 m or 60 degrees away). Printed is for each
-threshold on the share of coarse cells that one homography explains, how many of both pass. Drives
-must be rendered (`vslam synth`).
+Each drive, every so many frames (4, 8), is asked as ``vslam loops bench --protocol online`` asks:
+of the images older by so many seconds (6, 20), the one most like by `capsule`, once among those of
+the same place (within 5 m and 30 degrees), once among those elsewhere (25 m or 60 degrees away).
+Printed is for each threshold on the share of coarse cells that one homography explains, how many of
+both pass. Drives must be rendered (`vslam synth`).
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ from vslam.loopclosure.siamese.images import read_grey, to_size
 from vslam.loopclosure.siamese.inference import open_network
 from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
 
-SECONDS, RATE = 20.0, 10.0  # of the window; frames a second
+RATE = 10.0  # frames a second
+LEAST = 5  # images to choose from
 THRESHOLDS = np.arange(0.10, 0.41, 0.02)
 
 
-def shares(tree: Path, route: str, step: int) -> tuple[list[float], list[float]]:
+def shares(tree: Path, route: str, step: int, seconds: float) -> tuple[list[float], list[float]]:
     """Of the best right image of each frame that has one, and of its best wrong image."""
     capsule, local = open_network("capsule"), LocalDescriptors()
     least = LearnedMatchingConfig().coarse_alike
@@ -38,13 +39,13 @@ def shares(tree: Path, route: str, step: int) -> tuple[list[float], list[float]]
     descriptors = np.empty((len(files), capsule.dimensions), np.float32)
     right: list[float] = []
     wrong: list[float] = []
-    window = round(SECONDS * RATE / step)
+    window = round(seconds * RATE / step)
     for k, file in enumerate(files):
         image = read_grey(file)
         descriptors[k] = capsule.embed(to_size(image, capsule.size))
         maps.append(local.describe(image).coarse_alone())
         n = k - window
-        if n < 1:
+        if n < LEAST:
             continue
         p = capsule.compare(descriptors[k], descriptors[:n])
         away = np.linalg.norm(poses[:n, :, 3] - poses[k, :, 3], axis=1)
@@ -62,9 +63,11 @@ def shares(tree: Path, route: str, step: int) -> tuple[list[float], list[float]]
 
 def main() -> None:
     for given in sys.argv[1:]:
-        drive, _, step = given.rpartition(":")
+        drive, step, seconds = given.rsplit(":", 2)
         route, variation = parse_drive(drive)
-        right, wrong = shares(cache_folder() / folder_name(variation), route, int(step))
+        right, wrong = shares(
+            cache_folder() / folder_name(variation), route, int(step), float(seconds)
+        )
         print(f"{drive}: {len(right)} right, {len(wrong)} wrong")
         for least in THRESHOLDS:
             passed = [sum(one >= least for one in found) for found in (right, wrong)]

@@ -6,8 +6,7 @@
 Drives that are rendered completely are run, others are left out: the column `towns` says how many
 there are. A run whose report lies in FOLDER is not repeated, so the same command goes on; a
 new version of vslam needs a new folder. Runs go through the towns in turn, so that rows which are
-compared have the same towns when it is stopped early; rows that lack a town that another detector
-has are cut to the towns in common. Rows of drives that no run in FOLDER is of are kept.
+compared have the same towns when it is stopped early. Rows of the table with other seeds are kept.
 
 `capsule-orb` is the detector `capsule` whose candidates ORB alone verifies.
 """
@@ -115,25 +114,25 @@ def seeds_of(text: str) -> list[int]:
 def rows_of(done: dict[Cell, dict[str, Any]]) -> Iterator[dict[str, Any]]:
     for drive, perturb in dict.fromkeys((cell.drive, cell.perturb) for cell in done):
         here = [cell for cell in done if (cell.drive, cell.perturb) == (drive, perturb)]
-        detectors = sorted({cell.detector for cell in here}, key=lambda one: TITLES.get(one, one))
-        towns = [{cell.seed for cell in here if cell.detector == name} for name in detectors]
-        for name in detectors:
-            cells = [c for c in here if c.detector == name and c.seed in set.intersection(*towns)]
-            if cells:
-                yield row(sorted(cells), [done[cell] for cell in sorted(cells)])
+        for name in sorted({cell.detector for cell in here}):
+            cells = sorted(cell for cell in here if cell.detector == name)
+            yield row(cells, [done[cell] for cell in cells])
 
 
 def write(rows: list[dict[str, Any]], out: Path) -> None:
-    """Write the table; rows of other drives that it held stay."""
-    measured = {(one["drive"], one["perturb"]) for one in rows}
+    """Write the table; rows that it held stay, but those of seeds that are measured again."""
+
+    def again(old: dict[str, Any]) -> bool:
+        return any(
+            all(old[key] == new[key] for key in ("drive", "perturb", "detector"))
+            and set(old["seeds"].split()) & set(new["seeds"].split())
+            for new in rows
+        )
+
     if out.exists():
         with out.open(newline="") as file:
-            rows += [
-                one
-                for one in csv.DictReader(file)
-                if (one["drive"], one["perturb"]) not in measured
-            ]
-    rows.sort(key=lambda one: (one["drive"], one["perturb"], one["detector"]))
+            rows = rows + [old for old in csv.DictReader(file) if not again(old)]
+    rows.sort(key=lambda one: (one["drive"], one["perturb"], one["detector"], one["seeds"]))
     with out.open("w", newline="") as file:
         table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         table.writeheader()

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import CEILING, PLANES, StereoSequence
+from conftest import StereoSequence, corridor_depth
 
 from vslam.camera import Camera
 from vslam.cli.main import app
@@ -34,23 +34,6 @@ from vslam.trajectory import Trajectory, write_tum
 REAL = Path(__file__).parents[2] / "shared/data/tum/rgbd_dataset_freiburg1_desk"
 SCALE = 1000.0
 FRAMES = 16
-
-
-def corridor_depth(camera: Camera, T_wc: np.ndarray) -> np.ndarray:
-    """Depth ``(H, W)`` metres of the corridor along the camera's z, 0 where there is sky."""
-    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = np.stack(
-        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u, float)], axis=-1
-    )
-    rays, centre = rays @ T_wc[:3, :3].T, T_wc[:3, 3]
-    depth = np.full(u.shape, np.inf)
-    for normal, offset in PLANES:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            along = (offset - normal @ centre) / (rays @ normal)
-        hit = centre + along[..., None] * rays
-        nearer = (along > 0.05) & (along < depth) & (hit[..., 1] > CEILING)
-        depth[nearer] = along[nearer]
-    return np.where(np.isfinite(depth), depth, 0.0)
 
 
 def write_list(path: Path, times, folder: str) -> None:

@@ -140,6 +140,8 @@ def test_calibrations(folder):
 
     sizes = "made for 240x80 pixels but the images have 480x160"
     refused(f"other.yaml: {sizes}", "video", path, options("other.yaml"))
+    wide = "made for 480x160 pixels but the images have 960x160; say --side-by-side"
+    refused(wide, "video", path, SourceOptions((folder / "mono.yaml",)), sensor="mono")
     refused(sizes, "images", folder / "images", SourceOptions((folder / "other.yaml",)))
     refused("right camera is missing", "video", path, options("mono.yaml"))
     refused("no calibration; .*docs/cameras.md", "video", path, SourceOptions(side_by_side=True))

@@ -127,9 +127,12 @@ def rectification_for(
     models = [model for model in (calibration.left, calibration.right) if model is not None]
     for model, (width, height) in zip(models, sizes, strict=True):
         if (model.width, model.height) != (width, height):
+            fix = "take the calibration of these images"
+            if (2 * model.width, model.height) == (width, height):
+                fix = "say --side-by-side if each holds both of a stereo pair"
             raise InputError(
                 f"{calibration.source}: made for {model.width}x{model.height} pixels but the "
-                f"images have {width}x{height}; take the calibration of these images."
+                f"images have {width}x{height}; {fix}."
             )
     return rectify(calibration)
 

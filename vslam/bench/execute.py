@@ -38,6 +38,7 @@ class RunOptions:
         threads: of each run; its result does not depend on it.
         command: program that takes the words of ``vslam``; None for vslam itself.
         scratch: where runs write; None for the temporary folder of the machine.
+        source: words of ``vslam run`` on how the data is to be read.
     """
 
     data: Path | None
@@ -45,6 +46,7 @@ class RunOptions:
     threads: int
     command: tuple[str, ...] | None = None
     scratch: Path | None = None
+    source: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,7 @@ def run_cell(
         command = list(options.command or (sys.executable, "-m", "vslam.cli.child"))
         command += ["run", *cell.arguments(), "--threads", str(options.threads)]
         command += ["--data", str(options.data)] if options.data else []
+        command += options.source
         command += ["--config", str(work / "config.json"), "--no-record", "--no-report", "--quiet"]
         code = _call([*command, "--out", str(work / "runs")], work / "log.txt", stopped)
         log = (work / "log.txt").read_text(errors="replace")

@@ -118,16 +118,18 @@ def make_grid(
     Args:
         weights: by detector, for those that do not use the shipped ones.
     """
-    files = {name: (str(path), _digest(path)) for name, path in (weights or {}).items()}
+    paths = {name: str(path) for name, path in (weights or {}).items()}
+    digests = {name: _digest(path) for name, path in (weights or {}).items()}
     return [
         Cell(
-            dataset,
-            sequence,
-            perturb,
-            detector,
-            seed,
-            max_frames,
-            *files.get(detector, (None, "")),
+            dataset=dataset,
+            sequence=sequence,
+            perturb=perturb,
+            detector=detector,
+            seed=seed,
+            max_frames=max_frames,
+            weights=paths.get(detector),
+            digest=digests.get(detector, ""),
             sensor=sensor,
             calib=calib,
         )

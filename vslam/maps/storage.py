@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,8 @@ from vslam.errors import InputError
 from vslam.features import Features
 from vslam.map import Map
 from vslam.map_kernels import link_many, refresh_landmarks
+from vslam.maps.validation import check_arrays
+from vslam.untrusted import read_npz
 
 SCHEMA = 1
 
@@ -64,17 +65,19 @@ def load_map(path: Path) -> tuple[Map, Camera]:
     """Read a map written by ``save_map``.
 
     Raises:
-        InputError: no such file, no map, or of another schema.
+        InputError: no such file, no map, of another schema, or damaged.
     """
+    data = read_npz(path, "a map of vslam")
+    schema = data.get("schema", np.array("none"))
+    if schema.shape or schema != SCHEMA:
+        raise InputError(
+            f"{path}: map schema {schema.ravel()[:1]}, this version reads {SCHEMA}; name a map.npz."
+        )
     try:
-        with np.load(path, allow_pickle=False) as file:
-            data = dict(file)
-        schema = int(data["schema"])
-        values = data["camera"].tolist()
-    except (OSError, ValueError, KeyError, EOFError, TypeError, BadZipFile) as error:
-        raise InputError(f"{path}: not a map of vslam ({error}); name a map.npz.") from error
-    if schema != SCHEMA:
-        raise InputError(f"{path}: map schema {schema}, this version reads {SCHEMA}.")
+        check_arrays(data)
+    except ValueError as error:
+        raise InputError(f"{path}: damaged map ({error}); take another copy.") from error
+    values = data["camera"].tolist()
     camera = Camera(*values[:5], *map(int, values[5:7]), *map(bool, values[7:]))
     map_ = Map(data["scales"])
     first = data["keyframe_first_row"]

@@ -76,18 +76,19 @@ def _check_camera(camera: NDArray[Any]) -> None:
 
 
 def _check_indices(data: Arrays) -> None:
-    scales, first = data["scales"], data["keyframe_first_row"]
+    scales, first = data["scales"], data["keyframe_first_row"].astype(np.int64)
+    counts = first[1:] - first[:-1]
     n_rows, n_landmarks = len(data["row_landmark"]), len(data["landmark_xyz"])
     if not len(scales) or (scales <= 0).any():
         raise ValueError("scales are no positive numbers")
-    if first[0] != 0 or first[-1] != n_rows or (np.diff(first.astype(np.int64)) < 0).any():
+    if first[0] != 0 or first[-1] != n_rows or (counts < 0).any():
         raise ValueError("keyframe_first_row does not lead through the rows")
     _check_within("row_octave", data["row_octave"], 0, len(scales))
     _check_within("row_landmark", data["row_landmark"], -1, n_landmarks)
     _check_within("keyframe_frame", data["keyframe_frame"], 0, 2**31)
-    _check_within("keyframe_parent", data["keyframe_parent"], -1, len(first) - 1)
+    _check_within("keyframe_parent", data["keyframe_parent"], -1, len(counts))
     _check_tree(data["keyframe_parent"].astype(np.int64))
-    owner = np.repeat(np.arange(len(first) - 1), np.diff(first.astype(np.int64)))
+    owner = np.repeat(np.arange(len(counts)), counts)
     seen = data["row_landmark"].astype(np.int64)
     pairs = (owner * (n_landmarks + 1) + seen)[seen >= 0]
     if len(np.unique(pairs)) != len(pairs):

@@ -30,7 +30,7 @@ from vslam.cli.report import write_overview_of
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
+    from collections.abc import Generator, Iterable
 
     from vslam.bench.execute import CellOutcome, RunOptions
     from vslam.bench.grid import Cell
@@ -139,7 +139,9 @@ def bench(
         source=tuple(_words_of(given)),
     )
     out = out.absolute()
-    frames, identity = _open_all(kind, root, seqs, given, max_frames, sensor, shown=not quiet)
+    frames, identity = open_all(
+        kind, root, _sequences(kind, seqs), max_frames, given, sensor, shown=not quiet
+    )
     cells = make_grid(
         kind, frames, laws, chosen, runs, max_frames, files,
         sensor=sensor, calib=tuple(map(str, given.calibration)),
@@ -159,7 +161,7 @@ def bench(
     stopped = False
     try:
         with shown_live(progress, shown=not quiet) as say:
-            outcomes = _outcomes(missing, options, jobs, scheduler, out, shown=not quiet)
+            outcomes = outcomes_of(missing, options, jobs, scheduler, out, shown=not quiet)
             with closing(outcomes):
                 for outcome in outcomes:
                     say(progress.add(outcome))
@@ -194,13 +196,22 @@ def _words_of(options: SourceOptions) -> list[str]:
     return words + [str(x) for pair in values.items() if pair[1] is not None for x in pair]
 
 
-def _open_all(
+def _sequences(kind: str, seqs: str | None) -> list[str | None]:
+    """Of ``--seqs``; None is the only one there."""
+    from vslam.bench.grid import parse_sequences
+
+    if seqs is None and kind not in ("kitti", "synthetic"):
+        return [None]
+    return list(parse_sequences(_FIRST_SEQUENCES if seqs is None else seqs))
+
+
+def open_all(
     kind: str,
     root: Path,
-    seqs: str | None,
-    options: SourceOptions,
+    sequences: Iterable[str | None],
     max_frames: int | None,
-    sensor: str | None,
+    options: SourceOptions | None = None,
+    sensor: str | None = None,
     *,
     shown: bool,
 ) -> tuple[dict[str, int], str]:
@@ -209,15 +220,13 @@ def _open_all(
 
     Rendered ones are rendered here: two runs cannot render one sequence at a time.
     """
-    from vslam.bench.grid import parse_sequences
     from vslam.cli.progress import render_bar
-    from vslam.datasets.sources import open_source
+    from vslam.datasets.sources import SourceOptions, open_source
     from vslam.datasets.stream import count_expected
 
-    if seqs is None and kind in ("kitti", "synthetic"):
-        seqs = _FIRST_SEQUENCES
+    options = options or SourceOptions()
     frames = {}
-    for name in [None] if seqs is None else parse_sequences(seqs):
+    for name in sequences:
         with render_bar(shown=shown) as on_render:
             found = open_source(
                 kind, str(root), name, options,
@@ -231,7 +240,7 @@ def _open_all(
     return frames, f"rendered towns {store.folder_name(Variation())}"
 
 
-def _outcomes(
+def outcomes_of(
     cells: list[Cell],
     options: RunOptions,
     jobs: int,
@@ -240,6 +249,7 @@ def _outcomes(
     *,
     shown: bool,
 ) -> Generator[CellOutcome, None, None]:
+    """Run cells here or on a cluster and publish them."""
     if scheduler is not None:
         from vslam.bench.cluster import run_on_cluster
 

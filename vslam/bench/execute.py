@@ -47,8 +47,8 @@ class RunOptions:
     threads: int
     command: tuple[str, ...] | None = None
     scratch: Path | None = None
-    source: tuple[str, ...] = ()
     others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    source: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

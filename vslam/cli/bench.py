@@ -30,7 +30,7 @@ from vslam.cli.report import write_overview_of
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterable
+    from collections.abc import Generator
 
     from vslam.bench.execute import CellOutcome, RunOptions
     from vslam.bench.grid import Cell
@@ -139,9 +139,7 @@ def bench(
         source=tuple(_words_of(given)),
     )
     out = out.absolute()
-    frames, identity = open_all(
-        kind, root, _sequences(kind, seqs), max_frames, given, sensor, shown=not quiet
-    )
+    frames, identity = open_all(kind, root, seqs, given, max_frames, sensor, shown=not quiet)
     cells = make_grid(
         kind, frames, laws, chosen, runs, max_frames, files,
         sensor=sensor, calib=tuple(map(str, given.calibration)),
@@ -196,22 +194,13 @@ def _words_of(options: SourceOptions) -> list[str]:
     return words + [str(x) for pair in values.items() if pair[1] is not None for x in pair]
 
 
-def _sequences(kind: str, seqs: str | None) -> list[str | None]:
-    """Of ``--seqs``; None is the only one there."""
-    from vslam.bench.grid import parse_sequences
-
-    if seqs is None and kind not in ("kitti", "synthetic"):
-        return [None]
-    return list(parse_sequences(_FIRST_SEQUENCES if seqs is None else seqs))
-
-
 def open_all(
     kind: str,
     root: Path,
-    sequences: Iterable[str | None],
+    seqs: str | None,
+    options: SourceOptions,
     max_frames: int | None,
-    options: SourceOptions | None = None,
-    sensor: str | None = None,
+    sensor: str | None,
     *,
     shown: bool,
 ) -> tuple[dict[str, int], str]:
@@ -220,13 +209,15 @@ def open_all(
 
     Rendered ones are rendered here: two runs cannot render one sequence at a time.
     """
+    from vslam.bench.grid import parse_sequences
     from vslam.cli.progress import render_bar
-    from vslam.datasets.sources import SourceOptions, open_source
+    from vslam.datasets.sources import open_source
     from vslam.datasets.stream import count_expected
 
-    options = options or SourceOptions()
+    if seqs is None and kind in ("kitti", "synthetic"):
+        seqs = _FIRST_SEQUENCES
     frames = {}
-    for name in sequences:
+    for name in [None] if seqs is None else parse_sequences(seqs):
         with render_bar(shown=shown) as on_render:
             found = open_source(
                 kind, str(root), name, options,

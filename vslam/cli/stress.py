@@ -108,6 +108,7 @@ def stress(
     from vslam.cli.progress import announce
     from vslam.config import Config, load_config
     from vslam.datasets import open_sequence
+    from vslam.datasets.sources import SourceOptions
     from vslam.loopclosure.registry import require_detector
     from vslam.machine import available_cores
     from vslam.stress.criterion import Criterion
@@ -134,7 +135,9 @@ def stress(
         scratch=None if scheduler else execute.scratch_folder(out),
         others={name: _program(name, command) for name, command in others.items()},
     )
-    _, identity = open_all(dataset, data.absolute(), sequences, max_frames, shown=not quiet)
+    _, identity = open_all(
+        dataset, data.absolute(), seqs, SourceOptions(), max_frames, None, shown=not quiet
+    )
     opened = {name: open_sequence(dataset, data, name, max_frames=max_frames) for name in sequences}
     fitting, notes = _fitting(parse_laws(laws), opened) if preset is None else ([], [])
     plan = Plan(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -10,7 +12,8 @@ from vslam.camera import Camera
 from vslam.config import Config
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.tracking import TrackingContext, extract_features
-from vslam.run.rig import rig_warnings
+from vslam.geometry import inverse, se3_exp
+from vslam.run.rig import RigResiduals, measure_rig, residual_warnings, rig_warnings
 
 CONFIG = Config().stereo
 CAMERA = Camera(300.0, 300.0, 200.0, 100.0, 0.5, 400, 200)
@@ -108,3 +111,60 @@ def test_warnings_say_what_was_seen_and_done():
     assert "left side alone" in said
     (said,) = rig_warnings([Sides(black="left")] * 4)
     assert "could not be tracked" in said
+
+
+TWIST = np.array([0.3, 0.0, -8.0, 0.0, -0.3, 0.0])  # per second: ahead and to the right
+
+
+def driven(delay_s: float = 0.0, turned_px: float = 0.0, n: int = 5000) -> SimpleNamespace:
+    """A map of 10 keyframes with exact observations, but for what the right side does."""
+    rng = np.random.default_rng(1)
+    times = 0.1 * np.arange(10)
+    T_cw = np.array([se3_exp(TWIST * t) for t in times])
+    keyframe = rng.integers(0, 10, n)
+    z = rng.uniform(3.0, 30.0, n)
+    in_camera = np.stack([rng.uniform(-0.5, 0.5, n) * z, rng.uniform(-0.2, 0.2, n) * z, z], axis=1)
+    T_wc = np.array([inverse(T) for T in T_cw])[keyframe]
+    xyz = np.einsum("nij,nj->ni", T_wc[:, :3, :3], in_camera) + T_wc[:, :3, 3]
+    late = np.array([se3_exp(TWIST * (t + delay_s)) for t in times])[keyframe]
+    seen = np.einsum("nij,nj->ni", late[:, :3, :3], xyz) + late[:, :3, 3]
+    u = CAMERA.fx * in_camera[:, 0] / z + CAMERA.cx
+    u_right = CAMERA.fx * (seen[:, 0] - CAMERA.baseline) / seen[:, 2] + CAMERA.cx - turned_px
+    arrays = SimpleNamespace(
+        landmark=np.arange(n), keyframe=keyframe, T_cw=T_cw, xyz=xyz,
+        xy=np.stack([u, u], axis=1), u_right=u_right + rng.normal(0.0, 0.2, n),
+    )  # fmt: skip
+    return SimpleNamespace(
+        arrays=arrays, n_rows=n, n_keyframes=10, timestamps=times.tolist(),
+        living_keyframes=lambda: np.arange(10),
+    )  # fmt: skip
+
+
+def test_residuals_tell_a_late_side_from_a_turned_one():
+    sound = measure_rig(driven(), CAMERA)
+    assert sound.delay_s == pytest.approx(0.0, abs=1e-4)
+    assert sound.offset_px == pytest.approx(0.0, abs=0.03)
+    late = measure_rig(driven(delay_s=0.005), CAMERA)
+    assert late.delay_s == pytest.approx(0.005, rel=0.05)
+    turned = measure_rig(driven(turned_px=0.4), CAMERA)
+    assert turned.offset_px == pytest.approx(-0.4, abs=0.03)
+    assert turned.delay_s == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_map_that_cannot_tell_says_nothing():
+    assert measure_rig(driven(n=1000), CAMERA) is None
+    assert measure_rig(driven(), CAMERA.left_camera()) is None
+    still = driven()
+    still.timestamps = (100.0 * np.arange(10)).tolist()
+    assert measure_rig(still, CAMERA) is None  # gaps: nobody knows how it moved
+    assert residual_warnings(None, CAMERA) == []
+
+
+def test_a_fault_of_the_rig_is_said_with_its_size():
+    assert residual_warnings(RigResiduals(1e-4, 0.05), CAMERA) == []
+    assert residual_warnings(RigResiduals(float("nan"), 0.05), CAMERA) == []
+    (said,) = residual_warnings(RigResiduals(1.2e-3, 0.2), CAMERA)
+    assert "right one is at least 1.2 ms late" in said
+    (said,) = residual_warnings(RigResiduals(1e-4, -0.3), CAMERA)
+    assert "0.30 pixels" in said
+    assert "3.4 arc minutes" in said

@@ -41,7 +41,7 @@ from vslam.map import Map
 from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
 from vslam.run.realtime import Played, play
 from vslam.run.recorder import NullRecorder, Recorder
-from vslam.run.rig import rig_warnings
+from vslam.run.rig import measure_rig, residual_warnings, rig_warnings
 from vslam.slam import Slam
 
 _log = logging.getLogger(__name__)
@@ -134,7 +134,10 @@ def run_sequence(
         keyframes=slam.keyframe_trajectory(),
         tracks=tracks,
         skipped=skipped,
-        warnings=rig_warnings(sides),
+        warnings=[
+            *rig_warnings(sides),
+            *residual_warnings(measure_rig(slam.map, sequence.camera), sequence.camera),
+        ],
         wall_s=wall,
         cpu_s=cpu,
         startup_s=startup,

@@ -148,7 +148,8 @@ def stress(
     fitting, notes = _fitting(parse_laws(laws), opened) if preset is None else ([], [])
     plan = Plan(
         dataset, tuple(sequences), tuple(fitting), tuple(names), seeds, steps, max_frames,
-        baseline or names[0], Criterion(max_lost, ate_factor, ate_least), tuple(others), preset, sensor,
+        baseline or names[0], Criterion(max_lost, ate_factor, ate_least), tuple(others), preset,
+        sensor,
     )  # fmt: skip
     execute.prepare(out, identity)
     searches, results = plan.searches(), Results(out, options.config)

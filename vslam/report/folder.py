@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import re
+from collections.abc import Collection
 from datetime import datetime
 from itertools import count
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vslam.errors import InputError, ResultsError
 from vslam.evaluation.loops import evaluate_loops
@@ -18,6 +20,9 @@ from vslam.report.schema import ReportJson
 from vslam.report.summary import evaluate_run, summarize
 from vslam.run.outcome import RunOutcome, matched_ground_truth
 from vslam.trajectory import write_kitti, write_tum
+
+if TYPE_CHECKING:
+    from vslam.run.moments import Moment
 
 _LONGEST_PART = 60  # characters: file systems take 255 for a name, and a URL may have more
 
@@ -53,7 +58,12 @@ def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, dete
 
 
 def write_results(
-    folder: Path, outcome: RunOutcome, *, pages: bool = True, ply: bool = False
+    folder: Path,
+    outcome: RunOutcome,
+    moments: Collection[Moment] = (),
+    *,
+    pages: bool = True,
+    ply: bool = False,
 ) -> ReportJson:
     """Evaluate a run, in any state of completion, and write all that is known of it.
 
@@ -67,6 +77,7 @@ def write_results(
         outcome: the run; it may be interrupted, all lost, or without a single frame.
         pages: write what people read, too: Markdown, HTML and figures.
         ply: write the landmarks as ``map.ply``, too.
+        moments: images of keyframes for the HTML page.
 
     Raises:
         ResultsError: a file could not be written; those before it are complete.
@@ -77,7 +88,7 @@ def write_results(
         write_frames(folder / "frames.csv", outcome.tracks)
         config = outcome.settings.config.model_dump_json(indent=2) + "\n"
         (folder / "config.json").write_text(config)
-        report = _write_report(folder, outcome, config, pages=pages)
+        report = _write_report(folder, outcome, config, moments, pages=pages)
         if outcome.map is not None:
             save_map(folder / "map.npz", outcome.map, outcome.sequence.camera)
             if ply:
@@ -107,7 +118,14 @@ def write_trajectories(folder: Path, outcome: RunOutcome) -> None:
         write_tum(folder / "ground_truth.tum", ground_truth)
 
 
-def _write_report(folder: Path, outcome: RunOutcome, config: str, *, pages: bool) -> ReportJson:
+def _write_report(
+    folder: Path,
+    outcome: RunOutcome,
+    config: str,
+    moments: Collection[Moment],
+    *,
+    pages: bool,
+) -> ReportJson:
     """``report.json``, and with ``pages`` what people read."""
     evaluation, remark = evaluate_run(outcome)
     verdict = evaluate_loops(outcome)
@@ -122,13 +140,17 @@ def _write_report(folder: Path, outcome: RunOutcome, config: str, *, pages: bool
     report = summarize(outcome, evaluation, verdict, command, remark)
     (folder / "report.json").write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
     if pages:
+        from vslam.report.explorer import explorer_data
         from vslam.report.figures import draw_figures
         from vslam.report.render import render_html, render_markdown
 
         (folder / "report.md").write_text(render_markdown(report), encoding="utf-8")
         figures = draw_figures(outcome, evaluation, matched_ground_truth(outcome), verdict)
+        explorer = explorer_data(outcome, evaluation, matched_ground_truth(outcome), moments)
         (folder / "figures").mkdir(exist_ok=True)
         for figure in figures:
             (folder / "figures" / f"{figure.name}.png").write_bytes(figure.png)
-        (folder / "report.html").write_text(render_html(report, config, figures), encoding="utf-8")
+        (folder / "report.html").write_text(
+            render_html(report, config, figures, explorer), encoding="utf-8"
+        )
     return report

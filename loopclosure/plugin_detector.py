@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from vslam.config import Config
 from vslam.errors import InputError
 from vslam.features import Features
 from vslam.loopclosure.detector import LoopDetector
-from vslam.loops import LoopCandidate
+from vslam.loops import DetectorMemory, LoopCandidate
 from vslam.map import Map
 from vslam.plugins import PlugIn
 
@@ -44,6 +45,36 @@ class PlugInDetector:
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
         return self._candidates(-1, map_, self._detector.locate, _read_only(image), features, map_)
+
+    def memory(self) -> DetectorMemory:
+        """What the package gives for a map file; the bare name if it gives nothing."""
+        bare = DetectorMemory(self.name)
+        if not callable(getattr(self._detector, "memory", None)):
+            return bare
+        found = self._ask(self._detector.memory)
+        if found is None and self.problem is not None:
+            return bare
+        if not isinstance(found, DetectorMemory):
+            self.problem = (
+                f"{self._plugin}: memory gave {type(found).__name__}, no DetectorMemory; repair "
+                "the package"
+            )
+            return bare
+        return replace(found, name=self.name)
+
+    def restore(self, memory: DetectorMemory) -> None:
+        """See `LoopDetector`.
+
+        Raises:
+            ValueError: the package cannot: it has no such method, or it fails.
+        """
+        if memory.name != self.name:
+            raise ValueError(f"made with the detector {memory.name}, not {self.name}")
+        if not callable(getattr(self._detector, "restore", None)):
+            raise ValueError(f"{self._plugin} has no restore: it cannot go on in a map")
+        self._ask(self._detector.restore, memory)
+        if self.problem is not None:
+            raise ValueError(self.problem)
 
     def _ask(self, method: Callable[..., Any], *arguments: object) -> Any:
         """What a method gives back, None once the detector has failed."""

@@ -104,7 +104,7 @@ def test_the_package_of_the_page_is_found(installed):
     assert {group: list(names) for group, names in found.items()} == {
         "vslam.detectors": ["thumbnail"],
         "vslam.readers": ["frames"],
-        "vslam.perturbations": ["fog"],
+        "vslam.perturbations": ["haze"],
     }
     assert str(found["vslam.readers"]["frames"]) == (
         "the reader frames of the package vslam-example 1.0"
@@ -118,7 +118,7 @@ def test_a_run_with_reader_perturbation_and_detector(target: Path, corridor, tmp
     environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(target), "COLUMNS": "200"}
     environment["HOME"] = str(Path.home())
     words = ["run", "--dataset", "frames", "--data", str(data), "--detector", "thumbnail"]
-    words += ["--perturb", "fog:0.5", "--start", "1", "--max-frames", "10", "--no-record"]
+    words += ["--perturb", "haze:0.5", "--start", "1", "--max-frames", "10", "--no-record"]
     words += ["--out", str(tmp_path / "runs")]
 
     def vslam(*words: str) -> str:
@@ -135,13 +135,13 @@ def test_a_run_with_reader_perturbation_and_detector(target: Path, corridor, tmp
     assert kept == {
         "dataset": "frames",
         "sequence": "frames",
-        "perturb": "fog:0.5",
+        "perturb": "haze:0.5",
         "detector": "thumbnail",
         "frames": 10,
     }
     assert (report["lost_frames"], report["skipped_frames"]) == (0, 0)
     shown = vslam("run", "--help")
-    assert all(name in shown for name in ("thumbnail", "frames", "fog"))
+    assert all(name in shown for name in ("thumbnail", "frames", "haze"))
     assert "vslam-example 1.0" in vslam("info", "--data", str(data))
 
 
@@ -175,15 +175,15 @@ def test_vslam_selects_frames_of_a_reader(installed, corridor, tmp_path: Path):
         open_sequence("frames", data, "elsewhere")
 
 
-def test_fog_is_the_same_for_one_seed(installed, corridor):
+def test_haze_is_the_same_for_one_seed(installed, corridor):
     image = corridor.left[0]
     once, again, other = (
-        parse_perturbation("fog:2", seed).apply(3, 0.3, image, image) for seed in (0, 0, 1)
+        parse_perturbation("haze:2", seed).apply(3, 0.3, image, image) for seed in (0, 0, 1)
     )
     assert np.array_equal(once[0], again[0])
     assert np.array_equal(once[0], once[1])
     assert not np.array_equal(once[0], other[0])
-    assert parse_perturbation("fog,blur:1", 0).name == "fog:1,blur:1"
+    assert parse_perturbation("haze,blur:1", 0).name == "haze:1,blur:1"
 
 
 @pytest.mark.parametrize(

@@ -212,6 +212,7 @@ def _write_map(folder: Path) -> None:
     from vslam.map import Map
     from vslam.map_kernels import link_many, refresh_landmarks
     from vslam.maps.storage import save_map
+    from vslam.maps.stored_map import StoredMap
 
     rng = np.random.default_rng(3)
     map_ = Map(1.2 ** np.arange(8))
@@ -232,7 +233,7 @@ def _write_map(folder: Path) -> None:
         rows = np.arange(n * k, n * (k + 1))
         link_many(map_.arrays, rows, ids.astype(np.int32))
     refresh_landmarks(map_.arrays, ids, map_.scales)
-    save_map(folder / "map.npz", map_, _camera())
+    save_map(folder / "map.npz", StoredMap(map_, _camera()))
 
 
 def _write_json(kind: str, folder: Path) -> None:
@@ -349,7 +350,7 @@ def _read_calibrations(folder: Path) -> None:
 def _read_map(folder: Path) -> None:
     from vslam.maps.storage import load_map
 
-    map_, _ = load_map(folder / "map.npz")
+    map_ = load_map(folder / "map.npz").map
     for k in range(map_.n_keyframes):
         map_.covisible(k)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Collection
+from dataclasses import replace
 from datetime import datetime
 from itertools import count
 from pathlib import Path
@@ -12,13 +13,14 @@ from typing import TYPE_CHECKING
 
 from vslam.errors import InputError, ResultsError
 from vslam.evaluation.loops import evaluate_loops
-from vslam.evaluation.trajectories import evo_command
+from vslam.evaluation.trajectories import Evaluation, evo_command
+from vslam.evaluation.worlds import world_of
 from vslam.maps.ply import save_ply
 from vslam.maps.storage import save_map
 from vslam.report.frame_table import write_frames
 from vslam.report.schema import ReportJson
 from vslam.report.summary import evaluate_run, summarize
-from vslam.run.outcome import RunOutcome, matched_ground_truth
+from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_truth
 from vslam.trajectory import write_kitti, write_tum
 
 if TYPE_CHECKING:
@@ -64,11 +66,13 @@ def write_results(
     *,
     pages: bool = True,
     ply: bool = False,
+    map_file: Path | None = None,
 ) -> ReportJson:
     """Evaluate a run, in any state of completion, and write all that is known of it.
 
-    Files: ``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``,
-    ``config.json`` (read by ``--config``), ``keyframes.tum``, ``frames.csv``, ``report.json``,
+    Files: ``trajectory_kitti.txt``, ``trajectory.tum``, ``trajectory_causal.tum`` (poses as they
+    were given at the time), ``ground_truth_kitti.txt``, ``config.json`` (read by ``--config``),
+    ``keyframes.tum``, ``frames.csv``, ``report.json``,
     ``report.md``, ``report.html`` (one file, no network request), ``figures/*.png``, ``map.npz``,
     ``map.ply``; what matters most comes first.
 
@@ -78,22 +82,29 @@ def write_results(
         pages: write what people read, too: Markdown, HTML and figures.
         ply: write the landmarks as ``map.ply``, too.
         moments: images of keyframes for the HTML page.
+        map_file: where to write the map, too.
 
     Raises:
         ResultsError: a file could not be written; those before it are complete.
     """
     try:
         write_trajectories(folder, outcome)
+        write_tum(folder / "trajectory_causal.tum", causal_trajectory(outcome))
         write_tum(folder / "keyframes.tum", outcome.keyframes)
         write_frames(folder / "frames.csv", outcome.tracks)
         config = outcome.settings.config.model_dump_json(indent=2) + "\n"
         (folder / "config.json").write_text(config)
-        report = _write_report(folder, outcome, config, moments, pages=pages)
-        if outcome.map is not None:
-            save_map(folder / "map.npz", outcome.map, outcome.sequence.camera)
-            if ply:
-                landmarks = outcome.map.living_landmarks()
-                save_ply(folder / "map.ply", outcome.map.arrays.xyz[landmarks])
+        evaluation, remark = evaluate_run(outcome)
+        report = _write_report(folder, outcome, config, evaluation, remark, moments, pages=pages)
+        if outcome.map is not None and ply:
+            landmarks = outcome.map.living_landmarks()
+            save_ply(folder / "map.ply", outcome.map.arrays.xyz[landmarks])
+        if (stored := outcome.stored) is not None:
+            if outcome.settings.map is None and evaluation is not None:
+                stored = replace(stored, world=world_of(outcome, evaluation))
+            save_map(folder / "map.npz", stored)
+            if map_file is not None:
+                save_map(map_file, stored)
     except OSError as error:
         files = sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime_ns)
         raise ResultsError(
@@ -122,12 +133,13 @@ def _write_report(
     folder: Path,
     outcome: RunOutcome,
     config: str,
+    evaluation: Evaluation | None,
+    remark: str | None,
     moments: Collection[Moment],
     *,
     pages: bool,
 ) -> ReportJson:
     """``report.json``, and with ``pages`` what people read."""
-    evaluation, remark = evaluate_run(outcome)
     verdict = evaluate_loops(outcome)
     command = None
     if evaluation is not None:
@@ -146,11 +158,10 @@ def _write_report(
 
         (folder / "report.md").write_text(render_markdown(report), encoding="utf-8")
         figures = draw_figures(outcome, evaluation, matched_ground_truth(outcome), verdict)
-        explorer = explorer_data(outcome, evaluation, matched_ground_truth(outcome), moments)
         (folder / "figures").mkdir(exist_ok=True)
         for figure in figures:
             (folder / "figures" / f"{figure.name}.png").write_bytes(figure.png)
-        (folder / "report.html").write_text(
-            render_html(report, config, figures, explorer), encoding="utf-8"
-        )
+        explorer = explorer_data(outcome, evaluation, matched_ground_truth(outcome), moments)
+        page = render_html(report, config, figures, explorer)
+        (folder / "report.html").write_text(page, encoding="utf-8")
     return report

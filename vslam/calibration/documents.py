@@ -18,8 +18,7 @@ from vslam.calibration.models import Array
 from vslam.errors import InputError
 
 _HEADER = re.compile(r"\A\ufeff?%YAML[: ]1\.\d.*\n?")
-# A list of aliases of lists of aliases, and so on, is a few lines of text and gigabytes of numbers.
-_ALIAS = re.compile(r"(?:^|[\s\[{,:])\*\w")
+_MOST_STEPS = 10_000  # lists and numbers at one key
 _NO_SPACE = re.compile(r"^(\s*[\w.]+):(?=\[)", re.MULTILINE)
 
 
@@ -98,8 +97,6 @@ def read_document(path: Path) -> Document:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: the calibration is missing or no text; name another.") from error
     text = _NO_SPACE.sub(r"\1: ", _HEADER.sub("", text))
-    if _ALIAS.search(text):
-        raise InputError(f"{path}: the calibration has an alias of YAML (*NAME); write it out.")
     try:
         values = yaml.load(text, yaml.BaseLoader)
     except (yaml.YAMLError, RecursionError) as error:
@@ -112,6 +109,16 @@ def read_document(path: Path) -> Document:
 
 
 def _flat(value: object) -> list[str]:
-    if isinstance(value, list):
-        return [text for item in value for text in _flat(item)]
-    return [str(value)] if isinstance(value, str) else ["no number"]
+    """All texts in lists of lists. A list of aliases of lists of aliases, and so on, is a few lines
+    of text and gigabytes of numbers, or has no end: beyond any matrix it is no number."""
+    found: list[str] = []
+    waiting = [value]
+    for _ in range(_MOST_STEPS):
+        if not waiting:
+            return found
+        item = waiting.pop()
+        if isinstance(item, list):
+            waiting.extend(reversed(item))
+        else:
+            found.append(item if isinstance(item, str) else "no number")
+    return ["no number"]

@@ -22,6 +22,7 @@ from vslam.calibration.models import (
     without_zeros,
 )
 from vslam.errors import InputError
+from vslam.untrusted import MOST_PIXELS
 
 Size = tuple[int, int]
 _LENSES: dict[str, Lens] = {
@@ -303,6 +304,10 @@ def _camera(
         )
     if width < 1 or height < 1:
         raise InputError(f"{source}: the image size {width}x{height} must be positive.")
+    if width * height > MOST_PIXELS:
+        raise InputError(
+            f"{source}: no camera has images of {width}x{height} pixels; mend the size."
+        )
     if fx <= 0 or fy <= 0:
         raise InputError(f"{source}: the focal lengths {fx:g}, {fy:g} must be positive.")
     if not (0 < cx < width and 0 < cy < height):

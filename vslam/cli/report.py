@@ -14,6 +14,8 @@ _EXAMPLES = """
 
   vslam report runs/20261121-1* other/bench --out comparison
 
+  vslam report runs --serve
+
   vslam report bench --trajectory ORB-SLAM3@00=orbslam3/00.txt
 """
 
@@ -34,10 +36,37 @@ def report(
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("report"),
+    serve: Annotated[
+        bool,
+        typer.Option(
+            "--serve",
+            help="Show a page of all runs, to be compared side by side, on this machine alone, "
+            "until Ctrl-C; nothing is written.",
+        ),
+    ] = False,
+    port: Annotated[
+        int,
+        typer.Option(min=0, max=65535, help="Of --serve.", show_default="any that is free"),
+    ] = 0,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing.")] = False,
 ) -> None:
     """Write one report of finished runs: medians, detectors compared, trajectories, curves."""
+    if serve:
+        serve_runs(runs, port)
+        return
     write_overview_of(runs, trajectory or [], out, quiet=quiet)
+
+
+def serve_runs(folders: list[Path], port: int) -> None:
+    """Serve a page of the runs in some folders until Ctrl-C."""
+    from vslam.overview.serve import make_server
+
+    with make_server(folders, port) as server:
+        typer.echo(f"http://127.0.0.1:{server.server_port}/ shows the runs; Ctrl-C ends it")
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            typer.echo("ended")
 
 
 def write_overview_of(runs: list[Path], trajectories: list[str], out: Path, *, quiet: bool) -> None:

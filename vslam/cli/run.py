@@ -175,6 +175,7 @@ def run(
     # Bad input has been refused by now; what follows takes a second to import.
     from vslam.cli.summary import print_summary
     from vslam.report.folder import create_run_folder, write_results
+    from vslam.run.moments import MomentRecorder
     from vslam.run.outcome import RunSettings
     from vslam.run.pipeline import require_camera, run_sequence, with_comparison
     from vslam.run.recorder import (
@@ -209,6 +210,9 @@ def run(
     viewer = None if view is None else open_viewer(view)
     folder = create_run_folder(out, kind, source.name, perturbation.name, detector)
     recorder: Recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
+    moments = MomentRecorder()
+    if pages:
+        recorder = SeveralRecorders((recorder, moments))
     if viewer is not None:
         recorder = SeveralRecorders((recorder, RerunRecorder(viewer)))
         if viewer.address:
@@ -221,7 +225,9 @@ def run(
     if compare_loops and not outcome.interrupted:
         with progress_bar(count_expected(source), shown=not quiet) as on_frame:
             outcome = with_comparison(outcome, perturbation, on_frame=on_frame)
-    report = write_results(folder, outcome, pages=pages, ply=ply, map_file=save_map)
+    report = write_results(
+        folder, outcome, moments.moments, pages=pages, ply=ply, map_file=save_map
+    )
     if not quiet:
         print_summary(report, folder)
     if outcome.interrupted:

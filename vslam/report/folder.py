@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import re
+from collections.abc import Collection
 from dataclasses import replace
 from datetime import datetime
 from itertools import count
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vslam.errors import InputError, ResultsError
 from vslam.evaluation.loops import evaluate_loops
@@ -20,6 +22,9 @@ from vslam.report.schema import ReportJson
 from vslam.report.summary import evaluate_run, summarize
 from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_truth
 from vslam.trajectory import write_kitti, write_tum
+
+if TYPE_CHECKING:
+    from vslam.run.moments import Moment
 
 _LONGEST_PART = 60  # characters: file systems take 255 for a name, and a URL may have more
 
@@ -57,6 +62,7 @@ def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, dete
 def write_results(
     folder: Path,
     outcome: RunOutcome,
+    moments: Collection[Moment] = (),
     *,
     pages: bool = True,
     ply: bool = False,
@@ -75,6 +81,7 @@ def write_results(
         outcome: the run; it may be interrupted, all lost, or without a single frame.
         pages: write what people read, too: Markdown, HTML and figures.
         ply: write the landmarks as ``map.ply``, too.
+        moments: images of keyframes for the HTML page.
         map_file: where to write the map, too.
 
     Raises:
@@ -88,7 +95,7 @@ def write_results(
         config = outcome.settings.config.model_dump_json(indent=2) + "\n"
         (folder / "config.json").write_text(config)
         evaluation, remark = evaluate_run(outcome)
-        report = _write_report(folder, outcome, config, evaluation, remark, pages=pages)
+        report = _write_report(folder, outcome, config, evaluation, remark, moments, pages=pages)
         if outcome.map is not None and ply:
             landmarks = outcome.map.living_landmarks()
             save_ply(folder / "map.ply", outcome.map.arrays.xyz[landmarks])
@@ -128,6 +135,7 @@ def _write_report(
     config: str,
     evaluation: Evaluation | None,
     remark: str | None,
+    moments: Collection[Moment],
     *,
     pages: bool,
 ) -> ReportJson:
@@ -144,6 +152,7 @@ def _write_report(
     report = summarize(outcome, evaluation, verdict, command, remark)
     (folder / "report.json").write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
     if pages:
+        from vslam.report.explorer import explorer_data
         from vslam.report.figures import draw_figures
         from vslam.report.render import render_html, render_markdown
 
@@ -152,5 +161,7 @@ def _write_report(
         (folder / "figures").mkdir(exist_ok=True)
         for figure in figures:
             (folder / "figures" / f"{figure.name}.png").write_bytes(figure.png)
-        (folder / "report.html").write_text(render_html(report, config, figures), encoding="utf-8")
+        explorer = explorer_data(outcome, evaluation, matched_ground_truth(outcome), moments)
+        page = render_html(report, config, figures, explorer)
+        (folder / "report.html").write_text(page, encoding="utf-8")
     return report

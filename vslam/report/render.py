@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
 
 from vslam.report.loop_tables import loop_tables
 from vslam.report.page import markdown_table, render_page
@@ -139,13 +140,19 @@ def render_markdown(report: ReportJson) -> str:
     return "\n".join(lines)
 
 
-def render_html(report: ReportJson, config: str, figures: Collection[ReportFigure]) -> str:
+def render_html(
+    report: ReportJson,
+    config: str,
+    figures: Collection[ReportFigure],
+    explorer: dict[str, Any] | None = None,
+) -> str:
     """One self-contained page: style, figures and numbers are inside, nothing is loaded.
 
     Args:
         report: the numbers.
         config: text of ``config.json``, shown as it is.
         figures: drawn by :func:`vslam.report.figures.draw_figures`.
+        explorer: made by :func:`vslam.report.explorer.explorer_data`.
     """
     return render_page(
         "report.html.jinja",
@@ -158,6 +165,8 @@ def render_html(report: ReportJson, config: str, figures: Collection[ReportFigur
         machine=machine_rows(report),
         config=config,
         figures=figures,
+        explorer=explorer,
+        explorer_program=files("vslam.report").joinpath("explorer.js").read_text("utf-8"),
     )
 
 

@@ -1,0 +1,286 @@
+"""The explorer of a report, and the page of all runs: in a browser, at phone width."""
+
+from __future__ import annotations
+
+import functools
+import http.client
+import http.server
+import json
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from base64 import b64decode
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from test_report import make_outcome
+
+from vslam.errors import InputError
+from vslam.features import Features
+from vslam.overview.serve import list_runs, make_server
+from vslam.report.explorer import explorer_data
+from vslam.report.folder import evaluate_run, matched_ground_truth, write_results
+from vslam.run.moments import MomentRecorder
+
+FRAMES = 150
+
+
+def filled(n_keyframes: int, every: int = 1) -> MomentRecorder:
+    """A recorder that has seen keyframes whose images tell them apart."""
+    recorder, outcome = MomentRecorder(), make_outcome(n_keyframes * every)
+    rng = np.random.default_rng(0)
+    xy = np.stack([rng.uniform(0, 720, 50), rng.uniform(0, 200, 50)], axis=1).astype(np.float32)
+    none = np.zeros(50, np.float32)
+    features = Features(xy, none.astype(np.uint8), none, np.zeros((50, 32), np.uint8), none)
+    for k, track in enumerate(outcome.tracks):
+        recorder.frame(track, np.eye(4))
+        if k % every == 0:
+            image = np.full((200, 720), k % 250, np.uint8)
+            recorder.keyframe(track, image, features, np.arange(50) < 20)
+    return recorder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "first"
+    folder.mkdir()
+    write_results(folder, make_outcome(FRAMES, lost=slice(20, 22)), filled(30, 5).moments)
+    return folder
+
+
+def test_moments_are_bounded_and_evenly_spread():
+    for n in (1, 96, 97, 192, 1000):
+        frames = [moment.frame for moment in filled(n).moments]
+        assert len(frames) <= 96
+        assert len(frames) >= min(n, 48)
+        assert frames[0] == 0
+        steps = set(np.diff(frames).tolist())
+        assert len(steps) <= 1, (n, steps)
+    assert sum(len(moment.jpeg) for moment in filled(1000).moments) < 10**6
+
+
+def test_a_moment_is_the_small_image_with_its_keypoints():
+    moment = filled(3).moments[2]
+    image = cv2.imdecode(np.frombuffer(moment.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert image.shape == (100, 360)
+    assert abs(int(image.mean()) - 2) <= 2
+    assert moment.points.shape == (50, 2)
+    assert moment.tracked.sum() == 20
+    assert moment.tracked[:20].all()
+
+
+def test_the_data_are_those_of_the_run():
+    outcome = make_outcome(FRAMES, lost=slice(20, 22))
+    evaluation, _ = evaluate_run(outcome)
+    moments = filled(30, 5).moments
+    data = explorer_data(outcome, evaluation, matched_ground_truth(outcome), moments)
+    assert data is not None
+    json.dumps(data, allow_nan=False)
+    assert data["frame"] == list(range(FRAMES))
+    assert [k for k, state in enumerate(data["state"]) if state == "LOST"] == [20, 21]
+    assert np.allclose(data["error"], evaluation.errors_m, atol=1e-4)
+    assert np.allclose(data["x"], evaluation.T_wc_aligned[:, 0, 3], atol=1e-3)
+    errors = np.hypot(
+        np.subtract(data["x"], data["truth"]["x"]), np.subtract(data["z"], data["truth"]["z"])
+    )
+    assert (errors <= evaluation.errors_m + 2e-3).all()
+    assert [moment["frame"] for moment in data["moments"]] == list(range(0, 150, 5))
+    assert b64decode(data["moments"][1]["jpeg"])[:2] == b"\xff\xd8"
+
+
+def test_a_run_without_ground_truth_and_a_short_one():
+    outcome = make_outcome(20)
+    data = explorer_data(outcome, None, None, [])
+    assert data is not None
+    assert set(data["error"]) == {None}
+    assert data["truth"] == {"x": [], "z": []}
+    assert explorer_data(make_outcome(1), None, None, []) is None
+
+
+def test_a_long_run_is_drawn_of_few_frames():
+    outcome = make_outcome(7001)
+    data = explorer_data(outcome, None, None, [])
+    assert data is not None
+    assert len(data["frame"]) <= 3001
+    assert data["frame"][-1] == 7000
+
+
+_PROBE = """<!doctype html><meta charset="utf-8"><pre id="found"></pre>
+<iframe id="page" width="WIDTH" height="900" style="border: 0"></iframe>
+<script>
+const page = document.getElementById("page"), wait = () => new Promise(r => setTimeout(r, 100));
+const until = async (holds) => { for (let k = 0; k < 60 && !holds(); k++) await wait(); };
+page.onload = async () => {
+  const inner = page.contentDocument, window_ = page.contentWindow;
+  const find = name => inner.querySelector("#explorer ." + name);
+  const ink = name => {
+    const c = find(name), d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+    let sum = 0;
+    for (let k = 3; k < d.length; k += 4) sum += d[k] > 0;
+    return sum;
+  };
+  const copy = name => find(name).toDataURL();
+  await until(() => find("said").textContent && ink("picture"));
+  const first = { said: find("said").textContent, map: copy("map") };
+  const slider = find("time");
+  slider.value = 21;
+  slider.dispatchEvent(new window_.Event("input"));
+  await until(() => find("said").textContent !== first.said && copy("map") !== first.map);
+  const second = { said: find("said").textContent, map: copy("map"), picture: copy("picture") };
+  find("closer").click();
+  await until(() => copy("map") !== second.map);
+  const near = copy("map");
+  find("all").click();
+  await until(() => copy("map") !== near);
+  const whole = copy("map");
+  const box = find("map").getBoundingClientRect();
+  document.getElementById("found").textContent = "FOUND" + JSON.stringify({
+    first: first.said, second: second.said, frames: +slider.max,
+    moved: first.map !== second.map, zoomed: near !== second.map, back: whole === second.map,
+    ink: ["map", "strip", "picture"].map(ink), map: [box.left, box.right, box.height],
+    shown: inner.documentElement.clientWidth, needed: inner.documentElement.scrollWidth,
+    requests: window_.performance.getEntriesByType("resource").map(x => x.name)
+      .filter(x => !x.startsWith("data:")),
+  }) + "END";
+};
+page.src = "report.html";
+</script>"""
+
+
+def chromium() -> str:
+    found = next(
+        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+    )
+    if found is None:
+        pytest.skip("no Chromium here: apt-get install chromium")
+    return found
+
+
+def dumped(address: str, profile: Path) -> str:
+    flags = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run "
+    flags += "--disable-background-networking --disable-component-update --disable-sync "
+    flags += "--virtual-time-budget=40000 --dump-dom"
+    command = [chromium(), *flags.split(), f"--user-data-dir={profile}", address]
+    return subprocess.run(command, capture_output=True, text=True, timeout=180).stdout
+
+
+@pytest.mark.parametrize("width", [400, 1200])
+def test_the_explorer_in_a_browser(run: Path, tmp_path: Path, width: int):
+    """The slider moves through time, buttons zoom, nothing is asked for."""
+    chromium()
+    shutil.copy(run / "report.html", tmp_path)
+    (tmp_path / "probe.html").write_text(_PROBE.replace("WIDTH", str(width)))
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, format, *arguments):
+            pass
+
+    handler = functools.partial(Handler, directory=str(tmp_path))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}/probe.html"
+        text = dumped(address, tmp_path / "profile")
+        server.shutdown()
+    found = json.loads(re.search("FOUND(.*)END</pre>", text)[1].replace("&amp;", "&"))
+    assert found["frames"] == FRAMES - 1
+    assert found["first"].startswith("frame 0 · 0.0 s · OK")
+    assert found["second"].startswith("frame 21 · ")
+    assert "LOST" in found["second"]
+    assert "image of keyframe 20" in found["second"]
+    assert re.search(r"error \d\.\d+ m", found["second"])
+    assert (found["moved"], found["zoomed"], found["back"]) == (True, True, True)
+    assert min(found["ink"]) > 200
+    left, right, height = found["map"]
+    assert 0 <= left < right <= width
+    assert height > 200
+    assert found["needed"] <= found["shown"] <= width
+    assert found["requests"] == []
+
+
+def test_the_page_is_one_file_of_bounded_size(run: Path):
+    text = (run / "report.html").read_text()
+    assert not re.findall(r"(?:src|href)=\"(?!data:|#)[^\"]+\"", text)
+    assert len(text) < 2 * 10**6
+
+
+@pytest.fixture
+def server(run: Path, tmp_path: Path):
+    second = tmp_path / "<b>second"
+    second.mkdir()
+    write_results(second, make_outcome(20), pages=True)
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    write_results(bare, make_outcome(20), pages=False)
+    (tmp_path / "secret.html").write_text("secret")
+    made = make_server([run.parent, tmp_path])
+    threading.Thread(target=made.serve_forever, daemon=True).start()
+    yield made
+    made.shutdown()
+    made.server_close()
+
+
+def ask(server, path: str, host: str | None = None) -> tuple[int, str]:
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=30)
+    headers = {"Host": host} if host else {}
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    return answer.status, answer.read().decode()
+
+
+def test_the_list_links_every_run_that_has_a_page(server):
+    status, text = ask(server, "/")
+    assert status == 200
+    assert len(re.findall(r'href="/run/\d+"', text)) == 2
+    assert "&lt;b&gt;second" in text
+    assert "<b>second" not in text
+    assert ">bare<" in text
+    for link in re.findall(r'href="(/run/\d+)"', text):
+        status, page = ask(server, link)
+        assert status == 200
+        assert "<h1>" in page
+
+
+def test_runs_side_by_side(server):
+    status, text = ask(server, "/compare?run=0&run=1&run=1&run=99")
+    assert status == 200
+    assert re.findall(r'<iframe src="(/run/\d)"', text) == ["/run/0", "/run/1"]
+    assert ask(server, "/compare?run=0")[0] == 400
+
+
+def test_nothing_but_reports_is_served_and_to_nobody_else(server):
+    for path in ("/secret.html", "/../secret.html", "/run/../secret.html", "/run/-1", "/run/9",
+                 "/run/%2e%2e/secret.html", "/run/1/report.json"):  # fmt: skip
+        assert ask(server, path)[0] == 404, path
+    assert ask(server, "/", "evil.example:80")[0] == 403
+    assert ask(server, "/", f"localhost:{server.server_port}")[0] == 200
+    assert server.server_address[0] == "127.0.0.1"
+
+
+def test_what_cannot_be_served_is_said(tmp_path: Path, server):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(InputError, match="no run here"):
+        list_runs([empty])
+    with pytest.raises(InputError, match="no such folder"):
+        make_server([tmp_path / "nowhere"])
+    with pytest.raises(InputError, match=r"--port \d+: cannot be opened"):
+        make_server([tmp_path], server.server_port)
+
+
+def test_the_command_serves_until_it_is_interrupted(run: Path):
+    import signal
+
+    command = [sys.executable, "-u", "-m", "vslam", "report", str(run.parent), "--serve"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        port = int(re.match(r"http://127\.0\.0\.1:(\d+)/ shows", line)[1])
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+        connection.request("GET", "/")
+        assert connection.getresponse().status == 200
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0

@@ -1,0 +1,60 @@
+"""The notebooks of the documentation run from top to bottom and come out as they say."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+nbformat = pytest.importorskip("nbformat")
+nbclient = pytest.importorskip("nbclient")
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "docs" / "notebooks").glob("*.ipynb"))
+FRAMES = 16  # in place of 40: rendering them is most of the time
+
+
+def executed(path: Path):
+    """The notebook after its execution, on few frames."""
+    notebook = nbformat.read(path, as_version=4)
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            frames = rf"\g<1>{FRAMES}"
+            cell.source = re.sub(r"^(FRAMES(?:, EVERY)? = )40", frames, cell.source, flags=re.M)
+    nbclient.NotebookClient(notebook, timeout=600, kernel_name="python3").execute()
+    return notebook
+
+
+def outputs(notebook) -> str:
+    found = [o for cell in notebook.cells if cell.cell_type == "code" for o in cell.outputs]
+    return "".join(o.get("text", "") or o.get("data", {}).get("text/plain", "") for o in found)
+
+
+def pictures(notebook) -> int:
+    found = [o for cell in notebook.cells if cell.cell_type == "code" for o in cell.outputs]
+    return sum("image/png" in o.get("data", {}) for o in found)
+
+
+def test_notebooks_are_stored_without_outputs():
+    assert [path.stem for path in NOTEBOOKS] == ["detectors", "slam"]
+    for path in NOTEBOOKS:
+        cells = nbformat.read(path, as_version=4).cells
+        assert not any(cell.get("outputs") for cell in cells)
+
+
+def test_slam_from_python():
+    notebook = executed(NOTEBOOKS[1])
+    said = outputs(notebook)
+    assert f"{FRAMES} poses, 0 lost" in said
+    assert float(re.search(r"greatest error ([\d.]+) m", said)[1]) < 0.2
+    assert pictures(notebook) == 2
+
+
+def test_detectors_compared():
+    notebook = executed(NOTEBOOKS[0])
+    shares = {
+        name: [float(x) for x in values.split(",")]
+        for name, values in re.findall(r"'([\w-]+)': \[([\d., ]+)\]", outputs(notebook))
+    }
+    assert shares.keys() == {"bow", "capsule"}
+    assert all(values[0] == 1.0 for values in shares.values())  # unchanged images find themselves
+    assert pictures(notebook) == 1

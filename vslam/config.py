@@ -98,7 +98,7 @@ class DepthConfig(_Section):
         "and one more. [own]",
     )
     edge_ratio: float = Field(
-        0.1, gt=0, description="Range of depth there, share of the nearest; above, an edge. [own]"
+        0.07, gt=0, description="Range of depth there, share of the nearest; above, an edge. [own]"
     )
 
 

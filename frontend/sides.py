@@ -22,6 +22,7 @@ _STRIDE = 8  # a few thousand pixels tell quantiles to a grey level
 _LOW, _MIDDLE, _HIGH = 0.05, 0.5, 0.95
 _CLIPPED = 250.0  # where the upper quantile is white, the lower half tells the gain
 _LEAST_RANGE = 4.0  # grey levels: below that a quantile's rounding is the gain
+_LEAST_HALF = 2.0  # of a dark side beside one that reaches white
 _BLACK, _SEES = 6.0, 16.0  # upper quantile of a black side, range of grey values of one that sees
 
 
@@ -79,11 +80,13 @@ def _stops(
     halves = [(q[1] - q[0], q[2] - q[1]) for q in (ours, theirs)]
     if max(ours[2], theirs[2]) >= _CLIPPED:
         (a, _), (b, _) = halves
-        return log2(a / b) if min(a, b) > _LEAST_RANGE else 0.0
+        return log2(a / b) if min(a, b) > _LEAST_HALF else 0.0
     (a_low, a_high), (b_low, b_high) = halves
-    if min(a_low + a_high, b_low + b_high) < _LEAST_RANGE or min(a_low, b_low, a_high, b_high) <= 0:
+    least = min(a_low, b_low, a_high, b_high)
+    if min(a_low + a_high, b_low + b_high) < _LEAST_RANGE or least <= 0:
         return 0.0
-    if abs(log2(a_low / b_low) - log2(a_high / b_high)) > tolerance:
+    disagreement = abs(log2(a_low / b_low) - log2(a_high / b_high))
+    if least >= _LEAST_RANGE and disagreement > tolerance:  # below, halves differ by rounding
         return 0.0
     return log2((a_low + a_high) / (b_low + b_high))
 

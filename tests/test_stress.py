@@ -263,6 +263,12 @@ def test_preset_compares_with_a_baseline(tmp_path):
         assert entry.ate_sum_m["bow"] == pytest.approx(1.0)
     assert mean_error(entries, "worse") == pytest.approx(250.0)
     assert all(entry.note == "no law" for entry in entries if not entry.specs)
+    write_report(tmp_path, summarise(plan, [], reports, []), {})
+    text = (tmp_path / "report.md").read_text()
+    assert "Corruption error against bow, preset kitti-c" in text
+    assert "| mean " in text
+    assert "250 %" in text
+    assert not (tmp_path / "boundaries.csv").exists()
 
 
 def test_laws_are_named_without_strengths():

@@ -71,8 +71,9 @@ def _curves(
     kind = law_kind(law)
     for panel, (_, title) in zip(panels, _PANELS, strict=True):
         panel.set_ylabel(title)
-        panel.set_ylim(bottom=0)
+        panel.set_ylim(0, max(1e-9, 1.05 * panel.get_ylim()[1]))
         panel.tick_params(length=3)
+    panels[2].set_ylim(0, max(1.2, panels[2].get_ylim()[1]))
     panels[2].yaxis.set_major_locator(MaxNLocator(3, integer=True))
     panels[2].set_xlabel("strength" if kind.unit == "x" else kind.unit)
     if kind.logarithmic:

@@ -43,8 +43,8 @@ def test_sequences():
 def test_perturbations():
     text = "none,brightness:0.50,brightness:1.5+blur,none"
     assert grid.parse_perturbations(text) == ["none", "brightness:0.5", "brightness:1.5,blur:1"]
-    with pytest.raises(InputError, match="unknown law 'fog'"):
-        grid.parse_perturbations("none,fog:2")
+    with pytest.raises(InputError, match="unknown law 'snow'"):
+        grid.parse_perturbations("none,snow:2")
 
 
 def test_only_seeded_perturbations_are_repeated_and_seeds_come_last():
@@ -330,7 +330,7 @@ def test_bench_loses_nothing_to_an_interrupt(bench, stub: Path, monkeypatch):
         ("--detectors bow,vgg16", ["vgg16", "ships no weights"]),
         ("--detectors orb", ["--detectors orb", "unknown"]),
         ("--seqs 00-02", ["no such sequence", "01"]),
-        ("--perturb fog", ["unknown law 'fog'"]),
+        ("--perturb snow", ["unknown law 'snow'"]),
     ],
 )
 def test_bench_refuses_before_it_starts(bench, words, parts):

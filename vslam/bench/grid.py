@@ -9,11 +9,9 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from vslam.datasets.perturbation import parse_perturbation
+from vslam.datasets.perturbation import law_kind, parse_perturbation
 from vslam.errors import InputError
 from vslam.report.schema import ReportJson
-
-_UNSEEDED = {"none", "blur"}
 
 
 @dataclass(frozen=True, order=True)
@@ -126,7 +124,8 @@ def _digest(path: Path) -> str:
 
 def draws(perturb: str) -> bool:
     """Whether the images depend on the seed."""
-    return not {law.partition(":")[0] for law in perturb.split(",")} <= _UNSEEDED
+    laws = {law.partition(":")[0] for law in perturb.split(",")} - {"none"}
+    return any(law_kind(law).drawn for law in laws)
 
 
 def read_report(folder: Path) -> ReportJson | None:

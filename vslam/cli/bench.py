@@ -92,7 +92,7 @@ def bench(
     )
     cells = make_grid(dataset, sequences, laws, chosen, runs, max_frames, files)
     out = out.absolute()
-    frames, identity = _open_all(dataset, data.absolute(), sequences, max_frames, shown=not quiet)
+    frames, identity = open_all(dataset, data.absolute(), sequences, max_frames, shown=not quiet)
     execute.prepare(out, identity)
     finished = execute.finished_cells(cells, out, options.config)
     progress = GridProgress(cells, finished, frames, out, jobs)
@@ -108,7 +108,7 @@ def bench(
     stopped = False
     try:
         with shown_live(progress, shown=not quiet) as say:
-            outcomes = _outcomes(missing, options, jobs, scheduler, out, shown=not quiet)
+            outcomes = outcomes_of(missing, options, jobs, scheduler, out, shown=not quiet)
             with closing(outcomes):
                 for outcome in outcomes:
                     say(progress.add(outcome))
@@ -130,7 +130,7 @@ def bench(
         raise typer.Exit(1)
 
 
-def _open_all(
+def open_all(
     dataset: str, root: Path, sequences: list[str], max_frames: int | None, *, shown: bool
 ) -> tuple[dict[str, int], str]:
     """Open every sequence, so that what is missing is said before the first run and not after the
@@ -153,7 +153,7 @@ def _open_all(
     return frames, f"rendered towns {store.folder_name(Variation())}"
 
 
-def _outcomes(
+def outcomes_of(
     cells: list[Cell],
     options: RunOptions,
     jobs: int,
@@ -162,6 +162,7 @@ def _outcomes(
     *,
     shown: bool,
 ) -> Generator[CellOutcome, None, None]:
+    """Run cells here or on a cluster and publish them."""
     if scheduler is not None:
         from vslam.bench.cluster import run_on_cluster
 

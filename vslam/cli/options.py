@@ -7,16 +7,49 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from vslam import plugins
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
     from vslam.datasets.sources import SourceOptions
 
+
+def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
+    """vslam's own names, then those of other packages (docs/plugins.md)."""
+    return (*names, *(name for name in plugins.find_plugins(group) if name not in names))
+
+
+_DATASETS = _with_plugins(("kitti", "euroc", "tum", "synthetic"), plugins.READERS)
+_SOURCES = ("images", "video", "bag", "camera")
+_DETECTORS = _with_plugins(
+    (
+        "none", "bow", "both", "capsule", "capsule-pruned", "alexnet", "vgg16", "darknet19",
+        "googlenet", "mobilenet", "squeezenet", "pcanet",
+    ),
+    plugins.DETECTORS,
+)  # fmt: skip
+_LAWS = _with_plugins(
+    (
+        "brightness", "gamma", "flicker", "noise", "blur", "occlusion", "fog", "rain", "night",
+        "exposure", "motion", "flare", "vignetting", "dirt", "jpeg", "resolution", "drop",
+        "outage", "bias", "contrast", "shot", "impulse", "bits", "stereo_gain", "desync",
+        "baseline", "yaw", "pitch", "black_right", "black_left",
+    ),
+    plugins.PERTURBATIONS,
+)  # fmt: skip
+
 Data = Annotated[
     Path,
     typer.Option(envvar="KITTI_ROOT", help="Folder with the data set, see datasets.md."),
 ]
-DatasetName = Literal["kitti", "euroc", "tum", "synthetic"]
+if TYPE_CHECKING:
+    DatasetName = str
+    SourceName = str
+    DetectorName = str
+else:  # what is installed decides
+    DatasetName = Literal[_DATASETS]
+    SourceName = Literal[(*_DATASETS, *_SOURCES)]
+    DetectorName = Literal[_DETECTORS]
 Dataset = Annotated[DatasetName, typer.Option(help="Data set.")]
 Source = Annotated[
     str,
@@ -27,7 +60,6 @@ Source = Annotated[
         "docs/sources.md.",
     ),
 ]
-SourceName = Literal[DatasetName, "images", "video", "bag", "camera"]
 SourceKind = Annotated[
     SourceName | None,
     typer.Option("--dataset", help="What it is.", show_default="found out from what is there"),
@@ -69,8 +101,9 @@ DepthScale = Annotated[
 Perturb = Annotated[
     str,
     typer.Option(
-        help="Photometric laws, each with a strength, joined by commas: brightness, gamma, "
-        "flicker, noise, blur, occlusion. Example: [b]brightness:1.5,blur:0.5[/b]"
+        help="Laws of light, weather, glass, sensor and stereo rig, each with a strength in its "
+        f"unit (docs/stress.md), joined by commas: {', '.join(_LAWS)}. Example: "
+        "[b]brightness:1.5,fog:60[/b]"
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all that is random.")]
@@ -85,10 +118,6 @@ Weights = Annotated[
     list[str] | None,
     typer.Option(metavar="NAME=FILE", help="Weights of a detector, not the shipped ones."),
 ]
-DetectorName = Literal[
-    "none", "bow", "both", "capsule", "capsule-pruned", "alexnet", "vgg16", "darknet19",
-    "googlenet", "mobilenet", "squeezenet", "pcanet",
-]  # fmt: skip
 SensorName = Literal["stereo", "mono", "rgbd"]
 ViewerName = Literal["native", "web"]
 Sensor = Annotated[

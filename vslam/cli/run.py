@@ -164,6 +164,7 @@ def run(
             start=start, every=every, max_frames=max_frames, sensor=sensor,
             on_render=on_render,
         )  # fmt: skip
+    perturbation.bound_to(source)  # refuses laws that the data cannot serve
     if is_live(source):
         if compare_loops:
             raise InputError("--compare-loops: a camera cannot be seen twice; leave it out.")

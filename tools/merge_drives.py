@@ -3,10 +3,10 @@
     vslam synth 05                                    # once
     python tools/merge_drives.py 05 --parts 4
 
-The parts overlap by ``--overlap`` frames, taken from every other image: odd parts see the even
-frames and even parts the odd ones, so that no image is in two maps. Each has a brightness walk of
-another seed. Prints which pairs of drives truly meet and which were joined by loops of their own,
-wrong loops, and the ATE (m) of all keyframes beside that of one long drive.
+The parts overlap by ``--overlap`` frames, and meet where the route comes back. Each has a
+brightness walk of another seed; the long drive beside it has that of the first. Prints which pairs
+of drives truly meet and which were joined by loops of their own, wrong loops, and the ATE (m) of
+all keyframes, of each drive alone, merged, and of the long drive.
 """
 
 from __future__ import annotations
@@ -50,20 +50,20 @@ def main() -> None:
     for route in options.routes:
         sequence = open_sequence("synthetic", None, route, max_frames=options.max_frames)
         if whole is None and not options.without_whole:
-            whole = drive(sequence, range(len(sequence)), options.detector, "none", 0)
+            whole = drive(sequence, range(len(sequence)), options.detector, options.perturb, 0)
         for number, frames in enumerate(parts(len(sequence), options.parts, options.overlap)):
             drives.append((sequence, frames, route))
             maps.append(drive(sequence, frames, options.detector, options.perturb, number))
+            truth = sequence.ground_truth[np.array(maps[-1].map.frames)]
+            name = f"{route}, frames {frames.start} to {frames[-1]}"
+            print(f"{name}: ATE {ate(maps[-1].map, truth):.4f} m", flush=True)
     merged = merge_maps(maps, Config(), lambda: memory(options.detector))
     tell(merged, drives, whole)
 
 
 def parts(n: int, number: int, overlap: int) -> list[range]:
     ends = np.linspace(0, n, number + 1).round().astype(int).tolist()
-    return [
-        range(max(0, first - overlap) // 2 * 2 + k % 2, last, 2)
-        for k, (first, last) in enumerate(pairwise(ends))
-    ]
+    return [range(max(0, first - overlap), last) for first, last in pairwise(ends)]
 
 
 def memory(detector: str):
@@ -115,7 +115,7 @@ def true_meetings(drives) -> set[tuple[int, int]]:
     met = set()
     for i, j in combinations(range(len(drives)), 2):
         (one, frames, route), (other, others, other_route) = drives[i], drives[j]
-        if route.partition("+")[0] != other_route.partition("+")[0]:
+        if route != other_route:
             continue
         T, U = one.ground_truth[list(frames)], other.ground_truth[list(others)]
         distance, nearest = cKDTree(U[:, :3, 3]).query(T[:, :3, 3])

@@ -398,6 +398,9 @@ class Slam:
             frame.T_cw = T_cw
             restarted = self._lose(frame)
             return _result(frame, state, matches, inliers, restarted, clock)
+        if not relocalised:
+            step = se3_log(orthonormalised(frame.T_cw @ inverse(T_cw)))
+            self._velocity = step / (frame.timestamp - self._poses.timestamp(-1))
         self._place(frame)
         is_keyframe = self._extend_map(frame, inliers, visible)
         clock.lap("keyframe")

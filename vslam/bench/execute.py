@@ -39,6 +39,7 @@ class RunOptions:
         command: program that takes the words of ``vslam``; None for vslam itself.
         others: programs as ``command`` for the cells whose detector has such a name: other systems.
         scratch: where runs write; None for the temporary folder of the machine.
+        source: words of ``vslam run`` on how the data is to be read.
     """
 
     data: Path | None
@@ -47,6 +48,7 @@ class RunOptions:
     command: tuple[str, ...] | None = None
     scratch: Path | None = None
     others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    source: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,7 @@ def run_cell(
         command = list(program or (sys.executable, "-m", "vslam.cli.child"))
         command += ["run", *cell.arguments(), "--threads", str(options.threads)]
         command += ["--data", str(options.data)] if options.data else []
+        command += options.source
         command += ["--config", str(work / "config.json"), "--no-record", "--no-report", "--quiet"]
         code = _call([*command, "--out", str(work / "runs")], work / "log.txt", stopped)
         log = (work / "log.txt").read_text(errors="replace")
@@ -153,6 +156,8 @@ def publish(outcome: CellOutcome, out: Path) -> None:
         shutil.rmtree(part, ignore_errors=True)
         for name, data in outcome.files.items():
             path = part / name
+            if not path.resolve().is_relative_to(part.resolve()):
+                raise ResultsError(f"{name}: a worker sent a file outside its folder.")
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.suffix in (".json", ".md", ".html"):  # the command that reproduces the ATE
                 data = data.replace(outcome.folder.encode(), shlex.quote(str(target)).encode())

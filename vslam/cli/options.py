@@ -82,6 +82,10 @@ Calib = Annotated[
 Right = Annotated[
     Path | None, typer.Option(help="Folder of the right images, --data has the left ones.")
 ]
+Depth = Annotated[
+    Path | None,
+    typer.Option(help="Folder of the depth images, --data has the images they belong to."),
+]
 FramesPerSecond = Annotated[
     float | None,
     typer.Option("--fps", help="Frames a second of images or a video without time stamps."),
@@ -90,12 +94,16 @@ SideBySide = Annotated[
     bool, typer.Option("--side-by-side", help="Video or camera of both sides in one image.")
 ]
 Topics = Annotated[
-    str, typer.Option(metavar="LEFT,RIGHT", help="Image topics of a bag, one with mono.")
+    str,
+    typer.Option(
+        metavar="LEFT,RIGHT", help="Image topics of a bag: one with mono, COLOUR,DEPTH with rgbd."
+    ),
 ]
 DepthScale = Annotated[
     float | None,
     typer.Option(
-        help="What depth images count in a metre.", show_default="the calibration's, or 5000"
+        help="What depth images count in a metre.",
+        show_default="the calibration's; of tum 5000, of a bag as its encoding says",
     ),
 ]
 Perturb = Annotated[
@@ -153,6 +161,7 @@ def kind_of_source(named: SourceName | None, data: str) -> str:
 def source_options(
     calib: list[Path] | None,
     right: Path | None,
+    depth: Path | None,
     fps: float | None,
     side_by_side: bool,
     topics: str,
@@ -169,5 +178,5 @@ def source_options(
         if value is not None and not 0.0 < value < float("inf"):
             raise InputError(f"{option} {value}: must be a positive number.")
     return SourceOptions(
-        calib or (), right, fps, side_by_side, tuple(names_in(topics)), depth_scale
+        calib or (), right, depth, fps, side_by_side, tuple(names_in(topics)), depth_scale
     )

@@ -10,6 +10,7 @@ import typer
 from vslam.cli.options import (
     KITTI_ROOT,
     Calib,
+    Depth,
     DepthScale,
     DetectorName,
     Every,
@@ -62,6 +63,7 @@ def run(
     seq: Seq = None,
     calib: Calib = None,
     right: Right = None,
+    depth: Depth = None,
     fps: FramesPerSecond = None,
     side_by_side: SideBySide = False,
     topics: Topics = "",
@@ -157,7 +159,7 @@ def run(
     thresholds = Config() if config is None else load_config(config)
     kind = kind_of_source(dataset, data)
     perturbation = parse_perturbation(perturb, seed)
-    options = source_options(calib, right, fps, side_by_side, topics, depth_scale)
+    options = source_options(calib, right, depth, fps, side_by_side, topics, depth_scale)
     with render_bar(shown=not quiet) as on_render:
         source = open_source(
             kind, data, seq, options,

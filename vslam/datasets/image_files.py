@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vslam.camera import ImageMap
 from vslam.datasets.sequence import Image
 from vslam.errors import InputError, UnreadableImageError
+from vslam.untrusted import MOST_PIXELS
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
 
@@ -82,11 +83,12 @@ def list_images(folder: Path) -> dict[str, Path]:
     """Image files of a folder by stem, in the order of their names; empty without the folder."""
     if not folder.is_dir():
         return {}
-    return {
-        path.stem: path
-        for path in sorted(folder.iterdir())
-        if path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
-    }
+    return {path.stem: path for path in sorted(folder.iterdir()) if is_image(path)}
+
+
+def is_image(path: Path) -> bool:
+    """Whether a file is named as an image."""
+    return path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
 
 
 def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bool]) -> Path | None:
@@ -151,7 +153,7 @@ def read_grey(path: Path) -> Image:
     the upper eight.
 
     Raises:
-        UnreadableImageError: missing or damaged.
+        UnreadableImageError: missing, damaged or larger than `MOST_PIXELS`.
     """
     import cv2
 
@@ -162,7 +164,13 @@ def read_grey(path: Path) -> Image:
         if (image := decode_png(data)) is not None:
             return image
         decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except (OSError, cv2.error):
+    except cv2.error as error:
+        if "MAX_IMAGE" in str(error):
+            raise UnreadableImageError(
+                path, f"larger than {MOST_PIXELS / 1e6:.0f} million pixels; scale it down."
+            ) from error
+        decoded = None
+    except OSError:
         decoded = None
     if decoded is None:
         raise UnreadableImageError(path, "cannot be decoded; download the file again.")

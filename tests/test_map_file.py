@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from ring import CAMERA, Ring
@@ -20,7 +21,7 @@ from vslam.errors import InputError
 from vslam.features import Features
 from vslam.geometry import se3_exp
 from vslam.loopclosure.bow import BowDetector
-from vslam.loopclosure.registry import create_detector
+from vslam.loopclosure.registry import create_detector, create_images
 from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe
 from vslam.map import Map
 from vslam.map_kernels import link_many, refresh_landmarks
@@ -184,6 +185,53 @@ def test_what_the_detector_knew_comes_back(slam, file, ring):
     assert again.locate(None, seen, map_) == fresh.locate(None, seen, map_)
     last = map_.n_keyframes - 1
     assert again.query(last, map_) == fresh.query(last, map_)
+
+
+def test_descriptors_and_images_of_learned_detectors_come_back(tmp_path):
+    def create():
+        images = create_images("both", CONFIG)
+        assert images is not None
+        return create_detector("both", CONFIG, None, images), images
+
+    rng = np.random.default_rng(0)
+    noise = rng.uniform(0, 255, (3, 12, 32)).astype(np.float32)
+    pictures = [cv2.resize(n, (640, 240), interpolation=cv2.INTER_CUBIC) for n in noise]
+    pictures = [np.clip(picture, 0, 255).astype(np.uint8) for picture in pictures]
+    detector, images = create()
+    map_ = Map(1.2 ** np.arange(8))
+    for k in range(4):
+        map_.add_keyframe(Features.none(), np.eye(4), float(k), k)
+        map_.parents[k] = k - 1
+        # The second keyframe is culled, the last one was kept without its image.
+        picture = pictures[min(k, 2)] if k < 3 else None
+        detector.add(k, picture, Features.none())
+        if picture is not None:
+            images.add(k, picture)
+    map_.cull_keyframe(1)
+    stored = StoredMap(map_, CAMERA, detector=detector.memory(), images=images.files(4))
+    save_map(tmp_path / "m.npz", stored)
+
+    found = load_map(tmp_path / "m.npz")
+    again, kept = create()
+    again.restore(found.detector)
+    assert found.images is not None
+    kept.restore(found.images, 640)
+    assert [k in kept for k in range(3)] == [True, True, False]
+    assert np.array_equal(kept.image(1), images.image(2))
+    (before,) = detector.locate(pictures[2], Features.none(), map_)[:1]
+    (after,) = again.locate(pictures[2], Features.none(), found.map)[:1]
+    assert (before.match, after.match) == (2, 1)
+    assert (before.score, before.alike) == (after.score, after.alike)
+
+    values = found.images.values.copy()
+    values[:2] = 0
+    with pytest.raises(ValueError, match="keyframe 0 is no JPEG"):
+        create()[1].restore(replace(found.images, values=values), 640)
+    table = found.detector.tables["capsule/descriptors"]
+    other = replace(table, values=np.full_like(table.values, np.nan))
+    tables = {**found.detector.tables, "capsule/descriptors": other}
+    with pytest.raises(ValueError, match="not those of the network"):
+        create()[0].restore(replace(found.detector, tables=tables))
 
 
 def test_a_restart_that_was_culled_still_begins_its_submap(slam):

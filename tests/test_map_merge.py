@@ -194,6 +194,18 @@ def test_merge_names_what_meets_and_what_does_not(files, tmp_path):
     assert "drives        2: ring 0, ring 55" in run("map", "info", out).output
 
 
+def test_a_merged_map_is_exported(drives, tmp_path):
+    merged = merge_maps([drives[0], drives[2]], CONFIG, create).stored
+    save_map(tmp_path / "town.npz", merged)
+    for words in (("g2o",), ("ply", "--no-colours")):
+        result = run("export", words[0], tmp_path / "town.npz", *words[1:])
+        assert result.exit_code == 0, result.output
+    lines = (tmp_path / "town.g2o").read_text().splitlines()
+    ids = [line.split()[1] for line in lines if line.startswith("VERTEX")]
+    assert ids == [str(k) for k in range(merged.map.n_keyframes)]
+    assert (tmp_path / "town.ply").stat().st_size > 0
+
+
 def test_merge_of_maps_that_do_not_meet_writes_nothing(files, tmp_path):
     result = run("map", "merge", files[0], files[3], "--out", tmp_path / "m.npz", "--quiet")
     assert result.exit_code == 1

@@ -3,8 +3,8 @@
     python tools/split_run.py --data KITTI --seq 06
     python tools/split_run.py --dataset synthetic --seq demo --detector both
 
-Prints ATE (m) of the whole run, of the run that was saved at half of its frames and resumed by a
-new process's objects, and of all frames localised in the map of the whole run, with their share.
+Prints ATE (m) of the whole run, of the run that was saved after some of its frames, loaded and
+resumed, and of all frames localised in the map of the whole run, with their share.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ def main() -> None:
     parser.add_argument("--mono", action="store_true")
     parser.add_argument("--detector", default="bow")
     parser.add_argument("--max-frames", type=int)
+    parser.add_argument("--at", type=float, default=0.5, help="share of the frames before the cut")
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     sequence = open_sequence(
@@ -45,11 +46,11 @@ def main() -> None:
         monocular=options.mono,
     )
     with tempfile.TemporaryDirectory() as folder:
-        compare(sequence, options.detector, options.threads, Path(folder))
+        compare(sequence, options.detector, options.at, options.threads, Path(folder))
 
 
-def compare(sequence: Sequence, detector: str, threads: int, folder: Path) -> None:
-    n, half = len(sequence), len(sequence) // 2
+def compare(sequence: Sequence, detector: str, at: float, threads: int, folder: Path) -> None:
+    n, half = len(sequence), round(at * len(sequence))
     whole = begin(sequence, detector, threads)
     drive(whole, sequence, range(n), threads)
     whole.save(folder / "whole.npz")

@@ -118,6 +118,11 @@ class Slam:
             map_=None if start is None else start.map,
         )
         self._poses = FramePoses(self._mapping, before)
+        self._resumed = before is not None and len(before.timestamp) > 0
+        if self._resumed:
+            newest = self._mapping.reference
+            self._mapping.last_frame = self._mapping.map.frames[newest]
+            self._mapping.last_timestamp = self._mapping.map.timestamps[newest]
         self._velocity: Matrix | None = None  # twist per second, None if unknown
         self._lost_frames = 0
         self._initialiser = Initialiser(self.context)  # of monocular maps
@@ -378,17 +383,28 @@ class Slam:
     def _find_in_map(self, frame: Frame, clock: _Clock) -> TrackResult:
         """A frame in a map that was loaded, before the camera was found in it."""
         T_cw = self._predict(frame.timestamp)
-        matches = inliers = self._relocalise(frame)
-        state = self._state_of(inliers, matches)
-        clock.lap("relocalise")
+        matches, inliers, visible = 0, 0, np.empty(0, np.int32)
+        if self._resumed and self._lost_frames == 0:
+            inliers = track_descriptors(frame, self._mapping.reference_view, T_cw, self.context)
+            matches, inliers, visible = self._track_local_map(frame, inliers)
+            clock.lap("track_local_map")
+        state, relocalised = self._state_of(inliers, matches), False
+        if state == TrackingState.LOST:
+            matches = inliers = self._relocalise(frame)
+            state = self._state_of(inliers, matches)
+            relocalised = state != TrackingState.LOST
+            clock.lap("relocalise")
         if state == TrackingState.LOST:
             frame.T_cw = T_cw
             restarted = self._lose(frame)
             return _result(frame, state, matches, inliers, restarted, clock)
+        if not relocalised:
+            step = se3_log(orthonormalised(frame.T_cw @ inverse(T_cw)))
+            self._velocity = step / (frame.timestamp - self._poses.timestamp(-1))
         self._place(frame)
-        is_keyframe = self._extend_map(frame, inliers, np.empty(0, np.int32))
+        is_keyframe = self._extend_map(frame, inliers, visible)
         clock.lap("keyframe")
-        return _result(frame, state, matches, inliers, is_keyframe, clock, relocalised=True)
+        return _result(frame, state, matches, inliers, is_keyframe, clock, relocalised=relocalised)
 
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix) -> int:
         """Along the prediction; where there is none or it fails, against the reference keyframe."""

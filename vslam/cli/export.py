@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from vslam.backend.pose_graph import PoseGraph
     from vslam.datasets.sequence import Sequence
+    from vslam.map import Map
     from vslam.maps.reconstruction import Reconstruction
     from vslam.report.finished_run import FinishedRun
 
@@ -27,6 +29,9 @@ commands = typer.Typer(
 )
 
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, like runs/latest.")]
+RunOrFile = Annotated[
+    Path, typer.Argument(metavar="RUN|FILE", help="Folder of a run, or a map.npz.")
+]
 Link = Annotated[
     bool, typer.Option("--link", help="Link the image files of the data set, do not copy them.")
 ]
@@ -93,7 +98,7 @@ def nerfstudio(
 
 @commands.command(epilog="[b]Example[/b]\n\n  vslam export ply runs/latest --data ~/kitti")
 def ply(
-    run: Run,
+    run: RunOrFile,
     data: Data = KITTI_ROOT,
     out: Annotated[Path | None, _out("landmarks.ply")] = None,
     colours: Annotated[
@@ -106,8 +111,11 @@ def ply(
     from vslam.maps.new_output import new_file
     from vslam.maps.ply import save_ply
 
-    finished, reconstruction = _read(run)
-    target = out or run / "landmarks.ply"
+    if run.is_file() and not colours:
+        reconstruction = _reconstruction_of_file(run)
+    else:
+        finished, reconstruction = _read(run)
+    target = out or _beside(run, "landmarks.ply")
     with new_file(target) as file:
         seen = None
         if colours:
@@ -120,7 +128,7 @@ def ply(
 
 @commands.command(epilog="[b]Example[/b]\n\n  vslam export g2o runs/latest")
 def g2o(
-    run: Run,
+    run: RunOrFile,
     out: Annotated[Path | None, _out("pose_graph.g2o")] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -131,12 +139,12 @@ def g2o(
     from vslam.geometry import inverses
     from vslam.maps.g2o import save_g2o
     from vslam.maps.new_output import new_file
-    from vslam.report.finished_run import pose_graph, read_run
 
-    finished = read_run(run)
-    graph = pose_graph(finished)
-    ids = np.array(finished.map.frames)[graph.keyframes]
-    target = out or run / "pose_graph.g2o"
+    graph, map_ = _graph(run)
+    ids = graph.keyframes  # frames of several drives are not unique
+    if len(set(map_.sessions)) == 1:
+        ids = np.array(map_.frames)[ids]
+    target = out or _beside(run, "pose_graph.g2o")
     with new_file(target) as file:
         save_g2o(file, ids, inverses(graph.T_cw), graph.edges, graph.T_i_j, graph.sigmas)
     if not quiet:
@@ -160,6 +168,32 @@ def euroc(
         write_euroc(file, trajectory)
     if not quiet:
         typer.echo(f"{target}: {len(trajectory)} poses")
+
+
+def _beside(run: Path, name: str) -> Path:
+    """In the folder of a run; of a map that is a file alone, beside it under its name."""
+    return run / name if run.is_dir() else run.with_suffix(Path(name).suffix)
+
+
+def _graph(run: Path) -> tuple[PoseGraph, Map]:
+    """The pose graph of a run, or of a map that is a file alone, with the usual weights."""
+    from vslam.config import Config
+    from vslam.maps.storage import load_map
+    from vslam.report.finished_run import graph_of_map, pose_graph, read_run
+
+    if run.is_file():
+        stored = load_map(run)
+        return graph_of_map(stored.map, stored.loops, Config()), stored.map
+    finished = read_run(run)
+    return pose_graph(finished), finished.map
+
+
+def _reconstruction_of_file(path: Path) -> Reconstruction:
+    from vslam.maps.reconstruction import reconstruction_of
+    from vslam.maps.storage import load_map
+
+    stored = load_map(path)
+    return reconstruction_of(stored.map, stored.camera)
 
 
 def _read(run: Path) -> tuple[FinishedRun, Reconstruction]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from vslam.backend.pose_graph import PoseGraph, essential_graph
 from vslam.camera import Camera, same_camera
-from vslam.config import load_config
+from vslam.config import Config, load_config
 from vslam.datasets import known_datasets, open_sequence
 from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError
@@ -124,11 +124,17 @@ def pose_graph(run: FinishedRun) -> PoseGraph:
     Raises:
         InputError: the run's thresholds cannot be read.
     """
+    config = load_config(run.folder / "config.json")
+    return graph_of_map(run.map, run.loops, config)
+
+
+def graph_of_map(map_: Map, loops: Collection[LoopEdge], config: Config) -> PoseGraph:
+    """The essential graph of a map that is finished."""
     return essential_graph(
-        run.map,
-        run.loops,
-        load_config(run.folder / "config.json").pose_graph,
-        weak=run.map.restarts,
-        unpredicted=run.map.unpredicted_restarts,
+        map_,
+        loops,
+        config.pose_graph,
+        weak=map_.restarts,
+        unpredicted=map_.unpredicted_restarts,
         driven=True,
     )

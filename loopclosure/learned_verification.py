@@ -77,9 +77,13 @@ def shows_known(
 ) -> bool:
     """Whether a keyframe shows mostly what a keyframe with an image shows: no network need see it.
 
-    A camera that moves slowly, one that turns, and one that drives through a mapped place again
-    are told from one that sees something new in the same way, whatever makes keyframes.
+    One that follows a keyframe with an image is not seen either: of few keyframes, far apart, every
+    second one is enough. A camera that moves slowly, one that turns, and one that drives through a
+    mapped place again are told from one that sees something new in the same way, whatever makes
+    keyframes.
     """
+    if keyframe - 1 in images:
+        return True
     observed = np.count_nonzero(map_.arrays.landmark[map_.rows(keyframe)] >= 0)
     known, _ = map_.covisible(keyframe, int(np.ceil(config.most_shared * observed)))
     return any(one in images for one in known.tolist())

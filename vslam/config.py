@@ -275,6 +275,14 @@ class KeyframeConfig(_Section):
     monocular_urgent_ratio: float = Field(
         0.5, gt=0, le=1, description="urgent_ratio of a monocular camera. [own]"
     )
+    known_after_s: float = Field(
+        30.0, gt=0, description="Age from which a keyframe makes its place known, seconds. [own]"
+    )
+    known_ratio: float = Field(
+        0.5,
+        gt=0,
+        description="Tracked share of an old keyframe's points; above, its place is known. [own]",
+    )
     merge_after_frames: int = Field(
         2, ge=1, description="Frames after which local mapping is merged. [own]"
     )

@@ -28,6 +28,18 @@ def count_shared(a, keyframe, n_keyframes):
 
 
 @kernel
+def count_observers(a, landmarks, n_keyframes):
+    """How many of ``(N,)`` landmarks each keyframe observes, ``(n_keyframes,)`` int64."""
+    counts = np.zeros(n_keyframes, np.int64)
+    for landmark in landmarks:
+        row = a.head[landmark]
+        while row >= 0:
+            counts[a.keyframe[row]] += 1
+            row = a.next_row[row]
+    return counts
+
+
+@kernel
 def link(a, row, landmark):
     """Let a free row observe a landmark."""
     a.landmark[row] = landmark

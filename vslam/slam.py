@@ -16,7 +16,13 @@ from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.frame_poses import FramePoses
-from vslam.frontend.keyframes import KeyframeEvidence, needs_keyframe, needs_monocular_keyframe
+from vslam.frontend.keyframes import (
+    KeyframeEvidence,
+    PlaceEvidence,
+    is_known_place,
+    needs_keyframe,
+    needs_monocular_keyframe,
+)
 from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracking import (
     Frame,
@@ -171,7 +177,7 @@ class Slam:
 
         self._mapping.count(visible, frame.landmark[frame.landmark >= 0])
         self._update_motion(frame, relocalised)
-        is_keyframe = self._needs_keyframe(frame, inliers)
+        is_keyframe = self._needs_keyframe(frame, inliers) and not self._follow_known(frame)
         if is_keyframe:
             self._insert_keyframe(frame)
         clock.lap("keyframe")
@@ -371,6 +377,27 @@ class Slam:
         if self.camera.monocular:
             return needs_monocular_keyframe(evidence, self.config.keyframes)
         return needs_keyframe(evidence, self.config.keyframes, depth=self.camera.depth)
+
+    def _follow_known(self, frame: Frame) -> bool:
+        """Track on by an old keyframe if the place is known by it; returns whether."""
+        self._merge(frame)
+        keyframe, n_shared, n_place = self._mapping.old_keyframe(frame)
+        if keyframe < 0:
+            return False
+        close = feature_depth(frame.features, self.camera) < self.context.close_depth
+        tracked = frame.landmark >= 0
+        evidence = PlaceEvidence(
+            n_inliers=int(np.count_nonzero(tracked)),
+            n_shared=n_shared,
+            n_place=n_place,
+            tracked_close=int(np.count_nonzero(close & tracked)),
+            untracked_close=int(np.count_nonzero(close & ~tracked)),
+        )
+        if not is_known_place(evidence, self.config.keyframes):
+            return False
+        self._mapping.follow(keyframe, frame)
+        self._poses.follow_reference(frame.index, frame.T_cw)
+        return True
 
     def _insert_keyframe(self, frame: Frame, *, predicted: bool = True) -> None:
         """Make a keyframe of the frame placed last (``MappingThread.insert``)."""

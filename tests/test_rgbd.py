@@ -285,8 +285,8 @@ def test_the_result_does_not_depend_on_the_threads(outcome, tree):
 
 
 def test_a_map_keeps_its_camera(outcome, tmp_path):
-    save_map(tmp_path / "map.npz", outcome.map, outcome.sequence.camera)
-    assert load_map(tmp_path / "map.npz")[1] == outcome.sequence.camera
+    save_map(tmp_path / "map.npz", outcome.stored)
+    assert load_map(tmp_path / "map.npz").camera == outcome.sequence.camera
 
 
 def test_the_command_names_the_sensor(tree, tmp_path, capsys):

@@ -26,7 +26,7 @@ from vslam.features import Features
 from vslam.frontend.tracking import Frame
 from vslam.geometry import Matrix
 from vslam.map import LocalMap, Map, local_map
-from vslam.map_kernels import count_observers, count_seen_by, link_many, resolve
+from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
 from vslam.monocular import TwoViewStart
 
 
@@ -54,12 +54,14 @@ class MappingThread:
         closing: LoopClosing,
         *,
         threads: int,
+        map_: Map | None = None,
     ) -> None:
+        """``map_``: to go on in; an empty one by default."""
         self.reference = 0
         self.n_keyframes = 0
         self.last_frame = -1
         self.last_timestamp = -np.inf
-        self._map = Map(scales)
+        self._map = map_ or Map(scales)
         self._camera = camera
         self._config = config
         self._closing = closing
@@ -69,6 +71,9 @@ class MappingThread:
         self._reference_unit_scale = 1.0
         self._visible: list[NDArray[np.int32]] = []
         self._found: list[NDArray[np.int32]] = []
+        if self._map.n_keyframes:
+            self.n_keyframes = self._map.n_keyframes
+            self.set_reference(int(self._map.living_keyframes()[-1]))
 
     @property
     def busy(self) -> bool:
@@ -95,7 +100,7 @@ class MappingThread:
         Args:
             predicted: whether the pose of such a root is at least a prediction.
         """
-        self._write_counts()
+        self.write_counts()
         map_ = self._map
         keyframe = map_.add_keyframe(frame.features, frame.T_cw, frame.timestamp, frame.index)
         tracked = np.flatnonzero(frame.landmark >= 0)
@@ -126,7 +131,7 @@ class MappingThread:
         Returns:
             The keyframes that the two frames are.
         """
-        self._write_counts()
+        self.write_counts()
         map_, frames = self._map, (start.first, start.second)
         one, two = map_two_views(
             map_,
@@ -153,7 +158,7 @@ class MappingThread:
             return False
         pending, self._pending = self._pending, None
         pending()
-        self._write_counts()
+        self.write_counts()
         self._copy_view()
         return True
 
@@ -210,18 +215,25 @@ class MappingThread:
             Its id, how many landmarks it shares, and how many of its own at least three keyframes
             see; -1, 0, 0 if there is none.
         """
-        a = self.map.arrays
-        shared = count_observers(a, frame.landmark[frame.landmark >= 0], self.n_keyframes)
+        map_ = self.map
         since = frame.timestamp - self._config.keyframes.known_after_s
-        shared[np.searchsorted(self.map.timestamps, since, side="right") :] = 0
+        young = np.array(map_.sessions) == map_.session
+        young &= np.array(map_.timestamps) > since
+        shared = np.where(young, 0, self.count_shared(frame))
         best = int(np.argmax(shared))
         if shared[best] == 0:
             return -1, 0, 0
-        return best, int(shared[best]), count_seen_by(a, best, 3)
+        return best, int(shared[best]), count_seen_by(map_.arrays, best, 3)
+
+    def count_shared(self, frame: Frame) -> NDArray[np.int64]:
+        """``(n_keyframes,)`` how many of the landmarks of a frame each keyframe observes."""
+        a, n = self.map.arrays, self.map.n_keyframes
+        _, rows = gather_observations(a, frame.landmark[frame.landmark >= 0], np.arange(n))
+        return np.bincount(a.keyframe[rows], minlength=n)
 
     def follow(self, keyframe: int, frame: Frame) -> None:
         """Track by an old keyframe instead of making a new one. Merge first."""
-        self._write_counts()
+        self.write_counts()
         self.last_timestamp = frame.timestamp
         self.set_reference(keyframe)
         if self._closing.follow(self.n_keyframes - 1):
@@ -242,7 +254,8 @@ class MappingThread:
         self.last_frame, self.last_timestamp = frame.index, frame.timestamp
         self.set_reference(keyframe)
 
-    def _write_counts(self) -> None:
+    def write_counts(self) -> None:
+        """Write down what ``count`` remembered. Merge first."""
         for seen, counter in (
             (self._visible, self._map.arrays.visible),
             (self._found, self._map.arrays.found),

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.errors import InputError
-
 if TYPE_CHECKING:
     from vslam.cli.summary import Rows
     from vslam.map import Map
@@ -32,7 +30,8 @@ def info(
     from vslam.maps.storage import load_map
 
     file = run / "map.npz" if run.is_dir() else run
-    map_, camera = load_map(file)
+    stored = load_map(file)
+    map_, camera = stored.map, stored.camera
     reconstruction = reconstruction_of(map_, camera)
     print_rows(
         [
@@ -43,7 +42,10 @@ def info(
                 f"fx {camera.fx:.1f}, fy {camera.fy:.1f}, cx {camera.cx:.1f}, cy {camera.cy:.1f}",
             ),
             *(_contents(map_, reconstruction) if map_.n_keyframes else [("keyframes", "none")]),
-            *_submaps(file),
+            ("sub-maps", str(len({0, *map_.restarts}) if map_.n_keyframes else 0)),
+            ("drives", f"{len(stored.drives)}: {', '.join(stored.drives)}"),
+            ("loops", str(len(stored.loops))),
+            ("detector", stored.detector.name),
         ]
     )
 
@@ -66,15 +68,3 @@ def _contents(map_: Map, reconstruction: Reconstruction) -> Rows:
         ("observations", observations),
         ("length", f"{path:.1f} {unit} in {np.ptp(r.timestamps):.1f} s"),
     ]
-
-
-def _submaps(file: Path) -> Rows:
-    """The map itself does not say; the report of its run does."""
-    from vslam.report.finished_run import read_report
-
-    if not (file.parent / "report.json").is_file():
-        return []
-    try:
-        return [("sub-maps", str(read_report(file.parent).submaps))]
-    except InputError as error:
-        return [("sub-maps", f"unknown: {error}")]

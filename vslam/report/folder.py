@@ -78,11 +78,11 @@ def write_results(
         config = outcome.settings.config.model_dump_json(indent=2) + "\n"
         (folder / "config.json").write_text(config)
         report = _write_report(folder, outcome, config, pages=pages)
-        if outcome.map is not None:
-            save_map(folder / "map.npz", outcome.map, outcome.sequence.camera)
-            if ply:
-                landmarks = outcome.map.living_landmarks()
-                save_ply(folder / "map.ply", outcome.map.arrays.xyz[landmarks])
+        if outcome.map is not None and ply:
+            landmarks = outcome.map.living_landmarks()
+            save_ply(folder / "map.ply", outcome.map.arrays.xyz[landmarks])
+        if outcome.stored is not None:
+            save_map(folder / "map.npz", outcome.stored)
     except OSError as error:
         files = sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime_ns)
         raise ResultsError(

@@ -25,14 +25,15 @@ class StageTime(_Model):
 class LoopEntry(_Model):
     """One loop candidate, accepted or not, in frames of this run.
 
-    ``query_frame`` is None for a frame that was not in the map. ``right`` says whether the relative
-    pose found is the ground truth's, None where that cannot be said. ``moved_m`` is the farthest
-    way that the correction moved a keyframe, ``correction_s`` its time; None if rejected.
-    ``matched_by`` names the descriptors that the relative pose comes from, ``orb`` or ``learned``.
+    ``query_frame`` is None for a frame that was not in the map, ``match_frame`` for one of an
+    earlier drive. ``right`` says whether the relative pose found is the ground truth's, None where
+    that cannot be said. ``moved_m`` is the farthest way that the correction moved a keyframe,
+    ``correction_s`` its time; None if rejected. ``matched_by`` names the descriptors that the
+    relative pose comes from, ``orb`` or ``learned``.
     """
 
     query_frame: int | None
-    match_frame: int
+    match_frame: int | None
     score: float
     matches: int
     inliers: int
@@ -145,6 +146,8 @@ class ReportJson(_Model):
     weights: Path | None = None
     realtime: bool = False
     calib: tuple[Path, ...] = ()
+    map: Path | None = None
+    localize: bool = False
 
     machine: Machine
     versions: dict[str, str]

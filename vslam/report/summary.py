@@ -8,6 +8,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.errors import InputError
 from vslam.evaluation.loops import LoopEvaluation
@@ -134,8 +135,8 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
         correction = corrections.get((edge.query, edge.match)) if edge.accepted else None
         entries.append(
             LoopEntry(
-                query_frame=int(frames[edge.query]) if edge.query >= 0 else None,
-                match_frame=int(frames[edge.match]),
+                query_frame=_frame(frames, edge.query),
+                match_frame=_frame(frames, edge.match),
                 score=edge.score,
                 matches=edge.n_matches,
                 inliers=edge.n_inliers,
@@ -148,6 +149,11 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
             )
         )
     return entries
+
+
+def _frame(frames: NDArray[np.int64], keyframe: int) -> int | None:
+    """The frame of this run that a keyframe was; None for none, and for those of earlier drives."""
+    return int(frames[keyframe]) if keyframe >= 0 and frames[keyframe] >= 0 else None
 
 
 def _moved(correction: LoopCorrection) -> float:

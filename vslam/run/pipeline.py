@@ -22,15 +22,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import ImageMap
+from vslam.camera import Camera, ImageMap, same_camera
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import Stream, TimedFrame, is_live, timed_frames
-from vslam.errors import BrokenSourceError, UnreadableImageError
+from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 from vslam.features import Features, TrackResult
 from vslam.frontend.tracking import TrackingContext, extract_features
 from vslam.loopclosure.registry import create_detector, create_images
 from vslam.machine import peak_memory_mb, process_age
+from vslam.map import Map
 from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
 from vslam.run.realtime import Played, play
 from vslam.run.recorder import NullRecorder, Recorder
@@ -65,9 +66,7 @@ def run_sequence(
     far is kept.
     """
     cv2.setNumThreads(1)  # the pool uses the cores
-    images = create_images(settings.detector, settings.config)
-    detector = create_detector(settings.detector, settings.config, settings.weights, images)
-    slam = Slam(sequence.camera, settings.config, detector, threads=settings.threads, images=images)
+    slam = begin(sequence.camera, settings)
     tracks: list[TrackResult] = []
     skipped: list[str] = []
     latency_ms: list[float] = []
@@ -108,6 +107,7 @@ def run_sequence(
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     _tell_loops(recorder, slam, n_told)
     trajectory = slam.trajectory()
+    drive = f"{settings.dataset} {sequence.name}"
     recorder.finish(trajectory, slam.map)
     return RunOutcome(
         settings=settings,
@@ -124,12 +124,41 @@ def run_sequence(
         n_keyframes=len(slam.map.living_keyframes()),
         n_landmarks=len(slam.map.living_landmarks()),
         map=slam.map,
+        stored=None if settings.localize else slam.stored_map(drive),
         loops=slam.loops,
         corrections=slam.corrections,
-        keyframe_frames=np.array(slam.map.frames, np.int64),
+        keyframe_frames=_frames_of_this_run(slam.map),
         n_submaps=len({0, *slam.map.restarts}) if slam.map.n_keyframes else 0,
         interrupted=broken[0] if broken else None,
     )
+
+
+def begin(camera: Camera, settings: RunSettings) -> Slam:
+    """SLAM before its first frame, with the detector asked for, in a new map or in one of a file.
+
+    Raises:
+        InputError: no such map, one of another camera, detector or pyramid, or weights that cannot
+            be read.
+    """
+    config, threads = settings.config, settings.threads
+    images = create_images(settings.detector, config)
+    detector = create_detector(settings.detector, config, settings.weights, images)
+    if settings.map is None:
+        return Slam(camera, config, detector, threads=threads, images=images)
+    slam = Slam.load(
+        settings.map, config, detector, threads=threads, images=images, localize=settings.localize
+    )
+    if not same_camera(slam.camera, camera):
+        raise InputError(
+            f"{settings.map}: the map's camera is not that of the sequence; maps go on with images "
+            "of the camera that they were made with, rectified alike."
+        )
+    return slam
+
+
+def _frames_of_this_run(map_: Map) -> NDArray[np.int64]:
+    of_this = np.array(map_.sessions, np.int64) == map_.session
+    return np.where(of_this, np.array(map_.frames, np.int64), -1)
 
 
 def with_comparison(
@@ -143,13 +172,14 @@ def with_comparison(
     Everything else is the same: images, perturbation, thresholds. Where Ctrl-C ends the second run
     there is nothing to compare, and the first one's outcome says so.
     """
-    settings = replace(outcome.settings, detector="none", weights=None)
+    settings = replace(outcome.settings, detector="none", weights=None, map=None)
     without = run_sequence(
         outcome.sequence, perturbation, settings, NullRecorder(), on_frame=on_frame
     )
     if without.interrupted:
         return replace(outcome, interrupted=f"{without.interrupted}, in the run without loops")
-    return replace(outcome, without_loops=replace(without, map=None))  # a map takes 100s of MB
+    without = replace(without, map=None, stored=None)  # a map takes 100s of MB
+    return replace(outcome, without_loops=without)
 
 
 def _until_broken(frames: Iterator[TimedFrame], broken: list[str]) -> Iterator[TimedFrame]:

@@ -66,6 +66,7 @@ class Slam:
     Attributes:
         frame: the last frame tracked, for drawing; None before the first.
         context: camera, thresholds and pyramid scales, as ``extract_features`` takes them.
+        world: where the map that was loaded lies in that of a ground truth, None if unknown.
     """
 
     def __init__(
@@ -108,7 +109,7 @@ class Slam:
         self._detector = detector or NoDetector()
         self._localize = localize
         self._drives: tuple[str, ...] = ()
-        self._world: World | None = None
+        self.world: World | None = None
         self._closing = LoopClosing(
             self._detector, camera, self.config, threads=threads, images=images
         )
@@ -195,7 +196,7 @@ class Slam:
             images=None if images is None else images.files(map_.n_keyframes),
             frames=self._poses.table(),
             drives=self._drives if self._localize else (*self._drives, drive),
-            world=self._world,
+            world=self.world,
         )
 
     @property
@@ -313,10 +314,21 @@ class Slam:
         self._check_finished()
         return self._poses.trajectory()
 
+    def in_map(self) -> NDArray[np.bool_]:
+        """``(N,)`` frames tracked in the part of the map that holds its first keyframe, sub-maps
+        joined to it by loops included. Call ``finish()`` first."""
+        frames = self._poses.table()
+        if not self.map.n_keyframes:
+            return frames.tracked
+        part = self._closing.joined_submaps(self.map)
+        return frames.tracked & (part[frames.reference] == part[0])
+
     def keyframe_trajectory(self) -> Trajectory:
-        """Final pose of every keyframe that was not culled. Call ``finish()`` first."""
+        """Final pose of every keyframe of this drive that was not culled. Call ``finish()``
+        first."""
         map_ = self.map
         living = map_.living_keyframes()
+        living = living[np.array(map_.sessions, np.int64)[living] == map_.session]
         times = np.array([map_.timestamps[k] for k in living], np.float64)
         return Trajectory(times, inverses(map_.arrays.T_cw[living]))
 
@@ -333,7 +345,7 @@ class Slam:
         if self._closing.images is not None and start.images is not None:
             self._closing.images.restore(start.images, self.camera.width)
         self._closing.closed = list(start.loops)
-        self._drives, self._world = start.drives, start.world
+        self._drives, self.world = start.drives, start.world
         if resume:
             self._drives = self._drives[:-1]
             return start.frames

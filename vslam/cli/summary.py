@@ -53,6 +53,7 @@ def print_summary(report: ReportJson, folder: Path) -> None:
                 f"{report.frames} done, {report.lost_frames} lost, "
                 f"{report.skipped_frames} unreadable",
             ),
+            *in_map_rows(report),
             *_latency(report),
             *([("evaluation", report.evaluation_remark)] if report.evaluation_remark else []),
             *(error_rows(report) if evaluated else []),
@@ -65,6 +66,21 @@ def print_summary(report: ReportJson, folder: Path) -> None:
         ]
     )
     _print_comparison(report)
+
+
+def in_map_rows(report: ReportJson) -> Rows:
+    """How a run found itself in the map that it went on in."""
+    if (found := report.in_map) is None:
+        return []
+    fix = "never" if found.first_fix_s is None else f"after {found.first_fix_s:.2f} s"
+    error = "" if found.error_m is None else f", {found.error_m:.3f} m off by its alignment"
+    return [
+        ("in the map", f"{found.in_map_percent:.1f} % of the frames{error}"),
+        (
+            "found in it",
+            f"first {fix}; {found.found} of the {found.sought} times it was looked for",
+        ),
+    ]
 
 
 def _latency(report: ReportJson) -> Rows:

@@ -7,6 +7,8 @@ be there in a second.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -139,8 +141,30 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
     return arrays
 
 
+def map_file_of(path: Path) -> Path:
+    """The map of the folder of a run; a file as it is."""
+    return path / "map.npz" if path.is_dir() else path
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    """What a map file says of itself, its arrays unread.
+
+    Raises:
+        InputError: as ``load_map``.
+    """
+    with _opened(path) as (_, header):
+        return header
+
+
 def _read(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
     """All arrays of a map file, and its header."""
+    with _opened(path) as (file, header):
+        return {name: file[name] for name in file.files if name != "header"}, header
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """An archive of arrays, and its header if it is a map of this schema."""
     try:
         with np.load(path, allow_pickle=False) as file:
             if "header" not in file.files and "keyframe_first_row" in file.files:
@@ -156,7 +180,7 @@ def _read(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
                     f"{path}: a map of schema {header.get('schema')}, this version reads {SCHEMA}; "
                     "use the version of vslam that wrote it."
                 )
-            return {name: file[name] for name in file.files if name != "header"}, header
+            yield file, header
     except OSError as error:
         why = error.strerror or error
         raise InputError(

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import re
+from dataclasses import replace
 from datetime import datetime
 from itertools import count
 from pathlib import Path
 
 from vslam.errors import InputError, ResultsError
 from vslam.evaluation.loops import evaluate_loops
-from vslam.evaluation.trajectories import evo_command
+from vslam.evaluation.trajectories import Evaluation, evo_command
+from vslam.evaluation.worlds import world_of
 from vslam.maps.ply import save_ply
 from vslam.maps.storage import save_map
 from vslam.report.frame_table import write_frames
@@ -53,7 +55,12 @@ def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, dete
 
 
 def write_results(
-    folder: Path, outcome: RunOutcome, *, pages: bool = True, ply: bool = False
+    folder: Path,
+    outcome: RunOutcome,
+    *,
+    pages: bool = True,
+    ply: bool = False,
+    map_file: Path | None = None,
 ) -> ReportJson:
     """Evaluate a run, in any state of completion, and write all that is known of it.
 
@@ -67,6 +74,7 @@ def write_results(
         outcome: the run; it may be interrupted, all lost, or without a single frame.
         pages: write what people read, too: Markdown, HTML and figures.
         ply: write the landmarks as ``map.ply``, too.
+        map_file: where to write the map, too.
 
     Raises:
         ResultsError: a file could not be written; those before it are complete.
@@ -77,12 +85,17 @@ def write_results(
         write_frames(folder / "frames.csv", outcome.tracks)
         config = outcome.settings.config.model_dump_json(indent=2) + "\n"
         (folder / "config.json").write_text(config)
-        report = _write_report(folder, outcome, config, pages=pages)
+        evaluation, remark = evaluate_run(outcome)
+        report = _write_report(folder, outcome, config, evaluation, remark, pages=pages)
         if outcome.map is not None and ply:
             landmarks = outcome.map.living_landmarks()
             save_ply(folder / "map.ply", outcome.map.arrays.xyz[landmarks])
-        if outcome.stored is not None:
-            save_map(folder / "map.npz", outcome.stored)
+        if (stored := outcome.stored) is not None:
+            if outcome.settings.map is None and evaluation is not None:
+                stored = replace(stored, world=world_of(outcome, evaluation))
+            save_map(folder / "map.npz", stored)
+            if map_file is not None:
+                save_map(map_file, stored)
     except OSError as error:
         files = sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime_ns)
         raise ResultsError(
@@ -107,9 +120,16 @@ def write_trajectories(folder: Path, outcome: RunOutcome) -> None:
         write_tum(folder / "ground_truth.tum", ground_truth)
 
 
-def _write_report(folder: Path, outcome: RunOutcome, config: str, *, pages: bool) -> ReportJson:
+def _write_report(
+    folder: Path,
+    outcome: RunOutcome,
+    config: str,
+    evaluation: Evaluation | None,
+    remark: str | None,
+    *,
+    pages: bool,
+) -> ReportJson:
     """``report.json``, and with ``pages`` what people read."""
-    evaluation, remark = evaluate_run(outcome)
     verdict = evaluate_loops(outcome)
     command = None
     if evaluation is not None:

@@ -69,6 +69,24 @@ class LoopFigures(_Model):
     loops_closed: int
 
 
+class MapFigures(_Model):
+    """How a run found itself in the map that it went on in.
+
+    ``in_map_percent`` of the frames are placed in it at the end. ``first_fix_s`` is the time from
+    the first frame to the first that was found in it, None if none was. The camera was looked for
+    in the whole map at ``sought`` frames and found at ``found`` of them. ``error_m`` is the RMSE of
+    the positions of those frames, each as the map says, with the alignment that the drives of the
+    map had: what is wrong with the place of the whole counts. None where the map does not lie in
+    the world of the ground truth.
+    """
+
+    in_map_percent: float
+    first_fix_s: float | None
+    sought: int
+    found: int
+    error_m: float | None
+
+
 class Machine(_Model):
     """Where the times were measured; ``cores`` counts those that the process may use."""
 
@@ -132,6 +150,7 @@ class ReportJson(_Model):
     revisits: list[RevisitEntry]
     loops: list[LoopEntry]
     without_loops: LoopFigures | None
+    in_map: MapFigures | None = None
 
     dataset: str
     sequence: str

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vslam.errors import InputError
 from vslam.evaluation.loops import LoopEvaluation
 from vslam.evaluation.trajectories import Evaluation, evaluate_trajectory
+from vslam.evaluation.worlds import error_in_map
 from vslam.features import TrackingState, TrackResult
 from vslam.geometry import inverses
 from vslam.loops import LoopCorrection
@@ -21,6 +22,7 @@ from vslam.report.schema import (
     LoopEntry,
     LoopFigures,
     Machine,
+    MapFigures,
     ReportJson,
     RevisitEntry,
     StageTime,
@@ -85,6 +87,7 @@ def summarize(
         revisits=_revisits(verdict) if verdict else [],
         loops=loops,
         without_loops=_figures_without_loops(outcome),
+        in_map=_figures_in_map(outcome),
         machine=this_machine(),
         versions=versions(),
         created=datetime.now(UTC).replace(microsecond=0),
@@ -118,6 +121,24 @@ def _figures_without_loops(outcome: RunOutcome) -> LoopFigures | None:
         t_rel_percent=evaluation.t_rel_percent if evaluation else None,
         lost_frames=sum(track.state is TrackingState.LOST for track in without.tracks),
         loops_closed=sum(edge.accepted for edge in without.loops),
+    )
+
+
+def _figures_in_map(outcome: RunOutcome) -> MapFigures | None:
+    inside, tracks = outcome.in_map, outcome.tracks
+    if inside is None:
+        return None
+    # While a keyframe is being mapped the camera is not looked for.
+    lost = [track for track in tracks if track.state == TrackingState.LOST]
+    found = [track for track in tracks if track.relocalised]
+    sought = sum("relocalise" in track.stage_ms for track in lost) + len(found)
+    fix = found[0].timestamp - tracks[0].timestamp if found else None
+    return MapFigures(
+        in_map_percent=100.0 * float(inside.mean()) if len(inside) else 0.0,
+        first_fix_s=fix,
+        sought=sought,
+        found=len(found),
+        error_m=error_in_map(outcome),
     )
 
 

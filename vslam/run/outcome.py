@@ -14,7 +14,7 @@ from vslam.datasets.stream import Stream
 from vslam.features import TrackResult
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.map import Map
-from vslam.maps.stored_map import StoredMap
+from vslam.maps.stored_map import StoredMap, World
 from vslam.trajectory import Trajectory
 
 
@@ -65,6 +65,9 @@ class RunOutcome:
         peak_memory_mb: of the process.
         n_landmarks, n_keyframes: in the final map.
         map: the final map, None for a trajectory from elsewhere.
+        world: where the map that the run went on in lies, as far as that is known.
+        in_map: ``(N,)`` bool, frames placed in the map that the run went on in, at the end; None
+            for a run that began a map.
         stored: the map with all that is needed to go on in it; None where it was only localised in.
         loops: all that became of loop candidates, in the order of their decision.
         corrections: what the accepted ones did to the map, in order.
@@ -90,6 +93,8 @@ class RunOutcome:
     latency_ms: list[float] = field(default_factory=list)
     map: Map | None = None
     stored: StoredMap | None = None
+    world: World | None = None
+    in_map: NDArray[np.bool_] | None = None
     loops: list[LoopEdge] = field(default_factory=list)
     corrections: list[LoopCorrection] = field(default_factory=list)
     keyframe_frames: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))

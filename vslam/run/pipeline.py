@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -32,6 +33,7 @@ from vslam.frontend.tracking import TrackingContext, extract_features
 from vslam.loopclosure.registry import create_detector, create_images
 from vslam.machine import peak_memory_mb, process_age
 from vslam.map import Map
+from vslam.maps.storage import read_header
 from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
 from vslam.run.realtime import Played, play
 from vslam.run.recorder import NullRecorder, Recorder
@@ -125,6 +127,8 @@ def run_sequence(
         n_landmarks=len(slam.map.living_landmarks()),
         map=slam.map,
         stored=None if settings.localize else slam.stored_map(drive),
+        world=slam.world,
+        in_map=None if settings.map is None else slam.in_map(),
         loops=slam.loops,
         corrections=slam.corrections,
         keyframe_frames=_frames_of_this_run(slam.map),
@@ -145,15 +149,24 @@ def begin(camera: Camera, settings: RunSettings) -> Slam:
     detector = create_detector(settings.detector, config, settings.weights, images)
     if settings.map is None:
         return Slam(camera, config, detector, threads=threads, images=images)
-    slam = Slam.load(
+    return Slam.load(
         settings.map, config, detector, threads=threads, images=images, localize=settings.localize
     )
-    if not same_camera(slam.camera, camera):
+
+
+def require_camera(map_file: Path, camera: Camera) -> None:
+    """Refuse images of another camera than those that a map was made of.
+
+    Raises:
+        InputError: it is another one, or there is no such map.
+    """
+    made_with = Camera(**read_header(map_file)["camera"])
+    if not same_camera(made_with, camera):
         raise InputError(
-            f"{settings.map}: the map's camera is not that of the sequence; maps go on with images "
-            "of the camera that they were made with, rectified alike."
+            f"{map_file}: the map's camera is not that of the images ({made_with.sensor}, "
+            f"{made_with.width}x{made_with.height}, fx {made_with.fx:.1f}); go on with images of "
+            "the same camera, rectified alike."
         )
-    return slam
 
 
 def _frames_of_this_run(map_: Map) -> NDArray[np.int64]:

@@ -98,7 +98,9 @@ class Laps:
         late, early = find_seam(route.ground_truth)
         first, later = np.arange(late + 1), np.arange(early + 1, late + 1)
         frames = np.concatenate([first, *[later] * (laps - 1)])
-        lap = np.concatenate([np.full(len(first), 1)] + [np.full(len(later), k) for k in range(2, laps + 1)])
+        lap = np.concatenate(
+            [np.full(len(first), 1)] + [np.full(len(later), k) for k in range(2, laps + 1)]
+        )
         step = np.median(np.diff(route.timestamps))
         return cls(route, frames, lap, route.timestamps[0] + step * np.arange(len(frames)))
 
@@ -215,12 +217,16 @@ def main() -> None:
     compile_kernels(processes=1)
     rows = []
     print(*COLUMNS, sep="\t", flush=True)
-    for row in drive(laps, config, options.perturb, options.seed, options.threads, options.detector):
+    for row in drive(
+        laps, config, options.perturb, options.seed, options.threads, options.detector
+    ):
         rows.append(row)
         print(*row, sep="\t", flush=True)
     waits = [result.stage_ms.get("wait_for_mapping", 0.0) for result in drive.tracks]
     ks = [result.stage_ms.get("keyframe", 0.0) for result in drive.tracks]
-    print(f"wait for mapping: p99 {np.percentile(waits, 99):.0f} ms, max {max(waits):.0f}; keyframe p99 {np.percentile(ks,99):.0f}")
+    print(
+        f"wait for mapping: p99 {np.percentile(waits, 99):.0f} ms, max {max(waits):.0f}; keyframe p99 {np.percentile(ks, 99):.0f}"
+    )
     if options.out:
         with options.out.open("w", newline="") as file:
             csv.writer(file).writerows([COLUMNS, *rows])

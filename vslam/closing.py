@@ -121,6 +121,11 @@ class LoopClosing:
                 self.edges += [_superseded(other) for other in verified[number + 1 :]]
                 break
 
+    @property
+    def is_adjusting(self) -> bool:
+        """Whether a global bundle adjustment is yet to be merged."""
+        return self._global is not None
+
     def follow(self, keyframe: int) -> bool:
         """Note that an old keyframe serves where the newest one's, ``keyframe``, successor would
         be; returns whether ``finish`` is due."""
@@ -269,9 +274,7 @@ class LoopClosing:
             )
 
         solution = work if self._executor is None else self._executor.submit(work).result
-        return _PendingAdjustment(
-            snapshot, solution, keyframe + self._followed + wait, stop
-        )
+        return _PendingAdjustment(snapshot, solution, keyframe + self._followed + wait, stop)
 
 
 def _superseded(candidate: LoopCandidate) -> LoopEdge:

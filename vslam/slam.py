@@ -126,6 +126,8 @@ class Slam:
         self._velocity: Matrix | None = None  # twist per second, None if unknown
         self._lost_frames = 0
         self._initialiser = Initialiser(self.context)  # of monocular maps
+        if before is not None and len(before.tracked) > 1 and before.tracked[-2:].all():
+            self._move_on(before)
 
     @classmethod
     def load(
@@ -213,6 +215,11 @@ class Slam:
     def is_mapping(self) -> bool:
         """Whether a keyframe is being mapped."""
         return self._mapping.busy
+
+    @property
+    def is_adjusting(self) -> bool:
+        """Whether a global bundle adjustment is yet to be merged."""
+        return self._closing.is_adjusting
 
     @property
     def loops(self) -> list[LoopEdge]:
@@ -353,6 +360,12 @@ class Slam:
             start.map.session += 1
         return None
 
+    def _move_on(self, frames: FrameTable) -> None:
+        """Expect the next frame after the last ones, as if they had just been tracked."""
+        self._mapping.set_reference(int(frames.reference[-1]))
+        step = se3_log(orthonormalised(self._poses.pose(-1) @ inverse(self._poses.pose(-2))))
+        self._velocity = step / (frames.timestamp[-1] - frames.timestamp[-2])
+
     def _check_finished(self) -> None:
         if self._mapping.busy:
             raise RuntimeError("a keyframe is being mapped: call finish() first")
@@ -376,9 +389,15 @@ class Slam:
         return orthonormalised(se3_exp(self._velocity * elapsed) @ T_last)
 
     def _find_in_map(self, frame: Frame, clock: _Clock) -> TrackResult:
-        """A frame in a map that was loaded, before the camera was found in it."""
+        """A frame in a map that was loaded, before the camera was found in it. In a drive that is
+        resumed it is not far from where the last frame was."""
         T_cw = self._predict(frame.timestamp)
-        matches = inliers = self._relocalise(frame)
+        matches = inliers = 0
+        if self._velocity is not None:
+            inliers = track_descriptors(frame, self._mapping.reference_view, T_cw, self.context)
+            matches, inliers, _ = self._track_local_map(frame, inliers)
+        if relocalised := self._state_of(inliers, matches) == TrackingState.LOST:
+            matches = inliers = self._relocalise(frame)
         state = self._state_of(inliers, matches)
         clock.lap("relocalise")
         if state == TrackingState.LOST:
@@ -388,7 +407,7 @@ class Slam:
         self._place(frame)
         is_keyframe = self._extend_map(frame, inliers, np.empty(0, np.int32))
         clock.lap("keyframe")
-        return _result(frame, state, matches, inliers, is_keyframe, clock, relocalised=True)
+        return _result(frame, state, matches, inliers, is_keyframe, clock, relocalised=relocalised)
 
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix) -> int:
         """Along the prediction; where there is none or it fails, against the reference keyframe."""

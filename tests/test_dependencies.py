@@ -37,7 +37,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.map", "vslam.frame_poses"),
     ("vslam.frontend", "vslam.backend", "vslam.loopclosure", "vslam.datasets", "vslam.maps"),
     ("vslam.monocular", "vslam.closing"),
-    ("vslam.mapping",),
+    ("vslam.mapping", "vslam.merging"),
     ("vslam.slam",),
     ("vslam.run",),
     ("vslam.evaluation",),

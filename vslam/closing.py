@@ -100,7 +100,10 @@ class LoopClosing:
         if self.images is not None and image is not None:
             self.images.add(keyframe, image)
             self.images.keep(map_.arrays.keyframe_alive)
-        candidates = self.detector.query(keyframe, map_)
+        self.consider(map_, keyframe, self.detector.query(keyframe, map_))
+
+    def consider(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> None:
+        """Verify what a keyframe looks like, best first; close the first real loop."""
         consistent, rejected = self._consistency.update(keyframe, candidates, map_)
         chosen = self._trials.choose(keyframe, candidates)
         self.edges += [edge for edge in rejected if edge.match not in chosen]

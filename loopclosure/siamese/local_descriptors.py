@@ -133,8 +133,18 @@ class KeyframeImages:
         """The same of an image that is not kept."""
         return self.network.describe(image, GLANCE_WIDTH)
 
-    def _described(self, keyframe: int, width: int) -> DescriptorMaps:
-        file, scale = self._files[keyframe]
+    def image(self, keyframe: int) -> NDArray[np.uint8]:
+        """The image of a keyframe that was added, reduced to 640 columns.
+
+        Raises:
+            InputError: its file, from a map that was loaded, is damaged.
+        """
+        file, _ = self._files[keyframe]
         image = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_GRAYSCALE)
-        maps = self.network.describe(np.asarray(image, np.uint8), width)
-        return maps._replace(scale=maps.scale * scale)
+        if image is None:
+            raise InputError(f"the map's image of keyframe {keyframe} is damaged; save it again.")
+        return np.asarray(image, np.uint8)
+
+    def _described(self, keyframe: int, width: int) -> DescriptorMaps:
+        maps = self.network.describe(self.image(keyframe), width)
+        return maps._replace(scale=maps.scale * self._files[keyframe][1])

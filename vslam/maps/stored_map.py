@@ -11,7 +11,15 @@ from vslam.camera import Camera
 from vslam.frame_poses import FrameTable
 from vslam.geometry import orthonormalised
 from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe, ranges
-from vslam.map import NONE, Arrays, Map, loop_of_living
+from vslam.map import (
+    KEYFRAME_FIELDS,
+    LANDMARK_FIELDS,
+    NONE,
+    ROW_FIELDS,
+    Arrays,
+    Map,
+    loop_of_living,
+)
 from vslam.map_kernels import gather_observations
 
 
@@ -180,6 +188,62 @@ def observations(
         if len(count)
         else np.zeros(0, np.int32),
     }
+
+
+def appended(one: StoredMap, other: StoredMap) -> StoredMap:
+    """Two compact maps as one, the second a sub-map of which nobody knows where it lies."""
+    a, b = one.map, other.map
+    n, n_landmarks, n_rows = a.n_keyframes, a.n_landmarks, a.n_rows
+    found = Map(a.scales)
+    found.n_keyframes = n + b.n_keyframes
+    found.n_landmarks, found.n_rows = n_landmarks + b.n_landmarks, n_rows + b.n_rows
+    shift = {
+        "first_keyframe": n, "keyframe": n, "merged_into": 0, "landmark": n_landmarks,
+        "head": n_rows, "next_row": n_rows,
+    }  # fmt: skip
+    arrays = {}
+    for fields, sizes in (
+        (KEYFRAME_FIELDS, (n, b.n_keyframes)),
+        (LANDMARK_FIELDS, (n_landmarks, b.n_landmarks)),
+        (ROW_FIELDS, (n_rows, b.n_rows)),
+    ):
+        for name in fields:
+            first, second = (
+                getattr(map_.arrays, name)[:size] for map_, size in zip((a, b), sizes, strict=True)
+            )
+            if name in shift:
+                second = np.where(second >= 0, second + shift[name], NONE).astype(second.dtype)
+            arrays[name] = np.concatenate([first, second])
+    ends = n_rows + b.arrays.first_row[: b.n_keyframes + 1]
+    arrays["first_row"] = np.concatenate([a.arrays.first_row[:n], ends])
+    found.arrays = Arrays(**arrays)
+    found.timestamps = [*a.timestamps, *b.timestamps]
+    found.frames = [*a.frames, *b.frames]
+    found.unit_scale = [*a.unit_scale, *b.unit_scale]
+    drives = a.session + 1
+    found.sessions = [*a.sessions, *(drives + session for session in b.sessions)]
+    found.session = drives + b.session
+    found.parents = [*a.parents, *(n + parent if parent >= 0 else 0 for parent in b.parents)]
+    found.restarts = [*a.restarts, n, *(n + k for k in b.restarts)]
+    unpredicted = [*a.unpredicted_restarts, n, *(n + k for k in b.unpredicted_restarts)]
+    found.unpredicted_restarts = unpredicted
+    loops = tuple(replace(loop, query=n + loop.query, match=n + loop.match) for loop in other.loops)
+    tables = {
+        name: table.followed_by(other.detector.tables[name])
+        for name, table in one.detector.tables.items()
+    }
+    images = one.images
+    if images is not None and other.images is not None:
+        images = images.followed_by(other.images)
+    return StoredMap(
+        map=found,
+        camera=one.camera,
+        loops=(*one.loops, *loops),
+        detector=replace(one.detector, tables=tables),
+        images=images,
+        drives=(*one.drives, *other.drives),
+        world=one.world,
+    )
 
 
 def _ancestor(map_: Map, keyframe: int, new_id: NDArray[np.int64]) -> int:

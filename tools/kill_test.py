@@ -2,7 +2,7 @@
 
 Each time ``kill -9`` ends the run once it has done a number of frames drawn from a seed, or in the
 middle of the next autosave. All that it left is read, and the run resumed. The table has the frame
-of the kill, the frames saved, the seconds of the run that are lost, and the ATE after the resumption.
+of the kill, the frames saved, the seconds of the run that are lost, and the ATE of the whole run.
 
     python tools/kill_test.py --kills 10 --autosave 4 -- --dataset synthetic --seq demo
 """
@@ -101,7 +101,9 @@ def main() -> None:
                 saved, wall_s = saved_frames(folder)
             except InputError as error:
                 sys.exit(f"kill {number}: {error}")
-            row = f"{number}\t{'save' if saving else 'run'}\t{done}\t{saved}\t{seconds - wall_s:.1f}"
+            row = (
+                f"{number}\t{'save' if saving else 'run'}\t{done}\t{saved}\t{seconds - wall_s:.1f}"
+            )
             if saved == 0:
                 print(f"{row}\tnothing saved yet", flush=True)
                 continue

@@ -2,10 +2,15 @@
 
 The frames of a rendered route are linked into laps: where the route passes its own beginning again,
 its last frame is followed by the next one of the first pass, so that nothing leaps. Times and
-ground truth go on. ``--perturb`` runs on over the laps: a walk of brightness shows each of them in
-another light.
+ground truth go on. With ``--lights N`` lap k is driven in light k mod N, the walk of ``brightness``
+of that seed, light 0 being as rendered. ``--incidents`` mixes in what happens to a camera: frames
+dropped, black images, and cuts to another place of the route, most of them to another light, too.
 
-    python tools/laps.py --seq demo --laps 20 --out laps.csv
+    python tools/laps.py --laps 20 --out docs/lifelong/laps.csv
+    python tools/laps.py --laps 60 --lights 4 --incidents --figure docs/lifelong/soak.svg
+
+A frame in a light is prepared once; the milliseconds are of tracking and mapping it. Ctrl-C ends
+after the lap under way, and what is done so far is written.
 """
 
 from __future__ import annotations
@@ -14,34 +19,40 @@ import argparse
 import csv
 import sys
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, DepthImage, Image, ImageMap
 from vslam.config import Config, load_config
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import parse_perturbation, perturbed
 from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import TimedFrame, timed_frames
+from vslam.datasets.stream import TimedFrame
 from vslam.errors import InputError
+from vslam.evaluation.loops import LoopLimits
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.features import TrackingState, TrackResult
-from vslam.loopclosure.registry import create_detector, create_images
+from vslam.features import Features, TrackingState, TrackResult
+from vslam.frontend.tracking import TrackingContext
+from vslam.geometry import inverse, se3_log
+from vslam.loopclosure.registry import create_detector
+from vslam.loops import LoopEdge
 from vslam.machine import available_cores, peak_memory_mb
-from vslam.run.pipeline import PreparedFrame, prepared_frames
+from vslam.run.pipeline import prepared_frames
 from vslam.run.warmup import compile_kernels
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory
 
-DEGREE = 0.05  # m that a degree counts for, where the seam is looked for
+DEGREE_M = 0.05  # what a degree counts for, where the seam is looked for
 MAX_SEAM_M, MAX_SEAM_DEG = 0.5, 2.0
+LIGHT = "brightness:1.0"
+BLACK = -1
 COLUMNS = (
-    "lap", "frames", "new_keyframes", "keyframes", "landmarks", "loops", "lost", "ate_m",
-    "cpu_ms", "wait_p99_ms", "memory_mb",
+    "lap", "light", "frames", "new_keyframes", "keyframes", "landmarks", "loops", "wrong_loops",
+    "lost", "ate_m", "cpu_ms", "wait_p99_ms", "peak_mb",
 )  # fmt: skip
 
 
@@ -61,7 +72,7 @@ def find_seam(T_wc: NDArray[np.float64]) -> tuple[int, int]:
     position, forward = T_wc[:, :3, 3], T_wc[:, :3, 2]
     apart = np.linalg.norm(position[half:, None] - position[None, :half], axis=-1)
     turned = np.degrees(np.arccos(np.clip(forward[half:] @ forward[:half].T, -1.0, 1.0)))
-    late, early = np.unravel_index(np.argmin(apart + DEGREE * turned), apart.shape)
+    late, early = np.unravel_index(np.argmin(apart + DEGREE_M * turned), apart.shape)
     if apart[late, early] > MAX_SEAM_M or turned[late, early] > MAX_SEAM_DEG:
         raise InputError(
             "the route does not close on itself: its ends are "
@@ -70,168 +81,228 @@ def find_seam(T_wc: NDArray[np.float64]) -> tuple[int, int]:
     return half + int(late), int(early)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Laps:
-    """A route driven several times (``vslam.datasets.sequence.Sequence``).
+    """N frames to be driven; those dropped are left out, their times are not.
 
     Attributes:
-        route: the frames to be had.
-        frames: ``(N,)`` int64, frame of the route that each frame of the laps is.
-        lap: ``(N,)`` int64, from 1.
-        timestamps: ``(N,)`` seconds.
+        frame: of the route, or BLACK.
+        place: of the route, where the camera is.
+        lap: from 1.
+        light: 0 is as rendered.
+        step: of the clock.
     """
 
-    route: Sequence
-    frames: NDArray[np.int64]
-    lap: NDArray[np.int64]
-    timestamps: NDArray[np.float64]
+    frame: list[int] = field(default_factory=list)
+    place: list[int] = field(default_factory=list)
+    lap: list[int] = field(default_factory=list)
+    light: list[int] = field(default_factory=list)
+    step: list[int] = field(default_factory=list)
 
-    @classmethod
-    def of(cls, route: Sequence, laps: int) -> Laps:
-        """Link a route into laps, the first from its first frame to its last.
+    def add(self, place: int, lap: int, light: int, step: int, *, black: bool = False) -> None:
+        """Append a frame."""
+        self.frame.append(BLACK if black else place)
+        self.place.append(place)
+        self.lap.append(lap)
+        self.light.append(light)
+        self.step.append(step)
 
-        Raises:
-            InputError: no ground truth, or a route that does not close on itself.
-        """
-        if route.ground_truth is None:
-            raise InputError(f"{route.name}: laps need the ground truth; it has none.")
-        late, early = find_seam(route.ground_truth)
-        first, later = np.arange(late + 1), np.arange(early + 1, late + 1)
-        frames = np.concatenate([first, *[later] * (laps - 1)])
-        lap = np.concatenate(
-            [np.full(len(first), 1)] + [np.full(len(later), k) for k in range(2, laps + 1)]
+
+def plan_laps(seam: tuple[int, int], laps: int, lights: int, seed: int | None = None) -> Laps:
+    """Drive from frame 0 to the seam, then round and round.
+
+    Args:
+        seam: as of ``find_seam``.
+        seed: of the incidents; None for none. They begin with the third lap. About once in 100
+            frames up to 10 are dropped, or up to 15 are black; once in 400 the camera is somewhere
+            else, and has the light of another lap from there on.
+    """
+    late, early = seam
+    length, rng = late - early, np.random.default_rng(seed)
+    planned, place, step, black, light = Laps(), 0, 0, 0, 0
+    total = late + 1 + (laps - 1) * length
+    for done in range(total):
+        lap = 1 if done <= late else 2 + (done - late - 1) // length
+        if done <= late or (done - late - 1) % length == 0:
+            light = (lap - 1) % lights
+        if seed is not None and lap > 2:
+            chance = rng.random()
+            if chance < 0.005:
+                step += int(rng.integers(1, 11))
+                place += step - planned.step[-1] - 1
+            elif chance < 0.01:
+                black = int(rng.integers(1, 16))
+            elif chance < 0.0125:
+                place, light = int(rng.integers(early + 1, late + 1)), int(rng.integers(lights))
+        if place > late:
+            place -= length
+        planned.add(place, lap, light, step, black=black > 0)
+        place, step, black = place + 1, step + 1, max(0, black - 1)
+    return planned
+
+
+class PreparedRoute:
+    """Features of the frames of a route in each light, extracted when they are first wanted."""
+
+    def __init__(self, route: Sequence, context: TrackingContext, threads: int, seed: int) -> None:
+        self._route, self._context, self._threads, self._seed = route, context, threads, seed
+        self._lights: dict[int, list[Features]] = {}
+
+    def features(self, frame: int, light: int) -> Features:
+        """Of a frame of the route, or of a black one."""
+        if frame == BLACK:
+            return Features.none()
+        if light not in self._lights:
+            self._lights[light] = list(self._prepare(light))
+        return self._lights[light][frame]
+
+    def _prepare(self, light: int) -> Iterator[Features]:
+        spec = LIGHT if light else "none"
+        frames = (
+            TimedFrame(float(time), partial(self._route.read, index))
+            for index, time in enumerate(self._route.timestamps)
         )
-        step = np.median(np.diff(route.timestamps))
-        return cls(route, frames, lap, route.timestamps[0] + step * np.arange(len(frames)))
-
-    @property
-    def dataset(self) -> str:
-        return self.route.dataset
-
-    @property
-    def name(self) -> str:
-        return f"{self.route.name}-laps"
-
-    @property
-    def camera(self) -> Camera:
-        return self.route.camera
-
-    @property
-    def ground_truth(self) -> NDArray[np.float64]:
-        assert self.route.ground_truth is not None
-        return self.route.ground_truth[self.frames]
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def read(
-        self, index: int, image_map: ImageMap = map
-    ) -> tuple[Image, Image | DepthImage | None]:
-        return self.route.read(int(self.frames[index]), image_map)
+        changed = perturbed(frames, parse_perturbation(spec, self._seed + light))
+        for _, prepared in prepared_frames(changed, self._context, self._threads):
+            assert prepared.features is not None, prepared.problem
+            yield prepared.features
 
 
-def lap_row(
-    slam: Slam, laps: Laps, tracks: list[TrackResult], first: int, cpu_s: float
-) -> list[float | int | str]:
-    """What one lap, the frames from ``first`` on, did to the map (``COLUMNS``); ``ate_m`` is that
-    of all frames so far."""
-    results = tracks[first:]
-    waits = [result.stage_ms.get("wait_for_mapping", 0.0) for result in results]
-    truth = Trajectory(laps.timestamps[: len(tracks)], laps.ground_truth[: len(tracks)])
-    error = evaluate_trajectory(slam.trajectory(), truth)
-    return [
-        int(laps.lap[first]),
-        len(results),
-        sum(result.is_keyframe for result in results),
-        len(slam.map.living_keyframes()),
-        len(slam.map.living_landmarks()),
-        len(slam.corrections),
-        sum(result.state == TrackingState.LOST for result in results),
-        f"{error.ate_rmse_m:.4f}",
-        f"{1e3 * cpu_s / len(results):.1f}",
-        f"{np.percentile(waits, 99):.0f}",
-        f"{peak_memory_mb():.0f}",
-    ]
+def is_right(edge: LoopEdge, frames: NDArray[np.int64], T_wc: NDArray[np.float64]) -> bool:
+    """Whether a loop's relative pose is that of the ground truth ``(N, 4, 4)`` of the frames."""
+    assert edge.T_query_match is not None
+    T_match_query = inverse(T_wc[frames[edge.match]]) @ T_wc[frames[edge.query]]
+    error, limits = se3_log(edge.T_query_match @ T_match_query), LoopLimits()
+    return bool(
+        np.linalg.norm(error[:3]) <= limits.max_error_m
+        and np.degrees(np.linalg.norm(error[3:])) <= limits.max_error_deg
+    )
 
 
-def drive(laps: Laps, config: Config, perturb: str, seed: int, threads: int, detector: str):
+@dataclass
+class Drive:
+    """Laps under way: SLAM, what it said of each frame, and what is true."""
+
+    slam: Slam
+    laps: Laps
+    seconds: float
+    T_wc: NDArray[np.float64]  # of the route
+    tracks: list[TrackResult] = field(default_factory=list)
+
+    def row(self, first: int, cpu_s: float) -> list[int | str]:
+        """``COLUMNS`` of the frames from ``first`` on; ``ate_m`` is of all tracked frames so far,
+        ``wrong_loops`` too."""
+        slam, done = self.slam, len(self.tracks)
+        results = self.tracks[first:]
+        waits = [result.stage_ms.get("wait_for_mapping", 0.0) for result in results]
+        times = self.seconds * np.array(self.laps.step[:done], np.float64)
+        truth = Trajectory(times, self.T_wc[self.laps.place[:done]])
+        tracked = np.array([r.state in (TrackingState.OK, TrackingState.WEAK) for r in self.tracks])
+        known = np.flatnonzero(tracked)
+        error = evaluate_trajectory(slam.trajectory().select(known), truth.select(known))
+        loops = [edge for edge in slam.loops if edge.accepted]
+        frames = np.array(slam.map.frames)
+        return [
+            self.laps.lap[first],
+            self.laps.light[first],
+            len(results),
+            sum(result.is_keyframe for result in results),
+            len(slam.map.living_keyframes()),
+            len(slam.map.living_landmarks()),
+            len(loops),
+            sum(not is_right(edge, frames, truth.T_wc) for edge in loops),
+            int(np.count_nonzero(~tracked[first:])),
+            f"{error.ate_rmse_m:.4f}",
+            f"{1e3 * cpu_s / len(results):.1f}",
+            f"{np.percentile(waits, 99):.0f}",
+            f"{peak_memory_mb():.0f}",
+        ]
+
+
+def drive(run: Drive, prepared: PreparedRoute) -> Iterator[list[int | str]]:
     """Run SLAM over the laps; yields a row when each is done."""
-    images = create_images(detector, config)
-    slam = Slam(
-        laps.camera, config, create_detector(detector, config, None, images),
-        threads=threads, images=images,
-    )  # fmt: skip
-    perturbation = parse_perturbation(perturb, seed)
-    known: dict[int, PreparedFrame] = {}  # unperturbed, a lap looks like the one before
-
-    def frames():
-        unread = perturbed(timed_frames(laps), perturbation)
-        if perturbation.laws:
-            yield from prepared_frames(unread, slam.context, threads)
-            return
-        first = np.unique(laps.frames, return_index=True)[1]
-        n_new = int(first.max()) + 1
-        for index, prepared in enumerate(
-            prepared_frames((f for f, _ in zip(unread, range(n_new))), slam.context, threads)
-        ):
-            known[int(laps.frames[index])] = replace(prepared[1], left=None)
-            yield prepared
-        for index in range(n_new, len(laps)):
-            yield float(laps.timestamps[index]), known[int(laps.frames[index])]
-
-    tracks: list[TrackResult] = []
-    first, cpu = 0, 0.0
-    for timestamp, frame in frames():
-        assert frame.features is not None
+    laps, slam, first, cpu = run.laps, run.slam, 0, 0.0
+    for done in range(len(laps.frame)):
+        features = prepared.features(laps.frame[done], laps.light[done])
         start = time.process_time()
-        tracks.append(slam.step_features(frame.features, timestamp, frame.left))
+        run.tracks.append(slam.step_features(features, run.seconds * laps.step[done]))
         cpu += time.process_time() - start
-        done = len(tracks)
-        if done == len(laps):
+        last = done + 1 == len(laps.frame)
+        if last:
             slam.finish()
-        if done == len(laps) or laps.lap[done] != laps.lap[first]:
-            while slam.is_mapping:
-                slam._merge()
-            yield lap_row(slam, laps, tracks, first, cpu)
-            first, cpu = done, 0.0
-    drive.tracks, drive.slam = tracks, slam
+        # The map can be looked at when no keyframe is being mapped: a frame or two later.
+        if last or (laps.lap[done] != laps.lap[first] and not slam.is_mapping):
+            yield run.row(first, cpu)
+            first, cpu = done + 1, 0.0
+
+
+def draw(rows: list[list[int | str]], path: Path) -> None:
+    """The map, the cost and the memory over the frames."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    column = {name: np.array([float(r[i]) for r in rows]) for i, name in enumerate(COLUMNS)}
+    frames = np.cumsum(column["frames"])
+    figure, axes = plt.subplots(3, 1, figsize=(7, 6), sharex=True, layout="constrained")
+    for axis, name, label in zip(
+        axes,
+        ("keyframes", "cpu_ms", "peak_mb"),
+        ("keyframes in the map", "CPU time per frame (ms)", "peak memory (MB)"),
+        strict=True,
+    ):
+        axis.plot(frames, column[name], color="#2563eb", linewidth=1.2)
+        axis.set_ylim(0, 1.15 * column[name].max())
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+    axes[-1].set_xlabel("frames")
+    figure.savefig(path)
+    plt.close(figure)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seq", default="demo", help="rendered route")
     parser.add_argument("--laps", type=int, default=20)
-    parser.add_argument("--perturb", default="none")
+    parser.add_argument("--lights", type=int, default=1)
+    parser.add_argument("--incidents", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--detector", default="bow")
     parser.add_argument("--threads", type=int, default=min(available_cores(), 4))
     parser.add_argument("--config", type=Path)
-    parser.add_argument("--out", type=Path, help="CSV")
+    parser.add_argument("--out", type=Path, help="CSV table")
+    parser.add_argument("--figure", type=Path, help="SVG or PNG")
     options = parser.parse_args()
-    config = Config() if options.config is None else load_config(options.config)
     try:
+        config = Config() if options.config is None else load_config(options.config)
         route = open_sequence("synthetic", Path(), options.seq)
-        laps = Laps.of(route, options.laps)
+        assert route.ground_truth is not None
+        seam = find_seam(route.ground_truth)
     except InputError as error:
-        sys.exit(str(error))
+        sys.exit(f"error: {error}")
     compile_kernels(processes=1)
-    rows = []
-    print(*COLUMNS, sep="\t", flush=True)
-    for row in drive(
-        laps, config, options.perturb, options.seed, options.threads, options.detector
-    ):
-        rows.append(row)
-        print(*row, sep="\t", flush=True)
-    waits = [result.stage_ms.get("wait_for_mapping", 0.0) for result in drive.tracks]
-    ks = [result.stage_ms.get("keyframe", 0.0) for result in drive.tracks]
-    print(
-        f"wait for mapping: p99 {np.percentile(waits, 99):.0f} ms, max {max(waits):.0f}; keyframe p99 {np.percentile(ks, 99):.0f}"
+    detector = create_detector("bow", config, None, None)
+    slam = Slam(route.camera, config, detector, threads=options.threads)
+    laps = plan_laps(
+        seam, options.laps, options.lights, options.seed if options.incidents else None
     )
+    seconds = float(np.median(np.diff(route.timestamps)))
+    run = Drive(slam, laps, seconds, route.ground_truth)
+    rows: list[list[int | str]] = []
+    print(*COLUMNS, sep="\t", flush=True)
+    try:
+        for row in drive(run, PreparedRoute(route, slam.context, options.threads, options.seed)):
+            rows.append(row)
+            print(*row, sep="\t", flush=True)
+    except KeyboardInterrupt:
+        print("interrupted", flush=True)
+    waits = [result.stage_ms.get("wait_for_mapping", 0.0) for result in run.tracks]
+    print(f"{len(run.tracks)} frames, wait for mapping p99 {np.percentile(waits, 99):.0f} ms")
     if options.out:
-        with options.out.open("w", newline="") as file:
-            csv.writer(file).writerows([COLUMNS, *rows])
-    e = [x for x in drive.slam.loops if x.accepted]
-    print([(x.query, x.match) for x in e], len(drive.slam.loops))
+        with options.out.open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
+    if options.figure and rows:
+        draw(rows, options.figure)
 
 
 if __name__ == "__main__":

@@ -284,6 +284,10 @@ class Slam:
             state = self._state_of(inliers, matches)
             relocalised = state != TrackingState.LOST
             clock.lap("relocalise")
+        elif self._is_doubtful(frame, inliers) and (found := self._find_better(frame, inliers)):
+            matches, inliers, visible = found, found, np.empty(0, np.int32)
+            state, relocalised = self._state_of(inliers, matches), True
+            clock.lap("relocalise")
         if state == TrackingState.LOST:
             frame.T_cw = T_cw
             restarted = self._lose(frame)
@@ -437,6 +441,27 @@ class Slam:
                 self._mapping.set_reference(candidate.match)
                 return inliers
         return self._relocalise_learned(frame, candidates)
+
+    def _is_doubtful(self, frame: Frame, inliers: int) -> bool:
+        """Whether a frame after a gap tracks so little that it may be matched with other things."""
+        assert self.frame is not None
+        usual = self._poses.timestamp(-1) - self._poses.timestamp(-2) if len(self._poses) > 1 else 0
+        config = self.config.relocalization
+        gap = frame.timestamp - self.frame.timestamp > config.doubtful_gap * usual > 0.0
+        return gap and inliers < config.doubtful_share * self._mapping.n_reference
+
+    def _find_better(self, frame: Frame, inliers: int) -> int:
+        """Look for a frame in the whole map, and leave it as it is unless it tracks more there;
+        returns inliers or 0."""
+        T_cw, landmark, xyz = frame.T_cw, frame.landmark.copy(), frame.xyz.copy()
+        reference = self._mapping.reference
+        found = self._relocalise(frame)
+        if found > self.config.relocalization.better * inliers:
+            return found
+        frame.T_cw, frame.landmark, frame.xyz = T_cw, landmark, xyz
+        if self._mapping.reference != reference:
+            self._mapping.set_reference(reference)
+        return 0
 
     def _relocalise_learned(self, frame: Frame, candidates: list[LoopCandidate]) -> int:
         """By local descriptors of the network: where the light has changed ORB's find nothing."""

@@ -174,8 +174,8 @@ def is_right(edge: LoopEdge, frames: NDArray[np.int64], T_wc: NDArray[np.float64
     T_match_query = inverse(T_wc[frames[edge.match]]) @ T_wc[frames[edge.query]]
     error, limits = se3_log(edge.T_query_match @ T_match_query), LoopLimits()
     return bool(
-        np.linalg.norm(error[:3]) <= limits.max_error_m
-        and np.degrees(np.linalg.norm(error[3:])) <= limits.max_error_deg
+        np.linalg.norm(error[:3]) <= limits.max_translation_m
+        and np.degrees(np.linalg.norm(error[3:])) <= limits.max_rotation_deg
     )
 
 

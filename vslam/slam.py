@@ -123,6 +123,11 @@ class Slam:
             map_=None if start is None else start.map,
         )
         self._poses = FramePoses(self._mapping, before)
+        self._resumed = before is not None and len(before.timestamp) > 0
+        if self._resumed:
+            newest = self._mapping.reference
+            self._mapping.last_frame = self._mapping.map.frames[newest]
+            self._mapping.last_timestamp = self._mapping.map.timestamps[newest]
         self._velocity: Matrix | None = None  # twist per second, None if unknown
         self._lost_frames = 0
         self._initialiser = Initialiser(self.context)  # of monocular maps
@@ -396,20 +401,23 @@ class Slam:
         """A frame in a map that was loaded, before the camera was found in it. In a drive that is
         resumed it is not far from where the last frame was."""
         T_cw = self._predict(frame.timestamp)
-        matches = inliers = 0
-        if self._velocity is not None:
+        matches, inliers, visible = 0, 0, np.empty(0, np.int32)
+        if self._resumed and self._lost_frames == 0:
             inliers = track_descriptors(frame, self._mapping.reference_view, T_cw, self.context)
-            matches, inliers, _ = self._track_local_map(frame, inliers)
-        if relocalised := self._state_of(inliers, matches) == TrackingState.LOST:
+            matches, inliers, visible = self._track_local_map(frame, inliers)
+            clock.lap("track_local_map")
+        state, relocalised = self._state_of(inliers, matches), False
+        if state == TrackingState.LOST:
             matches = inliers = self._relocalise(frame)
-        state = self._state_of(inliers, matches)
-        clock.lap("relocalise")
+            state = self._state_of(inliers, matches)
+            relocalised = state != TrackingState.LOST
+            clock.lap("relocalise")
         if state == TrackingState.LOST:
             frame.T_cw = T_cw
             restarted = self._lose(frame)
             return _result(frame, state, matches, inliers, restarted, clock)
         self._place(frame)
-        is_keyframe = self._extend_map(frame, inliers, np.empty(0, np.int32))
+        is_keyframe = self._extend_map(frame, inliers, visible)
         clock.lap("keyframe")
         return _result(frame, state, matches, inliers, is_keyframe, clock, relocalised=relocalised)
 

@@ -1,0 +1,281 @@
+"""Going on in a map: found again, extended, resumed, or only localised in."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ring import CAMERA, LAP, Ring
+from typer.testing import CliRunner
+
+from vslam.cli.main import app
+from vslam.config import Config
+from vslam.errors import InputError
+from vslam.features import Features, TrackingState, TrackResult
+from vslam.geometry import inverse
+from vslam.loopclosure.registry import create_detector
+from vslam.slam import Slam
+
+CONFIG = Config()
+NOTHING = Features.none()
+
+
+@pytest.fixture(scope="module")
+def ring() -> Ring:
+    return Ring.create()
+
+
+def new(threads: int = 1) -> Slam:
+    return Slam(CAMERA, CONFIG, create_detector("bow", CONFIG), threads=threads)
+
+
+def drive(slam: Slam, ring: Ring, places, seed: int, start: float = 0.0) -> list[TrackResult]:
+    """Ten frames a second; None is a black image."""
+    results = [
+        slam.step_features(NOTHING if k is None else ring.see(k, seed), start + 0.1 * i)
+        for i, k in enumerate(places)
+    ]
+    slam.finish()
+    return results
+
+
+def states(results: list[TrackResult]) -> str:
+    return "".join(result.state[0] for result in results)
+
+
+def off(slam: Slam, ring: Ring, places, first: float = 0.0) -> np.ndarray:
+    """Metres from each frame to where it was, in the world of the map."""
+    true = np.array([inverse(ring.pose(first)) @ ring.pose(k) for k in places])
+    return np.linalg.norm(slam.trajectory().T_wc[:, :3, 3] - true[:, :3, 3], axis=1)
+
+
+def everything(slam: Slam) -> bytes:
+    """All that a map file would hold, and what it leaves out."""
+    map_, memory = slam.map, slam._detector.memory()
+    lists = (map_.timestamps, map_.frames, map_.parents, map_.sessions, map_.restarts)
+    arrays = [*map_.arrays, *(table.values for table in memory.tables.values())]
+    return b"".join(np.ascontiguousarray(a).tobytes() for a in arrays) + repr(lists).encode()
+
+
+@pytest.fixture(scope="module")
+def file(ring, tmp_path_factory) -> Path:
+    """The first 100 places of the ring."""
+    slam = new()
+    drive(slam, ring, range(100), seed=0)
+    path = tmp_path_factory.mktemp("maps") / "ring.npz"
+    slam.save(path, "ring")
+    return path
+
+
+def test_localising_finds_every_frame_and_changes_nothing(file, ring):
+    slam = Slam.load(file, threads=1, localize=True)
+    before = everything(slam)
+    places = range(20, 80)
+    results = drive(slam, ring, places, seed=1, start=500.0)
+    assert states(results) == "O" * 60
+    assert [result.relocalised for result in results] == [True] + 59 * [False]
+    assert not any(result.is_keyframe for result in results)
+    assert off(slam, ring, places).max() < 0.3
+    assert slam.in_map().all()
+    assert everything(slam) == before
+    assert not slam.loops
+
+
+def test_localising_backwards_through_the_map_looks_around_where_it_is(file, ring):
+    """The reference keyframe follows: it is not the one at which the camera was found."""
+    slam = Slam.load(file, threads=1, localize=True)
+    places = [80 - 0.5 * k for k in range(120)]
+    results = drive(slam, ring, places, seed=2)
+    assert states(results).count("L") == 0
+    assert off(slam, ring, places).max() < 0.3
+
+
+def test_localising_outside_the_map_is_lost_and_found_again(file, ring):
+    slam = Slam.load(file, threads=1, localize=True)
+    places = [*range(150, 160), *range(30, 40), *range(150, 155), *range(60, 65)]
+    results = drive(slam, ring, places, seed=3)
+    assert states(results) == "L" * 10 + "O" * 10 + "L" * 5 + "O" * 5
+    assert slam.in_map().tolist() == [False] * 10 + [True] * 10 + [False] * 5 + [True] * 5
+    # Before it was found, the camera stands where it was found.
+    T_wc = slam.trajectory().T_wc
+    assert np.array_equal(T_wc[0], T_wc[10])
+    assert np.array_equal(T_wc[9], T_wc[10])
+
+
+def test_a_camera_that_is_never_found_has_poses_all_the_same(file):
+    slam = Slam.load(file, threads=1, localize=True)
+    slam.skip(0.0)
+    for k in range(5):
+        assert slam.step_features(NOTHING, 1.0 + k).state == TrackingState.LOST
+    slam.finish()
+    assert len(slam.trajectory()) == 6
+    assert not slam.in_map().any()
+
+
+def test_going_on_extends_the_map_and_closes_the_ring(file, ring, check_map):
+    slam = Slam.load(file, threads=1)
+    n = slam.map.n_keyframes
+    places = [*range(90, LAP + 25)]
+    results = drive(slam, ring, places, seed=4)
+    check_map(slam.map)
+    assert states(results) == "O" * len(places)
+    assert results[0].relocalised
+    assert not slam.map.restarts
+    assert slam.map.sessions[:n] == [0] * n
+    assert set(slam.map.sessions[n:]) == {1}
+    # It came round to where the first drive began: a loop from one drive to the other.
+    closed = [edge for edge in slam.loops if edge.accepted]
+    assert closed
+    assert all(edge.match < n <= edge.query for edge in closed)
+    assert off(slam, ring, places).max() < 1.0
+    assert len(slam.keyframe_trajectory()) == sum(
+        bool(slam.map.arrays.keyframe_alive[k]) for k in range(n, slam.map.n_keyframes)
+    )
+
+
+def test_elsewhere_a_submap_begins_until_a_loop_joins_it(file, ring, check_map, tmp_path):
+    slam = Slam.load(file, threads=1)
+    n = slam.map.n_keyframes
+    places = [*range(150, LAP + 25)]
+    results = drive(slam, ring, places, seed=5)
+    check_map(slam.map)
+    assert states(results).startswith("LL")
+    assert slam.map.restarts == slam.map.unpredicted_restarts == [n]
+    assert any(edge.accepted for edge in slam.loops)
+    tracked = np.array([result.state != TrackingState.LOST for result in results])
+    assert slam.in_map()[tracked].mean() > 0.99
+    assert off(slam, ring, places)[tracked].max() < 1.5
+    # What was joined is one part, also after it was saved.
+    slam.save(tmp_path / "joined.npz", "again")
+    again = Slam.load(tmp_path / "joined.npz", threads=1, localize=True)
+    drive(again, ring, range(160, 165), seed=6)
+    assert again.in_map().all()
+
+
+def test_what_was_not_joined_is_not_in_the_map(file, ring):
+    slam = Slam.load(file, threads=1)
+    results = drive(slam, ring, range(130, 160), seed=7)
+    assert states(results)[5:] == "O" * 25
+    assert not slam.in_map().any()
+
+
+def test_a_resumed_drive_has_all_its_frames(ring, tmp_path):
+    whole, first = new(), new()
+    drive(whole, ring, range(120), seed=8)
+    drive(first, ring, range(60), seed=8)
+    first.save(tmp_path / "half.npz", "half")
+    second = Slam.load(tmp_path / "half.npz", threads=1, resume=True)
+    results = drive(second, ring, range(60, 120), seed=8, start=6.0)
+    assert states(results) == "O" * 60
+    assert not results[0].relocalised  # it was known where the camera was
+    assert len(second.trajectory()) == 120
+    errors = [np.sqrt((off(slam, ring, range(120)) ** 2).mean()) for slam in (whole, second)]
+    assert errors[1] < 1.2 * errors[0]
+    assert set(second.map.sessions) == {0}
+    assert second.map.frames[-1] > 100
+    second.save(tmp_path / "whole.npz", "whole")
+    assert second.stored_map("x").drives == ("x",)
+    with pytest.raises(ValueError, match="not later than the last one"):
+        second.step_features(NOTHING, 5.0)
+
+
+def test_a_drive_without_a_detector_resumes_where_it_was(ring, tmp_path):
+    first = Slam(CAMERA, CONFIG, threads=1)
+    drive(first, ring, range(30), seed=9)
+    first.save(tmp_path / "half.npz")
+    second = Slam.load(tmp_path / "half.npz", threads=1, resume=True)
+    assert states(drive(second, ring, range(30, 60), seed=9, start=3.0)) == "O" * 30
+    assert off(second, ring, range(60)).max() < 0.3
+
+
+@pytest.mark.parametrize("localize", [False, True])
+def test_the_same_bytes_with_one_thread_and_two(file, ring, localize):
+    places = [*range(60, 120), None, None, None, None, *range(20, 50)]
+    done = []
+    for threads in (1, 2, 1):
+        slam = Slam.load(file, threads=threads, localize=localize)
+        online = np.array([r.T_wc for r in drive(slam, ring, places, seed=10)])
+        done.append(everything(slam) + online.tobytes() + slam.trajectory().T_wc.tobytes())
+    assert done[0] == done[1] == done[2]
+
+
+# -- the command line -----------------------------------------------------------------------------
+
+
+def vslam(*words: object):
+    return CliRunner().invoke(app, [*map(str, words)])
+
+
+def report_of(folder: Path) -> dict:
+    return json.loads((folder / "latest" / "report.json").read_text())
+
+
+def refusal(*words: object) -> str:
+    result = vslam(*words)
+    assert isinstance(result.exception, InputError), result.output
+    assert "\n" not in str(result.exception)
+    return str(result.exception)
+
+
+@pytest.fixture(scope="module")
+def mapped(kitti_tree, tmp_path_factory) -> Path:
+    """A run over the first 20 frames of the corridor."""
+    out = tmp_path_factory.mktemp("mapped")
+    words = ("--data", kitti_tree, "--no-record", "--no-report", "--quiet", "--out", out)
+    result = vslam("run", *words, "--max-frames", 20, "--save-map", out / "kept.npz")
+    assert result.exit_code == 0, result.output
+    assert (out / "kept.npz").read_bytes() == (out / "latest" / "map.npz").read_bytes()
+    return out / "latest"
+
+
+def test_localise_by_the_command_line(kitti_tree, mapped, tmp_path):
+    before = (mapped / "map.npz").read_bytes()
+    words = ("run", "--data", kitti_tree, "--no-record", "--out", tmp_path, "--start", 4)
+    result = vslam(*words, "--map", mapped, "--localize")
+    assert result.exit_code == 0, result.output
+    assert re.search(r"in the map +100\.0 % of the frames, 0\.0\d+ m off", result.output)
+    assert "first after 0.00 s; 1 of 1 times" in result.output
+    report = report_of(tmp_path)
+    assert report["localize"]
+    assert report["detector"] == "bow"
+    figures = report["in_map"]
+    assert (figures["in_map_percent"], figures["found"], figures["sought"]) == (100.0, 1, 1)
+    assert figures["first_fix_s"] == 0.0
+    # Each alignment has its own idea of where the corridor lies: by the map's the error is greater.
+    assert report["ate_rmse_m"] <= figures["error_m"] < 0.1
+    assert not (tmp_path / "latest" / "map.npz").exists()
+    assert (mapped / "map.npz").read_bytes() == before
+    page = (tmp_path / "latest" / "report.md").read_text()
+    assert "In the map" in page
+
+
+def test_go_on_by_the_command_line(kitti_tree, mapped, tmp_path):
+    words = ("run", "--data", kitti_tree, "--no-record", "--no-report", "--quiet")
+    result = vslam(*words, "--out", tmp_path, "--start", 16, "--map", mapped / "map.npz")
+    assert result.exit_code == 0, result.output
+    figures = report_of(tmp_path)["in_map"]
+    assert figures["in_map_percent"] == 100.0
+    assert figures["error_m"] < 0.1
+    info = vslam("map", "info", tmp_path / "latest").output
+    assert "drives        2: kitti 00, kitti 00\n" in info
+    images = ("--data", kitti_tree)
+    assert "several drives" in refusal("export", "colmap", tmp_path / "latest", *images)
+
+
+def test_refusals(kitti_tree, mapped, tmp_path):
+    run = ("run", "--data", kitti_tree, "--no-record", "--out", tmp_path / "out")
+    assert "--map" in refusal(*run, "--localize")
+    assert "leave it out" in refusal(*run, "--map", mapped, "--compare-loops")
+    assert "leave it out" in refusal(
+        *run, "--map", mapped, "--localize", "--save-map", tmp_path / "m.npz"
+    )
+    assert "cannot be read" in refusal(*run, "--map", tmp_path)
+    assert "made with the detector bow" in refusal(*run, "--map", mapped, "--detector", "none")
+    assert "camera is not that of the images" in refusal(*run, "--map", mapped, "--sensor", "mono")
+    config = tmp_path / "config.json"
+    config.write_text(json.dumps({"orb": {"n_levels": 4}}))
+    assert "another pyramid" in refusal(*run, "--map", mapped, "--config", config)
+    assert not list((tmp_path / "out").glob("*/report.json"))

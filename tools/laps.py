@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import resource
 import sys
 import time
 from collections.abc import Iterator
@@ -40,7 +41,7 @@ from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_log
 from vslam.loopclosure.registry import create_detector
 from vslam.loops import LoopEdge
-from vslam.machine import available_cores, peak_memory_mb
+from vslam.machine import available_cores
 from vslam.run.pipeline import prepared_frames
 from vslam.run.warmup import compile_kernels
 from vslam.slam import Slam
@@ -52,7 +53,7 @@ LIGHT = "brightness:1.0"
 BLACK = -1
 COLUMNS = (
     "lap", "light", "frames", "new_keyframes", "keyframes", "landmarks", "loops", "wrong_loops",
-    "lost", "ate_m", "cpu_ms", "wait_p99_ms", "peak_mb",
+    "lost", "ate_m", "cpu_ms", "wait_p99_ms", "memory_mb",
 )  # fmt: skip
 
 
@@ -179,6 +180,11 @@ def is_right(edge: LoopEdge, frames: NDArray[np.int64], T_wc: NDArray[np.float64
     )
 
 
+def resident_mb() -> float:
+    """Memory of the process (Linux), images and figures included."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
+
+
 @dataclass
 class Drive:
     """Laps under way: SLAM, what it said of each frame, and what is true."""
@@ -192,7 +198,7 @@ class Drive:
     def row(self, first: int, cpu_s: float) -> list[int | str]:
         """``COLUMNS`` of the frames from ``first`` on; ``ate_m`` is of all tracked frames so far,
         ``wrong_loops`` too."""
-        slam, done = self.slam, len(self.tracks)
+        slam, done, memory = self.slam, len(self.tracks), resident_mb()
         results = self.tracks[first:]
         waits = [result.stage_ms.get("wait_for_mapping", 0.0) for result in results]
         times = self.seconds * np.array(self.laps.step[:done], np.float64)
@@ -215,7 +221,7 @@ class Drive:
             f"{error.ate_rmse_m:.4f}",
             f"{1e3 * cpu_s / len(results):.1f}",
             f"{np.percentile(waits, 99):.0f}",
-            f"{peak_memory_mb():.0f}",
+            f"{memory:.0f}",
         ]
 
 
@@ -248,8 +254,8 @@ def draw(rows: list[list[int | str]], path: Path) -> None:
     figure, axes = plt.subplots(3, 1, figsize=(7, 6), sharex=True, layout="constrained")
     for axis, name, label in zip(
         axes,
-        ("keyframes", "cpu_ms", "peak_mb"),
-        ("keyframes in the map", "CPU time per frame (ms)", "peak memory (MB)"),
+        ("keyframes", "cpu_ms", "memory_mb"),
+        ("keyframes in the map", "CPU time per frame (ms)", "memory (MB)"),
         strict=True,
     ):
         axis.plot(frames, column[name], color="#2563eb", linewidth=1.2)

@@ -549,14 +549,14 @@ class RelocalizationConfig(_Section):
         1.5, gt=1, description="Time since the last tracked frame, usual ones, that is a gap. [own]"
     )
     doubtful_share: float = Field(
-        0.25,
+        0.5,
         ge=0,
         le=1,
         description="Tracked share of the reference; below, a frame after a gap is looked for in "
         "the whole map. [own]",
     )
     better: float = Field(
-        2.0, ge=1, description="Ratio of inliers from which it is moved to where it is found. [own]"
+        1.5, ge=1, description="Ratio of inliers from which it is moved to where it is found. [own]"
     )
     neighbours: int = Field(20, ge=1, description="Keyframes whose landmarks are searched. [own]")
 

@@ -44,12 +44,14 @@ from vslam.trajectory import read_trajectory
 FRAMES = 28
 
 KILLED = """
-import os, signal, sys
+import os, signal, sys, time
 from pathlib import Path
 from test_autosave import drive
 
 def on_frame(result):
     if result.index == int(sys.argv[3]):
+        while not (Path(sys.argv[2]) / "autosave.npz").exists():  # a slow disk
+            time.sleep(0.01)
         os.kill(os.getpid(), signal.SIGKILL)
 
 drive(Path(sys.argv[1]), Path(sys.argv[2]), on_frame=on_frame)

@@ -75,25 +75,20 @@ class PlaceEvidence:
         n_inliers: landmarks tracked in the frame.
         n_shared: of these, landmarks of the old keyframe that shares the most.
         n_place: landmarks of that keyframe that at least three keyframes see.
-        tracked_close, untracked_close: as of :class:`KeyframeEvidence`.
     """
 
     n_inliers: int
     n_shared: int
     n_place: int
-    tracked_close: int
-    untracked_close: int
 
 
 def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
     """Whether a keyframe here would repeat an old one: the frame tracks as much of the map as one
-    may that is next to that keyframe, and a good part of it is that keyframe's."""
-    starved = (
-        evidence.tracked_close < config.min_tracked_close
-        and evidence.untracked_close > config.min_new_close
-    )
+    may that is next to that keyframe, and a good part of it is that keyframe's.
+
+    Few close points are no reason to map the place once more: mapping it has not made them more.
+    """
     return (
-        not starved
-        and evidence.n_inliers >= config.max_tracked_ratio * evidence.n_place
+        evidence.n_inliers >= config.max_tracked_ratio * evidence.n_place
         and evidence.n_shared >= config.known_ratio * evidence.n_place
     )

@@ -103,17 +103,13 @@ def test_one_camera_needs_no_keyframe_by_time_alone():
     assert decide_monocular(seconds_since_keyframe=1.0, n_inliers=179, mapping_idle=False)
 
 
-KNOWN = PlaceEvidence(
-    n_inliers=150, n_shared=100, n_place=200, tracked_close=100, untracked_close=300
-)
+KNOWN = PlaceEvidence(n_inliers=150, n_shared=100, n_place=200)
 
 
 @pytest.mark.parametrize(("changes", "known"), [
     ({}, True),
     ({"n_inliers": 149}, False),
     ({"n_shared": 99}, False),
-    ({"tracked_close": 99}, False),
-    ({"tracked_close": 99, "untracked_close": 70}, True),
     ({"n_place": 0, "n_inliers": 0, "n_shared": 0}, True),
 ])  # fmt: skip
 def test_a_place_is_known_that_is_tracked_like_its_old_keyframe(changes, known):

@@ -616,15 +616,8 @@ class Slam:
         keyframe, n_shared, n_place = self._mapping.old_keyframe(frame)
         if keyframe < 0:
             return False
-        close = feature_depth(frame.features, self.camera) < self.context.close_depth
-        tracked = frame.landmark >= 0
-        evidence = PlaceEvidence(
-            n_inliers=int(np.count_nonzero(tracked)),
-            n_shared=n_shared,
-            n_place=n_place,
-            tracked_close=int(np.count_nonzero(close & tracked)),
-            untracked_close=int(np.count_nonzero(close & ~tracked)),
-        )
+        n_inliers = int(np.count_nonzero(frame.landmark >= 0))
+        evidence = PlaceEvidence(n_inliers, n_shared, n_place)
         if not is_known_place(evidence, self.config.keyframes):
             return False
         self._mapping.follow(keyframe, frame)

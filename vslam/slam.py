@@ -217,6 +217,11 @@ class Slam:
         return self._mapping.map
 
     @property
+    def detector(self) -> LoopDetector:
+        """What finds loops and relocalises."""
+        return self._detector
+
+    @property
     def is_mapping(self) -> bool:
         """Whether a keyframe is being mapped."""
         return self._mapping.busy

@@ -49,7 +49,7 @@ def drive(
     kind = kind_of_source(cast("SourceName | None", o.dataset), o.data)
     perturbation = parse_perturbation(o.perturb, o.seed)
     of_source = source_options(
-        list(o.calib), o.right, o.fps, o.side_by_side, o.topics, o.depth_scale
+        list(o.calib), o.right, o.depth, o.fps, o.side_by_side, o.topics, o.depth_scale
     )
     with render_bar(shown=shown) as on_render:
         source = open_source(
@@ -57,6 +57,7 @@ def drive(
             start=o.start, every=o.every, max_frames=o.max_frames, sensor=o.sensor,
             on_render=on_render,
         )  # fmt: skip
+    perturbation.bound_to(source)  # refuses laws that the data cannot serve
     if is_live(source):
         if compare_loops:
             raise InputError("--compare-loops: a camera cannot be seen twice; leave it out.")

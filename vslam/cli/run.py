@@ -11,6 +11,7 @@ from vslam.cli.drive import Output, drive
 from vslam.cli.options import (
     KITTI_ROOT,
     Calib,
+    Depth,
     DepthScale,
     DetectorName,
     Every,
@@ -64,6 +65,7 @@ def run(
     seq: Seq = None,
     calib: Calib = None,
     right: Right = None,
+    depth: Depth = None,
     fps: FramesPerSecond = None,
     side_by_side: SideBySide = False,
     topics: Topics = "",
@@ -178,6 +180,7 @@ def run(
         seq=seq,
         calib=tuple(calib or ()),
         right=right,
+        depth=depth,
         fps=fps,
         side_by_side=side_by_side,
         topics=topics,

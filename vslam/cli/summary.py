@@ -24,8 +24,10 @@ def print_rows(rows: Rows) -> None:
 
 def error_rows(errors: Evaluation | ReportJson) -> Rows:
     """ATE, RPE and drift."""
+    causal = getattr(errors, "causal_ate_rmse_m", None)
     rows = [
         ("ATE rmse", f"{errors.ate_rmse_m:.3f} m"),
+        *([("causal ATE", f"{causal:.3f} m, poses as given at the time")] if causal else []),
         ("ATE mean, max", f"{errors.ate_mean_m:.3f} m, {errors.ate_max_m:.3f} m"),
         ("RPE per frame", f"{errors.rpe_m:.4f} m, {errors.rpe_deg:.4f} deg"),
     ]

@@ -82,11 +82,12 @@ def list_images(folder: Path) -> dict[str, Path]:
     """Image files of a folder by stem, in the order of their names; empty without the folder."""
     if not folder.is_dir():
         return {}
-    return {
-        path.stem: path
-        for path in sorted(folder.iterdir())
-        if path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
-    }
+    return {path.stem: path for path in sorted(folder.iterdir()) if is_image(path)}
+
+
+def is_image(path: Path) -> bool:
+    """Whether a file is named as an image."""
+    return path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
 
 
 def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bool]) -> Path | None:
@@ -155,14 +156,18 @@ def read_grey(path: Path) -> Image:
     """
     import cv2
 
+    from vslam.datasets.png import decode_png
+
     try:
-        data = np.fromfile(path, np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+        data = path.read_bytes()
+        if (image := decode_png(data)) is not None:
+            return image
+        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     except (OSError, cv2.error):
-        image = None
-    if image is None:
+        decoded = None
+    if decoded is None:
         raise UnreadableImageError(path, "cannot be decoded; download the file again.")
-    return np.asarray(image, np.uint8)
+    return np.asarray(decoded, np.uint8)
 
 
 def read_grey_of_size(path: Path, width: int, height: int) -> Image:

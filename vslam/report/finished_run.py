@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from vslam.backend.pose_graph import PoseGraph, essential_graph
 from vslam.camera import Camera, same_camera
 from vslam.config import load_config
-from vslam.datasets import DATASETS, open_sequence
+from vslam.datasets import known_datasets, open_sequence
 from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError
 from vslam.loops import LoopEdge
@@ -89,10 +89,11 @@ def open_images(
             f"{run.folder}: the map is of several drives, whose images cannot be opened together; "
             "export g2o, euroc or ply --no-colours, which need none."
         )
-    if report.dataset not in DATASETS:
+    if report.dataset not in known_datasets():
         raise InputError(
             f"{run.folder}: images of {report.dataset} cannot be opened again, only those of "
-            f"{', '.join(DATASETS)}; export g2o, euroc or ply --no-colours, which need none."
+            f"{', '.join(known_datasets())}; export g2o, euroc or ply --no-colours, which need "
+            "none."
         )
     sequence = open_sequence(
         report.dataset,

@@ -18,7 +18,7 @@ from vslam.maps.storage import save_map
 from vslam.report.frame_table import write_frames
 from vslam.report.schema import ReportJson
 from vslam.report.summary import evaluate_run, summarize
-from vslam.run.outcome import RunOutcome, matched_ground_truth
+from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_truth
 from vslam.trajectory import write_kitti, write_tum
 
 _LONGEST_PART = 60  # characters: file systems take 255 for a name, and a URL may have more
@@ -64,8 +64,9 @@ def write_results(
 ) -> ReportJson:
     """Evaluate a run, in any state of completion, and write all that is known of it.
 
-    Files: ``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``,
-    ``config.json`` (read by ``--config``), ``keyframes.tum``, ``frames.csv``, ``report.json``,
+    Files: ``trajectory_kitti.txt``, ``trajectory.tum``, ``trajectory_causal.tum`` (poses as they
+    were given at the time), ``ground_truth_kitti.txt``, ``config.json`` (read by ``--config``),
+    ``keyframes.tum``, ``frames.csv``, ``report.json``,
     ``report.md``, ``report.html`` (one file, no network request), ``figures/*.png``, ``map.npz``,
     ``map.ply``; what matters most comes first.
 
@@ -81,6 +82,7 @@ def write_results(
     """
     try:
         write_trajectories(folder, outcome)
+        write_tum(folder / "trajectory_causal.tum", causal_trajectory(outcome))
         write_tum(folder / "keyframes.tum", outcome.keyframes)
         write_frames(folder / "frames.csv", outcome.tracks)
         config = outcome.settings.config.model_dump_json(indent=2) + "\n"

@@ -47,6 +47,9 @@ def headlines(report: ReportJson) -> list[Headline]:
         ),
         *_in_map(report),
         Headline("ATE RMSE", _number(report.ate_rmse_m, "m"), evaluated),
+        Headline(
+            "Causal ATE", _number(report.causal_ate_rmse_m, "m"), "poses as given at the time"
+        ),
         Headline("RPE", _number(report.rpe_m, "m"), f"a frame; rotation {rotation}"),
         Headline("t_rel", _number(report.t_rel_percent, "%"), "KITTI drift over 100-800 m"),
         Headline("r_rel", _number(report.r_rel_deg_per_100m, "°"), "every 100 m"),

@@ -101,6 +101,8 @@ class ReportJson(_Model):
 
     Errors are None without ground truth, and KITTI's drift also on paths shorter than 100 m;
     ``evaluation_remark`` says why there are none, or of how many frames they are.
+    ``causal_ate_rmse_m`` is of the poses as they were given at the time
+    (``trajectory_causal.tum``), after an alignment of their own.
     ``without_loops`` is of the same run with the detector ``none`` (``--compare-loops``).
     ``frames`` counts the frames done; of them ``skipped_frames`` had an unreadable image and
     ``dropped_frames`` were overtaken by a newer one in a real-time run, whose ``latency_ms`` is
@@ -122,6 +124,7 @@ class ReportJson(_Model):
 
     alignment: str | None
     ate_rmse_m: float | None
+    causal_ate_rmse_m: float | None = None
     ate_mean_m: float | None = None
     ate_max_m: float | None = None
     rpe_m: float | None

@@ -27,7 +27,7 @@ from vslam.report.schema import (
     RevisitEntry,
     StageTime,
 )
-from vslam.run.outcome import RunOutcome, matched_ground_truth
+from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_truth
 
 
 def summarize(
@@ -61,6 +61,7 @@ def summarize(
         interrupted=outcome.interrupted,
         alignment=evaluation.alignment if evaluation else None,
         ate_rmse_m=evaluation.ate_rmse_m if evaluation else None,
+        causal_ate_rmse_m=causal_ate(outcome),
         ate_mean_m=evaluation.ate_mean_m if evaluation else None,
         ate_max_m=evaluation.ate_max_m if evaluation else None,
         rpe_m=evaluation.rpe_m if evaluation else None,
@@ -108,6 +109,18 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
     if found.frames == len(outcome.trajectory):
         return found, None
     return found, f"{found.frames} of {len(outcome.trajectory)} frames have a ground truth"
+
+
+def causal_ate(outcome: RunOutcome) -> float | None:
+    """ATE of the poses as they were given at the time, None where it cannot be said."""
+    ground_truth = matched_ground_truth(outcome)
+    if ground_truth is None or not outcome.tracks:
+        return None
+    try:
+        given = causal_trajectory(outcome)
+        return evaluate_trajectory(given, ground_truth, outcome.settings.alignment).ate_rmse_m
+    except InputError:
+        return None
 
 
 def _figures_without_loops(outcome: RunOutcome) -> LoopFigures | None:

@@ -22,6 +22,7 @@ class RunOptions(BaseModel):
     seq: str | None = None
     calib: tuple[Path, ...] = ()
     right: Path | None = None
+    depth: Path | None = None
     fps: float | None = None
     side_by_side: bool = False
     topics: str = ""
@@ -52,7 +53,7 @@ def write_options(folder: Path, options: RunOptions) -> None:
     data = Path(options.data)
     absolute: dict[str, object] = {
         name: path.resolve()
-        for name in ("right", "weights", "map_file", "save_map")
+        for name in ("right", "depth", "weights", "map_file", "save_map")
         if (path := getattr(options, name)) is not None
     }
     absolute["data"] = str(data.resolve()) if data.exists() else options.data

@@ -103,6 +103,15 @@ class RunOutcome:
     without_loops: RunOutcome | None = None
 
 
+def causal_trajectory(outcome: RunOutcome) -> Trajectory:
+    """The pose of every frame as it was given at the time, in the map as it stood then: later
+    corrections, by bundle adjustment or a loop, are not in it. A lost or dropped frame has its
+    predicted pose."""
+    times = np.array([track.timestamp for track in outcome.tracks], np.float64)
+    poses = [track.T_wc for track in outcome.tracks]
+    return Trajectory(times, np.array(poses, np.float64).reshape(-1, 4, 4))
+
+
 def ground_truth_of(source: Sequence | Stream) -> Trajectory | None:
     """The ground truth of all frames that have one, None without any."""
     if isinstance(source, Stream) or source.ground_truth is None:

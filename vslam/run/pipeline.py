@@ -29,10 +29,15 @@ from vslam.camera import Camera, ImageMap, same_camera
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import Stream, TimedFrame, is_live, timed_frames
-from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
+from vslam.errors import (
+    BrokenSourceError,
+    DroppedFrameError,
+    InputError,
+    UnreadableImageError,
+)
 from vslam.features import Features, TrackResult
 from vslam.frontend.tracking import TrackingContext, extract_features
-from vslam.loopclosure.registry import create_detector, create_images
+from vslam.loopclosure.registry import create_detector, create_images, problem_of
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.machine import peak_memory_mb, process_age
 from vslam.map import Map
@@ -48,12 +53,14 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame ready to be tracked, or the reason why it cannot be read."""
+    """A frame ready to be tracked, or the reason why it cannot be read; ``dropped`` by a
+    perturbation."""
 
     left: NDArray[np.uint8] | None
     features: Features | None
     stage_ms: dict[str, float]
     problem: str | None = None
+    dropped: bool = False
 
 
 def run_sequence(
@@ -70,8 +77,8 @@ def run_sequence(
 
     A frame that cannot be read is skipped: it gets a predicted pose, counts as lost and is listed
     in the outcome. One that is dropped in a real-time run gets an interpolated pose. Ctrl-C ends
-    the run after the current frame, a source that breaks off after its last good one; all done so
-    far is kept.
+    the run after the current frame, a source that breaks off after its last good one, a detector of
+    another package where it fails; all done so far is kept.
 
     Args:
         autosave: saves what is done while the run goes on.
@@ -85,6 +92,7 @@ def run_sequence(
     skipped = list(before.skipped)
     latency_ms = list(before.latency_ms)
     n_told = 0  # loops that the recorder knows of
+    perturbation = perturbation.bound_to(sequence)
     recorder.begin(sequence.camera, ground_truth_of(sequence))
     startup = process_age()
     wall, cpu = time.perf_counter(), time.process_time()
@@ -109,7 +117,7 @@ def run_sequence(
             frames = dropwhile(partial(_not_later, tracks[-1].timestamp), frames)
         for played in _prepared(frames, slam.context, settings, live=is_live(sequence)):
             timestamp, frame = played.timestamp, played.made
-            if frame is None:
+            if frame is None or frame.dropped:
                 tracks.append(slam.skip(timestamp, dropped=True))
                 autosave.frame(tracks[-1])
                 on_frame(tracks[-1])
@@ -132,11 +140,16 @@ def run_sequence(
                 n_told = _tell_loops(recorder, slam, n_told)
             on_frame(result)
             autosave.offer(slam, so_far)
+            if problem := problem_of(slam.detector):
+                broken.append(problem)
+                break
             if interrupted.is_set():
                 if not is_live(sequence):  # a camera has no other end
                     broken.append("Ctrl-C")
                 break
         slam.finish()
+    if not broken and (problem := problem_of(slam.detector)):
+        broken.append(problem)
     autosave.close(slam, so_far, whole=not broken)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     _tell_loops(recorder, slam, n_told)
@@ -315,7 +328,8 @@ def prepare_frame(
     try:
         left, second = frame.read(image_map)
     except UnreadableImageError as error:
-        return PreparedFrame(None, None, {}, str(error))
+        dropped = isinstance(error, DroppedFrameError)
+        return PreparedFrame(None, None, {}, str(error), dropped)
     read = time.perf_counter()
     features = extract_features(left, second, context, image_map)
     done = time.perf_counter()

@@ -1,0 +1,170 @@
+"""Decoding the PNG files that rectified stereo sequences consist of: grey, 8 bits, not interlaced.
+
+OpenCV's decoder spends as much time on undoing the filters of the lines as on inflating, because
+every pixel waits for the one on its left. Here 32 lines are decoded at once, each one pixel behind
+the line above, so that a register holds a pixel of each (a wavefront).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.kernels import inline, inner_kernel, kernel
+
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+GREY_8_BITS = (8, 0, 0, 0, 0)  # depth, colour type, compression, filter method, no interlacing
+# Chunks that change no pixel. Others may (transparency, orientation, animation).
+WITHOUT_EFFECT = {b"gAMA", b"cHRM", b"sRGB", b"pHYs", b"tIME", b"tEXt", b"bKGD"}
+LANES = 32  # lines decoded at once
+MAX_PIXELS = 1 << 28
+
+
+def decode_png(data: bytes) -> NDArray[np.uint8] | None:
+    """Decode a file: ``(H, W)`` uint8, exactly as libpng does.
+
+    None for all that is not an undamaged PNG of 8-bit grey levels, not interlaced: every check sum
+    is looked at. What becomes of such a file, another decoder may say.
+    """
+    import deflate
+
+    try:
+        size, compressed = _contents(data)
+        height, width = size
+        filtered = deflate.zlib_decompress(compressed, height * (width + 1))
+    except (ValueError, struct.error, deflate.DeflateError):
+        return None
+    if len(filtered) != height * (width + 1):
+        return None
+    image = np.empty((height, width), np.uint8)
+    lines = np.frombuffer(filtered, np.uint8).reshape(height, width + 1)
+    return image if unfilter(lines, image) else None
+
+
+def _contents(data: bytes) -> tuple[tuple[int, int], bytes]:
+    """Height and width, and the joined image data.
+
+    Raises:
+        ValueError: not a file of this kind, or damaged.
+    """
+    chunks = _chunks(data)
+    kind, header = next(chunks)
+    width, height, *form = struct.unpack(">II5B", header)
+    if kind != b"IHDR" or tuple(form) != GREY_8_BITS or not 0 < width * height <= MAX_PIXELS:
+        raise ValueError("not a PNG of 8-bit grey levels, not interlaced")
+    parts: list[memoryview] = []
+    for kind, body in chunks:
+        if kind == b"IDAT":
+            parts.append(body)
+        elif kind not in WITHOUT_EFFECT:
+            raise ValueError(f"chunk {kind!r}")
+    return (height, width), b"".join(parts)
+
+
+def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
+    """Kind and contents of every chunk but the last one.
+
+    Raises:
+        ValueError, struct.error: cut off, or a check sum is wrong.
+    """
+    import deflate
+
+    if not data.startswith(SIGNATURE):
+        raise ValueError("no PNG")
+    view = memoryview(data)
+    at = len(SIGNATURE)
+    while True:
+        length, kind = struct.unpack_from(">I4s", data, at)
+        end = at + 8 + length
+        (expected,) = struct.unpack_from(">I", data, end)
+        if deflate.crc32(view[at + 4 : end]) != expected:
+            raise ValueError("wrong check sum")
+        if kind == b"IEND":
+            return
+        yield kind, view[at + 8 : end]
+        at = end + 4
+
+
+@kernel
+def unfilter(lines, image):
+    """Undo the filters of ``(H, W + 1)`` uint8 lines, which begin with the number of their filter.
+
+    Lane l of step s is pixel s - l of the l-th line of a block, so that the pixels it needs are
+    done: the left one by the same lane, the two above by the lane before, one and two steps ago.
+
+    Args:
+        image: ``(H, W)`` uint8, written.
+
+    Returns:
+        Whether all filters are known.
+    """
+    height, width = image.shape
+    n = np.uintp(width)
+    steps = width + LANES - 1
+    # Of each step all lanes; the decoded ones behind a lane that holds the line above the block,
+    # and behind two steps of zeros, the pixels left of the image.
+    coded = np.zeros(steps * LANES, np.uint8)
+    decoded = np.zeros((steps + 2) * (LANES + 1), np.uint8)
+    left, above = np.zeros(LANES, np.int16), np.zeros(LANES, np.int16)
+    corner = np.zeros(LANES, np.int16)
+    is_average = np.zeros(LANES, np.bool_)
+    for first in range(0, height, LANES):
+        count = min(LANES, height - first)
+        for lane in range(count):
+            line = lines[first + lane]
+            if not choose_filter(line[0], lane, left, above, corner, is_average):
+                return False
+            skewed = coded[lane * (LANES + 1) :]
+            for x in range(n):
+                skewed[x * np.uintp(LANES)] = line[x + np.uintp(1)]
+        if first > 0:
+            line_above = image[first - 1]
+            for x in range(n):
+                decoded[(x + np.uintp(1)) * np.uintp(LANES + 1)] = line_above[x]
+        advance(coded, decoded, left, above, corner, is_average, steps)
+        for lane in range(count):
+            target = image[first + lane]
+            skewed = decoded[(lane + 2) * (LANES + 1) + lane + 1 :]
+            for x in range(n):
+                target[x] = skewed[x * np.uintp(LANES + 1)]
+    return True
+
+
+@inline
+def choose_filter(number, lane, left, above, corner, is_average):
+    """Set the masks of a lane for a filter of the PNG specification, section 9.2.
+
+    Paeth's predictor with the pixels above taken for zeros is the left pixel (Sub), with the others
+    taken for zeros the one above (Up).
+    """
+    left[lane] = 255 if number == 1 or number == 4 else 0
+    above[lane] = 255 if number == 2 or number == 4 else 0
+    corner[lane] = 255 if number == 4 else 0
+    is_average[lane] = number == 3
+    return number <= 4
+
+
+@inner_kernel
+def advance(coded, decoded, left, above, corner, is_average, steps):
+    """Decode all steps of a block."""
+    lanes, row, one = np.uintp(LANES), np.uintp(LANES + 1), np.uintp(1)
+    for step in range(np.uintp(steps)):
+        before = decoded[step * row : (step + one) * row]  # two steps ago
+        last = decoded[(step + one) * row : (step + np.uintp(2)) * row]
+        out = decoded[(step + np.uintp(2)) * row + one : (step + np.uintp(3)) * row]
+        code = coded[step * lanes : (step + one) * lanes]
+        for lane in range(lanes):
+            a_all, b_all = np.int16(last[lane + one]), np.int16(last[lane])
+            a, b = np.int16(a_all & left[lane]), np.int16(b_all & above[lane])
+            c = np.int16(np.int16(before[lane]) & corner[lane])
+            from_c_b, from_c_a = np.int16(b - c), np.int16(a - c)
+            error_a, error_b = np.int16(abs(from_c_b)), np.int16(abs(from_c_a))
+            error_c = np.int16(abs(np.int16(from_c_a + from_c_b)))
+            other = b if error_b <= error_c else c
+            predicted = a if (error_a <= error_b) & (error_a <= error_c) else other
+            average = np.int16(np.int16(a_all + b_all) >> 1)
+            predicted = average if is_average[lane] else predicted
+            out[lane] = np.uint8(np.int16(code[lane]) + predicted)

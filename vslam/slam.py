@@ -456,12 +456,16 @@ class Slam:
         return self._relocalise_learned(frame, candidates)
 
     def _is_doubtful(self, frame: Frame, inliers: int) -> bool:
-        """Whether a frame after a gap tracks so little that it may be matched with other things."""
+        """Whether a frame whose pose could hardly be predicted, after a gap or next to one found
+        in the map, tracks so little that it may be matched with other things."""
         assert self.frame is not None
         usual = self._poses.timestamp(-1) - self._poses.timestamp(-2) if len(self._poses) > 1 else 0
         config = self.config.relocalization
         gap = frame.timestamp - self.frame.timestamp > config.doubtful_gap * usual > 0.0
-        return gap and inliers < config.doubtful_share * self._mapping.n_reference
+        old = self._mapping.n_keyframes > self.config.tracking.young_keyframes
+        unpredicted = self._velocity is None and old
+        few = inliers < config.doubtful_share * self._mapping.n_reference
+        return few and (gap or unpredicted)
 
     def _find_better(self, frame: Frame, inliers: int) -> int:
         """Look for a frame in the whole map, and leave it as it is unless it tracks more there;

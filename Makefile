@@ -1,6 +1,6 @@
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help install demo test check format clean
+.PHONY: help install demo test check format docs clean
 
 VENV ?= .venv
 BIN := $(abspath $(VENV))/bin
@@ -32,6 +32,9 @@ check: $(INSTALLED)  ## check format, lint and types
 format: $(INSTALLED)  ## format the code and repair what lint can
 	$(BIN)/ruff format
 	$(BIN)/ruff check --fix
+
+docs: $(INSTALLED)  ## build the documentation site, warnings are errors: build/site/index.html
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs build/site
 
 clean:  ## remove build products and caches (.venv, data and runs stay)
 	rm -rf build dist vslam.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -9,7 +9,6 @@ neighbours in memory: going down a level reads one piece of 32 k bytes.
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError, ResultsError
 from vslam.kernels import hamming, kernel
+from vslam.untrusted import read_npz
 
 SCHEMA = 1
 SHIPPED = Path(__file__).with_name("vocabulary.npz")
@@ -216,21 +216,22 @@ def load(path: Path = SHIPPED) -> Vocabulary:
         InputError: no such file, damaged, of another schema, or not a vocabulary.
     """
     again = "make it again with vslam vocabulary train or convert"
+    parts = read_npz(path, "a vocabulary", again)
     try:
-        with np.load(path, allow_pickle=False) as parts:
-            if "schema" not in parts or "n_children" not in parts:
-                raise InputError(f"{path}: holds no vocabulary; {again}.")
-            if (schema := int(parts["schema"])) != SCHEMA:
-                raise InputError(f"{path}: schema {schema}, this version reads {SCHEMA}; {again}.")
-            return from_children(
-                int(parts["branching"]),
-                int(parts["levels"]),
-                parts["descriptors"].astype(np.uint64, copy=False),
-                parts["n_children"].astype(np.uint8, copy=False),
-                parts["weight"].astype(np.float32, copy=False),
-            )
-    except OSError as error:
-        why = error.strerror or "not an npz file"
-        raise InputError(f"{path}: cannot read the vocabulary ({why}); {again}.") from error
-    except (ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        if "schema" not in parts or "n_children" not in parts:
+            raise InputError(f"{path}: holds no vocabulary; {again}.")
+        if (schema := int(parts["schema"])) != SCHEMA:
+            raise InputError(f"{path}: schema {schema}, this version reads {SCHEMA}; {again}.")
+        kinds = (("descriptors", np.uint64), ("n_children", np.uint8), ("weight", np.float32))
+        for name, kind in kinds:
+            if parts[name].dtype != kind:
+                raise ValueError(f"{name} is {parts[name].dtype}")
+        return from_children(
+            int(parts["branching"]),
+            int(parts["levels"]),
+            parts["descriptors"],
+            parts["n_children"],
+            parts["weight"],
+        )
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputError(f"{path}: damaged vocabulary ({error}); {again}.") from error

@@ -26,7 +26,7 @@ FOLDERS = {
 # together on one level may not import each other, save where SIBLINGS says so.
 LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.errors", "vslam.machine", "vslam.kernels"),
-    ("vslam.plugins",),
+    ("vslam.plugins", "vslam.untrusted"),
     ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.features", "vslam.camera"),
     (
         "vslam.loops",
@@ -224,7 +224,7 @@ def test_heavy_libraries_stay_where_they_belong(library):
 
 
 def test_few_modules_lie_directly_in_the_package():
-    assert len(list((ROOT / "vslam").glob("*.py"))) <= 22
+    assert len(list((ROOT / "vslam").glob("*.py"))) <= 24
 
 
 def test_long_files_give_their_reason():

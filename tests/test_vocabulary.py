@@ -435,7 +435,7 @@ def test_commands_train_convert_and_show(call, tmp_path):
         (("train", "broken.jpg", "--out", "v.dat"), "name ends in .npz or in .txt"),
         (("train", "broken.jpg", "--out", "none/v.npz"), "there is no folder none"),
         (("convert", "v.npz", "v.dat"), "name ends in .npz or in .txt"),
-        (("convert", "v.npz", "v.txt"), "v.npz: cannot read the vocabulary (No such file"),
+        (("convert", "v.npz", "v.txt"), "v.npz: not a vocabulary (No such file"),
         (("info", "broken.jpg"), "name ends in .npz or in .txt"),
     ],
 )

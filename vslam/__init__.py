@@ -10,6 +10,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from vslam.untrusted import limit_images
+
 __version__ = "0.1.0"
 __all__ = ["Camera", "Slam", "TrackResult", "TrackingState", "__version__"]
 
@@ -19,6 +21,8 @@ _HOME = {
     "TrackResult": "vslam.features",
     "TrackingState": "vslam.features",
 }
+
+limit_images()
 
 if TYPE_CHECKING:
     from vslam.camera import Camera

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from vslam.errors import InputError, ResultsError
 from vslam.loopclosure.siamese.image_source import ImageSource
 from vslam.loopclosure.siamese.images import Fit, Size
+from vslam.untrusted import read_npz
 
 
 def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> None:
@@ -46,16 +46,16 @@ def read_pack(path: Path) -> list[ImageSource]:
     Raises:
         InputError: missing or damaged file.
     """
+    content = read_npz(path, "a pack of places", "write it with 'vslam export places'")
     try:
-        with np.load(path) as content:
-            sources = []
-            for k in range(int(content["count"])):
-                name, family, *names = content[f"{k}_text"].tolist()
-                ends = np.cumsum(content[f"{k}_sizes"])[:-1]
-                images = tuple(np.split(content[f"{k}_bytes"], ends))
-                relation, unit = content[f"{k}_relation"], content[f"{k}_unit"]
-                sources.append(ImageSource(name, family, tuple(names), images, relation, unit))
-    except (OSError, KeyError, ValueError, BadZipFile) as error:
+        sources = []
+        for k in range(int(content["count"])):
+            name, family, *names = content[f"{k}_text"].tolist()
+            ends = np.cumsum(content[f"{k}_sizes"])[:-1]
+            images = tuple(np.split(content[f"{k}_bytes"], ends))
+            relation, unit = content[f"{k}_relation"], content[f"{k}_unit"]
+            sources.append(ImageSource(name, family, tuple(names), images, relation, unit))
+    except (KeyError, ValueError, TypeError) as error:
         raise InputError(
             f"{path}: not a pack of places; write it with 'vslam export places'."
         ) from error

@@ -156,6 +156,8 @@ def publish(outcome: CellOutcome, out: Path) -> None:
         shutil.rmtree(part, ignore_errors=True)
         for name, data in outcome.files.items():
             path = part / name
+            if not path.resolve().is_relative_to(part.resolve()):
+                raise ResultsError(f"{name}: a worker sent a file outside its folder.")
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.suffix in (".json", ".md", ".html"):  # the command that reproduces the ATE
                 data = data.replace(outcome.folder.encode(), shlex.quote(str(target)).encode())

@@ -18,6 +18,8 @@ from vslam.calibration.models import Array
 from vslam.errors import InputError
 
 _HEADER = re.compile(r"\A\ufeff?%YAML[: ]1\.\d.*\n?")
+# A list of aliases of lists of aliases, and so on, is a few lines of text and gigabytes of numbers.
+_ALIAS = re.compile(r"(?:^|[\s\[{,:])\*\w")
 _NO_SPACE = re.compile(r"^(\s*[\w.]+):(?=\[)", re.MULTILINE)
 
 
@@ -96,6 +98,8 @@ def read_document(path: Path) -> Document:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: the calibration is missing or no text; name another.") from error
     text = _NO_SPACE.sub(r"\1: ", _HEADER.sub("", text))
+    if _ALIAS.search(text):
+        raise InputError(f"{path}: the calibration has an alias of YAML (*NAME); write it out.")
     try:
         values = yaml.load(text, yaml.BaseLoader)
     except (yaml.YAMLError, RecursionError) as error:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vslam.camera import ImageMap
 from vslam.datasets.sequence import Image
 from vslam.errors import InputError, UnreadableImageError
+from vslam.untrusted import MOST_PIXELS
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
 
@@ -152,7 +153,7 @@ def read_grey(path: Path) -> Image:
     the upper eight.
 
     Raises:
-        UnreadableImageError: missing or damaged.
+        UnreadableImageError: missing, damaged or larger than `MOST_PIXELS`.
     """
     import cv2
 
@@ -163,7 +164,13 @@ def read_grey(path: Path) -> Image:
         if (image := decode_png(data)) is not None:
             return image
         decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except (OSError, cv2.error):
+    except cv2.error as error:
+        if "MAX_IMAGE" in str(error):
+            raise UnreadableImageError(
+                path, f"larger than {MOST_PIXELS / 1e6:.0f} million pixels; scale it down."
+            ) from error
+        decoded = None
+    except OSError:
         decoded = None
     if decoded is None:
         raise UnreadableImageError(path, "cannot be decoded; download the file again.")

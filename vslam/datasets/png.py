@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.kernels import inline, inner_kernel, kernel
+from vslam.untrusted import MOST_PIXELS
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 GREY_8_BITS = (8, 0, 0, 0, 0)  # depth, colour type, compression, filter method, no interlacing
 # Chunks that change no pixel. Others may (transparency, orientation, animation).
 WITHOUT_EFFECT = {b"gAMA", b"cHRM", b"sRGB", b"pHYs", b"tIME", b"tEXt", b"bKGD"}
 LANES = 32  # lines decoded at once
-MAX_PIXELS = 1 << 28
 
 
 def decode_png(data: bytes) -> NDArray[np.uint8] | None:
@@ -53,7 +53,7 @@ def _contents(data: bytes) -> tuple[tuple[int, int], bytes]:
     chunks = _chunks(data)
     kind, header = next(chunks)
     width, height, *form = struct.unpack(">II5B", header)
-    if kind != b"IHDR" or tuple(form) != GREY_8_BITS or not 0 < width * height <= MAX_PIXELS:
+    if kind != b"IHDR" or tuple(form) != GREY_8_BITS or not 0 < width * height <= MOST_PIXELS:
         raise ValueError("not a PNG of 8-bit grey levels, not interlaced")
     parts: list[memoryview] = []
     for kind, body in chunks:

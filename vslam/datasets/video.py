@@ -12,6 +12,7 @@ from vslam.datasets.capture import Capture, open_capture, read_sides, sizes_of
 from vslam.datasets.sequence import Image
 from vslam.datasets.stream import TimedFrame
 from vslam.errors import BrokenSourceError, InputError
+from vslam.untrusted import MOST_PIXELS
 
 _CONVERT = "convert the video, with ffmpeg -i VIDEO -c:v libx264 -crf 12 NEW.mp4 for example"
 _MISSING_SHARE = 0.05  # what the end may lack of the frames that the file speaks of: it estimates
@@ -76,6 +77,7 @@ def open_video(
             "stereo pair, or run with --sensor mono."
         )
     capture = _open(path)
+    _check_size(path, capture)
     n = _count(capture)
     first = list(islice(_images(capture), 2))
     if not first:
@@ -97,6 +99,19 @@ def _open(path: Path) -> Capture:
             f"{_CONVERT}."
         )
     return capture
+
+
+def _check_size(path: Path, capture: Capture) -> None:
+    """Before the first frame takes the memory that the header asks for."""
+    import cv2
+
+    kinds = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
+    width, height = (capture.get(kind) for kind in kinds)
+    if width * height > MOST_PIXELS:
+        raise InputError(
+            f"{path}: frames of {width:.0f}x{height:.0f} pixels; {MOST_PIXELS / 1e6:.0f} million "
+            "are the limit, so scale the video down."
+        )
 
 
 def _count(capture: Capture) -> int | None:

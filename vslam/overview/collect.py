@@ -59,7 +59,7 @@ def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
         if (folder / "ground_truth_kitti.txt").is_file():
             found.truth.setdefault((entry.drive.dataset, entry.drive.place), folder)
         if (folder / "config.json").is_file():
-            configs.setdefault((folder / "config.json").read_text(), folder)
+            configs.setdefault((folder / "config.json").read_text(errors="replace"), folder)
     if not found.runs:
         raise InputError(
             f"{', '.join(map(str, folders))}: no finished run here; name folders that 'vslam run' "
@@ -109,7 +109,7 @@ def _read(folder: Path, notes: list[str]) -> ReportJson | None:
     path = folder / "report.json"
     try:
         content = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         notes.append(f"{path} is damaged and left out")
         return None
     if isinstance(content, dict) and content.get("kind") == "overview":

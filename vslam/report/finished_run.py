@@ -66,7 +66,7 @@ def read_report(folder: Path) -> ReportJson:
         raise InputError(
             f"{path}: report schema {schema}, this version reads {known}; run again with it."
         ) from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: missing or damaged; name the folder of a run.") from error
 
 

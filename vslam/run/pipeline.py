@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import dropwhile
 from pathlib import Path
@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, ImageMap, same_camera
+from vslam.camera import Camera, DepthImage, Image, ImageMap, same_camera
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import Stream, TimedFrame, is_live, timed_frames
@@ -36,6 +36,7 @@ from vslam.errors import (
     UnreadableImageError,
 )
 from vslam.features import Features, TrackResult
+from vslam.frontend.sides import Sides, compare_sides
 from vslam.frontend.tracking import TrackingContext, extract_features
 from vslam.loopclosure.registry import create_detector, create_images, problem_of
 from vslam.loops import LoopCorrection, LoopEdge
@@ -46,6 +47,7 @@ from vslam.run.autosave import NO_AUTOSAVE, Autosave, Progress, Unfinished, in_f
 from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
 from vslam.run.realtime import Played, play
 from vslam.run.recorder import NullRecorder, Recorder
+from vslam.run.rig import measure_rig, residual_warnings, rig_warnings
 from vslam.slam import Slam
 
 _log = logging.getLogger(__name__)
@@ -61,6 +63,7 @@ class PreparedFrame:
     stage_ms: dict[str, float]
     problem: str | None = None
     dropped: bool = False
+    sides: Sides = field(default_factory=Sides)
 
 
 def run_sequence(
@@ -90,6 +93,7 @@ def run_sequence(
     before = Progress() if resume is None else resume.progress
     tracks = list(before.tracks)
     skipped = list(before.skipped)
+    sides: list[Sides] = []
     latency_ms = list(before.latency_ms)
     n_told = 0  # loops that the recorder knows of
     perturbation = perturbation.bound_to(sequence)
@@ -122,6 +126,7 @@ def run_sequence(
                 autosave.frame(tracks[-1])
                 on_frame(tracks[-1])
                 continue
+            sides.append(frame.sides)
             if frame.features is None or frame.left is None:
                 skipped.append(f"frame {len(tracks)}: {frame.problem}")
                 _log.warning("frame %d skipped: %s", len(tracks), frame.problem)
@@ -164,6 +169,10 @@ def run_sequence(
         keyframes=slam.keyframe_trajectory(),
         tracks=tracks,
         skipped=skipped,
+        warnings=[
+            *rig_warnings(sides),
+            *residual_warnings(measure_rig(slam.map, sequence.camera), sequence.camera),
+        ],
         wall_s=before.wall_s + wall,
         cpu_s=before.cpu_s + cpu,
         startup_s=startup,
@@ -334,7 +343,13 @@ def prepare_frame(
     features = extract_features(left, second, context, image_map)
     done = time.perf_counter()
     stage_ms = {"read": 1e3 * (read - start), "extract": 1e3 * (done - read)}
-    return PreparedFrame(left, features, stage_ms)
+    return PreparedFrame(left, features, stage_ms, sides=_sides(left, second, context))
+
+
+def _sides(left: Image, second: Image | DepthImage | None, context: TrackingContext) -> Sides:
+    if second is None or second.dtype != np.uint8:
+        return Sides()
+    return compare_sides(left, np.asarray(second, np.uint8), context.config.stereo)
 
 
 def _tell_loops(recorder: Recorder, slam: Slam, n_told: int) -> int:

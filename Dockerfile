@@ -1,0 +1,29 @@
+# vslam for the CPU, without root:
+#
+#   docker build --tag vslam .
+#   docker run --rm --volume "$PWD/runs:/work/runs" vslam run --dataset synthetic --seq demo
+#
+# On Linux, add --user "$(id -u):$(id -g)" if the folder runs/ is not user 1000's.
+FROM python:3.11-slim AS wheel
+WORKDIR /source
+COPY . .
+RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheel .
+
+FROM python:3.11-slim
+COPY --from=wheel /wheel /wheel
+COPY constraints.txt /wheel/constraints.txt
+# torch for the CPU first: the one on PyPI brings gigabytes of CUDA.
+RUN pip install --no-cache-dir torch --index-url https://download.pytorch.org/whl/cpu \
+        --constraint /wheel/constraints.txt \
+    && pip install --no-cache-dir "$(ls /wheel/vslam-*.whl)[bag]" \
+        --constraint /wheel/constraints.txt \
+    && useradd --create-home --uid 1000 vslam \
+    && install --directory --owner vslam /work /work/runs \
+    && install --directory --mode 1777 /cache
+ENV NUMBA_CACHE_DIR=/cache/numba VSLAM_CACHE=/cache/vslam MPLCONFIGDIR=/cache/matplotlib
+USER vslam
+WORKDIR /work
+# Kernels are compiled here, once, and not in the first run.
+RUN python -c "from vslam.run.warmup import compile_kernels; compile_kernels(processes=2)"
+ENTRYPOINT ["vslam"]
+CMD ["--help"]

@@ -1,0 +1,81 @@
+"""Sphinx: the documentation site (``make docs``).
+
+Sphinx with furo and MyST rather than MkDocs: docstrings carry Sphinx's roles already, autodoc
+imports the package as it is installed (three of its folders lie outside ``vslam/``), and the theme
+asks no other host for fonts or scripts.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from site_reference import write_reference
+
+from vslam import __version__
+
+ROOT = Path(__file__).resolve().parent.parent
+project, author, version = "vslam", "The vslam authors", __version__
+copyright = author
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["notebooks"]
+html_theme = "furo"
+html_title = f"vslam {__version__}"
+html_copy_source = False
+html_show_sphinx = False
+pygments_style, pygments_dark_style = "tango", "monokai"
+suppress_warnings = ["myst.header", "misc.highlighting_failure"]
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_default_options = {"members": True, "show-inheritance": False}
+napoleon_use_ivar = True
+default_role = "py:obj"
+myst_heading_anchors = 4
+myst_links_external_new_tab = False
+
+# Pages that lie elsewhere in the repository, by their path there.
+_PAGES = {
+    "datasets.md": "about/datasets.md",
+    "CONTRIBUTING.md": "about/contributing.md",
+    "CHANGELOG.md": "about/changelog.md",
+    "loopclosure/vocabulary.md": "about/vocabulary.md",
+}
+_LINK = re.compile(r"\[([^]]*)\]\((?!https?:|#|mailto:)([^)#\s]+)(#[^)\s]*)?\)")
+
+
+def _mend_links(path: Path, text: str) -> str:
+    """Links between files of the repository become links between pages of the site; a folder or a
+    source file is named without a link."""
+
+    def mended(found: re.Match[str]) -> str:
+        words, link, anchor = found[1], found[2], found[3] or ""
+        target = (path.parent / link).resolve()
+        if not target.is_relative_to(ROOT):
+            return found[0]
+        name = target.relative_to(ROOT).as_posix()
+        page = _PAGES.get(name) or (name.removeprefix("docs/") if name.startswith("docs/") else "")
+        if target.is_dir() or not page:
+            return words
+        return f"[{words}](/{page}{anchor})"
+
+    return _LINK.sub(mended, text)
+
+
+def _read(app, docname, source):
+    path = Path(app.srcdir) / f"{docname}.md"
+    if not path.exists():
+        return
+    included = re.fullmatch(r"```\{include\} (\S+)\n```\n", source[0])
+    if included:
+        path = (path.parent / included[1]).resolve()
+        source[0] = path.read_text()
+    source[0] = _mend_links(path, source[0])
+
+
+def setup(app):
+    write_reference(Path(app.srcdir) / "reference")
+    app.connect("source-read", _read)

@@ -1,0 +1,98 @@
+"""Pages of the site that are made from the program: its commands, and its modules."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import get_args
+
+MODULES = (
+    "vslam.slam",
+    "vslam.camera",
+    "vslam.features",
+    "vslam.trajectory",
+    "vslam.map",
+    "vslam.loops",
+    "vslam.errors",
+    "vslam.geometry",
+    "vslam.plugins",
+    "vslam.datasets",
+    "vslam.datasets.sequence",
+    "vslam.datasets.stream",
+    "vslam.datasets.sources",
+    "vslam.datasets.perturbation",
+    "vslam.calibration.files",
+    "vslam.calibration.models",
+    "vslam.loopclosure.detector",
+    "vslam.loopclosure.registry",
+    "vslam.run.pipeline",
+    "vslam.run.outcome",
+    "vslam.evaluation.trajectories",
+    "vslam.maps.storage",
+    "vslam.report.schema",
+)
+
+
+def write_reference(folder: Path) -> None:
+    """Write ``commands.md`` and a page for each module into a folder."""
+    (folder / "commands.md").write_text(commands_page())
+    generated = folder / "generated"
+    shutil.rmtree(generated, ignore_errors=True)
+    generated.mkdir(parents=True)
+    for name in MODULES:
+        title = name.replace("_", r"\_")
+        page = f"{title}\n{'=' * len(title)}\n\n.. automodule:: {name}\n"
+        (generated / f"{name}.rst").write_text(page)
+
+
+def commands_page() -> str:
+    """Every command with its arguments and options, from the command line itself."""
+    import typer
+
+    from vslam.cli.main import app
+
+    lines = ["# Commands", "", "Made from the command line itself; `vslam COMMAND --help` shows"]
+    lines += ["the same.", ""]
+    for name, command in _commands("vslam", typer.main.get_command(app)):
+        lines += [f"## `{name}`", "", _plain(command.help or ""), ""]
+        options = [_row(p) for p in command.params if p.name != "help"]
+        if options:
+            lines += ["| option | what it does | default |", "|---|---|---|", *options, ""]
+        examples = re.findall(r"^ *(vslam .*?)$", _plain(command.epilog or ""), re.MULTILINE)
+        if examples:
+            lines += ["```sh", *examples, "```", ""]
+    return "\n".join(lines)
+
+
+def _commands(name, command):
+    """Commands without sub-commands, in their order."""
+    inner = getattr(command, "commands", None)
+    if not inner:
+        return [(name, command)]
+    return [found for key, one in inner.items() for found in _commands(f"{name} {key}", one)]
+
+
+def _row(parameter) -> str:
+    names = ", ".join([*parameter.opts, *parameter.secondary_opts])
+    if parameter.param_type_name == "argument":
+        names = (parameter.metavar or parameter.name or "").strip("{}[]").upper()
+    shown = getattr(parameter, "show_default", None)
+    default = shown if isinstance(shown, str) else parameter.default
+    if default in (None, "", False) or callable(default) or str(default) == "Sentinel.UNSET":
+        default = ""
+    text = _plain(getattr(parameter, "help", None) or "").replace("\n", " ")
+    descriptor = getattr(parameter, "type_descriptor", None)
+    choices = [
+        one for one in get_args(getattr(descriptor, "annotation", None)) if isinstance(one, str)
+    ]
+    if choices:
+        text += " One of " + ", ".join(f"`{choice}`" for choice in choices) + "."
+    cells = (f"`{names}`", text, f"{default}")
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _plain(text: str) -> str:
+    """Without Rich's markup."""
+    text = re.sub(r"\[b\](.*?)\[/b\]", r"`\1`", text)
+    return text.replace("\\[", "[").strip()

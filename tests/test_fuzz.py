@@ -1,0 +1,75 @@
+"""Damaged files end in one sentence: a little of what ``python tools/fuzz.py`` does at length.
+
+``VSLAM_FUZZ_INPUTS=1000`` tries more of each reader.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+INPUTS = int(os.environ.get("VSLAM_FUZZ_INPUTS", "8"))
+SLOW = ("weights",)  # torch
+
+
+@pytest.fixture
+def fuzz(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    import fuzz
+
+    return fuzz
+
+
+def test_every_reader_survives_damaged_files(fuzz, tmp_path: Path):
+    names = [name for name in fuzz.READERS if name not in SLOW or INPUTS > 100]
+    command = [sys.executable, str(ROOT / "tools" / "fuzz.py"), "--work", ",".join(names)]
+    command += ["0", str(INPUTS), "0", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    tried = [line for line in lines if "number" in line]
+    wrong = [line for line in tried if line["outcome"] not in ("read", "refused")]
+    assert wrong == []
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert len(tried) == INPUTS * len(names)
+    for name in names:  # all of them are harmed, and some of them noticeably
+        assert any(line["outcome"] == "refused" for line in tried if line["reader"] == name), name
+
+
+def test_mutations_are_seeded_and_change_the_file(fuzz):
+    data = bytes(range(256)) * 4
+    made = [fuzz.mutate(data, np.random.default_rng(seed), "a.bin") for seed in (1, 1, 2)]
+    assert made[0] == made[1] != made[2]
+    assert made[0] != data
+
+
+def test_the_harness_sees_an_exception_a_crash_and_a_hang(tmp_path: Path):
+    """It would not help if it were blind."""
+    script = f"""
+import sys
+sys.path.insert(0, {str(ROOT / "tools")!r})
+import fuzz
+from pathlib import Path
+fuzz.SECONDS = 8
+def write(folder): (folder / "a.txt").write_text("1 2 3")
+calls = iter(range(99))
+def read(folder):
+    number = next(calls)
+    if number == 1: raise KeyError("x")
+    if number == 2: bytearray(700 * 2**20)[::4096] = b"x" * (700 * 256)
+    if number == 3: import time; time.sleep(60)
+fuzz.READERS = {{"bad": fuzz.Reader(write, read, "a.txt")}}
+fuzz._work("bad", 0, 4, 0, Path({str(tmp_path)!r}))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [line["outcome"] for line in lines if "number" in line] == ["KeyError", "memory"]
+    assert lines[-1] == {"begin": 2}
+    assert done.returncode != 0
+    assert "Timeout" in done.stderr

@@ -1,0 +1,147 @@
+"""The wheel is the same bytes whoever builds it, says all about itself, and containers exist."""
+
+from __future__ import annotations
+
+import email
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+PARTS = ("vslam", "frontend", "backend", "loopclosure")
+
+
+def build(source: Path, out: Path) -> Path:
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-index"]
+    command += ["--no-build-isolation", "--wheel-dir", str(out), str(source)]
+    done = subprocess.run(
+        command,
+        env=os.environ | {"SOURCE_DATE_EPOCH": "1700000000"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    (wheel,) = out.glob("*.whl")
+    return wheel
+
+
+@pytest.fixture(scope="module")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Built from two copies in different folders, with different times of their files."""
+    root = tmp_path_factory.mktemp("wheels")
+    made = []
+    for number in range(2):
+        source = root / f"source{number}"
+        source.mkdir()
+        for name in ("pyproject.toml", "README.md", "LICENSE"):
+            shutil.copyfile(ROOT / name, source / name)
+        for name in PARTS:
+            ignored = shutil.ignore_patterns("__pycache__")
+            shutil.copytree(ROOT / name, source / name, ignore=ignored)
+        for path in source.rglob("*"):
+            os.utime(path, (1e9 + 1e6 * number, 1e9 + 1e6 * number))
+        made.append(build(source, root / f"wheel{number}"))
+    return made[0], made[1]
+
+
+def test_the_same_bytes_twice(wheels):
+    assert wheels[0].read_bytes() == wheels[1].read_bytes()
+
+
+def test_the_wheel_holds_every_source_and_the_files_beside_them(wheels):
+    with zipfile.ZipFile(wheels[0]) as archive:
+        inside = set(archive.namelist())
+    missing = []
+    for part in PARTS:
+        for path in (ROOT / part).rglob("*"):
+            if path.suffix not in {
+                ".py",
+                ".jinja",
+                ".npy",
+                ".npz",
+                ".onnx",
+                ".safetensors",
+                ".typed",
+            }:
+                continue
+            name = path.relative_to(ROOT).as_posix()
+            name = name if part == "vslam" else f"vslam/{name}"
+            missing += [] if name in inside else [name]
+    assert missing == []
+    assert not {name for name in inside if "tests/" in name or name.endswith(".pyc")}
+
+
+def test_its_metadata_are_complete(wheels):
+    with zipfile.ZipFile(wheels[0]) as archive:
+        (name,) = (n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
+        metadata = email.message_from_string(archive.read(name).decode())
+        points = archive.read(name.replace("METADATA", "entry_points.txt")).decode()
+    for key in ("Name", "Version", "Summary", "Author", "Keywords", "License-Expression",
+                "License-File", "Requires-Python", "Description-Content-Type"):  # fmt: skip
+        assert metadata[key], key
+    classifiers = metadata.get_all("Classifier") or []
+    for version in ("3.11", "3.12", "3.13"):
+        assert f"Programming Language :: Python :: {version}" in classifiers
+    assert {"bag", "cluster", "docs", "dev"} == set(metadata.get_all("Provides-Extra") or [])
+    assert "vslam = vslam.cli.main:main" in points
+    assert "# vslam" in str(metadata.get_payload())
+
+
+def test_a_plain_installation_stays_lean():
+    """What only some need is in an extra, and the error names the extra."""
+    plain = " ".join(PROJECT["dependencies"])
+    extras = {
+        re.split(r"[<>=\[]", item)[0]
+        for name, items in PROJECT["optional-dependencies"].items()
+        for item in items
+    } - {"vslam"}
+    assert not [name for name in extras if re.search(rf"\b{name}\b", plain)]
+    for library, extra, where in (
+        ("rosbags", "bag", "vslam/datasets/bag.py"),
+        ("distributed", "cluster", "vslam/bench/cluster.py"),
+    ):
+        assert library in extras
+        assert f"vslam[{extra}]" in (ROOT / where).read_text()
+    assert "vslam[bag,cluster,docs]" in PROJECT["optional-dependencies"]["dev"]  # make installs all
+
+
+def make_targets() -> set[str]:
+    return set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+
+
+def test_the_image_is_not_root_and_copies_what_exists():
+    lines = (ROOT / "Dockerfile").read_text().replace("\\\n", " ").splitlines()
+    steps = [line.split(None, 1) for line in lines if line and not line.startswith("#")]
+    words = [step[0] for step in steps]
+    assert words.index("USER") < words.index("ENTRYPOINT")
+    assert ["USER", "vslam"] in steps
+    assert all("slim" in rest for word, rest in steps if word == "FROM")
+    for rest in (rest for word, rest in steps if word == "COPY" and "--from" not in rest):
+        assert all((ROOT / name).exists() for name in rest.split()[:-1])
+    comment = "\n".join(line for line in lines if line.startswith("#"))
+    assert "docker build --tag vslam ." in comment
+    (command,) = re.findall(r"docker run .* vslam (run .*)", comment)
+    from typer.main import get_command
+
+    from vslam.cli.main import app
+
+    known = {o for p in get_command(app).commands["run"].params for o in p.opts}  # type: ignore[attr-defined]
+    assert {word for word in command.split() if word.startswith("--")} <= known
+    for name in re.findall(r"from (vslam\.\S+) import (\w+)", "\n".join(lines)):
+        source = ROOT / (name[0].replace(".", "/") + ".py")
+        assert f"def {name[1]}(" in source.read_text()
+
+
+def test_the_development_container_names_targets_of_make():
+    content = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text())
+    named = set(re.findall(r"make (\w+)", json.dumps(content)))
+    assert {"install", "demo", "test"} <= named <= make_targets()

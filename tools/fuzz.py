@@ -1,0 +1,738 @@
+"""Feed damaged files to every reader: an answer or one sentence must come, and soon.
+
+Each input is a valid small file, changed by a seeded mutation. Success and `InputError` are right.
+Everything else is a failure: another exception, a crash, more than SECONDS, or more than MEGABYTES
+of memory. Readers run in a process of their own, so that a crash is a line in the table.
+
+usage: python tools/fuzz.py [--inputs 1000] [--seed 0] [--readers kitti,video] [--keep FOLDER]
+"""
+
+from __future__ import annotations
+
+import argparse
+import faulthandler
+import gc
+import io
+import json
+import logging
+import re
+import resource
+import shutil
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "tests"))
+SECONDS, MEGABYTES = 20, 600
+ADDRESS_SPACE = 8 * 2**30  # beyond it there is a MemoryError: this machine stays usable
+_NUMBERS = ["nan", "inf", "-inf", "1e999", "-1", "0", "1e-320", "9" * 30, "2147483648", "0x10", ""]
+_SPECIAL = [0, 1, 0x7F, 0xFF, 0x7FFFFFFF, 0xFFFFFFFF, 0x80000000, 0x7FFFFFFFFFFFFFFF]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """What is fuzzed: ``write`` makes valid files in a folder, ``read`` reads them, and one of
+    those that match ``changed`` is mutated."""
+
+    write: Callable[[Path], object]
+    read: Callable[[Path], object]
+    changed: str
+
+
+# -- valid files ----------------------------------------------------------------------------------
+
+
+def _camera():
+    from vslam.camera import Camera
+
+    return Camera(60.0, 60.0, 31.5, 23.5, 0.2, 64, 48)
+
+
+def _images(n: int = 3) -> list[np.ndarray]:
+    rng = np.random.default_rng(5)
+    return [rng.integers(0, 256, (48, 64), dtype=np.uint8) for _ in range(n)]
+
+
+def _write_images(folder: Path) -> None:
+    from source_files import write_calibration, write_images
+
+    names = [f"{k}.png" for k in range(3)]
+    write_images(folder, {"left": _images(), "right": _images()}, names)
+    (folder / "times.txt").write_text("0.0\n0.1\n0.2\n")
+    write_calibration(folder / "stereo.yaml", _camera())
+
+
+def _write_other_images(folder: Path) -> None:
+    """One image of each kind of file, time stamps in their names."""
+    import cv2
+    from source_files import write_calibration
+
+    for k, suffix in enumerate(("png", "jpg", "webp", "bmp", "tif", "pgm", "ppm")):
+        colour = np.repeat(_images()[0][..., None], 3, axis=2)
+        image = colour if suffix == "ppm" else colour[..., 0]
+        assert cv2.imwrite(str(folder / f"{1_700_000_000 + k}.{suffix}"), image)
+    write_calibration(folder.parent / "mono.yaml", _camera(), mono=True)
+
+
+def _write_kitti(folder: Path) -> None:
+    import cv2
+
+    from vslam.trajectory import write_kitti
+
+    sequence = folder / "sequences" / "00"
+    for side in ("image_0", "image_1"):
+        (sequence / side).mkdir(parents=True)
+        for k, image in enumerate(_images()):
+            cv2.imwrite(str(sequence / side / f"{k:06d}.png"), image)
+    c = _camera()
+    rows = (
+        f"P{k}: {c.fx} 0 {c.cx} {-c.bf * (k % 2)} 0 {c.fy} {c.cy} 0 0 0 1 0\n" for k in range(4)
+    )
+    (sequence / "calib.txt").write_text("".join(rows))
+    (sequence / "times.txt").write_text("0.0\n0.1\n0.2\n")
+    (folder / "poses").mkdir()
+    write_kitti(folder / "poses" / "00.txt", np.tile(np.eye(4), (3, 1, 1)))
+
+
+def _write_tum(folder: Path) -> None:
+    import cv2
+    from source_files import write_calibration
+
+    for side, images in (("rgb", _images()), ("depth", [i.astype(np.uint16) for i in _images()])):
+        (folder / side).mkdir()
+        lines = ["# time file\n"]
+        for k, image in enumerate(images):
+            cv2.imwrite(str(folder / side / f"{k}.png"), image)
+            lines.append(f"{100 + 0.1 * k:.2f} {side}/{k}.png\n")
+        (folder / f"{side}.txt").write_text("".join(lines))
+    (folder / "groundtruth.txt").write_text(
+        "".join(f"{99.9 + 0.1 * k:.2f} {k} 0 0 0 0 0 1\n" for k in range(6))
+    )
+    write_calibration(folder / "calibration.yaml", _camera(), mono=True)
+
+
+def _write_euroc(folder: Path) -> None:
+    import cv2
+
+    for side in range(2):
+        camera = folder / "mav0" / f"cam{side}"
+        (camera / "data").mkdir(parents=True)
+        lines = ["#timestamp [ns],filename\n"]
+        for k, image in enumerate(_images()):
+            stamp = 1_403_636_579_763_555_584 + 50_000_000 * k
+            cv2.imwrite(str(camera / "data" / f"{stamp}.png"), image)
+            lines.append(f"{stamp},{stamp}.png\n")
+        (camera / "data.csv").write_text("".join(lines))
+        (camera / "sensor.yaml").write_text(_EUROC.format(shift=0.1 * side))
+    truth = folder / "mav0" / "state_groundtruth_estimate0"
+    truth.mkdir()
+    rows = (
+        f"{1_403_636_579_663_555_584 + 50_000_000 * k},{k},0,0,1,0,0,0,0,0,0,0,0,0,0,0,0\n"
+        for k in range(9)
+    )
+    (truth / "data.csv").write_text("#timestamp,p\n" + "".join(rows))
+    (truth / "sensor.yaml").write_text("T_BS:\n  data: [1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1]\n")
+
+
+_EUROC = """sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [1, 0, 0, {shift}, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+resolution: [64, 48]
+camera_model: pinhole
+intrinsics: [60, 60, 31.5, 23.5]
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28, 0.07, 0.0002, 1.7e-05]
+"""
+_CALIBRATIONS = {
+    "own.yaml": "left: {size: [64, 48], focal: [60, 60], centre: [31.5, 23.5], lens: fisheye, "
+    "distortion: [0.01, 0, 0, 0]}\nright: {size: [64, 48], focal: [60, 60], centre: [31.5, 23.5]}"
+    "\nT_left_right: [1,0,0,0.2, 0,1,0,0, 0,0,1,0, 0,0,0,1]\n",
+    "kalibr.yaml": "cam0:\n  camera_model: pinhole\n  intrinsics: [60, 60, 31.5, 23.5]\n"
+    "  distortion_model: equidistant\n  distortion_coeffs: [0.01, 0, 0, 0]\n"
+    "  resolution: [64, 48]\ncam1:\n  camera_model: pinhole\n  intrinsics: [60, 60, 31.5, 23.5]\n"
+    "  distortion_model: radtan\n  distortion_coeffs: [0.01, 0, 0, 0]\n  resolution: [64, 48]\n"
+    "  T_cn_cnm1:\n  - [1, 0, 0, -0.2]\n  - [0, 1, 0, 0]\n  - [0, 0, 1, 0]\n  - [0, 0, 0, 1]\n",
+    "euroc.yaml": _EUROC.format(shift=0.0),
+    "ros.yaml": "image_width: 64\nimage_height: 48\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
+    "  data: [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]\ndistortion_model: plumb_bob\n"
+    "distortion_coefficients:\n  data: [0.1, 0, 0, 0, 0]\nrectification_matrix:\n"
+    "  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nprojection_matrix:\n"
+    "  data: [60, 0, 31.5, 0, 0, 60, 23.5, 0, 0, 0, 1, 0]\n",
+    "opencv.yml": "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+    "   data: [ 60., 0., 31.5, 0., 60., 23.5, 0., 0., 1. ]\nD1: !!opencv-matrix\n   data: [0.1, 0,"
+    " 0, 0, 0]\nM2: !!opencv-matrix\n   data: [ 60., 0., 31.5, 0., 60., 23.5, 0., 0., 1. ]\n"
+    "D2: !!opencv-matrix\n   data: [0, 0, 0, 0, 0]\nR: !!opencv-matrix\n"
+    "   data: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nT: !!opencv-matrix\n   data: [-0.2, 0, 0]\n",
+    "orbslam2.yaml": "%YAML:1.0\nCamera.fx: 60\nCamera.fy: 60\nCamera.cx: 31.5\nCamera.cy: 23.5\n"
+    "Camera.k1: 0.1\nCamera.k2: 0\nCamera.p1: 0\nCamera.p2: 0\nCamera.width: 64\n"
+    "Camera.height: 48\nCamera.bf: 12\n",
+}
+
+
+def _write_calibrations(folder: Path) -> None:
+    for name, text in _CALIBRATIONS.items():
+        (folder / name).write_text(text)
+
+
+def _write_bag(kind: str, encoding: str, folder: Path) -> None:
+    from source_files import LEFT, RIGHT, write_bag
+
+    sides = {LEFT: _images(), RIGHT: _images()}
+    name = {"ros1": "a.bag"}.get(kind, "a")
+    write_bag(folder / name, kind, sides, [10**8 * (k + 1) for k in range(3)], encoding=encoding,
+              camera=_camera())  # fmt: skip
+
+
+def _write_video(folder: Path) -> None:
+    from source_files import write_calibration, write_video
+
+    write_video(folder / "a.mkv", _images(8))
+    write_video(folder / "b.avi", [np.tile(i, (1, 2)) for i in _images(8)], codec="MJPG")
+    write_calibration(folder.parent / "mono.yaml", _camera(), mono=True)
+    wide = replace(_camera(), width=2 * _camera().width)
+    write_calibration(folder.parent / "wide.yaml", wide, mono=True)
+
+
+def _write_map(folder: Path) -> None:
+    from vslam.features import Features
+    from vslam.map import Map
+    from vslam.map_kernels import link_many, refresh_landmarks
+    from vslam.maps.storage import save_map
+    from vslam.maps.stored_map import StoredMap
+
+    rng = np.random.default_rng(3)
+    map_ = Map(1.2 ** np.arange(8))
+    n = 12
+    for k in range(3):
+        features = Features(
+            rng.uniform(0, 48, (n, 2)).astype(np.float32),
+            rng.integers(0, 8, n).astype(np.uint8),
+            rng.uniform(0, 6, n).astype(np.float32),
+            rng.integers(0, 256, (n, 32)).astype(np.uint8),
+            np.full(n, np.nan, np.float32),
+        )
+        map_.add_keyframe(features, np.eye(4), 0.1 * k, k)
+        map_.parents[k] = k - 1
+    descriptors = rng.integers(0, 2**63, (n, 4)).astype(np.uint64)
+    ids = map_.add_landmarks(rng.uniform(1, 9, (n, 3)), descriptors, 0)
+    for k in range(3):
+        rows = np.arange(n * k, n * (k + 1))
+        link_many(map_.arrays, rows, ids.astype(np.int32))
+    refresh_landmarks(map_.arrays, ids, map_.scales)
+    save_map(folder / "map.npz", StoredMap(map_, _camera()))
+
+
+def _write_json(kind: str, folder: Path) -> None:
+    from vslam.config import Config
+
+    if kind == "config":
+        (folder / "config.json").write_text(Config().model_dump_json())
+        return
+    from test_report import make_outcome, report_of
+
+    report_of(make_outcome(20), folder)
+
+
+def _write_vocabulary(folder: Path) -> None:
+    from vslam.loopclosure.vocabulary import from_children
+    from vslam.loopclosure.vocabulary_text import write_vocabulary
+
+    rng = np.random.default_rng(1)
+    descriptors = rng.integers(0, 2**63, (13, 4)).astype(np.uint64)
+    descriptors[0] = 0
+    children = np.array([3, 3, 3, 3] + [0] * 9, np.uint8)
+    made = from_children(3, 2, descriptors, children, rng.uniform(0.1, 1, 9).astype(np.float32))
+    for name in ("words.npz", "words.txt"):
+        write_vocabulary(made, folder / name)
+
+
+def _write_trajectories(folder: Path) -> None:
+    from vslam.trajectory import Trajectory, write_kitti, write_tum
+
+    T_wc = np.tile(np.eye(4), (5, 1, 1))
+    write_kitti(folder / "a.kitti", T_wc)
+    write_tum(folder / "a.tum", Trajectory(0.1 * np.arange(5), T_wc))
+
+
+def _write_onnx(folder: Path) -> None:
+    from vslam.loopclosure.siamese.weights import SHIPPED
+
+    shutil.copy(SHIPPED / "capsule-pruned.onnx", folder / "net.onnx")
+
+
+def _write_weights(folder: Path) -> None:
+    shipped = ROOT / "loopclosure" / "siamese" / "weights"
+    found = sorted(shipped.glob("*.safetensors"))
+    if found:
+        shutil.copy(found[0], folder / "net.safetensors")
+        return
+    from vslam.loopclosure.siamese.siamese import build_network, save_network
+
+    save_network(build_network("squeezenet", None), folder / "net.safetensors", {})
+
+
+# -- readers --------------------------------------------------------------------------------------
+
+
+def _use(source) -> None:
+    """Every frame of it; a frame may be refused, alone."""
+    from vslam.datasets.stream import timed_frames
+    from vslam.errors import InputError, UnreadableImageError
+
+    try:
+        for frame in timed_frames(source):
+            try:
+                frame.read(map)
+            except UnreadableImageError:
+                continue
+    except InputError:
+        return
+
+
+def _each(read: Callable[[str], object], names: Iterable[str]) -> None:
+    """Read all files; the refusal of one is told after the last."""
+    from vslam.errors import InputError
+
+    refused = None
+    for name in names:
+        try:
+            read(name)
+        except InputError as error:
+            refused = error
+    if refused is not None:
+        raise refused
+
+
+def _read_source(dataset: str, data: str, folder: Path, **options) -> None:
+    from vslam.datasets.sources import SourceOptions, open_source
+
+    more = {key: options.pop(key) for key in ("sensor",) if key in options}
+    calibration = options.pop("calib", None)
+    if calibration:
+        options["calibration"] = (folder / calibration,)
+    _use(open_source(dataset, str(folder / data), None, SourceOptions(**options), **more))
+
+
+def _read_video(folder: Path) -> None:
+    def read(file: str) -> None:
+        calib = "../mono.yaml" if file == "a.mkv" else "../wide.yaml"
+        _read_source("video", file, folder, sensor="mono", calib=calib)
+
+    _each(read, ("a.mkv", "b.avi"))
+
+
+def _read_calibrations(folder: Path) -> None:
+    from vslam.calibration.files import read_calibration
+    from vslam.calibration.rectification import rectify
+
+    def read(name: str) -> None:
+        found = rectify(read_calibration([folder / name], (64, 48)))
+        if (found.camera.width, found.camera.height) == (64, 48):
+            found.left(_images()[0])
+
+    _each(read, _CALIBRATIONS)
+
+
+def _read_map(folder: Path) -> None:
+    from vslam.maps.storage import load_map
+
+    map_ = load_map(folder / "map.npz").map
+    for k in range(map_.n_keyframes):
+        map_.covisible(k)
+
+
+def _read_config(folder: Path) -> None:
+    from vslam.config import load_config
+
+    load_config(folder / "config.json")
+
+
+def _read_report(folder: Path) -> None:
+    from vslam.overview import write_overview
+    from vslam.report.finished_run import read_report
+    from vslam.report.render import render_html, render_markdown
+
+    report = read_report(folder)
+    render_html(report, "", [])
+    render_markdown(report)
+    write_overview([folder], [], folder / "overview")
+
+
+def _read_vocabulary(folder: Path) -> None:
+    from vslam.loopclosure.vocabulary_text import read_vocabulary
+
+    def read(name: str) -> None:
+        read_vocabulary(folder / name).words(np.zeros((3, 32), np.uint8))
+
+    _each(read, ("words.npz", "words.txt"))
+
+
+def _read_trajectories(folder: Path) -> None:
+    from vslam.trajectory import read_trajectory
+
+    _each(lambda name: read_trajectory(folder / name), ("a.kitti", "a.tum"))
+
+
+def _read_onnx(folder: Path) -> None:
+    from vslam.loopclosure.siamese.inference import OnnxNetwork
+
+    network = OnnxNetwork(folder / "net.onnx")
+    network.embed(np.zeros(network.size, np.uint8))
+
+
+def _read_weights(folder: Path) -> None:
+    from vslam.loopclosure.siamese.siamese import load_network
+
+    load_network(folder / "net.safetensors")
+
+
+def _bag(kind: str, encoding: str, data: str, changed: str) -> Reader:
+    return Reader(partial(_write_bag, kind, encoding), partial(_read_source, "bag", data), changed)
+
+
+READERS: dict[str, Reader] = {
+    "images": Reader(
+        _write_images, partial(_read_source, "images", "", calib="stereo.yaml"), "**/*.*"
+    ),
+    "image-kinds": Reader(
+        _write_other_images,
+        partial(_read_source, "images", "", calib="../mono.yaml", sensor="mono"),
+        "*.*",
+    ),
+    "kitti": Reader(_write_kitti, partial(_read_source, "kitti", ""), "**/*.*"),
+    "tum": Reader(_write_tum, partial(_read_source, "tum", ""), "**/*.*"),
+    "euroc": Reader(_write_euroc, partial(_read_source, "euroc", ""), "**/*.*"),
+    "calibration": Reader(_write_calibrations, _read_calibrations, "*.*"),
+    "bag-ros1": _bag("ros1", "mono8", "a.bag", "a.bag"),
+    "bag-ros2": _bag("ros2", "png", "a", "a/*"),
+    "bag-mcap": _bag("folder", "mono16", "a", "a/*"),
+    "video": Reader(_write_video, _read_video, "*.*"),
+    "map": Reader(_write_map, _read_map, "map.npz"),
+    "config": Reader(partial(_write_json, "config"), _read_config, "config.json"),
+    "report": Reader(partial(_write_json, "report"), _read_report, "*.json"),
+    "vocabulary": Reader(_write_vocabulary, _read_vocabulary, "words.*"),
+    "trajectory": Reader(_write_trajectories, _read_trajectories, "a.*"),
+    "onnx": Reader(_write_onnx, _read_onnx, "net.onnx"),
+    "weights": Reader(_write_weights, _read_weights, "net.safetensors"),
+}
+
+
+# -- mutations ------------------------------------------------------------------------------------
+
+
+def mutate(data: bytes, rng: np.random.Generator, name: str) -> bytes:
+    """A file with one to four changes; now and then one that knows the format."""
+    if name.endswith(".npz") and rng.random() < 0.6:
+        return _mutate_npz(data, rng)
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and rng.random() < 0.3:
+        return _mutate_png(data, rng)
+    text = not data[:512].translate(None, bytes(range(32, 127)) + b"\n\r\t")
+    changes = (_BYTES + _TEXT * 3) if text else _BYTES
+    for _ in range(int(rng.integers(1, 5))):
+        if data:
+            data = changes[int(rng.integers(len(changes)))](data, rng)
+    return data
+
+
+def _place(data: bytes, rng: np.random.Generator) -> int:
+    """Half of all changes fall into the first 256 bytes, where headers are."""
+    return int(rng.integers(min(len(data), 256) if rng.random() < 0.5 else len(data)))
+
+
+def _flip(data: bytes, rng: np.random.Generator) -> bytes:
+    at = _place(data, rng)
+    return data[:at] + bytes([data[at] ^ 1 << int(rng.integers(8))]) + data[at + 1 :]
+
+
+def _byte(data: bytes, rng: np.random.Generator) -> bytes:
+    at = _place(data, rng)
+    return data[:at] + rng.bytes(1) + data[at + 1 :]
+
+
+def _integer(data: bytes, rng: np.random.Generator) -> bytes:
+    at, size = _place(data, rng), int(rng.choice([1, 2, 4, 8]))
+    value = _SPECIAL[int(rng.integers(len(_SPECIAL)))] & (1 << 8 * size) - 1
+    order = "little" if rng.random() < 0.5 else "big"
+    return data[:at] + value.to_bytes(size, order) + data[at + size :]
+
+
+def _cut(data: bytes, rng: np.random.Generator) -> bytes:
+    return data[: _place(data, rng)]
+
+
+def _remove(data: bytes, rng: np.random.Generator) -> bytes:
+    at = _place(data, rng)
+    return data[:at] + data[at + int(rng.integers(1, 64)) :]
+
+
+def _repeat(data: bytes, rng: np.random.Generator) -> bytes:
+    at, size = _place(data, rng), int(rng.integers(1, 64))
+    return data[:at] + data[at : at + size] * int(rng.integers(2, 50)) + data[at + size :]
+
+
+def _insert(data: bytes, rng: np.random.Generator) -> bytes:
+    at = _place(data, rng)
+    return data[:at] + rng.bytes(int(rng.integers(1, 64))) + data[at:]
+
+
+def _number(data: bytes, rng: np.random.Generator) -> bytes:
+    """Another number in place of one."""
+    found = list(re.finditer(rb"-?\d+(\.\d+)?(e[-+]?\d+)?", data))
+    if not found:
+        return data
+    one = found[int(rng.integers(len(found)))]
+    return data[: one.start()] + str(rng.choice(_NUMBERS)).encode() + data[one.end() :]
+
+
+def _lines(data: bytes, rng: np.random.Generator) -> bytes:
+    """A line moved, doubled or left out."""
+    lines = data.split(b"\n")
+    at, to = (int(rng.integers(len(lines))) for _ in range(2))
+    line = lines[at] if rng.random() < 0.3 else lines.pop(at)
+    if rng.random() < 0.7:
+        lines.insert(to, line)
+    return b"\n".join(lines)
+
+
+def _nest(data: bytes, rng: np.random.Generator) -> bytes:
+    """Deep brackets, or YAML's aliases that grow at every level."""
+    bombs = (
+        b"[" * 20_000,
+        b'{"a":' * 20_000,
+        b"- " * 20_000,
+        b"\n".join(
+            [b"a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+            + [b"a%d: &a%d [%s]" % (k, k, b", ".join([b"*a%d" % (k - 1)] * 9)) for k in range(1, 9)]
+        ),
+        "\u202e\ufeff\x00é".encode(),
+    )
+    at = _place(data, rng)
+    bomb = bombs[int(rng.integers(len(bombs)))]
+    return bomb + b"\n" + data if rng.random() < 0.5 else data[:at] + bomb + data[at:]
+
+
+def _alias(data: bytes, rng: np.random.Generator) -> bytes:
+    """A number of YAML that is an alias of a list that grows."""
+    head = b"\n".join(
+        [b"a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+        + [b"a%d: &a%d [%s]" % (k, k, b", ".join([b"*a%d" % (k - 1)] * 9)) for k in range(1, 9)]
+    )
+    return head + b"\n" + re.sub(rb"\[[^]]*\]", b"*a8", data, count=1)
+
+
+_BYTES = [_flip, _flip, _byte, _integer, _integer, _cut, _remove, _repeat, _insert]
+_TEXT = [_number, _number, _lines, _nest, _alias]
+
+
+def _mutate_npz(data: bytes, rng: np.random.Generator) -> bytes:
+    """One array of other values, shape or kind, or a member that promises too much."""
+    with np.load(io.BytesIO(data)) as file:
+        arrays = dict(file)
+    name = str(rng.choice(sorted(arrays)))
+    array = arrays[name]
+    way = int(rng.integers(8))
+    if way == 0:
+        del arrays[name]
+    elif way == 1:
+        arrays[name] = array.reshape(-1)[: int(rng.integers(0, array.size + 1))]
+    elif way == 2:
+        arrays[name] = np.concatenate([array.reshape(-1)] * 3)
+    elif way == 3:
+        arrays[name] = array.astype(str(rng.choice(["f8", "i1", "u8", "c16", "S3", "f2"])))
+    elif way == 4:
+        arrays[name] = array.reshape((1, *array.shape, 1))
+    elif way in (5, 6) and array.size:
+        changed = array.reshape(-1).copy()
+        values = [-1, -(2**40), 2**40, 77, 0, np.nan, np.inf]
+        with np.errstate(all="ignore"):
+            at = int(rng.integers(array.size)) if way == 5 else slice(None)
+            changed[at] = np.array(rng.choice(values)).astype(array.dtype)
+        arrays[name] = changed.reshape(array.shape)
+    else:
+        return _promising(arrays, name)
+    out = io.BytesIO()
+    np.savez(out, **arrays)
+    return out.getvalue()
+
+
+def _promising(arrays: dict[str, np.ndarray], name: str) -> bytes:
+    """A header that speaks of 100 GB."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for key, array in arrays.items():
+            buffer = io.BytesIO()
+            np.save(buffer, array)
+            raw = buffer.getvalue()
+            if key == name:
+                header = io.BytesIO()
+                np.lib.format.write_array_header_1_0(
+                    header, {"descr": "<f8", "fortran_order": False, "shape": (12_500_000_000,)}
+                )
+                raw = header.getvalue() + bytes(64)
+            archive.writestr(f"{key}.npy", raw)
+    return out.getvalue()
+
+
+def _mutate_png(data: bytes, rng: np.random.Generator) -> bytes:
+    """Another size, depth or kind in a header whose checksum is right."""
+    sizes = [0, 1, 47, 64, 65, 11_000, 100_000, 2**31 - 1]
+    width, height = (int(rng.choice(sizes)) for _ in range(2))
+    depth, kind = int(rng.choice([1, 8, 16])), int(rng.choice([0, 2, 3, 6]))
+    body = b"IHDR" + struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, 0)
+    return data[:12] + body + struct.pack(">I", zlib.crc32(body)) + data[33:]
+
+
+# -- in the process of the readers ----------------------------------------------------------------
+
+
+def _peak_mb() -> float:
+    status = Path("/proc/self/status")
+    found = re.search(r"VmHWM:\s+(\d+)", status.read_text()) if status.exists() else None
+    return int(found[1]) / 1024 if found else 0.0
+
+
+def _forget_peak() -> None:
+    clear = Path("/proc/self/clear_refs")
+    if clear.exists():
+        clear.write_text("5")
+
+
+def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
+    """Try inputs and say of each, a JSON line: its number, before it and what came of it."""
+    from vslam.errors import InputError
+
+    logging.disable(logging.CRITICAL)
+    resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
+    reader = READERS[name]
+    valid = scratch / "valid"
+    valid.mkdir(parents=True, exist_ok=True)
+    if not any(valid.iterdir()):
+        reader.write(valid)
+    reader.read(valid)  # must succeed; imports and compiles what is needed
+    files = sorted(p for p in valid.glob(reader.changed) if p.is_file())
+    for number in range(first, inputs):
+        print(json.dumps({"begin": number}), flush=True)
+        rng = np.random.default_rng([seed, zlib.crc32(name.encode()), number])
+        file = files[int(rng.integers(len(files)))]
+        data = mutate(file.read_bytes(), rng, file.name)
+        folder = scratch / "now"
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(valid, folder)
+        (folder / file.relative_to(valid)).write_bytes(data)
+        gc.collect()
+        _forget_peak()
+        before, start = _peak_mb(), time.perf_counter()
+        faulthandler.dump_traceback_later(SECONDS, exit=True)
+        said = None
+        try:
+            reader.read(folder)
+            outcome = "read"
+        except InputError as error:
+            outcome, said = "refused", str(error)
+            if "\n" in said:
+                outcome, said = "more than a line", said
+        except BaseException as error:
+            outcome, said = type(error).__name__, traceback.format_exc()
+        faulthandler.cancel_dump_traceback_later()
+        seconds, grown = time.perf_counter() - start, _peak_mb() - before
+        if outcome in ("read", "refused") and grown > MEGABYTES:
+            outcome, said = "memory", f"{grown:.0f} MB"
+        line = {"reader": name, "number": number, "file": file.name, "outcome": outcome}
+        line |= {"said": said, "seconds": seconds, "mb": grown}
+        print(json.dumps(line), flush=True)
+
+
+# -- in the process that watches ------------------------------------------------------------------
+
+
+def fuzz(name: str, inputs: int, seed: int, keep: Path | None = None) -> dict[str, object]:
+    """Outcomes of a reader: how many inputs were read and refused, and every failure."""
+    tried, read, refused, slowest, most = 0, 0, 0, 0.0, 0.0
+    failures: list[dict[str, object]] = []
+    with tempfile.TemporaryDirectory(prefix="vslam-fuzz-") as scratch:
+        first = 0
+        while first < inputs:
+            command = [sys.executable, __file__, "--work", name, str(first), str(inputs)]
+            command += [str(seed), scratch]
+            done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+            lines = [json.loads(x) for x in done.stdout.splitlines() if x.startswith("{")]
+            begun = [line["begin"] for line in lines if "begin" in line]
+            ended = [line for line in lines if "number" in line]
+            tried += len(begun)
+            for line in ended:
+                slowest, most = max(slowest, line["seconds"]), max(most, line["mb"])
+                read += line["outcome"] == "read"
+                refused += line["outcome"] == "refused"
+                if line["outcome"] not in ("read", "refused"):
+                    failures.append(line)
+            if not begun or len(begun) > len(ended):
+                number = begun[-1] if begun else first
+                why = "hang" if "Timeout" in done.stderr else f"exit code {done.returncode}"
+                failures.append({"number": number, "outcome": why, "said": done.stderr[-3000:]})
+                if not begun:
+                    break
+                if keep is not None:
+                    shutil.copytree(
+                        f"{scratch}/{name}/now", keep / f"{name}-{number}", dirs_exist_ok=True
+                    )
+            first = begun[-1] + 1
+    return {
+        "reader": name,
+        "tried": tried,
+        "read": read,
+        "refused": refused,
+        "failures": failures,
+        "slowest_s": round(slowest, 2),
+        "most_mb": round(most),
+    }
+
+
+def main() -> None:
+    if sys.argv[1:2] == ["--work"]:
+        names, first, inputs, seed, scratch = sys.argv[2:]
+        for name in names.split(","):
+            _work(name, int(first), int(inputs), int(seed), Path(scratch) / name)
+        return
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--inputs", type=int, default=1000, help="of each reader")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--readers", default=",".join(READERS))
+    parser.add_argument("--keep", type=Path, help="folder for inputs that crash or hang")
+    given = parser.parse_args()
+    total, failed = 0, 0
+    print("| reader | inputs | read | refused | failures | slowest | most memory |")
+    print("|---|---|---|---|---|---|---|")
+    problems = []
+    for name in given.readers.split(","):
+        found = fuzz(name, given.inputs, given.seed, given.keep)
+        failures = found["failures"]
+        assert isinstance(failures, list)
+        total, failed = total + int(str(found["tried"])), failed + len(failures)
+        problems += [(name, one) for one in failures]
+        print(
+            f"| {name} | {found['tried']} | {found['read']} | {found['refused']} | "
+            f"{len(failures)} | {found['slowest_s']} s | {found['most_mb']} MB |",
+            flush=True,
+        )
+    print(f"\n{total} inputs, {failed} failures")
+    for name, one in problems:
+        print(f"\n{name} {one['number']}: {one['outcome']}\n{one['said']}")
+    sys.exit(1 if failed else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""Files of other people: limits on what they may make this machine do.
+
+A small file can speak of a huge one: an image header of 100,000 x 100,000 pixels, a zip member that
+unpacks to 100 GB. What is promised is compared with what is there before memory is taken for it.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError
+
+MOST_PIXELS = 2**27
+"""Of an image file: 11,585 x 11,585; OpenCV itself allows eight times as many."""
+
+_OPENCV_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
+_DAMAGED = (OSError, EOFError, ValueError, KeyError, NotImplementedError, RuntimeError)
+_READ = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+def limit_images() -> None:
+    """Let OpenCV refuse larger images by their header; it asks once, when it is first imported."""
+    os.environ.setdefault(_OPENCV_LIMIT, str(MOST_PIXELS))
+
+
+def read_npz(path: Path, what: str, fix: str = "name another file") -> dict[str, NDArray[Any]]:
+    """All arrays of an npz file; Python objects (pickles) are refused.
+
+    Args:
+        what: that the file should be, with an article, and ``fix``: for the messages.
+
+    Raises:
+        InputError: missing, damaged, no npz, or arrays that are not in the file or beyond the
+            memory of this machine.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _check_memory(path, archive, what)
+            return {
+                member.filename.removesuffix(".npy"): _read_member(archive, member)
+                for member in archive.infolist()
+            }
+    except InputError:
+        raise
+    except (*_DAMAGED, zipfile.BadZipFile, zipfile.LargeZipFile, _zlib_error()) as error:
+        why = error.strerror if isinstance(error, OSError) else None
+        raise InputError(
+            f"{path}: not {what} ({why or error or type(error).__name__}); {fix}."
+        ) from error
+
+
+def require_memory(path: Path, what: str) -> None:
+    """Refuse an archive that unpacks to more than the free memory; other files pass.
+
+    Raises:
+        InputError: it does.
+    """
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            _check_memory(path, archive, what)
+
+
+def _check_memory(path: Path, archive: zipfile.ZipFile, what: str) -> None:
+    import psutil
+
+    needed = sum(member.file_size for member in archive.infolist())
+    there = psutil.virtual_memory().available
+    if needed > there:
+        raise InputError(
+            f"{path}: unpacks to {needed / 2**30:.1f} GB and {there / 2**30:.1f} GB of memory are "
+            f"free; this is hardly {what}."
+        )
+
+
+def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    """An array, after a look at its header: it must not be larger than its member."""
+    with archive.open(member) as file:
+        version = np.lib.format.read_magic(file)
+        if version not in _READ:
+            raise ValueError(f"npy format {version} in {member.filename}")
+        shape, fortran, dtype = _READ[version](file)
+        if dtype.hasobject:
+            raise ValueError(f"{member.filename} holds Python objects")
+        count = 1
+        for length in shape:
+            count *= int(length)
+        if min(shape, default=0) < 0 or count * dtype.itemsize != member.file_size - file.tell():
+            raise ValueError(f"{member.filename} is not as long as its header says")
+        array = np.frombuffer(file.read(), dtype, count) if count else np.zeros(0, dtype)
+    ordered = array.reshape(shape[::-1]).T if fortran else array.reshape(shape)
+    return ordered.copy()  # writable, and in the order of C
+
+
+def _zlib_error() -> type[Exception]:
+    import zlib
+
+    return zlib.error

@@ -65,3 +65,30 @@ def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig)
     urgent = tracked < max(config.monocular_urgent_ratio * reference, config.monocular_min_tracked)
     late = evidence.seconds_since_keyframe >= config.max_interval_s
     return evidence.mapping_idle or urgent or late
+
+
+@dataclass(frozen=True)
+class PlaceEvidence:
+    """How well a place is known that a frame has come back to.
+
+    Attributes:
+        n_inliers: landmarks tracked in the frame.
+        n_shared: of these, landmarks of the old keyframe that shares the most.
+        n_place: landmarks of that keyframe that at least three keyframes see.
+    """
+
+    n_inliers: int
+    n_shared: int
+    n_place: int
+
+
+def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
+    """Whether a keyframe here would repeat an old one: the frame tracks as much of the map as one
+    may that is next to that keyframe, and a good part of it is that keyframe's.
+
+    Few close points are no reason to map the place once more: mapping it has not made them more.
+    """
+    return (
+        evidence.n_inliers >= config.max_tracked_ratio * evidence.n_place
+        and evidence.n_shared >= config.known_ratio * evidence.n_place
+    )

@@ -210,7 +210,9 @@ def pipeline(monkeypatch) -> SimpleNamespace:
     """In place of SLAM: returns the ground truth, shifted; notes what it was called with."""
     calls = SimpleNamespace(interrupted=None, interrupted_without=None, loops=[], runs=[])
 
-    def run_sequence(sequence, perturbation, settings, recorder, on_frame):
+    def run_sequence(
+        sequence, perturbation, settings, recorder, on_frame, autosave=None, resume=None
+    ):
         looped = settings.detector != "none" or not calls.runs
         calls.runs.append((settings.detector, recorder))
         calls.settings, calls.recorder = settings, recorder

@@ -9,6 +9,8 @@ import pytest
 from vslam.config import KeyframeConfig
 from vslam.frontend.keyframes import (
     KeyframeEvidence,
+    PlaceEvidence,
+    is_known_place,
     needs_keyframe,
     needs_monocular_keyframe,
 )
@@ -99,3 +101,17 @@ def test_one_camera_does_not_wait_where_half_is_gone_or_little_is_left():
 def test_one_camera_needs_no_keyframe_by_time_alone():
     assert not decide_monocular(seconds_since_keyframe=60.0)
     assert decide_monocular(seconds_since_keyframe=1.0, n_inliers=179, mapping_idle=False)
+
+
+KNOWN = PlaceEvidence(n_inliers=150, n_shared=100, n_place=200)
+
+
+@pytest.mark.parametrize(("changes", "known"), [
+    ({}, True),
+    ({"n_inliers": 149}, False),
+    ({"n_shared": 99}, False),
+    ({"n_place": 0, "n_inliers": 0, "n_shared": 0}, True),
+])  # fmt: skip
+def test_a_place_is_known_that_is_tracked_like_its_old_keyframe(changes, known):
+    config = KeyframeConfig(max_tracked_ratio=0.75, known_ratio=0.5)
+    assert is_known_place(replace(KNOWN, **changes), config) == known

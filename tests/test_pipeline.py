@@ -180,7 +180,8 @@ def test_run_without_pages_is_enough_for_a_report_later(kitti_tree, tmp_path):
     folder = tmp_path / "runs" / "latest"
     assert {path.name for path in folder.iterdir()} == {
         "config.json", "frames.csv", "ground_truth_kitti.txt", "keyframes.tum", "map.npz",
-        "report.json", "trajectory.tum", "trajectory_causal.tum", "trajectory_kitti.txt",
+        "report.json", "run.json", "trajectory.tum", "trajectory_causal.tum",
+        "trajectory_kitti.txt", "trajectory_online.tum",
     }  # fmt: skip
     with (folder / "frames.csv").open(newline="") as file:
         frames = list(csv.DictReader(file))

@@ -86,12 +86,13 @@ class LoopClosing:
         self._consistency = LoopConsistency(consistency)
         self._executor = ThreadPoolExecutor(1, "global-adjustment") if threads > 1 else None
         self._global: _PendingAdjustment | None = None
+        self._followed = 0  # times that an old keyframe served instead of a new one
 
     def process(
         self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
     ) -> None:
         """Look for loops at a keyframe whose local mapping is done; close the first real one."""
-        if self._global is not None and keyframe >= self._global.due:
+        if self._is_due(keyframe):
             self.finish(map_)
         if self.images is not None and shows_known(
             map_, keyframe, self.images, self._config.learned
@@ -124,6 +125,20 @@ class LoopClosing:
                 self._consistency.reset()
                 self.edges += [_superseded(other) for other in verified[number + 1 :]]
                 break
+
+    @property
+    def is_adjusting(self) -> bool:
+        """Whether a global bundle adjustment is yet to be merged."""
+        return self._global is not None
+
+    def follow(self, keyframe: int) -> bool:
+        """Note that an old keyframe serves where the newest one's, ``keyframe``, successor would
+        be; returns whether ``finish`` is due."""
+        self._followed += 1
+        return self._is_due(keyframe)
+
+    def _is_due(self, keyframe: int) -> bool:
+        return self._global is not None and keyframe + self._followed >= self._global.due
 
     def _verify_learned(self, map_: Map, candidate: LoopCandidate, by_orb: LoopEdge) -> LoopEdge:
         """What learned descriptors say of a candidate that ORB's did not verify."""
@@ -264,7 +279,7 @@ class LoopClosing:
             )
 
         solution = work if self._executor is None else self._executor.submit(work).result
-        return _PendingAdjustment(snapshot, solution, keyframe + wait, stop)
+        return _PendingAdjustment(snapshot, solution, keyframe + self._followed + wait, stop)
 
 
 def _superseded(candidate: LoopCandidate) -> LoopEdge:

@@ -295,6 +295,14 @@ class KeyframeConfig(_Section):
     monocular_urgent_ratio: float = Field(
         0.5, gt=0, le=1, description="urgent_ratio of a monocular camera. [own]"
     )
+    known_after_s: float = Field(
+        30.0, gt=0, description="Age from which a keyframe makes its place known, seconds. [own]"
+    )
+    known_ratio: float = Field(
+        0.5,
+        gt=0,
+        description="Tracked share of an old keyframe's points; above, its place is known. [own]",
+    )
     merge_after_frames: int = Field(
         2, ge=1, description="Frames after which local mapping is merged. [own]"
     )
@@ -564,6 +572,19 @@ class RelocalizationConfig(_Section):
         15, ge=0, description="Inliers outside the third of the image that has the most. [own]"
     )
     max_candidates: int = Field(5, ge=1, description="Places tried per lost frame. [own]")
+    doubtful_gap: float = Field(
+        1.5, gt=1, description="Time since the last tracked frame, usual ones, that is a gap. [own]"
+    )
+    doubtful_share: float = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="Tracked share of the reference; below, a frame after a gap is looked for in "
+        "the whole map. [own]",
+    )
+    better: float = Field(
+        1.5, ge=1, description="Ratio of inliers from which it is moved to where it is found. [own]"
+    )
     neighbours: int = Field(20, ge=1, description="Keyframes whose landmarks are searched. [own]")
 
 

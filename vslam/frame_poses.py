@@ -99,17 +99,25 @@ class FramePoses:
         Args:
             tracked: False for a pose that is only predicted.
         """
-        keyframes = self._keyframes
-        reference = keyframes.reference
-        T_rw = keyframes.keyframe_pose(reference) if keyframes.n_keyframes else np.eye(4)
-        relative = orthonormalised(T_cw @ inverse(T_rw))
-        self._frames.append(FramePose(timestamp, reference, relative, tracked, self.unit))
+        self._frames.append(self._placed(timestamp, T_cw, tracked))
 
     def replace(self, index: int, keyframe: int) -> None:
         """A frame has become a keyframe: from now on it is where that is."""
         unit = self._keyframes.unit_scale(keyframe)
         timestamp = self._frames[index].timestamp
         self._frames[index] = FramePose(timestamp, keyframe, np.eye(4), True, unit)
+
+    def follow_reference(self, index: int, T_cw: Matrix) -> None:
+        """The reference keyframe is another one: from now on a frame at ``T_cw`` follows that."""
+        frame = self._frames[index]
+        self._frames[index] = self._placed(frame.timestamp, T_cw, frame.tracked)
+
+    def _placed(self, timestamp: float, T_cw: Matrix, tracked: bool) -> FramePose:
+        keyframes = self._keyframes
+        reference = keyframes.reference
+        T_rw = keyframes.keyframe_pose(reference) if keyframes.n_keyframes else np.eye(4)
+        relative = orthonormalised(T_cw @ inverse(T_rw))
+        return FramePose(timestamp, reference, relative, tracked, self.unit)
 
     def pose(self, index: int) -> Matrix:
         """``T_cw`` of a frame as its keyframe is placed now; the last one is -1."""

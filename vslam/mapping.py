@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +22,11 @@ from vslam.backend.two_views import map_two_views
 from vslam.camera import Camera
 from vslam.closing import LoopClosing
 from vslam.config import Config
+from vslam.features import Features
 from vslam.frontend.tracking import Frame
 from vslam.geometry import Matrix
 from vslam.map import LocalMap, Map, local_map
-from vslam.map_kernels import count_seen_by, link_many, resolve
+from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
 from vslam.monocular import TwoViewStart
 
 
@@ -115,7 +117,9 @@ class MappingThread:
         # The map is the thread's from here on.
         self._observe(frame, keyframe)
         if keyframe > 0:
-            self._pending = self._start(keyframe, frame)
+            self._pending = self._start(
+                partial(self._map_keyframe, keyframe, frame.features, frame.image)
+            )
         else:
             self._closing.process(map_, keyframe, frame.features, frame.image)
 
@@ -203,6 +207,39 @@ class MappingThread:
         frame.landmark = ids
         frame.xyz = np.where((ids >= 0)[:, None], arrays.xyz[ids], np.nan)
 
+    def old_keyframe(self, frame: Frame) -> tuple[int, int, int]:
+        """The keyframe that shares most landmarks with a frame, of those that are old enough for
+        their place to be known; merge first.
+
+        Returns:
+            Its id, how many landmarks it shares, and how many of its own at least three keyframes
+            see; -1, 0, 0 if there is none.
+        """
+        map_ = self.map
+        since = frame.timestamp - self._config.keyframes.known_after_s
+        young = np.array(map_.sessions) == map_.session
+        young &= np.array(map_.timestamps) > since
+        shared = np.where(young, 0, self.count_shared(frame))
+        best = int(np.argmax(shared))
+        if shared[best] == 0:
+            return -1, 0, 0
+        return best, int(shared[best]), count_seen_by(map_.arrays, best, 3)
+
+    def count_shared(self, frame: Frame) -> NDArray[np.int64]:
+        """``(n_keyframes,)`` how many of the landmarks of a frame each keyframe observes."""
+        a, n = self.map.arrays, self.map.n_keyframes
+        _, rows = gather_observations(a, frame.landmark[frame.landmark >= 0], np.arange(n))
+        return np.bincount(a.keyframe[rows], minlength=n)
+
+    def follow(self, keyframe: int, frame: Frame) -> None:
+        """Track by an old keyframe instead of making a new one. Merge first."""
+        self.write_counts()
+        self.last_timestamp = frame.timestamp
+        self.set_reference(keyframe)
+        if self._closing.follow(self.n_keyframes - 1):
+            self.last_frame = frame.index
+            self._pending = self._start(lambda: self._closing.finish(self._map))
+
     def set_reference(self, keyframe: int) -> None:
         """Make another keyframe the reference, and show tracking what is around it."""
         self.reference = keyframe
@@ -227,13 +264,13 @@ class MappingThread:
                 counter[ids] += 1
             seen.clear()
 
-    def _start(self, keyframe: int, frame: Frame) -> Callable[[], None]:
-        features, image = frame.features, frame.image
+    def _map_keyframe(
+        self, keyframe: int, features: Features, image: NDArray[np.uint8] | None
+    ) -> None:
+        map_keyframe(self._map, keyframe, self._camera, self._config)
+        self._closing.process(self._map, keyframe, features, image)
 
-        def work() -> None:
-            map_keyframe(self._map, keyframe, self._camera, self._config)
-            self._closing.process(self._map, keyframe, features, image)
-
+    def _start(self, work: Callable[[], None]) -> Callable[[], None]:
         if self._executor is None:
             return work
         future: Future[None] = self._executor.submit(work)

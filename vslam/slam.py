@@ -18,7 +18,13 @@ from vslam.config import Config
 from vslam.errors import InputError
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.frame_poses import FramePoses, FrameTable
-from vslam.frontend.keyframes import KeyframeEvidence, needs_keyframe, needs_monocular_keyframe
+from vslam.frontend.keyframes import (
+    KeyframeEvidence,
+    PlaceEvidence,
+    is_known_place,
+    needs_keyframe,
+    needs_monocular_keyframe,
+)
 from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracking import (
     Frame,
@@ -36,7 +42,6 @@ from vslam.loopclosure.registry import create_detector, create_images
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map, local_map
-from vslam.map_kernels import gather_observations
 from vslam.mapping import MappingThread
 from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap, World
@@ -126,6 +131,8 @@ class Slam:
         self._velocity: Matrix | None = None  # twist per second, None if unknown
         self._lost_frames = 0
         self._initialiser = Initialiser(self.context)  # of monocular maps
+        if before is not None and len(before.tracked) > 1 and before.tracked[-2:].all():
+            self._move_on(before)
 
     @classmethod
     def load(
@@ -220,6 +227,11 @@ class Slam:
         return self._mapping.busy
 
     @property
+    def is_adjusting(self) -> bool:
+        """Whether a global bundle adjustment is yet to be merged."""
+        return self._closing.is_adjusting
+
+    @property
     def loops(self) -> list[LoopEdge]:
         """Every loop candidate and what became of it. Call ``finish()`` first."""
         return self._closing.edges
@@ -281,6 +293,10 @@ class Slam:
             matches = inliers = self._relocalise(frame)
             state = self._state_of(inliers, matches)
             relocalised = state != TrackingState.LOST
+            clock.lap("relocalise")
+        elif self._is_doubtful(frame, inliers) and (found := self._find_better(frame, inliers)):
+            matches, inliers, visible = found, found, np.empty(0, np.int32)
+            state, relocalised = self._state_of(inliers, matches), True
             clock.lap("relocalise")
         if state == TrackingState.LOST:
             frame.T_cw = T_cw
@@ -358,6 +374,12 @@ class Slam:
             start.map.session += 1
         return None
 
+    def _move_on(self, frames: FrameTable) -> None:
+        """Expect the next frame after the last ones, as if they had just been tracked."""
+        self._mapping.set_reference(int(frames.reference[-1]))
+        step = se3_log(orthonormalised(self._poses.pose(-1) @ inverse(self._poses.pose(-2))))
+        self._velocity = step / (frames.timestamp[-1] - frames.timestamp[-2])
+
     def _check_finished(self) -> None:
         if self._mapping.busy:
             raise RuntimeError("a keyframe is being mapped: call finish() first")
@@ -381,7 +403,8 @@ class Slam:
         return orthonormalised(se3_exp(self._velocity * elapsed) @ T_last)
 
     def _find_in_map(self, frame: Frame, clock: _Clock) -> TrackResult:
-        """A frame in a map that was loaded, before the camera was found in it."""
+        """A frame in a map that was loaded, before the camera was found in it. In a drive that is
+        resumed it is not far from where the last frame was."""
         T_cw = self._predict(frame.timestamp)
         matches, inliers, visible = 0, 0, np.empty(0, np.int32)
         if self._resumed and self._lost_frames == 0:
@@ -434,6 +457,31 @@ class Slam:
                 self._mapping.set_reference(candidate.match)
                 return inliers
         return self._relocalise_learned(frame, candidates)
+
+    def _is_doubtful(self, frame: Frame, inliers: int) -> bool:
+        """Whether a frame whose pose could hardly be predicted, after a gap or next to one found
+        in the map, tracks so little that it may be matched with other things."""
+        assert self.frame is not None
+        usual = self._poses.timestamp(-1) - self._poses.timestamp(-2) if len(self._poses) > 1 else 0
+        config = self.config.relocalization
+        gap = frame.timestamp - self.frame.timestamp > config.doubtful_gap * usual > 0.0
+        old = self._mapping.n_keyframes > self.config.tracking.young_keyframes
+        unpredicted = self._velocity is None and old
+        few = inliers < config.doubtful_share * self._mapping.n_reference
+        return few and (gap or unpredicted)
+
+    def _find_better(self, frame: Frame, inliers: int) -> int:
+        """Look for a frame in the whole map, and leave it as it is unless it tracks more there;
+        returns inliers or 0."""
+        T_cw, landmark, xyz = frame.T_cw, frame.landmark.copy(), frame.xyz.copy()
+        reference = self._mapping.reference
+        found = self._relocalise(frame)
+        if found > self.config.relocalization.better * inliers:
+            return found
+        frame.T_cw, frame.landmark, frame.xyz = T_cw, landmark, xyz
+        if self._mapping.reference != reference:
+            self._mapping.set_reference(reference)
+        return 0
 
     def _relocalise_learned(self, frame: Frame, candidates: list[LoopCandidate]) -> int:
         """By local descriptors of the network: where the light has changed ORB's find nothing."""
@@ -546,7 +594,7 @@ class Slam:
             self._look_around(frame)
             return False
         self._mapping.count(visible, frame.landmark[frame.landmark >= 0])
-        is_keyframe = self._needs_keyframe(frame, inliers)
+        is_keyframe = self._needs_keyframe(frame, inliers) and not self._follow_known(frame)
         if is_keyframe:
             self._insert_keyframe(frame)
         return is_keyframe
@@ -554,12 +602,9 @@ class Slam:
     def _look_around(self, frame: Frame) -> None:
         """The keyframe that sees most of the landmarks of a frame becomes the reference (ORB-SLAM,
         V-D)."""
-        a, n = self.map.arrays, self.map.n_keyframes
-        _, rows = gather_observations(a, frame.landmark[frame.landmark >= 0], np.arange(n))
-        if not len(rows):
-            return
-        best = int(np.argmax(np.bincount(a.keyframe[rows], minlength=n)))
-        if best != self._mapping.reference:
+        shared = self._mapping.count_shared(frame)
+        best = int(np.argmax(shared))
+        if shared[best] and best != self._mapping.reference:
             self._mapping.set_reference(best)
 
     def _needs_keyframe(self, frame: Frame, inliers: int) -> bool:
@@ -576,6 +621,20 @@ class Slam:
         if self.camera.monocular:
             return needs_monocular_keyframe(evidence, self.config.keyframes)
         return needs_keyframe(evidence, self.config.keyframes, depth=self.camera.depth)
+
+    def _follow_known(self, frame: Frame) -> bool:
+        """Track on by an old keyframe if the place is known by it; returns whether."""
+        self._merge(frame)
+        keyframe, n_shared, n_place = self._mapping.old_keyframe(frame)
+        if keyframe < 0:
+            return False
+        n_inliers = int(np.count_nonzero(frame.landmark >= 0))
+        evidence = PlaceEvidence(n_inliers, n_shared, n_place)
+        if not is_known_place(evidence, self.config.keyframes):
+            return False
+        self._mapping.follow(keyframe, frame)
+        self._poses.follow_reference(frame.index, frame.T_cw)
+        return True
 
     def _insert_keyframe(self, frame: Frame, *, predicted: bool = True) -> None:
         """Make a keyframe of the frame placed last (``MappingThread.insert``)."""

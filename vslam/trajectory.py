@@ -173,6 +173,16 @@ def write_kitti(path: Path, T_wc: NDArray[np.float64]) -> None:
     path.write_text("".join(" ".join(f"{x:.12e}" for x in row) + "\n" for row in rows))
 
 
+def tum_line(timestamp: float, T_wc: NDArray[np.float64]) -> str:
+    """One ``(4, 4)`` pose as a line of TUM's format."""
+    from scipy.spatial.transform import Rotation
+
+    quaternion = Rotation.from_matrix(T_wc[:3, :3]).as_quat(canonical=True)
+    # Twelve digits keep the quaternion on the unit sphere to the rounding of the poses.
+    numbers = [f"{x:.9f}" for x in T_wc[:3, 3]] + [f"{x:.12f}" for x in quaternion]
+    return " ".join([f"{timestamp:.9f}", *numbers]) + "\n"
+
+
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory in TUM's format: nanoseconds, nanometres, quaternions with qw >= 0."""
     from scipy.spatial.transform import Rotation

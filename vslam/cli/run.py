@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from vslam.cli.drive import Output, drive
 from vslam.cli.options import (
     KITTI_ROOT,
     Calib,
@@ -28,8 +29,6 @@ from vslam.cli.options import (
     Thresholds,
     Topics,
     ViewerName,
-    kind_of_source,
-    source_options,
 )
 from vslam.errors import InputError
 
@@ -46,6 +45,8 @@ _EXAMPLES = """
 
   vslam run --seq 00 --max-frames 200 --no-record --quiet
 
+  vslam run --resume runs/20261123-101500-kitti-00-none-bow
+
   vslam run --data drive.mp4 --side-by-side --calib stereo.yaml
 
   vslam run --data ~/kitti --seq 00 --map runs/latest --localize
@@ -58,6 +59,7 @@ def register(app: typer.Typer) -> None:
 
 
 def run(
+    context: typer.Context,
     data: Source = str(KITTI_ROOT),
     dataset: SourceKind = None,
     seq: Seq = None,
@@ -111,6 +113,18 @@ def run(
         Path | None,
         typer.Option(metavar="FILE", help="Write the map to this file, too, in place of another."),
     ] = None,
+    autosave: Annotated[
+        float,
+        typer.Option(
+            min=0, metavar="SECONDS", help="What a killed run loses at most; 0 saves at the end."
+        ),
+    ] = 60.0,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Go on at the next frame of a run that was cut off; alone."
+        ),
+    ] = None,
     realtime: Annotated[
         bool,
         typer.Option("--realtime", help="Play frames at their times; drop overtaken ones."),
@@ -134,6 +148,13 @@ def run(
     """Run SLAM on a sequence and write trajectory, map, recording and report to a folder."""
     from vslam.loopclosure.registry import require_detector
 
+    output = Output(record=record, view=view, pages=pages, ply=ply, quiet=quiet)
+    if resume is not None:
+        _refuse_beside_resume(context)
+        from vslam.run.options import read_options
+
+        drive(read_options(resume), output, resume=resume)
+        return
     if localize and map_file is None:
         raise InputError("--localize: name the map to localise in with --map.")
     if localize and save_map is not None:
@@ -149,89 +170,53 @@ def run(
     if compare_loops and realtime:
         raise InputError("--compare-loops: two runs drop different frames; leave out --realtime.")
 
-    from vslam.cli.progress import announce, progress_bar, render_bar
     from vslam.config import Config, load_config
-    from vslam.datasets.perturbation import parse_perturbation
-    from vslam.datasets.sources import open_source
-    from vslam.datasets.stream import count_expected, is_live
     from vslam.machine import available_cores
+    from vslam.run.options import RunOptions
 
-    thresholds = Config() if config is None else load_config(config)
-    kind = kind_of_source(dataset, data)
-    perturbation = parse_perturbation(perturb, seed)
-    options = source_options(calib, right, depth, fps, side_by_side, topics, depth_scale)
-    with render_bar(shown=not quiet) as on_render:
-        source = open_source(
-            kind, data, seq, options,
-            start=start, every=every, max_frames=max_frames, sensor=sensor,
-            on_render=on_render,
-        )  # fmt: skip
-    perturbation.bound_to(source)  # refuses laws that the data cannot serve
-    if is_live(source):
-        if compare_loops:
-            raise InputError("--compare-loops: a camera cannot be seen twice; leave it out.")
-        realtime = True
-
-    # Bad input has been refused by now; what follows takes a second to import.
-    from vslam.cli.summary import print_summary
-    from vslam.report.folder import create_run_folder, write_results
-    from vslam.run.moments import MomentRecorder
-    from vslam.run.outcome import RunSettings
-    from vslam.run.pipeline import require_camera, run_sequence, with_comparison
-    from vslam.run.recorder import (
-        NullRecorder,
-        Recorder,
-        RerunRecorder,
-        SeveralRecorders,
-        open_viewer,
-    )
-    from vslam.run.warmup import compile_kernels, is_cold
-
-    settings = RunSettings(
-        dataset=kind,
-        sequence=source.name,
-        perturb=perturbation.name,
-        detector=detector,
-        sensor=source.camera.sensor,
-        seed=seed,
-        threads=threads or min(available_cores(), 4),
+    options = RunOptions(
+        data=data,
+        dataset=dataset,
+        seq=seq,
+        calib=tuple(calib or ()),
+        right=right,
+        depth=depth,
+        fps=fps,
+        side_by_side=side_by_side,
+        topics=topics,
+        depth_scale=depth_scale,
+        perturb=perturb,
         start=start,
         every=every,
         max_frames=max_frames,
-        config=thresholds,
+        seed=seed,
+        threads=threads or min(available_cores(), 4),
+        detector=detector,
         weights=weights,
-        realtime=realtime,
-        calib=tuple(calib or ()),
-        map=map_file,
+        sensor=sensor,
+        thresholds=Config() if config is None else load_config(config),
+        map_file=map_file,
         localize=localize,
+        save_map=save_map,
+        realtime=realtime,
+        autosave=autosave,
     )
-    if map_file is not None:
-        require_camera(map_file, source.camera)
-    viewer = None if view is None else open_viewer(view)
-    folder = create_run_folder(out, kind, source.name, perturbation.name, detector)
-    recorder: Recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
-    moments = MomentRecorder()
-    if pages:
-        recorder = SeveralRecorders((recorder, moments))
-    if viewer is not None:
-        recorder = SeveralRecorders((recorder, RerunRecorder(viewer)))
-        if viewer.address:
-            announce(f"live at {viewer.address}", shown=not quiet)
-    if is_cold():
-        announce("first run: compiling the kernels, less than a minute ...", shown=not quiet)
-    compile_kernels(processes=min(settings.threads, 2))
-    with progress_bar(count_expected(source), shown=not quiet) as on_frame:
-        outcome = run_sequence(source, perturbation, settings, recorder, on_frame=on_frame)
-    if compare_loops and not outcome.interrupted:
-        with progress_bar(count_expected(source), shown=not quiet) as on_frame:
-            outcome = with_comparison(outcome, perturbation, on_frame=on_frame)
-    report = write_results(
-        folder, outcome, moments.moments, pages=pages, ply=ply, map_file=save_map
-    )
-    if not quiet:
-        print_summary(report, folder)
-    if outcome.interrupted:
-        raise typer.Exit(1)
+    drive(options, output, out=out, compare_loops=compare_loops)
+
+
+_BESIDE_RESUME = {"resume", "record", "view", "pages", "ply", "quiet"}
+
+
+def _refuse_beside_resume(context: typer.Context) -> None:
+    """A run goes on with its own options."""
+    for option in context.command.params:
+        source = context.get_parameter_source(option.name or "")
+        given = source is not None and source.name == "COMMANDLINE"
+        if given and option.name not in _BESIDE_RESUME:
+            raise InputError(
+                f"{option.opts[0]}: a run that is resumed goes on with its own options; leave it "
+                "out."
+            )
 
 
 def _map_to_go_on_in(file: Path, detector: DetectorName | None) -> tuple[Path, DetectorName]:

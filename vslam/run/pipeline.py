@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import dropwhile
 from pathlib import Path
 
 import cv2
@@ -37,9 +39,11 @@ from vslam.features import Features, TrackResult
 from vslam.frontend.sides import Sides, compare_sides
 from vslam.frontend.tracking import TrackingContext, extract_features
 from vslam.loopclosure.registry import create_detector, create_images, problem_of
+from vslam.loops import LoopCorrection, LoopEdge
 from vslam.machine import peak_memory_mb, process_age
 from vslam.map import Map
 from vslam.maps.storage import read_header
+from vslam.run.autosave import NO_AUTOSAVE, Autosave, Progress, Unfinished, in_frames
 from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
 from vslam.run.realtime import Played, play
 from vslam.run.recorder import NullRecorder, Recorder
@@ -69,6 +73,8 @@ def run_sequence(
     recorder: Recorder,
     *,
     on_frame: Callable[[TrackResult], None] = lambda result: None,
+    autosave: Autosave = NO_AUTOSAVE,
+    resume: Unfinished | None = None,
 ) -> RunOutcome:
     """Run SLAM over a whole sequence, or over a stream until it ends.
 
@@ -76,25 +82,48 @@ def run_sequence(
     in the outcome. One that is dropped in a real-time run gets an interpolated pose. Ctrl-C ends
     the run after the current frame, a source that breaks off after its last good one, a detector of
     another package where it fails; all done so far is kept.
+
+    Args:
+        autosave: saves what is done while the run goes on.
+        resume: what such a run left; this one goes on at the next frame, and its outcome covers
+            both.
     """
     cv2.setNumThreads(1)  # the pool uses the cores
-    slam = begin(sequence.camera, settings)
-    tracks: list[TrackResult] = []
-    skipped: list[str] = []
+    slam = begin(sequence.camera, settings, None if resume is None else resume.map)
+    before = Progress() if resume is None else resume.progress
+    tracks = list(before.tracks)
+    skipped = list(before.skipped)
     sides: list[Sides] = []
-    latency_ms: list[float] = []
+    latency_ms = list(before.latency_ms)
     n_told = 0  # loops that the recorder knows of
     perturbation = perturbation.bound_to(sequence)
     recorder.begin(sequence.camera, ground_truth_of(sequence))
     startup = process_age()
     wall, cpu = time.perf_counter(), time.process_time()
     broken: list[str] = []
+
+    def so_far() -> Progress:
+        frames = _frames_of_this_run(slam.map)
+        loops, corrections = in_frames(slam.loops, slam.corrections, frames)
+        return Progress(
+            tracks=tracks.copy(),
+            skipped=skipped.copy(),
+            latency_ms=latency_ms.copy(),
+            wall_s=before.wall_s + time.perf_counter() - wall,
+            cpu_s=before.cpu_s + time.process_time() - cpu,
+            loops=before.loops + loops,
+            corrections=before.corrections + corrections,
+        )
+
     with _stop_on_interrupt() as interrupted:
         frames = perturbed(_until_broken(timed_frames(sequence), broken), perturbation)
+        if tracks:
+            frames = dropwhile(partial(_not_later, tracks[-1].timestamp), frames)
         for played in _prepared(frames, slam.context, settings, live=is_live(sequence)):
             timestamp, frame = played.timestamp, played.made
             if frame is None or frame.dropped:
                 tracks.append(slam.skip(timestamp, dropped=True))
+                autosave.frame(tracks[-1])
                 on_frame(tracks[-1])
                 continue
             sides.append(frame.sides)
@@ -107,6 +136,7 @@ def run_sequence(
                 if settings.realtime:
                     latency_ms.append(1e3 * (time.perf_counter() - played.came))
             tracks.append(result)
+            autosave.frame(result)
             recorder.frame(result, result.T_wc)
             if result.is_keyframe and slam.frame is not None and frame.left is not None:
                 recorder.keyframe(result, frame.left, slam.frame.features, slam.frame.landmark >= 0)
@@ -114,6 +144,7 @@ def run_sequence(
                 recorder.map(slam.map)
                 n_told = _tell_loops(recorder, slam, n_told)
             on_frame(result)
+            autosave.offer(slam, so_far)
             if problem := problem_of(slam.detector):
                 broken.append(problem)
                 break
@@ -124,8 +155,10 @@ def run_sequence(
         slam.finish()
     if not broken and (problem := problem_of(slam.detector)):
         broken.append(problem)
+    autosave.close(slam, so_far, whole=not broken)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     _tell_loops(recorder, slam, n_told)
+    loops, corrections, keyframe_frames = _with_earlier(before, slam)
     trajectory = slam.trajectory()
     drive = f"{settings.dataset} {sequence.name}"
     recorder.finish(trajectory, slam.map)
@@ -140,8 +173,8 @@ def run_sequence(
             *rig_warnings(sides),
             *residual_warnings(measure_rig(slam.map, sequence.camera), sequence.camera),
         ],
-        wall_s=wall,
-        cpu_s=cpu,
+        wall_s=before.wall_s + wall,
+        cpu_s=before.cpu_s + cpu,
         startup_s=startup,
         peak_memory_mb=peak_memory_mb(),
         latency_ms=latency_ms,
@@ -151,16 +184,44 @@ def run_sequence(
         stored=None if settings.localize else slam.stored_map(drive),
         world=slam.world,
         in_map=None if settings.map is None else slam.in_map(),
-        loops=slam.loops,
-        corrections=slam.corrections,
-        keyframe_frames=_frames_of_this_run(slam.map),
+        loops=loops,
+        corrections=corrections,
+        keyframe_frames=keyframe_frames,
         n_submaps=len({0, *slam.map.restarts}) if slam.map.n_keyframes else 0,
         interrupted=broken[0] if broken else None,
     )
 
 
-def begin(camera: Camera, settings: RunSettings) -> Slam:
-    """SLAM before its first frame, with the detector asked for, in a new map or in one of a file.
+def _not_later(timestamp: float, frame: TimedFrame) -> bool:
+    return frame.timestamp <= timestamp
+
+
+def _with_earlier(
+    before: Progress, slam: Slam
+) -> tuple[list[LoopEdge], list[LoopCorrection], NDArray[np.int64]]:
+    """Loops and corrections of a whole run, and the frame of each keyframe that they name.
+
+    Those of before name frames. These get numbers after those of the map's keyframes.
+    """
+    frames = _frames_of_this_run(slam.map)
+    if not before.loops:
+        return slam.loops, slam.corrections, frames
+    named = {end for loop in before.loops for end in (loop.query, loop.match)}
+    extra = np.array(sorted(named), np.int64)
+    number = {frame: len(frames) + k for k, frame in enumerate(extra.tolist())}
+
+    def renamed(loop: LoopEdge) -> LoopEdge:
+        query = number[loop.query] if loop.query >= 0 else -1
+        return replace(loop, query=query, match=number[loop.match])
+
+    loops = [renamed(loop) for loop in before.loops]
+    corrections = [replace(one, edge=renamed(one.edge)) for one in before.corrections]
+    return loops + slam.loops, corrections + slam.corrections, np.concatenate([frames, extra])
+
+
+def begin(camera: Camera, settings: RunSettings, saved: Path | None = None) -> Slam:
+    """SLAM before its first frame, with the detector asked for, in a new map or in one of a file;
+    with ``saved``, the map that an unfinished run left, before the next frame of that run.
 
     Raises:
         InputError: no such map, one of another camera, detector or pyramid, or weights that cannot
@@ -169,6 +230,8 @@ def begin(camera: Camera, settings: RunSettings) -> Slam:
     config, threads = settings.config, settings.threads
     images = create_images(settings.detector, config)
     detector = create_detector(settings.detector, config, settings.weights, images)
+    if saved is not None:
+        return Slam.load(saved, config, detector, threads=threads, images=images, resume=True)
     if settings.map is None:
         return Slam(camera, config, detector, threads=threads, images=images)
     return Slam.load(

@@ -1,0 +1,243 @@
+"""A run that is killed loses little: what it saved loads, and the run goes on at the next frame."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_pipeline import vslam
+
+from vslam.config import Config
+from vslam.datasets import open_sequence
+from vslam.datasets.perturbation import parse_perturbation
+from vslam.errors import InputError
+from vslam.evaluation.trajectories import evaluate_trajectory
+from vslam.features import TrackingState, TrackResult
+from vslam.loops import LoopCorrection, LoopEdge
+from vslam.maps.storage import load_map
+from vslam.run import autosave as saving
+from vslam.run.autosave import (
+    MAP,
+    ONLINE,
+    PROGRESS,
+    FolderAutosave,
+    Progress,
+    Unfinished,
+    find_unfinished,
+    read_progress,
+    write_progress,
+)
+from vslam.run.options import RunOptions, read_options, write_options
+from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
+from vslam.run.pipeline import _with_earlier, run_sequence
+from vslam.run.recorder import NullRecorder
+from vslam.slam import Slam
+from vslam.trajectory import read_trajectory
+
+FRAMES = 28
+
+KILLED = """
+import os, signal, sys, time
+from pathlib import Path
+from test_autosave import drive
+
+def on_frame(result):
+    if result.index == int(sys.argv[3]):
+        while not (Path(sys.argv[2]) / "autosave.npz").exists():  # a slow disk
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+drive(Path(sys.argv[1]), Path(sys.argv[2]), on_frame=on_frame)
+"""
+
+
+def drive(
+    root: Path, folder: Path | None, resume: Unfinished | None = None, **options: object
+) -> RunOutcome:
+    """Run over the corridor; with a folder, saving whenever that is possible."""
+    sequence = open_sequence("kitti", root, "00")
+    settings = RunSettings("kitti", "00", "none", "bow", "stereo", 0, 2, 0, 1, None, Config())
+    autosave = {} if folder is None else {"autosave": FolderAutosave(folder, 1e-6, "kitti 00")}
+    law = parse_perturbation("none", 0)
+    return run_sequence(
+        sequence, law, settings, NullRecorder(), resume=resume, **autosave, **options
+    )
+
+
+@pytest.fixture(scope="module")
+def undisturbed(kitti_tree):
+    return drive(kitti_tree, None)
+
+
+def ate(outcome: RunOutcome) -> float:
+    truth = ground_truth_of(outcome.sequence)
+    assert truth is not None
+    return evaluate_trajectory(outcome.trajectory, truth).ate_rmse_m
+
+
+def test_saving_changes_no_byte(kitti_tree, tmp_path, undisturbed):
+    saved = drive(kitti_tree, tmp_path)
+    assert saved.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
+    assert (tmp_path / MAP).is_file()
+    online = read_trajectory(tmp_path / ONLINE)
+    as_tracked = np.array([track.T_wc for track in saved.tracks])
+    np.testing.assert_allclose(online.T_wc, as_tracked, atol=1e-8)
+
+
+@pytest.mark.parametrize("frame", [9, 17, 26])
+def test_a_killed_run_goes_on_at_the_next_frame(kitti_tree, tmp_path, undisturbed, frame):
+    words = [sys.executable, "-c", KILLED, str(kitti_tree), str(tmp_path), str(frame)]
+    done = subprocess.run(words, cwd=Path(__file__).parent, timeout=300)
+    assert done.returncode == -signal.SIGKILL
+    assert len(read_trajectory(tmp_path / ONLINE)) == frame + 1
+    unfinished = find_unfinished(tmp_path)
+    n_saved = len(unfinished.progress.tracks)
+    assert 1 < n_saved <= frame + 1
+    whole = drive(kitti_tree, tmp_path, unfinished)
+    assert [track.index for track in whole.tracks] == list(range(FRAMES))
+    assert all(track.state == TrackingState.OK for track in whole.tracks)
+    assert len(whole.trajectory) == FRAMES
+    assert len(read_trajectory(tmp_path / ONLINE)) == FRAMES
+    before = whole.tracks[n_saved - 1].T_wc
+    assert np.array_equal(before, undisturbed.tracks[n_saved - 1].T_wc)
+    assert ate(whole) < 1.05 * ate(undisturbed) + 1e-3
+
+
+def test_an_interrupted_run_is_saved_at_its_end(kitti_tree, tmp_path):
+    def interrupt(result: TrackResult) -> None:
+        if result.index == 12:
+            signal.raise_signal(signal.SIGINT)
+
+    drive(kitti_tree, tmp_path, on_frame=interrupt)
+    assert len(find_unfinished(tmp_path).progress.tracks) == 13
+
+
+def test_a_full_disk_is_told_once_and_the_run_goes_on(
+    kitti_tree, tmp_path, monkeypatch, caplog, undisturbed
+):
+    def full(path, progress):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(saving, "write_progress", full)
+    with caplog.at_level(logging.WARNING):
+        outcome = drive(kitti_tree, tmp_path)
+    assert outcome.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
+    told = [record.message for record in caplog.records]
+    assert told == [
+        f"{tmp_path / MAP}: cannot be written (No space left on device); the run goes on without."
+    ]
+
+
+def some_progress() -> Progress:
+    T = np.eye(4)
+    T[:3, 3] = 0.1, 0.2, 0.3
+    tracks = [
+        TrackResult(0, 1.5, np.eye(4), TrackingState.OK, 9, 8, 7, 6, True, False, {"extract": 2.5}),
+        TrackResult(1, 1.6, T, TrackingState.LOST, 5, 4, 3, 2, False, True, {"relocalise": 1.25}),
+        TrackResult(2, 1.7, T, TrackingState.DROPPED, 0, 0, 0, 0, False),
+    ]
+    early = LoopEdge(1, 0, 0.5, True, "closed", 40, 30, T)
+    late = LoopEdge(2, -1, 0.25, False, "too few matches")
+    correction = LoopCorrection(early, np.array([0, 1]), np.stack([T, T]), np.stack([T, T]), 0.125)
+    skipped = ["frame 1: a.png: damaged", "frame 2: b.png: damaged"]
+    return Progress(tracks, skipped, [3.0], 60.5, 42.25, [early, late], [correction])
+
+
+def test_progress_is_read_as_it_was_written(tmp_path):
+    progress = some_progress()
+    write_progress(tmp_path / PROGRESS, progress)
+    read = read_progress(tmp_path / PROGRESS)
+    for was, now in zip(progress.tracks, read.tracks, strict=True):
+        assert np.array_equal(was.T_wc, now.T_wc)
+        assert replace(was, T_wc=now.T_wc) == now
+    assert (read.skipped, read.latency_ms) == (progress.skipped, progress.latency_ms)
+    assert (read.wall_s, read.cpu_s) == (60.5, 42.25)
+    assert [vars(loop).keys() for loop in read.loops]
+    assert read.loops[1] == progress.loops[1]
+    assert np.array_equal(read.loops[0].T_query_match, progress.loops[0].T_query_match)
+    assert read.corrections[0].seconds == 0.125
+    assert read.corrections[0].keyframes.tolist() == [0, 1]
+
+
+def test_progress_until_a_frame_knows_nothing_later():
+    two = some_progress().until(2)
+    assert [track.index for track in two.tracks] == [0, 1]
+    assert [loop.query for loop in two.loops] == [1]
+    assert len(two.corrections) == 1
+    assert two.skipped == ["frame 1: a.png: damaged"]
+
+
+def test_earlier_loops_get_keyframes_of_their_own():
+    progress = some_progress()
+    loops, corrections, frames = _with_earlier(progress, Slam(open_camera(), threads=1))
+    assert [(frames[loop.query], frames[loop.match]) for loop in loops] == [(1, 0), (2, -1)]
+    assert frames[corrections[0].edge.query] == 1
+
+
+def open_camera():
+    from ring import CAMERA
+
+    return CAMERA
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.9, 0.0])
+def test_a_damaged_file_gets_a_sentence(tmp_path, kept):
+    path = tmp_path / PROGRESS
+    write_progress(path, some_progress())
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
+    with pytest.raises(InputError, match=r"there is nothing to resume\.$"):
+        read_progress(path)
+
+
+def test_options_come_back_with_absolute_paths(tmp_path, monkeypatch):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "camera.yaml").write_text("")
+    monkeypatch.chdir(tmp_path)
+    options = RunOptions(data="images", calib=(Path("camera.yaml"),), seed=3, autosave=5.0)
+    write_options(tmp_path, options)
+    read = read_options(tmp_path)
+    assert read.data == str(tmp_path / "images")
+    assert read.calib == (tmp_path / "camera.yaml",)
+    assert read.model_copy(update={"data": "images", "calib": options.calib}) == options
+
+
+def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
+    brief = ("--no-record", "--no-report", "--quiet")
+    done = vslam("run", "--data", kitti_tree, "--max-frames", 12, *brief, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    folder = (tmp_path / "runs" / "latest").resolve()
+    assert not (folder / MAP).exists()  # the run is whole
+    refused = vslam("run", "--resume", folder, "--seed", 2, *brief, cwd=tmp_path)
+    assert refused.returncode == 2
+    assert refused.stderr == (
+        "error: --seed: a run that is resumed goes on with its own options; leave it out.\n"
+    )
+    nothing = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
+    assert nothing.returncode == 2
+    assert "no autosave.npz here" in nothing.stderr
+    # As if it had been cut off after these frames, of more to come.
+    drive_until(kitti_tree, folder, 11)
+    write_options(folder, read_options(folder).model_copy(update={"max_frames": None}))
+    resumed = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
+    assert resumed.returncode == 0, resumed.stderr
+    assert len(read_trajectory(folder / "trajectory.tum")) == FRAMES
+    frames = load_map(folder / "map.npz").frames
+    assert frames is not None
+    assert len(frames.timestamp) == FRAMES
+    assert not (folder / MAP).exists()
+
+
+def drive_until(root: Path, folder: Path, frame: int) -> None:
+    def interrupt(result: TrackResult) -> None:
+        if result.index == frame:
+            signal.raise_signal(signal.SIGINT)
+
+    drive(root, folder, on_frame=interrupt)

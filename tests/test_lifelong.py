@@ -1,0 +1,154 @@
+"""Driving known streets does not grow the map; laps are linked where they meet."""
+
+from __future__ import annotations
+
+import sys
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ring import CAMERA, LAP, RADIUS, STEP, Oracle, Ring
+from test_closing import errors
+
+from vslam.config import Config
+from vslam.errors import InputError
+from vslam.features import Features
+from vslam.geometry import inverse
+from vslam.loops import LoopEdge
+from vslam.slam import Slam
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+from laps import BLACK, find_seam, is_right, plan_laps
+
+RING = Ring.create()
+PLACES = [float(k % LAP) for k in range(5 * LAP)]
+NEVER_KNOWN = 1e9
+
+
+@cache
+def view(k: int) -> Features:
+    return RING.see(k, 1)
+
+
+@cache
+def laps(known_after_s: float, threads: int = 1) -> tuple[Slam, tuple[int, ...], list]:
+    """Five laps of the ring, 21 s each; the keyframes alive after each."""
+    config = Config.model_validate({"keyframes": {"known_after_s": known_after_s}})
+    slam = Slam(CAMERA, config, Oracle(RING, PLACES), threads=threads)
+    keyframes, results = [], []
+    for i, place in enumerate(PLACES):
+        image = np.array([[i & 255, i >> 8]], np.uint8)
+        results.append(slam.step_features(view(int(place)), 0.1 * i, image))
+        if i % LAP == LAP - 1:
+            while slam.is_mapping:
+                slam._merge()
+            keyframes.append(len(slam.map.living_keyframes()))
+    slam.finish()
+    return slam, tuple(keyframes), results
+
+
+def test_known_streets_do_not_grow_the_map(check_map):
+    slam, keyframes, results = laps(10.0)
+    _, growing, _ = laps(NEVER_KNOWN)
+    assert keyframes[0] == growing[0]  # the first lap is new to both
+    assert keyframes[-1] < 1.4 * keyframes[1]
+    assert growing[-1] > 1.4 * growing[0]
+    assert sum(result.is_keyframe for result in results[3 * LAP :]) < 20
+    check_map(slam.map)
+
+
+def test_what_is_known_is_tracked_no_worse():
+    mean = [float(errors(laps(known)[0], RING, PLACES).mean()) for known in (10.0, NEVER_KNOWN)]
+    assert mean[0] < 1.1 * mean[1]
+    assert all(result.n_inliers > 60 for result in laps(10.0)[2][2 * LAP :])
+
+
+def test_known_streets_give_the_same_bytes_with_one_thread_and_two():
+    one, two = laps(10.0)[0], laps(10.0, threads=2)[0]
+    assert one.trajectory().T_wc.tobytes() == two.trajectory().T_wc.tobytes()
+
+
+def test_a_frame_that_is_found_nowhere_better_stays_as_it_is(monkeypatch):
+    slam = Slam(CAMERA, None, Oracle(RING, PLACES), threads=1)
+    for k in range(12):
+        slam.step_features(view(k), 0.1 * k)
+    slam._merge()
+    frame, reference = slam.frame, slam._mapping.reference
+    assert frame is not None
+    before = frame.T_cw.copy(), frame.landmark.copy(), frame.xyz.copy()
+
+    def elsewhere(frame) -> int:
+        frame.T_cw = np.eye(4)
+        frame.landmark[:] = -1
+        slam._mapping.set_reference(0)
+        return 100
+
+    monkeypatch.setattr(slam, "_relocalise", elsewhere)
+    assert slam._find_better(frame, inliers=67) == 0
+    assert slam._mapping.reference == reference
+    for was, now in zip(before, (frame.T_cw, frame.landmark, frame.xyz), strict=True):
+        assert np.array_equal(was, now, equal_nan=True)
+    assert slam._find_better(frame, inliers=66) == 100
+    assert slam._mapping.reference == 0
+
+
+@pytest.mark.parametrize(("seconds", "share", "doubtful"), [
+    (0.1, 0.4, False), (0.14, 0.4, False), (0.16, 0.4, True), (0.16, 0.6, False),
+])  # fmt: skip
+def test_only_a_frame_after_a_gap_that_tracks_little_is_doubtful(seconds, share, doubtful):
+    slam = Slam(CAMERA, None, threads=1)
+    for k in range(12):
+        slam.step_features(view(k), 0.1 * k)
+    slam._merge()
+    assert slam.frame is not None
+    frame = slam._next_frame(view(12), slam.frame.timestamp + seconds, None)
+    assert slam._is_doubtful(frame, int(share * slam._mapping.n_reference)) == doubtful
+
+
+def circle(n: int, frames: int) -> np.ndarray:
+    """``(frames, 4, 4)`` poses along a circle of n frames."""
+    whole = 2 * np.pi * RADIUS / STEP
+    return np.array([RING.pose(k * whole / n) for k in range(frames)])
+
+
+def test_laps_are_linked_where_the_route_meets_itself():
+    assert find_seam(circle(100, 101)) == (100, 0)
+    with pytest.raises(InputError, match="does not close on itself"):
+        find_seam(circle(100, 95))
+
+
+def test_laps_go_round_without_a_leap():
+    planned = plan_laps((12, 2), laps=4, lights=3)
+    assert planned.place == [*range(13), *[*range(3, 13)] * 3]
+    assert planned.frame == planned.place
+    assert planned.lap == [1] * 13 + [2] * 10 + [3] * 10 + [4] * 10
+    assert planned.light == [0] * 13 + [1] * 10 + [2] * 10 + [0] * 10
+    assert planned.step == list(range(43))
+
+
+def test_incidents_come_from_the_third_lap_on_and_time_goes_on():
+    plain, planned = (plan_laps((400, 20), 30, 4, seed) for seed in (None, 0))
+    first = plain.lap.index(3)
+    assert planned.place[:first] == plain.place[:first]
+    assert planned.frame[:first] == plain.frame[:first]
+    steps, places = np.diff(planned.step), np.diff(planned.place) % 380
+    assert steps.min() == 1
+    assert steps.max() > 5
+    dropped = steps > 1
+    assert (places[dropped] == steps[dropped]).all()  # the camera drives on
+    cuts = np.flatnonzero((places != steps) & (places != steps % 380))
+    assert 10 < len(cuts) < 60
+    assert 100 < planned.frame.count(BLACK) < 2000
+    assert all(21 <= place <= 400 for place in planned.place[first:])
+    assert plan_laps((400, 20), 30, 4, 0) == planned
+
+
+def test_a_loop_is_judged_by_the_truth():
+    T_wc, frames = circle(100, 10), np.array([0, 5])
+    T = inverse(T_wc[5]) @ T_wc[0]
+    edge = LoopEdge(1, 0, 1.0, True, "closed", T_query_match=T)
+    assert is_right(edge, frames, T_wc)
+    T_off = T.copy()
+    T_off[0, 3] += 2.1
+    assert not is_right(LoopEdge(1, 0, 1.0, True, "closed", T_query_match=T_off), frames, T_wc)

@@ -1,0 +1,116 @@
+"""Kill a run at random moments, every other time while it saves, and resume it: what is lost?
+
+Each time ``kill -9`` ends the run once it has done a number of frames drawn from a seed, or in the
+middle of the next autosave. All that it left is read, and the run resumed. The table has the frame
+of the kill, the frames saved, the seconds of the run that are lost, and the ATE of the whole run.
+
+    python tools/kill_test.py --kills 10 --autosave 4 -- --dataset synthetic --seq demo
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from vslam.errors import InputError
+from vslam.maps.storage import load_map
+from vslam.run.autosave import MAP, ONLINE, PROGRESS, read_progress
+from vslam.trajectory import read_trajectory
+
+RUN = (sys.executable, "-m", "vslam", "run")
+BRIEF = ("--no-record", "--no-report", "--quiet")
+
+
+def report_of(folder: Path) -> dict[str, float]:
+    """The report of a finished run."""
+    return json.loads((folder / "report.json").read_text())
+
+
+def frames_done(folder: Path) -> int:
+    """Frames that a run has tracked so far."""
+    try:
+        return (folder / ONLINE).read_bytes().count(b"\n")
+    except OSError:
+        return 0
+
+
+def is_saving(folder: Path) -> bool:
+    """Whether an autosave is being written."""
+    return any(folder.glob(".autosave*.part"))
+
+
+def kill_at(words: list[str], out: Path, frame: int, saving: bool) -> tuple[Path, int, float]:
+    """Start a run and kill it; returns its folder, the frames done and the seconds they took."""
+    process = subprocess.Popen([*RUN, *words, *BRIEF, "--out", str(out)])
+    folder, begin = out / "latest", 0.0
+    while process.poll() is None:
+        done = frames_done(folder)
+        begin = begin or (time.monotonic() if done else 0.0)
+        if done >= frame and (not saving or is_saving(folder)):
+            os.kill(process.pid, signal.SIGKILL)
+            break
+        time.sleep(0.001 if done >= frame else 0.05)
+    process.wait()
+    return folder.resolve(), frames_done(folder), time.monotonic() - begin
+
+
+def saved_frames(folder: Path) -> tuple[int, float]:
+    """Read everything that a killed run left: frames saved, and seconds it had taken for them."""
+    read_trajectory(folder / ONLINE)
+    if not (folder / MAP).exists():
+        return 0, 0.0
+    frames = load_map(folder / MAP).frames
+    assert frames is not None
+    progress = read_progress(folder / PROGRESS)
+    assert len(progress.tracks) >= len(frames.timestamp)
+    return len(frames.timestamp), progress.wall_s
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=int, default=10)
+    parser.add_argument("--autosave", type=float, default=4.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("words", nargs="+", help="options of vslam run that name the images")
+    options = parser.parse_args()
+    random_ = random.Random(options.seed)
+    words = [*options.words, "--autosave", str(options.autosave)]
+    with tempfile.TemporaryDirectory() as name:
+        out = Path(name)
+        subprocess.run([*RUN, *options.words, *BRIEF, "--out", str(out / "whole")], check=True)
+        whole = report_of(out / "whole" / "latest")
+        frames = int(whole["frames"])
+        print(f"undisturbed: {frames} frames, ATE {whole['ate_rmse_m']:.4f} m", flush=True)
+        print("kill\tduring\tframe\tsaved\tlost_s\tate_m\tframes", flush=True)
+        for number in range(options.kills):
+            saving = number % 2 == 1
+            at = random_.randrange(1, frames - 1)
+            folder, done, seconds = kill_at(words, out / str(number), at, saving)
+            if (folder / "report.json").exists():
+                print(f"{number}\tthe run ended before it could be killed", flush=True)
+                continue
+            try:
+                saved, wall_s = saved_frames(folder)
+            except InputError as error:
+                sys.exit(f"kill {number}: {error}")
+            row = (
+                f"{number}\t{'save' if saving else 'run'}\t{done}\t{saved}\t{seconds - wall_s:.1f}"
+            )
+            if saved == 0:
+                print(f"{row}\tnothing saved yet", flush=True)
+                continue
+            subprocess.run([*RUN, "--resume", str(folder), *BRIEF], check=True)
+            report = report_of(folder)
+            print(f"{row}\t{report['ate_rmse_m']:.4f}\t{report['frames']}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,85 @@
+"""The options of ``vslam run`` that a run depends on, kept in its folder to be resumed with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from vslam.config import Config
+from vslam.errors import InputError
+
+OPTIONS = "run.json"
+
+
+class RunOptions(BaseModel):
+    """As the command line has them; paths are absolute in a file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    data: str
+    dataset: str | None = None
+    seq: str | None = None
+    calib: tuple[Path, ...] = ()
+    right: Path | None = None
+    depth: Path | None = None
+    fps: float | None = None
+    side_by_side: bool = False
+    topics: str = ""
+    depth_scale: float | None = None
+    perturb: str = "none"
+    start: int = 0
+    every: int = 1
+    max_frames: int | None = None
+    seed: int = 0
+    threads: int = 1
+    detector: str = "bow"
+    weights: Path | None = None
+    sensor: str | None = None
+    thresholds: Config = Config()
+    map_file: Path | None = None
+    localize: bool = False
+    save_map: Path | None = None
+    realtime: bool = False
+    autosave: float = 60.0
+
+
+def write_options(folder: Path, options: RunOptions) -> None:
+    """Write ``run.json``.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    data = Path(options.data)
+    absolute: dict[str, object] = {
+        name: path.resolve()
+        for name in ("right", "depth", "weights", "map_file", "save_map")
+        if (path := getattr(options, name)) is not None
+    }
+    absolute["data"] = str(data.resolve()) if data.exists() else options.data
+    absolute["calib"] = tuple(path.resolve() for path in options.calib)
+    text = options.model_copy(update=absolute).model_dump_json(indent=2)
+    try:
+        (folder / OPTIONS).write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(
+            f"{folder / OPTIONS}: cannot be written ({error.strerror}); name a folder with some "
+            "space with --out."
+        ) from error
+
+
+def read_options(folder: Path) -> RunOptions:
+    """Read ``run.json`` of the folder of a run.
+
+    Raises:
+        InputError: there is none, or it is damaged.
+    """
+    path = folder / OPTIONS
+    try:
+        return RunOptions.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); name the folder of a run with --resume."
+        ) from error
+    except ValidationError as error:
+        raise InputError(f"{path}: damaged, or of another version; run again.") from error

@@ -25,6 +25,7 @@ from vslam.frontend.matching import (
 )
 from vslam.frontend.orb import extract, scale_factors
 from vslam.frontend.pose import optimise_pose
+from vslam.frontend.sides import balanced
 from vslam.frontend.stereo import match_stereo
 from vslam.geometry import compose, inverse, transform
 from vslam.map import LocalMap
@@ -137,7 +138,7 @@ def extract_features(
             scale, depth = context.scales[found.octave], np.asarray(second, np.float32)
             u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
     else:
-        pair = [left, np.asarray(second, np.uint8)]
+        pair = balanced(left, np.asarray(second, np.uint8), config.stereo)
         found, right = image_map(lambda image: extract(image, config.orb), pair)
         u_right = match_stereo(found, right, camera, config.stereo)
     return Features(found.xy, found.octave, found.angle, found.descriptors, u_right)

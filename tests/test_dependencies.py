@@ -224,7 +224,7 @@ def test_heavy_libraries_stay_where_they_belong(library):
 
 
 def test_few_modules_lie_directly_in_the_package():
-    assert len(list((ROOT / "vslam").glob("*.py"))) <= 23
+    assert len(list((ROOT / "vslam").glob("*.py"))) <= 24
 
 
 def test_long_files_give_their_reason():

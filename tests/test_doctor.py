@@ -252,6 +252,17 @@ def test_one_camera_alone(clean):
     assert found == {"images", "features", "sharpness", "order of times", "gaps", "jitter"}
 
 
+@pytest.mark.parametrize(
+    ("n", "missing", "verdict"),
+    [(10, 1, "good"), (20, 2, "good"), (20, 4, "fault"), (200, 10, "good"), (200, 20, "fault")],
+)
+def test_one_frame_missing_in_a_short_clip_is_no_fault(n, missing, verdict):
+    steps = np.full(n - 1, 0.1)
+    steps[np.linspace(0, n - 2, missing).astype(int)] = 0.2
+    found = {f.check: f.verdict for f in check_times(np.cumsum(steps))}
+    assert found["gaps"] == verdict
+
+
 def test_few_frames_have_no_rhythm():
     assert [f.verdict for f in check_times(np.array([0.0, 1.0]))] == ["unknown"]
 

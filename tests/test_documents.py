@@ -12,9 +12,14 @@ import pytest
 import yaml
 
 ROOT = Path(__file__).parents[1]
+GENERATED = ROOT / "docs" / "reference"  # commands.md and generated/, when the site is built
 DOCUMENTS = sorted(
-    [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "loopclosure").glob("*.md")]
-)
+    path
+    for path in [
+        *ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "loopclosure").glob("*.md")
+    ]
+    if path.name != "commands.md" and GENERATED / "generated" not in path.parents
+)  # fmt: skip
 MOST_WORDS = {"README.md": 900, "docs/loops.md": 1500, "docs/training.md": 1500}
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)[^)]*\)")
 SOURCE = re.compile(
@@ -34,7 +39,8 @@ def test_documents_are_short(document, most):
 @pytest.mark.parametrize("document", DOCUMENTS, ids=name)
 def test_links_and_files_named_exist(document):
     text = document.read_text()
-    missing = [link for link in LINK.findall(text) if not (document.parent / link).exists()]
+    links = [link for link in LINK.findall(text) if not link.endswith("reference/commands.md")]
+    missing = [link for link in links if not (document.parent / link).exists()]
     missing += [file for file in SOURCE.findall(text) if not (ROOT / file).exists()]
     assert missing == []
 

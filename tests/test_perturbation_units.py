@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -397,3 +398,11 @@ def test_units_are_refused_out_of_their_range():
 def test_a_pair_without_a_right_image_passes_the_faults_of_one_side():
     pair = Pair(0, 0.0, np.zeros((160, 320), np.uint8), None, (np.zeros((160, 320)), None))
     assert pair.right is None
+
+
+def test_the_table_of_laws_is_that_of_the_code(monkeypatch):
+    tools = Path(__file__).parents[1] / "tools"
+    monkeypatch.syspath_prepend(str(tools))
+    import law_table
+
+    assert law_table.TABLE.read_text() == law_table.table()

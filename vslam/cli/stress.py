@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from vslam.cli.bench import open_all, outcomes_of
-from vslam.cli.options import KITTI_ROOT, Data, Dataset, MaxFrames, Thresholds, names_in
+from vslam.cli.options import KITTI_ROOT, Data, Dataset, MaxFrames, Sensor, Thresholds, names_in
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -87,6 +87,7 @@ def stress(
         float, typer.Option(min=0.0, help="Metres of ATE below which no run fails by it.")
     ] = 0.25,
     max_frames: MaxFrames = None,
+    sensor: Sensor = None,
     jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 1,
     threads: Annotated[
         int | None,
@@ -126,6 +127,8 @@ def stress(
         raise InputError("--systems: no system; name vslam, orbslam3 or one of --system.")
     if baseline is not None and baseline not in names:
         raise InputError(f"--baseline {baseline}: not tested; choose from {', '.join(names)}.")
+    if sensor == "mono" and others:
+        raise InputError("--sensor mono: of vslam alone; other systems get both sides.")
     thresholds = Config() if config is None else load_config(config)
     out = out.absolute()
     options = execute.RunOptions(
@@ -136,13 +139,17 @@ def stress(
         others={name: _program(name, command) for name, command in others.items()},
     )
     _, identity = open_all(
-        dataset, data.absolute(), seqs, SourceOptions(), max_frames, None, shown=not quiet
+        dataset, data.absolute(), seqs, SourceOptions(), max_frames, sensor, shown=not quiet
     )
-    opened = {name: open_sequence(dataset, data, name, max_frames=max_frames) for name in sequences}
+    opened = {
+        name: open_sequence(dataset, data, name, max_frames=max_frames, monocular=sensor == "mono")
+        for name in sequences
+    }
     fitting, notes = _fitting(parse_laws(laws), opened) if preset is None else ([], [])
     plan = Plan(
         dataset, tuple(sequences), tuple(fitting), tuple(names), seeds, steps, max_frames,
         baseline or names[0], Criterion(max_lost, ate_factor, ate_least), tuple(others), preset,
+        sensor,
     )  # fmt: skip
     execute.prepare(out, identity)
     searches, results = plan.searches(), Results(out, options.config)

@@ -62,6 +62,7 @@ def print_summary(report: ReportJson, folder: Path) -> None:
             ("loops", _loops(report)),
             ("speed", f"{report.fps:.1f} fps"),
             ("map", f"{report.keyframes} keyframes, {report.landmarks} landmarks{submaps}"),
+            *(("warning", warning) for warning in report.warnings),
             *([("advice", advice(report))] if advice(report) else []),
             ("folder", str(folder)),
             *((name, str(folder / file)) for name, file in _LOOK_AT if (folder / file).exists()),

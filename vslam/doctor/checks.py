@@ -33,7 +33,7 @@ FEATURES = 0.5  # of those asked for
 SHARP = 0.18
 JITTER = 0.2  # of the interval, standard deviation
 GAP = 1.75  # of the interval: a frame is missing
-GAPS = 0.05  # share of intervals
+GAPS = 0.05  # share of intervals, and two standard deviations more: few intervals scatter
 LONG_GAP = 3.5  # of the interval: two or more frames are missing in a row
 DEPTH_PX = 4.0  # depth edges of structured light are off by 2 to 3 px
 DEPTH_SHARE = 0.3
@@ -177,9 +177,11 @@ def check_times(timestamps: Times) -> list[Finding]:
         return [order]
     gaps = steps > GAP * interval
     longest = int(np.argmax(steps))
+    n = len(steps)
+    most = GAPS * n + 2.0 * np.sqrt(GAPS * (1.0 - GAPS) * n)
     gap = judge(
         "gaps",
-        bool(np.mean(gaps) > GAPS or steps[longest] > LONG_GAP * interval),
+        bool(gaps.sum() > most or steps[longest] > LONG_GAP * interval),
         f"{int(gaps.sum())} intervals with frames missing, the longest {steps[longest]:.3f} s "
         f"after frame {longest}",
         "frames were lost on the way to the disk: record to a faster one, or at a lower rate",

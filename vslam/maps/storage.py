@@ -25,6 +25,7 @@ from vslam.map_kernels import gather_observations
 from vslam.maps.checked_map import ARRAYS, DamagedMapError, checked_map
 from vslam.maps.new_output import replaced_file
 from vslam.maps.stored_map import StoredMap
+from vslam.untrusted import require_memory
 
 SCHEMA = 2
 _FOREIGN = "not a map of vslam; name a map.npz, or the folder of a run"
@@ -166,6 +167,7 @@ def _read(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
 def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
     """An archive of arrays, and its header if it is a map of this schema."""
     try:
+        require_memory(path, "a map of vslam")
         with np.load(path, allow_pickle=False) as file:
             if "header" not in file.files and "keyframe_first_row" in file.files:
                 raise InputError(

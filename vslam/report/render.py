@@ -121,6 +121,8 @@ def render_markdown(report: ReportJson) -> str:
     if report.interrupted:
         lines += [f"**Interrupted: {report.interrupted}.** Numbers are of the frames done.", ""]
     lines += markdown_table(("", "", ""), [(h.label, h.value, h.note) for h in headlines(report)])
+    for warning in report.warnings:
+        lines += ["", f"**Warning: {warning}**"]
     lines += ["", advice(report)] if advice(report) else []
     if report.skipped_messages:
         lines += ["", "## Skipped frames", "", *(f"- {text}" for text in report.skipped_messages)]

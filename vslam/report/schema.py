@@ -103,6 +103,7 @@ class ReportJson(_Model):
     ``evaluation_remark`` says why there are none, or of how many frames they are.
     ``causal_ate_rmse_m`` is of the poses as they were given at the time
     (``trajectory_causal.tum``), after an alignment of their own.
+    ``warnings`` are sentences on faults of the rig that the run has shown.
     ``without_loops`` is of the same run with the detector ``none`` (``--compare-loops``).
     ``frames`` counts the frames done; of them ``skipped_frames`` had an unreadable image and
     ``dropped_frames`` were overtaken by a newer one in a real-time run, whose ``latency_ms`` is
@@ -121,6 +122,7 @@ class ReportJson(_Model):
     dropped_frames: int = 0
     frames: int
     interrupted: str | None
+    warnings: tuple[str, ...] = ()
 
     alignment: str | None
     ate_rmse_m: float | None

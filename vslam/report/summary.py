@@ -59,6 +59,7 @@ def summarize(
         dropped_frames=states[TrackingState.DROPPED],
         frames=frames,
         interrupted=outcome.interrupted,
+        warnings=tuple(outcome.warnings),
         alignment=evaluation.alignment if evaluation else None,
         ate_rmse_m=evaluation.ate_rmse_m if evaluation else None,
         causal_ate_rmse_m=causal_ate(outcome),

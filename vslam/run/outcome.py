@@ -58,6 +58,7 @@ class RunOutcome:
         trajectory: final pose of every frame done, lost ones included.
         keyframes: final keyframe poses.
         tracks: one result a frame.
+        warnings: faults of the rig that the run has shown, in sentences.
         skipped: messages of the frames whose images could not be read.
         latency_ms: of each frame tracked in a real-time run, from its time to its pose.
         wall_s, cpu_s: seconds from the first frame read to the last one tracked and mapped.
@@ -90,6 +91,7 @@ class RunOutcome:
     peak_memory_mb: float
     n_keyframes: int
     n_landmarks: int
+    warnings: list[str] = field(default_factory=list)
     latency_ms: list[float] = field(default_factory=list)
     map: Map | None = None
     stored: StoredMap | None = None

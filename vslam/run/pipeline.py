@@ -16,14 +16,14 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, ImageMap, same_camera
+from vslam.camera import Camera, DepthImage, Image, ImageMap, same_camera
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import Stream, TimedFrame, is_live, timed_frames
@@ -34,6 +34,7 @@ from vslam.errors import (
     UnreadableImageError,
 )
 from vslam.features import Features, TrackResult
+from vslam.frontend.sides import Sides, compare_sides
 from vslam.frontend.tracking import TrackingContext, extract_features
 from vslam.loopclosure.registry import create_detector, create_images, problem_of
 from vslam.machine import peak_memory_mb, process_age
@@ -42,6 +43,7 @@ from vslam.maps.storage import read_header
 from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
 from vslam.run.realtime import Played, play
 from vslam.run.recorder import NullRecorder, Recorder
+from vslam.run.rig import measure_rig, residual_warnings, rig_warnings
 from vslam.slam import Slam
 
 _log = logging.getLogger(__name__)
@@ -57,6 +59,7 @@ class PreparedFrame:
     stage_ms: dict[str, float]
     problem: str | None = None
     dropped: bool = False
+    sides: Sides = field(default_factory=Sides)
 
 
 def run_sequence(
@@ -78,6 +81,7 @@ def run_sequence(
     slam = begin(sequence.camera, settings)
     tracks: list[TrackResult] = []
     skipped: list[str] = []
+    sides: list[Sides] = []
     latency_ms: list[float] = []
     n_told = 0  # loops that the recorder knows of
     perturbation = perturbation.bound_to(sequence)
@@ -93,6 +97,7 @@ def run_sequence(
                 tracks.append(slam.skip(timestamp, dropped=True))
                 on_frame(tracks[-1])
                 continue
+            sides.append(frame.sides)
             if frame.features is None or frame.left is None:
                 skipped.append(f"frame {len(tracks)}: {frame.problem}")
                 _log.warning("frame %d skipped: %s", len(tracks), frame.problem)
@@ -131,6 +136,10 @@ def run_sequence(
         keyframes=slam.keyframe_trajectory(),
         tracks=tracks,
         skipped=skipped,
+        warnings=[
+            *rig_warnings(sides),
+            *residual_warnings(measure_rig(slam.map, sequence.camera), sequence.camera),
+        ],
         wall_s=wall,
         cpu_s=cpu,
         startup_s=startup,
@@ -271,7 +280,13 @@ def prepare_frame(
     features = extract_features(left, second, context, image_map)
     done = time.perf_counter()
     stage_ms = {"read": 1e3 * (read - start), "extract": 1e3 * (done - read)}
-    return PreparedFrame(left, features, stage_ms)
+    return PreparedFrame(left, features, stage_ms, sides=_sides(left, second, context))
+
+
+def _sides(left: Image, second: Image | DepthImage | None, context: TrackingContext) -> Sides:
+    if second is None or second.dtype != np.uint8:
+        return Sides()
+    return compare_sides(left, np.asarray(second, np.uint8), context.config.stereo)
 
 
 def _tell_loops(recorder: Recorder, slam: Slam, n_told: int) -> int:

@@ -80,6 +80,7 @@ class Plan:
         systems: loop detectors of vslam, and names of other systems.
         repeated: those systems that differ from run to run: they get all seeds under every law.
         preset: ``kitti-c`` for fixed severities, or None.
+        sensor: ``mono`` for the left camera alone, None for all that the data has.
         baseline: the system that errors of a preset are set against.
     """
 
@@ -94,11 +95,12 @@ class Plan:
     criterion: Criterion
     repeated: tuple[str, ...] = ()
     preset: str | None = None
+    sensor: str | None = None
 
     def clean_cells(self) -> list[Cell]:
         """Each system on the images as they are."""
         return [
-            Cell(self.dataset, sequence, "none", system, 0, self.max_frames)
+            Cell(self.dataset, sequence, "none", system, 0, self.max_frames, sensor=self.sensor)
             for sequence in self.sequences
             for system in self.systems
         ]

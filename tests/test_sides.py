@@ -1,0 +1,170 @@
+"""A stereo rig whose sides see different light is noticed and mended."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from vslam.camera import Camera
+from vslam.config import Config
+from vslam.frontend.sides import Sides, balanced, compare_sides
+from vslam.frontend.tracking import TrackingContext, extract_features
+from vslam.geometry import inverse, se3_exp
+from vslam.run.rig import RigResiduals, measure_rig, residual_warnings, rig_warnings
+
+CONFIG = Config().stereo
+CAMERA = Camera(300.0, 300.0, 200.0, 100.0, 0.5, 400, 200)
+DISPARITY = 7
+
+
+def scene(mean: float = 110.0, spread: float = 35.0) -> tuple[np.ndarray, np.ndarray]:
+    rough = gaussian_filter(np.random.default_rng(0).normal(size=(200, 420)), 1.5)
+    grey = np.clip(mean + spread * rough / rough.std(), 0, 255)
+    return grey[:, :400].astype(np.uint8), grey[:, DISPARITY : 400 + DISPARITY].astype(np.uint8)
+
+
+def darker(image: np.ndarray, stops: float, bias: float = 0.0) -> np.ndarray:
+    return np.clip(np.rint(image * 2.0**-stops + bias), 0, 255).astype(np.uint8)
+
+
+def test_sides_alike_stay_the_same_objects():
+    left, right = scene()
+    assert compare_sides(left, right, CONFIG) == Sides()
+    one, two = balanced(left, right, CONFIG)
+    assert one is left
+    assert two is right
+
+
+@pytest.mark.parametrize("stops", [0.5, 1.0, 2.0, 3.0])
+def test_a_dark_side_is_measured_in_stops_and_brightened(stops):
+    left, right = scene()
+    for ours, theirs, sign in ((left, darker(right, stops), 1), (darker(left, stops), right, -1)):
+        found = compare_sides(ours, theirs, CONFIG)
+        assert found.darker_stops == pytest.approx(sign * stops, abs=0.08)
+        one, two = balanced(ours, theirs, CONFIG)
+        for image, clean in ((one, left), (two, right)):
+            assert np.abs(image.astype(float) - clean).mean() < 0.6 + 0.6 * 2**stops
+
+
+def test_a_shift_of_the_black_level_is_undone_with_the_gain():
+    left, right = scene()
+    _, mended = balanced(left, darker(right, 1.0, bias=30.0), CONFIG)
+    assert np.abs(mended.astype(float) - right).mean() < 2.0
+
+
+def test_a_clipped_side_is_measured_by_its_dark_half():
+    left, right = scene(mean=200.0)
+    found = compare_sides(np.minimum(2.0 * left, 255).astype(np.uint8), right, CONFIG)
+    assert found.darker_stops == 0.0 or found.darker_stops == pytest.approx(1.0, abs=0.1)
+    left, right = scene(mean=110.0)
+    bright = np.minimum(2.0 * left, 255).astype(np.uint8)
+    assert compare_sides(bright, right, CONFIG).darker_stops == pytest.approx(1.0, abs=0.1)
+
+
+def test_what_is_no_gain_is_left_alone():
+    left, right = scene()
+    covered = right.copy()
+    covered[:, :160] = 20
+    assert balanced(left, covered, CONFIG)[1] is covered
+    assert compare_sides(left, np.full_like(left, 90), CONFIG) == Sides()
+
+
+def test_a_small_difference_is_left_alone():
+    left, right = scene()
+    assert compare_sides(left, darker(right, 0.2), CONFIG) == Sides()
+
+
+def test_a_black_side_is_named_but_not_by_night():
+    left, right = scene()
+    black = np.full_like(left, 2)
+    assert compare_sides(left, black, CONFIG) == Sides(black="right")
+    assert compare_sides(black, right, CONFIG) == Sides(black="left")
+    assert compare_sides(black, black, CONFIG) == Sides()
+    assert compare_sides(darker(left, 5), darker(right, 5), CONFIG).black == ""
+
+
+@pytest.mark.parametrize("stops", [1.0, 2.0])
+def test_disparities_stay_true_when_a_side_is_dark(stops):
+    """Without the mend, a side two stops darker leaves few matches and wrong ones."""
+    left, right = scene()
+    context = TrackingContext.create(CAMERA, Config())
+    clean, dark = (extract_features(left, r, context) for r in (right, darker(right, stops)))
+    for features, least in ((clean, 0.9), (dark, 0.7)):
+        d = features.xy[:, 0] - features.u_right
+        found = np.isfinite(d)
+        assert found.mean() > least * np.isfinite(clean.u_right).mean()
+        assert np.abs(np.median(d[found]) - DISPARITY) < 0.05
+        assert np.mean(np.abs(d[found] - DISPARITY) < 0.5) > 0.95
+
+
+def test_warnings_say_what_was_seen_and_done():
+    dark, black, fine = Sides(darker_stops=-1.5), Sides(black="right"), Sides()
+    assert rig_warnings([fine] * 100) == []
+    assert rig_warnings([fine] * 100 + [dark, black, black]) == []
+    (said,) = rig_warnings([dark] * 7 + [fine] * 3)
+    assert "left side was 1.5 stops darker than the right one in 7 of 10 frames" in said
+    (said,) = rig_warnings([black] * 4 + [fine] * 6)
+    assert "right side was black in 4 of 10 frames" in said
+    assert "left side alone" in said
+    (said,) = rig_warnings([Sides(black="left")] * 4)
+    assert "could not be tracked" in said
+
+
+TWIST = np.array([0.3, 0.0, -8.0, 0.0, -0.3, 0.0])  # per second: ahead and to the right
+
+
+def driven(delay_s: float = 0.0, turned_px: float = 0.0, n: int = 5000) -> SimpleNamespace:
+    """A map of 10 keyframes with exact observations, but for what the right side does."""
+    rng = np.random.default_rng(1)
+    times = 0.1 * np.arange(10)
+    T_cw = np.array([se3_exp(TWIST * t) for t in times])
+    keyframe = rng.integers(0, 10, n)
+    z = rng.uniform(3.0, 30.0, n)
+    in_camera = np.stack([rng.uniform(-0.5, 0.5, n) * z, rng.uniform(-0.2, 0.2, n) * z, z], axis=1)
+    T_wc = np.array([inverse(T) for T in T_cw])[keyframe]
+    xyz = np.einsum("nij,nj->ni", T_wc[:, :3, :3], in_camera) + T_wc[:, :3, 3]
+    late = np.array([se3_exp(TWIST * (t + delay_s)) for t in times])[keyframe]
+    seen = np.einsum("nij,nj->ni", late[:, :3, :3], xyz) + late[:, :3, 3]
+    u = CAMERA.fx * in_camera[:, 0] / z + CAMERA.cx
+    u_right = CAMERA.fx * (seen[:, 0] - CAMERA.baseline) / seen[:, 2] + CAMERA.cx - turned_px
+    arrays = SimpleNamespace(
+        landmark=np.arange(n), keyframe=keyframe, T_cw=T_cw, xyz=xyz,
+        xy=np.stack([u, u], axis=1), u_right=u_right + rng.normal(0.0, 0.2, n),
+    )  # fmt: skip
+    return SimpleNamespace(
+        arrays=arrays, n_rows=n, n_keyframes=10, timestamps=times.tolist(),
+        living_keyframes=lambda: np.arange(10),
+    )  # fmt: skip
+
+
+def test_residuals_tell_a_late_side_from_a_turned_one():
+    sound = measure_rig(driven(), CAMERA)
+    assert sound.delay_s == pytest.approx(0.0, abs=1e-4)
+    assert sound.offset_px == pytest.approx(0.0, abs=0.03)
+    late = measure_rig(driven(delay_s=0.005), CAMERA)
+    assert late.delay_s == pytest.approx(0.005, rel=0.05)
+    turned = measure_rig(driven(turned_px=0.4), CAMERA)
+    assert turned.offset_px == pytest.approx(-0.4, abs=0.03)
+    assert turned.delay_s == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_map_that_cannot_tell_says_nothing():
+    assert measure_rig(driven(n=1000), CAMERA) is None
+    assert measure_rig(driven(), CAMERA.left_camera()) is None
+    still = driven()
+    still.timestamps = (100.0 * np.arange(10)).tolist()
+    assert measure_rig(still, CAMERA) is None  # gaps: nobody knows how it moved
+    assert residual_warnings(None, CAMERA) == []
+
+
+def test_a_fault_of_the_rig_is_said_with_its_size():
+    assert residual_warnings(RigResiduals(1e-4, 0.05), CAMERA) == []
+    assert residual_warnings(RigResiduals(float("nan"), 0.05), CAMERA) == []
+    (said,) = residual_warnings(RigResiduals(1.2e-3, 0.2), CAMERA)
+    assert "right one is at least 1.2 ms late" in said
+    (said,) = residual_warnings(RigResiduals(1e-4, -0.3), CAMERA)
+    assert "0.30 pixels" in said
+    assert "3.4 arc minutes" in said

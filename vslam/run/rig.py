@@ -1,0 +1,143 @@
+"""Faults of a stereo rig that show in a run, said in sentences for its report."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Camera
+from vslam.frontend.sides import Sides
+from vslam.geometry import compose, inverse, orthonormalised, se3_log
+from vslam.map import Map
+
+_FEWEST = 3  # frames: below that it was a reflection or a hand
+_FEWEST_OBSERVATIONS, _MOST_OBSERVATIONS = 3_000, 100_000
+_LARGEST_RESIDUAL_PX = 3.0
+_HUBER_PX = 0.3
+_ROUNDS = 10
+_LEAST_IMAGE_SPEED = 50.0  # pixels a second, deviation: a rig that stands still shows no delay
+_LONGEST_GAP_S = 2.0  # between keyframes; over a longer one their motion is not known
+# Of sound rigs 0.15 ms and 0.11 pixels at most, of one 10 ms late 1.1 ms, of one turned by 2 arc
+# minutes 0.29 pixels (docs/stress.md): bundle adjustment hides a part of both.
+_SUSPECT_DELAY_S, _SUSPECT_OFFSET_PX = 0.4e-3, 0.2
+
+
+@dataclass(frozen=True)
+class RigResiduals:
+    """What the final map leaves unexplained of the columns in right images.
+
+    Attributes:
+        delay_s: by which the right side seems later, from residuals that grow with the speed of
+            the image; NaN where the camera hardly moved.
+        offset_px: of all disparities.
+    """
+
+    delay_s: float
+    offset_px: float
+
+
+def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
+    """Fit the stereo residuals of a map by a delay, an offset and a scale of disparities; None with
+    too few observations, or without two sides."""
+    if camera.sensor != "stereo" or map_.n_keyframes < 3:
+        return None
+    arrays = map_.arrays
+    seen = (arrays.landmark[: map_.n_rows] >= 0) & np.isfinite(arrays.u_right[: map_.n_rows])
+    rows = np.flatnonzero(seen)
+    if len(rows) < _FEWEST_OBSERVATIONS:
+        return None
+    rows = rows[:: -(-len(rows) // _MOST_OBSERVATIONS)]
+    keyframe = arrays.keyframe[rows]
+    T_cw = arrays.T_cw[keyframe]
+    p = np.einsum("nij,nj->ni", T_cw[:, :3, :3], arrays.xyz[arrays.landmark[rows]]) + T_cw[:, :3, 3]
+    twist = _twists(map_)[keyframe]
+    moved = twist[:, :3] + np.cross(twist[:, 3:], p)
+    z = p[:, 2]
+    speed = camera.fx * (moved[:, 0] - p[:, 0] * moved[:, 2] / z) / z
+    disparity = camera.bf / z
+    found = arrays.xy[rows, 0].astype(np.float64) - arrays.u_right[rows]
+    residual = disparity - found  # of the column in the right image
+    good = (np.abs(residual) < _LARGEST_RESIDUAL_PX) & (z > 0) & np.isfinite(speed)
+    if good.sum() < _FEWEST_OBSERVATIONS:
+        return None
+    delay, offset, _ = fit(residual[good], speed[good], disparity[good])
+    still = speed[good].std() < _LEAST_IMAGE_SPEED
+    return RigResiduals(float("nan") if still else delay, offset)
+
+
+def fit(
+    residual: NDArray[np.float64], speed: NDArray[np.float64], disparity: NDArray[np.float64]
+) -> tuple[float, float, float]:
+    """Delay (s), offset (px) and share of the disparity that explain ``(N,)`` residuals in pixels
+    best, by their Huber loss; ``speed`` in pixels a second."""
+    A = np.stack([speed, np.ones_like(speed), disparity], axis=1)
+    x = np.zeros(3)
+    for _ in range(_ROUNDS):
+        weight = np.sqrt(1.0 / np.maximum(1.0, np.abs(residual - A @ x) / _HUBER_PX))
+        x = np.linalg.lstsq(A * weight[:, None], residual * weight, rcond=None)[0]
+    return float(x[0]), float(x[1]), float(x[2])
+
+
+def _twists(map_: Map) -> NDArray[np.float64]:
+    """``(K, 6)`` motion of each keyframe per second, NaN beside a gap."""
+    living = map_.living_keyframes()
+    T_cw, times = map_.arrays.T_cw, map_.timestamps
+    twists = np.full((map_.n_keyframes, 6), np.nan)
+    for k, keyframe in enumerate(living):
+        before, behind = living[max(0, k - 1)], living[min(len(living) - 1, k + 1)]
+        elapsed = times[behind] - times[before]
+        if 0 < elapsed < _LONGEST_GAP_S:
+            step = compose(T_cw[behind], inverse(T_cw[before]))
+            twists[keyframe] = se3_log(orthonormalised(step)) / elapsed
+    return twists
+
+
+def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
+    """What residuals say of the rig, nothing of a sound one."""
+    if found is None:
+        return []
+    said = []
+    if abs(found.delay_s) > _SUSPECT_DELAY_S:
+        side = "right" if found.delay_s > 0 else "left"
+        said.append(
+            f"The sides seem not to be synchronised: the {side} one is at least "
+            f"{1e3 * abs(found.delay_s):.1f} ms late, and most of a delay stays hidden. Trigger "
+            "both by one signal."
+        )
+    elif abs(found.offset_px) > _SUSPECT_OFFSET_PX:
+        minutes = 60.0 * np.degrees(abs(found.offset_px) / camera.fx)
+        said.append(
+            f"Disparities are {abs(found.offset_px):.2f} pixels off throughout: the cameras are "
+            f"turned against their calibration by {minutes:.1f} arc minutes or more. Calibrate "
+            "the rig again."
+        )
+    return said
+
+
+def rig_warnings(sides: Sequence[Sides]) -> list[str]:
+    """What set the sides apart during a run, nothing for a rig without a fault."""
+    found = []
+    for side, other, effect in (
+        ("left", "right", "they could not be tracked"),
+        ("right", "left", "they were tracked with the left side alone"),
+    ):
+        black = sum(pair.black == side for pair in sides)
+        if black >= _FEWEST:
+            found.append(
+                f"The {side} side was black in {black} of {len(sides)} frames while the {other} "
+                f"one was not: {effect}. Check its cable, shutter and lens cap."
+            )
+    darker = [pair.darker_stops for pair in sides if pair.darker_stops]
+    if len(darker) >= _FEWEST:
+        stops = statistics.median(darker)
+        side, other = ("right", "left") if stops > 0 else ("left", "right")
+        found.append(
+            f"The {side} side was {abs(stops):.1f} stops darker than the {other} one in "
+            f"{len(darker)} of {len(sides)} frames: it was brightened to match. Check exposure, "
+            "gain and aperture of both."
+        )
+    return found

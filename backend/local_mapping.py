@@ -14,7 +14,12 @@ from vslam.camera import Camera
 from vslam.config import Config
 from vslam.kernels import kernel
 from vslam.map import Map
-from vslam.map_kernels import erase_landmark, refresh_landmarks, unlink
+from vslam.map_kernels import (
+    erase_landmark,
+    gather_observations,
+    refresh_landmarks,
+    unlink,
+)
 from vslam.reprojection import stack_uvr
 
 RECENT_KEYFRAMES = 3  # a landmark is on probation for this many keyframes (ORB-SLAM, VI-B)
@@ -159,29 +164,6 @@ def assemble(
         intrinsics=camera.intrinsics,
     )
     return problem, rows
-
-
-@kernel
-def gather_observations(a, landmarks, index):
-    """Rows of each landmark in keyframes with an index, as ``first`` ``(P + 1,)`` and rows."""
-    first = np.zeros(len(landmarks) + 1, np.int64)
-    for i in range(len(landmarks)):
-        first[i + 1] = first[i]
-        row = a.head[landmarks[i]]
-        while row >= 0:
-            if index[a.keyframe[row]] >= 0:
-                first[i + 1] += 1
-            row = a.next_row[row]
-    rows = np.empty(first[-1], np.int64)
-    n = 0
-    for i in range(len(landmarks)):
-        row = a.head[landmarks[i]]
-        while row >= 0:
-            if index[a.keyframe[row]] >= 0:
-                rows[n] = row
-                n += 1
-            row = a.next_row[row]
-    return first, rows
 
 
 @kernel

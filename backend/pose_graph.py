@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import PoseGraphConfig
-from vslam.geometry import compose, inverse, inverses, orthonormalised, se3_log
+from vslam.geometry import compose, inverse, inverses, se3_log
 from vslam.kernels import kernel
 from vslam.loops import LoopEdge
-from vslam.map import Map
+from vslam.map import Map, loop_of_living
 from vslam.map_kernels import covisible_pairs
 
 TREE, COVISIBLE, WEAK, LOOP, GAP = range(5)  # kinds of edges
@@ -119,8 +119,10 @@ def essential_graph(
                 kind[pair] = GAP if driven and not _passes(pair, unpredicted_restarts) else WEAK
     measured: dict[tuple[int, int], tuple[NDArray[np.float64], float]] = {}
     for loop in loops:
-        query, match, T = _loop_of_living(map_, loop)
-        scale = loop.scale
+        found = loop_of_living(map_, loop)
+        query, match, scale = found.query, found.match, found.scale
+        assert found.T_query_match is not None
+        T = found.T_query_match
         if query != match:
             if query > match:
                 query, match, T, scale = match, query, inverse(T), 1.0 / scale
@@ -152,22 +154,6 @@ def _passes(pair: tuple[int, int], keyframes: NDArray[np.int64]) -> bool:
     """Whether one of the sorted keyframes lies behind the first and not behind the second."""
     low, high = np.searchsorted(keyframes, pair, side="right")
     return bool(low < high)
-
-
-def _loop_of_living(map_: Map, loop: LoopEdge) -> tuple[int, int, NDArray[np.float64]]:
-    """Ends of a loop and their relative pose, with culled ends replaced by their parents."""
-    if loop.T_query_match is None:
-        raise ValueError(f"The loop from keyframe {loop.query} to {loop.match} has no pose.")
-    query, match, T = loop.query, loop.match, loop.T_query_match
-    if not map_.arrays.keyframe_alive[query]:
-        T_parent_query = inverse(map_.T_c_parent[query])
-        T_parent_query[:3, 3] /= loop.scale  # to the unit of the match
-        T = compose(T_parent_query, T)
-        query = map_.parents[query]
-    if not map_.arrays.keyframe_alive[match]:
-        T = compose(T, map_.T_c_parent[match])
-        match = map_.parents[match]
-    return query, match, orthonormalised(T)
 
 
 def edge_sigmas(

@@ -134,9 +134,8 @@ def extract_features(
         if second is None:
             u_right = np.full(len(found.xy), np.nan, np.float32)
         else:
-            u_right = columns_of_depth(
-                found.xy, np.asarray(second, np.float32), camera, config.depth
-            )
+            scale, depth = context.scales[found.octave], np.asarray(second, np.float32)
+            u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
     else:
         pair = [left, np.asarray(second, np.uint8)]
         found, right = image_map(lambda image: extract(image, config.orb), pair)

@@ -7,6 +7,9 @@ keyframes. The index gives the score of every keyframe at once, the neighbours' 
 
 from __future__ import annotations
 
+from functools import cached_property
+from hashlib import sha256
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,8 +17,9 @@ from vslam.config import BowConfig
 from vslam.features import Features
 from vslam.kernels import inner_kernel, kernel
 from vslam.loopclosure.bow_index import InvertedIndex, Likeness, grown
+from vslam.loopclosure.detector import require_same
 from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
-from vslam.loops import LoopCandidate
+from vslam.loops import DetectorMemory, LoopCandidate, PerKeyframe
 from vslam.map import Map
 from vslam.map_kernels import count_shared
 
@@ -73,6 +77,29 @@ class BowDetector:
         likeness = self._index.compare(bow_vector(self.vocabulary, words))
         eligible = map_.arrays.keyframe_alive[: len(likeness.score)].copy()
         return self._candidates(-1, likeness, eligible, 0.0, map_)
+
+    def memory(self) -> DetectorMemory:
+        """See :class:`LoopDetector`: the words of all features."""
+        first = self._start[: self._n_keyframes + 1]
+        words = PerKeyframe(first, self._word[: first[-1]])
+        return DetectorMemory(self.name, self._fingerprint, {"words": words})
+
+    def restore(self, memory: DetectorMemory) -> None:
+        """See :class:`LoopDetector`."""
+        require_same(self.memory(), memory)
+        words = memory.tables["words"]
+        known = words.values.dtype == np.int32 and words.values.ndim == 1
+        if not known or ((words.values < 0) | (words.values >= self.vocabulary.n_words)).any():
+            raise ValueError("the words of the keyframes are not those of the vocabulary")
+        for keyframe in range(len(words)):
+            self._store(keyframe, words.of(keyframe))
+            self._index.add(keyframe, bow_vector(self.vocabulary, words.of(keyframe)))
+
+    @cached_property
+    def _fingerprint(self) -> str:
+        vocabulary = self.vocabulary
+        digest = sha256(vocabulary.descriptors.tobytes() + vocabulary.weight.tobytes())
+        return digest.hexdigest()[:16]
 
     def _store(self, keyframe: int, words: NDArray[np.int32]) -> None:
         first = int(self._start[self._n_keyframes])

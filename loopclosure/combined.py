@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.features import Features
-from vslam.loopclosure.detector import LoopDetector
-from vslam.loops import LoopCandidate
+from vslam.loopclosure.detector import LoopDetector, require_same
+from vslam.loops import DetectorMemory, LoopCandidate
 from vslam.map import Map
 
 
@@ -40,6 +40,25 @@ class CombinedDetector:
     ) -> list[LoopCandidate]:
         """See :class:`LoopDetector`."""
         return self._merged([one.locate(image, features, map_) for one in self._detectors], map_)
+
+    def memory(self) -> DetectorMemory:
+        """See :class:`LoopDetector`: the memories of the detectors, each under its name."""
+        memories = [one.memory() for one in self._detectors]
+        tables = {
+            f"{memory.name}/{name}": table
+            for memory in memories
+            for name, table in memory.tables.items()
+        }
+        fingerprint = "/".join(memory.fingerprint for memory in memories)
+        return DetectorMemory(self.name, fingerprint, tables)
+
+    def restore(self, memory: DetectorMemory) -> None:
+        """See :class:`LoopDetector`."""
+        require_same(self.memory(), memory)
+        for one in self._detectors:
+            own = one.memory()
+            tables = {name: memory.tables[f"{own.name}/{name}"] for name in own.tables}
+            one.restore(replace(own, tables=tables))
 
     def _merged(self, found: list[list[LoopCandidate]], map_: Map) -> list[LoopCandidate]:
         merged: list[LoopCandidate] = []

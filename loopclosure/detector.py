@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.features import Features
-from vslam.loops import LoopCandidate
+from vslam.loops import DetectorMemory, LoopCandidate
 from vslam.map import Map
 
 
@@ -37,6 +37,31 @@ class LoopDetector(Protocol):
         """Living keyframes that look like a frame outside the map, best first, with query -1."""
         ...
 
+    def memory(self) -> DetectorMemory:
+        """What is known of all keyframes up to now, for a map file. Its arrays are not to be
+        written to: they are the detector's own."""
+        ...
+
+    def restore(self, memory: DetectorMemory) -> None:
+        """Remember what a detector like this one knew, in place of ``add`` for each keyframe.
+
+        Raises:
+            ValueError: in a few words: it was another detector, or the memory is damaged.
+        """
+        ...
+
+
+def require_same(detector: DetectorMemory, memory: DetectorMemory) -> None:
+    """Refuse the memory of another detector than this one, whose own memory is ``detector``.
+
+    Raises:
+        ValueError: it has another name, vocabulary or weights.
+    """
+    if memory.name != detector.name:
+        raise ValueError(f"made with the detector {memory.name}, not {detector.name}")
+    if memory.fingerprint != detector.fingerprint:
+        raise ValueError(f"made with another vocabulary or other weights of {detector.name}")
+
 
 class NoDetector:
     """Finds nothing: odometry only."""
@@ -53,3 +78,9 @@ class NoDetector:
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
         return []
+
+    def memory(self) -> DetectorMemory:
+        return DetectorMemory()
+
+    def restore(self, memory: DetectorMemory) -> None:
+        require_same(self.memory(), memory)

@@ -1,4 +1,4 @@
-"""The loop detectors by name."""
+"""The loop detectors by name: vslam's own, and those of other packages (docs/plugins.md)."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vslam import plugins
 from vslam.config import Config
 from vslam.errors import InputError
 from vslam.loopclosure.detector import LoopDetector, NoDetector
+from vslam.loopclosure.plugin_detector import PlugInDetector, open_plugin
 from vslam.loopclosure.siamese.weights import NETWORKS, find_weights
 
 if TYPE_CHECKING:
@@ -24,11 +26,20 @@ def require_detector(name: str, weights: Path | None = None, option: str = "--de
         InputError: no such detector, or no weights for it.
     """
     if name not in DETECTORS:
-        raise InputError(f"{option} {name}: unknown; choose one of {', '.join(DETECTORS)}.")
-    if name in (*NETWORKS, "both"):
+        others = plugins.find_plugins(plugins.DETECTORS)
+        if name not in others:
+            known = ", ".join((*DETECTORS, *others))
+            raise InputError(f"{option} {name}: unknown; choose one of {known}.")
+        open_plugin(others[name], Config(), weights)
+    elif name in (*NETWORKS, "both"):
         find_weights(_network_of(name), weights)
     elif weights is not None:
         raise InputError(f"--weights: the detector {name} has none; leave the option out.")
+
+
+def problem_of(detector: LoopDetector) -> str | None:
+    """What failed in a detector of another package, in one sentence; None if nothing did."""
+    return detector.problem if isinstance(detector, PlugInDetector) else None
 
 
 def create_detector(
@@ -44,7 +55,7 @@ def create_detector(
         images: of the keyframes, from :func:`create_images`; given to ``LoopClosing``, too.
 
     Raises:
-        InputError: its vocabulary or weights cannot be read.
+        InputError: its vocabulary or weights cannot be read, or its package is broken.
         ValueError: no such detector.
     """
     if name == "none":
@@ -66,17 +77,21 @@ def create_detector(
         from vslam.loopclosure.siamese.detector import open_detector
 
         return open_detector(name, config.siamese, weights, config.learned, images)
+    others = plugins.find_plugins(plugins.DETECTORS)
+    if name in others:
+        return open_plugin(others[name], config, weights)
     raise ValueError(f"no loop detector {name!r}")
 
 
 def create_images(name: str, config: Config) -> KeyframeImages | None:
     """What keeps the images that learned descriptors verify a detector's candidates with; None for
-    a detector that does without a network, or where the configuration switches it off.
+    a detector that does without a network, one of another package too, or where the configuration
+    switches it off.
 
     Raises:
         InputError: the network cannot be read.
     """
-    if name in ("none", "bow") or config.learned.max_candidates == 0:
+    if name not in ("both", *NETWORKS) or config.learned.max_candidates == 0:
         return None
     from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
 

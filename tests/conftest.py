@@ -200,3 +200,20 @@ def _check_map(map_: Map) -> None:
         if a.merged_into[i] >= 0:
             assert not alive[i]
             assert a.merged_into[i] != i
+
+
+def corridor_depth(camera: Camera, T_wc: np.ndarray) -> np.ndarray:
+    """Depth ``(H, W)`` metres of the corridor along the camera's z, 0 where there is sky."""
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = np.stack(
+        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u, float)], axis=-1
+    )
+    rays, centre = rays @ T_wc[:3, :3].T, T_wc[:3, 3]
+    depth = np.full(u.shape, np.inf)
+    for normal, offset in PLANES:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = (offset - normal @ centre) / (rays @ normal)
+        hit = centre + along[..., None] * rays
+        nearer = (along > 0.05) & (along < depth) & (hit[..., 1] > CEILING)
+        depth[nearer] = along[nearer]
+    return np.where(np.isfinite(depth), depth, 0.0)

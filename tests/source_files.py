@@ -56,13 +56,30 @@ def write_video(
 
 
 def encoded(image: np.ndarray, encoding: str) -> np.ndarray:
-    """Grey pixels ``(H, W)`` as those of a ROS image, with the same grey values."""
+    """Grey pixels ``(H, W)`` as those of a ROS image, with the same grey values; depth in mm as of
+    REP 118."""
+    if image.dtype == np.uint16:
+        return image if encoding == "16UC1" else (image * np.float32(0.001)).astype("<f4")
     if encoding == "mono16":
         return image.astype("<u2") << 8 | 77
     if encoding in ("bgr8", "rgb8"):
         return np.repeat(image[..., None], 3, axis=2)
     assert encoding in ("mono8", "8UC1")
     return image
+
+
+def compressed(image: np.ndarray, kind: str) -> tuple[str, np.ndarray]:
+    """Format and bytes of a compressed image, or of depth (mm) as by ``compressed_depth``."""
+    if kind == "png":
+        return kind, cv2.imencode(".png", image)[1].ravel()
+    a, b = np.float32(500.0), np.float32(-3.0)  # a / metres + b is what the PNG holds
+    header = np.array([(1, a, b)], [("kind", "<i4"), ("a", "<f4"), ("b", "<f4")])
+    if kind.startswith("32FC1"):
+        with np.errstate(divide="ignore"):
+            inverse = np.rint(a * np.float32(1000.0) / image + b)
+        image = np.where(image > 0, inverse, 0).astype(np.uint16)
+    data = np.frombuffer(header.tobytes() + cv2.imencode(".png", image)[1].tobytes(), np.uint8)
+    return f"{kind.removesuffix(' png')}; compressedDepth png", data
 
 
 def write_bag(
@@ -72,6 +89,7 @@ def write_bag(
     stamps: list[int],
     *,
     encoding: str = "mono8",
+    depth_encoding: str = "16UC1",
     camera: Camera | None = None,
     baseline: bool = True,
     calibrated: bool = True,
@@ -84,6 +102,7 @@ def write_bag(
         kind: ``ros1``, ``ros2``, ``mcap``, or ``folder`` for a ROS 2 bag of MCAP files.
         stamps: nanoseconds.
         encoding: of the images, or ``png`` for compressed ones.
+        depth_encoding: of sides of uint16 (mm): ``16UC1``, ``32FC1``, or with `` png`` behind it.
         camera: write its camera_info.
         baseline: it has the baseline, in the right P.
         calibrated: it is not all zero.
@@ -113,13 +132,13 @@ def write_bag(
         return types["Header"](stamp=time, frame_id="", **counter)
 
     def message(image: np.ndarray, stamp: int):
-        if encoding == "png":
-            data = cv2.imencode(".png", image)[1].ravel()
-            return types["CompressedImage"](header(stamp), "png", data)
-        pixels = encoded(image, encoding)
+        kind = depth_encoding if image.dtype == np.uint16 else encoding
+        if kind in ("png", "16UC1 png", "32FC1 png"):
+            return types["CompressedImage"](header(stamp), *compressed(image, kind))
+        pixels = encoded(image, kind)
         rows = pixels.reshape(len(image), -1).view(np.uint8)
         rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=99)
-        return types["Image"](header(stamp), *image.shape, encoding, 0, rows.shape[1], rows.ravel())
+        return types["Image"](header(stamp), *image.shape, kind, 0, rows.shape[1], rows.ravel())
 
     def info(side: int):
         P = np.array([camera.fx, 0, camera.cx, -side * camera.bf * baseline,
@@ -132,18 +151,25 @@ def write_bag(
         )
 
     with writer:
-        image_type = f"sensor_msgs/msg/{'CompressedImage' if encoding == 'png' else 'Image'}"
+        image_types = [
+            f"sensor_msgs/msg/{'CompressedImage' if kind.endswith('png') else 'Image'}"
+            for kind in (
+                depth_encoding if images[0].dtype == np.uint16 else encoding
+                for images in sides.values()
+            )
+        ]
         info_type = "sensor_msgs/msg/CameraInfo"
         connections = []
-        for number, topic in enumerate(sides):
-            where = topic + "/compressed" * (encoding == "png")
+        for number, (topic, image_type) in enumerate(zip(sides, image_types, strict=True)):
+            where = topic + "/compressed" * image_type.endswith("CompressedImage")
             connections.append(writer.add_connection(where, image_type, typestore=store))
             if camera is not None:
                 where = topic.rpartition("/")[0] + "/camera_info"
                 connection = writer.add_connection(where, info_type, typestore=store)
                 writer.write(connection, stamps[0], serialize(info(number), info_type))
         for stamp, *images in zip(stamps, *sides.values(), strict=True):
-            for number, (connection, image) in enumerate(zip(connections, images, strict=True)):
+            kinds = zip(connections, images, image_types, strict=True)
+            for number, (connection, image, image_type) in enumerate(kinds):
                 made = message(image, stamp + number * lag)
                 writer.write(connection, stamp + number, serialize(made, image_type))
     return next(path.glob("*.mcap")) if kind == "mcap" else path

@@ -52,7 +52,7 @@ def test_topics(folder):
     listed = "image topics are /cam0/image_raw, /cam1/image_raw"
     options = SourceOptions(topics=(LEFT, "/cam9"))
     refused(f"--topics /cam9: not in .*ros1.bag; {listed}", "bag", bag, options)
-    refused("right ones, or run with --sensor mono", "bag", bag, SourceOptions(topics=(LEFT,)))
+    refused("or of the depth, or run with --sensor mono", "bag", bag, SourceOptions(topics=(LEFT,)))
     refused(f"choose with --topics TOPIC; {listed}", "bag", bag, SourceOptions(), sensor="mono")
 
 
@@ -140,6 +140,8 @@ def test_calibrations(folder):
 
     sizes = "made for 240x80 pixels but the images have 480x160"
     refused(f"other.yaml: {sizes}", "video", path, options("other.yaml"))
+    wide = "made for 480x160 pixels but the images have 960x160; say --side-by-side"
+    refused(wide, "video", path, SourceOptions((folder / "mono.yaml",)), sensor="mono")
     refused(sizes, "images", folder / "images", SourceOptions((folder / "other.yaml",)))
     refused("right camera is missing", "video", path, options("mono.yaml"))
     refused("no calibration; .*docs/cameras.md", "video", path, SourceOptions(side_by_side=True))
@@ -241,7 +243,9 @@ def test_options_of_a_second_image_with_the_left_camera_alone():
 def test_another_sensor(folder, kitti_tree):
     options = SourceOptions((folder / "stereo.yaml",))
     images = folder / "images"
-    refused("--sensor rgbd: images is of sensor stereo", "images", images, options, sensor="rgbd")
+    refused("rgb and depth, .* with --depth", "images", images, options, sensor="rgbd")
+    refused("rgbd needs an image topic and one of depth; image topics are /cam0", "bag",
+            folder / "ros1.bag", options, sensor="rgbd")  # fmt: skip
     with pytest.raises(InputError, match="--sensor rgbd: 00 is of sensor stereo"):
         open_source("kitti", str(kitti_tree), None, SourceOptions(), sensor="rgbd")
 

@@ -10,13 +10,17 @@ import sys
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
+from source_files import write_calibration, write_video
 from stub_runner import COMMAND, started, wait_for
+from typer.testing import CliRunner
 
 from vslam.bench import estimate, execute, grid, table
 from vslam.bench.grid import Cell
 from vslam.cli import main as cli
+from vslam.cli.main import app
 from vslam.config import Config
 from vslam.errors import InputError, ResultsError
 
@@ -43,8 +47,8 @@ def test_sequences():
 def test_perturbations():
     text = "none,brightness:0.50,brightness:1.5+blur,none"
     assert grid.parse_perturbations(text) == ["none", "brightness:0.5", "brightness:1.5,blur:1"]
-    with pytest.raises(InputError, match="unknown law 'fog'"):
-        grid.parse_perturbations("none,fog:2")
+    with pytest.raises(InputError, match="unknown law 'snow'"):
+        grid.parse_perturbations("none,snow:2")
 
 
 def test_only_seeded_perturbations_are_repeated_and_seeds_come_last():
@@ -330,7 +334,7 @@ def test_bench_loses_nothing_to_an_interrupt(bench, stub: Path, monkeypatch):
         ("--detectors bow,vgg16", ["vgg16", "ships no weights"]),
         ("--detectors orb", ["--detectors orb", "unknown"]),
         ("--seqs 00-02", ["no such sequence", "01"]),
-        ("--perturb fog", ["unknown law 'fog'"]),
+        ("--perturb snow", ["unknown law 'snow'"]),
     ],
 )
 def test_bench_refuses_before_it_starts(bench, words, parts):
@@ -378,3 +382,37 @@ def test_a_run_ends_by_itself_though_its_standard_input_is_open():
     command = [sys.executable, "-m", "vslam.cli.child", "--version"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.wait(60) == 0
+
+
+def test_a_video_is_a_grid_of_one_sequence(corridor, tmp_path: Path, monkeypatch):
+    """It runs once, and the same command again finds that done."""
+    pairs = [np.hstack(pair) for pair in zip(corridor.left, corridor.right, strict=True)][:5]
+    video = write_video(tmp_path / "drive.mkv", pairs)
+    calib = write_calibration(tmp_path / "stereo.yaml", corridor.camera)
+    words = ["bench", "--data", "drive.mkv", "--side-by-side", "--calib", "stereo.yaml"]
+    words += ["--perturb", "none", "--detectors", "none", "--out", "grid"]
+    monkeypatch.chdir(tmp_path)
+    first = CliRunner().invoke(app, words)
+    assert first.exit_code == 0, first.output
+    assert "1 of 1 cells finished" in first.output
+    (report,) = (tmp_path / "grid").glob("*/report.json")
+    found = json.loads(report.read_text())
+    assert (found["dataset"], found["sequence"], found["frames"]) == ("video", "drive", 5)
+    assert found["calib"] == [str(calib)]
+    again = CliRunner().invoke(app, words)
+    assert "1 cells, 0 to do" in again.output
+    other = CliRunner().invoke(app, [*words, "--fps", "20"])
+    assert f"holds runs on {video} --side-by-side {calib}, not on {video}" in str(other.exception)
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ("--data 0", "--data 0: a camera cannot be seen twice; record a video or a bag"),
+        ("--dataset video --data a.mkv --seqs 00", "--seq 00: only for data sets, not video"),
+    ],
+)
+def test_sources_that_cannot_be_a_grid(tmp_path: Path, monkeypatch, words, part):
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["bench", *words.split()])
+    assert part in str(done.exception)

@@ -179,7 +179,7 @@ def test_the_choices_of_presets_are_those_of_the_settings():
     [
         ("--seq 05", ["no such sequence", "00"]),
         ("", ["unequal counts", "--max-frames 10"]),
-        ("--max-frames 5 --perturb fog", ["unknown law 'fog'", "brightness"]),
+        ("--max-frames 5 --perturb snow", ["unknown law 'snow'", "brightness"]),
         ("--max-frames 5 --start 99", ["--start 99"]),
         ("--max-frames 5 --out kitti/poses/00.txt", ["cannot create a run folder", "--out"]),
     ],

@@ -26,6 +26,7 @@ FOLDERS = {
 # together on one level may not import each other, save where SIBLINGS says so.
 LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.errors", "vslam.machine", "vslam.kernels"),
+    ("vslam.plugins",),
     ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.features", "vslam.camera"),
     (
         "vslam.loops",
@@ -37,12 +38,13 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.map", "vslam.frame_poses"),
     ("vslam.frontend", "vslam.backend", "vslam.loopclosure", "vslam.datasets", "vslam.maps"),
     ("vslam.monocular", "vslam.closing"),
-    ("vslam.mapping",),
+    ("vslam.mapping", "vslam.merging"),
     ("vslam.slam",),
     ("vslam.run",),
     ("vslam.evaluation",),
     ("vslam.report",),
     ("vslam.overview", "vslam.bench", "vslam.loopbench", "vslam.doctor"),
+    ("vslam.stress",),
     ("vslam.cli",),
     ("vslam.__main__", "vslam"),
 )
@@ -57,6 +59,7 @@ SIBLINGS = {
 # A benchmark starts the command line in processes of its own: nothing comes back but files.
 STARTED = {
     ("vslam.bench.execute", "vslam.cli.child"),
+    ("vslam.cli.stress", "vslam.cli.child"),
     ("vslam.loopbench.cost", "vslam.loopbench.cost"),
     ("vslam.run.warmup", "vslam.run.warmup"),
 }
@@ -71,6 +74,7 @@ ONLY_IN = {
     "distributed": "vslam.bench.cluster",
     "rosbags": "vslam.datasets.bag",
     "PIL": "vslam.datasets.image_folders",
+    "pyorbslam3": "vslam.stress.orbslam3",
     "deflate": "vslam.datasets.png",
     "typer": "vslam.cli",
 }

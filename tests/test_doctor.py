@@ -185,6 +185,23 @@ def test_depth_of_another_camera(depth_images):
     assert faults(right(depth_images, lambda d: np.roll(d, 9, axis=1))) == ["registration"]
 
 
+def test_one_view_does_not_tell_that_depth_is_off(depth_images):
+    """Eight frames of one view are evidence of one: its edges may fit elsewhere by chance."""
+    image, depth = depth_images.left[0], np.roll(depth_images.second[0], 9, axis=1)
+    shaken = [np.roll(image, k, axis=1) for k in range(8)]
+    moved = [np.roll(depth, k, axis=1) for k in range(8)]
+    found = {
+        f.check: f for f in examine(replace(depth_images, left=shaken, second=moved), FEW).findings
+    }
+    assert found["registration"].verdict == "unknown"
+    assert "one view" in found["registration"].measured
+    shaken[4:], moved[4:] = (
+        depth_images.left[4:],
+        [np.roll(d, 9, axis=1) for d in depth_images.second[4:]],
+    )
+    assert faults(replace(depth_images, left=shaken, second=moved)) == ["registration"]
+
+
 def windows_of_desk() -> list[tuple[list, list]]:
     """Images and depth of eight frames each, from nine windows of 60."""
     desk = open_tum(REAL / "tum", "rgbd_dataset_freiburg1_desk")
@@ -271,7 +288,7 @@ def test_the_command_looks_at_the_beginning_of_a_video(corridor, tmp_path, monke
     ("words", "part"),
     [
         ("--sensor rgbd", "--sensor rgbd: 00 is of sensor stereo"),
-        ("--depth-scale 9", "--depth-scale: only for --dataset tum, not kitti"),
+        ("--depth-scale 9", "--depth-scale: only for --dataset tum or images or bag, not kitti"),
         ("--dataset images --seq 00", "--seq 00: only for data sets, not images"),
     ],
 )

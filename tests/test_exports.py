@@ -37,9 +37,9 @@ from vslam.maps.nerfstudio import save_nerfstudio
 from vslam.maps.ply import save_ply
 from vslam.maps.reconstruction import Reconstruction, reconstruction_of
 from vslam.maps.storage import load_map, save_map
+from vslam.maps.stored_map import StoredMap
 from vslam.report.finished_run import FinishedRun, pose_graph, read_report, read_run
 from vslam.report.folder import write_results
-from vslam.report.schema import LoopEntry
 from vslam.trajectory import Trajectory, write_euroc
 
 CAMERA = Camera(300.0, 310.0, 159.5, 119.5, 0.4, 320, 240)
@@ -316,12 +316,6 @@ def test_gtsam_reads_the_pose_graph_and_weighs_it_alike(tmp_path):
 
 
 def test_loops_and_gaps_of_a_run_become_edges(corridor_run, tmp_path):
-    def entry(query: int | None, match: int, accepted: bool) -> LoopEntry:
-        return LoopEntry(
-            query_frame=query, match_frame=match, score=0.5, matches=90, inliers=60, right=None,
-            accepted=accepted, reason="closed", moved_m=None, correction_s=None,
-        )  # fmt: skip
-
     grown = small_map()
     for row in range(grown.rows(5).start, grown.n_rows):  # the last two see what nothing else does
         if grown.arrays.landmark[row] >= 0:
@@ -329,20 +323,22 @@ def test_loops_and_gaps_of_a_run_become_edges(corridor_run, tmp_path):
     shared = grown.add_landmarks(np.ones((20, 3)), np.zeros((20, 4), np.uint64), 5)
     for k in (5, 6):
         link_many(grown.arrays, grown.rows(k).start + np.arange(20), shared)
-    save_map(tmp_path / "map.npz", grown, CAMERA)
-    map_, camera = load_map(tmp_path / "map.npz")
+    grown.begin_submap(5, 4, predicted=True)
+    T_query_match = se3_exp(np.array([0.1, 0.0, 2.0, 0.0, 0.1, 0.0]))
+    # The keyframe at frame 6 was culled: its parent takes its place.
+    loop = LoopEdge(6, 2, 0.5, True, "closed", T_query_match=T_query_match)
+    save_map(tmp_path / "map.npz", StoredMap(grown, CAMERA, (loop,)))
+    stored = load_map(tmp_path / "map.npz")
+    map_ = stored.map
     assert map_.frames == [0, 3, 9, 12, 15, 18]
-    # The keyframe at frame 6 was culled; of the living ones that at frame 3 is nearest to 5.
-    loops = [entry(18, 5, True), entry(15, 0, False), entry(None, 3, True)]
-    report = read_report(corridor_run).model_copy(update={"loops": loops})
-    graph = pose_graph(FinishedRun(corridor_run, report, map_, camera))
+    report = read_report(corridor_run)
+    graph = pose_graph(FinishedRun(corridor_run, report, map_, stored.camera, stored.loops))
     kinds = dict(zip(map(tuple, graph.edges.tolist()), graph.kind.tolist(), strict=True))
     tree = {(k, k + 1): TREE for k in range(5)}
     assert kinds == tree | {(3, 4): GAP, (1, 5): LOOP}
-    T_cw = map_.arrays.T_cw
-    expected = T_cw[1] @ np.linalg.inv(T_cw[5])
-    loop = graph.edges.tolist().index([1, 5])
-    np.testing.assert_allclose(graph.T_i_j[loop], expected, atol=1e-12)
+    expected = np.linalg.inv(T_query_match @ grown.T_c_parent[2])
+    measured = graph.edges.tolist().index([1, 5])
+    np.testing.assert_allclose(graph.T_i_j[measured], expected, atol=1e-9)
 
 
 def test_evo_reads_the_csv_of_euroc(tmp_path):
@@ -465,13 +461,10 @@ def test_map_info(corridor_run, tmp_path):
     assert f"observations  {len(reconstruction.xy)} by " in out
     assert "sub-maps      1\n" in out
     assert "stereo, 480x160" in out
-    lone = tmp_path / "map.npz"
-    lone.write_bytes((corridor_run / "map.npz").read_bytes())
-    assert "sub-maps" not in vslam("map", "info", lone)
 
 
 def test_map_info_tells_depth_from_a_pair(tmp_path):
-    save_map(tmp_path / "map.npz", small_map(), replace(CAMERA, depth=True))
+    save_map(tmp_path / "map.npz", StoredMap(small_map(), replace(CAMERA, depth=True)))
     assert "rgbd, " in vslam("map", "info", tmp_path)
 
 
@@ -484,7 +477,7 @@ def refusal(*words: object) -> str:
 
 def test_refusals(corridor_run, kitti_tree, tmp_path):
     assert "no map.npz here" in refusal("export", "colmap", tmp_path)
-    assert "not a map of vslam" in refusal("map", "info", tmp_path)
+    assert "map.npz: cannot be read" in refusal("map", "info", tmp_path)
     out = ("--out", tmp_path / "out")
     words = ("export", "nerfstudio", corridor_run, *out)
     assert "--data" in refusal(*words, "--data", tmp_path / "gone")
@@ -508,8 +501,8 @@ def test_refusals(corridor_run, kitti_tree, tmp_path):
     report = json.loads((corridor_run / "report.json").read_text())
     (run / "report.json").write_text(json.dumps({**report, "schema_version": 3, "eyes": 2}))
     assert "report schema 3, this version reads 4" in refusal("export", "g2o", run, *out)
-    np.savez(tmp_path / "new.npz", schema=99, camera=np.zeros(7))
-    assert "map schema 99" in refusal("map", "info", tmp_path / "new.npz")
+    np.savez(tmp_path / "new.npz", schema=1, keyframe_first_row=np.zeros(1))
+    assert "a map of schema 1" in refusal("map", "info", tmp_path / "new.npz")
     assert not (tmp_path / "out").exists()
 
 

@@ -206,7 +206,7 @@ def test_occlusion_covers_the_stated_area_and_moves_every_second():
 @pytest.mark.parametrize(
     ("spec", "part"),
     [
-        ("fog", "unknown law 'fog'"),
+        ("snow", "unknown law 'snow'"),
         ("brightness,,blur", "unknown law ''"),
         ("none,blur", "unknown law 'none'"),
         ("blur:", "bad strength ''"),

@@ -29,6 +29,7 @@ from vslam.features import TrackingState
 from vslam.frontend.tracking import TrackingContext
 from vslam.loops import LoopEdge
 from vslam.maps.storage import load_map, save_map
+from vslam.maps.stored_map import StoredMap
 from vslam.report.schema import LoopFigures
 from vslam.report.summary import summarize
 from vslam.run.outcome import RunOutcome, RunSettings
@@ -258,8 +259,9 @@ def test_map_round_trip(kitti_tree, tmp_path, check_map):
     outcome = run(kitti_tree)
     before, camera = outcome.map, outcome.sequence.camera
     check_map(before)
-    save_map(tmp_path / "map.npz", before, camera)
-    after, same_camera = load_map(tmp_path / "map.npz")
+    save_map(tmp_path / "map.npz", StoredMap(before, camera))
+    stored = load_map(tmp_path / "map.npz")
+    after, same_camera = stored.map, stored.camera
     check_map(after)
     assert same_camera == camera
     living = before.living_keyframes()

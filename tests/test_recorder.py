@@ -280,7 +280,8 @@ def window(monkeypatch):
 
     started = []
 
-    def spawn(*, port, **_):
+    def spawn(*, port, recording, **_):
+        assert rerun.is_enabled(recording)  # the real one does nothing otherwise
         started.append(subprocess.Popen([sys.executable, "-c", SERVER, str(port)]))
 
     monkeypatch.setattr(rerun, "spawn", spawn)

@@ -279,6 +279,20 @@ def test_json_round_trips_through_its_schema(fixture: str, request: pytest.Fixtu
     assert ReportJson.model_validate_json(text).model_dump_json(indent=2) + "\n" == text
 
 
+def test_causal_ate_is_of_the_poses_as_they_were_given(written: tuple[RunOutcome, Path]) -> None:
+    outcome, folder = written
+    report = json.loads((folder / "report.json").read_text())
+    given = read_trajectory(folder / "trajectory_causal.tum")
+    assert len(given) == report["frames"]
+    np.testing.assert_allclose(given.T_wc, [track.T_wc for track in outcome.tracks], atol=1e-8)
+    truth = matched_ground_truth(outcome)
+    assert truth is not None
+    assert report["causal_ate_rmse_m"] == pytest.approx(
+        evaluate_trajectory(given, truth).ate_rmse_m, abs=1e-6
+    )
+    assert f"{report['causal_ate_rmse_m']:.2f}"[:4] in (folder / "report.md").read_text()
+
+
 def test_evo_command_names_files_that_reproduce_the_ate(written: tuple[RunOutcome, Path]) -> None:
     _, folder = written
     report = ReportJson.model_validate_json((folder / "report.json").read_bytes())

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import CEILING, PLANES, StereoSequence
+from conftest import StereoSequence, corridor_depth
 
 from vslam.camera import Camera
 from vslam.cli.main import app
@@ -34,23 +34,6 @@ from vslam.trajectory import Trajectory, write_tum
 REAL = Path(__file__).parents[2] / "shared/data/tum/rgbd_dataset_freiburg1_desk"
 SCALE = 1000.0
 FRAMES = 16
-
-
-def corridor_depth(camera: Camera, T_wc: np.ndarray) -> np.ndarray:
-    """Depth ``(H, W)`` metres of the corridor along the camera's z, 0 where there is sky."""
-    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = np.stack(
-        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u, float)], axis=-1
-    )
-    rays, centre = rays @ T_wc[:3, :3].T, T_wc[:3, 3]
-    depth = np.full(u.shape, np.inf)
-    for normal, offset in PLANES:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            along = (offset - normal @ centre) / (rays @ normal)
-        hit = centre + along[..., None] * rays
-        nearer = (along > 0.05) & (along < depth) & (hit[..., 1] > CEILING)
-        depth[nearer] = along[nearer]
-    return np.where(np.isfinite(depth), depth, 0.0)
 
 
 def write_list(path: Path, times, folder: str) -> None:
@@ -124,7 +107,7 @@ def test_columns_are_those_of_a_virtual_right_camera():
     camera = Camera(100.0, 100.0, 2.0, 1.0, 0.5, 4, 3, depth=True)
     depth = np.array([[1, 2, 5, 0], [10, 4, np.nan, 0.05], [50, 25, 200, 2]], np.float32)
     xy = np.array([[0, 0], [1.4, 0.6], [3, 0], [2, 1], [3, 1], [2, 2], [3.4, 2.4]], np.float32)
-    found = columns_of_depth(xy, depth, camera, DepthConfig())
+    found = columns_of_depth(xy, np.ones(7), depth, camera, DepthConfig(edge_radius=0))
     # fx b = 50: d = 1, then 4 at pixel (1, 1), unknown, NaN, too near, too far, then 2 at (3, 2).
     np.testing.assert_allclose(found[[0, 1, 6]], [0 - 50, 1.4 - 12.5, 3.4 - 25], rtol=1e-6)
     assert np.isnan(found[2:6]).all()
@@ -138,10 +121,29 @@ def test_features_without_depth_are_monocular(corridor):
     features = extract_features(corridor.left[0], depth, context)
     rows, columns = np.rint(features.xy).astype(int).T[::-1]
     known = np.isfinite(features.u_right)
-    np.testing.assert_array_equal(known, depth[rows, columns] > 0)
+    assert (depth[rows, columns][known] > 0).all()
     assert 100 < np.count_nonzero(known) < len(known) - 100
     found = camera.bf / (features.xy[known, 0] - features.u_right[known])
     np.testing.assert_allclose(found, depth[rows, columns][known], rtol=1e-3)
+
+
+def test_a_corner_at_an_edge_of_depth_has_none():
+    camera = Camera(100.0, 100.0, 20.0, 20.0, 0.5, 40, 40, depth=True)
+    depth = np.full((40, 40), 2.0, np.float32)
+    depth[:, 20:] = 2.3  # farther by 15 %
+    depth[30:] = 2.1  # by 5 %: no edge
+    depth[0:4, 0:4] = 0.0  # unknown depth tells nothing
+    xy = np.array([[14, 9], [15, 9], [16, 9], [23, 9], [24, 9], [8, 33], [5, 5], [19, 9]])
+    around = {radius: columns_of_depth(
+        xy.astype(np.float32), np.ones(len(xy)), depth, camera, DepthConfig(edge_radius=radius)
+    ) for radius in (0, 4)}  # fmt: skip
+    assert np.isfinite(around[0]).all()
+    assert np.isfinite(around[4]).tolist() == [1, 1, 0, 0, 1, 1, 1, 0]
+    # A keypoint of a coarser octave has a larger patch.
+    twice = columns_of_depth(
+        xy.astype(np.float32), np.full(len(xy), 2.0), depth, camera, DepthConfig(edge_radius=4)
+    )
+    assert np.isfinite(twice).tolist() == [0, 0, 0, 0, 0, 1, 1, 0]
 
 
 def test_a_step_takes_depth_in_metres_and_nothing_else(corridor):
@@ -285,8 +287,8 @@ def test_the_result_does_not_depend_on_the_threads(outcome, tree):
 
 
 def test_a_map_keeps_its_camera(outcome, tmp_path):
-    save_map(tmp_path / "map.npz", outcome.map, outcome.sequence.camera)
-    assert load_map(tmp_path / "map.npz")[1] == outcome.sequence.camera
+    save_map(tmp_path / "map.npz", outcome.stored)
+    assert load_map(tmp_path / "map.npz").camera == outcome.sequence.camera
 
 
 def test_the_command_names_the_sensor(tree, tmp_path, capsys):

@@ -38,6 +38,7 @@ def test_files_devices_and_urls(tmp_path, monkeypatch, data, dataset):
         ("1.png", "images"),
         ("image_0/1.jpg", "images"),
         ("cam0/data/1.png", "images"),
+        ("rgb/1.png", "images"),
         ("metadata.yaml", "bag"),
     ],
 )
@@ -48,6 +49,12 @@ def test_folders(tmp_path, file, dataset):
 
 
 def test_what_is_not_known_is_told_what_was_looked_for(tmp_path):
+    with pytest.raises(InputError, match="the folder is empty; name another one"):
+        detect_dataset(str(tmp_path))
+    (tmp_path / "1.png").touch()
+    with pytest.raises(InputError, match="one image; name the folder that it is in"):
+        detect_dataset(str(tmp_path / "1.png"))
+    (tmp_path / "1.png").rename(tmp_path / "notes.txt")
     with pytest.raises(InputError) as caught:
         detect_dataset(str(tmp_path))
     for word in ("sequences", "mav0", "rgb.txt", "metadata.yaml", "left/", "video"):

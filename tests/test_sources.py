@@ -187,16 +187,16 @@ def test_times_in_names(corridor, tmp_path, names, times):
 )
 def test_images_come_in_the_order_of_times_or_numbers(corridor, tmp_path, names):
     write_images(tmp_path, {"": corridor.left[:4]}, [f"{name}.png" for name in names])
-    found = open_images(tmp_path, fps=10.0, monocular=True)
-    assert [path.stem for path in found.left] == names
+    found = open_images(tmp_path, fps=10.0, sensor="mono")
+    assert [path.stem for path in found.sides[0]] == names
 
 
 def test_sides_without_a_common_name_belong_together_by_order(corridor, tmp_path):
     write_images(tmp_path, {"left": corridor.left[:3]}, ["l8.png", "l9.png", "l10.png"])
     write_images(tmp_path, {"right": corridor.right[:3]}, ["r8.png", "r9.png", "r10.png"])
     found = open_images(tmp_path, fps=10.0)
-    assert [path.stem for path in found.left] == ["l8", "l9", "l10"]
-    assert [path.stem for path in found.right] == ["r8", "r9", "r10"]
+    assert [path.stem for path in found.sides[0]] == ["l8", "l9", "l10"]
+    assert [path.stem for path in found.sides[1]] == ["r8", "r9", "r10"]
 
 
 def test_times_in_exif(corridor, tmp_path):

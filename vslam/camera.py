@@ -84,6 +84,12 @@ class Camera:
         return np.stack([x, y, z], axis=1)
 
 
+def same_camera(one: Camera, other: Camera) -> bool:
+    """Whether two cameras are one, up to the rounding of calibration files."""
+    shapes = [(c.width, c.height, c.depth, c.monocular) for c in (one, other)]
+    return shapes[0] == shapes[1] and bool(np.allclose(one.intrinsics, other.intrinsics, rtol=1e-6))
+
+
 Given = TypeVar("Given")
 Made = TypeVar("Made")
 

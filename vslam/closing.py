@@ -59,6 +59,7 @@ class LoopClosing:
         images: of the keyframes, for verification by learned descriptors; None for ORB alone.
         edges: every candidate and what became of it, in order.
         corrections: the loops that were closed.
+        closed: their edges in the units of today, after those that the map came with.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class LoopClosing:
         self.edges: list[LoopEdge] = []
         self.corrections: list[LoopCorrection] = []
         self._trials = LearnedTrials(config.learned)
-        self._closed: list[LoopEdge] = []  # corrections' edges, in the units of today
+        self.closed: list[LoopEdge] = []
         self._camera = camera
         self._config = config
         consistency = config.consistency
@@ -98,7 +99,10 @@ class LoopClosing:
         if self.images is not None and image is not None:
             self.images.add(keyframe, image)
             self.images.keep(map_.arrays.keyframe_alive)
-        candidates = self.detector.query(keyframe, map_)
+        self.consider(map_, keyframe, self.detector.query(keyframe, map_))
+
+    def consider(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> None:
+        """Verify what a keyframe looks like, best first; close the first real loop."""
         consistent, rejected = self._consistency.update(keyframe, candidates, map_)
         chosen = self._trials.choose(keyframe, candidates)
         self.edges += [edge for edge in rejected if edge.match not in chosen]
@@ -153,10 +157,10 @@ class LoopClosing:
         before = map_.arrays.T_cw[keyframes]
         query_side = [edge.query, *strong_neighbours(map_, edge.query, config)]
         match_side = [edge.match, *strong_neighbours(map_, edge.match, config)]
-        self._closed.append(edge)
+        self.closed.append(edge)
         if self._camera.monocular:
             growth = move_keyframes_similarly(map_, keyframes, solved.S_wc)
-            self._closed = [loop_in_new_units(closed, growth) for closed in self._closed]
+            self.closed = [loop_in_new_units(closed, growth) for closed in self.closed]
         else:
             move_keyframes(map_, keyframes, solved.T_cw)
         fuse_loop(map_, edge, query_side, match_side, self._camera, config)
@@ -173,7 +177,7 @@ class LoopClosing:
         """The pose graph with a new loop, under one of two hypotheses of what happened where
         tracking was lost: the camera drove on about as predicted, or it was carried to where the
         loop puts it."""
-        config, loops = self._config.pose_graph, [*self._closed, edge]
+        config, loops = self._config.pose_graph, [*self.closed, edge]
         graph = essential_graph(
             map_,
             loops,
@@ -238,8 +242,8 @@ class LoopClosing:
     def joined_submaps(self, map_: Map) -> NDArray[np.int64]:
         """``(n_keyframes,)`` sub-map of each keyframe; those joined by loops count as one."""
         submap = map_.submaps()
-        for correction in self.corrections:
-            one, other = submap[correction.edge.query], submap[correction.edge.match]
+        for edge in self.closed:
+            one, other = submap[edge.query], submap[edge.match]
             submap[submap == max(one, other)] = min(one, other)
         return submap
 

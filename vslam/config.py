@@ -80,6 +80,15 @@ class DepthConfig(_Section):
     max_metres: float = Field(
         100.0, gt=0, description="Depth above which a pixel's is unknown, metres. [own]"
     )
+    edge_radius: float = Field(
+        4.0,
+        ge=0,
+        description="Pixels at octave 0 around a keypoint that must have its depth: FAST's circle "
+        "and one more. [own]",
+    )
+    edge_ratio: float = Field(
+        0.1, gt=0, description="Range of depth there, share of the nearest; above, an edge. [own]"
+    )
 
 
 class TrackingConfig(_Section):

@@ -20,6 +20,13 @@ class UnreadableImageError(InputError):
         self.path = path
 
 
+class DroppedFrameError(UnreadableImageError):
+    """A frame that a perturbation keeps back; during a run it counts as dropped, not as lost."""
+
+    def __init__(self, frame: int) -> None:
+        super().__init__(Path(f"frame {frame}"), "dropped by --perturb")
+
+
 class BrokenSourceError(InputError):
     """A video, bag or camera ended before its time: a file cut off, a device unplugged.
 

@@ -108,6 +108,7 @@ class TrackResult:
         n_matches: landmark matches before the last pose optimisation.
         n_inliers: matches that survived it.
         is_keyframe: whether the frame became a keyframe.
+        relocalised: whether it was looked for in the whole map, and found.
         stage_ms: milliseconds by stage of the pipeline (wall time of that stage).
     """
 
@@ -120,4 +121,5 @@ class TrackResult:
     n_matches: int
     n_inliers: int
     is_keyframe: bool
+    relocalised: bool = False
     stage_ms: dict[str, float] = field(default_factory=dict)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.geometry import Matrix, inverse, orthonormalised
 from vslam.trajectory import Trajectory, bridge_gaps
@@ -44,12 +45,40 @@ class FramePose:
     unit_scale: float = 1.0
 
 
+class FrameTable(NamedTuple):
+    """The poses of N frames as arrays: the fields of ``FramePose``, ``T_c_reference``
+    ``(N, 4, 4)``."""
+
+    timestamp: NDArray[np.float64]
+    reference: NDArray[np.int64]
+    T_c_reference: NDArray[np.float64]
+    tracked: NDArray[np.bool_]
+    unit_scale: NDArray[np.float64]
+
+
 class FramePoses:
     """The poses of all frames, in order; those before the first keyframe are in the world."""
 
-    def __init__(self, keyframes: KeyframePoses) -> None:
+    def __init__(self, keyframes: KeyframePoses, before: FrameTable | None = None) -> None:
+        """``before``: frames of the same drive that were placed already."""
         self._keyframes = keyframes
         self._frames: list[FramePose] = []
+        if before is not None:
+            self._frames = [
+                FramePose(float(time), int(reference), T, bool(tracked), float(unit))
+                for time, reference, T, tracked, unit in zip(*before, strict=True)
+            ]
+
+    def table(self) -> FrameTable:
+        """All frames, for a file."""
+        frames = self._frames
+        return FrameTable(
+            np.array([frame.timestamp for frame in frames], np.float64),
+            np.array([frame.reference for frame in frames], np.int64),
+            np.array([frame.T_c_reference for frame in frames], np.float64).reshape(-1, 4, 4),
+            np.array([frame.tracked for frame in frames], np.bool_),
+            np.array([frame.unit_scale for frame in frames], np.float64),
+        )
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -96,9 +125,12 @@ class FramePoses:
 
     def trajectory(self) -> Trajectory:
         """Pose of every frame, those that were only predicted interpolated between the frames
-        tracked before and after."""
+        tracked before and after; those before the first one tracked stand where that is."""
         times = np.array([frame.timestamp for frame in self._frames], np.float64)
         poses = [inverse(self.pose(k)) for k in range(len(self._frames))]
         tracked = np.array([frame.tracked for frame in self._frames], np.bool_)
         T_wc = np.array(poses, np.float64).reshape(-1, 4, 4)
+        if tracked.any():
+            first = int(np.argmax(tracked))
+            T_wc[:first] = T_wc[first]
         return bridge_gaps(Trajectory(times, T_wc), tracked)

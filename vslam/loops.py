@@ -1,8 +1,9 @@
-"""What passes between loop detection, verification and correction."""
+"""What passes between loop detection, verification and correction, and what is kept of it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -76,3 +77,56 @@ class LoopCorrection:
     T_cw_before: NDArray[np.float64]
     T_cw_after: NDArray[np.float64]
     seconds: float
+
+
+def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The numbers ``first[i] ... first[i] + count[i] - 1`` of each of N ranges, in one row."""
+    before = np.cumsum(count) - count
+    return np.arange(int(count.sum()), dtype=np.int64) + np.repeat(first - before, count)
+
+
+@dataclass(frozen=True)
+class PerKeyframe:
+    """Something of each of K keyframes, of any length each: words, a descriptor, an image file.
+
+    Attributes:
+        first: ``(K + 1,)`` int64, where that of each keyframe begins.
+        values: ``(N, ...)``; those of keyframe k are ``values[first[k]:first[k + 1]]``.
+    """
+
+    first: NDArray[np.int64]
+    values: NDArray
+
+    def __len__(self) -> int:
+        return len(self.first) - 1
+
+    def of(self, keyframe: int) -> NDArray:
+        """What a keyframe has."""
+        return self.values[self.first[keyframe] : self.first[keyframe + 1]]
+
+    def select(self, keyframes: NDArray[np.int64]) -> PerKeyframe:
+        """Those of ``(M,)`` keyframes, numbered anew; of keyframes not known here, nothing."""
+        known = np.minimum(keyframes, max(len(self) - 1, 0))
+        count = np.where(keyframes < len(self), np.diff(self.first, append=0)[known], 0)
+        first = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+        return PerKeyframe(first, self.values[ranges(self.first[known], count)])
+
+    def followed_by(self, other: PerKeyframe) -> PerKeyframe:
+        """Those of another map's keyframes appended."""
+        first = np.concatenate([self.first, self.first[-1] + other.first[1:]])
+        return PerKeyframe(first, np.concatenate([self.values, other.values]))
+
+
+@dataclass(frozen=True)
+class DetectorMemory:
+    """What a loop detector knows of keyframes, for a file.
+
+    Attributes:
+        name: of the detector.
+        fingerprint: of the vocabulary or weights that it was made with.
+        tables: by the detector's own names.
+    """
+
+    name: str = "none"
+    fingerprint: str = ""
+    tables: Mapping[str, PerKeyframe] = field(default_factory=dict)

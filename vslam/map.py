@@ -9,6 +9,7 @@ never reused; arrays grow by half.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from vslam.features import Features
 from vslam.geometry import compose, inverse, orthonormalised
+from vslam.loops import LoopEdge
 from vslam.map_kernels import collect_landmarks, count_shared, detach_keyframe
 
 NONE = -1
@@ -77,6 +79,8 @@ class Map:
         arrays: everything that kernels touch.
         n_keyframes, n_landmarks, n_rows: how much of the capacity is in use, dead ones included.
         timestamps, frames, parents: of each keyframe: seconds, frame index, spanning-tree parent.
+        sessions: of each keyframe: the drive that its time and frame are of, from 0.
+        session: the drive of the keyframes to come.
         T_c_parent: pose relative to the parent, set when a keyframe is culled.
         unit_scale: of each keyframe: units of the map around it that were one when it was
             added. 1 in metric maps; loops of monocular ones change it.
@@ -95,6 +99,8 @@ class Map:
         self.timestamps: list[float] = []
         self.frames: list[int] = []
         self.parents: list[int] = []
+        self.sessions: list[int] = []
+        self.session = 0
         self.T_c_parent: dict[int, NDArray[np.float64]] = {}
         self.unit_scale: list[float] = []
         self.restarts: list[int] = []
@@ -157,6 +163,7 @@ class Map:
         self.timestamps.append(timestamp)
         self.frames.append(frame)
         self.parents.append(NONE)
+        self.sessions.append(self.session)
         self.unit_scale.append(1.0)
         self.n_rows += n
         self.n_keyframes += 1
@@ -246,6 +253,26 @@ class Map:
     def living_landmarks(self) -> NDArray[np.int64]:
         """Ids of the landmarks that were neither culled nor merged into another."""
         return np.flatnonzero(self.arrays.landmark_alive[: self.n_landmarks])
+
+
+def loop_of_living(map_: Map, loop: LoopEdge) -> LoopEdge:
+    """A loop between the living keyframes that its ends, where they were culled, are placed by.
+
+    Raises:
+        ValueError: it has no pose.
+    """
+    if loop.T_query_match is None:
+        raise ValueError(f"The loop from keyframe {loop.query} to {loop.match} has no pose.")
+    query, match, T = loop.query, loop.match, loop.T_query_match
+    if not map_.arrays.keyframe_alive[query]:
+        T_parent_query = inverse(map_.T_c_parent[query])
+        T_parent_query[:3, 3] /= loop.scale  # to the unit of the match
+        T = compose(T_parent_query, T)
+        query = map_.parents[query]
+    if not map_.arrays.keyframe_alive[match]:
+        T = compose(T, map_.T_c_parent[match])
+        match = map_.parents[match]
+    return replace(loop, query=query, match=match, T_query_match=orthonormalised(T))
 
 
 class LocalMap(NamedTuple):

@@ -268,3 +268,26 @@ def covisible_pairs(a, keyframes, n_keyframes, minimum):
                 n += 1
             counts[k] = 0
     return pairs[:n], shared[:n]
+
+
+@kernel
+def gather_observations(a, landmarks, index):
+    """Rows of each landmark in keyframes with an index, as ``first`` ``(P + 1,)`` and rows."""
+    first = np.zeros(len(landmarks) + 1, np.int64)
+    for i in range(len(landmarks)):
+        first[i + 1] = first[i]
+        row = a.head[landmarks[i]]
+        while row >= 0:
+            if index[a.keyframe[row]] >= 0:
+                first[i + 1] += 1
+            row = a.next_row[row]
+    rows = np.empty(first[-1], np.int64)
+    n = 0
+    for i in range(len(landmarks)):
+        row = a.head[landmarks[i]]
+        while row >= 0:
+            if index[a.keyframe[row]] >= 0:
+                rows[n] = row
+                n += 1
+            row = a.next_row[row]
+    return first, rows

@@ -52,12 +52,14 @@ class MappingThread:
         closing: LoopClosing,
         *,
         threads: int,
+        map_: Map | None = None,
     ) -> None:
+        """``map_``: to go on in; an empty one by default."""
         self.reference = 0
         self.n_keyframes = 0
         self.last_frame = -1
         self.last_timestamp = -np.inf
-        self._map = Map(scales)
+        self._map = map_ or Map(scales)
         self._camera = camera
         self._config = config
         self._closing = closing
@@ -67,6 +69,9 @@ class MappingThread:
         self._reference_unit_scale = 1.0
         self._visible: list[NDArray[np.int32]] = []
         self._found: list[NDArray[np.int32]] = []
+        if self._map.n_keyframes:
+            self.n_keyframes = self._map.n_keyframes
+            self.set_reference(int(self._map.living_keyframes()[-1]))
 
     @property
     def busy(self) -> bool:
@@ -93,7 +98,7 @@ class MappingThread:
         Args:
             predicted: whether the pose of such a root is at least a prediction.
         """
-        self._write_counts()
+        self.write_counts()
         map_ = self._map
         keyframe = map_.add_keyframe(frame.features, frame.T_cw, frame.timestamp, frame.index)
         tracked = np.flatnonzero(frame.landmark >= 0)
@@ -122,7 +127,7 @@ class MappingThread:
         Returns:
             The keyframes that the two frames are.
         """
-        self._write_counts()
+        self.write_counts()
         map_, frames = self._map, (start.first, start.second)
         one, two = map_two_views(
             map_,
@@ -149,7 +154,7 @@ class MappingThread:
             return False
         pending, self._pending = self._pending, None
         pending()
-        self._write_counts()
+        self.write_counts()
         self._copy_view()
         return True
 
@@ -212,7 +217,8 @@ class MappingThread:
         self.last_frame, self.last_timestamp = frame.index, frame.timestamp
         self.set_reference(keyframe)
 
-    def _write_counts(self) -> None:
+    def write_counts(self) -> None:
+        """Write down what ``count`` remembered. Merge first."""
         for seen, counter in (
             (self._visible, self._map.arrays.visible),
             (self._found, self._map.arrays.found),

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, DepthImage, Image
+from vslam.camera import Camera, DepthImage, Image, same_camera
 from vslam.closing import LoopClosing
 from vslam.config import Config
+from vslam.errors import InputError
 from vslam.features import Features, TrackingState, TrackResult
-from vslam.frame_poses import FramePoses
+from vslam.frame_poses import FramePoses, FrameTable
 from vslam.frontend.keyframes import KeyframeEvidence, needs_keyframe, needs_monocular_keyframe
 from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracking import (
@@ -30,10 +32,14 @@ from vslam.frontend.tracking import (
 from vslam.geometry import Matrix, inverse, inverses, orthonormalised, se3_exp, se3_log
 from vslam.loopclosure.detector import LoopDetector, NoDetector
 from vslam.loopclosure.learned_verification import recognise
+from vslam.loopclosure.registry import create_detector, create_images
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map, local_map
+from vslam.map_kernels import gather_observations
 from vslam.mapping import MappingThread
+from vslam.maps.storage import load_map, save_map
+from vslam.maps.stored_map import StoredMap, World
 from vslam.monocular import Initialiser
 from vslam.trajectory import Trajectory
 
@@ -46,10 +52,16 @@ class Slam:
     ...     result = slam.step(left, right, timestamp)
     >>> slam.finish()
     >>> slam.trajectory().T_wc
+    >>> slam.save(path)
+
+    ``Slam.load(path)`` goes on in that map: the camera is looked for in all of it, and what is new
+    is added; where it is not found, a new sub-map begins, until a loop joins it. With
+    ``localize=True`` the map stays as it is, to the byte.
 
     Attributes:
         frame: the last frame tracked, for drawing; None before the first.
         context: camera, thresholds and pyramid scales, as ``extract_features`` takes them.
+        world: where the map that was loaded lies in that of a ground truth, None if unknown.
     """
 
     def __init__(
@@ -60,6 +72,9 @@ class Slam:
         *,
         threads: int = 2,
         images: KeyframeImages | None = None,
+        start: StoredMap | None = None,
+        localize: bool = False,
+        resume: bool = False,
     ) -> None:
         """
         Args:
@@ -71,22 +86,113 @@ class Slam:
                 ORB alone.
             threads: with 1, mapping runs where it is merged instead of beside tracking. The
                 result is the same.
+            start: a map to begin in, of the same camera, detector and pyramid; it becomes this
+                one's own. ``Slam.load`` reads one from a file.
+            localize: only track in that map.
+            resume: the frames to come are of the drive that the map's last ones are of; otherwise
+                a new drive begins, with a clock of its own.
+
+        Raises:
+            ValueError: in a few words why the map cannot be gone on in.
         """
+        if localize and (start is None or not start.map.n_keyframes):
+            raise ValueError("there is no map to localise in")
         self.camera = camera
         self.config = config or Config()
         self.context = TrackingContext.create(camera, self.config)
         self.frame: Frame | None = None
         self._detector = detector or NoDetector()
+        self._localize = localize
+        self._drives: tuple[str, ...] = ()
+        self.world: World | None = None
         self._closing = LoopClosing(
             self._detector, camera, self.config, threads=threads, images=images
         )
+        before = None if start is None else self._begin_in(start, resume=resume)
         self._mapping = MappingThread(
-            self.context.scales, camera, self.config, self._closing, threads=threads
+            self.context.scales,
+            camera,
+            self.config,
+            self._closing,
+            threads=threads,
+            map_=None if start is None else start.map,
         )
-        self._poses = FramePoses(self._mapping)
+        self._poses = FramePoses(self._mapping, before)
         self._velocity: Matrix | None = None  # twist per second, None if unknown
         self._lost_frames = 0
         self._initialiser = Initialiser(self.context)  # of monocular maps
+
+    @classmethod
+    def load(
+        cls,
+        path: Path,
+        config: Config | None = None,
+        detector: LoopDetector | None = None,
+        *,
+        threads: int = 2,
+        images: KeyframeImages | None = None,
+        localize: bool = False,
+        resume: bool = False,
+    ) -> Slam:
+        """Go on in a map that ``save`` or a run wrote.
+
+        Args:
+            detector: like the one that the map was made with; None for just that, as it is shipped.
+            config, threads, images, localize, resume: as for a new map.
+
+        Raises:
+            InputError: no map, a damaged one, or one of another detector or pyramid.
+        """
+        config = config or Config()
+        stored = load_map(path)
+        try:
+            if detector is None:
+                images = create_images(stored.detector.name, config)
+                detector = create_detector(stored.detector.name, config, None, images)
+            return cls(
+                stored.camera,
+                config,
+                detector,
+                threads=threads,
+                images=images,
+                start=stored,
+                localize=localize,
+                resume=resume,
+            )
+        except (ValueError, KeyError) as error:
+            raise InputError(f"{path}: {error}; go on with the options of its run.") from error
+
+    def save(self, path: Path, drive: str = "") -> None:
+        """Write the map to a file, in place of what is there: all that ``load`` needs to go on.
+
+        Args:
+            drive: what the images since the start were, "kitti 06" for example.
+
+        Raises:
+            RuntimeError: a keyframe is being mapped: look at ``is_mapping``, or call ``finish()``.
+            OSError: the file cannot be written; one that was there is as it was.
+        """
+        save_map(path, self.stored_map(drive))
+
+    def stored_map(self, drive: str = "") -> StoredMap:
+        """What ``save`` writes. Its arrays are those of the map: ``compact()``, which copies them,
+        before the next step.
+
+        Raises:
+            RuntimeError: a keyframe is being mapped.
+        """
+        map_, images = self.map, self._closing.images
+        self._mapping.write_counts()
+        return StoredMap(
+            map=map_,
+            camera=self.camera,
+            loops=tuple(self._closing.closed),
+            detector=self._detector.memory(),
+            images=None if images is None else images.files(map_.n_keyframes),
+            frames=self._poses.table(),
+            drives=self._drives if self._localize else (*self._drives, drive),
+            world=self.world,
+        )
 
     @property
     def map(self) -> Map:
@@ -97,6 +203,11 @@ class Slam:
         """
         self._check_finished()
         return self._mapping.map
+
+    @property
+    def detector(self) -> LoopDetector:
+        """What finds loops and relocalises."""
+        return self._detector
 
     @property
     def is_mapping(self) -> bool:
@@ -152,6 +263,8 @@ class Slam:
         clock.lap("wait_for_mapping")
         if self._mapping.n_keyframes == 0:
             return self._start(frame, clock)
+        if self.frame is None:
+            return self._find_in_map(frame, clock)
 
         T_cw = self._predict(timestamp)
         inliers = self._track_previous_frame(frame, T_cw)
@@ -169,19 +282,16 @@ class Slam:
             restarted = self._lose(frame)
             return _result(frame, state, matches, inliers, restarted, clock)
 
-        self._mapping.count(visible, frame.landmark[frame.landmark >= 0])
         self._update_motion(frame, relocalised)
-        is_keyframe = self._needs_keyframe(frame, inliers)
-        if is_keyframe:
-            self._insert_keyframe(frame)
+        is_keyframe = self._extend_map(frame, inliers, visible)
         clock.lap("keyframe")
-        return _result(frame, state, matches, inliers, is_keyframe, clock)
+        return _result(frame, state, matches, inliers, is_keyframe, clock, relocalised=relocalised)
 
     def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
         """Account for a frame without images, at the predicted pose: it is LOST, or DROPPED if
         there was only no time for it."""
         frame = self._next_frame(Features.none(), timestamp, None)
-        if len(self._poses):
+        if len(self._poses) or self._mapping.n_keyframes:
             frame.T_cw = self._predict(timestamp)
         if self._mapping.n_keyframes and not dropped:
             self._lost_frames += 1
@@ -204,12 +314,44 @@ class Slam:
         self._check_finished()
         return self._poses.trajectory()
 
+    def in_map(self) -> NDArray[np.bool_]:
+        """``(N,)`` frames tracked in the part of the map that holds its first keyframe, sub-maps
+        joined to it by loops included. Call ``finish()`` first."""
+        frames = self._poses.table()
+        if not self.map.n_keyframes:
+            return frames.tracked
+        part = self._closing.joined_submaps(self.map)
+        return frames.tracked & (part[frames.reference] == part[0])
+
     def keyframe_trajectory(self) -> Trajectory:
-        """Final pose of every keyframe that was not culled. Call ``finish()`` first."""
+        """Final pose of every keyframe of this drive that was not culled. Call ``finish()``
+        first."""
         map_ = self.map
         living = map_.living_keyframes()
+        living = living[np.array(map_.sessions, np.int64)[living] == map_.session]
         times = np.array([map_.timestamps[k] for k in living], np.float64)
         return Trajectory(times, inverses(map_.arrays.T_cw[living]))
+
+    def _begin_in(self, start: StoredMap, *, resume: bool) -> FrameTable | None:
+        """Take over what belongs to a map; returns the frames that are placed already."""
+        if not np.array_equal(start.map.scales, self.context.scales):
+            raise ValueError(
+                f"made with another pyramid, of {len(start.map.scales)} levels by "
+                f"{start.map.scales[1] / start.map.scales[0]:g}"
+            )
+        if not same_camera(start.camera, self.camera):
+            raise ValueError("made with another camera")
+        self._detector.restore(start.detector)
+        if self._closing.images is not None and start.images is not None:
+            self._closing.images.restore(start.images, self.camera.width)
+        self._closing.closed = list(start.loops)
+        self._drives, self.world = start.drives, start.world
+        if resume:
+            self._drives = self._drives[:-1]
+            return start.frames
+        if not self._localize and start.map.n_keyframes:
+            start.map.session += 1
+        return None
 
     def _check_finished(self) -> None:
         if self._mapping.busy:
@@ -223,12 +365,30 @@ class Slam:
         return Frame.untracked(features, self.camera, len(self._poses), timestamp, image)
 
     def _predict(self, timestamp: float) -> Matrix:
-        """Constant velocity, in seconds: dropped frames do not disturb it."""
+        """Constant velocity, in seconds: dropped frames do not disturb it. In a map that was
+        loaded, the camera is taken to be where that ends until it is found."""
+        if not len(self._poses):
+            return self._mapping.keyframe_pose(self._mapping.reference)
         T_last = self._poses.pose(-1)
         if self._velocity is None:
             return T_last
         elapsed = timestamp - self._poses.timestamp(-1)
         return orthonormalised(se3_exp(self._velocity * elapsed) @ T_last)
+
+    def _find_in_map(self, frame: Frame, clock: _Clock) -> TrackResult:
+        """A frame in a map that was loaded, before the camera was found in it."""
+        T_cw = self._predict(frame.timestamp)
+        matches = inliers = self._relocalise(frame)
+        state = self._state_of(inliers, matches)
+        clock.lap("relocalise")
+        if state == TrackingState.LOST:
+            frame.T_cw = T_cw
+            restarted = self._lose(frame)
+            return _result(frame, state, matches, inliers, restarted, clock)
+        self._place(frame)
+        is_keyframe = self._extend_map(frame, inliers, np.empty(0, np.int32))
+        clock.lap("keyframe")
+        return _result(frame, state, matches, inliers, is_keyframe, clock, relocalised=True)
 
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix) -> int:
         """Along the prediction; where there is none or it fails, against the reference keyframe."""
@@ -293,10 +453,14 @@ class Slam:
         """Place the frame; the velocity is that since the last frame tracked."""
         assert self.frame is not None
         step = se3_log(orthonormalised(frame.T_cw @ inverse(self._poses.pose(self.frame.index))))
-        self._initialiser.reset()
         # A leap to where the camera was found again is no motion.
         elapsed = frame.timestamp - self.frame.timestamp
         self._velocity = None if relocalised else step / elapsed
+        self._place(frame)
+
+    def _place(self, frame: Frame) -> None:
+        """Keep the pose of a frame that was tracked."""
+        self._initialiser.reset()
         self._lost_frames = 0
         self._poses.append(frame.timestamp, frame.T_cw, tracked=True)
         self.frame = frame
@@ -305,6 +469,8 @@ class Slam:
         """Keep the prediction as the pose; after a while, map anew from there: returns whether."""
         self._poses.append(frame.timestamp, frame.T_cw, tracked=False)
         self._lost_frames += 1
+        if self._localize:
+            return False
         config = self.config.tracking
         if self.camera.monocular:
             long = self._lost_frames >= config.monocular_lost_frames
@@ -356,6 +522,29 @@ class Slam:
 
     def _can_start(self, frame: Frame) -> bool:
         return frame.n_stereo >= self.config.tracking.min_stereo_start
+
+    def _extend_map(self, frame: Frame, inliers: int, visible: NDArray[np.int32]) -> bool:
+        """Count what the frame saw, of what it should see, and make it a keyframe if it is new;
+        when only localising, just look at the map from where it is. Returns whether it was."""
+        if self._localize:
+            self._look_around(frame)
+            return False
+        self._mapping.count(visible, frame.landmark[frame.landmark >= 0])
+        is_keyframe = self._needs_keyframe(frame, inliers)
+        if is_keyframe:
+            self._insert_keyframe(frame)
+        return is_keyframe
+
+    def _look_around(self, frame: Frame) -> None:
+        """The keyframe that sees most of the landmarks of a frame becomes the reference (ORB-SLAM,
+        V-D)."""
+        a, n = self.map.arrays, self.map.n_keyframes
+        _, rows = gather_observations(a, frame.landmark[frame.landmark >= 0], np.arange(n))
+        if not len(rows):
+            return
+        best = int(np.argmax(np.bincount(a.keyframe[rows], minlength=n)))
+        if best != self._mapping.reference:
+            self._mapping.set_reference(best)
 
     def _needs_keyframe(self, frame: Frame, inliers: int) -> bool:
         close = feature_depth(frame.features, self.camera) < self.context.close_depth
@@ -419,6 +608,8 @@ def _result(
     inliers: int,
     is_keyframe: bool,
     clock: _Clock,
+    *,
+    relocalised: bool = False,
 ) -> TrackResult:
     return TrackResult(
         index=frame.index,
@@ -430,6 +621,7 @@ def _result(
         n_matches=matches,
         n_inliers=inliers,
         is_keyframe=is_keyframe,
+        relocalised=relocalised,
         stage_ms=clock.laps,
     )
 

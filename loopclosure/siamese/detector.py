@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from vslam.config import LearnedMatchingConfig, SiameseConfig
 from vslam.features import Features
+from vslam.loopclosure.detector import require_same
 from vslam.loopclosure.local_matching import DescriptorMaps, likeness
 from vslam.loopclosure.siamese.images import to_size
 from vslam.loopclosure.siamese.inference import OnnxNetwork, open_network
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
-from vslam.loops import LoopCandidate
+from vslam.loops import DetectorMemory, LoopCandidate, PerKeyframe
 from vslam.map import Map
 
 
@@ -49,7 +50,7 @@ class SiameseDetector:
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
         """Embed and remember a keyframe. Without its image it can be neither query nor match."""
         while keyframe >= len(self._known):
-            more = len(self._known) // 2
+            more = max(64, len(self._known) // 2)
             self._descriptors = np.pad(self._descriptors, ((0, more), (0, 0)))
             self._known = np.pad(self._known, (0, more))
         if image is not None:
@@ -86,6 +87,25 @@ class SiameseDetector:
         if self._images is not None:
             order = self._reranked(p, self._images.glance_at(image))
         return self._best(-1, p, order, map_)
+
+    def memory(self) -> DetectorMemory:
+        """See :class:`LoopDetector`: the descriptors of the keyframes with an image."""
+        known = np.flatnonzero(self._known)
+        first = np.concatenate([[0], np.cumsum(self._known)]).astype(np.int64)
+        table = PerKeyframe(first, self._descriptors[known])
+        return DetectorMemory(self.name, self._network.fingerprint, {"descriptors": table})
+
+    def restore(self, memory: DetectorMemory) -> None:
+        """See :class:`LoopDetector`."""
+        require_same(self.memory(), memory)
+        table = memory.tables["descriptors"]
+        known, values = np.diff(table.first), table.values
+        right = values.dtype == np.float32 and values.shape[1:] == self._descriptors.shape[1:]
+        if not right or not np.isfinite(values).all() or (known > 1).any():
+            raise ValueError("the descriptors of the keyframes are not those of the network")
+        self._descriptors = np.zeros((len(known), values.shape[1]), np.float32)
+        self._descriptors[known > 0] = values
+        self._known = known > 0
 
     def _alive(self, map_: Map) -> NDArray[np.bool_]:
         n = min(map_.n_keyframes, len(self._known))

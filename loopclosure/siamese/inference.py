@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ class OnnxNetwork:
         name: one of ``NETWORKS``.
         size: height and width of the images it takes.
         dimensions: D of its descriptors.
+        fingerprint: of the file.
         about: what the weights were made of; ``parameters``, numbers learned.
     """
 
@@ -47,6 +49,7 @@ class OnnxNetwork:
         self._views = tuple(compared[0].shape)
         self._compared = [one.name for one in compared]
         self.name: str = metadata[NAME]
+        self.fingerprint = sha256(path.read_bytes()).hexdigest()[:16]
         self.about: dict[str, Any] = json.loads(metadata[ABOUT])
         height, width = self._embedding.get_inputs()[0].shape
         self.size: Size = (height, width)

@@ -15,10 +15,12 @@ from vslam.errors import InputError
 from vslam.loopclosure.local_matching import DescriptorMaps
 from vslam.loopclosure.siamese.inference import FORMAT, NAME, VERSION, open_session
 from vslam.loopclosure.siamese.weights import SHIPPED
+from vslam.loops import PerKeyframe
 
 WIDTH = 640  # pixels of the image that the network reads; docs/loops.md has other widths
 GLANCE_WIDTH = 320  # of a first look
 _QUALITY = 90  # of the JPEG files of keyframes in memory
+_JPEG = b"\xff\xd8"
 _KEPT = 6  # descriptor maps, the latest used
 
 
@@ -79,6 +81,25 @@ class KeyframeImages:
         file = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
         self._files[keyframe] = file.tobytes(), WIDTH / image.shape[1]
 
+    def files(self, n_keyframes: int) -> PerKeyframe:
+        """The JPEG files of so many keyframes, uint8, for a map file."""
+        files = [self._files[k][0] if k in self._files else b"" for k in range(n_keyframes)]
+        first = np.cumsum([0, *map(len, files)]).astype(np.int64)
+        return PerKeyframe(first, np.frombuffer(b"".join(files), np.uint8))
+
+    def restore(self, files: PerKeyframe, width: int) -> None:
+        """Keep what ``files`` gave, of images that had so many columns.
+
+        Raises:
+            ValueError: in a few words: something is no image.
+        """
+        for keyframe in range(len(files)):
+            file = files.of(keyframe).tobytes()
+            if file and not file.startswith(_JPEG):
+                raise ValueError(f"the image of keyframe {keyframe} is no JPEG file")
+            if file:
+                self._files[keyframe] = file, WIDTH / width
+
     def keep(self, alive: NDArray[np.bool_]) -> None:
         """Forget the images of keyframes that are gone from the map.
 
@@ -112,8 +133,18 @@ class KeyframeImages:
         """The same of an image that is not kept."""
         return self.network.describe(image, GLANCE_WIDTH)
 
-    def _described(self, keyframe: int, width: int) -> DescriptorMaps:
-        file, scale = self._files[keyframe]
+    def image(self, keyframe: int) -> NDArray[np.uint8]:
+        """The image of a keyframe that was added, reduced to 640 columns.
+
+        Raises:
+            InputError: its file, from a map that was loaded, is damaged.
+        """
+        file, _ = self._files[keyframe]
         image = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_GRAYSCALE)
-        maps = self.network.describe(np.asarray(image, np.uint8), width)
-        return maps._replace(scale=maps.scale * scale)
+        if image is None:
+            raise InputError(f"the map's image of keyframe {keyframe} is damaged; save it again.")
+        return np.asarray(image, np.uint8)
+
+    def _described(self, keyframe: int, width: int) -> DescriptorMaps:
+        maps = self.network.describe(self.image(keyframe), width)
+        return maps._replace(scale=maps.scale * self._files[keyframe][1])

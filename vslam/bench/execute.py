@@ -14,10 +14,10 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Collection, Generator
+from collections.abc import Callable, Collection, Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from vslam.bench.grid import Cell, is_finished
@@ -37,7 +37,9 @@ class RunOptions:
         config: thresholds, the text of a ``config.json``.
         threads: of each run; its result does not depend on it.
         command: program that takes the words of ``vslam``; None for vslam itself.
+        others: programs as ``command`` for the cells whose detector has such a name: other systems.
         scratch: where runs write; None for the temporary folder of the machine.
+        source: words of ``vslam run`` on how the data is to be read.
     """
 
     data: Path | None
@@ -45,6 +47,8 @@ class RunOptions:
     threads: int
     command: tuple[str, ...] | None = None
     scratch: Path | None = None
+    others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    source: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -81,9 +85,11 @@ def run_cell(
     with tempfile.TemporaryDirectory(prefix=f"{cell.name}.", dir=options.scratch) as name:
         work = Path(name)
         (work / "config.json").write_text(options.config)
-        command = list(options.command or (sys.executable, "-m", "vslam.cli.child"))
+        program = options.others.get(cell.detector) or options.command
+        command = list(program or (sys.executable, "-m", "vslam.cli.child"))
         command += ["run", *cell.arguments(), "--threads", str(options.threads)]
         command += ["--data", str(options.data)] if options.data else []
+        command += options.source
         command += ["--config", str(work / "config.json"), "--no-record", "--no-report", "--quiet"]
         code = _call([*command, "--out", str(work / "runs")], work / "log.txt", stopped)
         log = (work / "log.txt").read_text(errors="replace")

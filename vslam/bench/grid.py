@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from vslam.datasets.perturbation import parse_perturbation
+from vslam.datasets.perturbation import law_kind, parse_perturbation
+from vslam.datasets.sources import SOURCES
 from vslam.errors import InputError
 from vslam.report.schema import ReportJson
-
-_UNSEEDED = {"none", "blur"}
 
 
 @dataclass(frozen=True, order=True)
@@ -26,6 +25,8 @@ class Cell:
         weights: of a learned detector, a file that every worker has under this path; None for the
             shipped ones.
         digest: of these weights.
+        sensor: that the run is told to be of, None for all that the data has.
+        calib: calibration files.
     """
 
     dataset: str
@@ -36,6 +37,8 @@ class Cell:
     max_frames: int | None = None
     weights: str | None = None
     digest: str = ""
+    sensor: str | None = None
+    calib: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -44,12 +47,16 @@ class Cell:
         parts = [self.dataset, self.sequence, light, self.detector, f"seed{self.seed}"]
         parts += [f"{self.max_frames}frames"] if self.max_frames else []
         parts += [f"weights{self.digest}"] if self.digest else []
+        parts += [self.sensor] if self.sensor else []
         return "-".join(re.sub(r"[^A-Za-z0-9.+-]+", "_", part) for part in parts)
 
     def arguments(self) -> list[str]:
         """Of ``vslam run``."""
-        words = ["--dataset", self.dataset, "--seq", self.sequence, "--perturb", self.perturb]
+        words = ["--dataset", self.dataset, "--perturb", self.perturb]
         words += ["--detector", self.detector, "--seed", str(self.seed)]
+        words += [] if self.dataset in SOURCES else ["--seq", self.sequence]
+        words += ["--sensor", self.sensor] if self.sensor else []
+        words += [word for path in self.calib for word in ("--calib", path)]
         words += ["--weights", self.weights] if self.weights else []
         return words + (["--max-frames", str(self.max_frames)] if self.max_frames else [])
 
@@ -97,6 +104,8 @@ def make_grid(
     runs: int,
     max_frames: int | None = None,
     weights: Mapping[str, Path] | None = None,
+    sensor: str | None = None,
+    calib: tuple[str, ...] = (),
 ) -> list[Cell]:
     """All cells, in the order in which they are worth most if the work is cut short: every
     sequence with the first seed, then with the next.
@@ -107,9 +116,21 @@ def make_grid(
     Args:
         weights: by detector, for those that do not use the shipped ones.
     """
-    files = {name: (str(path), _digest(path)) for name, path in (weights or {}).items()}
+    paths = {name: str(path) for name, path in (weights or {}).items()}
+    digests = {name: _digest(path) for name, path in (weights or {}).items()}
     return [
-        Cell(dataset, sequence, perturb, detector, seed, max_frames, *files.get(detector, ()))
+        Cell(
+            dataset=dataset,
+            sequence=sequence,
+            perturb=perturb,
+            detector=detector,
+            seed=seed,
+            max_frames=max_frames,
+            weights=paths.get(detector),
+            digest=digests.get(detector, ""),
+            sensor=sensor,
+            calib=calib,
+        )
         for seed, sequence, perturb, detector in product(
             range(runs), sequences, perturbations, detectors
         )
@@ -126,7 +147,8 @@ def _digest(path: Path) -> str:
 
 def draws(perturb: str) -> bool:
     """Whether the images depend on the seed."""
-    return not {law.partition(":")[0] for law in perturb.split(",")} <= _UNSEEDED
+    laws = {law.partition(":")[0] for law in perturb.split(",")} - {"none"}
+    return any(law_kind(law).drawn for law in laws)
 
 
 def read_report(folder: Path) -> ReportJson | None:
@@ -164,6 +186,9 @@ def is_finished(cell: Cell, folder: Path, config: str) -> bool:
         report.max_frames,
         str(report.weights) if report.weights else None,
         cell.digest,  # the folder is named after it
+        cell.sensor,
+        tuple(map(str, report.calib)),
     )
-    whole = report.sensor != "mono" and (report.start, report.every, report.calib) == (0, 1, ())
-    return same_config and whole and found == cell
+    as_asked = (report.sensor == "mono") == (cell.sensor == "mono")
+    whole = (report.start, report.every) == (0, 1)
+    return same_config and as_asked and whole and found == cell

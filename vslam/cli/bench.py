@@ -8,15 +8,36 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.options import KITTI_ROOT, Data, Dataset, Thresholds, Weights, names_in
+from vslam.cli.options import (
+    KITTI_ROOT,
+    Calib,
+    Depth,
+    DepthScale,
+    FramesPerSecond,
+    Right,
+    Sensor,
+    SideBySide,
+    Source,
+    SourceKind,
+    Thresholds,
+    Topics,
+    Weights,
+    kind_of_source,
+    names_in,
+    source_options,
+)
 from vslam.cli.report import write_overview_of
+from vslam.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Generator
 
     from vslam.bench.execute import CellOutcome, RunOptions
     from vslam.bench.grid import Cell
+    from vslam.datasets.sources import SourceOptions
 
+_UNKNOWN_LENGTH = 1000  # frames of a stream that does not say, for the estimate of time
+_FIRST_SEQUENCES = "00-05"
 _EXAMPLES = """
 [b]Examples[/b]
 
@@ -25,6 +46,8 @@ _EXAMPLES = """
   vslam bench --dataset synthetic --seqs demo --perturb brightness:0.5,brightness:1,brightness:2
 
   vslam bench --data ~/kitti --seqs 00,05-07 --perturb brightness:1.5+blur:0.5 --jobs 4
+
+  vslam bench --data drive.mp4 --side-by-side --calib stereo.yaml --runs 1
 
 The same command again goes on where it was stopped. docs/bench.md tells more.
 """
@@ -36,9 +59,23 @@ def register(app: typer.Typer) -> None:
 
 
 def bench(
-    dataset: Dataset = "kitti",
-    data: Data = KITTI_ROOT,
-    seqs: Annotated[str, typer.Option(help="Sequences, 00-05 or 00,demo for example.")] = "00-05",
+    dataset: SourceKind = None,
+    data: Source = str(KITTI_ROOT),
+    seqs: Annotated[
+        str | None,
+        typer.Option(
+            help="Sequences of a data set, 00-05 or 00,demo for example.",
+            show_default="00-05; of euroc and tum the only one there",
+        ),
+    ] = None,
+    calib: Calib = None,
+    right: Right = None,
+    depth: Depth = None,
+    fps: FramesPerSecond = None,
+    side_by_side: SideBySide = False,
+    topics: Topics = "",
+    depth_scale: DepthScale = None,
+    sensor: Sensor = None,
     perturb: Annotated[
         str,
         typer.Option(
@@ -72,7 +109,7 @@ def bench(
     chosen = names_in(detectors)
     from vslam.bench import execute
     from vslam.bench.estimate import check_disk, duration, estimate, size
-    from vslam.bench.grid import make_grid, parse_perturbations, parse_sequences
+    from vslam.bench.grid import make_grid, parse_perturbations
     from vslam.bench.table import GridProgress, shown_live
     from vslam.cli.progress import announce
     from vslam.config import Config, load_config
@@ -82,17 +119,31 @@ def bench(
     files = parse_weights(weights or [], chosen)
     for name in chosen or [""]:
         require_detector(name, files.get(name), option="--detectors")
-    sequences, laws = parse_sequences(seqs), parse_perturbations(perturb)
+    laws = parse_perturbations(perturb)
+    kind = kind_of_source(dataset, data)
+    if kind == "camera":
+        raise InputError(f"--data {data}: a camera cannot be seen twice; record a video or a bag.")
+    root = Path(data).absolute()
+    given = source_options(
+        None if calib is None else [path.absolute() for path in calib],
+        None if right is None else right.absolute(),
+        None if depth is None else depth.absolute(),
+        fps, side_by_side, topics, depth_scale,
+    )  # fmt: skip
     thresholds = Config() if config is None else load_config(config)
     options = execute.RunOptions(
-        data=data.absolute() if dataset != "synthetic" else None,
+        data=root if kind != "synthetic" else None,
         config=thresholds.model_dump_json(indent=2) + "\n",  # as a run writes it
         threads=threads or max(1, min(available_cores() // jobs, 4)),
         scratch=None if scheduler else execute.scratch_folder(out.absolute()),
+        source=tuple(_words_of(given)),
     )
-    cells = make_grid(dataset, sequences, laws, chosen, runs, max_frames, files)
     out = out.absolute()
-    frames, identity = _open_all(dataset, data.absolute(), sequences, max_frames, shown=not quiet)
+    frames, identity = open_all(kind, root, seqs, given, max_frames, sensor, shown=not quiet)
+    cells = make_grid(
+        kind, frames, laws, chosen, runs, max_frames, files,
+        sensor=sensor, calib=tuple(map(str, given.calibration)),
+    )  # fmt: skip
     execute.prepare(out, identity)
     finished = execute.finished_cells(cells, out, options.config)
     progress = GridProgress(cells, finished, frames, out, jobs)
@@ -108,7 +159,7 @@ def bench(
     stopped = False
     try:
         with shown_live(progress, shown=not quiet) as say:
-            outcomes = _outcomes(missing, options, jobs, scheduler, out, shown=not quiet)
+            outcomes = outcomes_of(missing, options, jobs, scheduler, out, shown=not quiet)
             with closing(outcomes):
                 for outcome in outcomes:
                     say(progress.add(outcome))
@@ -130,30 +181,57 @@ def bench(
         raise typer.Exit(1)
 
 
-def _open_all(
-    dataset: str, root: Path, sequences: list[str], max_frames: int | None, *, shown: bool
+def _words_of(options: SourceOptions) -> list[str]:
+    """Of ``vslam run``; calibrations are the cells' own."""
+    words = ["--side-by-side"] if options.side_by_side else []
+    values = {
+        "--right": options.right,
+        "--depth": options.depth,
+        "--fps": options.fps,
+        "--topics": ",".join(options.topics) or None,
+        "--depth-scale": options.depth_scale,
+    }
+    return words + [str(x) for pair in values.items() if pair[1] is not None for x in pair]
+
+
+def open_all(
+    kind: str,
+    root: Path,
+    seqs: str | None,
+    options: SourceOptions,
+    max_frames: int | None,
+    sensor: str | None,
+    *,
+    shown: bool,
 ) -> tuple[dict[str, int], str]:
     """Open every sequence, so that what is missing is said before the first run and not after the
-    last: frames of each, and what tells this data from other data.
+    last: frames of each by name, and what tells this data from other data.
 
     Rendered ones are rendered here: two runs cannot render one sequence at a time.
     """
+    from vslam.bench.grid import parse_sequences
     from vslam.cli.progress import render_bar
-    from vslam.datasets import open_sequence
+    from vslam.datasets.sources import open_source
+    from vslam.datasets.stream import count_expected
 
+    if seqs is None and kind in ("kitti", "synthetic"):
+        seqs = _FIRST_SEQUENCES
     frames = {}
-    for name in sequences:
+    for name in [None] if seqs is None else parse_sequences(seqs):
         with render_bar(shown=shown) as on_render:
-            found = open_sequence(dataset, root, name, max_frames=max_frames, on_render=on_render)
-        frames[name] = len(found)
-    if dataset != "synthetic":
-        return frames, str(root)
+            found = open_source(
+                kind, str(root), name, options,
+                max_frames=max_frames, sensor=sensor, on_render=on_render,
+            )  # fmt: skip
+        frames[name or found.name] = count_expected(found) or _UNKNOWN_LENGTH
+    if kind != "synthetic":
+        return frames, " ".join([str(root), *_words_of(options), *map(str, options.calibration)])
     from vslam.datasets.synthetic import Variation, store
 
     return frames, f"rendered towns {store.folder_name(Variation())}"
 
 
-def _outcomes(
+def outcomes_of(
     cells: list[Cell],
     options: RunOptions,
     jobs: int,
@@ -162,6 +240,7 @@ def _outcomes(
     *,
     shown: bool,
 ) -> Generator[CellOutcome, None, None]:
+    """Run cells here or on a cluster and publish them."""
     if scheduler is not None:
         from vslam.bench.cluster import run_on_cluster
 

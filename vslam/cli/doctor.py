@@ -9,6 +9,7 @@ import typer
 
 from vslam.cli.options import (
     Calib,
+    Depth,
     DepthScale,
     Every,
     FramesPerSecond,
@@ -48,6 +49,7 @@ def doctor(
     seq: Seq = None,
     calib: Calib = None,
     right: Right = None,
+    depth: Depth = None,
     fps: FramesPerSecond = None,
     side_by_side: SideBySide = False,
     topics: Topics = "",
@@ -70,7 +72,7 @@ def doctor(
 
     thresholds = Config() if config is None else load_config(config)
     try:
-        options = source_options(calib, right, fps, side_by_side, topics, depth_scale)
+        options = source_options(calib, right, depth, fps, side_by_side, topics, depth_scale)
         found = open_source(
             kind_of_source(dataset, source), source, seq, options,
             start=start, every=every, max_frames=max_frames, sensor=sensor,

@@ -19,7 +19,7 @@ def register(app: typer.Typer) -> None:
 
 def info(data: Data = KITTI_ROOT) -> None:
     """Show versions, cores, compiled kernels and the data found."""
-    from vslam import machine
+    from vslam import machine, plugins
     from vslam.datasets.kitti import list_kitti
 
     versions = machine.versions()
@@ -37,6 +37,11 @@ def info(data: Data = KITTI_ROOT) -> None:
         rows.append(("kitti root", str(data)))
     except InputError as error:
         rows.append(("kitti", str(error)))
+    rows += [
+        (f"{kind} {name}", ", ".join(plugin.packages))
+        for group, kind in plugins.KINDS.items()
+        for name, plugin in plugins.find_plugins(group).items()
+    ]
     if warning := machine.opencv_conflict(versions):
         rows.append(("warning", warning))
     print_rows(rows)

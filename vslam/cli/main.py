@@ -19,6 +19,7 @@ from vslam.cli import (
     perturb,
     report,
     run,
+    stress,
     synth,
     train,
     vocabulary,
@@ -34,8 +35,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 _GROUPS = (
-    run, evaluate, perturb, info, doctor, bench, report, synth, train, export, map_, vocabulary,
-    loops,
+    run, evaluate, perturb, info, doctor, bench, stress, report, synth, train, export, map_,
+    vocabulary, loops,
 )  # fmt: skip
 for _group in _GROUPS:
     _group.register(app)

@@ -7,14 +7,28 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.errors import InputError
+from vslam.cli.options import Thresholds
+from vslam.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
     from vslam.cli.summary import Rows
     from vslam.map import Map
     from vslam.maps.reconstruction import Reconstruction
+    from vslam.maps.stored_map import StoredMap
 
-commands = typer.Typer(help="Look at the maps of runs.", no_args_is_help=True)
+commands = typer.Typer(
+    help="Look at the maps of runs, make several one, cut parts out (docs/maps.md).",
+    no_args_is_help=True,
+)
+
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bar.")]
+Out = Annotated[Path, typer.Option(help="The map to write; it must not be there yet.")]
+MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="A map.npz, or the folder of a run.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -29,10 +43,11 @@ def info(
     """Show what a map holds: keyframes, landmarks, observations, length, sub-maps, sizes."""
     from vslam.cli.summary import print_rows
     from vslam.maps.reconstruction import reconstruction_of
-    from vslam.maps.storage import load_map
+    from vslam.maps.storage import load_map, map_file_of
 
-    file = run / "map.npz" if run.is_dir() else run
-    map_, camera = load_map(file)
+    file = map_file_of(run)
+    stored = load_map(file)
+    map_, camera = stored.map, stored.camera
     reconstruction = reconstruction_of(map_, camera)
     print_rows(
         [
@@ -43,7 +58,10 @@ def info(
                 f"fx {camera.fx:.1f}, fy {camera.fy:.1f}, cx {camera.cx:.1f}, cy {camera.cy:.1f}",
             ),
             *(_contents(map_, reconstruction) if map_.n_keyframes else [("keyframes", "none")]),
-            *_submaps(file),
+            ("sub-maps", str(len({0, *map_.restarts}) if map_.n_keyframes else 0)),
+            ("drives", f"{len(stored.drives)}: {', '.join(stored.drives)}"),
+            ("loops", str(len(stored.loops))),
+            ("detector", stored.detector.name),
         ]
     )
 
@@ -64,17 +82,139 @@ def _contents(map_: Map, reconstruction: Reconstruction) -> Rows:
         ("keyframes", f"{len(r.frames)}, frames {r.frames.min()} to {r.frames.max()}"),
         ("landmarks", str(len(map_.living_landmarks()))),
         ("observations", observations),
+        ("extent", ", ".join(_extent(r.T_wc))),
         ("length", f"{path:.1f} {unit} in {np.ptp(r.timestamps):.1f} s"),
     ]
 
 
-def _submaps(file: Path) -> Rows:
-    """The map itself does not say; the report of its run does."""
-    from vslam.report.finished_run import read_report
+def _extent(T_wc: NDArray[np.float64]) -> list[str]:
+    low, high = T_wc[:, :3, 3].min(axis=0), T_wc[:, :3, 3].max(axis=0)
+    return [f"{axis} {low[i]:.1f} to {high[i]:.1f}" for i, axis in ((0, "x"), (2, "z"))]
 
-    if not (file.parent / "report.json").is_file():
-        return []
+
+@commands.command(
+    epilog="[b]Example[/b]\n\n  vslam map merge runs/monday runs/tuesday --out town.npz"
+)
+def merge(
+    maps: Annotated[
+        list[Path],
+        typer.Argument(metavar="MAP...", help="Maps, or folders of runs; the first is the world."),
+    ],
+    out: Out,
+    config: Thresholds = None,
+    weights: Annotated[
+        Path | None, typer.Option(help="Weights of the detector that the maps were made with.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Make several maps one, by verified loops between them.
+
+    A map that meets no other is left out and named; if none meets the first, nothing is written
+    and the exit code is 1. The files of the maps stay as they are.
+    """
+    from vslam.cli.progress import count_bar
+    from vslam.config import Config, load_config
+    from vslam.loopclosure.registry import create_detector, create_images
+    from vslam.maps.storage import load_map, map_file_of, save_map
+    from vslam.merging import Memory, merge_maps
+
+    if len(maps) < 2:
+        raise InputError(f"{maps[0]}: one map alone; name two or more to make them one.")
+    _require_free(out)
+    thresholds = Config() if config is None else load_config(config)
+    files = [map_file_of(path) for path in maps]
+    stored = [load_map(file) for file in files]
+    if not stored[0].map.n_keyframes:
+        raise InputError(f"{files[0]}: the map is empty; name one that others can be joined to.")
+    name = stored[0].detector.name
+    if name == "none":
+        raise InputError(f"{files[0]}: made with the detector none, which finds nothing again.")
+
+    def create() -> Memory:
+        images = create_images(name, thresholds)
+        return create_detector(name, thresholds, weights, images), images
+
+    keyframes = sum(one.map.n_keyframes for one in stored[1:])
     try:
-        return [("sub-maps", str(read_report(file.parent).submaps))]
-    except InputError as error:
-        return [("sub-maps", f"unknown: {error}")]
+        with count_bar("keyframes", keyframes, shown=not quiet) as advance:
+            merged = merge_maps(stored, thresholds, create, advance)
+    except ValueError as error:
+        raise InputError(f"{files[0]} and the others are not to be merged: {error}.") from error
+    for number in merged.joined:
+        typer.echo(f"{files[number]}: joined by {len(merged.loops[number])} loops")
+    for number in merged.left_out:
+        typer.echo(f"{files[number]}: left out, no verified loop leads to it; the file is kept")
+    if not merged.joined:
+        typer.echo("no map meets the first one: nothing was written")
+        raise typer.Exit(1)
+    _save(save_map, out, merged.stored)
+
+
+@commands.command(
+    epilog="[b]Examples[/b]\n\n  vslam map crop town.npz --box=-50,50,0,200 --out street.npz\n\n"
+    "  vslam map crop town.npz --point 20,140 --within 60 --out crossing.npz\n\n"
+    "  vslam map crop town.npz --frames 300:500 --within 10 --out way.npz"
+)
+def crop(
+    map_file: MapFile,
+    out: Out,
+    box: Annotated[
+        str, typer.Option(metavar="X,X,Z,Z", help="Keep keyframes between two x and two z.")
+    ] = "",
+    point: Annotated[str, typer.Option(metavar="X,Z", help="Keep those --within of it.")] = "",
+    frames: Annotated[
+        str,
+        typer.Option(metavar="FIRST:LAST", help="Keep those --within of these frames' keyframes."),
+    ] = "",
+    drive: Annotated[int, typer.Option(min=0, help="The drive that --frames are of.")] = 0,
+    within: Annotated[float, typer.Option(min=0.0, help="Metres, or units of the map.")] = 0.0,
+) -> None:
+    """Cut a part out of a map: its keyframes, and the landmarks that they see.
+
+    x is right and z ahead of the map's first camera; its height does not count.
+    """
+    from vslam.maps.crop import in_box, near_frames, near_point
+    from vslam.maps.storage import load_map, map_file_of, save_map
+
+    if sum(map(bool, (box, point, frames))) != 1:
+        raise InputError("--box, --point or --frames: name one of them to say what is kept.")
+    _require_free(out)
+    file = map_file_of(map_file)
+    stored = load_map(file)
+    if box:
+        kept = in_box(stored.map, _numbers("--box", box, 4))
+    elif point:
+        kept = near_point(stored.map, _numbers("--point", point, 2), within)
+    else:
+        first, last = _numbers("--frames", frames, 2, separator=":")
+        kept = near_frames(stored.map, drive, first, last, within)
+    if not len(kept):
+        raise InputError(f"{file}: no keyframe lies there; 'vslam map info' tells its extent.")
+    _save(save_map, out, stored.select(kept))
+
+
+def _numbers(option: str, text: str, n: int, separator: str = ",") -> list[float]:
+    try:
+        numbers = [float(word) for word in text.split(separator)]
+    except ValueError:
+        numbers = []
+    if len(numbers) != n:
+        raise InputError(f"{option} {text}: must be {n} numbers with '{separator}' between them.")
+    return numbers
+
+
+def _require_free(out: Path) -> None:
+    if out.exists():
+        raise InputError(f"{out}: exists already; remove it, or name another place with --out.")
+
+
+def _save(save_map: Callable[[Path, StoredMap], None], out: Path, stored: StoredMap) -> None:
+    try:
+        save_map(out, stored)
+    except OSError as error:
+        raise ResultsError(
+            f"{out}: cannot be written ({error.strerror or error}); free some space or name "
+            "another place with --out."
+        ) from error
+    map_ = stored.map
+    typer.echo(f"{out}: {map_.n_keyframes} keyframes, {map_.n_landmarks} landmarks")

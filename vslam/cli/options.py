@@ -7,16 +7,49 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from vslam import plugins
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
     from vslam.datasets.sources import SourceOptions
 
+
+def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
+    """vslam's own names, then those of other packages (docs/plugins.md)."""
+    return (*names, *(name for name in plugins.find_plugins(group) if name not in names))
+
+
+_DATASETS = _with_plugins(("kitti", "euroc", "tum", "synthetic"), plugins.READERS)
+_SOURCES = ("images", "video", "bag", "camera")
+_DETECTORS = _with_plugins(
+    (
+        "none", "bow", "both", "capsule", "capsule-pruned", "alexnet", "vgg16", "darknet19",
+        "googlenet", "mobilenet", "squeezenet", "pcanet",
+    ),
+    plugins.DETECTORS,
+)  # fmt: skip
+_LAWS = _with_plugins(
+    (
+        "brightness", "gamma", "flicker", "noise", "blur", "occlusion", "fog", "rain", "night",
+        "exposure", "motion", "flare", "vignetting", "dirt", "jpeg", "resolution", "drop",
+        "outage", "bias", "contrast", "shot", "impulse", "bits", "stereo_gain", "desync",
+        "baseline", "yaw", "pitch", "black_right", "black_left",
+    ),
+    plugins.PERTURBATIONS,
+)  # fmt: skip
+
 Data = Annotated[
     Path,
     typer.Option(envvar="KITTI_ROOT", help="Folder with the data set, see datasets.md."),
 ]
-DatasetName = Literal["kitti", "euroc", "tum", "synthetic"]
+if TYPE_CHECKING:
+    DatasetName = str
+    SourceName = str
+    DetectorName = str
+else:  # what is installed decides
+    DatasetName = Literal[_DATASETS]
+    SourceName = Literal[(*_DATASETS, *_SOURCES)]
+    DetectorName = Literal[_DETECTORS]
 Dataset = Annotated[DatasetName, typer.Option(help="Data set.")]
 Source = Annotated[
     str,
@@ -27,7 +60,6 @@ Source = Annotated[
         "docs/sources.md.",
     ),
 ]
-SourceName = Literal[DatasetName, "images", "video", "bag", "camera"]
 SourceKind = Annotated[
     SourceName | None,
     typer.Option("--dataset", help="What it is.", show_default="found out from what is there"),
@@ -50,6 +82,10 @@ Calib = Annotated[
 Right = Annotated[
     Path | None, typer.Option(help="Folder of the right images, --data has the left ones.")
 ]
+Depth = Annotated[
+    Path | None,
+    typer.Option(help="Folder of the depth images, --data has the images they belong to."),
+]
 FramesPerSecond = Annotated[
     float | None,
     typer.Option("--fps", help="Frames a second of images or a video without time stamps."),
@@ -58,19 +94,24 @@ SideBySide = Annotated[
     bool, typer.Option("--side-by-side", help="Video or camera of both sides in one image.")
 ]
 Topics = Annotated[
-    str, typer.Option(metavar="LEFT,RIGHT", help="Image topics of a bag, one with mono.")
+    str,
+    typer.Option(
+        metavar="LEFT,RIGHT", help="Image topics of a bag: one with mono, COLOUR,DEPTH with rgbd."
+    ),
 ]
 DepthScale = Annotated[
     float | None,
     typer.Option(
-        help="What depth images count in a metre.", show_default="the calibration's, or 5000"
+        help="What depth images count in a metre.",
+        show_default="the calibration's; of tum 5000, of a bag as its encoding says",
     ),
 ]
 Perturb = Annotated[
     str,
     typer.Option(
-        help="Photometric laws, each with a strength, joined by commas: brightness, gamma, "
-        "flicker, noise, blur, occlusion. Example: [b]brightness:1.5,blur:0.5[/b]"
+        help="Laws of light, weather, glass, sensor and stereo rig, each with a strength in its "
+        f"unit (docs/stress.md), joined by commas: {', '.join(_LAWS)}. Example: "
+        "[b]brightness:1.5,fog:60[/b]"
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all that is random.")]
@@ -85,10 +126,6 @@ Weights = Annotated[
     list[str] | None,
     typer.Option(metavar="NAME=FILE", help="Weights of a detector, not the shipped ones."),
 ]
-DetectorName = Literal[
-    "none", "bow", "both", "capsule", "capsule-pruned", "alexnet", "vgg16", "darknet19",
-    "googlenet", "mobilenet", "squeezenet", "pcanet",
-]  # fmt: skip
 SensorName = Literal["stereo", "mono", "rgbd"]
 ViewerName = Literal["native", "web"]
 Sensor = Annotated[
@@ -124,6 +161,7 @@ def kind_of_source(named: SourceName | None, data: str) -> str:
 def source_options(
     calib: list[Path] | None,
     right: Path | None,
+    depth: Path | None,
     fps: float | None,
     side_by_side: bool,
     topics: str,
@@ -140,5 +178,5 @@ def source_options(
         if value is not None and not 0.0 < value < float("inf"):
             raise InputError(f"{option} {value}: must be a positive number.")
     return SourceOptions(
-        calib or (), right, fps, side_by_side, tuple(names_in(topics)), depth_scale
+        calib or (), right, depth, fps, side_by_side, tuple(names_in(topics)), depth_scale
     )

@@ -10,7 +10,13 @@ import typer
 from vslam.cli.options import KITTI_ROOT, Data, Dataset, Every, MaxFrames, Perturb, Seed, Seq, Start
 from vslam.errors import InputError
 
-_EXAMPLE = "[b]Example[/b]\n\n  vslam perturb --seq 00 --perturb brightness:1.5 --out sheet.png"
+_EXAMPLE = """
+[b]Examples[/b]
+
+  vslam perturb --seq 00 --perturb brightness:1.5 --out sheet.png
+
+  vslam perturb --seq 00 --perturb all --start 100
+"""
 
 
 def register(app: typer.Typer) -> None:
@@ -30,21 +36,39 @@ def preview(
     frames: Annotated[int, typer.Option(min=1, help="Frames to show, evenly spread.")] = 8,
     out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("perturbation.png"),
 ) -> None:
-    """Preview a perturbation: the left image as it is beside both images perturbed."""
+    """Preview a perturbation: the left image as it is beside both images perturbed.
+
+    [b]--perturb all[/b] shows one frame under every law at its default strength.
+    """
     import cv2
     import numpy as np
 
     from vslam.datasets import open_sequence
-    from vslam.datasets.perturbation import contact_sheet, parse_perturbation
+    from vslam.datasets.perturbation import (
+        contact_sheet,
+        law_kind,
+        laws_for,
+        parse_perturbation,
+        sheet_of_laws,
+    )
 
+    name = perturb if perturb == "all" else parse_perturbation(perturb, seed).name
     sequence = open_sequence(dataset, data, seq, start=start, every=every, max_frames=max_frames)
-    law = parse_perturbation(perturb, seed)
-    shown = np.unique(np.linspace(0, len(sequence) - 1, frames).round().astype(int)).tolist()
-    sheet = cv2.imencode(".png", contact_sheet(sequence, law, shown))[1]
+    if perturb == "all":
+        fit, unfit = laws_for(sequence)
+        for why in unfit:
+            typer.echo(f"left out: {why}", err=True)
+        shown = [min(10, len(sequence) - 1)]
+        specs = [f"{law}:{law_kind(law).default:g}" for law in fit]
+        image = sheet_of_laws(sequence, specs, shown[0], seed)
+    else:
+        shown = np.unique(np.linspace(0, len(sequence) - 1, frames).round().astype(int)).tolist()
+        image = contact_sheet(sequence, parse_perturbation(perturb, seed), shown)
+    sheet = cv2.imencode(".png", image)[1]
     try:
         out.write_bytes(sheet.tobytes())
     except OSError as error:
         raise InputError(
             f"{out}: cannot be written ({error.strerror}); name another file with --out."
         ) from error
-    typer.echo(f"{out}: {law.name}, seed {seed}, frames {', '.join(map(str, shown))}")
+    typer.echo(f"{out}: {name}, seed {seed}, frames {', '.join(map(str, shown))}")

@@ -10,6 +10,7 @@ import typer
 from vslam.cli.options import (
     KITTI_ROOT,
     Calib,
+    Depth,
     DepthScale,
     DetectorName,
     Every,
@@ -46,6 +47,8 @@ _EXAMPLES = """
   vslam run --seq 00 --max-frames 200 --no-record --quiet
 
   vslam run --data drive.mp4 --side-by-side --calib stereo.yaml
+
+  vslam run --data ~/kitti --seq 00 --map runs/latest --localize
 """
 
 
@@ -60,6 +63,7 @@ def run(
     seq: Seq = None,
     calib: Calib = None,
     right: Right = None,
+    depth: Depth = None,
     fps: FramesPerSecond = None,
     side_by_side: SideBySide = False,
     topics: Topics = "",
@@ -76,12 +80,13 @@ def run(
         ),
     ] = None,
     detector: Annotated[
-        DetectorName,
+        DetectorName | None,
         typer.Option(
             help="Loop detector; [b]none[/b] for odometry only; those after capsule-pruned need "
-            "[b]--weights[/b]."
+            "[b]--weights[/b].",
+            show_default="bow, or that of --map",
         ),
-    ] = "bow",
+    ] = None,
     weights: Annotated[
         Path | None, typer.Option(help="Safetensors file of a learned detector (vslam train).")
     ] = None,
@@ -92,6 +97,20 @@ def run(
         bool,
         typer.Option("--compare-loops", help="Run again without loop closing; print both."),
     ] = False,
+    map_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--map", metavar="FILE", help="Go on in this map, the map.npz of a run for example."
+        ),
+    ] = None,
+    localize: Annotated[
+        bool,
+        typer.Option("--localize", help="Only track in the map of --map; it stays as it is."),
+    ] = False,
+    save_map: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the map to this file, too, in place of another."),
+    ] = None,
     realtime: Annotated[
         bool,
         typer.Option("--realtime", help="Play frames at their times; drop overtaken ones."),
@@ -115,6 +134,15 @@ def run(
     """Run SLAM on a sequence and write trajectory, map, recording and report to a folder."""
     from vslam.loopclosure.registry import require_detector
 
+    if localize and map_file is None:
+        raise InputError("--localize: name the map to localise in with --map.")
+    if localize and save_map is not None:
+        raise InputError("--save-map: localising changes no map; leave it out.")
+    if map_file is not None:
+        if compare_loops:
+            raise InputError("--compare-loops: not for a run that goes on in a map; leave it out.")
+        map_file, detector = _map_to_go_on_in(map_file, detector)
+    detector = detector or "bow"
     require_detector(detector, weights)
     if compare_loops and detector == "none":
         raise InputError("--compare-loops: nothing to compare with --detector none; name another.")
@@ -131,13 +159,14 @@ def run(
     thresholds = Config() if config is None else load_config(config)
     kind = kind_of_source(dataset, data)
     perturbation = parse_perturbation(perturb, seed)
-    options = source_options(calib, right, fps, side_by_side, topics, depth_scale)
+    options = source_options(calib, right, depth, fps, side_by_side, topics, depth_scale)
     with render_bar(shown=not quiet) as on_render:
         source = open_source(
             kind, data, seq, options,
             start=start, every=every, max_frames=max_frames, sensor=sensor,
             on_render=on_render,
         )  # fmt: skip
+    perturbation.bound_to(source)  # refuses laws that the data cannot serve
     if is_live(source):
         if compare_loops:
             raise InputError("--compare-loops: a camera cannot be seen twice; leave it out.")
@@ -147,7 +176,7 @@ def run(
     from vslam.cli.summary import print_summary
     from vslam.report.folder import create_run_folder, write_results
     from vslam.run.outcome import RunSettings
-    from vslam.run.pipeline import run_sequence, with_comparison
+    from vslam.run.pipeline import require_camera, run_sequence, with_comparison
     from vslam.run.recorder import (
         NullRecorder,
         Recorder,
@@ -172,7 +201,11 @@ def run(
         weights=weights,
         realtime=realtime,
         calib=tuple(calib or ()),
+        map=map_file,
+        localize=localize,
     )
+    if map_file is not None:
+        require_camera(map_file, source.camera)
     viewer = None if view is None else open_viewer(view)
     folder = create_run_folder(out, kind, source.name, perturbation.name, detector)
     recorder: Recorder = RerunRecorder(folder / "recording.rrd") if record else NullRecorder()
@@ -188,8 +221,21 @@ def run(
     if compare_loops and not outcome.interrupted:
         with progress_bar(count_expected(source), shown=not quiet) as on_frame:
             outcome = with_comparison(outcome, perturbation, on_frame=on_frame)
-    report = write_results(folder, outcome, pages=pages, ply=ply)
+    report = write_results(folder, outcome, pages=pages, ply=ply, map_file=save_map)
     if not quiet:
         print_summary(report, folder)
     if outcome.interrupted:
         raise typer.Exit(1)
+
+
+def _map_to_go_on_in(file: Path, detector: DetectorName | None) -> tuple[Path, DetectorName]:
+    """The map of a file or of the folder of a run, and the detector that it was made with."""
+    from vslam.maps.storage import map_file_of, read_header
+
+    file = map_file_of(file)
+    made_with: DetectorName = read_header(file)["detector"]["name"]
+    if detector not in (None, made_with):
+        raise InputError(
+            f"--detector {detector}: {file} was made with the detector {made_with}; leave it out."
+        )
+    return file, made_with

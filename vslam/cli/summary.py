@@ -24,8 +24,10 @@ def print_rows(rows: Rows) -> None:
 
 def error_rows(errors: Evaluation | ReportJson) -> Rows:
     """ATE, RPE and drift."""
+    causal = getattr(errors, "causal_ate_rmse_m", None)
     rows = [
         ("ATE rmse", f"{errors.ate_rmse_m:.3f} m"),
+        *([("causal ATE", f"{causal:.3f} m, poses as given at the time")] if causal else []),
         ("ATE mean, max", f"{errors.ate_mean_m:.3f} m, {errors.ate_max_m:.3f} m"),
         ("RPE per frame", f"{errors.rpe_m:.4f} m, {errors.rpe_deg:.4f} deg"),
     ]
@@ -53,6 +55,7 @@ def print_summary(report: ReportJson, folder: Path) -> None:
                 f"{report.frames} done, {report.lost_frames} lost, "
                 f"{report.skipped_frames} unreadable",
             ),
+            *in_map_rows(report),
             *_latency(report),
             *([("evaluation", report.evaluation_remark)] if report.evaluation_remark else []),
             *(error_rows(report) if evaluated else []),
@@ -65,6 +68,21 @@ def print_summary(report: ReportJson, folder: Path) -> None:
         ]
     )
     _print_comparison(report)
+
+
+def in_map_rows(report: ReportJson) -> Rows:
+    """How a run found itself in the map that it went on in."""
+    if (found := report.in_map) is None:
+        return []
+    fix = "never" if found.first_fix_s is None else f"after {found.first_fix_s:.2f} s"
+    error = "" if found.error_m is None else f", {found.error_m:.3f} m off by its alignment"
+    return [
+        ("in the map", f"{found.in_map_percent:.1f} % of the frames{error}"),
+        (
+            "found in it",
+            f"first {fix}; {found.found} of the {found.sought} times it was looked for",
+        ),
+    ]
 
 
 def _latency(report: ReportJson) -> Rows:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from collections.abc import Sequence as Several
 from pathlib import Path
 
+from vslam import plugins
 from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError
 
@@ -35,11 +36,13 @@ def open_sequence(
     (docs/cameras.md) to be used instead of the data set's own; images are rectified by them.
     ``depth_scale``, what depth images count in a metre, is for RGB-D data alone.
 
+    A reader of another package (docs/plugins.md) is named as a data set is.
+
     A synthetic sequence has no ``root``: it is rendered into the user's cache on first use, and
     ``on_render`` is told the frames done and in all.
 
     Raises:
-        InputError: unknown data set, or bad input as the reader of the data set says.
+        InputError: unknown data set, a broken package, or bad input as the reader says.
     """
     if dataset == "kitti":
         from vslam.datasets.kitti import open_kitti, open_kitti_images
@@ -94,6 +97,25 @@ def open_sequence(
             monocular=monocular,
             on_frame=on_render,
         )
-    raise InputError(
-        f"--dataset {dataset}: unknown data set; this version reads {', '.join(DATASETS)}."
+    others = plugins.find_plugins(plugins.READERS)
+    if dataset not in others:
+        known = ", ".join((*DATASETS, *others))
+        raise InputError(f"--dataset {dataset}: unknown data set; this version reads {known}.")
+    if calib:
+        raise InputError(f"--calib: {others[dataset]} brings its own; leave it out.")
+    from vslam.datasets.plugin_reader import open_plugin
+
+    return open_plugin(
+        others[dataset],
+        root,
+        name,
+        start=start,
+        every=every,
+        max_frames=max_frames,
+        monocular=monocular,
     )
+
+
+def known_datasets() -> tuple[str, ...]:
+    """All that `open_sequence` knows: vslam's own and those of other packages."""
+    return (*DATASETS, *plugins.find_plugins(plugins.READERS))

@@ -1,8 +1,11 @@
 """Bags of ROS 1 and ROS 2 and MCAP files, read by the library rosbags.
 
 Images are those of ``sensor_msgs/Image`` and ``CompressedImage``, their times the stamps in their
-headers. Images of two topics belong together when their stamps lie within 5 ms; others are left
-out. Where the bag holds the ``camera_info`` of its image topics, that is their calibration.
+headers. Images of two topics belong together when their stamps lie within 5 ms, an image and its
+depth within 20 ms, and none is nearer; others are left out. Where the bag holds the
+``camera_info`` of its image topics, that is their calibration.
+
+One file because it is the only one that imports rosbags.
 """
 
 from __future__ import annotations
@@ -16,6 +19,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vslam.calibration.formats import read_ros
 from vslam.calibration.models import Calibration
 from vslam.camera import ImageMap
@@ -24,17 +29,25 @@ from vslam.datasets.bag_messages import (
     IMAGE_TYPES,
     Message,
     camera_info,
+    depth_of,
     grey_of,
+    is_depth,
     stamp_of,
 )
 from vslam.datasets.image_files import size_text
-from vslam.datasets.sequence import Image
+from vslam.datasets.sequence import DepthImage, Image
 from vslam.datasets.stream import TimedFrame
 from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 
 Bag = Any  # rosbags.highlevel.AnyReader
 
 _TOLERANCE_NS = 5_000_000
+_DEPTH_TOLERANCE_NS = 20_000_000  # Kinects take them in turn; as TUM's associate.py
+_NEEDED = {
+    "mono": "an image topic",
+    "stereo": "two image topics",
+    "rgbd": "an image topic and one of depth",
+}
 _MOST_WAITING = 32  # images of one side that wait for a partner
 
 
@@ -43,13 +56,17 @@ class BagStream:
     """See `vslam.datasets.stream.RawStream`.
 
     Attributes:
-        topics: of the left images, and of the right ones.
+        topics: of the left images, and of the right ones or the depth.
+        depth: whether the second topic has the depth of the first one's pixels.
+        depth_scale: what depth counts in a metre, None as its encoding says.
     """
 
     path: Path
     topics: tuple[str, ...]
     sizes: tuple[tuple[int, int], ...]
     n_expected: int | None
+    depth: bool = False
+    depth_scale: float | None = None
 
     @property
     def dataset(self) -> str:
@@ -66,20 +83,21 @@ class BagStream:
     def frames(self) -> Iterator[TimedFrame]:
         """See `vslam.datasets.stream.RawStream.frames`."""
         with _opened(self.path) as bag:
-            for messages in _together(_messages(bag, self.path, self.topics), self.topics):
-                timestamp = stamp_of(messages[0]) / 10**9
-                yield TimedFrame(timestamp, partial(self._read, messages))
+            messages = _messages(bag, self.path, self.topics)
+            for together in _together(messages, self.topics, _tolerance(self.depth)):
+                yield TimedFrame(stamp_of(together[0]) / 10**9, partial(self._read, together))
 
     def _read(
         self, messages: tuple[Message, ...], image_map: ImageMap
-    ) -> tuple[Image, Image | None]:
-        sides = zip(messages, self.topics, self.sizes, strict=False)
-        left, *right = image_map(self._grey, list(sides))
-        return left, right[0] if right else None
+    ) -> tuple[Image, Image | DepthImage | None]:
+        kinds = (False, self.depth)
+        sides = zip(messages, self.topics, self.sizes, kinds, strict=False)
+        left, *second = image_map(self._of_size, list(sides))
+        return np.asarray(left, np.uint8), second[0] if second else None
 
-    def _grey(self, side: tuple[Message, str, tuple[int, int]]) -> Image:
-        message, topic, size = side
-        image = _decoded(self.path, topic, message)
+    def _of_size(self, side: tuple[Message, str, tuple[int, int], bool]) -> Image | DepthImage:
+        message, topic, size, depth = side
+        image = _decoded(self.path, topic, message, depth, self.depth_scale)
         if image.shape[::-1] != size:
             raise UnreadableImageError(
                 self.path,
@@ -89,14 +107,22 @@ class BagStream:
         return image
 
 
-def open_bag(path: Path, *, topics: tuple[str, ...] = (), monocular: bool = False) -> BagStream:
+def open_bag(
+    path: Path,
+    *,
+    topics: tuple[str, ...] = (),
+    sensor: str | None = None,
+    depth_scale: float | None = None,
+) -> BagStream:
     """Open a bag and read its first frame.
 
     Args:
         path: ``.bag``, ``.mcap`` or ``.db3``, or the folder of a ROS 2 bag.
-        topics: of the left and the right images; without any, the only image topics there are, in
-            the order of their names.
-        monocular: one topic is enough, and of two given the first one is taken.
+        topics: of the left images and of the right ones or the depth; without any, the only image
+            topics there are, a right one in the order of their names.
+        sensor: ``stereo`` or ``rgbd``; ``mono``, and of two topics given the first one is taken;
+            None for what the topics hold.
+        depth_scale: what depth counts in a metre, None as its encoding says.
 
     Raises:
         InputError: rosbags is not installed, no bag, cut off, topics missing, or images that have
@@ -105,25 +131,36 @@ def open_bag(path: Path, *, topics: tuple[str, ...] = (), monocular: bool = Fals
     if not path.exists():
         raise InputError(f"{path}: no such file; name a bag with --data.")
     with _opened(path) as bag:
-        chosen = _choose_topics(path, bag, topics, 1 if monocular else 2)
-        pairs = _together(_messages(bag, path, chosen), chosen)
-        begin = list(islice(pairs, 2))
+        chosen, depth = _choose_topics(path, bag, topics, sensor)
+        tolerance = _tolerance(depth)
+        begin = list(islice(_together(_messages(bag, path, chosen), chosen, tolerance), 2))
         if not begin:
             raise InputError(
                 f"{path}: {' and '.join(chosen)} have no images of one time (within "
-                f"{_TOLERANCE_NS / 1e6:g} ms); name topics of one camera with --topics."
+                f"{tolerance / 1e6:g} ms); name topics of one camera with --topics."
             )
         if all(stamp_of(messages[0]) == 0 for messages in begin):
             raise InputError(
                 f"{path}: the images of {chosen[0]} have no time stamps (header.stamp is 0); "
                 "record them again with a driver that sets it."
             )
-        images = [_decoded(path, *side) for side in zip(chosen, begin[0], strict=True)]
+        images = [
+            _decoded(path, topic, message, is_second and depth, depth_scale)
+            for topic, message, is_second in zip(chosen, begin[0], (False, True), strict=False)
+        ]
+        if depth and images[0].shape != images[1].shape:
+            raise InputError(
+                f"{path}: depth of {size_text(images[1].shape)} pixels in {chosen[1]} but images "
+                f"of {size_text(images[0].shape)} in {chosen[0]}; name a topic of depth that is "
+                "registered to the images."
+            )
         return BagStream(
             path=path,
             topics=chosen,
             sizes=tuple((image.shape[1], image.shape[0]) for image in images),
             n_expected=min(bag.topics[topic].msgcount for topic in chosen) or None,
+            depth=depth,
+            depth_scale=depth_scale,
         )
 
 
@@ -138,7 +175,7 @@ def find_calibration(stream: BagStream) -> Calibration | None:
     path = stream.path
     documents = []
     with _opened(path) as bag:
-        for topic in stream.topics:
+        for topic in stream.topics[: 1 if stream.depth else None]:
             namespace, _, image = topic.removesuffix("/compressed").rpartition("/")
             info = f"{namespace}/camera_info"
             if not any(c.topic == info and c.msgtype == CAMERA_INFO_TYPE for c in bag.connections):
@@ -197,48 +234,83 @@ def _reason(error: Exception) -> str:
     return (str(error) or type(error).__name__).splitlines()[0].rstrip(".")
 
 
+def _tolerance(depth: bool) -> int:
+    return _DEPTH_TOLERANCE_NS if depth else _TOLERANCE_NS
+
+
 def _together(
-    messages: Iterator[tuple[str, Message]], topics: tuple[str, ...]
+    messages: Iterator[tuple[str, Message]], topics: tuple[str, ...], tolerance: int
 ) -> Iterator[tuple[Message, ...]]:
-    """Messages of one time, one of each topic."""
+    """Messages of one time, one of each topic: the first two there are, unless one of them has a
+    nearer one coming."""
     if len(topics) == 1:
         yield from ((message,) for _, message in messages)
         return
     waiting = {topic: deque[Message](maxlen=_MOST_WAITING) for topic in topics}
     first, second = waiting.values()
-    for topic, message in messages:
-        waiting[topic].append(message)
-        while first and second:
+
+    def pairs(enough: int) -> Iterator[tuple[Message, ...]]:
+        while min(len(first), len(second)) >= enough:
             apart = stamp_of(first[0]) - stamp_of(second[0])
-            if abs(apart) <= _TOLERANCE_NS:
+            early, late = (first, second) if apart < 0 else (second, first)
+            behind = abs(stamp_of(early[1]) - stamp_of(late[0])) if len(early) > 1 else tolerance
+            if abs(apart) <= min(behind, tolerance):
                 yield first.popleft(), second.popleft()
             else:
-                (first if apart < 0 else second).popleft()
+                early.popleft()
+
+    for topic, message in messages:
+        waiting[topic].append(message)
+        yield from pairs(2)
+    yield from pairs(1)
 
 
-def _choose_topics(path: Path, bag: Bag, topics: tuple[str, ...], n: int) -> tuple[str, ...]:
+def _choose_topics(
+    path: Path, bag: Bag, topics: tuple[str, ...], sensor: str | None
+) -> tuple[tuple[str, ...], bool]:
+    """Topics of the left images and of the second ones, and whether these are depth."""
     there = sorted({c.topic for c in bag.connections if c.msgtype in IMAGE_TYPES})
     listed = f"image topics are {', '.join(there)}" if there else "there are no image topics"
-    if len(there) < n:
-        instead = "; run with --sensor mono" if there else ""
-        raise InputError(f"{path}: stereo needs two image topics; {listed}{instead}.")
     for topic in topics:
         if topic not in there:
             raise InputError(f"--topics {topic}: not in {path}; {listed}.")
-    if not topics and len(there) > n:
-        wanted = "LEFT,RIGHT" if n == 2 else "TOPIC"
-        raise InputError(f"{path}: choose with --topics {wanted}; {listed}.")
-    chosen = topics or tuple(there)
-    if not n <= len(chosen) <= 2:
+    with_depth = tuple(topic for topic in there if _has_depth(bag, path, topic))
+    n = 1 if sensor == "mono" else 2
+    if not topics:
+        grey = tuple(topic for topic in there if topic not in with_depth)
+        sensor = sensor or ("rgbd" if with_depth and len(grey) == 1 else "stereo")
+        topics = (*grey, *with_depth) if sensor == "rgbd" else grey
+        if len(there) < n or (sensor == "rgbd" and not (with_depth and grey)):
+            instead = "; run with --sensor mono" if grey and n == 2 else ""
+            raise InputError(f"{path}: {sensor} needs {_NEEDED[sensor]}; {listed}{instead}.")
+        if len(topics) != n:
+            wanted = {"mono": "TOPIC", "stereo": "LEFT,RIGHT", "rgbd": "COLOUR,DEPTH"}[sensor]
+            raise InputError(f"{path}: choose with --topics {wanted}; {listed}.")
+    if not n <= len(topics) <= 2:
         raise InputError(
             f"--topics {','.join(topics)}: name the topic of the left images and that of the "
-            "right ones, or run with --sensor mono."
+            "right ones or of the depth, or run with --sensor mono."
         )
-    return chosen[:n]
+    if topics[0] in with_depth:
+        raise InputError(
+            f"--topics {','.join(topics)}: {topics[0]} holds depth; name the images first."
+        )
+    depth = n == 2 and (sensor == "rgbd" or (sensor is None and topics[1] in with_depth))
+    return topics[:n], depth
 
 
-def _decoded(path: Path, topic: str, message: Message) -> Image:
+def _has_depth(bag: Bag, path: Path, topic: str) -> bool:
     try:
-        return grey_of(message)
+        _, message = next(_messages(bag, path, (topic,)))
+    except (StopIteration, BrokenSourceError):
+        return False
+    return is_depth(message, topic)
+
+
+def _decoded(
+    path: Path, topic: str, message: Message, depth: bool, scale: float | None
+) -> Image | DepthImage:
+    try:
+        return depth_of(message, scale) if depth else grey_of(message)
     except ValueError as error:
         raise UnreadableImageError(path, f"{topic}: {error}.") from error

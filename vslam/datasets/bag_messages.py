@@ -12,9 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.calibration.documents import Document
-from vslam.datasets.sequence import Image
+from vslam.datasets.sequence import DepthImage, Image
 
 Message = Any  # classes that rosbags makes out of the bag's definitions
+
+_COMPRESSED_DEPTH = "compressedDepth"  # of image_transport: a header of 12 bytes, then a PNG
+_MILLIMETRES = 1000.0  # of 16-bit depth; that of 32 bits is in metres (REP 118)
+_DEPTH_ENCODINGS = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
@@ -69,7 +73,63 @@ def grey_of(message: Message) -> Image:
     return np.ascontiguousarray(image, np.uint8)
 
 
-def _pixels(message: Message, channels: int, bits: int) -> NDArray[Any]:
+def is_depth(message: Message, topic: str) -> bool:
+    """Whether an image message holds depth: 16 bits are grey values but in topics named so."""
+    if not hasattr(message, "encoding"):
+        return _COMPRESSED_DEPTH in message.format
+    steps = message.encoding == "16UC1" and "depth" in topic.lower()
+    return steps or message.encoding == "32FC1"
+
+
+def depth_of(message: Message, scale: float | None) -> DepthImage:
+    """``(H, W)`` float32 metres, 0 where unknown, of an ``Image``, or of a ``CompressedImage`` of
+    image_transport's plugin ``compressed_depth``.
+
+    Args:
+        scale: what the image counts in a metre; None: as REP 118 says, 1000 with 16 bits and 1
+            with 32.
+
+    Raises:
+        ValueError: with the reason why it cannot be decoded.
+    """
+    if not hasattr(message, "encoding"):
+        return _compressed_depth(message, scale)
+    kind = _DEPTH_ENCODINGS.get(message.encoding)
+    if kind is None:
+        known = ", ".join(_DEPTH_ENCODINGS)
+        raise ValueError(f"encoding '{message.encoding}' is no depth; known are {known}")
+    image = _pixels(message, 1, 8 * np.dtype(kind).itemsize, "f" if kind is np.float32 else "u")
+    return _metres(image, scale)
+
+
+def _compressed_depth(message: Message, scale: float | None) -> DepthImage:
+    """Of 16 bits the PNG holds the steps; of 32 bits their inverse, by two numbers of the header
+    (``compressed_depth_image_transport``, ``ConfigHeader``)."""
+    import cv2
+
+    data = np.asarray(message.data, np.uint8)
+    header = np.dtype([("kind", "<i4"), ("a", "<f4"), ("b", "<f4")])
+    try:
+        image = cv2.imdecode(data[header.itemsize :], cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if _COMPRESSED_DEPTH not in message.format or image is None or image.dtype != np.uint16:
+        raise ValueError(f"compressed depth of format '{message.format}' cannot be decoded")
+    if "32FC1" not in message.format:
+        return _metres(np.asarray(image), scale)
+    (numbers,) = np.frombuffer(data[: header.itemsize].tobytes(), header)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        metres = numbers["a"] / (image.astype(np.float32) - numbers["b"])
+    return _metres(np.where(image > 0, metres, np.float32(0.0)).astype(np.float32), scale)
+
+
+def _metres(image: NDArray[Any], scale: float | None) -> DepthImage:
+    scale = scale or (_MILLIMETRES if image.dtype.kind == "u" else 1.0)
+    metres = np.asarray(image, np.float32) * np.float32(1.0 / scale)
+    return np.where(np.isfinite(metres), metres, np.float32(0.0))
+
+
+def _pixels(message: Message, channels: int, bits: int, kind: str = "u") -> NDArray[Any]:
     """The rows of an image without their padding."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.asarray(message.data, np.uint8)
@@ -78,7 +138,7 @@ def _pixels(message: Message, channels: int, bits: int) -> NDArray[Any]:
         raise ValueError(f"{data.size} bytes are no image of {width}x{height} {message.encoding}")
     rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row])
     order = ">" if message.is_bigendian else "<"
-    pixels = rows.view(f"{order}u{bits // 8}")
+    pixels = rows.view(f"{order}{kind}{bits // 8}")
     return pixels.reshape(height, width, channels) if channels > 1 else pixels
 
 

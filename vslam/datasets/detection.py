@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from vslam.datasets.euroc import is_euroc
+from vslam.datasets.image_files import is_image
 from vslam.datasets.image_folders import has_images
 from vslam.errors import InputError
 
@@ -55,6 +56,10 @@ def detect_dataset(data: str) -> str:
     if _URL.match(data):
         return "camera"
     path = Path(data)
+    if path.is_file() and is_image(path):
+        raise InputError(f"{data}: one image; name the folder that it is in with --data.")
+    if path.is_dir() and not any(path.iterdir()):
+        raise InputError(f"{data}: the folder is empty; name another one with --data.")
     if path.exists():
         for kind, _, holds in _KINDS:
             if holds(path):

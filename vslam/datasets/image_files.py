@@ -82,11 +82,12 @@ def list_images(folder: Path) -> dict[str, Path]:
     """Image files of a folder by stem, in the order of their names; empty without the folder."""
     if not folder.is_dir():
         return {}
-    return {
-        path.stem: path
-        for path in sorted(folder.iterdir())
-        if path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
-    }
+    return {path.stem: path for path in sorted(folder.iterdir()) if is_image(path)}
+
+
+def is_image(path: Path) -> bool:
+    """Whether a file is named as an image."""
+    return path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
 
 
 def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bool]) -> Path | None:

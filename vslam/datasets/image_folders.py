@@ -1,8 +1,9 @@
-"""Folders of images: one of a single camera, two of a stereo pair.
+"""Folders of images: one of a single camera, two of a stereo pair or of images with their depth.
 
-A pair is two folders beside each other (`PAIRS` of names), or one named with ``--right``. Its
-images belong together by their names, or by their order where no name is on both sides and both
-have equally many. Times are taken from the first of these that is there:
+A pair is two folders beside each other (`PAIRS` and `DEPTH_PAIRS` of names), or one named with
+``--right`` or ``--depth``. Its images belong together by their names, or by their order where no
+name is on both sides and both have equally many; images and depth whose names are times (not the
+same ones), by these, within 20 ms. Times are taken from the first of these that is there:
 
 1. ``--fps``;
 2. ``times.txt`` or ``timestamps.txt``, in the folder of the images or the one above: a time in
@@ -16,12 +17,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.datasets.association import associate
+from vslam.datasets.depth_images import DepthFiles, checked_depth_files, image_size
 from vslam.datasets.image_files import ImageFiles, checked_files, list_images, select_frames
 from vslam.errors import InputError
 from vslam.trajectory import read_table
@@ -33,6 +37,8 @@ PAIRS = (
     ("cam0", "cam1"),
     ("cam0/data", "cam1/data"),
 )
+DEPTH_PAIRS = (("rgb", "depth"), ("color", "depth"), ("colour", "depth"), ("image", "depth"))
+_NEAR_S = 0.02  # as TUM's associate.py
 _TIME_FILES = ("times.txt", "timestamps.txt")
 _EXIF = 0x8769  # tags of EXIF 2.32
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL = 0x9003, 0x9291
@@ -43,60 +49,125 @@ _UNITS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3), (_FIRST_TIME, 1))
 
 def has_images(folder: Path) -> bool:
     """Whether a folder holds images, or a pair of folders with some."""
-    return any(list_images(place) for place in (folder, *(folder / left for left, _ in PAIRS)))
+    inside = (folder / left for left, _ in PAIRS + DEPTH_PAIRS)
+    return any(list_images(place) for place in (folder, *inside))
+
+
+@dataclass(frozen=True)
+class ImageFolders:
+    """Files of a folder or of a pair of folders, in order and in time.
+
+    Attributes:
+        name: of the folder.
+        sides: N image files each: left and right ones, images and depth, or those of one camera.
+        depth: whether the second side is the depth of the first one.
+        size: width and height of the first image.
+    """
+
+    name: str
+    timestamps: NDArray[np.float64]
+    sides: tuple[tuple[Path, ...], ...]
+    depth: bool
+    size: tuple[int, int]
+
+    def images(self) -> ImageFiles:
+        """As a sequence of one camera or of a stereo pair.
+
+        Raises:
+            UnreadableImageError: a file is empty, or the first frame cannot be decoded.
+        """
+        return checked_files("images", self.name, self.timestamps, None, self.sides)
+
+    def with_depth(self, scale: float | None) -> DepthFiles:
+        """As a sequence of images with depth, which counts ``scale`` in a metre.
+
+        Raises:
+            InputError: there is no scale.
+            UnreadableImageError: a file is empty, or the first frame cannot be decoded.
+        """
+        colour, depth = self.sides
+        if scale is None:
+            raise InputError(
+                f"{depth[0].parent}: what depth images count in a metre is not known; give "
+                "--depth-scale, 1000 for millimetres, or depth_scale in the calibration."
+            )
+        return checked_depth_files(
+            DepthFiles("images", self.name, self.timestamps, None, colour, depth, self.size, scale)
+        )
 
 
 def open_images(
     folder: Path,
     right: Path | None = None,
     *,
+    depth: Path | None = None,
     fps: float | None = None,
     start: int = 0,
     every: int = 1,
     max_frames: int | None = None,
-    monocular: bool = False,
-) -> ImageFiles:
-    """Open a folder of images, or a pair of folders.
+    sensor: str | None = None,
+) -> ImageFolders:
+    """Find the files of a folder of images, or of a pair of folders.
 
     Args:
         folder: of the images, or of both folders of a pair.
         right: folder of the right images where ``folder`` has the left ones.
+        depth: folder of the depth images, likewise.
         fps: frames a second, in place of time stamps.
+        sensor: ``stereo``, ``rgbd``, or ``mono`` for the left images alone; None for what there is.
 
     Raises:
-        InputError: no images, no right ones, sides that do not match, or no usable times.
-        UnreadableImageError: a file is empty, or the first frame cannot be decoded.
+        InputError: no images, no second ones, sides that do not match, or no usable times.
+        UnreadableImageError: the first image cannot be decoded.
     """
-    sides = _find_sides(folder, right, monocular)
-    files = _matched([_sorted_images(side) for side in sides], sides)
+    places, is_depth = _find_sides(folder, right, depth, sensor)
+    files = _matched([_sorted_images(place) for place in places], places, by_time=is_depth)
     n = len(files[0])
-    times = np.arange(n) / fps if fps is not None else _find_times(sides[0], files[0])
+    times = np.arange(n) / fps if fps is not None else _find_times(places[0], files[0])
     if (bad := np.flatnonzero(np.diff(times) <= 0)).size:
         raise InputError(
             f"{files[0][bad[0] + 1]}: its time is not later than that of the image before it; "
             "repair the times, or give --fps."
         )
     chosen = select_frames(folder, n, start, every, max_frames)
-    selected = [tuple(side[k] for k in chosen) for side in files]
-    return checked_files("images", folder.resolve().name, times[chosen], None, selected)
+    sides = tuple(tuple(side[k] for k in chosen) for side in files)
+    size = image_size(sides[0][0])
+    return ImageFolders(folder.resolve().name, times[chosen], sides, is_depth, size)
 
 
-def _find_sides(folder: Path, right: Path | None, monocular: bool) -> list[Path]:
+def _find_sides(
+    folder: Path, right: Path | None, depth: Path | None, sensor: str | None
+) -> tuple[list[Path], bool]:
+    """Folders of the first and second images, and whether the second ones are depth."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; name a folder of images with --data.")
-    if right is not None:
-        return [folder] if monocular else [folder, right]
-    for names in PAIRS:
-        pair = [folder / name for name in names]
-        if all(list_images(side) for side in pair[: 1 if monocular else 2]):
-            return pair[: 1 if monocular else 2]
-    if not monocular:
-        pairs = ", ".join(" and ".join(names) for names in PAIRS)
-        raise InputError(
-            f"{folder}: images of a left and a right camera are looked for in {pairs}; name the "
-            "folder of the right ones with --right, or run with --sensor mono."
+    if right is not None and depth is not None:
+        raise InputError(f"--depth {depth}: of no use with --right; leave one of them out.")
+    if right is not None or depth is not None:
+        return [
+            folder,
+            *(place for place in (right, depth) if place is not None),
+        ], depth is not None
+    wanted = [(names, False) for names in PAIRS if sensor != "rgbd"]
+    wanted += [(names, True) for names in DEPTH_PAIRS if sensor != "stereo"]
+    n = 1 if sensor == "mono" else 2
+    for names, is_depth in wanted:
+        pair = [folder / name for name in names[:n]]
+        if all(list_images(side) for side in pair):
+            return pair, is_depth and n == 2
+    if sensor != "mono":
+        kinds = {None: PAIRS + DEPTH_PAIRS[:1], "stereo": PAIRS, "rgbd": DEPTH_PAIRS}[sensor]
+        pairs = ", ".join(" and ".join(names) for names in kinds)
+        option = (
+            "that of the depth with --depth"
+            if sensor == "rgbd"
+            else ("that of the right ones with --right")
         )
-    return [folder]
+        raise InputError(
+            f"{folder}: images of a pair are looked for in {pairs}; name the folder of the first "
+            f"ones with --data and {option}, or run with --sensor mono."
+        )
+    return [folder], False
 
 
 def _sorted_images(folder: Path) -> dict[str, Path]:
@@ -115,18 +186,38 @@ def _sorted_images(folder: Path) -> dict[str, Path]:
     return {stem: images[stem] for stem in ordered or sorted(images, key=by_number)}
 
 
-def _matched(sides: list[dict[str, Path]], folders: list[Path]) -> list[list[Path]]:
+def _matched(
+    sides: list[dict[str, Path]], folders: list[Path], *, by_time: bool
+) -> list[list[Path]]:
     """The files of each side in order, as many of one as of the other."""
     first, *rest = sides
     for other in rest:
         if first.keys() == other.keys():
             return [[side[stem] for stem in first] for side in sides]
+        if by_time and (pairs := _near_in_time(first, other)) is not None:
+            return pairs
         if len(other) != len(first) or first.keys() & other.keys():
             raise InputError(
                 f"{folders[1]}: {len(other)} images but {len(first)} in {folders[0]}, "
                 f"{min(first.keys() ^ other.keys())} on one side only; remove what has no partner."
             )
     return [list(side.values()) for side in sides]
+
+
+def _near_in_time(first: dict[str, Path], second: dict[str, Path]) -> list[list[Path]] | None:
+    """Files of both sides whose names are times near each other, None where names are no times."""
+    files = [list(side.values()) for side in (first, second)]
+    times = [[_time_of_name(path) for path in side] for side in files]
+    if any(time is None for side in times for time in side):
+        return None
+    colour, depth = (np.array(side, np.float64) for side in times)
+    pairs = associate(colour, depth, _NEAR_S)
+    if not len(pairs[0]):
+        raise InputError(
+            f"{files[1][0].parent}: no depth image is of the time of an image, to 20 ms, by their "
+            "names; name folders of one recording."
+        )
+    return [[side[k] for k in chosen] for side, chosen in zip(files, pairs, strict=True)]
 
 
 def _find_times(folder: Path, files: list[Path]) -> NDArray[np.float64]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from collections.abc import Sequence as Several
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from vslam.calibration.models import Calibration
 from vslam.calibration.rectification import Rectification, rectify
 from vslam.camera import Camera, ImageMap
+from vslam.datasets.depth_images import with_depth
 from vslam.datasets.sequence import DepthImage, Image, Sequence
 from vslam.errors import InputError
 
@@ -47,7 +49,7 @@ class RectifiedSequence:
     """See `rectified`."""
 
     raw: RawSequence
-    rectification: Rectification
+    rectification: Rectification  # its camera is that of the depth, too
 
     @property
     def dataset(self) -> str:
@@ -77,15 +79,20 @@ class RectifiedSequence:
     def __len__(self) -> int:
         return len(self.raw)
 
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
-        """Rectified left and right image; see `Sequence.read`."""
+    def read(
+        self, index: int, image_map: ImageMap = map
+    ) -> tuple[Image, Image | DepthImage | None]:
+        """Rectified left and second image; see `Sequence.read`."""
         return rectify_images(self.rectification, *self.raw.read(index, image_map), image_map)
 
 
-def rectified(raw: RawSequence, calibration: Calibration) -> Sequence:
+def rectified(raw: RawSequence, calibration: Calibration, *, depth: bool = False) -> Sequence:
     """A sequence whose images are rectified as they are read, the maps computed once.
 
     Where the images are rectified already they are handed on as they are.
+
+    Args:
+        depth: the second images are the depth of the first ones' pixels.
 
     Raises:
         InputError: the images are not of the calibrated size, there is no calibration of the
@@ -93,15 +100,23 @@ def rectified(raw: RawSequence, calibration: Calibration) -> Sequence:
         UnreadableImageError: the first frame cannot be read.
     """
     sizes = [(image.shape[1], image.shape[0]) for image in raw.read(0) if image is not None]
-    return RectifiedSequence(raw, rectification_for(calibration, sizes))
+    return RectifiedSequence(raw, rectification_for(calibration, sizes, depth=depth))
 
 
-def rectification_for(calibration: Calibration, sizes: Several[tuple[int, int]]) -> Rectification:
+def rectification_for(
+    calibration: Calibration, sizes: Several[tuple[int, int]], *, depth: bool = False
+) -> Rectification:
     """The rectification of images of one camera or two, by width and height of each one's.
+
+    Args:
+        depth: see `rectified`; depth has its pixels where the left image has them.
 
     Raises:
         InputError: see `rectified`.
     """
+    if depth:
+        alone = rectification_for(calibration, sizes[:1])
+        return replace(alone, camera=with_depth(alone.camera, calibration))
     if len(sizes) == 1 and calibration.right is not None:
         calibration = calibration.left_alone()
     if len(sizes) == 2 and calibration.right is None:
@@ -112,9 +127,12 @@ def rectification_for(calibration: Calibration, sizes: Several[tuple[int, int]])
     models = [model for model in (calibration.left, calibration.right) if model is not None]
     for model, (width, height) in zip(models, sizes, strict=True):
         if (model.width, model.height) != (width, height):
+            fix = "take the calibration of these images"
+            if (2 * model.width, model.height) == (width, height):
+                fix = "say --side-by-side if each holds both of a stereo pair"
             raise InputError(
                 f"{calibration.source}: made for {model.width}x{model.height} pixels but the "
-                f"images have {width}x{height}; take the calibration of these images."
+                f"images have {width}x{height}; {fix}."
             )
     return rectify(calibration)
 
@@ -122,13 +140,22 @@ def rectification_for(calibration: Calibration, sizes: Several[tuple[int, int]])
 def rectify_images(
     rectification: Rectification,
     left: Image,
-    right: Image | DepthImage | None,
+    second: Image | DepthImage | None,
     image_map: ImageMap = map,
-) -> tuple[Image, Image | None]:
-    """Both images rectified, or the left one where there is no right one. Readers of depth
-    undistort it themselves."""
-    sides = [partial(rectification.left, left)]
-    if right is not None:
-        sides.append(partial(rectification.right, np.asarray(right, np.uint8)))
-    left, *rest = image_map(partial.__call__, sides)
-    return left, rest[0] if rest else None
+) -> tuple[Image, Image | DepthImage | None]:
+    """Both images rectified, or the left one where there is no second one; depth by
+    the nearest pixel."""
+    left_side: Callable[[], Image | DepthImage] = partial(rectification.left, left)
+    if second is None:
+        return np.asarray(left_side(), np.uint8), None
+    second_side: Callable[[], Image | DepthImage]
+    if rectification.camera.depth:
+        second_side = partial(rectification.left_depth, second)
+    else:
+        second_side = partial(rectification.right, np.asarray(second, np.uint8))
+    first, other = image_map(_call, [left_side, second_side])
+    return np.asarray(first, np.uint8), other
+
+
+def _call(function: Callable[[], Image | DepthImage]) -> Image | DepthImage:
+    return function()

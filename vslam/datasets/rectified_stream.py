@@ -11,7 +11,7 @@ from vslam.calibration.models import Calibration
 from vslam.calibration.rectification import Rectification
 from vslam.camera import Camera, ImageMap
 from vslam.datasets.rectified import rectification_for, rectify_images
-from vslam.datasets.sequence import Image
+from vslam.datasets.sequence import DepthImage, Image
 from vslam.datasets.stream import RawStream, TimedFrame, increasing
 from vslam.errors import InputError
 
@@ -73,8 +73,12 @@ def rectified_stream(
     start: int = 0,
     every: int = 1,
     max_frames: int | None = None,
+    depth: bool = False,
 ) -> RectifiedStream:
     """Every N-th frame of a stream from a first one on, rectified.
+
+    Args:
+        depth: see `vslam.datasets.rectified.rectified`.
 
     Raises:
         InputError: the stream ends before ``start``, or as `vslam.datasets.rectified.rectified`.
@@ -83,10 +87,11 @@ def rectified_stream(
         raise InputError(
             f"--start {start}: {raw.name} has about {raw.n_expected} frames; choose a smaller one."
         )
-    return RectifiedStream(raw, rectification_for(calibration, raw.sizes), start, every, max_frames)
+    rectification = rectification_for(calibration, raw.sizes, depth=depth)
+    return RectifiedStream(raw, rectification, start, every, max_frames)
 
 
 def _read(
     frame: TimedFrame, rectification: Rectification, image_map: ImageMap
-) -> tuple[Image, Image | None]:
+) -> tuple[Image, Image | DepthImage | None]:
     return rectify_images(rectification, *frame.read(image_map), image_map)

@@ -26,14 +26,16 @@ class SourceOptions:
     Attributes:
         calibration: files, see `vslam.calibration.files.read_calibration`.
         right: folder of the right images.
+        depth: folder of the depth images.
         fps: frames a second, in place of time stamps.
         side_by_side: each frame holds the left image and, right of it, the right one.
-        topics: of the left and of the right images in a bag.
+        topics: of the left images in a bag, and of the right ones or the depth.
         depth_scale: what depth images count in a metre.
     """
 
     calibration: Several[Path] = ()
     right: Path | None = None
+    depth: Path | None = None
     fps: float | None = None
     side_by_side: bool = False
     topics: tuple[str, ...] = ()
@@ -42,12 +44,13 @@ class SourceOptions:
 
 _FOR = {
     "right": ("images",),
+    "depth": ("images",),
     "fps": ("images", "video"),
     "side_by_side": ("video", "camera"),
     "topics": ("bag",),
-    "depth_scale": ("tum",),
+    "depth_scale": ("tum", "images", "bag"),
 }
-_NOT_MONOCULAR = ("right", "depth_scale")
+_NOT_MONOCULAR = ("right", "depth", "depth_scale")
 
 
 def open_source(
@@ -79,7 +82,7 @@ def open_source(
     _check_options(dataset, name, options, monocular)
     source: Sequence | Stream
     if dataset in SOURCES:
-        source = _open_images(dataset, data, options, start, every, max_frames, monocular)
+        source = _open_images(dataset, data, options, start, every, max_frames, sensor)
     else:
         source = open_sequence(
             dataset, Path(data), name, start=start, every=every, max_frames=max_frames,
@@ -101,18 +104,23 @@ def _open_images(
     start: int,
     every: int,
     max_frames: int | None,
-    monocular: bool,
+    sensor: str | None,
 ) -> Sequence | Stream:
     if dataset == "images":
         from vslam.datasets.image_folders import open_images
 
-        images = open_images(
-            Path(data), options.right, fps=options.fps, start=start, every=every,
-            max_frames=max_frames, monocular=monocular,
+        found = open_images(
+            Path(data), options.right, depth=options.depth, fps=options.fps, start=start,
+            every=every, max_frames=max_frames, sensor=sensor,
         )  # fmt: skip
-        return rectified(images, _calibration(dataset, options, images.sizes[0]))
+        calibration = _calibration(dataset, options, found.size)
+        if not found.depth:
+            return rectified(found.images(), calibration)
+        raw = found.with_depth(options.depth_scale or calibration.depth_scale)
+        return rectified(raw, calibration, depth=True)
     stream: RawStream
     own: Calibration | None = None
+    monocular, depth = sensor == "mono", False
     if dataset == "video":
         from vslam.datasets.video import open_video
 
@@ -122,8 +130,10 @@ def _open_images(
     elif dataset == "bag":
         from vslam.datasets.bag import find_calibration, open_bag
 
-        stream = bag = open_bag(Path(data), topics=options.topics, monocular=monocular)
-        own = None if options.calibration else find_calibration(bag)
+        stream = bag = open_bag(
+            Path(data), topics=options.topics, sensor=sensor, depth_scale=options.depth_scale
+        )
+        own, depth = None if options.calibration else find_calibration(bag), bag.depth
     else:
         from vslam.datasets.live_camera import open_camera
 
@@ -134,6 +144,7 @@ def _open_images(
         start=start,
         every=every,
         max_frames=max_frames,
+        depth=depth,
     )
 
 

@@ -9,7 +9,6 @@ FOLDER/calibration.yaml      optional: the camera (docs/cameras.md); without it 
 from __future__ import annotations
 
 from collections.abc import Sequence as Several
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,26 +16,19 @@ from numpy.typing import NDArray
 
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration, CameraModel
-from vslam.calibration.rectification import Rectification, rectify
-from vslam.camera import Camera, DepthImage, Image, ImageMap
+from vslam.datasets.association import associate
+from vslam.datasets.depth_images import DepthFiles, checked_depth_files, image_size
 from vslam.datasets.ground_truth import poses_at
-from vslam.datasets.image_files import (
-    check_not_empty,
-    find_sequence,
-    read_grey,
-    read_grey_of_size,
-    select_frames,
-    size_text,
-)
-from vslam.errors import InputError, UnreadableImageError
+from vslam.datasets.image_files import find_sequence, select_frames
+from vslam.datasets.rectified import rectified
+from vslam.datasets.sequence import Sequence
+from vslam.errors import InputError
 from vslam.trajectory import read_trajectory
 
 _HOME = "https://cvg.cit.tum.de/data/datasets/rgbd-dataset"
 CALIBRATION = "calibration.yaml"
 _NEAR_S = 0.02  # as TUM's associate.py
 _DEPTH_SCALE = 5000.0  # TUM's "file formats"
-# Of a Kinect: its projector stands so far from its camera (ORB-SLAM2, section III-A).
-_VIRTUAL_BASELINE = 0.08
 # TUM's "intrinsic camera calibration"; the images of freiburg3 are undistorted already.
 _CAMERAS = {
     "freiburg1": CameraModel(
@@ -49,52 +41,6 @@ _CAMERAS = {
 }
 
 
-@dataclass(frozen=True)
-class TumSequence:
-    """The selected frames of one sequence; see :class:`vslam.datasets.sequence.Sequence`.
-
-    Attributes:
-        name: of the folder.
-        camera: of the undistorted images, with the virtual baseline; monocular without depth.
-        timestamps: ``(N,)`` float64 seconds of the colour images.
-        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` in the world of the file, or None.
-        colour, depth: N image files each; depth is empty for the colour images alone.
-        depth_scale: what depth images count in a metre.
-        rectification: undistorts both.
-    """
-
-    name: str
-    camera: Camera
-    timestamps: NDArray[np.float64]
-    ground_truth: NDArray[np.float64] | None
-    colour: tuple[Path, ...]
-    depth: tuple[Path, ...]
-    depth_scale: float
-    rectification: Rectification
-
-    @property
-    def dataset(self) -> str:
-        return "tum"
-
-    def __len__(self) -> int:
-        return len(self.colour)
-
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, DepthImage | None]:
-        """Grey image ``(H, W)`` uint8 and depth ``(H, W)`` float32 metres, both undistorted, None
-        without depth. Safe to call from several threads.
-
-        Raises:
-            UnreadableImageError: a file is missing, damaged, of another size, or the depth not of
-                16 bits.
-        """
-        size = self.camera.width, self.camera.height
-        left = self.rectification.left(read_grey_of_size(self.colour[index], *size))
-        if not self.depth:
-            return left, None
-        steps = self.rectification.left_depth(_read_depth(self.depth[index], *size))
-        return left, steps * np.float32(1.0 / self.depth_scale)
-
-
 def open_tum(
     root: Path,
     name: str | None = None,
@@ -105,7 +51,7 @@ def open_tum(
     monocular: bool = False,
     calib: Several[Path] = (),
     depth_scale: float | None = None,
-) -> TumSequence:
+) -> Sequence:
     """Open a sequence; its images are undistorted as they are read.
 
     A frame is a colour image with the depth image nearest in time, within 20 ms; each is used
@@ -147,57 +93,25 @@ def open_tum(
     times = times[frames[chosen]]
     colour = tuple(colour_files[k] for k in frames[chosen])
     depth = () if monocular else tuple(depth_files[k] for k in partners[chosen])
-    for path in (*colour, *depth):
-        check_not_empty(path)
-    height, width = read_grey(colour[0]).shape
-    calibration = _calibration(folder, calib, width, height)
-    rectification = rectify(calibration)
-    camera = rectification.camera
-    if not monocular:
-        _read_depth(depth[0], width, height)
-        baseline = calibration.virtual_baseline or _VIRTUAL_BASELINE
-        camera = replace(camera, baseline=baseline, depth=True)
+    size = image_size(colour[0])
+    calibration = _calibration(folder, calib, size)
     truth = folder / "groundtruth.txt"
-    return TumSequence(
+    raw = DepthFiles(
+        dataset="tum",
         name=folder.resolve().name,
-        camera=camera,
         timestamps=times,
         ground_truth=(poses_at(truth, read_trajectory(truth), times) if truth.is_file() else None),
         colour=colour,
         depth=depth,
+        size=size,
         depth_scale=depth_scale or calibration.depth_scale or _DEPTH_SCALE,
-        rectification=rectification,
     )
+    return rectified(checked_depth_files(raw), calibration, depth=not monocular)
 
 
 def is_tum(folder: Path) -> bool:
     """Whether a folder holds a sequence in this layout."""
     return (folder / "rgb.txt").is_file()
-
-
-def associate(
-    first: NDArray[np.float64], second: NDArray[np.float64], max_difference: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pair times that are less than ``max_difference`` apart, the nearest first, each once.
-
-    Args:
-        first, second: ``(N,)`` and ``(M,)`` seconds, increasing.
-
-    Returns:
-        ``(P,)`` indices into each, those into ``first`` increasing.
-    """
-    low = np.searchsorted(second, first - max_difference, side="right")
-    high = np.searchsorted(second, first + max_difference, side="left")
-    near = [(i, j) for i in range(len(first)) for j in range(low[i], high[i])]
-    near.sort(key=lambda pair: (abs(first[pair[0]] - second[pair[1]]), pair))
-    partner: dict[int, int] = {}
-    taken: set[int] = set()
-    for i, j in near:
-        if i not in partner and j not in taken:
-            partner[i] = j
-            taken.add(j)
-    pairs = np.array(sorted(partner.items()), np.int64).reshape(-1, 2)
-    return pairs[:, 0], pairs[:, 1]
 
 
 def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
@@ -234,19 +148,11 @@ def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
     return np.array(times), files
 
 
-def _calibration(folder: Path, calib: Several[Path], width: int, height: int) -> Calibration:
+def _calibration(folder: Path, calib: Several[Path], size: tuple[int, int]) -> Calibration:
     own = folder / CALIBRATION
     if calib or own.is_file():
-        found = read_calibration(calib or [own], (width, height)).left_alone()
-    else:
-        found = _known_camera(folder)
-    model = found.left
-    if (model.width, model.height) != (width, height):
-        raise InputError(
-            f"{found.source}: made for {model.width}x{model.height} pixels but the images have "
-            f"{width}x{height}; take the calibration of these images."
-        )
-    return found
+        return read_calibration(calib or [own], size)
+    return _known_camera(folder)
 
 
 def _known_camera(folder: Path) -> Calibration:
@@ -257,28 +163,3 @@ def _known_camera(folder: Path) -> Calibration:
         f"{folder}: of no known camera (no {', '.join(_CAMERAS)} in its name, no {CALIBRATION}); "
         "name a calibration with --calib."
     )
-
-
-def _read_depth(path: Path, width: int, height: int) -> NDArray[np.uint16]:
-    import cv2
-
-    try:
-        image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (OSError, cv2.error):
-        image = None
-    if image is None:
-        raise UnreadableImageError(path, "cannot be decoded; download the file again.")
-    if image.dtype != np.uint16 or image.ndim != 2:
-        channels = 1 if image.ndim == 2 else image.shape[2]
-        raise UnreadableImageError(
-            path,
-            f"depth of {8 * image.dtype.itemsize} bits and {channels} channels; it must be one "
-            "channel of 16 bits, so take the original.",
-        )
-    if image.shape != (height, width):
-        raise UnreadableImageError(
-            path,
-            f"depth of {size_text(image.shape)} pixels but the colour image has {width}x{height}; "
-            "take depth that is registered to the colour images.",
-        )
-    return np.asarray(image, np.uint16)

@@ -5,7 +5,7 @@ One file because each check is a few lines, and their thresholds are read togeth
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vslam.config import OrbConfig
 from vslam.datasets.sequence import Image
 from vslam.doctor.findings import Finding, judge
-from vslam.doctor.matching import Matches
+from vslam.doctor.matching import Matches, count_views
 from vslam.frontend.orb import extract
 
 Times = NDArray[np.float64]
@@ -43,6 +43,7 @@ DEPTH_SHARE = 0.3
 DEPTH_AT_ZERO = 0.6
 DEPTH_SECOND = 0.8
 _ANOTHER_PX = 8.0  # what lies so far from the best is another peak
+DEPTH_VIEWS = 2  # that do not share half of what they show: one scene may fit elsewhere by chance
 _BORDER = 2  # px; a best so near the end of the search may lie behind it
 _REACH = 16, 48  # px that depth edges are looked for, down and across: sensors lie side by side
 
@@ -211,11 +212,12 @@ def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Findin
     contrast = float((fit.max() - np.median(fit)) / max(float(np.std(fit)), 1e-12))
     if not fit.any() or contrast < 2.0:
         return [there, Finding("registration", "unknown", "no edges of depth in these images")]
-    return [there, _registration(fit)]
+    return [there, _registration(fit, lambda: count_views(images))]
 
 
-def _registration(fit: NDArray[np.float32]) -> Finding:
-    """A fault where the best shift is a clear one: no ridge, no second peak, no end of a search."""
+def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding:
+    """A fault where the best shift is a clear one (no ridge, no second peak, no end of a search)
+    and more than one view has been seen."""
     reach = np.array(_REACH)
     best = np.array(np.unravel_index(np.argmax(fit), fit.shape)) - reach
     shifts = np.moveaxis(np.indices(fit.shape), 0, -1) - reach
@@ -227,6 +229,9 @@ def _registration(fit: NDArray[np.float32]) -> Finding:
     clear = at_zero < DEPTH_AT_ZERO and second < DEPTH_SECOND
     if off > DEPTH_PX and not (clear and (np.abs(best) <= reach - _BORDER).all()):
         return Finding("registration", "unknown", f"{measured}, but no shift fits clearly best")
+    if off > DEPTH_PX and views() < DEPTH_VIEWS:
+        few = "but these images show one view, which may fit there by chance"
+        return Finding("registration", "unknown", f"{measured}, {few}")
     return judge(
         "registration",
         off > DEPTH_PX,

@@ -6,6 +6,7 @@ whether that is right must look everywhere.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -20,6 +21,7 @@ _EPIPOLAR_PX = 1.5
 _REFINED_PX = 3.0  # a keypoint of a coarse octave is off by so much
 _WINDOW = (15, 15)
 _MIN_MATCHES = 12
+_ANOTHER_VIEW = 0.25  # of the width: what is matched has moved so far
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,21 @@ def match_images(left: Image, right: Image) -> Matches:
         return none
     kept = obeys.ravel() == 1
     return Matches(a[kept], b[kept])
+
+
+def count_views(images: Sequence[Image]) -> int:
+    """How many images, taken in order, show another view than all that were counted before."""
+    views: list[Image] = []
+    for image in images:
+        if not any(_one_view(image, view) for view in views):
+            views.append(image)
+    return len(views)
+
+
+def _one_view(image: Image, other: Image) -> bool:
+    matches = match_images(image, other)
+    moved = np.linalg.norm(matches.left - matches.right, axis=1)
+    return len(matches) > 0 and float(np.median(moved)) < _ANOTHER_VIEW * image.shape[1]
 
 
 def joined(several: list[Matches]) -> Matches:

@@ -200,7 +200,7 @@ def judge_loops(
 
     Args:
         edges: E loops, accepted or not.
-        frames: ``(K,)`` frame of each keyframe that the edges name.
+        frames: ``(K,)`` frame of each keyframe that the edges name, -1 for one of another drive.
         T_wc: ``(N, 4, 4)`` ground truth of the frames.
         timestamps: ``(N,)`` seconds.
     """
@@ -230,7 +230,7 @@ def _is_right(edge: LoopEdge, frames: Indices, T_wc: Poses, limits: LoopLimits) 
     if edge.T_query_match is None or edge.query < 0:
         return None
     query, match = frames[edge.query], frames[edge.match]
-    if max(query, match) >= len(T_wc):
+    if max(query, match) >= len(T_wc) or min(query, match) < 0:
         return None
     T_wq, T_wm = T_wc[query], T_wc[match]
     T_match_query = inverses(T_wm[None])[0] @ T_wq

@@ -1,4 +1,4 @@
-"""Files and folders that are there as a whole or not at all, and never replace anything."""
+"""Files and folders that are there as a whole or not at all."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from vslam.errors import InputError, ResultsError
 
@@ -50,6 +51,31 @@ def new_file(path: Path) -> Iterator[Path]:
             part.rename(path)
         finally:
             part.unlink(missing_ok=True)
+
+
+@contextmanager
+def replaced_file(path: Path) -> Iterator[BinaryIO]:
+    """Yield a file to write; at the end it is on the disk and takes the place of ``path``, in one
+    step. After an error ``path`` is what it was.
+
+    Raises:
+        OSError: it cannot be written, on a full disk for example.
+    """
+    part = _beside(path)
+    try:
+        with part.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    if os.name == "posix":  # else after a power cut the name may be the old one's
+        folder = os.open(path.absolute().parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
 
 
 def _refuse_existing(path: Path) -> None:

@@ -1,109 +1,193 @@
-"""The map on disk: one compressed ``.npz`` with a schema number."""
+"""The map on disk: an ``.npz`` that is written as a whole or not at all, and trusted in nothing.
+
+Arrays are not compressed: most of a map are descriptors, in which nothing repeats, and a map is to
+be there in a second.
+"""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.errors import InputError
-from vslam.features import Features
-from vslam.map import Map
-from vslam.map_kernels import link_many, refresh_landmarks
+from vslam.frame_poses import FrameTable
+from vslam.machine import versions
+from vslam.map import LANDMARK_FIELDS, ROW_FIELDS
+from vslam.map_kernels import gather_observations
+from vslam.maps.checked_map import ARRAYS, DamagedMapError, checked_map
+from vslam.maps.new_output import replaced_file
+from vslam.maps.stored_map import StoredMap
 
-SCHEMA = 1
-
-
-def save_map(path: Path, map_: Map, camera: Camera) -> None:
-    """Write the living part of a map, renumbered without gaps.
-
-    Arrays of the file (K keyframes, L landmarks, R keypoints):
-        ``schema``; ``camera`` (8,) fx, fy, cx, cy, baseline, width, height, depth;
-        ``scales``;
-        ``keyframe_T_cw`` (K, 4, 4), ``keyframe_timestamp``, ``keyframe_frame``,
-        ``keyframe_parent`` (K,), ``keyframe_first_row`` (K + 1,);
-        ``landmark_xyz`` (L, 3), ``landmark_descriptor`` (L, 32);
-        ``row_xy`` (R, 2), ``row_u_right``, ``row_octave``, ``row_angle``, ``row_landmark`` (R,)
-        with -1 for none, ``row_descriptor`` (R, 32).
-    """
-    a = map_.arrays
-    # Landmarks are in the order of their first keyframe, culled ones included; a map keeps that.
-    keyframes, landmarks = map_.living_keyframes(), map_.living_landmarks()
-    new_keyframe = _renumbering(keyframes, map_.n_keyframes)
-    new_landmark = _renumbering(landmarks, map_.n_landmarks)
-    rows = np.concatenate(
-        [np.arange(a.first_row[k], a.first_row[k + 1]) for k in keyframes] or [np.empty(0, int)]
-    ).astype(np.int64)
-    counts = a.first_row[keyframes + 1] - a.first_row[keyframes]
-    parents = np.array(map_.parents, np.int64)[keyframes]
-    np.savez_compressed(
-        path,
-        schema=SCHEMA,
-        camera=np.array([*vars(camera).values()], np.float64),
-        scales=map_.scales,
-        keyframe_T_cw=a.T_cw[keyframes],
-        keyframe_timestamp=np.array(map_.timestamps)[keyframes],
-        keyframe_frame=np.array(map_.frames, np.int64)[keyframes],
-        keyframe_parent=np.where(parents >= 0, new_keyframe[parents], -1),
-        keyframe_first_row=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        landmark_xyz=a.xyz[landmarks],
-        landmark_descriptor=a.landmark_descriptor[landmarks].view(np.uint8),
-        row_xy=a.xy[rows],
-        row_u_right=a.u_right[rows],
-        row_octave=a.octave[rows],
-        row_angle=a.angle[rows],
-        row_descriptor=a.descriptor[rows].view(np.uint8),
-        row_landmark=np.where(a.landmark[rows] >= 0, new_landmark[a.landmark[rows]], -1),
-    )
+SCHEMA = 2
+_FOREIGN = "not a map of vslam; name a map.npz, or the folder of a run"
 
 
-def load_map(path: Path) -> tuple[Map, Camera]:
-    """Read a map written by ``save_map``.
+def save_map(path: Path, stored: StoredMap) -> None:
+    """Write the living part of a map, in place of what is there.
+
+    The file is complete or, after an error or a power cut, what it was before. Its ``header`` is
+    JSON (schema, camera, detector, drives, versions); the arrays are those of ``ARRAYS``, and
+    ``detector_NAME_first``, ``detector_NAME_values`` and ``image_first``, ``image_values`` by
+    keyframe. Observations are listed by landmark, in the order of the map's chains.
 
     Raises:
-        InputError: no such file, no map, or of another schema.
+        OSError: it cannot be written.
     """
+    write_map(path, stored.compact())
+
+
+def write_map(path: Path, stored: StoredMap) -> None:
+    """``save_map`` of a map that is compact already: ``StoredMap.compact`` is a copy, which one
+    thread can write while another goes on in the map.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    arrays = _as_arrays(stored)
+    with replaced_file(path) as file:
+        np.savez(file, allow_pickle=False, **arrays)
+
+
+def load_map(path: Path) -> StoredMap:
+    """Read a map written by ``save_map``, and check all that kernels rely on.
+
+    Raises:
+        InputError: no such file, no map, damaged, or of another schema.
+    """
+    data, header = _read(path)
+    try:
+        return checked_map(data, header)
+    except (DamagedMapError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: the map is damaged ({error}); save it again.") from error
+
+
+def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
+    map_, a = stored.map, stored.map.arrays
+    n_landmarks, n_rows = map_.n_landmarks, map_.n_rows
+    landmarks = np.arange(n_landmarks, dtype=np.int32)
+    index = np.arange(map_.n_keyframes, dtype=np.int64)
+    first, rows = gather_observations(a, landmarks, index)
+    loops = stored.loops
+    T = [loop.T_query_match for loop in loops]
+    frames = stored.frames or FrameTable(
+        np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros(0, np.bool_), np.zeros(0)
+    )
+    header: dict[str, Any] = {
+        "kind": "vslam map",
+        "schema": SCHEMA,
+        "versions": versions(),
+        "camera": asdict(stored.camera),
+        "drives": list(stored.drives),
+        "detector": {
+            "name": stored.detector.name,
+            "fingerprint": stored.detector.fingerprint,
+            "tables": sorted(stored.detector.tables),
+        },
+        "images": stored.images is not None,
+        "frames": stored.frames is not None,
+        "session": map_.session,
+        "world": None
+        if stored.world is None
+        else {
+            "name": stored.world.name,
+            "S_truth_world": stored.world.S_truth_world.tolist(),
+        },
+    }
+    arrays = {
+        "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
+        "scales": map_.scales,
+        "keyframe_T_cw": a.T_cw[: map_.n_keyframes],
+        "keyframe_first_row": a.first_row[: map_.n_keyframes + 1],
+        "keyframe_timestamp": np.array(map_.timestamps, np.float64),
+        "keyframe_frame": np.array(map_.frames, np.int64),
+        "keyframe_parent": np.array(map_.parents, np.int64),
+        "keyframe_session": np.array(map_.sessions, np.int64),
+        "keyframe_unit_scale": np.array(map_.unit_scale, np.float64),
+        "restarts": np.array(map_.restarts, np.int64),
+        "unpredicted_restarts": np.array(map_.unpredicted_restarts, np.int64),
+        "landmark_first_observation": first,
+        "observation_row": rows,
+        "loop_ends": np.array([(one.query, one.match) for one in loops], np.int64).reshape(-1, 2),
+        "loop_T_query_match": np.array(T, np.float64).reshape(-1, 4, 4),
+        "loop_scale": np.array([loop.scale for loop in loops], np.float64),
+        "loop_score": np.array([loop.score for loop in loops], np.float64),
+        "loop_counts": np.array(
+            [(loop.n_matches, loop.n_inliers) for loop in loops], np.int64
+        ).reshape(-1, 2),
+        "loop_learned": np.array([loop.matched_by == "learned" for loop in loops], np.bool_),
+    }
+    for prefix, fields, n in (
+        ("landmark", LANDMARK_FIELDS, n_landmarks),
+        ("row", ROW_FIELDS, n_rows),
+    ):
+        for name in fields:
+            if f"{prefix}_{name.removeprefix('landmark_')}" in ARRAYS:
+                arrays[f"{prefix}_{name.removeprefix('landmark_')}"] = getattr(a, name)[:n]
+    for name in FrameTable._fields:
+        arrays[f"frame_{name}"] = getattr(frames, name)
+    for name, table in stored.detector.tables.items():
+        arrays[f"detector_{name}_first"] = table.first
+        arrays[f"detector_{name}_values"] = table.values
+    if stored.images is not None:
+        arrays["image_first"], arrays["image_values"] = stored.images.first, stored.images.values
+    return arrays
+
+
+def map_file_of(path: Path) -> Path:
+    """The map of the folder of a run; a file as it is."""
+    return path / "map.npz" if path.is_dir() else path
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    """What a map file says of itself, its arrays unread.
+
+    Raises:
+        InputError: as ``load_map``.
+    """
+    with _opened(path) as (_, header):
+        return header
+
+
+def _read(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    """All arrays of a map file, and its header."""
+    with _opened(path) as (file, header):
+        return {name: file[name] for name in file.files if name != "header"}, header
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """An archive of arrays, and its header if it is a map of this schema."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            data = dict(file)
-        schema = int(data["schema"])
-        values = data["camera"].tolist()
-    except (OSError, ValueError, KeyError, EOFError, TypeError, BadZipFile) as error:
-        raise InputError(f"{path}: not a map of vslam ({error}); name a map.npz.") from error
-    if schema != SCHEMA:
-        raise InputError(f"{path}: map schema {schema}, this version reads {SCHEMA}.")
-    camera = Camera(*values[:5], *map(int, values[5:7]), *map(bool, values[7:]))
-    map_ = Map(data["scales"])
-    first = data["keyframe_first_row"]
-    for k, T_cw in enumerate(data["keyframe_T_cw"]):
-        rows = slice(int(first[k]), int(first[k + 1]))
-        features = Features(
-            data["row_xy"][rows],
-            data["row_octave"][rows],
-            data["row_angle"][rows],
-            data["row_descriptor"][rows],
-            data["row_u_right"][rows],
-        )
-        timestamp, frame = data["keyframe_timestamp"][k], data["keyframe_frame"][k]
-        map_.add_keyframe(features, T_cw, float(timestamp), int(frame))
-        map_.parents[k] = int(data["keyframe_parent"][k])
-    landmark = data["row_landmark"]
-    observed = np.flatnonzero(landmark >= 0)
-    descriptors = data["landmark_descriptor"].view(np.uint64)
-    ids = map_.add_landmarks(data["landmark_xyz"], descriptors, 0)
-    a = map_.arrays
-    link_many(a, observed, landmark[observed].astype(np.int32))
-    first_seen = np.full(len(ids), map_.n_keyframes, np.int32)
-    np.minimum.at(first_seen, landmark[observed], a.keyframe[observed])
-    a.first_keyframe[: len(ids)] = first_seen
-    refresh_landmarks(a, ids, map_.scales)
-    return map_, camera
-
-
-def _renumbering(living: NDArray[np.int64], total: int) -> NDArray[np.int64]:
-    new = np.full(total, -1, np.int64)
-    new[living] = np.arange(len(living))
-    return new
+            if "header" not in file.files and "keyframe_first_row" in file.files:
+                raise InputError(
+                    f"{path}: a map of schema {int(file['schema'])}, this version reads {SCHEMA}; "
+                    "run again with it."
+                )
+            header = json.loads(bytes(file["header"]))
+            if not isinstance(header, dict) or header.get("kind") != "vslam map":
+                raise InputError(f"{path}: {_FOREIGN}.")
+            if header.get("schema") != SCHEMA:
+                raise InputError(
+                    f"{path}: a map of schema {header.get('schema')}, this version reads {SCHEMA}; "
+                    "use the version of vslam that wrote it."
+                )
+            yield file, header
+    except OSError as error:
+        why = error.strerror or error
+        raise InputError(
+            f"{path}: cannot be read ({why}); name a map.npz, or the folder of a run."
+        ) from error
+    except BadZipFile as error:
+        raise InputError(f"{path}: {_FOREIGN}, or the file is damaged ({error}).") from error
+    except (ValueError, KeyError, EOFError, TypeError, AttributeError, MemoryError) as error:
+        # np.load tells of pickles and of what is no npz by ValueError; a plain array is no archive.
+        raise InputError(f"{path}: {_FOREIGN}.") from error

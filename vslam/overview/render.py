@@ -18,7 +18,8 @@ _OTHER = ("loops_found", "loops_missed", "loops_wrong", "fps")
 _ABOUT_ERRORS = (
     "Medians over runs, in brackets the least and the greatest. ATE after the alignment named, of "
     "every frame, lost ones included: SE3 without scale, Sim3 with scale for monocular runs, which "
-    "have none. Systems with different alignments are not compared. RPE from one frame to the next."
+    "have none; causal ATE is of the poses as they were given at the time. Systems with different "
+    "alignments are not compared. RPE from one frame to the next."
 )
 _ABOUT_OTHERS = (
     "Loops by the ground truth. fps of the frame loop: runs made side by side have fewer."

@@ -12,6 +12,7 @@ Measure = tuple[str, str, str, int]
 MEASURES: tuple[Measure, ...] = (
     ("lost_frames", "lost frames", "", 0),
     ("ate_rmse_m", "ATE RMSE", "m", 3),
+    ("causal_ate_rmse_m", "causal ATE", "m", 3),
     ("rpe_m", "RPE", "m", 4),
     ("t_rel_percent", "t_rel", "%", 3),
     ("r_rel_deg_per_100m", "r_rel", "°/100 m", 3),

@@ -11,12 +11,11 @@ import numpy as np
 from pydantic import ValidationError
 
 from vslam.backend.pose_graph import PoseGraph, essential_graph
-from vslam.camera import Camera
+from vslam.camera import Camera, same_camera
 from vslam.config import load_config
-from vslam.datasets import DATASETS, open_sequence
+from vslam.datasets import known_datasets, open_sequence
 from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError
-from vslam.geometry import compose, inverse
 from vslam.loops import LoopEdge
 from vslam.map import Map
 from vslam.maps.storage import load_map
@@ -25,12 +24,16 @@ from vslam.report.schema import ReportJson
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What the folder of a run holds; ``map`` has the living keyframes only."""
+    """What the folder of a run holds; ``map`` has the living keyframes only.
+
+    ``loops`` are those that were closed, with the relative poses that they measured.
+    """
 
     folder: Path
     report: ReportJson
     map: Map
     camera: Camera
+    loops: tuple[LoopEdge, ...] = ()
 
 
 def read_run(folder: Path) -> FinishedRun:
@@ -41,10 +44,10 @@ def read_run(folder: Path) -> FinishedRun:
     """
     if not (folder / "map.npz").is_file():
         raise InputError(f"{folder}: no map.npz here; name the folder of a run, like runs/latest.")
-    map_, camera = load_map(folder / "map.npz")
-    if not map_.n_keyframes:
+    stored = load_map(folder / "map.npz")
+    if not stored.map.n_keyframes:
         raise InputError(f"{folder / 'map.npz'}: the map is empty; name a run that has one.")
-    return FinishedRun(folder, read_report(folder), map_, camera)
+    return FinishedRun(folder, read_report(folder), stored.map, stored.camera, stored.loops)
 
 
 def read_report(folder: Path) -> ReportJson:
@@ -81,10 +84,16 @@ def open_images(
         InputError: the images are not there, not those of the run, or of no data set.
     """
     report = run.report
-    if report.dataset not in DATASETS:
+    if len(set(run.map.sessions)) > 1:
+        raise InputError(
+            f"{run.folder}: the map is of several drives, whose images cannot be opened together; "
+            "export g2o, euroc or ply --no-colours, which need none."
+        )
+    if report.dataset not in known_datasets():
         raise InputError(
             f"{run.folder}: images of {report.dataset} cannot be opened again, only those of "
-            f"{', '.join(DATASETS)}; export g2o, euroc or ply --no-colours, which need none."
+            f"{', '.join(known_datasets())}; export g2o, euroc or ply --no-colours, which need "
+            "none."
         )
     sequence = open_sequence(
         report.dataset,
@@ -100,7 +109,7 @@ def open_images(
     same = len(sequence) > max(run.map.frames) and np.allclose(
         sequence.timestamps[run.map.frames], run.map.timestamps, rtol=0.0, atol=1e-6
     )
-    if not same or not np.allclose(_numbers(run.camera), _numbers(sequence.camera)):
+    if not same or not same_camera(run.camera, sequence.camera):
         raise InputError(
             f"{report.dataset} {report.sequence}: times or camera are not those of {run.folder}; "
             "name the data that the run was made on with --data."
@@ -108,44 +117,18 @@ def open_images(
     return sequence
 
 
-def _numbers(camera: Camera) -> list[float]:
-    return [*camera.intrinsics.tolist(), camera.width, camera.height]
-
-
 def pose_graph(run: FinishedRun) -> PoseGraph:
-    """The essential graph of a run's final map with its loops, weighed as by the run.
-
-    A report does not keep the relative poses that loops measured: their edges, as all others, have
-    those of the final map. An end that was culled is replaced by the keyframe nearest in time.
-    Where a keyframe shares no landmark with its parent, mapping began anew: that edge is a GAP.
+    """The essential graph of a run's final map with its loops as they were measured, weighed as by
+    the run.
 
     Raises:
         InputError: the run's thresholds cannot be read.
     """
-    map_, loops = run.map, []
-    frames = np.array(map_.frames)
-    for entry in run.report.loops:
-        if entry.accepted and entry.query_frame is not None:
-            ends = (entry.query_frame, entry.match_frame)
-            query, match = (int(np.abs(frames - frame).argmin()) for frame in ends)
-            T_query_match = compose(map_.arrays.T_cw[query], inverse(map_.arrays.T_cw[match]))
-            loops.append(
-                LoopEdge(query, match, entry.score, True, entry.reason, T_query_match=T_query_match)
-            )
     return essential_graph(
-        map_,
-        loops,
+        run.map,
+        run.loops,
         load_config(run.folder / "config.json").pose_graph,
-        weak={*map_.restarts, *_unmeasured(map_)},
-        unpredicted=map_.unpredicted_restarts,
+        weak=run.map.restarts,
+        unpredicted=run.map.unpredicted_restarts,
         driven=True,
     )
-
-
-def _unmeasured(map_: Map) -> list[int]:
-    """Keyframes that nothing but a prediction connects with their parent."""
-    return [
-        keyframe
-        for keyframe, parent in enumerate(map_.parents)
-        if parent >= 0 and not np.isin(map_.landmarks_of(keyframe), map_.landmarks_of(parent)).any()
-    ]

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import re
+from dataclasses import replace
 from datetime import datetime
 from itertools import count
 from pathlib import Path
 
 from vslam.errors import InputError, ResultsError
 from vslam.evaluation.loops import evaluate_loops
-from vslam.evaluation.trajectories import evo_command
+from vslam.evaluation.trajectories import Evaluation, evo_command
+from vslam.evaluation.worlds import world_of
 from vslam.maps.ply import save_ply
 from vslam.maps.storage import save_map
 from vslam.report.frame_table import write_frames
 from vslam.report.schema import ReportJson
 from vslam.report.summary import evaluate_run, summarize
-from vslam.run.outcome import RunOutcome, matched_ground_truth
+from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_truth
 from vslam.trajectory import write_kitti, write_tum
 
 _LONGEST_PART = 60  # characters: file systems take 255 for a name, and a URL may have more
@@ -53,12 +55,18 @@ def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, dete
 
 
 def write_results(
-    folder: Path, outcome: RunOutcome, *, pages: bool = True, ply: bool = False
+    folder: Path,
+    outcome: RunOutcome,
+    *,
+    pages: bool = True,
+    ply: bool = False,
+    map_file: Path | None = None,
 ) -> ReportJson:
     """Evaluate a run, in any state of completion, and write all that is known of it.
 
-    Files: ``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``,
-    ``config.json`` (read by ``--config``), ``keyframes.tum``, ``frames.csv``, ``report.json``,
+    Files: ``trajectory_kitti.txt``, ``trajectory.tum``, ``trajectory_causal.tum`` (poses as they
+    were given at the time), ``ground_truth_kitti.txt``, ``config.json`` (read by ``--config``),
+    ``keyframes.tum``, ``frames.csv``, ``report.json``,
     ``report.md``, ``report.html`` (one file, no network request), ``figures/*.png``, ``map.npz``,
     ``map.ply``; what matters most comes first.
 
@@ -67,22 +75,29 @@ def write_results(
         outcome: the run; it may be interrupted, all lost, or without a single frame.
         pages: write what people read, too: Markdown, HTML and figures.
         ply: write the landmarks as ``map.ply``, too.
+        map_file: where to write the map, too.
 
     Raises:
         ResultsError: a file could not be written; those before it are complete.
     """
     try:
         write_trajectories(folder, outcome)
+        write_tum(folder / "trajectory_causal.tum", causal_trajectory(outcome))
         write_tum(folder / "keyframes.tum", outcome.keyframes)
         write_frames(folder / "frames.csv", outcome.tracks)
         config = outcome.settings.config.model_dump_json(indent=2) + "\n"
         (folder / "config.json").write_text(config)
-        report = _write_report(folder, outcome, config, pages=pages)
-        if outcome.map is not None:
-            save_map(folder / "map.npz", outcome.map, outcome.sequence.camera)
-            if ply:
-                landmarks = outcome.map.living_landmarks()
-                save_ply(folder / "map.ply", outcome.map.arrays.xyz[landmarks])
+        evaluation, remark = evaluate_run(outcome)
+        report = _write_report(folder, outcome, config, evaluation, remark, pages=pages)
+        if outcome.map is not None and ply:
+            landmarks = outcome.map.living_landmarks()
+            save_ply(folder / "map.ply", outcome.map.arrays.xyz[landmarks])
+        if (stored := outcome.stored) is not None:
+            if outcome.settings.map is None and evaluation is not None:
+                stored = replace(stored, world=world_of(outcome, evaluation))
+            save_map(folder / "map.npz", stored)
+            if map_file is not None:
+                save_map(map_file, stored)
     except OSError as error:
         files = sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime_ns)
         raise ResultsError(
@@ -107,9 +122,16 @@ def write_trajectories(folder: Path, outcome: RunOutcome) -> None:
         write_tum(folder / "ground_truth.tum", ground_truth)
 
 
-def _write_report(folder: Path, outcome: RunOutcome, config: str, *, pages: bool) -> ReportJson:
+def _write_report(
+    folder: Path,
+    outcome: RunOutcome,
+    config: str,
+    evaluation: Evaluation | None,
+    remark: str | None,
+    *,
+    pages: bool,
+) -> ReportJson:
     """``report.json``, and with ``pages`` what people read."""
-    evaluation, remark = evaluate_run(outcome)
     verdict = evaluate_loops(outcome)
     command = None
     if evaluation is not None:

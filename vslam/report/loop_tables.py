@@ -115,8 +115,9 @@ _EVIDENCE = ("frame", "earlier", "score", "by", "matches", "inliers")
 
 def _evidence(loop: LoopEntry) -> Row:
     query = "lost" if loop.query_frame is None else str(loop.query_frame)
+    match = "before this run" if loop.match_frame is None else str(loop.match_frame)
     return (
-        query, str(loop.match_frame), f"{loop.score:.3f}", loop.matched_by, str(loop.matches),
+        query, match, f"{loop.score:.3f}", loop.matched_by, str(loop.matches),
         str(loop.inliers),
     )  # fmt: skip
 

@@ -45,7 +45,11 @@ def headlines(report: ReportJson) -> list[Headline]:
             f"{share} {report.frames}; {report.weak_frames} weak, {report.skipped_frames} skipped",
             "bad" if lost else "good",
         ),
+        *_in_map(report),
         Headline("ATE RMSE", _number(report.ate_rmse_m, "m"), evaluated),
+        Headline(
+            "Causal ATE", _number(report.causal_ate_rmse_m, "m"), "poses as given at the time"
+        ),
         Headline("RPE", _number(report.rpe_m, "m"), f"a frame; rotation {rotation}"),
         Headline("t_rel", _number(report.t_rel_percent, "%"), "KITTI drift over 100-800 m"),
         Headline("r_rel", _number(report.r_rel_deg_per_100m, "°"), "every 100 m"),
@@ -67,6 +71,18 @@ def advice(report: ReportJson) -> str:
     if report.lost_frames <= _MANY_LOST * report.frames:
         return ""
     return "Many frames were lost: vslam doctor checks images, calibration and time stamps."
+
+
+def _in_map(report: ReportJson) -> list[Headline]:
+    if (found := report.in_map) is None:
+        return []
+    fix = "no fix" if found.first_fix_s is None else f"first fix after {found.first_fix_s:.2f} s"
+    times = f"found {found.found} of the {found.sought} times it was looked for"
+    error = _number(found.error_m, "m")
+    return [
+        Headline("In the map", f"{found.in_map_percent:.1f} %", f"of the frames; {fix}, {times}"),
+        Headline("Error in the map", error, "RMSE of these frames, with the map's own alignment"),
+    ]
 
 
 def _latency(report: ReportJson) -> list[Headline]:

@@ -25,14 +25,15 @@ class StageTime(_Model):
 class LoopEntry(_Model):
     """One loop candidate, accepted or not, in frames of this run.
 
-    ``query_frame`` is None for a frame that was not in the map. ``right`` says whether the relative
-    pose found is the ground truth's, None where that cannot be said. ``moved_m`` is the farthest
-    way that the correction moved a keyframe, ``correction_s`` its time; None if rejected.
-    ``matched_by`` names the descriptors that the relative pose comes from, ``orb`` or ``learned``.
+    ``query_frame`` is None for a frame that was not in the map, ``match_frame`` for one of an
+    earlier drive. ``right`` says whether the relative pose found is the ground truth's, None where
+    that cannot be said. ``moved_m`` is the farthest way that the correction moved a keyframe,
+    ``correction_s`` its time; None if rejected. ``matched_by`` names the descriptors that the
+    relative pose comes from, ``orb`` or ``learned``.
     """
 
     query_frame: int | None
-    match_frame: int
+    match_frame: int | None
     score: float
     matches: int
     inliers: int
@@ -68,6 +69,24 @@ class LoopFigures(_Model):
     loops_closed: int
 
 
+class MapFigures(_Model):
+    """How a run found itself in the map that it went on in.
+
+    ``in_map_percent`` of the frames are placed in it at the end. ``first_fix_s`` is the time from
+    the first frame to the first that was found in it, None if none was. The camera was looked for
+    in the whole map at ``sought`` frames and found at ``found`` of them. ``error_m`` is the RMSE of
+    the positions of those frames, each as the map says, with the alignment that the drives of the
+    map had: what is wrong with the place of the whole counts. None where the map does not lie in
+    the world of the ground truth.
+    """
+
+    in_map_percent: float
+    first_fix_s: float | None
+    sought: int
+    found: int
+    error_m: float | None
+
+
 class Machine(_Model):
     """Where the times were measured; ``cores`` counts those that the process may use."""
 
@@ -82,6 +101,8 @@ class ReportJson(_Model):
 
     Errors are None without ground truth, and KITTI's drift also on paths shorter than 100 m;
     ``evaluation_remark`` says why there are none, or of how many frames they are.
+    ``causal_ate_rmse_m`` is of the poses as they were given at the time
+    (``trajectory_causal.tum``), after an alignment of their own.
     ``without_loops`` is of the same run with the detector ``none`` (``--compare-loops``).
     ``frames`` counts the frames done; of them ``skipped_frames`` had an unreadable image and
     ``dropped_frames`` were overtaken by a newer one in a real-time run, whose ``latency_ms`` is
@@ -103,6 +124,7 @@ class ReportJson(_Model):
 
     alignment: str | None
     ate_rmse_m: float | None
+    causal_ate_rmse_m: float | None = None
     ate_mean_m: float | None = None
     ate_max_m: float | None = None
     rpe_m: float | None
@@ -131,6 +153,7 @@ class ReportJson(_Model):
     revisits: list[RevisitEntry]
     loops: list[LoopEntry]
     without_loops: LoopFigures | None
+    in_map: MapFigures | None = None
 
     dataset: str
     sequence: str
@@ -145,6 +168,8 @@ class ReportJson(_Model):
     weights: Path | None = None
     realtime: bool = False
     calib: tuple[Path, ...] = ()
+    map: Path | None = None
+    localize: bool = False
 
     machine: Machine
     versions: dict[str, str]

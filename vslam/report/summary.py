@@ -8,10 +8,12 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.errors import InputError
 from vslam.evaluation.loops import LoopEvaluation
 from vslam.evaluation.trajectories import Evaluation, evaluate_trajectory
+from vslam.evaluation.worlds import error_in_map
 from vslam.features import TrackingState, TrackResult
 from vslam.geometry import inverses
 from vslam.loops import LoopCorrection
@@ -20,11 +22,12 @@ from vslam.report.schema import (
     LoopEntry,
     LoopFigures,
     Machine,
+    MapFigures,
     ReportJson,
     RevisitEntry,
     StageTime,
 )
-from vslam.run.outcome import RunOutcome, matched_ground_truth
+from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_truth
 
 
 def summarize(
@@ -58,6 +61,7 @@ def summarize(
         interrupted=outcome.interrupted,
         alignment=evaluation.alignment if evaluation else None,
         ate_rmse_m=evaluation.ate_rmse_m if evaluation else None,
+        causal_ate_rmse_m=causal_ate(outcome),
         ate_mean_m=evaluation.ate_mean_m if evaluation else None,
         ate_max_m=evaluation.ate_max_m if evaluation else None,
         rpe_m=evaluation.rpe_m if evaluation else None,
@@ -84,6 +88,7 @@ def summarize(
         revisits=_revisits(verdict) if verdict else [],
         loops=loops,
         without_loops=_figures_without_loops(outcome),
+        in_map=_figures_in_map(outcome),
         machine=this_machine(),
         versions=versions(),
         created=datetime.now(UTC).replace(microsecond=0),
@@ -106,6 +111,18 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
     return found, f"{found.frames} of {len(outcome.trajectory)} frames have a ground truth"
 
 
+def causal_ate(outcome: RunOutcome) -> float | None:
+    """ATE of the poses as they were given at the time, None where it cannot be said."""
+    ground_truth = matched_ground_truth(outcome)
+    if ground_truth is None or not outcome.tracks:
+        return None
+    try:
+        given = causal_trajectory(outcome)
+        return evaluate_trajectory(given, ground_truth, outcome.settings.alignment).ate_rmse_m
+    except InputError:
+        return None
+
+
 def _figures_without_loops(outcome: RunOutcome) -> LoopFigures | None:
     without = outcome.without_loops
     if without is None:
@@ -117,6 +134,24 @@ def _figures_without_loops(outcome: RunOutcome) -> LoopFigures | None:
         t_rel_percent=evaluation.t_rel_percent if evaluation else None,
         lost_frames=sum(track.state is TrackingState.LOST for track in without.tracks),
         loops_closed=sum(edge.accepted for edge in without.loops),
+    )
+
+
+def _figures_in_map(outcome: RunOutcome) -> MapFigures | None:
+    inside, tracks = outcome.in_map, outcome.tracks
+    if inside is None:
+        return None
+    # While a keyframe is being mapped the camera is not looked for.
+    lost = [track for track in tracks if track.state == TrackingState.LOST]
+    found = [track for track in tracks if track.relocalised]
+    sought = sum("relocalise" in track.stage_ms for track in lost) + len(found)
+    fix = found[0].timestamp - tracks[0].timestamp if found else None
+    return MapFigures(
+        in_map_percent=100.0 * float(inside.mean()) if len(inside) else 0.0,
+        first_fix_s=fix,
+        sought=sought,
+        found=len(found),
+        error_m=error_in_map(outcome),
     )
 
 
@@ -134,8 +169,8 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
         correction = corrections.get((edge.query, edge.match)) if edge.accepted else None
         entries.append(
             LoopEntry(
-                query_frame=int(frames[edge.query]) if edge.query >= 0 else None,
-                match_frame=int(frames[edge.match]),
+                query_frame=_frame(frames, edge.query),
+                match_frame=_frame(frames, edge.match),
                 score=edge.score,
                 matches=edge.n_matches,
                 inliers=edge.n_inliers,
@@ -148,6 +183,11 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
             )
         )
     return entries
+
+
+def _frame(frames: NDArray[np.int64], keyframe: int) -> int | None:
+    """The frame of this run that a keyframe was; None for none, and for those of earlier drives."""
+    return int(frames[keyframe]) if keyframe >= 0 and frames[keyframe] >= 0 else None
 
 
 def _moved(correction: LoopCorrection) -> float:

@@ -67,7 +67,10 @@ def top_view(
         chosen = [
             (edge.query, edge.match)
             for edge, is_right in zip(outcome.loops, right, strict=True)
-            if edge.accepted and edge.query >= 0 and (is_right is False) == wrong
+            if edge.accepted
+            and edge.query >= 0
+            and (is_right is False) == wrong
+            and outcome.keyframe_frames[edge.match] >= 0
         ]
         if chosen:
             frames = outcome.keyframe_frames[np.array(chosen)]

@@ -14,6 +14,7 @@ from vslam.datasets.stream import Stream
 from vslam.features import TrackResult
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.map import Map
+from vslam.maps.stored_map import StoredMap, World
 from vslam.trajectory import Trajectory
 
 
@@ -40,6 +41,8 @@ class RunSettings:
     weights: Path | None = None
     realtime: bool = False
     calib: tuple[Path, ...] = ()
+    map: Path | None = None
+    localize: bool = False
 
     @property
     def alignment(self) -> str:
@@ -62,10 +65,14 @@ class RunOutcome:
         peak_memory_mb: of the process.
         n_landmarks, n_keyframes: in the final map.
         map: the final map, None for a trajectory from elsewhere.
+        world: where the map that the run went on in lies, as far as that is known.
+        in_map: ``(N,)`` bool, frames placed in the map that the run went on in, at the end; None
+            for a run that began a map.
+        stored: the map with all that is needed to go on in it; None where it was only localised in.
         loops: all that became of loop candidates, in the order of their decision.
         corrections: what the accepted ones did to the map, in order.
         keyframe_frames: ``(K,)`` int64, the frame of this run that each keyframe was, culled ones
-            included: loops speak of keyframes, people of frames.
+            included: loops speak of keyframes, people of frames. -1 for those of earlier drives.
         n_submaps: how often mapping began, the first time included; 0 before the first keyframe.
         interrupted: why the run ended early ("Ctrl-C", a file cut off), or None.
         without_loops: the same run without a loop detector, if one was made to compare.
@@ -85,12 +92,24 @@ class RunOutcome:
     n_landmarks: int
     latency_ms: list[float] = field(default_factory=list)
     map: Map | None = None
+    stored: StoredMap | None = None
+    world: World | None = None
+    in_map: NDArray[np.bool_] | None = None
     loops: list[LoopEdge] = field(default_factory=list)
     corrections: list[LoopCorrection] = field(default_factory=list)
     keyframe_frames: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     n_submaps: int = 1
     interrupted: str | None = None
     without_loops: RunOutcome | None = None
+
+
+def causal_trajectory(outcome: RunOutcome) -> Trajectory:
+    """The pose of every frame as it was given at the time, in the map as it stood then: later
+    corrections, by bundle adjustment or a loop, are not in it. A lost or dropped frame has its
+    predicted pose."""
+    times = np.array([track.timestamp for track in outcome.tracks], np.float64)
+    poses = [track.T_wc for track in outcome.tracks]
+    return Trajectory(times, np.array(poses, np.float64).reshape(-1, 4, 4))
 
 
 def ground_truth_of(source: Sequence | Stream) -> Trajectory | None:

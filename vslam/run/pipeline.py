@@ -17,20 +17,28 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import ImageMap
+from vslam.camera import Camera, ImageMap, same_camera
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import Stream, TimedFrame, is_live, timed_frames
-from vslam.errors import BrokenSourceError, UnreadableImageError
+from vslam.errors import (
+    BrokenSourceError,
+    DroppedFrameError,
+    InputError,
+    UnreadableImageError,
+)
 from vslam.features import Features, TrackResult
 from vslam.frontend.tracking import TrackingContext, extract_features
-from vslam.loopclosure.registry import create_detector, create_images
+from vslam.loopclosure.registry import create_detector, create_images, problem_of
 from vslam.machine import peak_memory_mb, process_age
+from vslam.map import Map
+from vslam.maps.storage import read_header
 from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
 from vslam.run.realtime import Played, play
 from vslam.run.recorder import NullRecorder, Recorder
@@ -41,12 +49,14 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame ready to be tracked, or the reason why it cannot be read."""
+    """A frame ready to be tracked, or the reason why it cannot be read; ``dropped`` by a
+    perturbation."""
 
     left: NDArray[np.uint8] | None
     features: Features | None
     stage_ms: dict[str, float]
     problem: str | None = None
+    dropped: bool = False
 
 
 def run_sequence(
@@ -61,17 +71,16 @@ def run_sequence(
 
     A frame that cannot be read is skipped: it gets a predicted pose, counts as lost and is listed
     in the outcome. One that is dropped in a real-time run gets an interpolated pose. Ctrl-C ends
-    the run after the current frame, a source that breaks off after its last good one; all done so
-    far is kept.
+    the run after the current frame, a source that breaks off after its last good one, a detector of
+    another package where it fails; all done so far is kept.
     """
     cv2.setNumThreads(1)  # the pool uses the cores
-    images = create_images(settings.detector, settings.config)
-    detector = create_detector(settings.detector, settings.config, settings.weights, images)
-    slam = Slam(sequence.camera, settings.config, detector, threads=settings.threads, images=images)
+    slam = begin(sequence.camera, settings)
     tracks: list[TrackResult] = []
     skipped: list[str] = []
     latency_ms: list[float] = []
     n_told = 0  # loops that the recorder knows of
+    perturbation = perturbation.bound_to(sequence)
     recorder.begin(sequence.camera, ground_truth_of(sequence))
     startup = process_age()
     wall, cpu = time.perf_counter(), time.process_time()
@@ -80,7 +89,7 @@ def run_sequence(
         frames = perturbed(_until_broken(timed_frames(sequence), broken), perturbation)
         for played in _prepared(frames, slam.context, settings, live=is_live(sequence)):
             timestamp, frame = played.timestamp, played.made
-            if frame is None:
+            if frame is None or frame.dropped:
                 tracks.append(slam.skip(timestamp, dropped=True))
                 on_frame(tracks[-1])
                 continue
@@ -100,14 +109,20 @@ def run_sequence(
                 recorder.map(slam.map)
                 n_told = _tell_loops(recorder, slam, n_told)
             on_frame(result)
+            if problem := problem_of(slam.detector):
+                broken.append(problem)
+                break
             if interrupted.is_set():
                 if not is_live(sequence):  # a camera has no other end
                     broken.append("Ctrl-C")
                 break
         slam.finish()
+    if not broken and (problem := problem_of(slam.detector)):
+        broken.append(problem)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     _tell_loops(recorder, slam, n_told)
     trajectory = slam.trajectory()
+    drive = f"{settings.dataset} {sequence.name}"
     recorder.finish(trajectory, slam.map)
     return RunOutcome(
         settings=settings,
@@ -124,12 +139,52 @@ def run_sequence(
         n_keyframes=len(slam.map.living_keyframes()),
         n_landmarks=len(slam.map.living_landmarks()),
         map=slam.map,
+        stored=None if settings.localize else slam.stored_map(drive),
+        world=slam.world,
+        in_map=None if settings.map is None else slam.in_map(),
         loops=slam.loops,
         corrections=slam.corrections,
-        keyframe_frames=np.array(slam.map.frames, np.int64),
+        keyframe_frames=_frames_of_this_run(slam.map),
         n_submaps=len({0, *slam.map.restarts}) if slam.map.n_keyframes else 0,
         interrupted=broken[0] if broken else None,
     )
+
+
+def begin(camera: Camera, settings: RunSettings) -> Slam:
+    """SLAM before its first frame, with the detector asked for, in a new map or in one of a file.
+
+    Raises:
+        InputError: no such map, one of another camera, detector or pyramid, or weights that cannot
+            be read.
+    """
+    config, threads = settings.config, settings.threads
+    images = create_images(settings.detector, config)
+    detector = create_detector(settings.detector, config, settings.weights, images)
+    if settings.map is None:
+        return Slam(camera, config, detector, threads=threads, images=images)
+    return Slam.load(
+        settings.map, config, detector, threads=threads, images=images, localize=settings.localize
+    )
+
+
+def require_camera(map_file: Path, camera: Camera) -> None:
+    """Refuse images of another camera than those that a map was made of.
+
+    Raises:
+        InputError: it is another one, or there is no such map.
+    """
+    made_with = Camera(**read_header(map_file)["camera"])
+    if not same_camera(made_with, camera):
+        raise InputError(
+            f"{map_file}: the map's camera is not that of the images ({made_with.sensor}, "
+            f"{made_with.width}x{made_with.height}, fx {made_with.fx:.1f}); go on with images of "
+            "the same camera, rectified alike."
+        )
+
+
+def _frames_of_this_run(map_: Map) -> NDArray[np.int64]:
+    of_this = np.array(map_.sessions, np.int64) == map_.session
+    return np.where(of_this, np.array(map_.frames, np.int64), -1)
 
 
 def with_comparison(
@@ -143,13 +198,14 @@ def with_comparison(
     Everything else is the same: images, perturbation, thresholds. Where Ctrl-C ends the second run
     there is nothing to compare, and the first one's outcome says so.
     """
-    settings = replace(outcome.settings, detector="none", weights=None)
+    settings = replace(outcome.settings, detector="none", weights=None, map=None)
     without = run_sequence(
         outcome.sequence, perturbation, settings, NullRecorder(), on_frame=on_frame
     )
     if without.interrupted:
         return replace(outcome, interrupted=f"{without.interrupted}, in the run without loops")
-    return replace(outcome, without_loops=replace(without, map=None))  # a map takes 100s of MB
+    without = replace(without, map=None, stored=None)  # a map takes 100s of MB
+    return replace(outcome, without_loops=without)
 
 
 def _until_broken(frames: Iterator[TimedFrame], broken: list[str]) -> Iterator[TimedFrame]:
@@ -209,7 +265,8 @@ def prepare_frame(
     try:
         left, second = frame.read(image_map)
     except UnreadableImageError as error:
-        return PreparedFrame(None, None, {}, str(error))
+        dropped = isinstance(error, DroppedFrameError)
+        return PreparedFrame(None, None, {}, str(error), dropped)
     read = time.perf_counter()
     features = extract_features(left, second, context, image_map)
     done = time.perf_counter()

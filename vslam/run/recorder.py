@@ -202,7 +202,10 @@ def open_viewer(kind: str) -> Viewer:
         if not _has_display():
             raise InputError("--view native: there is no display here; use --view web.")
         port = _free_port(_VIEWER_PORT)
-        rr.spawn(port=port, connect=False, executable_path=_executable(), hide_welcome_screen=True)
+        rr.spawn(
+            port=port, connect=False, executable_path=_executable(), hide_welcome_screen=True,
+            recording=rr.RecordingStream("vslam"),  # without one, rerun only logs a warning
+        )  # fmt: skip
     except (OSError, RuntimeError) as error:
         raise InputError(f"--view {kind}: no viewer can be started ({error}).") from error
     until = time.monotonic() + _VIEWER_STARTS_S

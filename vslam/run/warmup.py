@@ -47,10 +47,11 @@ from vslam.backend.loop_correction import move_keyframes
 from vslam.backend.pose_graph import check_pose_graph, essential_graph
 from vslam.camera import Camera
 from vslam.closing import LoopClosing
-from vslam.config import Config, KeyframeConfig, MappingConfig
+from vslam.config import Config, DepthConfig, KeyframeConfig, MappingConfig
 from vslam.datasets.png import unfilter
 from vslam.features import Features
 from vslam.frontend import pnp
+from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.orb import scale_factors
 from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracking import Frame, TrackingContext
@@ -179,6 +180,12 @@ def run_slam(config: Config, frames: int) -> None:
     slam.trajectory()
 
 
+def compile_depth() -> None:
+    """Depth of keypoints."""
+    depth, scale = np.ones((8, 8), np.float32), np.ones(1)
+    columns_of_depth(np.zeros((1, 2), np.float32), scale, depth, CAMERA, DepthConfig())
+
+
 def compile_insertion() -> None:
     """What inserting a keyframe needs, in tracking's time."""
     map_synthetic(1)
@@ -297,7 +304,7 @@ def compile_bundle_adjustment() -> None:
 # The second starts with what it needs alone: when it comes to insert keyframes, the kernels for
 # that are in the cache, because the first starts with them.
 COMPILE_SHARES: dict[str, tuple[Callable[[], None], ...]] = {
-    "first": (compile_insertion, compile_tracking, compile_recognition),
+    "first": (compile_insertion, compile_tracking, compile_depth, compile_recognition),
     "second": (
         compile_bundle_adjustment,
         compile_local_mapping,
@@ -307,6 +314,7 @@ COMPILE_SHARES: dict[str, tuple[Callable[[], None], ...]] = {
 }
 EVERYTHING: tuple[Callable[[], None], ...] = (
     run_everything,
+    compile_depth,
     compile_recognition,
     compile_learned_matching,
     compile_correction,

@@ -1,0 +1,138 @@
+"""A loop detector of another package, watched: what it gives back is checked before it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.config import Config
+from vslam.errors import InputError
+from vslam.features import Features
+from vslam.loopclosure.detector import LoopDetector
+from vslam.loops import DetectorMemory, LoopCandidate
+from vslam.map import Map
+from vslam.plugins import PlugIn
+
+_METHODS = ("add", "query", "locate")
+
+
+class PlugInDetector:
+    """See `LoopDetector`. After its first failure the detector is asked no more.
+
+    Attributes:
+        problem: what failed, in one sentence, or None: the run ends then, with what it has.
+    """
+
+    def __init__(self, plugin: PlugIn, detector: LoopDetector) -> None:
+        self.name = plugin.name
+        self.problem: str | None = None
+        self._plugin = plugin
+        self._detector = detector
+
+    def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
+        self._ask(self._detector.add, keyframe, _read_only(image), features)
+
+    def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
+        return self._candidates(keyframe, map_, self._detector.query, keyframe, map_)
+
+    def locate(
+        self, image: NDArray[np.uint8] | None, features: Features, map_: Map
+    ) -> list[LoopCandidate]:
+        return self._candidates(-1, map_, self._detector.locate, _read_only(image), features, map_)
+
+    def memory(self) -> DetectorMemory:
+        """What the package gives for a map file; the bare name if it gives nothing."""
+        bare = DetectorMemory(self.name)
+        if not callable(getattr(self._detector, "memory", None)):
+            return bare
+        found = self._ask(self._detector.memory)
+        if found is None and self.problem is not None:
+            return bare
+        if not isinstance(found, DetectorMemory):
+            self.problem = (
+                f"{self._plugin}: memory gave {type(found).__name__}, no DetectorMemory; repair "
+                "the package"
+            )
+            return bare
+        return replace(found, name=self.name)
+
+    def restore(self, memory: DetectorMemory) -> None:
+        """See `LoopDetector`.
+
+        Raises:
+            ValueError: the package cannot: it has no such method, or it fails.
+        """
+        if memory.name != self.name:
+            raise ValueError(f"made with the detector {memory.name}, not {self.name}")
+        if not callable(getattr(self._detector, "restore", None)):
+            raise ValueError(f"{self._plugin} has no restore: it cannot go on in a map")
+        self._ask(self._detector.restore, memory)
+        if self.problem is not None:
+            raise ValueError(self.problem)
+
+    def _ask(self, method: Callable[..., Any], *arguments: object) -> Any:
+        """What a method gives back, None once the detector has failed."""
+        if self.problem is not None:
+            return None
+        try:
+            return self._plugin.guarded(method, *arguments)
+        except InputError as error:
+            self.problem = str(error).rstrip(".")
+            return None
+
+    def _candidates(
+        self, query: int, map_: Map, method: Callable[..., Any], *arguments: object
+    ) -> list[LoopCandidate]:
+        found = self._ask(method, *arguments)
+        if found is None and self.problem is not None:
+            return []
+        wrong = _wrong(found, query, map_)
+        if wrong:
+            self.problem = f"{self._plugin}: {method.__name__} {wrong}; repair the package"
+            return []
+        return list(found)
+
+
+def open_plugin(plugin: PlugIn, config: Config, weights: Path | None) -> PlugInDetector:
+    """Make a detector that remembers nothing yet.
+
+    Raises:
+        InputError: the package is broken, or what it makes is no detector.
+    """
+    made = plugin.call(config, weights)
+    missing = [name for name in _METHODS if not callable(getattr(made, name, None))]
+    if missing:
+        raise InputError(
+            f"{plugin}: {type(made).__name__} has no method {' nor '.join(missing)}; repair or "
+            "uninstall the package."
+        )
+    return PlugInDetector(plugin, made)
+
+
+def _wrong(found: object, query: int, map_: Map) -> str:
+    """What is wrong with candidates; empty if nothing is. Kernels trust these numbers."""
+    if not isinstance(found, (list, tuple)):
+        return f"gave {type(found).__name__}, no list"
+    for candidate in found:
+        if not isinstance(candidate, LoopCandidate):
+            return f"gave {type(candidate).__name__} in its list, no LoopCandidate"
+        if candidate.query != query or not isfinite(candidate.score):
+            return f"gave query {candidate.query} with score {candidate.score} for keyframe {query}"
+        inside = 0 <= candidate.match < map_.n_keyframes
+        if not inside or not map_.arrays.keyframe_alive[candidate.match]:
+            return f"gave keyframe {candidate.match}, which the map does not have"
+    return ""
+
+
+def _read_only(image: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
+    if image is None:
+        return None
+    view = image.view()
+    view.flags.writeable = False
+    return view

@@ -1,0 +1,183 @@
+"""Depth out of bags and folders: the same frames give the same run, whatever holds them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import StereoSequence, corridor_depth
+from source_files import run_source, write_bag, write_calibration, write_images
+
+from vslam.camera import Camera
+from vslam.datasets.depth_images import DepthFiles
+from vslam.datasets.detection import detect_dataset
+from vslam.datasets.rectified import RectifiedSequence
+from vslam.datasets.sources import SourceOptions, open_source
+from vslam.datasets.stream import timed_frames
+from vslam.errors import InputError
+
+FRAMES = 8
+COLOUR, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"
+NAMES = [f"{k}.png" for k in range(FRAMES)]
+STAMPS = [k * 10**8 for k in range(FRAMES)]
+
+
+@pytest.fixture(scope="module")
+def depths(corridor: StereoSequence) -> list[np.ndarray]:
+    """Millimetres, 0 where there is sky."""
+    poses = corridor.T_wc[:FRAMES]
+    metres = [corridor_depth(corridor.camera, T_wc) for T_wc in poses]
+    return [np.rint(1000 * m).clip(0, 65535).astype(np.uint16) for m in metres]
+
+
+@pytest.fixture(scope="module")
+def calib(corridor, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("calib") / "left.yaml"
+    return with_baseline(write_calibration(path, corridor.camera, mono=True), corridor.camera)
+
+
+def with_baseline(path: Path, camera: Camera, more: str = "") -> Path:
+    """A calibration with the virtual baseline of the camera."""
+    path.write_text(f'{path.read_text()[:-1]}, "virtual_baseline": {camera.baseline}{more}}}')
+    return path
+
+
+@pytest.fixture(scope="module")
+def folders(corridor, depths, tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("folders")
+    return write_images(root, {"rgb": corridor.left[:FRAMES], "depth": depths}, NAMES)
+
+
+def opened(data: Path, calib: Path | None = None, **options):
+    sensor = options.pop("sensor", None)
+    given = SourceOptions(() if calib is None else (calib,), **options)
+    return open_source(detect_dataset(str(data)), str(data), None, given, sensor=sensor)
+
+
+def refused(match: str, data: Path, calib: Path, **options):
+    with pytest.raises(InputError, match=match) as caught:
+        opened(data, calib, **options)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).endswith(".")
+
+
+@pytest.fixture(scope="module")
+def expected(folders, calib, corridor, depths):
+    source = opened(folders, calib, fps=10.0, depth_scale=1000.0)
+    assert source.camera == replace(corridor.camera, depth=True)
+    for k in range(FRAMES):
+        left, depth = source.read(k)
+        assert np.array_equal(left, corridor.left[k])
+        assert np.array_equal(depth, depths[k] * np.float32(0.001))
+    outcome = run_source(source)
+    assert all(track.state == "OK" for track in outcome.tracks)
+    return outcome
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1", "16UC1 png"])
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_a_bag_gives_the_trajectory_of_the_folders(
+    corridor, depths, calib, expected, tmp_path, kind, encoding
+):
+    sides = {COLOUR: corridor.left[:FRAMES], DEPTH: depths}
+    late = {"depth_encoding": encoding, "lag": 12_000_000, "padding": 4}
+    source = opened(write_bag(tmp_path / "a.bag", kind, sides, STAMPS, **late), calib)
+    assert source.camera == expected.sequence.camera
+    outcome = run_source(source)
+    assert outcome.trajectory.timestamps.tobytes() == expected.trajectory.timestamps.tobytes()
+    assert outcome.trajectory.T_wc.tobytes() == expected.trajectory.T_wc.tobytes()
+
+
+def test_compressed_inverse_depth(corridor, depths, calib, tmp_path):
+    sides = {COLOUR: corridor.left[:2], DEPTH: depths[:2]}
+    bag = write_bag(tmp_path / "a.bag", "ros1", sides, STAMPS[:2], depth_encoding="32FC1 png")
+    first = next(iter(timed_frames(opened(bag, calib))))
+    found = first.read(map)[1]
+    true = depths[0] / 1000.0
+    assert np.array_equal(found > 0, true > 0)
+    # Half a step of 500 / z - 3: an error of z^2 / 1000.
+    assert (abs(found - true) <= 1.01e-3 * true**2 + 1e-6).all()
+
+
+def test_a_scale_comes_before_that_of_the_encoding(corridor, depths, calib, tmp_path):
+    sides = {COLOUR: corridor.left[:2], DEPTH: depths[:2]}
+    bag = write_bag(tmp_path / "a.bag", "ros1", sides, STAMPS[:2])
+    first = next(iter(timed_frames(opened(bag, calib, depth_scale=500.0))))
+    np.testing.assert_allclose(first.read(map)[1], depths[0] / 500.0, rtol=1e-6)
+
+
+def test_the_camera_info_of_the_images_is_enough(corridor, depths, tmp_path):
+    sides = {COLOUR: corridor.left[:2], DEPTH: depths[:2]}
+    bag = write_bag(tmp_path / "a.bag", "ros1", sides, STAMPS[:2], camera=corridor.camera)
+    assert opened(bag).camera == replace(corridor.camera, baseline=0.08, depth=True)
+    assert opened(bag, sensor="mono").camera == corridor.camera.left_camera()
+
+
+def test_each_image_gets_the_nearest_depth(corridor, depths, calib, tmp_path):
+    """A Kinect's: depth at 30 Hz, 18 ms before and 15 ms after the images."""
+    stamps = [k * 33_000_000 for k in range(FRAMES)]
+    sides = {DEPTH: depths, COLOUR: corridor.left[:FRAMES]}
+    bag = write_bag(tmp_path / "a.bag", "ros1", sides, stamps, lag=18_000_000)
+    frames = list(timed_frames(opened(bag, calib)))
+    assert len(frames) == FRAMES - 1  # each takes the depth behind it, so that the last has none
+    for k, frame in enumerate(frames):
+        assert np.array_equal(frame.read(map)[1], depths[k + 1] * np.float32(0.001))
+
+
+def test_topics_of_bags_with_depth(corridor, depths, calib, tmp_path):
+    two, small = {COLOUR: corridor.left[:2], DEPTH: depths[:2]}, [d[:80] for d in depths[:2]]
+    more = {"/infra/image_raw": corridor.right[:2]}
+    bag = write_bag(tmp_path / "more.bag", "ros1", two | more, STAMPS[:2])
+    assert not opened(bag, calib, topics=(COLOUR,), sensor="mono").camera.depth
+    assert opened(bag, calib, topics=(COLOUR, DEPTH)).camera.depth
+    refused("choose with --topics COLOUR,DEPTH; image topics are", bag, calib, sensor="rgbd")
+    refused(f"{DEPTH} holds depth; name the images first", bag, calib, topics=(DEPTH, COLOUR))
+    refused("encoding 'mono8' is no depth; known are 16UC1", bag, calib,
+            topics=(COLOUR, "/infra/image_raw"), sensor="rgbd")  # fmt: skip
+    other = write_bag(tmp_path / "s.bag", "ros1", {**two, DEPTH: small}, STAMPS[:2])
+    refused("depth of 480x80 pixels in .* images of 480x160 in .* registered", other, calib)
+    alone = write_bag(tmp_path / "d.bag", "ros1", {DEPTH: depths[:2]}, STAMPS[:2])
+    refused("stereo needs two image topics; image topics are /camera/aligned", alone, calib)
+
+
+def test_folders_by_option_and_by_times(corridor, depths, calib, folders, tmp_path):
+    times = [1403636579.76 + 0.1 * k for k in range(3)]
+    write_images(tmp_path, {"a": corridor.left[:3]}, [f"{t:.6f}.png" for t in times])
+    # The second depth image is missing: by order, each would get the next one's.
+    late = [f"{t + 0.008:.6f}.png" for t in (times[0], times[2])]
+    write_images(tmp_path, {"b": [depths[0], depths[2]]}, late)
+    source = opened(tmp_path / "a", calib, depth=tmp_path / "b", depth_scale=1000.0)
+    np.testing.assert_allclose(source.timestamps, [times[0], times[2]])
+    assert np.array_equal(source.read(1)[1], depths[2] * np.float32(0.001))
+    assert np.array_equal(source.read(1)[0], corridor.left[2])
+    alone = opened(folders, calib, fps=10.0, sensor="mono")
+    assert alone.read(0)[1] is None
+
+
+def test_a_scale_out_of_the_calibration(folders, corridor, tmp_path):
+    path = write_calibration(tmp_path / "c.yaml", corridor.camera, mono=True)
+    source = opened(
+        folders, with_baseline(path, corridor.camera, ', "depth_scale": 1000'), fps=10.0
+    )
+    assert isinstance(source, RectifiedSequence)
+    assert isinstance(source.raw, DepthFiles)
+    assert (source.raw.depth_scale, source.camera.baseline) == (1000.0, corridor.camera.baseline)
+
+
+def test_bad_folders_with_depth(corridor, depths, calib, folders, tmp_path):
+    refused("what depth images count in a metre is not known; give --depth-scale", folders, calib,
+            fps=10.0)  # fmt: skip
+    options = {"fps": 10.0, "depth_scale": 1000.0}
+    both = {"right": folders / "rgb", "depth": folders / "depth"}
+    refused("--depth .*: of no use with --right", folders / "rgb", calib, **both, **options)
+    write_images(tmp_path, {"rgb": corridor.left[:3]}, NAMES[:3])
+    write_images(tmp_path, {"depth": depths[:2]}, NAMES[:2])
+    refused("2 images but 3 in .* 2 on one side only", tmp_path, calib, **options)
+    write_images(tmp_path, {"depth": [depths[0][:80], *depths[1:3]]}, NAMES[:3])
+    refused("depth of 480x80 pixels but the colour image has 480x160", tmp_path, calib, **options)
+    grey = cv2.convertScaleAbs(depths[0], alpha=0.01)
+    write_images(tmp_path, {"depth": [grey, *depths[1:3]]}, NAMES[:3])
+    refused("depth of 8 bits and 1 channels", tmp_path, calib, **options)

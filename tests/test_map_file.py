@@ -1,0 +1,412 @@
+"""Map files: complete, whole or not there, read in a second, and trusted in nothing."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import pickle
+import time
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ring import CAMERA, Ring
+
+from vslam.config import Config, OrbConfig
+from vslam.errors import InputError
+from vslam.features import Features
+from vslam.geometry import se3_exp
+from vslam.loopclosure.bow import BowDetector
+from vslam.loopclosure.registry import create_detector
+from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe
+from vslam.map import Map
+from vslam.map_kernels import link_many, refresh_landmarks
+from vslam.maps import new_output
+from vslam.maps.storage import load_map, save_map
+from vslam.maps.stored_map import StoredMap, World
+from vslam.slam import Slam
+
+CONFIG = Config()
+
+
+def driven(slam: Slam, ring: Ring, places, start: float = 0.0) -> Slam:
+    """Drive along the ring at ten frames a second."""
+    for i, k in enumerate(places):
+        slam.step_features(ring.see(k, seed=int(start)), start + 0.1 * i)
+    slam.finish()
+    return slam
+
+
+@pytest.fixture(scope="module")
+def ring() -> Ring:
+    return Ring.create()
+
+
+@pytest.fixture(scope="module")
+def slam(ring) -> Slam:
+    """Half a lap, one keyframe of it culled."""
+    done = driven(Slam(CAMERA, CONFIG, create_detector("bow", CONFIG), threads=1), ring, range(100))
+    assert len(done.map.living_keyframes()) < done.map.n_keyframes
+    return done
+
+
+@pytest.fixture(scope="module")
+def file(slam, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("maps") / "ring.npz"
+    slam.save(path, "ring 0")
+    return path
+
+
+def changed(file: Path, to: Path, **arrays: np.ndarray) -> Path:
+    """The file with some of its arrays replaced, None to leave one out."""
+    with np.load(file) as before:
+        data = {name: before[name] for name in before.files}
+    data |= arrays
+    np.savez(to, **{name: array for name, array in data.items() if array is not None})
+    return to
+
+
+def header_of(file: Path) -> dict:
+    with np.load(file) as data:
+        return json.loads(bytes(data["header"]))
+
+
+def as_header(header: dict) -> np.ndarray:
+    return np.frombuffer(json.dumps(header).encode(), np.uint8)
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(InputError) as stop:
+        load_map(path)
+    message = str(stop.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message
+
+
+def test_all_of_a_map_comes_back(slam, file, check_map):
+    before, after = slam.map, load_map(file).map
+    check_map(after)
+    keyframes, landmarks = before.living_keyframes(), before.living_landmarks()
+    a, b = before.arrays, after.arrays
+    n, m = after.n_keyframes, after.n_landmarks
+    assert (n, m) == (len(keyframes), len(landmarks))
+    assert np.array_equal(b.T_cw[:n], a.T_cw[keyframes])
+    assert after.timestamps == [before.timestamps[k] for k in keyframes]
+    assert after.frames == [before.frames[k] for k in keyframes]
+    for k in range(n):
+        old, new = before.rows(keyframes[k]), after.rows(k)
+        for name in ("xy", "u_right", "octave", "angle", "descriptor"):
+            assert np.array_equal(getattr(a, name)[old], getattr(b, name)[new], equal_nan=True)
+        # Both see the same points from there, each of them with all that is known of it.
+        ids, same = a.landmark[old], b.landmark[new]
+        assert np.array_equal(ids >= 0, same >= 0)
+        ids, same = ids[ids >= 0], same[same >= 0]
+        for name in (
+            "xyz", "normal", "distance_range", "landmark_descriptor", "visible", "found",
+            "n_observations",
+        ):  # fmt: skip
+            assert np.array_equal(getattr(a, name)[ids], getattr(b, name)[same])
+    assert (np.diff(b.first_keyframe[:m]) >= 0).all()
+    parents = np.array(before.parents)[keyframes]
+    assert np.array_equal(keyframes[np.array(after.parents)[1:]], parents[1:])
+
+
+def test_observations_keep_their_order(slam, file):
+    """The newest ones vote on the descriptor of a landmark."""
+    before, after = slam.map, load_map(file).map
+    keyframe = int(before.living_keyframes()[5])
+    old = before.landmarks_of(keyframe)
+    new = after.arrays.landmark[after.rows(5)]
+    new = new[new >= 0]
+    for map_, ids in ((before, old), (after, new)):
+        refresh_landmarks(map_.arrays, ids.astype(np.int32), map_.scales)
+    a, b = before.arrays, after.arrays
+    assert np.array_equal(a.landmark_descriptor[old], b.landmark_descriptor[new])
+
+
+def test_the_same_map_gives_the_same_bytes(file, tmp_path):
+    save_map(tmp_path / "again.npz", load_map(file))
+    assert (tmp_path / "again.npz").read_bytes() == file.read_bytes()
+
+
+def test_frames_placed_by_culled_keyframes_stay_where_they_are(slam, file):
+    before = slam.trajectory()
+    after = Slam.load(file, threads=1, resume=True).trajectory()
+    assert np.array_equal(after.timestamps, before.timestamps)
+    np.testing.assert_allclose(after.T_wc, before.T_wc, atol=1e-9)
+
+
+def test_loops_images_drives_and_world_come_back(slam, tmp_path):
+    living = slam.map.living_keyframes().tolist()
+    culled = next(k for k in range(slam.map.n_keyframes) if k not in living)
+    T = se3_exp(np.array([0.5, 0.0, 1.0, 0.0, 0.1, 0.0]))
+    loop = LoopEdge(living[-1], culled, 0.25, True, "closed", 90, 60, T, scale=1.5)
+    first = np.arange(slam.map.n_keyframes + 1)
+    images = PerKeyframe(first, np.arange(slam.map.n_keyframes, dtype=np.uint8))
+    world = World("kitti 06", np.diag([2.0, 2.0, 2.0, 1.0]))
+    stored = replace(slam.stored_map("x"), loops=(loop,), images=images, world=world)
+    save_map(tmp_path / "m.npz", stored)
+    found = load_map(tmp_path / "m.npz")
+    (edge,) = found.loops
+    parent = slam.map.parents[culled]
+    assert (edge.query, edge.match) == (len(living) - 1, living.index(parent))
+    assert (edge.score, edge.n_matches, edge.n_inliers, edge.scale) == (0.25, 90, 60, 1.5)
+    np.testing.assert_allclose(edge.T_query_match, T @ slam.map.T_c_parent[culled], atol=1e-9)
+    assert found.images is not None
+    assert found.images.values.tolist() == living
+    assert found.drives == ("x",)
+    assert found.world is not None
+    assert found.world.name == "kitti 06"
+    assert np.array_equal(found.world.S_truth_world, world.S_truth_world)
+
+
+def test_what_the_detector_knew_comes_back(slam, file, ring):
+    """Words need not be looked up again: the same candidates with the same scores."""
+    again = create_detector("bow", CONFIG)
+    stored = load_map(file)
+    again.restore(stored.detector)
+    fresh = create_detector("bow", CONFIG)
+    map_ = stored.map
+    for k in range(map_.n_keyframes):
+        rows, a = map_.rows(k), map_.arrays
+        descriptors = a.descriptor[rows].view(np.uint8)
+        fresh.add(
+            k,
+            None,
+            Features(a.xy[rows], a.octave[rows], a.angle[rows], descriptors, a.u_right[rows]),
+        )
+    seen = ring.see(40, seed=3)
+    assert again.locate(None, seen, map_)
+    assert again.locate(None, seen, map_) == fresh.locate(None, seen, map_)
+    last = map_.n_keyframes - 1
+    assert again.query(last, map_) == fresh.query(last, map_)
+
+
+def test_a_restart_that_was_culled_still_begins_its_submap(slam):
+    map_ = load_and_restart(slam)
+    selected = StoredMap(map_, CAMERA).compact().map
+    assert selected.restarts == [int(np.searchsorted(map_.living_keyframes(), map_.restarts[0]))]
+    assert selected.unpredicted_restarts == selected.restarts
+
+
+def load_and_restart(slam: Slam) -> Map:
+    map_ = slam.stored_map().compact().map
+    map_.restarts, map_.unpredicted_restarts = [9], [9]
+    map_.cull_keyframe(9)
+    return map_
+
+
+def test_a_part_of_a_map_is_a_map(slam, check_map):
+    stored = slam.stored_map().compact()
+    kept = np.array([3, 4, 5, 11, 12, 13])
+    part = stored.select(kept)
+    check_map(part.map)
+    assert part.frames is None
+    assert part.map.n_keyframes == 6
+    assert np.array_equal(part.map.arrays.T_cw[:6], stored.map.arrays.T_cw[kept])
+    seen = [set(stored.map.landmarks_of(int(k)).tolist()) for k in kept]
+    assert part.map.n_landmarks == len(set.union(*seen))
+    assert all(parent < k for k, parent in enumerate(part.map.parents))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.5, 0.9, 0.999])
+def test_a_file_cut_off_is_refused(file, tmp_path, share):
+    cut = tmp_path / "cut.npz"
+    cut.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    assert "damaged" in refusal(cut) or "not a map" in refusal(cut)
+
+
+def test_flipped_bytes_never_load_as_another_map(file, tmp_path):
+    content, rng = bytearray(file.read_bytes()), np.random.default_rng(0)
+    same = load_map(file).map.arrays
+    for position in rng.integers(0, len(content), 60):
+        damaged = content.copy()
+        damaged[position] ^= 1 << int(rng.integers(8))
+        path = tmp_path / "flipped.npz"
+        path.write_bytes(damaged)
+        with suppress(InputError):  # else it was in what a zip file says twice
+            found = load_map(path).map.arrays
+            assert np.array_equal(found.xyz, same.xyz)
+            assert np.array_equal(found.T_cw, same.T_cw)
+
+
+def test_foreign_files_are_refused(tmp_path):
+    path = tmp_path / "m.npz"
+    assert "No such file" in refusal(path)
+    assert "directory" in refusal(tmp_path)
+    path.write_text("not a map")
+    assert "not a map" in refusal(path)
+    np.savez(path, a=np.zeros(3))
+    assert "not a map" in refusal(path)
+    with path.open("wb") as out:
+        np.save(out, np.zeros(3))
+    assert "not a map" in refusal(path)
+    path.write_bytes(pickle.dumps({"schema": 2}))
+    assert "not a map" in refusal(path)
+    np.savez(path, header=np.array([{"kind": "vslam map"}], object), allow_pickle=True)
+    assert "not a map" in refusal(path)
+    np.savez(path, header=as_header({"kind": "vslam map"})[:-3])
+    assert "not a map" in refusal(path)
+
+
+def test_other_schemas_are_named(file, tmp_path):
+    newer = as_header(header_of(file) | {"schema": 3})
+    assert "schema 3, this version reads 2" in refusal(
+        changed(file, tmp_path / "n.npz", header=newer)
+    )
+    old = tmp_path / "old.npz"
+    np.savez(old, schema=1, keyframe_first_row=np.zeros(1, np.int64))
+    assert "schema 1, this version reads 2; run again" in refusal(old)
+
+
+def damage(name: str, position: tuple[int, ...], value: float):
+    def apply(file: Path, to: Path) -> Path:
+        with np.load(file) as data:
+            array = data[name].copy()
+        array[position] = value
+        return changed(file, to, **{name: array})
+
+    return pytest.param(apply, id=f"{name}-{value}")
+
+
+@pytest.mark.parametrize(
+    "apply",
+    [
+        damage("keyframe_T_cw", (2, 0, 3), np.nan),
+        damage("keyframe_T_cw", (2, 0, 0), 5.0),
+        damage("keyframe_T_cw", (2, 3, 0), 1.0),
+        damage("keyframe_first_row", (3,), 10**9),
+        damage("keyframe_first_row", (0,), 1),
+        damage("keyframe_parent", (4,), 4),
+        damage("keyframe_parent", (4,), -1),
+        damage("keyframe_timestamp", (1,), np.inf),
+        damage("keyframe_unit_scale", (1,), 0.0),
+        damage("landmark_xyz", (7, 1), np.nan),
+        damage("landmark_first_keyframe", (-1,), 10**6),
+        damage("landmark_first_keyframe", (5,), -1),
+        damage("landmark_first_observation", (3,), 0),
+        damage("observation_row", (3,), -1),
+        damage("observation_row", (3,), 10**8),
+        damage("row_octave", (5,), 200),
+        damage("row_u_right", (5,), np.inf),
+        damage("scales", (1,), 0.5),
+        damage("frame_reference", (2,), 10**6),
+        damage("frame_timestamp", (2,), -1.0),
+        damage("detector_words_first", (2,), 10**9),
+    ],
+)
+def test_damage_by_hand_is_refused(apply, file, tmp_path):
+    assert "damaged" in refusal(apply(file, tmp_path / "hand.npz"))
+
+
+def test_observations_that_contradict_each_other_are_refused(file, tmp_path):
+    with np.load(file) as data:
+        rows, first = data["observation_row"].copy(), data["landmark_first_observation"]
+    rows[1] = rows[0]
+    path = tmp_path / "m.npz"
+    assert "two landmarks" in refusal(changed(file, path, observation_row=rows))
+    with np.load(file) as data:
+        rows, starts = data["observation_row"].copy(), data["keyframe_first_row"]
+    free = np.setdiff1d(np.arange(starts[1]), rows)[0]
+    several = int(np.flatnonzero(np.diff(first) > 1)[0])
+    keyframe_of = np.searchsorted(starts, rows, side="right") - 1
+    here = slice(first[several], first[several + 1])
+    assert 0 in keyframe_of[here]
+    other = first[several] + int(np.flatnonzero(keyframe_of[here] != 0)[0])
+    rows[other] = free
+    assert "a landmark twice" in refusal(changed(file, path, observation_row=rows))
+
+
+@pytest.mark.parametrize("name", ["keyframe_T_cw", "row_descriptor", "frame_tracked", "loop_ends"])
+def test_arrays_that_lack_or_are_of_another_kind_are_refused(file, tmp_path, name):
+    path = tmp_path / "m.npz"
+    assert name in refusal(changed(file, path, **{name: None}))
+    with np.load(file) as data:
+        array = data[name]
+    assert name in refusal(changed(file, path, **{name: array.astype(np.complex128)}))
+    assert name in refusal(changed(file, path, **{name: array[..., None]}))
+    if array.ndim > 1 and array.size:
+        assert name in refusal(changed(file, path, **{name: np.asfortranarray(array)}))
+
+
+def test_headers_that_lack_something_are_refused(file, tmp_path):
+    header = header_of(file)
+    for name in ("camera", "detector", "session", "images", "drives"):
+        less = {key: value for key, value in header.items() if key != name}
+        assert name in refusal(changed(file, tmp_path / "m.npz", header=as_header(less)))
+    no_camera = as_header(header | {"camera": header["camera"] | {"fx": -1.0}})
+    assert "camera" in refusal(changed(file, tmp_path / "m.npz", header=no_camera))
+
+
+def test_a_full_disk_leaves_the_file_that_was_there(slam, file, tmp_path, monkeypatch):
+    path = tmp_path / "m.npz"
+    path.write_bytes(file.read_bytes())
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(new_output.os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        slam.save(path)
+    assert path.read_bytes() == file.read_bytes()
+    assert os.listdir(tmp_path) == ["m.npz"]
+
+
+def test_a_map_of_something_else_is_refused(file, tmp_path):
+    with pytest.raises(InputError, match="made with the detector bow, not none"):
+        Slam.load(file, detector=create_detector("none", CONFIG))
+    with pytest.raises(InputError, match=r"another pyramid, of 8 levels by 1\.2"):
+        Slam.load(file, Config(orb=OrbConfig(n_levels=4)))
+    header = header_of(file)
+    header["detector"]["fingerprint"] = "0" * 16
+    other = changed(file, tmp_path / "other.npz", header=as_header(header))
+    with pytest.raises(InputError, match="another vocabulary or other weights of bow"):
+        Slam.load(other)
+    with np.load(file) as data:
+        words = data["detector_words_values"].copy()
+    words[3] = 10**7
+    other = changed(file, tmp_path / "words.npz", detector_words_values=words)
+    with pytest.raises(InputError, match=r"words.npz: the words of the keyframes are not"):
+        Slam.load(other)
+
+
+def test_an_empty_map_is_a_map(tmp_path):
+    path = tmp_path / "empty.npz"
+    Slam(CAMERA, threads=1).save(path)
+    assert load_map(path).map.n_keyframes == 0
+    with pytest.raises(InputError, match="no map to localise in"):
+        Slam.load(path, localize=True)
+
+
+def test_a_thousand_keyframes_are_there_in_a_second(tmp_path):
+    """Of 2,000 features each, words included: seconds of the processor, not of a busy machine."""
+    rng = np.random.default_rng(0)
+    n, per = 1000, 2000
+    map_ = Map(1.2 ** np.arange(8))
+    descriptors = rng.integers(0, 256, (per, 32), dtype=np.uint8)
+    xy = rng.uniform(0, 300, (per, 2)).astype(np.float32)
+    features = Features(
+        xy, np.zeros(per, np.uint8), np.zeros(per, np.float32), descriptors, xy[:, 0] - 4
+    )
+    ids = map_.add_landmarks(rng.normal(size=(100_000, 3)), np.zeros((100_000, 4), np.uint64), 0)
+    for k in range(n):
+        map_.add_keyframe(features, np.eye(4), 0.1 * k, k)
+        map_.parents[k] = k - 1
+        seen = (100 * k + np.arange(800)) % len(ids)
+        link_many(map_.arrays, map_.rows(k).start + np.arange(800), ids[seen])
+    vocabulary = BowDetector(create_detector("bow", CONFIG).vocabulary)
+    first = per * np.arange(n + 1)
+    words = rng.integers(0, vocabulary.vocabulary.n_words, n * per).astype(np.int32)
+    memory = DetectorMemory(
+        "bow", vocabulary.memory().fingerprint, {"words": PerKeyframe(first, words)}
+    )
+    save_map(tmp_path / "large.npz", StoredMap(map_, CAMERA, detector=memory))
+    load_map(tmp_path / "large.npz")
+    start = time.process_time()
+    found = load_map(tmp_path / "large.npz")
+    assert time.process_time() - start < 1.0
+    assert found.map.n_keyframes == n

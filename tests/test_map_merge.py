@@ -1,0 +1,228 @@
+"""Maps of several drives made one, and parts of maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ring import CAMERA, LAP, Ring
+from typer.testing import CliRunner
+
+from vslam.camera import Camera
+from vslam.cli.main import app
+from vslam.config import Config
+from vslam.errors import InputError
+from vslam.geometry import inverse, inverses
+from vslam.loopclosure.registry import create_detector
+from vslam.maps.crop import in_box, near_frames, near_point
+from vslam.maps.storage import load_map, save_map
+from vslam.maps.stored_map import StoredMap, appended
+from vslam.merging import merge_maps
+from vslam.slam import Slam
+
+CONFIG = Config()
+
+
+def driven(ring: Ring, places: range, seed: int) -> StoredMap:
+    slam = Slam(CAMERA, CONFIG, create_detector("bow", CONFIG), threads=1)
+    for i, k in enumerate(places):
+        slam.step_features(ring.see(k, seed), 0.1 * i)
+    slam.finish()
+    return slam.stored_map(f"ring {places.start}").compact()
+
+
+@pytest.fixture(scope="module")
+def ring() -> Ring:
+    return Ring.create()
+
+
+@pytest.fixture(scope="module")
+def drives(ring) -> list[StoredMap]:
+    """The first meets the third, the third the second; each has a world of its own."""
+    parts = (range(80), range(110, 180), range(55, 130))
+    return [driven(ring, part, seed) for seed, part in enumerate(parts)]
+
+
+@pytest.fixture(scope="module")
+def elsewhere() -> StoredMap:
+    return driven(Ring.create(seed=5), range(60), 9)
+
+
+def create():
+    return create_detector("bow", CONFIG), None
+
+
+def frames_of(drives: list[StoredMap], starts: list[int]) -> list[np.ndarray]:
+    return [start + np.array(drive.map.frames) for drive, start in zip(drives, starts, strict=True)]
+
+
+def errors(map_, ring: Ring, starts: list[int]) -> np.ndarray:
+    """Metres from each keyframe to where it was, in the world of the first."""
+    places = [starts[s] + f for s, f in zip(map_.sessions, map_.frames, strict=True)]
+    true = np.array([inverse(ring.pose(starts[0])) @ ring.pose(k) for k in places])
+    T_wc = inverses(map_.arrays.T_cw[: map_.n_keyframes])
+    return np.linalg.norm(T_wc[:, :3, 3] - true[:, :3, 3], axis=1)
+
+
+def test_an_appended_map_is_as_it_was(drives, check_map):
+    one, other = drives[0], drives[1]
+    both = appended(one, other)
+    check_map(both.map)
+    n, k = one.map.n_keyframes, 7
+    assert both.map.restarts == both.map.unpredicted_restarts == [n]
+    assert both.map.n_keyframes == n + other.map.n_keyframes
+    assert np.array_equal(both.map.arrays.T_cw[n + k], other.map.arrays.T_cw[k])
+    seen, before = both.map.landmarks_of(n + k), other.map.landmarks_of(k)
+    assert np.array_equal(both.map.arrays.xyz[seen], other.map.arrays.xyz[before])
+    words = both.detector.tables["words"]
+    assert np.array_equal(words.of(n + k), other.detector.tables["words"].of(k))
+    assert both.map.sessions == [0] * n + [1] * other.map.n_keyframes
+    assert both.drives == ("ring 0", "ring 110")
+    # Each is in a part of its own until a loop joins them.
+    assert np.unique(both.map.submaps()).tolist() == [0, n]
+
+
+def test_drives_that_meet_become_one_map(drives, ring, check_map, tmp_path):
+    """The second one only by way of the third."""
+    merged = merge_maps(drives, CONFIG, create)
+    assert merged.joined == [2, 1]
+    assert merged.left_out == []
+    map_ = merged.stored.map
+    check_map(map_)
+    assert map_.n_keyframes == sum(drive.map.n_keyframes for drive in drives)
+    assert merged.stored.drives == ("ring 0", "ring 55", "ring 110")
+    alone = np.concatenate(
+        [
+            errors(drive.map, ring, [start])
+            for drive, start in zip(drives, (0, 110, 55), strict=True)
+        ]
+    )
+    assert alone.max() < 0.5
+    assert errors(map_, ring, [0, 55, 110]).max() < 1.0
+    # Keyframes of two drives see the same landmarks.
+    sessions = np.array(map_.sessions)
+    shared = [set(sessions[map_.covisible(k)[0]]) for k in range(map_.n_keyframes)]
+    assert any({0, 1} <= seen | {sessions[k]} for k, seen in enumerate(shared))
+    assert any({1, 2} <= seen | {sessions[k]} for k, seen in enumerate(shared))
+
+    # It is a map like any other: a camera is found in the parts of all three, or goes on in it.
+    save_map(tmp_path / "town.npz", merged.stored)
+    for place in (10, 90, 170):
+        slam = Slam.load(tmp_path / "town.npz", threads=1, localize=True)
+        assert slam.step_features(ring.see(place, seed=7), 0.0).relocalised
+        true = inverse(ring.pose(0)) @ ring.pose(place)
+        assert np.linalg.norm(slam.trajectory().T_wc[0, :3, 3] - true[:3, 3]) < 1.0
+
+
+def test_the_same_maps_give_the_same_map(drives, tmp_path):
+    for name in ("a", "b"):
+        save_map(tmp_path / name, merge_maps(drives[::2], CONFIG, create).stored)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_a_map_of_another_place_is_left_out(drives, elsewhere):
+    merged = merge_maps([drives[0], elsewhere, drives[2]], CONFIG, create)
+    assert merged.joined == [2]
+    assert merged.left_out == [1]
+    assert set(merged.stored.map.sessions) == {0, 1}
+
+
+def test_a_merged_map_is_merged_again(drives, ring):
+    first = merge_maps([drives[0], drives[2]], CONFIG, create).stored
+    merged = merge_maps([first, drives[1]], CONFIG, create)
+    assert merged.joined == [1]
+    assert errors(merged.stored.map, ring, [0, 55, 110]).max() < 1.0
+    assert len(merged.stored.loops) > len(first.loops)
+
+
+def test_maps_of_another_camera_or_detector_are_refused(drives):
+    camera = Camera(400.0, 400.0, 400.0, 150.0, 0.5, 800, 300)
+    with pytest.raises(ValueError, match="another camera"):
+        merge_maps([drives[0], StoredMap(drives[1].map, camera)], CONFIG, create)
+    with pytest.raises(ValueError, match="of the detector none, not bow"):
+        merge_maps([drives[0], StoredMap(drives[1].map, CAMERA)], CONFIG, create)
+
+
+# -- crop -----------------------------------------------------------------------------------------
+
+
+def test_crop_by_box_point_and_frames(drives):
+    map_ = drives[0].map
+    position = inverses(map_.arrays.T_cw[: map_.n_keyframes])[:, :3, 3]
+    x, z = position[:, 0], position[:, 2]
+    box = [x.min() - 1, x.max() + 1, 10.0, 30.0]
+    assert in_box(map_, box).tolist() == np.flatnonzero((z >= 10) & (z <= 30)).tolist()
+    distance = np.hypot(x - x[5], z - z[5])
+    assert near_point(map_, [x[5], z[5]], 12.0).tolist() == np.flatnonzero(distance <= 12).tolist()
+    first, last = map_.frames[4], map_.frames[6]
+    kept = near_frames(map_, 0, first, last, 1e-6)
+    assert kept.tolist() == [4, 5, 6]
+    assert len(near_frames(map_, 0, first, last, 8.0)) > 3
+    assert not len(near_frames(map_, 1, first, last, 8.0))
+
+
+# -- the command line -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def files(drives, elsewhere, tmp_path_factory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("maps")
+    for number, stored in enumerate([*drives, elsewhere]):
+        save_map(folder / f"{number}.npz", stored)
+    return [folder / f"{number}.npz" for number in range(4)]
+
+
+def run(*words: object):
+    return CliRunner().invoke(app, list(map(str, words)))
+
+
+def refusal(*words: object) -> str:
+    result = run(*words)
+    assert isinstance(result.exception, InputError), result.output
+    assert "\n" not in str(result.exception)
+    return str(result.exception)
+
+
+def test_merge_names_what_meets_and_what_does_not(files, tmp_path):
+    out = tmp_path / "town.npz"
+    result = run("map", "merge", files[0], files[3], files[2], "--out", out, "--quiet")
+    assert result.exit_code == 0, result.output
+    assert f"{files[2]}: joined by " in result.output
+    assert f"{files[3]}: left out" in result.output
+    assert load_map(out).drives == ("ring 0", "ring 55")
+    assert "drives        2: ring 0, ring 55" in run("map", "info", out).output
+
+
+def test_merge_of_maps_that_do_not_meet_writes_nothing(files, tmp_path):
+    result = run("map", "merge", files[0], files[3], "--out", tmp_path / "m.npz", "--quiet")
+    assert result.exit_code == 1
+    assert "nothing was written" in result.output
+    assert not list(tmp_path.iterdir())
+
+
+def test_crop_writes_a_map_to_localise_in(files, ring, tmp_path):
+    out = tmp_path / "part.npz"
+    words = ("map", "crop", files[0], "--frames", "30:60", "--within", "1", "--out", out)
+    assert run(*words).exit_code == 0
+    assert 5 < load_map(out).map.n_keyframes < load_map(files[0]).map.n_keyframes
+    slam = Slam.load(out, threads=1, localize=True)
+    assert slam.step_features(ring.see(45, seed=7), 0.0).relocalised
+    true = inverse(ring.pose(0)) @ ring.pose(45)
+    assert np.linalg.norm(slam.trajectory().T_wc[0, :3, 3] - true[:3, 3]) < 0.5
+
+
+def test_refusals(files, tmp_path):
+    out = ("--out", tmp_path / "m.npz")
+    assert "two or more" in refusal("map", "merge", files[0], *out)
+    assert "exists already" in refusal("map", "merge", *files[:2], "--out", files[2])
+    assert "cannot be read" in refusal("map", "merge", files[0], tmp_path / "gone", *out)
+    assert "name one of them" in refusal("map", "crop", files[0], *out)
+    assert "4 numbers" in refusal("map", "crop", files[0], "--box", "1,2,x", *out)
+    assert "no keyframe lies there" in refusal(
+        "map", "crop", files[0], "--point", "900,900", "--within", "5", *out
+    )
+    assert not (tmp_path / "m.npz").exists()
+
+
+assert LAP > 180  # the drives are parts of one lap

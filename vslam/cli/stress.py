@@ -1,0 +1,267 @@
+"""The command ``vslam stress``: at which strength of each law does a run fail."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Collection, Generator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from vslam.cli.bench import open_all, outcomes_of
+from vslam.cli.options import KITTI_ROOT, Data, Dataset, MaxFrames, Thresholds, names_in
+from vslam.errors import InputError
+
+if TYPE_CHECKING:
+    from vslam.bench.execute import CellOutcome
+    from vslam.bench.grid import Cell
+    from vslam.datasets.sequence import Sequence
+
+_EXAMPLES = """
+[b]Examples[/b]
+
+  vslam stress --data ~/kitti --seqs 00 --max-frames 216 --laws fog,rain,night --jobs 2
+
+  vslam stress --dataset synthetic --seqs demo --laws all --detectors bow,capsule,both
+
+  vslam stress --seqs 00 --systems vslam,orbslam3 --orbslam3-python ~/orb/bin/python \\
+      --vocabulary voc.txt
+
+  vslam stress --seqs 00 --preset kitti-c --baseline bow
+
+The same command again goes on where it was stopped. docs/stress.md tells more.
+"""
+_ORBSLAM3 = "orbslam3"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the application."""
+    app.command(epilog=_EXAMPLES)(stress)
+    app.command("foreign", hidden=True, context_settings={"allow_extra_args": True})(foreign)
+
+
+def stress(
+    dataset: Dataset = "kitti",
+    data: Data = KITTI_ROOT,
+    seqs: Annotated[str, typer.Option(help="Sequences, 00-05 or 00,demo for example.")] = "00",
+    laws: Annotated[
+        str, typer.Option(help="Laws without strengths, with commas, or [b]all[/b].")
+    ] = "all",
+    detectors: Annotated[str, typer.Option(help="Loop detectors of vslam, with commas.")] = "bow",
+    systems: Annotated[
+        str, typer.Option(help="[b]vslam[/b], [b]orbslam3[/b], names of --system, with commas.")
+    ] = "vslam",
+    system: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=COMMAND",
+            help="Another system: a command with {folder}, in KITTI's format, and {out}, see "
+            "docs/stress.md.",
+        ),
+    ] = None,
+    orbslam3_python: Annotated[
+        Path | None, typer.Option(help="Interpreter that has pyorbslam3.", show_default="this one")
+    ] = None,
+    vocabulary: Annotated[
+        Path | None, typer.Option(help="Vocabulary of ORB-SLAM3, DBoW2's text format.")
+    ] = None,
+    preset: Annotated[
+        Literal["kitti-c"] | None,
+        typer.Option(help="Fixed severities of a benchmark instead of --laws."),
+    ] = None,
+    baseline: Annotated[
+        str | None,
+        typer.Option(help="System that errors of a preset are set against.", show_default="first"),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Seeds of each random law.")] = 3,
+    steps: Annotated[int, typer.Option(min=1, max=10, help="Halvings of each bisection.")] = 5,
+    max_lost: Annotated[
+        float, typer.Option(min=0.0, help="Percent of the frames that may be lost.")
+    ] = 5.0,
+    ate_factor: Annotated[
+        float, typer.Option(min=1.0, help="Times the clean ATE that a run may have.")
+    ] = 3.0,
+    ate_least: Annotated[
+        float, typer.Option(min=0.0, help="Metres of ATE below which no run fails by it.")
+    ] = 0.25,
+    max_frames: MaxFrames = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 1,
+    threads: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Threads of each run.", show_default="cores for each job, up to 4"
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help="Dask scheduler, tcp://HOST:8786, whose workers run the cells."),
+    ] = None,
+    config: Thresholds = None,
+    out: Annotated[Path, typer.Option(help="Folder of the stress test.")] = Path("stress"),
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing while it runs.")] = False,
+) -> None:
+    """Find the strength of each perturbation at which a run fails, and report on it."""
+    from vslam.bench import execute
+    from vslam.bench.grid import parse_sequences
+    from vslam.cli.progress import announce
+    from vslam.config import Config, load_config
+    from vslam.datasets import open_sequence
+    from vslam.datasets.sources import SourceOptions
+    from vslam.loopclosure.registry import require_detector
+    from vslam.machine import available_cores
+    from vslam.stress.criterion import Criterion
+    from vslam.stress.plan import Plan, parse_laws
+    from vslam.stress.report import render_boundaries, write_report
+    from vslam.stress.run import Results, run_all
+    from vslam.stress.summary import summarise
+
+    others = _others(names_in(systems), system or [], orbslam3_python, vocabulary)
+    chosen = names_in(detectors) if "vslam" in names_in(systems) else []
+    for name in chosen:
+        require_detector(name, None, option="--detectors")
+    names, sequences = [*chosen, *others], parse_sequences(seqs)
+    if not names:
+        raise InputError("--systems: no system; name vslam, orbslam3 or one of --system.")
+    if baseline is not None and baseline not in names:
+        raise InputError(f"--baseline {baseline}: not tested; choose from {', '.join(names)}.")
+    thresholds = Config() if config is None else load_config(config)
+    out = out.absolute()
+    options = execute.RunOptions(
+        data=data.absolute() if dataset != "synthetic" else None,
+        config=thresholds.model_dump_json(indent=2) + "\n",
+        threads=threads or max(1, min(available_cores() // jobs, 4)),
+        scratch=None if scheduler else execute.scratch_folder(out),
+        others={name: _program(name, command) for name, command in others.items()},
+    )
+    _, identity = open_all(
+        dataset, data.absolute(), seqs, SourceOptions(), max_frames, None, shown=not quiet
+    )
+    opened = {name: open_sequence(dataset, data, name, max_frames=max_frames) for name in sequences}
+    fitting, notes = _fitting(parse_laws(laws), opened) if preset is None else ([], [])
+    plan = Plan(
+        dataset, tuple(sequences), tuple(fitting), tuple(names), seeds, steps, max_frames,
+        baseline or names[0], Criterion(max_lost, ate_factor, ate_least), tuple(others), preset,
+    )  # fmt: skip
+    execute.prepare(out, identity)
+    searches, results = plan.searches(), Results(out, options.config)
+
+    def run(cells: Collection[Cell]) -> Generator[CellOutcome, None, None]:
+        return outcomes_of(list(cells), options, jobs, scheduler, out, shown=not quiet)
+
+    announce(plan.criterion.words, shown=not quiet)
+    stopped = False
+    try:
+        run_all(
+            plan.clean_cells(), searches, plan.preset_cells(), results, plan.criterion, run,
+            lambda line: announce(line, shown=not quiet),
+        )  # fmt: skip
+    except KeyboardInterrupt:
+        stopped = True
+    finally:
+        execute.tidy(out)
+    report = summarise(plan, searches, results, notes)
+    write_report(out, report, opened)
+    if not quiet:
+        typer.echo(render_boundaries(report))
+        ended = f"{len(report.boundaries)} of {len(searches)} searches ended"
+        typer.echo(f"{out / 'report.html'}: {ended}")
+    if stopped or len(report.boundaries) < len(searches):
+        raise typer.Exit(1)
+
+
+def foreign(
+    context: typer.Context,
+    name: str,
+    template: str,
+    word: str,
+    dataset: Annotated[str, typer.Option()],
+    seq: Annotated[str, typer.Option()],
+    perturb: Annotated[str, typer.Option()],
+    detector: Annotated[str, typer.Option()],
+    seed: Annotated[int, typer.Option()],
+    threads: Annotated[int, typer.Option()],
+    config: Annotated[Path, typer.Option()],
+    out: Annotated[Path, typer.Option()],
+    data: Annotated[Path, typer.Option()] = KITTI_ROOT,
+    max_frames: Annotated[int | None, typer.Option()] = None,
+    no_record: Annotated[bool, typer.Option("--no-record")] = False,
+    no_report: Annotated[bool, typer.Option("--no-report")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet")] = False,
+) -> None:
+    """Run another system as [b]vslam run[/b] would run vslam: for [b]vslam stress[/b]."""
+    from vslam.config import load_config
+    from vslam.datasets import open_sequence
+    from vslam.datasets.perturbation import parse_perturbation
+    from vslam.report.folder import create_run_folder
+    from vslam.run.outcome import RunSettings
+    from vslam.stress.external import run_external
+
+    sequence = open_sequence(dataset, data, seq, max_frames=max_frames)
+    perturbation = parse_perturbation(perturb, seed)
+    settings = RunSettings(
+        dataset=dataset,
+        sequence=seq,
+        perturb=perturbation.name,
+        detector=name,
+        sensor=sequence.camera.sensor,
+        seed=seed,
+        threads=threads,
+        start=0,
+        every=1,
+        max_frames=max_frames,
+        config=load_config(config),
+    )
+    folder = create_run_folder(out, dataset, seq, perturbation.name, name)
+    run_external(sequence, perturbation, settings, template, folder)
+
+
+def _others(
+    systems: list[str], given: list[str], python: Path | None, vocabulary: Path | None
+) -> dict[str, str]:
+    """Command templates of the systems that are not vslam."""
+    from vslam.stress import orbslam3
+    from vslam.stress.external import check_template
+
+    templates: dict[str, str] = {}
+    for text in given:
+        name, separator, command = text.partition("=")
+        if not (name and separator):
+            raise InputError(f"--system {text}: write NAME=COMMAND.")
+        check_template(name, command)
+        templates[name] = command
+    if _ORBSLAM3 in systems and _ORBSLAM3 not in templates:
+        if vocabulary is None or not vocabulary.is_file():
+            raise InputError(
+                "--systems orbslam3: name its vocabulary, DBoW2's text format, with --vocabulary."
+            )
+        interpreter = python or Path(sys.executable)
+        if not interpreter.exists():
+            raise InputError(f"--orbslam3-python {interpreter}: not there.")
+        words = [interpreter.absolute(), Path(orbslam3.__file__), vocabulary.absolute()]
+        templates[_ORBSLAM3] = f"{shlex.join(map(str, words))} {{folder}} {{out}}"
+    for name in systems:
+        if name != "vslam" and name not in templates:
+            raise InputError(
+                f"--systems {name}: unknown; name vslam, orbslam3, or give --system {name}=COMMAND."
+            )
+    return {name: templates[name] for name in [*systems, *templates] if name in templates}
+
+
+def _program(name: str, template: str) -> tuple[str, ...]:
+    return (sys.executable, "-m", "vslam.cli.child", "foreign", name, template)
+
+
+def _fitting(laws: list[str], opened: Mapping[str, Sequence]) -> tuple[list[str], list[str]]:
+    """The laws that every sequence has the data for, and a note of each other one."""
+    from vslam.datasets.perturbation import laws_for
+
+    notes: dict[str, None] = {}
+    for sequence in opened.values():
+        fit, unfit = laws_for(sequence)
+        notes |= {why: None for why in unfit if why.split()[1].rstrip(":") in laws}
+        laws = [law for law in laws if law in fit]
+    if not laws:
+        raise InputError(f"--laws: none of them can be tested here. {next(iter(notes))}")
+    return laws, [f"left out: {why}" for why in notes]

@@ -1,0 +1,184 @@
+"""What a law is: of one image, or of a pair of images and the scene that they show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Camera, DepthImage, Image
+from vslam.datasets.sequence import Sequence
+from vslam.datasets.stream import Stream
+from vslam.errors import InputError
+
+RandomStream = tuple[int, int]
+"""Seed, and what tells laws of one seed apart; with more numbers behind it, seed of a generator."""
+
+Law = Callable[[int, float, int, Image], Image]
+"""``(frame, t, side, image) -> image`` of the same shape; t is in seconds since the first frame,
+side 0 is left, 1 is right."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The images of one frame on their way through the laws.
+
+    Attributes:
+        index: of the frame.
+        t: seconds since the first frame.
+        left: ``(H, W)`` uint8.
+        second: the right image, a depth image (float32), or None.
+        clean: both as they were read.
+    """
+
+    index: int
+    t: float
+    left: Image
+    second: Image | DepthImage | None
+    clean: tuple[Image, Image | DepthImage | None]
+
+    @property
+    def right(self) -> Image | None:
+        """The right image, None where there is none."""
+        if self.second is None or self.second.dtype != np.uint8:
+            return None
+        return np.asarray(self.second, np.uint8)
+
+
+PairLaw = Callable[[Pair], Pair]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is known beside one frame's images.
+
+    Attributes:
+        camera: as the data has it.
+        times: ``(N,)`` seconds since the first frame; None of a stream, whose frames are not known
+            beforehand.
+        T_wc: ``(N, 4, 4)`` true poses, NaN where unknown; None without any.
+        read: the images of any frame; None of a stream.
+    """
+
+    camera: Camera
+    times: NDArray[np.float64] | None = None
+    T_wc: NDArray[np.float64] | None = None
+    read: Callable[[int], tuple[Image, Image | DepthImage | None]] | None = None
+
+    @classmethod
+    def of(cls, source: Sequence | Stream) -> Scene:
+        """What a source knows."""
+        if isinstance(source, Stream):
+            return cls(source.camera)
+        times = np.asarray(source.timestamps, np.float64)
+        return cls(source.camera, times - times[:1], source.ground_truth, source.read)
+
+
+Need = Literal["right", "depth", "neighbours"]
+_LACKING: dict[Need, str] = {
+    "right": "needs the images of both sides; this source has one camera",
+    "depth": "needs depth: stereo images, or a depth image; this source has one camera",
+    "neighbours": "looks at the next frame, which a video, bag or camera does not have yet; use a "
+    "data set or a folder of images",
+}
+
+
+def check_need(law: str, need: Need, scene: Scene) -> None:
+    """Refuse a law that the data cannot serve.
+
+    Raises:
+        InputError: the data lack what it needs.
+    """
+    has = {
+        "right": scene.camera.sensor == "stereo",
+        "depth": not scene.camera.monocular,
+        "neighbours": scene.read is not None,
+    }
+    if not has[need]:
+        raise InputError(f"--perturb {law}: {_LACKING[need]}.")
+
+
+@dataclass(frozen=True)
+class SceneLaw:
+    """A law that is complete once it knows its scene."""
+
+    name: str
+    needs: tuple[Need, ...]
+    make: Callable[[Scene], PairLaw]
+
+    def bound_to(self, scene: Scene) -> PairLaw:
+        """The law for this scene.
+
+        Raises:
+            InputError: the data lack what it needs.
+        """
+        for need in self.needs:
+            check_need(self.name, need, scene)
+        return self.make(scene)
+
+    def __call__(self, pair: Pair) -> Pair:
+        raise RuntimeError(f"{self.name} must know its data: call Perturbation.bound_to(source)")
+
+
+@dataclass(frozen=True)
+class LawKind:
+    """A law of which only the strength is open.
+
+    Attributes:
+        make: ``(strength, stream) -> Law`` or ``(strength, stream, scene) -> PairLaw``, the latter
+            if ``of_scene``.
+        unit: of the strength.
+        default: strength where none is given.
+        weakest, strongest: between them ``vslam stress`` searches; visibility is strongest where
+            it is small.
+        least, most: what is allowed.
+        logarithmic: strengths are told apart by ratio, not by difference.
+        drawn: whether the images depend on the seed.
+        needs: what the data must have.
+        sides: ``both``, or ``one`` for a fault of the stereo rig.
+        about: the law in a few words.
+    """
+
+    make: Callable[..., Law | PairLaw]
+    unit: str
+    default: float
+    weakest: float
+    strongest: float
+    about: str
+    least: float = 0.0
+    most: float = 10.0
+    logarithmic: bool = False
+    drawn: bool = True
+    needs: tuple[Need, ...] = ()
+    of_scene: bool = False
+    sides: Literal["both", "one"] = "both"
+
+    def law(self, name: str, strength: float, stream: RandomStream) -> PairLaw | SceneLaw:
+        """The law of one strength and seed."""
+        if not self.of_scene:
+            return each_side(self.make(strength, stream))  # type: ignore[arg-type]
+        return SceneLaw(name, self.needs, partial(self._made, strength, stream))
+
+    def _made(self, strength: float, stream: RandomStream, scene: Scene) -> PairLaw:
+        return self.make(strength, stream, scene)  # type: ignore[return-value]
+
+
+def each_side(law: Law) -> PairLaw:
+    """Apply a law of one image to the images of both sides; depth has its own light."""
+
+    def applied(pair: Pair) -> Pair:
+        left = law(pair.index, pair.t, 0, pair.left)
+        if pair.right is None:
+            return replace(pair, left=left)
+        return replace(pair, left=left, second=law(pair.index, pair.t, 1, pair.right))
+
+    return applied
+
+
+def to_8_bits(values: NDArray[Any]) -> Image:
+    """Rounded and clipped."""
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)

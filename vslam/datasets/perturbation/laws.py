@@ -1,0 +1,198 @@
+"""Perturbations: what ``--perturb`` says, applied to the frames of a source."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from functools import partial
+from math import isfinite
+from zlib import crc32
+
+import numpy as np
+
+from vslam.camera import DepthImage, Image, ImageMap
+from vslam.datasets.perturbation.kinds import LawKind, Pair, PairLaw, Scene, SceneLaw
+from vslam.datasets.perturbation.registry import LAWS, all_laws
+from vslam.datasets.sequence import Sequence
+from vslam.datasets.stream import Stream, TimedFrame
+from vslam.errors import DroppedFrameError, InputError
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """Laws applied one after the other; without any, the images pass unchanged.
+
+    Attributes:
+        name: canonical spelling, ``none`` or ``brightness:1.5,blur:0.5`` for example.
+        laws: see the package.
+    """
+
+    name: str
+    laws: tuple[PairLaw | SceneLaw, ...] = ()
+
+    def bound_to(self, source: Sequence | Stream) -> Perturbation:
+        """The same for the frames of one source: laws that look at depth, poses or other frames
+        find them there.
+
+        Raises:
+            InputError: the source lacks what a law needs.
+        """
+        if not any(isinstance(law, SceneLaw) for law in self.laws):
+            return self
+        scene = Scene.of(source)
+        laws = (law.bound_to(scene) if isinstance(law, SceneLaw) else law for law in self.laws)
+        return Perturbation(self.name, tuple(laws))
+
+    def apply(
+        self, index: int, t: float, left: Image, second: Image | DepthImage | None
+    ) -> tuple[Image, Image | DepthImage | None]:
+        """Perturb both ``(H, W)`` uint8 images of frame ``index``, ``t`` seconds after the first
+        one; safe in several threads. A depth image stays as it is: it has its own light.
+
+        The left one becomes the same whatever the second one is, save under fog, whose depth comes
+        from both.
+
+        Raises:
+            DroppedFrameError: the frame does not come at all.
+        """
+        pair = Pair(index, t, left, second, (left, second))
+        for law in self.laws:
+            pair = law(pair)
+        return pair.left, pair.second
+
+
+def parse_perturbation(spec: str, seed: int) -> Perturbation:
+    """Build the perturbation that ``--perturb`` names.
+
+    Args:
+        spec: ``law[:strength]``, several joined by commas, applied in this order; ``none`` or
+            nothing for the identity.
+        seed: not negative; equal seeds give equal images.
+
+    Raises:
+        InputError: unknown or repeated law, strength no number or not within the law's range, a
+            negative seed, or a broken package.
+    """
+    if seed < 0:
+        raise InputError(f"--seed {seed}: must not be negative.")
+    if spec.strip() in ("", "none"):
+        return Perturbation("none")
+    strengths: dict[str, float] = {}
+    names = {law.strip().partition(":")[0] for law in spec.split(",")}
+    known = LAWS if names <= set(LAWS) else all_laws()
+    for item in spec.split(","):
+        law, _, strength = item.strip().partition(":")
+        if law not in known:
+            raise InputError(
+                f"--perturb {spec}: unknown law '{law}'; choose from none, {', '.join(known)}."
+            )
+        if law in strengths:
+            raise InputError(f"--perturb {spec}: {law} is given twice; add up its strengths.")
+        default = known[law].default
+        strengths[law] = _parse_strength(spec, known[law], strength) if ":" in item else default
+    return Perturbation(
+        ",".join(f"{law}:{strength:g}" for law, strength in strengths.items()),
+        tuple(
+            known[law].law(law, strength, (seed, crc32(law.encode())))
+            for law, strength in strengths.items()
+        ),
+    )
+
+
+def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Iterator[TimedFrame]:
+    """The same frames, perturbed as they are read; the first one's time is 0 to the laws."""
+    begin = None
+    for index, frame in enumerate(frames):
+        begin = frame.timestamp if begin is None else begin
+        t = frame.timestamp - begin
+        yield TimedFrame(frame.timestamp, partial(_read_perturbed, frame, perturbation, index, t))
+
+
+def _read_perturbed(
+    frame: TimedFrame, perturbation: Perturbation, index: int, t: float, image_map: ImageMap
+) -> tuple[Image, Image | DepthImage | None]:
+    return perturbation.apply(index, t, *frame.read(image_map))
+
+
+def contact_sheet(
+    sequence: Sequence, perturbation: Perturbation, indices: Collection[int]
+) -> Image:
+    """A grey image with a row for each frame: left image as it is, both images perturbed.
+
+    Raises:
+        InputError: the sequence lacks what a law needs.
+        UnreadableImageError: one of the frames cannot be read.
+    """
+    perturbation = perturbation.bound_to(sequence)
+    rows = []
+    for index in indices:
+        label = f"frame {index}, {sequence.timestamps[index]:.1f} s"
+        rows.append(_row(sequence, perturbation, index, label, width=480))
+    return np.vstack(rows)
+
+
+def sheet_of_laws(sequence: Sequence, specs: Collection[str], index: int, seed: int) -> Image:
+    """A grey image with a row for each perturbation: a frame as it is, both its images perturbed.
+
+    Raises:
+        UnreadableImageError: the frame cannot be read.
+    """
+    rows = [
+        _row(sequence, parse_perturbation(spec, seed).bound_to(sequence), index, spec, width=480)
+        for spec in specs
+    ]
+    if len(rows) % 2:
+        rows.append(np.zeros_like(rows[0]))
+    half = len(rows) // 2
+    return np.hstack([np.vstack(rows[:half]), np.vstack(rows[half:])])
+
+
+def laws_for(sequence: Sequence | Stream) -> tuple[list[str], list[str]]:
+    """Names of the laws that a source has the data for, and why the others do not apply."""
+    fit, unfit = [], []
+    for name in all_laws():
+        try:
+            parse_perturbation(name, 0).bound_to(sequence)
+        except InputError as error:
+            unfit.append(str(error))
+        else:
+            fit.append(name)
+    return fit, unfit
+
+
+def _row(
+    sequence: Sequence, perturbation: Perturbation, index: int, label: str, width: int
+) -> Image:
+    import cv2
+
+    t = float(sequence.timestamps[index] - sequence.timestamps[0])
+    left, second = sequence.read(index)
+    height = round(width * left.shape[0] / left.shape[1])
+    try:
+        images = perturbation.apply(index, t, left, second)
+    except DroppedFrameError:
+        images = (np.zeros_like(left), None if second is None else np.zeros_like(left))
+    row = np.hstack(
+        [
+            cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+            for image in (left, *images)
+            if image is not None and image.dtype == np.uint8
+        ]
+    )
+    row[:20, : max(150, 10 + 8 * len(label))] = 0
+    cv2.putText(row, label, (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, 255, 1)
+    return np.asarray(row, np.uint8)
+
+
+def _parse_strength(spec: str, kind: LawKind, text: str) -> float:
+    try:
+        strength = float(text)
+    except ValueError:
+        strength = float("nan")
+    if not (isfinite(strength) and kind.least <= strength <= kind.most):
+        unit = "" if kind.unit == "x" else f" {kind.unit}"
+        raise InputError(
+            f"--perturb {spec}: bad strength '{text}'; give a number from {kind.least:g} to "
+            f"{kind.most:g}{unit}, {kind.default:g} is the default."
+        )
+    return strength

@@ -1,0 +1,134 @@
+"""Laws of the light and of how the camera answers it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from math import exp
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Image
+from vslam.datasets.perturbation.kinds import Law, LawKind, RandomStream, to_8_bits
+from vslam.datasets.perturbation.streams import STEP_S, Drawn, jump_times, on_grid, ou_walk
+
+_GREYS = np.arange(256, dtype=np.float64)
+
+FULL_WELL = 10_000.0  # electrons at grey value 255, of a pixel of 3.75 um (Sony ICX267: 10,000)
+READ_NOISE = 10.0  # electrons, of the same kind of sensor
+_TUNNEL_STOPS = 3.0
+_TUNNELS_PER_S = 1.0 / 5.0
+
+
+def _pointwise(curve: Callable[[int, float], NDArray[np.float64]]) -> Law:
+    """A law that sends grey value v of frame k at time t to ``curve(k, t)[v]``."""
+
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
+        import cv2
+
+        table = np.clip(np.rint(curve(frame, t)), 0, 255).astype(np.uint8)
+        return np.asarray(cv2.LUT(image, table), np.uint8)
+
+    return law
+
+
+def _brightness(strength: float, stream: RandomStream) -> Law:
+    rng_gain, rng_bias = (np.random.default_rng([*stream, k]) for k in range(2))
+
+    def jumps() -> Iterator[float]:
+        return jump_times(np.random.default_rng([*stream, 2]))
+
+    log_gain = Drawn(ou_walk(0.35 * strength, rng_gain, jumps()))
+    bias = Drawn(ou_walk(20.0 * strength, rng_bias, jumps()))
+    limit = max(1.0, strength)
+
+    def curve(frame: int, t: float) -> NDArray[np.float64]:
+        at = on_grid(t)
+        return np.exp(np.clip(log_gain[at], -1.2 * limit, 0.7 * limit)) * _GREYS + bias[at]
+
+    return _pointwise(curve)
+
+
+def _gamma(strength: float, stream: RandomStream) -> Law:
+    walk = Drawn(ou_walk(0.35 * strength, np.random.default_rng(stream)))
+    return _pointwise(lambda frame, t: 255.0 * (_GREYS / 255.0) ** np.exp(walk[on_grid(t)]))
+
+
+def _flicker(strength: float, stream: RandomStream) -> Law:
+    numbers = Drawn(iter(np.random.default_rng(stream).standard_normal, None))
+    return _pointwise(lambda frame, t: np.exp(0.15 * strength * numbers[frame]) * _GREYS)
+
+
+def _exposure(seconds: float, stream: RandomStream) -> Law:
+    """The scene's light falls and rises by 3 stops; the camera follows with a time constant."""
+
+    def errors() -> Iterator[float]:
+        rng = np.random.default_rng(stream)
+        steps = (round(time / STEP_S) for time in jump_times(rng, _TUNNELS_PER_S))
+        follow = 1.0 if seconds == 0 else 1.0 - exp(-STEP_S / seconds)
+        k, light, metered, jump = 0, 0.0, 0.0, next(steps)
+        while True:
+            yield light - metered
+            k += 1
+            while jump <= k:
+                light, jump = -_TUNNEL_STOPS - light, next(steps)
+            metered += follow * (light - metered)
+
+    stops = Drawn(errors())
+    return _pointwise(lambda frame, t: _GREYS * 2.0 ** stops[on_grid(t)])
+
+
+def _night(stops: float, stream: RandomStream) -> Law:
+    """Electrons are counted: Poisson, then read noise; exposure and gain stay as by day."""
+    electrons = FULL_WELL / 255.0
+
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
+        if stops == 0:
+            return image
+        rng = np.random.Generator(np.random.SFC64([*stream, frame, side]))
+        mean = image * np.float32(electrons * 2.0**-stops)
+        # Poisson of variance m as a normal number: exact enough, for read noise is added.
+        noise = rng.standard_normal(image.shape, dtype=np.float32)
+        counted = mean + noise * np.sqrt(mean + np.float32(READ_NOISE**2))
+        return to_8_bits(counted / np.float32(electrons))
+
+    return law
+
+
+def _bias(greys: float, stream: RandomStream) -> Law:
+    return _pointwise(lambda frame, t: _GREYS + greys)
+
+
+def _contrast(percent: float, stream: RandomStream) -> Law:
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
+        import cv2
+
+        mean = float(image.mean())
+        table = to_8_bits(mean + percent / 100.0 * (_GREYS - mean))
+        return np.asarray(cv2.LUT(image, table), np.uint8)
+
+    return law
+
+
+KINDS = {
+    "brightness": LawKind(
+        _brightness, "x", 1.0, 0.1, 10.0, "gain and bias walk and jump", logarithmic=True
+    ),
+    "gamma": LawKind(_gamma, "x", 1.0, 0.1, 10.0, "gamma walks", logarithmic=True),
+    "flicker": LawKind(_flicker, "x", 1.0, 0.1, 10.0, "gain of each frame", logarithmic=True),
+    "exposure": LawKind(
+        _exposure, "s", 0.5, 0.02, 10.0, "lag of auto-exposure behind tunnels of 3 stops",
+        logarithmic=True,
+    ),
+    "night": LawKind(
+        _night, "stops", 4.0, 0.0, 10.0, "less light, shot and read noise", most=16.0
+    ),
+    "bias": LawKind(
+        _bias, "grey levels", 50.0, 0.0, 255.0, "brighter by so much", least=-255.0, most=255.0,
+        drawn=False,
+    ),
+    "contrast": LawKind(
+        _contrast, "%", 30.0, 100.0, 1.0, "contrast left, about the mean", most=100.0,
+        logarithmic=True, drawn=False,
+    ),
+}  # fmt: skip

@@ -1,0 +1,107 @@
+"""Laws of motion: blur while the shutter is open, by the true angular rate where it is known."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Image
+from vslam.datasets.perturbation.kinds import LawKind, PairLaw, RandomStream, Scene, each_side
+
+_SHRINK = 2
+
+
+def optical_flow(first: Image, second: Image) -> NDArray[np.float32]:
+    """``(H, W, 2)`` pixels that each pixel of ``first`` has moved by in ``second``: dense inverse
+    search (Kroeger et al., ECCV 2016) at half size."""
+    import cv2
+
+    height, width = first.shape
+    size = max(16, width // _SHRINK), max(16, height // _SHRINK)
+    one, two = (cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (first, second))
+    matcher = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    flow = cv2.resize(
+        matcher.calc(one, two, np.zeros((*one.shape, 2), np.float32)), (width, height)
+    )
+    scale = np.array([width / size[0], height / size[1]], np.float32)
+    return np.asarray(flow * scale, np.float32)
+
+
+def neighbours(scene: Scene, frame: int) -> tuple[int, int]:
+    """The frames before and behind, the frame itself at an end."""
+    assert scene.times is not None
+    return max(0, frame - 1), min(len(scene.times) - 1, frame + 1)
+
+
+def image_velocity(scene: Scene, frame: int) -> NDArray[np.float64]:
+    """``(2,)`` pixels a second by which the view turns past the middle of the image.
+
+    From the true rotation where it is known, else the median of the optical flow to the next
+    frame; that of the drive straight ahead is then part of it.
+    """
+    assert scene.times is not None
+    assert scene.read is not None
+    before, behind = neighbours(scene, frame)
+    elapsed = float(scene.times[behind] - scene.times[before])
+    if elapsed <= 0:
+        return np.zeros(2)
+    T_wc = None if scene.T_wc is None else scene.T_wc[[before, behind], :3, :3]
+    if T_wc is not None and np.isfinite(T_wc).all():
+        from scipy.spatial.transform import Rotation
+
+        turned = Rotation.from_matrix(T_wc[0].T @ T_wc[1]).as_rotvec()
+        return scene.camera.fx * np.array([-turned[1], turned[0]]) / elapsed
+    pair = (frame, behind) if behind > frame else (before, frame)
+    flow = optical_flow(*(scene.read(k)[0] for k in pair))
+    step = float(scene.times[pair[1]] - scene.times[pair[0]])
+    return np.median(flow.reshape(-1, 2), axis=0).astype(np.float64) / step
+
+
+def forward_speed(scene: Scene, frame: int) -> float:
+    """Metres a second ahead, 0 where nothing is known of it."""
+    if scene.times is None or scene.T_wc is None:
+        return 0.0
+    before, behind = neighbours(scene, frame)
+    elapsed = float(scene.times[behind] - scene.times[before])
+    T = scene.T_wc[[before, behind]]
+    if elapsed <= 0 or not np.isfinite(T).all():
+        return 0.0
+    return float((T[0, :3, :3].T @ (T[1, :3, 3] - T[0, :3, 3]))[2] / elapsed)
+
+
+def line_kernel(shift: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Weights of a filter that smears along ``shift`` pixels, with its middle at the pixel."""
+    reach = int(np.ceil(np.abs(shift).max() / 2.0)) + 1
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
+    n = max(2, int(4 * np.hypot(*shift)) + 1)
+    for x, y in reach + np.linspace(-0.5, 0.5, n)[:, None] * shift:
+        x0, y0 = int(x), int(y)
+        dx, dy = x - x0, y - y0
+        kernel[y0, x0] += (1 - dx) * (1 - dy)
+        kernel[y0, x0 + 1] += dx * (1 - dy)
+        kernel[y0 + 1, x0] += (1 - dx) * dy
+        kernel[y0 + 1, x0 + 1] += dx * dy
+    return (kernel / kernel.sum()).astype(np.float32)
+
+
+def _motion(shutter_ms: float, stream: RandomStream, scene: Scene) -> PairLaw:
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
+        import cv2
+
+        shift = image_velocity(scene, frame) * shutter_ms / 1e3
+        if np.hypot(*shift) < 0.1:
+            return image
+        kernel = line_kernel(np.clip(shift, -400.0, 400.0))
+        return np.asarray(
+            cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE), np.uint8
+        )
+
+    return each_side(law)
+
+
+KINDS = {
+    "motion": LawKind(
+        _motion, "ms", 50.0, 1.0, 1000.0, "shutter open while the camera turns", most=1000.0,
+        logarithmic=True, drawn=False, needs=("neighbours",), of_scene=True,
+    ),
+}  # fmt: skip

@@ -1,0 +1,123 @@
+"""Laws of the sensor and of what happens to the image behind it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vslam.camera import Image
+from vslam.datasets.perturbation.kinds import Law, LawKind, RandomStream, to_8_bits
+from vslam.errors import DroppedFrameError
+
+
+def _noise(strength: float, stream: RandomStream) -> Law:
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
+        rng = np.random.Generator(np.random.SFC64([*stream, frame, side]))
+        grain = rng.standard_normal(image.shape, dtype=np.float32)
+        return np.clip(np.rint(image + 8.0 * strength * grain), 0, 255).astype(np.uint8)
+
+    return law
+
+
+def _shot(photons: float, stream: RandomStream) -> Law:
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
+        rng = np.random.Generator(np.random.SFC64([*stream, frame, side]))
+        counts = rng.poisson(np.arange(256) * (photons / 255.0), (1024, 256)).astype(np.float32)
+        # A table of draws for each grey value: a draw for each pixel takes eight times as long.
+        which = rng.integers(0, len(counts), image.shape, dtype=np.int32)
+        return to_8_bits(counts[which, image] * np.float32(255.0 / photons))
+
+    return law
+
+
+def _impulse(percent: float, stream: RandomStream) -> Law:
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
+        rng = np.random.Generator(np.random.SFC64([*stream, frame, side]))
+        number = rng.random(image.shape, dtype=np.float32)
+        hit = number < percent / 100.0
+        white = number < percent / 200.0
+        return np.where(hit, np.where(white, np.uint8(255), np.uint8(0)), image)
+
+    return law
+
+
+def _bits(bits: float, stream: RandomStream) -> Law:
+    step = 2.0 ** (8.0 - bits)
+
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
+        return image if step == 1.0 else to_8_bits(np.floor(image / step) * step)
+
+    return law
+
+
+def _jpeg(quality: float, stream: RandomStream) -> Law:
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
+        import cv2
+
+        data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, round(quality)])[1]
+        return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+    return law
+
+
+def _resolution(share: float, stream: RandomStream) -> Law:
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
+        import cv2
+
+        height, width = image.shape
+        size = max(1, round(share * width)), max(1, round(share * height))
+        if size == (width, height):
+            return image
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        return np.asarray(cv2.resize(small, (width, height)), np.uint8)
+
+    return law
+
+
+def _drop(percent: float, stream: RandomStream) -> Law:
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
+        if frame and np.random.default_rng([*stream, frame]).uniform() < percent / 100.0:
+            raise DroppedFrameError(frame)
+        return image
+
+    return law
+
+
+def _outage(seconds: float, stream: RandomStream) -> Law:
+    """One outage in every ten seconds, somewhere in them, not in the first second of the run."""
+
+    def law(frame: int, t: float, side: int, image: Image) -> Image:
+        block = int(t // 10.0)
+        first = max(1.0, 10.0 * block)
+        begin = np.random.default_rng([*stream, block]).uniform(
+            first, max(first, 10.0 * (block + 1) - seconds)
+        )
+        if begin <= t < begin + seconds:
+            raise DroppedFrameError(frame)
+        return image
+
+    return law
+
+
+KINDS = {
+    "noise": LawKind(
+        _noise, "x", 1.0, 0.1, 15.0, "normal noise of 8 grey levels", most=15.0, logarithmic=True
+    ),
+    "shot": LawKind(
+        _shot, "photons", 25.0, 10_000.0, 0.5, "photons at white", least=0.1, most=1e5,
+        logarithmic=True,
+    ),
+    "impulse": LawKind(_impulse, "%", 5.0, 0.0, 50.0, "pixels black or white", most=100.0),
+    "bits": LawKind(_bits, "bits", 3.0, 8.0, 1.0, "grey values", least=1.0, most=8.0, drawn=False),
+    "jpeg": LawKind(
+        _jpeg, "quality", 10.0, 100.0, 1.0, "compression", least=1.0, most=100.0,
+        logarithmic=True, drawn=False,
+    ),
+    "resolution": LawKind(
+        _resolution, "of 1", 0.3, 1.0, 0.02, "resolution, scaled up again", least=0.01, most=1.0,
+        logarithmic=True, drawn=False,
+    ),
+    "drop": LawKind(_drop, "%", 30.0, 0.0, 95.0, "frames that do not come", most=99.0),
+    "outage": LawKind(
+        _outage, "s", 1.0, 0.1, 9.0, "no frames once in ten seconds", most=9.0, logarithmic=True
+    ),
+}  # fmt: skip

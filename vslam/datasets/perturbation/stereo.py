@@ -1,0 +1,157 @@
+"""Faults of a stereo rig: what one side does and the other does not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Image
+from vslam.datasets.perturbation.depth import disparity
+from vslam.datasets.perturbation.kinds import (
+    LawKind,
+    Pair,
+    PairLaw,
+    RandomStream,
+    Scene,
+    to_8_bits,
+)
+from vslam.datasets.perturbation.motion import neighbours, optical_flow
+
+
+def _of_right(change: Callable[[Pair, Image], Image]) -> PairLaw:
+    def law(pair: Pair) -> Pair:
+        right = pair.right
+        return pair if right is None else replace(pair, second=change(pair, right))
+
+    return law
+
+
+def _gain(stops: float, stream: RandomStream, scene: Scene) -> PairLaw:
+    gain = 2.0**-stops
+    return _of_right(lambda pair, right: to_8_bits(gain * right.astype(np.float32)))
+
+
+def _desync(ms: float, stream: RandomStream, scene: Scene) -> PairLaw:
+    """The right image as it is so much later: moved along the optical flow to the next frame."""
+    assert scene.times is not None
+    assert scene.read is not None
+    times, read = scene.times, scene.read
+
+    def later(pair: Pair, right: Image) -> Image:
+        before, behind = neighbours(scene, pair.index)
+        other = behind if behind > pair.index else before
+        image = read(other)[1]
+        if ms == 0 or other == pair.index or image is None:
+            return right
+        flow = optical_flow(np.asarray(pair.clean[1], np.uint8), np.asarray(image, np.uint8))
+        share = 1e-3 * ms / float(times[other] - times[pair.index])
+        return _moved(right, np.float32(share) * flow)
+
+    return _of_right(later)
+
+
+def _baseline(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
+    def longer(pair: Pair, right: Image) -> Image:
+        left, clean = pair.clean[0], np.asarray(pair.clean[1], np.uint8)
+        d = disparity(scene.camera, clean, left, mirrored=True)
+        shift = np.stack([-np.float32(percent / 100.0) * d, np.zeros_like(d)], axis=2)
+        return _moved(right, shift)
+
+    return _of_right(longer)
+
+
+def _moved(image: Image, shift: NDArray[np.float32]) -> Image:
+    """The image whose pixels have moved by ``(H, W, 2)`` pixels, looked up backwards."""
+    import cv2
+
+    y, x = np.mgrid[0 : image.shape[0], 0 : image.shape[1]].astype(np.float32)
+    moved = cv2.remap(
+        image, x - shift[:, :, 0], y - shift[:, :, 1], cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    return np.asarray(moved, np.uint8)
+
+
+def _turned(axis: int) -> Callable[[float, RandomStream, Scene], PairLaw]:
+    """The right camera is turned about its x (0) or y (1) axis."""
+
+    def make(arc_minutes: float, stream: RandomStream, scene: Scene) -> PairLaw:
+        from scipy.spatial.transform import Rotation
+
+        camera = scene.camera
+        K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+        R = Rotation.from_rotvec(np.eye(3)[axis] * np.radians(arc_minutes / 60.0)).as_matrix()
+        H = K @ R.T @ np.linalg.inv(K)  # of points: R turns the camera, points turn back
+
+        def turn(pair: Pair, right: Image) -> Image:
+            import cv2
+
+            size = (camera.width, camera.height)
+            seen = cv2.warpPerspective(right, H, size, borderMode=cv2.BORDER_REPLICATE)
+            return np.asarray(seen, np.uint8)
+
+        return _of_right(turn)
+
+    return make
+
+
+def _black(
+    side: Literal["left", "right"],
+) -> Callable[[float, RandomStream, Scene], PairLaw]:
+    def make(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
+        def law(pair: Pair) -> Pair:
+            dark = np.random.default_rng([*stream, int(pair.t)]).uniform() < percent / 100.0
+            if not dark or pair.right is None:
+                return pair
+            if side == "left":
+                return replace(pair, left=np.zeros_like(pair.left))
+            return replace(pair, second=np.zeros_like(pair.right))
+
+        return law
+
+    return make
+
+
+def _fault(
+    make: Callable[[float, RandomStream, Scene], PairLaw],
+    unit: str,
+    default: float,
+    strongest: float,
+    about: str,
+    *,
+    drawn: bool = False,
+    neighbours: bool = False,
+    weakest: float = 0.0,
+) -> LawKind:
+    return LawKind(
+        make, unit, default, weakest, strongest, about, least=0.0 if drawn else -strongest,
+        most=strongest, drawn=drawn, of_scene=True, sides="one", logarithmic=weakest > 0,
+        needs=("right", "neighbours") if neighbours else ("right",),
+    )  # fmt: skip
+
+
+KINDS = {
+    "stereo_gain": _fault(_gain, "stops", 1.0, 8.0, "the right side is darker"),
+    "desync": _fault(
+        _desync, "ms", 20.0, 200.0, "the right side comes later", neighbours=True, weakest=0.5
+    ),
+    "baseline": _fault(
+        _baseline, "%", 2.0, 50.0, "the rig is longer than calibrated", weakest=0.05
+    ),
+    "yaw": _fault(
+        _turned(1), "arc minutes", 5.0, 300.0, "the right side is turned right", weakest=0.1
+    ),
+    "pitch": _fault(
+        _turned(0), "arc minutes", 5.0, 300.0, "the right side is turned up", weakest=0.1
+    ),
+    "black_right": _fault(
+        _black("right"), "%", 30.0, 100.0, "seconds with a black right side", drawn=True
+    ),
+    "black_left": _fault(
+        _black("left"), "%", 10.0, 100.0, "seconds with a black left side", drawn=True
+    ),
+}

@@ -1,0 +1,55 @@
+"""Where a map lies in the world of its ground truth, and the error of what is localised in it.
+
+A trajectory is aligned with its ground truth before it is compared. What is localised in a map has
+a place already: it is that of the map, and so is its error.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vslam.evaluation.trajectories import Evaluation
+from vslam.geometry import Matrix
+from vslam.maps.stored_map import World
+from vslam.run.outcome import RunOutcome, matched_ground_truth
+
+
+def name_of_world(outcome: RunOutcome) -> str:
+    """Of the ground truth: drives of one route in other light, or among other cars, share it."""
+    return f"{outcome.settings.dataset} {outcome.sequence.name.partition('+')[0]}"
+
+
+def world_of(outcome: RunOutcome, evaluation: Evaluation) -> World:
+    """Where a map lies, by the alignment of the trajectory that it was made with."""
+    truth = matched_ground_truth(outcome)
+    assert truth is not None
+    kept = np.isin(outcome.trajectory.timestamps, truth.timestamps)
+    T_wc, aligned = outcome.trajectory.T_wc[kept], evaluation.T_wc_aligned
+    return World(name_of_world(outcome), _similarity(T_wc, aligned))
+
+
+def error_in_map(outcome: RunOutcome) -> float | None:
+    """RMSE (m) of the frames placed in the map that a run went on in, moved as the map was; None
+    where that does not lie in the world of the run's ground truth."""
+    world, truth = outcome.world, matched_ground_truth(outcome)
+    if world is None or truth is None or outcome.in_map is None:
+        return None
+    frames = np.isin(outcome.trajectory.timestamps, truth.timestamps) & outcome.in_map
+    if world.name != name_of_world(outcome) or not frames.any():
+        return None
+    true = truth.T_wc[np.isin(truth.timestamps, outcome.trajectory.timestamps[frames]), :3, 3]
+    S, position = world.S_truth_world, outcome.trajectory.T_wc[frames, :3, 3]
+    return float(np.sqrt(((position @ S[:3, :3].T + S[:3, 3] - true) ** 2).sum(axis=1).mean()))
+
+
+def _similarity(T_wc: Matrix, aligned: Matrix) -> Matrix:
+    """The similarity that takes poses to the aligned ones."""
+    spread, aligned_spread = (
+        np.linalg.norm(T[:, :3, 3] - T[:, :3, 3].mean(axis=0)) for T in (T_wc, aligned)
+    )
+    S = np.eye(4)
+    S[:3, :3] = aligned[0, :3, :3] @ T_wc[0, :3, :3].T
+    if spread > 0:
+        S[:3, :3] *= aligned_spread / spread
+    S[:3, 3] = aligned[0, :3, 3] - S[:3, :3] @ T_wc[0, :3, 3]
+    return S

@@ -1,0 +1,254 @@
+"""A map of arrays that may hold anything: all that kernels rely on is checked here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Camera
+from vslam.frame_poses import FrameTable
+from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe
+from vslam.map import NONE, Arrays, Map
+from vslam.maps.stored_map import StoredMap, World, observations
+
+# K keyframes, L landmarks, R keypoints, O observations, E loops, F frames of the last drive.
+# A number more than one of them: where each begins, and where the last one ends.
+ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
+    "scales": (np.float64, ("levels",)),
+    "keyframe_T_cw": (np.float64, ("K", 4, 4)),
+    "keyframe_first_row": (np.int64, ("K+1",)),
+    "keyframe_timestamp": (np.float64, ("K",)),
+    "keyframe_frame": (np.int64, ("K",)),
+    "keyframe_parent": (np.int64, ("K",)),
+    "keyframe_session": (np.int64, ("K",)),
+    "keyframe_unit_scale": (np.float64, ("K",)),
+    "restarts": (np.int64, ("restarts",)),
+    "unpredicted_restarts": (np.int64, ("unpredicted",)),
+    "landmark_xyz": (np.float64, ("L", 3)),
+    "landmark_normal": (np.float64, ("L", 3)),
+    "landmark_distance_range": (np.float64, ("L", 2)),
+    "landmark_descriptor": (np.uint64, ("L", 4)),
+    "landmark_first_keyframe": (np.int32, ("L",)),
+    "landmark_visible": (np.int32, ("L",)),
+    "landmark_found": (np.int32, ("L",)),
+    "landmark_first_observation": (np.int64, ("L+1",)),
+    "observation_row": (np.int64, ("O",)),
+    "row_xy": (np.float32, ("R", 2)),
+    "row_u_right": (np.float32, ("R",)),
+    "row_octave": (np.uint8, ("R",)),
+    "row_angle": (np.float32, ("R",)),
+    "row_descriptor": (np.uint64, ("R", 4)),
+    "loop_ends": (np.int64, ("E", 2)),
+    "loop_T_query_match": (np.float64, ("E", 4, 4)),
+    "loop_scale": (np.float64, ("E",)),
+    "loop_score": (np.float64, ("E",)),
+    "loop_counts": (np.int64, ("E", 2)),
+    "loop_learned": (np.bool_, ("E",)),
+    "frame_timestamp": (np.float64, ("F",)),
+    "frame_reference": (np.int64, ("F",)),
+    "frame_T_c_reference": (np.float64, ("F", 4, 4)),
+    "frame_tracked": (np.bool_, ("F",)),
+    "frame_unit_scale": (np.float64, ("F",)),
+}
+_MAY_BE_NAN = {"row_u_right"}
+_ROTATION_TOLERANCE = 1e-6
+
+
+class DamagedMapError(Exception):
+    """What is wrong with the arrays of a file."""
+
+
+def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
+    """The map of a file, of which both may hold anything.
+
+    Raises:
+        DamagedMapError, KeyError, TypeError, ValueError, AttributeError: in a few words what is
+            wrong with them.
+    """
+    sizes = _check_shapes(data)
+    map_ = _build_map(data, sizes, int(header["session"]))
+    detector, n = header["detector"], sizes["K"]
+    tables = {str(name): _per_keyframe(data, f"detector_{name}", n) for name in detector["tables"]}
+    images = _per_keyframe(data, "image", n) if header["images"] else None
+    if images is not None and (images.values.dtype != np.uint8 or images.values.ndim != 1):
+        raise DamagedMapError("images are no files")
+    world = header["world"]
+    return StoredMap(
+        map=map_,
+        camera=_camera(header["camera"]),
+        loops=_loops(data, n),
+        detector=DetectorMemory(str(detector["name"]), str(detector["fingerprint"]), tables),
+        images=images,
+        frames=_frames(data, n) if header["frames"] else None,
+        drives=tuple(str(drive) for drive in header["drives"]),
+        world=None if world is None else _world(world),
+    )
+
+
+def _check_shapes(data: dict[str, NDArray]) -> dict[str, int]:
+    """What K, L, R ... are; every array is there, of its type and of these sizes, and finite."""
+    sizes: dict[str, int] = {}
+    for name, (dtype, shape) in ARRAYS.items():
+        array = data[name]
+        plain = array.dtype == dtype and array.flags.c_contiguous
+        if not plain or array.ndim != len(shape):
+            raise DamagedMapError(f"{name} is of {array.dtype}, {array.ndim} dimensions")
+        for size, wanted in zip(array.shape, shape, strict=True):
+            if isinstance(wanted, str):
+                key, plus, _ = wanted.partition("+")
+                size -= bool(plus)
+                wanted = sizes.setdefault(key, size)
+            if size != wanted:
+                raise DamagedMapError(f"{name} has shape {array.shape}")
+        if dtype in (np.float32, np.float64) and name not in _MAY_BE_NAN:
+            _require(bool(np.isfinite(array).all()), f"{name} is not finite")
+    return sizes
+
+
+def _all_differ(numbers: NDArray[np.int64]) -> bool:
+    return bool((np.diff(np.sort(numbers)) > 0).all())
+
+
+def _require(holds: bool, otherwise: str) -> None:
+    if not holds:
+        raise DamagedMapError(otherwise)
+
+
+def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) -> Map:
+    n, n_landmarks, n_rows = sizes["K"], sizes["L"], sizes["R"]
+    scales, parent = data["scales"], data["keyframe_parent"]
+    _require(len(scales) > 1 and bool((np.diff(scales) > 0).all()), "scales do not grow")
+    _require(bool(scales[0] > 0), "scales are not positive")
+    first_row = data["keyframe_first_row"]
+    _check_first("keyframe_first_row", first_row, n_rows)
+    _check_rigid("keyframe_T_cw", data["keyframe_T_cw"])
+    _require(bool((parent[1:] >= 0).all() and (parent < np.arange(n)).all()), "keyframe_parent")
+    _check_ids("keyframe_parent", parent, n, least=NONE)
+    _require(bool((data["keyframe_unit_scale"] > 0).all()), "keyframe_unit_scale")
+    for name in ("restarts", "unpredicted_restarts"):
+        _check_ids(name, data[name], n, least=1)
+    _check_ids("row_octave", data["row_octave"], len(scales))
+    _require(not np.isinf(data["row_u_right"]).any(), "row_u_right is infinite")
+
+    first, rows = data["landmark_first_observation"], data["observation_row"]
+    _check_first("landmark_first_observation", first, sizes["O"])
+    _require(bool((np.diff(first) > 0).all()), "a landmark that nothing observes")
+    _check_ids("observation_row", rows, n_rows)
+    _require(_all_differ(rows), "a keypoint that observes two landmarks")
+    _check_ids("landmark_first_keyframe", data["landmark_first_keyframe"], n)
+    _require(bool((np.diff(data["landmark_first_keyframe"]) >= 0).all()), "order of landmarks")
+
+    keyframe = np.repeat(np.arange(n, dtype=np.int32), np.diff(first_row))
+    pairs = np.repeat(np.arange(n_landmarks, dtype=np.int64), np.diff(first)) * n + keyframe[rows]
+    _require(_all_differ(pairs), "a keyframe that observes a landmark twice")
+    map_ = Map(scales)
+    map_.n_keyframes, map_.n_landmarks, map_.n_rows = n, n_landmarks, n_rows
+    map_.arrays = Arrays(
+        T_cw=data["keyframe_T_cw"],
+        first_row=first_row,
+        keyframe_alive=np.ones(n, np.bool_),
+        xyz=data["landmark_xyz"],
+        normal=data["landmark_normal"],
+        distance_range=data["landmark_distance_range"],
+        landmark_descriptor=data["landmark_descriptor"],
+        first_keyframe=data["landmark_first_keyframe"],
+        visible=data["landmark_visible"],
+        found=data["landmark_found"],
+        landmark_alive=np.ones(n_landmarks, np.bool_),
+        merged_into=np.full(n_landmarks, NONE, np.int32),
+        xy=data["row_xy"],
+        u_right=data["row_u_right"],
+        octave=data["row_octave"],
+        angle=data["row_angle"],
+        descriptor=data["row_descriptor"],
+        keyframe=keyframe,
+        **observations(rows, first, data["row_u_right"]),
+    )
+    map_.timestamps = data["keyframe_timestamp"].tolist()
+    map_.frames = data["keyframe_frame"].tolist()
+    map_.parents = parent.tolist()
+    map_.sessions = data["keyframe_session"].tolist()
+    map_.session = session
+    map_.unit_scale = data["keyframe_unit_scale"].tolist()
+    map_.restarts = data["restarts"].tolist()
+    map_.unpredicted_restarts = data["unpredicted_restarts"].tolist()
+    return map_
+
+
+def _loops(data: dict[str, NDArray], n: int) -> tuple[LoopEdge, ...]:
+    _check_ids("loop_ends", data["loop_ends"], n)
+    _check_rigid("loop_T_query_match", data["loop_T_query_match"])
+    _require(bool((data["loop_scale"] > 0).all()), "loop_scale")
+    return tuple(
+        LoopEdge(
+            query=query,
+            match=match,
+            score=score,
+            accepted=True,
+            reason="closed",
+            n_matches=n_matches,
+            n_inliers=n_inliers,
+            T_query_match=T,
+            scale=scale,
+            matched_by="learned" if learned else "orb",
+        )
+        for (query, match), score, (n_matches, n_inliers), T, scale, learned in zip(
+            data["loop_ends"].tolist(),
+            data["loop_score"].tolist(),
+            data["loop_counts"].tolist(),
+            data["loop_T_query_match"],
+            data["loop_scale"].tolist(),
+            data["loop_learned"].tolist(),
+            strict=True,
+        )
+    )
+
+
+def _frames(data: dict[str, NDArray], n: int) -> FrameTable:
+    frames = FrameTable(*(data[f"frame_{name}"] for name in FrameTable._fields))
+    _check_ids("frame_reference", frames.reference, max(n, 1))
+    _check_rigid("frame_T_c_reference", frames.T_c_reference)
+    _require(bool((np.diff(frames.timestamp) > 0).all()), "frame_timestamp")
+    _require(bool((frames.unit_scale > 0).all()), "frame_unit_scale")
+    return frames
+
+
+def _per_keyframe(data: dict[str, NDArray], name: str, n: int) -> PerKeyframe:
+    first, values = data[f"{name}_first"], data[f"{name}_values"]
+    _require(first.dtype == np.int64 and first.shape == (n + 1,), f"{name}_first")
+    _check_first(f"{name}_first", first, len(values))
+    return PerKeyframe(first, values)
+
+
+def _camera(fields: dict[str, Any]) -> Camera:
+    camera = Camera(**fields)
+    numbers = [camera.fx, camera.fy, camera.width, camera.height]
+    sound = all(isinstance(x, int | float) and 0 < x < 1e6 for x in numbers)
+    sound = sound and bool(np.isfinite([camera.cx, camera.cy, camera.baseline]).all())
+    _require(sound and camera.baseline >= 0, "camera")
+    return replace(camera, width=int(camera.width), height=int(camera.height))
+
+
+def _world(fields: dict[str, Any]) -> World:
+    S = np.array(fields["S_truth_world"], np.float64)
+    _require(S.shape == (4, 4) and bool(np.isfinite(S).all()), "world")
+    return World(str(fields["name"]), S)
+
+
+def _check_first(name: str, first: NDArray[np.int64], end: int) -> None:
+    holds = len(first) and first[0] == 0 and first[-1] == end and (np.diff(first) >= 0).all()
+    _require(bool(holds), name)
+
+
+def _check_ids(name: str, ids: NDArray[np.integer], n: int, least: int = 0) -> None:
+    _require(bool(((ids >= least) & (ids < n)).all()), f"{name} out of range")
+
+
+def _check_rigid(name: str, T: NDArray[np.float64]) -> None:
+    R = T[:, :3, :3]
+    error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0)
+    last = np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0)
+    _require(bool(error < _ROTATION_TOLERANCE and last == 0.0), f"{name} is no rigid motion")

@@ -1,0 +1,291 @@
+"""A map with all that is needed to go on in it, and without what died on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Camera
+from vslam.frame_poses import FrameTable
+from vslam.geometry import orthonormalised
+from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe, ranges
+from vslam.map import (
+    KEYFRAME_FIELDS,
+    LANDMARK_FIELDS,
+    NONE,
+    ROW_FIELDS,
+    Arrays,
+    Map,
+    loop_of_living,
+)
+from vslam.map_kernels import gather_observations
+
+
+@dataclass(frozen=True)
+class World:
+    """Where the world of a map lies in that of a ground truth.
+
+    Attributes:
+        name: of the data set and sequence that the ground truth is of.
+        S_truth_world: ``(4, 4)`` motion of the trajectory of the first drive onto its ground truth,
+            a similarity for a monocular map.
+    """
+
+    name: str
+    S_truth_world: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StoredMap:
+    """What a map file holds.
+
+    Attributes:
+        map: keyframes, landmarks and observations.
+        camera: of all keyframes.
+        loops: those that were closed, in the units of today; without features and landmarks.
+        detector: what the loop detector knows of the keyframes.
+        images: JPEG files of the keyframes that learned descriptors may ask for, uint8; None
+            without such a detector.
+        frames: of the last drive, None if they are not kept.
+        drives: what the images of each drive were, "kitti 06" for example.
+        world: where the map lies, None where there is no ground truth.
+    """
+
+    map: Map
+    camera: Camera
+    loops: tuple[LoopEdge, ...] = ()
+    detector: DetectorMemory = field(default_factory=DetectorMemory)
+    images: PerKeyframe | None = None
+    frames: FrameTable | None = None
+    drives: tuple[str, ...] = ()
+    world: World | None = None
+
+    def compact(self) -> StoredMap:
+        """A copy with the living keyframes and landmarks alone, numbered without gaps.
+
+        What was placed by a culled keyframe is placed by the living one that took its place.
+        Landmarks come in the order of the first keyframe that lives.
+        """
+        return self.select(self.map.living_keyframes())
+
+    def select(self, keyframes: NDArray[np.int64]) -> StoredMap:
+        """``compact`` with some of the living keyframes only, and the landmarks that they see.
+
+        Args:
+            keyframes: ``(K,)`` ascending ids of living keyframes. Frames are dropped unless these
+                are all.
+        """
+        map_ = self.map
+        whole = len(keyframes) == np.count_nonzero(map_.arrays.keyframe_alive[: map_.n_keyframes])
+        new_id = np.full(map_.n_keyframes, NONE, np.int64)
+        new_id[keyframes] = np.arange(len(keyframes))
+        loops = []
+        for loop in self.loops:
+            edge = loop_of_living(map_, loop)
+            query, match = int(new_id[edge.query]), int(new_id[edge.match])
+            if query >= 0 and match >= 0 and query != match:
+                loops.append(replace(edge, query=query, match=match, features=None, landmarks=None))
+        tables = {name: table.select(keyframes) for name, table in self.detector.tables.items()}
+        return replace(
+            self,
+            map=selected(map_, keyframes),
+            loops=tuple(loops),
+            detector=replace(self.detector, tables=tables),
+            images=None if self.images is None else self.images.select(keyframes),
+            frames=None if self.frames is None or not whole else _moved(self.frames, map_, new_id),
+        )
+
+
+def selected(map_: Map, keyframes: NDArray[np.int64]) -> Map:
+    """A copy with some of the living keyframes only, ``(K,)`` ascending ids, and the landmarks that
+    they see, numbered without gaps.
+
+    The parent of a keyframe is its nearest ancestor among them, or else the first of them.
+    """
+    a, n = map_.arrays, len(keyframes)
+    new_id = np.full(map_.n_keyframes, NONE, np.int64)
+    new_id[keyframes] = np.arange(n)
+
+    living = map_.living_landmarks()
+    first, rows = gather_observations(a, living.astype(np.int32), new_id)
+    count = np.diff(first)
+    anchor = new_id[a.first_keyframe[living]]
+    # Without the keyframe that saw it first, a landmark goes with the first of those that see it.
+    earliest = np.full(len(living), n, np.int64)
+    np.minimum.at(earliest, np.repeat(np.arange(len(living)), count), new_id[a.keyframe[rows]])
+    anchor = np.where(anchor >= 0, anchor, earliest)
+    kept = np.flatnonzero(count > 0)
+    kept = kept[np.argsort(anchor[kept], kind="stable")]
+    landmarks = living[kept]
+    observing = rows[ranges(first[kept], count[kept])]
+
+    kept_rows = ranges(a.first_row[keyframes], np.diff(a.first_row)[keyframes])
+    new_row = np.full(map_.n_rows, NONE, np.int64)
+    new_row[kept_rows] = np.arange(len(kept_rows))
+    first_row = np.concatenate([[0], np.cumsum(np.diff(a.first_row)[keyframes])]).astype(np.int64)
+    links = observations(
+        new_row[observing],
+        np.concatenate([[0], np.cumsum(count[kept])]),
+        a.u_right[kept_rows],
+    )
+    found = Map(map_.scales)
+    found.n_keyframes, found.n_landmarks, found.n_rows = n, len(landmarks), len(kept_rows)
+    found.arrays = Arrays(
+        T_cw=a.T_cw[keyframes],
+        first_row=first_row,
+        keyframe_alive=np.ones(n, np.bool_),
+        xyz=a.xyz[landmarks],
+        normal=a.normal[landmarks],
+        distance_range=a.distance_range[landmarks],
+        landmark_descriptor=a.landmark_descriptor[landmarks],
+        first_keyframe=anchor[kept].astype(np.int32),
+        visible=a.visible[landmarks],
+        found=a.found[landmarks],
+        landmark_alive=np.ones(len(landmarks), np.bool_),
+        merged_into=np.full(len(landmarks), NONE, np.int32),
+        xy=a.xy[kept_rows],
+        u_right=a.u_right[kept_rows],
+        octave=a.octave[kept_rows],
+        angle=a.angle[kept_rows],
+        descriptor=a.descriptor[kept_rows],
+        keyframe=np.repeat(np.arange(n, dtype=np.int32), np.diff(first_row)),
+        **links,
+    )
+    for name in ("timestamps", "frames", "sessions", "unit_scale"):
+        values = getattr(map_, name)
+        setattr(found, name, [values[k] for k in keyframes.tolist()])
+    found.session = map_.session
+    found.parents = [_ancestor(map_, k, new_id) for k in keyframes.tolist()]
+    _begin_submaps(map_, found, new_id)
+    return found
+
+
+def observations(
+    rows: NDArray[np.int64], first: NDArray[np.int64], u_right: NDArray[np.float32]
+) -> dict[str, NDArray]:
+    """The fields of ``Arrays`` that tell which row observes what.
+
+    Args:
+        rows: ``(O,)`` those of each landmark, one landmark after the other, none twice.
+        first: ``(L + 1,)`` where those of each landmark begin.
+        u_right: ``(R,)`` of all rows.
+    """
+    count = np.diff(first)
+    landmark, next_row = (np.full(len(u_right), NONE, np.int32) for _ in range(2))
+    landmark[rows] = np.repeat(np.arange(len(count), dtype=np.int32), count)
+    last = np.zeros(len(rows), np.bool_)
+    last[first[1:] - 1] = True
+    following = np.flatnonzero(~last)
+    next_row[rows[following]] = rows[following + 1]
+    votes = np.where(np.isnan(u_right[rows]), 1, 2)
+    return {
+        "landmark": landmark,
+        "next_row": next_row,
+        "head": rows[first[:-1]].astype(np.int32),
+        "n_observations": np.add.reduceat(votes, first[:-1]).astype(np.int32)
+        if len(count)
+        else np.zeros(0, np.int32),
+    }
+
+
+def appended(one: StoredMap, other: StoredMap) -> StoredMap:
+    """Two compact maps as one, the second a sub-map of which nobody knows where it lies."""
+    a, b = one.map, other.map
+    n, n_landmarks, n_rows = a.n_keyframes, a.n_landmarks, a.n_rows
+    found = Map(a.scales)
+    found.n_keyframes = n + b.n_keyframes
+    found.n_landmarks, found.n_rows = n_landmarks + b.n_landmarks, n_rows + b.n_rows
+    shift = {
+        "first_keyframe": n, "keyframe": n, "merged_into": 0, "landmark": n_landmarks,
+        "head": n_rows, "next_row": n_rows,
+    }  # fmt: skip
+    arrays = {}
+    for fields, sizes in (
+        (KEYFRAME_FIELDS, (n, b.n_keyframes)),
+        (LANDMARK_FIELDS, (n_landmarks, b.n_landmarks)),
+        (ROW_FIELDS, (n_rows, b.n_rows)),
+    ):
+        for name in fields:
+            first, second = (
+                getattr(map_.arrays, name)[:size] for map_, size in zip((a, b), sizes, strict=True)
+            )
+            if name in shift:
+                second = np.where(second >= 0, second + shift[name], NONE).astype(second.dtype)
+            arrays[name] = np.concatenate([first, second])
+    ends = n_rows + b.arrays.first_row[: b.n_keyframes + 1]
+    arrays["first_row"] = np.concatenate([a.arrays.first_row[:n], ends])
+    found.arrays = Arrays(**arrays)
+    found.timestamps = [*a.timestamps, *b.timestamps]
+    found.frames = [*a.frames, *b.frames]
+    found.unit_scale = [*a.unit_scale, *b.unit_scale]
+    drives = a.session + 1
+    found.sessions = [*a.sessions, *(drives + session for session in b.sessions)]
+    found.session = drives + b.session
+    found.parents = [*a.parents, *(n + parent if parent >= 0 else 0 for parent in b.parents)]
+    found.restarts = [*a.restarts, n, *(n + k for k in b.restarts)]
+    unpredicted = [*a.unpredicted_restarts, n, *(n + k for k in b.unpredicted_restarts)]
+    found.unpredicted_restarts = unpredicted
+    loops = tuple(replace(loop, query=n + loop.query, match=n + loop.match) for loop in other.loops)
+    tables = {
+        name: table.followed_by(other.detector.tables[name])
+        for name, table in one.detector.tables.items()
+    }
+    images = one.images
+    if images is not None and other.images is not None:
+        images = images.followed_by(other.images)
+    return StoredMap(
+        map=found,
+        camera=one.camera,
+        loops=(*one.loops, *loops),
+        detector=replace(one.detector, tables=tables),
+        images=images,
+        drives=(*one.drives, *other.drives),
+        world=one.world,
+    )
+
+
+def _ancestor(map_: Map, keyframe: int, new_id: NDArray[np.int64]) -> int:
+    """New id of the nearest ancestor that is kept, or -1."""
+    parent = map_.parents[keyframe]
+    while parent >= 0 and new_id[parent] < 0:
+        parent = map_.parents[parent]
+    return int(new_id[parent]) if parent >= 0 else NONE
+
+
+def _begin_submaps(map_: Map, found: Map, new_id: NDArray[np.int64]) -> None:
+    """Where the sub-maps of a map begin in one that holds a part of it."""
+    restarts, unpredicted = set(), set()
+    # The first keyframe kept from there on: edges of the spanning tree that lead past it are weak.
+    kept = np.flatnonzero(new_id >= 0)
+    for restart in map_.restarts:
+        position = int(np.searchsorted(kept, restart))
+        if 0 < position < len(kept):
+            restarts.add(position)
+            if restart in map_.unpredicted_restarts:
+                unpredicted.add(position)
+    submap = map_.submaps()
+    for keyframe, parent in enumerate(found.parents):
+        if parent < 0 and keyframe > 0:
+            found.parents[keyframe] = 0
+            if submap[kept[keyframe]] != submap[kept[0]]:
+                restarts.add(keyframe)
+                unpredicted.add(keyframe)
+    found.restarts, found.unpredicted_restarts = sorted(restarts), sorted(unpredicted)
+
+
+def _moved(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> FrameTable:
+    """Frames placed by living keyframes, numbered anew."""
+    reference = frames.reference.copy()
+    T_c_reference, unit = frames.T_c_reference.copy(), frames.unit_scale.copy()
+    for i, keyframe in enumerate(frames.reference.tolist()):
+        if not map_.n_keyframes or map_.arrays.keyframe_alive[keyframe]:
+            continue
+        # As FramePoses.pose places it today.
+        T_c_reference[i, :3, 3] *= map_.unit_scale[keyframe] / unit[i]
+        T_c_reference[i] = orthonormalised(T_c_reference[i] @ map_.T_c_parent[keyframe])
+        reference[i] = map_.parents[keyframe]
+        unit[i] = map_.unit_scale[map_.parents[keyframe]]
+    reference = new_id[reference] if map_.n_keyframes else reference
+    return frames._replace(reference=reference, T_c_reference=T_c_reference, unit_scale=unit)

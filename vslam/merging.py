@@ -1,0 +1,148 @@
+"""Maps of several drives made one: loops between them, found and verified as those of one drive.
+
+A map is appended to another as a sub-map of which nobody knows where it lies, and each of its
+keyframes asks the other's detector where it is. From there on everything is loop closing: the
+first loop moves the sub-map to its place, the others correct what drifted, landmarks are fused,
+and at the end all is adjusted at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vslam.camera import same_camera
+from vslam.closing import LoopClosing
+from vslam.config import Config
+from vslam.features import Features
+from vslam.loopclosure.detector import LoopDetector
+from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
+from vslam.loops import LoopCandidate, LoopEdge
+from vslam.map import Map
+from vslam.maps.stored_map import StoredMap, appended
+
+Memory = tuple[LoopDetector, KeyframeImages | None]
+
+
+@dataclass(frozen=True)
+class MergedMaps:
+    """What became of M maps.
+
+    Attributes:
+        stored: the first map with those that it was joined to.
+        joined: of the others, in the order in which they were joined.
+        left_out: those that no verified loop leads to.
+        loops: of each map, by its number, the loops that join it to those before.
+    """
+
+    stored: StoredMap
+    joined: list[int]
+    left_out: list[int]
+    loops: dict[int, list[LoopEdge]]
+
+
+def merge_maps(
+    maps: Sequence[StoredMap],
+    config: Config,
+    create: Callable[[], Memory],
+    on_keyframe: Callable[[], None] = lambda: None,
+) -> MergedMaps:
+    """Join maps to the first one; a map that meets it only by way of another is joined after that.
+
+    Args:
+        maps: two or more, of one camera, pyramid and detector.
+        create: makes a detector like theirs that remembers nothing, and what keeps its images.
+        on_keyframe: called for each keyframe that was compared.
+
+    Raises:
+        ValueError: in a few words why these maps are not to be made one.
+    """
+    whole, waiting = maps[0].compact(), dict(enumerate(maps))
+    del waiting[0]
+    for other in waiting.values():
+        _require_alike(whole, other)
+    joined: list[int] = []
+    loops: dict[int, list[LoopEdge]] = {}
+    progress = True
+    while waiting and progress:
+        progress = False
+        for number, other in list(waiting.items()):
+            found = join(whole, other.compact(), config, create(), on_keyframe)
+            if found is not None:
+                whole, loops[number] = found
+                joined.append(number)
+                del waiting[number]
+                progress = True
+    return MergedMaps(whole, joined, list(waiting), loops)
+
+
+def join(
+    one: StoredMap,
+    other: StoredMap,
+    config: Config,
+    memory: Memory,
+    on_keyframe: Callable[[], None] = lambda: None,
+) -> tuple[StoredMap, list[LoopEdge]] | None:
+    """Join two compact maps; the world is that of the first.
+
+    Args:
+        memory: a detector that remembers nothing, and what keeps its images.
+
+    Returns:
+        The map of both and the loops that were closed between them, or None: they do not meet.
+
+    Raises:
+        ValueError: the detector is not that of the maps.
+    """
+    detector, images = memory
+    detector.restore(one.detector)
+    both = appended(one, other)
+    if images is not None and both.images is not None:
+        images.restore(both.images, one.camera.width)
+    # One thread: the global adjustment waits until it is asked for, after the last loop.
+    closing = LoopClosing(detector, one.camera, config, threads=1, images=images)
+    closing.closed = list(both.loops)
+    map_, n = both.map, one.map.n_keyframes
+    for keyframe in range(n, map_.n_keyframes):
+        candidates = _candidates(map_, keyframe, detector, images, config)
+        closing.consider(map_, keyframe, candidates)
+        on_keyframe()
+    if not closing.corrections:
+        return None
+    closing.finish(map_)
+    found = [correction.edge for correction in closing.corrections]
+    return replace(both, loops=tuple(closing.closed)).compact(), found
+
+
+def _candidates(
+    map_: Map,
+    keyframe: int,
+    detector: LoopDetector,
+    images: KeyframeImages | None,
+    config: Config,
+) -> list[LoopCandidate]:
+    """Keyframes of the first map that look like one of the second and share no landmarks yet."""
+    image = images.image(keyframe) if images is not None and keyframe in images else None
+    found = detector.locate(image, features_of(map_, keyframe), map_)
+    joined = set(map_.covisible(keyframe, config.consistency.min_shared)[0].tolist())
+    return [replace(one, query=keyframe) for one in found if one.match not in joined]
+
+
+def features_of(map_: Map, keyframe: int) -> Features:
+    """What a keyframe saw."""
+    a, rows = map_.arrays, map_.rows(keyframe)
+    descriptors = a.descriptor[rows].view(np.uint8)
+    return Features(a.xy[rows], a.octave[rows], a.angle[rows], descriptors, a.u_right[rows])
+
+
+def _require_alike(one: StoredMap, other: StoredMap) -> None:
+    if not same_camera(one.camera, other.camera):
+        raise ValueError("of another camera")
+    if not np.array_equal(one.map.scales, other.map.scales):
+        raise ValueError("of another pyramid")
+    if other.detector.name != one.detector.name:
+        raise ValueError(f"of the detector {other.detector.name}, not {one.detector.name}")
+    if other.detector.fingerprint != one.detector.fingerprint:
+        raise ValueError(f"of another vocabulary or other weights of {one.detector.name}")

@@ -1,0 +1,1 @@
+"""At which strength does a run fail: bisection over laws, systems and seeds, and its report."""

@@ -1,0 +1,53 @@
+"""When a run has failed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vslam.report.schema import ReportJson
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """Limits, each against the same system's run on the images as they are.
+
+    Attributes:
+        lost_percent: of the frames, that may be lost. Dropped frames are not lost.
+        ate_factor: times the clean ATE that a run may have.
+        ate_least_m: below this ATE no run fails by it: three times nothing is nothing.
+    """
+
+    lost_percent: float = 5.0
+    ate_factor: float = 3.0
+    ate_least_m: float = 0.25
+
+    @property
+    def words(self) -> str:
+        """The criterion in one sentence."""
+        return (
+            f"A run fails if more than {self.lost_percent:g} % of its frames are lost, if its ATE "
+            f"is above {self.ate_factor:g} times that of the same system on the images as they are "
+            f"and above {self.ate_least_m:g} m, if a loop is wrong, if it misses a revisit that it "
+            "then finds, or if it ends with an error."
+        )
+
+    def verdict(self, report: ReportJson, clean: ReportJson) -> str:
+        """Why a run failed, empty if it held."""
+        frames = max(1, report.frames - report.dropped_frames)
+        if 100.0 * report.lost_frames > self.lost_percent * frames:
+            return f"{100.0 * report.lost_frames / frames:.0f} % lost"
+        limit = self.ate_limit(clean)
+        if limit is not None and (report.ate_rmse_m is None or report.ate_rmse_m > limit):
+            ate = "unknown" if report.ate_rmse_m is None else f"{report.ate_rmse_m:.3g} m"
+            return f"ATE {ate}"
+        if (report.loops_wrong or 0) > (clean.loops_wrong or 0):
+            return "wrong loop"
+        if (clean.loops_found or 0) > (report.loops_found or 0):
+            return "revisit missed"
+        return ""
+
+    def ate_limit(self, clean: ReportJson) -> float | None:
+        """Metres; None where the clean run has no ATE."""
+        if clean.ate_rmse_m is None:
+            return None
+        return max(self.ate_least_m, self.ate_factor * clean.ate_rmse_m)

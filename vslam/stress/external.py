@@ -1,0 +1,232 @@
+"""Other systems: they read a folder in KITTI's format and write a trajectory.
+
+The command is a template with ``{folder}`` and ``{out}``. ``folder`` holds ``image_0``,
+``image_1``, ``calib.txt`` and ``times.txt`` of the frames as the perturbation leaves them; dropped
+ones are not there. The command writes into the folder ``out``:
+
+- ``trajectory.txt``: a pose a frame in KITTI's format, or poses with times in TUM's;
+- ``causal.txt``, if it can: the same, as given at the time;
+- ``states.txt``, if it can: ``OK`` or ``LOST`` a frame.
+"""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Camera
+from vslam.datasets.perturbation import Perturbation, perturbed
+from vslam.datasets.sequence import Sequence
+from vslam.datasets.stream import timed_frames
+from vslam.errors import DroppedFrameError, InputError
+from vslam.features import TrackingState, TrackResult
+from vslam.report.folder import write_results
+from vslam.report.schema import ReportJson
+from vslam.run.outcome import RunOutcome, RunSettings
+from vslam.trajectory import Trajectory, bridge_gaps, read_trajectory
+
+_SAME_TIME_S = 1e-3
+
+
+@dataclass(frozen=True)
+class Poses:
+    """``T_wc`` of each frame of a run, and which of them are known."""
+
+    T_wc: NDArray[np.float64]
+    known: NDArray[np.bool_]
+
+
+def check_template(name: str, template: str) -> None:
+    """Refuse a command that cannot work.
+
+    Raises:
+        InputError: a placeholder is missing or unknown.
+    """
+    try:
+        filled = template.format(folder="F", out="O")
+    except (KeyError, IndexError, ValueError) as error:
+        raise InputError(
+            f"--system {name}={template}: unknown placeholder {error}; write {{folder}} and "
+            "{out}."
+        ) from error
+    if "{folder}" not in template or "{out}" not in template or not shlex.split(filled):
+        raise InputError(
+            f"--system {name}={template}: must hold {{folder}} and {{out}}, see docs/stress.md."
+        )
+
+
+def run_external(
+    sequence: Sequence,
+    perturbation: Perturbation,
+    settings: RunSettings,
+    template: str,
+    folder: Path,
+) -> ReportJson:
+    """Run another system on a perturbed sequence and write its run folder: ``report.json`` and
+    trajectories. Loops are not judged: nobody tells of them.
+
+    Raises:
+        InputError: the system ends with an error, or writes no trajectory.
+    """
+    with tempfile.TemporaryDirectory(prefix="kitti.", dir=folder) as name:
+        work = Path(name)
+        out = work / "out"
+        out.mkdir()
+        kept = export_kitti(sequence, perturbation, work / "sequence")
+        start = time.perf_counter()
+        _call(template, work / "sequence", out)
+        wall = time.perf_counter() - start
+        outcome = _outcome(sequence, settings, kept, out, wall)
+    report = write_results(folder, outcome, pages=False)
+    report = report.model_copy(
+        update={"loops_found": None, "loops_missed": None, "loops_wrong": None}
+    )
+    (folder / "report.json").write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    return report
+
+
+def export_kitti(sequence: Sequence, perturbation: Perturbation, folder: Path) -> NDArray[np.int64]:
+    """Write the frames as the perturbation leaves them; returns which frames there are."""
+    import cv2
+
+    times: list[float] = []
+    kept: list[int] = []
+    for name in ("image_0", "image_1"):
+        (folder / name).mkdir(parents=True)
+    frames = perturbed(timed_frames(sequence), perturbation.bound_to(sequence))
+    for index, frame in enumerate(frames):
+        try:
+            images = frame.read(map)
+        except DroppedFrameError:
+            continue
+        for side, image in enumerate(images):
+            if image is not None and image.dtype == np.uint8:
+                path = folder / f"image_{side}" / f"{len(kept):06d}.png"
+                cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        kept.append(index)
+        times.append(frame.timestamp - float(sequence.timestamps[0]))
+    (folder / "times.txt").write_text("".join(f"{t:.9e}\n" for t in times))
+    (folder / "calib.txt").write_text(_calibration(sequence.camera))
+    return np.array(kept, np.int64)
+
+
+def _calibration(camera: Camera) -> str:
+    lines = []
+    for k in range(4):
+        row = [
+            camera.fx,
+            0,
+            camera.cx,
+            -camera.bf * (k % 2),
+            0,
+            camera.fy,
+            camera.cy,
+            0,
+            0,
+            0,
+            1,
+            0,
+        ]
+        lines.append(f"P{k}: " + " ".join(f"{x:.12e}" for x in row))
+    return "\n".join(lines) + "\n"
+
+
+def _call(template: str, sequence: Path, out: Path) -> None:
+    words = shlex.split(
+        template.format(folder=shlex.quote(str(sequence)), out=shlex.quote(str(out)))
+    )
+    try:
+        # A system that reads its standard input to the end knows when we are gone.
+        with subprocess.Popen(
+            words,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        ) as child:
+            assert child.stdout is not None
+            log = child.stdout.read()
+            code = child.wait()
+    except OSError as error:
+        raise InputError(f"{words[0]}: cannot be started ({error.strerror}).") from error
+    if code:
+        said = [line for line in log.splitlines() if line.strip()]
+        raise InputError(f"{words[0]}: exit code {code}: {said[-1] if said else 'no output'}")
+
+
+def _outcome(
+    sequence: Sequence, settings: RunSettings, kept: NDArray[np.int64], out: Path, wall: float
+) -> RunOutcome:
+    if not (out / "trajectory.txt").is_file():
+        raise InputError(f"{settings.detector}: no trajectory.txt in {{out}}.")
+    times = np.asarray(sequence.timestamps, np.float64)
+    final = _poses(out / "trajectory.txt", times, kept)
+    causal = _poses(out / "causal.txt", times, kept) if (out / "causal.txt").is_file() else final
+    lost = ~final.known
+    if (out / "states.txt").is_file():
+        states = (out / "states.txt").read_text().split()
+        if len(states) != len(kept):
+            raise InputError(f"{settings.detector}: {len(states)} states of {len(kept)} frames.")
+        lost[kept] = np.array(states) != "OK"
+    dropped = np.ones(len(times), bool)
+    dropped[kept] = False
+    trajectory = bridge_gaps(Trajectory(times, final.T_wc), final.known)
+    given = np.where(causal.known[:, None, None], causal.T_wc, _last_known(causal))
+    tracks = [
+        TrackResult(
+            k, float(times[k]), given[k],
+            TrackingState.DROPPED if dropped[k] else
+            TrackingState.LOST if lost[k] else TrackingState.OK,
+            0, 0, 0, 0, False,
+        )
+        for k in range(len(times))
+    ]  # fmt: skip
+    return RunOutcome(
+        settings=settings,
+        sequence=sequence,
+        trajectory=trajectory,
+        keyframes=Trajectory(times[:0], trajectory.T_wc[:0]),
+        tracks=tracks,
+        skipped=[],
+        wall_s=wall,
+        cpu_s=0.0,
+        startup_s=0.0,
+        peak_memory_mb=0.0,
+        n_keyframes=0,
+        n_landmarks=0,
+        n_submaps=0,
+    )
+
+
+def _poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:
+    """Poses by frame; unknown ones are those of the nearest known frame before, or the first."""
+    T_wc, known = np.tile(np.eye(4), (len(times), 1, 1)), np.zeros(len(times), bool)
+    try:
+        found = read_trajectory(path, times[kept] - times[0])
+    except InputError as error:
+        if path.read_text().strip():
+            raise InputError(str(error).replace(str(path), path.name)) from error
+        return Poses(T_wc, known)
+    for t, pose in zip(found.timestamps, found.T_wc, strict=True):
+        k = int(np.abs(times - times[0] - t).argmin())
+        if abs(times[k] - times[0] - t) < _SAME_TIME_S:
+            T_wc[k], known[k] = pose, True
+    if known.any():
+        T_wc = _last_known(Poses(T_wc, known))
+    return Poses(T_wc, known)
+
+
+def _last_known(poses: Poses) -> NDArray[np.float64]:
+    """Every pose replaced by the last known one at its time; before the first, by that."""
+    if not poses.known.any():
+        return poses.T_wc
+    at = np.where(poses.known, np.arange(len(poses.known)), -1)
+    at = np.maximum.accumulate(at)
+    return poses.T_wc[np.where(at < 0, int(np.flatnonzero(poses.known)[0]), at)]

@@ -1,0 +1,68 @@
+"""The preset ``kitti-c``: those corruptions of RoboDepth's KITTI-C that have a law here.
+
+KITTI-C (Kong et al., NeurIPS 2023) has 18 corruptions in 5 severities, most of them with the
+numbers of ImageNet-C (Hendrycks and Dietterich, ICLR 2019). Where a law takes the same number, it
+is theirs; where it does not, the note says what stands in its place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vslam.datasets.perturbation import parse_perturbation
+
+
+@dataclass(frozen=True)
+class Corruption:
+    """``specs`` as of ``--perturb``, weakest first, none without a law; ``note`` says how it
+    differs."""
+
+    specs: tuple[str, ...]
+    note: str = ""
+
+    @property
+    def perturbations(self) -> list[str]:
+        """``specs`` in canonical spelling."""
+        return [parse_perturbation(spec, 0).name for spec in self.specs]
+
+
+def _of(text: str, values: tuple[float, ...]) -> tuple[str, ...]:
+    return tuple(text.format(value) for value in values)
+
+
+_SIGMA = (0.08, 0.12, 0.18, 0.26, 0.38)  # of white
+
+CORRUPTIONS: dict[str, Corruption] = {
+    "brightness": Corruption(_of("bias:{:g}", (25.5, 51.0, 76.5, 102.0, 127.5))),
+    "dark": Corruption(
+        _of("night:{:g}", (0.74, 1.0, 1.32, 1.74, 2.32)),
+        "light times 0.6 to 0.2 with our sensor's noise; theirs squares the image besides",
+    ),
+    "fog": Corruption(
+        _of("fog:{:g}", (600, 300, 150, 75, 40)),
+        "by distance, visibility 600 to 40 m; theirs is a cloud over the image, without depth",
+    ),
+    "frost": Corruption((), "no law"),
+    "snow": Corruption((), "no law"),
+    "contrast": Corruption(_of("contrast:{:g}", (40, 30, 20, 10, 5))),
+    "defocus_blur": Corruption(
+        _of("blur:{:g}", (1.0, 1.33, 2.0, 2.67, 3.33)),
+        "Gaussian of the deviation of their discs of 3 to 10 pixels",
+    ),
+    "glass_blur": Corruption((), "no law"),
+    "motion_blur": Corruption(
+        _of("motion:{:g}", (20, 40, 60, 80, 100)),
+        "shutter of 20 to 100 ms by the true rate of turn; theirs has one direction and length",
+    ),
+    "zoom_blur": Corruption((), "no law"),
+    "elastic_transform": Corruption((), "no law"),
+    "color_quant": Corruption(_of("bits:{:g}", (5, 4, 3, 2, 1)), "of grey values"),
+    "gaussian_noise": Corruption(tuple(f"noise:{255 * s / 8:.3g}" for s in _SIGMA)),
+    "impulse_noise": Corruption(_of("impulse:{:g}", (3, 6, 9, 17, 27))),
+    "shot_noise": Corruption(_of("shot:{:g}", (60, 25, 12, 5, 3))),
+    "iso_noise": Corruption(tuple(f"shot:25,noise:{0.7 * 255 * s / 8:.3g}" for s in _SIGMA)),
+    "pixelate": Corruption(
+        _of("resolution:{:g}", (0.6, 0.5, 0.4, 0.3, 0.25)), "scaled up smoothly"
+    ),
+    "jpeg_compression": Corruption(_of("jpeg:{:g}", (25, 18, 15, 10, 7))),
+}

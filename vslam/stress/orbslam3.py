@@ -1,0 +1,112 @@
+"""Runs ORB-SLAM3 (``pip install pyorbslam3``) on a folder in KITTI's format.
+
+usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--mono]
+
+This file is started by the interpreter that has pyorbslam3, which need not have vslam: it imports
+neither. It ends when its standard input does.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+_SETTINGS = """%YAML:1.0
+Camera.type: "PinHole"
+Camera.fx: {fx}
+Camera.fy: {fy}
+Camera.cx: {cx}
+Camera.cy: {cy}
+Camera.k1: 0.0
+Camera.k2: 0.0
+Camera.p1: 0.0
+Camera.p2: 0.0
+Camera.width: {width}
+Camera.height: {height}
+Camera.fps: 10
+Camera.bf: {bf}
+Camera.RGB: 1
+ThDepth: 40.0
+ORBextractor.nFeatures: 2000
+ORBextractor.scaleFactor: 1.2
+ORBextractor.nLevels: 8
+ORBextractor.iniThFAST: 12
+ORBextractor.minThFAST: 7
+Viewer.KeyFrameSize: 0.6
+Viewer.KeyFrameLineWidth: 2.0
+Viewer.GraphLineWidth: 1.0
+Viewer.PointSize: 2.0
+Viewer.CameraSize: 0.7
+Viewer.CameraLineWidth: 3.0
+Viewer.ViewpointX: 0.0
+Viewer.ViewpointY: -100.0
+Viewer.ViewpointZ: -0.1
+Viewer.ViewpointF: 2000.0
+"""
+
+
+def main(vocabulary: str, folder: Path, out: Path, *, mono: bool) -> None:
+    """Track every frame; write ``trajectory.txt``, ``causal.txt`` and ``states.txt``."""
+    import pyorbslam3
+
+    left = sorted((folder / "image_0").iterdir())
+    right = left if mono else sorted((folder / "image_1").iterdir())
+    times = np.loadtxt(folder / "times.txt", ndmin=1)
+    rows = (folder / "calib.txt").read_text().splitlines()
+    P0, P1 = (np.array(row.split()[1:], float).reshape(3, 4) for row in rows[:2])
+    height, width = np.asarray(cv2.imread(str(left[0]), 0)).shape
+    settings = out / "settings.yaml"
+    settings.write_text(
+        _SETTINGS.format(
+            fx=P0[0, 0], fy=P0[1, 1], cx=P0[0, 2], cy=P0[1, 2], width=width, height=height,
+            bf=-P1[0, 3],
+        )
+    )  # fmt: skip
+    sensor = pyorbslam3.Sensor.MONOCULAR if mono else pyorbslam3.Sensor.STEREO
+    slam = pyorbslam3.Slam(vocabulary, str(settings), sensor, use_viewer=False)
+    causal, states = [], []
+    for ours, theirs, t in zip(left, right, times.tolist(), strict=True):
+        images = [cv2.imread(str(path), 0) for path in ((ours,) if mono else (ours, theirs))]
+        found = slam.track_monocular(*images, t) if mono else slam.track_stereo(*images, t)
+        states.append("OK" if found.state == pyorbslam3.TrackingState.OK else "LOST")
+        pose = found.pose_wc if found.pose_valid else None
+        if pose is not None:
+            causal.append((t, np.asarray(pose, float)))
+    slam.shutdown()
+    tum = out / "trajectory.txt"
+    (slam.save_keyframe_trajectory_tum if mono else slam.save_trajectory_tum)(str(tum))
+    _keep_first_of_each_time(tum)
+    (out / "causal.txt").write_text("".join(_tum(t, T) for t, T in causal))
+    (out / "states.txt").write_text("\n".join(states))
+
+
+def _keep_first_of_each_time(path: Path) -> None:
+    """After a loss ORB-SLAM3 writes some frames twice."""
+    by_time: dict[float, str] = {}
+    for line in path.read_text().splitlines():
+        by_time.setdefault(float(line.split()[0]), line)
+    path.write_text("".join(f"{by_time[t]}\n" for t in sorted(by_time)))
+
+
+def _tum(t: float, T_wc: np.ndarray) -> str:
+    from_matrix = cv2.Rodrigues(T_wc[:3, :3])[0].ravel()
+    angle = float(np.linalg.norm(from_matrix))
+    axis = from_matrix / angle if angle else np.zeros(3)
+    q = [*(np.sin(angle / 2) * axis), np.cos(angle / 2)]
+    return " ".join(f"{x:.9f}" for x in (t, *T_wc[:3, 3], *q)) + "\n"
+
+
+def _end_with_input() -> None:
+    while os.read(0, 1):
+        pass
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    main(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]), mono="--mono" in sys.argv)

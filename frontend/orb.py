@@ -66,7 +66,7 @@ def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
     A pure function of its arguments, safe to call from several threads.
     """
     pyramid = build_pyramid(image, config)
-    found = extract_levels(
+    xy, octave, angle, descriptors = extract_levels(
         pyramid.pixels,
         pyramid.offsets,
         pyramid.shapes,
@@ -78,7 +78,7 @@ def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
         DISC,
         PATTERN,
     )
-    return Extraction(*found, pyramid)
+    return Extraction(xy, octave, angle, descriptors, pyramid)
 
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:

@@ -20,6 +20,7 @@ from vslam.kernels import kernel
 
 PATCH_RADIUS = 15  # of the intensity centroid (Rublee et al., section 3.2)
 LANES = 32  # pixels read of each row of the disc: its 31 columns and one that counts nothing
+SPARE = 64  # bytes at the end of a pyramid
 MARGIN = 19  # reach of a rotated test point (13 sqrt 2) from a keypoint, rounded up
 PATTERN: NDArray[np.int8] = np.load(Path(__file__).with_name("orb_pattern.npy"))
 
@@ -29,7 +30,8 @@ class Pyramid:
     """Levels of one image, back to back in one buffer so that kernels can take all of them.
 
     Attributes:
-        pixels: ``(P,)`` uint8, the levels row by row.
+        pixels: ``(P + SPARE,)`` uint8, the levels row by row; kernels may read, and ignore, as much
+            as a register holds beyond the end.
         offsets: ``(L,)`` int64, where each level starts.
         shapes: ``(L, 2)`` int64, height and width.
         scales: ``(L,)`` float64, full-resolution pixels for each pixel of the level.
@@ -64,30 +66,19 @@ def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
     A pure function of its arguments, safe to call from several threads.
     """
     pyramid = build_pyramid(image, config)
-    quota = features_per_level(config)
-    xys, angles, descriptors, counts = [], [], [], []
-    for level in range(config.n_levels):
-        pixels = pyramid.level(level)
-        corners = detect_corners(
-            pixels,
-            quota[level],
-            config.fast_threshold,
-            config.fast_threshold_min,
-            config.cell_size,
-        )
-        angle = orientations(pixels, corners, DISC)
-        xys.append(corners * np.float32(pyramid.scales[level]))
-        angles.append(angle)
-        smooth = smoothed(pixels) if len(corners) else pixels  # the smallest levels have none
-        descriptors.append(describe(smooth, corners, angle, PATTERN))
-        counts.append(len(corners))
-    return Extraction(
-        xy=np.concatenate(xys).astype(np.float32),
-        octave=np.repeat(np.arange(config.n_levels, dtype=np.uint8), counts),
-        angle=np.concatenate(angles),
-        descriptors=np.concatenate(descriptors),
-        pyramid=pyramid,
+    xy, octave, angle, descriptors = extract_levels(
+        pyramid.pixels,
+        pyramid.offsets,
+        pyramid.shapes,
+        pyramid.scales,
+        features_per_level(config),
+        config.fast_threshold,
+        config.fast_threshold_min,
+        config.cell_size,
+        DISC,
+        PATTERN,
     )
+    return Extraction(xy, octave, angle, descriptors, pyramid)
 
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
@@ -112,7 +103,7 @@ def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
     shapes = np.round(np.array(image.shape) / scales[:, None]).astype(np.int64).clip(min=1)
     sizes = shapes.prod(axis=1)
     offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
-    pyramid = Pyramid(np.empty(sizes.sum(), np.uint8), offsets, shapes, scales)
+    pyramid = Pyramid(np.zeros(sizes.sum() + SPARE, np.uint8), offsets, shapes, scales)
     previous = pyramid.level(0)
     previous[:] = image
     for level in range(1, config.n_levels):
@@ -122,17 +113,50 @@ def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
     return pyramid
 
 
-def detect_corners(
-    pixels: NDArray[np.uint8], quota: int, threshold: int, threshold_min: int, cell: int
-) -> NDArray[np.float32]:
+@kernel
+def extract_levels(
+    pixels, offsets, shapes, scales, quota, threshold, threshold_min, cell, inside, pattern
+):
+    """Features of all levels: ``xy``, ``octave``, ``angle`` and ``descriptors`` of `Extraction`.
+
+    One kernel, so that Python, for which threads wait for each other, is called once an image.
+    """
+    capacity = quota.sum()
+    xy, octave = np.empty((capacity, 2), np.float32), np.empty(capacity, np.uint8)
+    angle, descriptors = np.empty(capacity, np.float32), np.empty((capacity, 32), np.uint8)
+    n = 0
+    for level in range(len(shapes)):
+        height, width = shapes[level]
+        first = offsets[level]
+        image = pixels[first : first + height * width].reshape(height, width)
+        corners = detect_corners(image, quota[level], threshold, threshold_min, cell)
+        if len(corners) == 0:
+            continue  # the smallest levels have none
+        turned = orientations(image, corners, inside)
+        described = describe(smoothed(image), corners, turned, pattern)
+        scale = np.float32(scales[level])
+        for i in range(len(corners)):
+            xy[n, 0], xy[n, 1] = corners[i, 0] * scale, corners[i, 1] * scale
+            octave[n], angle[n] = level, turned[i]
+            for k in range(32):
+                descriptors[n, k] = described[i, k]
+            n += 1
+    return xy[:n], octave[:n], angle[:n], descriptors[:n]
+
+
+@kernel
+def detect_corners(pixels, quota, threshold, threshold_min, cell):
     """FAST-9 corners of one level, spread evenly: ``(n, 2)`` float32 x, y in level pixels."""
     height, width = pixels.shape
     if min(height, width) <= 2 * MARGIN or quota == 0:
         return np.empty((0, 2), np.float32)
-    scores = fast_scores(pixels.reshape(-1), height, width)
+    scores = fast_scores(pixels.reshape(height * width), height, width)
     x, y, score = local_maxima(scores, MARGIN, threshold, threshold_min, cell)
     keep = spread(x, y, score, width, height, quota)
-    return np.stack([x[keep], y[keep]], axis=1).astype(np.float32)
+    corners = np.empty((len(keep), 2), np.float32)
+    for i in range(len(keep)):
+        corners[i, 0], corners[i, 1] = x[keep[i]], y[keep[i]]
+    return corners
 
 
 def disc(radius: int) -> NDArray[np.int16]:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from vslam.camera import Camera
 from vslam.config import StereoConfig
 from vslam.frontend.orb import Extraction
-from vslam.kernels import hamming, inner_kernel, kernel
+from vslam.kernels import hamming, inline, inner_kernel, kernel
 
+LANES = 16  # shifts of the SAD window tried at once
 MEDIAN_FACTOR = 1.5 * 1.4826  # 1.5 standard deviations, from the median of a half-normal
 
 
@@ -144,17 +145,9 @@ def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
         or x_r + reach + half >= width
     ):
         return np.nan, np.float32(-1.0)
-    costs = np.empty(2 * reach + 1, np.int32)
-    side = np.uintp(2 * half + 1)
-    for s in range(-reach, reach + 1):
-        total = np.int32(0)
-        for dy in range(-half, half + 1):
-            a = image_l[y_l + dy, x_l - half : x_l + half + 1]
-            b = image_r[y_l + dy, x_r + s - half : x_r + s + half + 1]
-            for k in range(side):
-                total += abs(np.int32(a[k]) - np.int32(b[k]))
-        costs[s + reach] = total
-    best = int(np.argmin(costs))
+    costs = np.zeros(-(-(2 * reach + 1) // LANES) * LANES, np.int32)
+    add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs)
+    best = int(np.argmin(costs[: 2 * reach + 1]))
     if best == 0 or best == 2 * reach:
         return np.nan, np.float32(-1.0)
     before, here, after = costs[best - 1], costs[best], costs[best + 1]
@@ -164,6 +157,53 @@ def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
     start = 0.5 * (before - after) / curvature
     refined = refine_shift(image_l, image_r, x_l, y_l, x_r + best - reach, start, half)
     return best - reach + refined, np.float32(here)
+
+
+@inner_kernel
+def add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs):
+    """Sums of absolute differences at all shifts: a register holds ``LANES`` shifts, and four
+    columns of the patch are summed before it is stored.
+
+    Lanes beyond the last shift count for nothing and may lie in the next row.
+    """
+    width = image_l.shape[1]
+    flat_l, flat_r = image_l.reshape(image_l.size), image_r.reshape(image_r.size)
+    side = 2 * half + 1
+    one, two, three = np.uintp(1), np.uintp(2), np.uintp(3)
+    total = np.empty(LANES, np.uint16)  # of a row
+    for first in range(0, len(costs), LANES):
+        for dy in range(-half, half + 1):
+            row = (y_l + dy) * width
+            a = flat_l[row + x_l - half :]
+            b = flat_r[row + x_r - reach - half + first :]
+            for s in range(np.uintp(LANES)):
+                total[s] = 0
+            k = 0
+            while k + 4 <= side:
+                a0, a1, a2, a3 = a[k], a[k + 1], a[k + 2], a[k + 3]
+                j = np.uintp(k)
+                for s in range(np.uintp(LANES)):
+                    total[s] = np.uint16(
+                        total[s]
+                        + difference(a0, b[j + s])
+                        + difference(a1, b[j + s + one])
+                        + difference(a2, b[j + s + two])
+                        + difference(a3, b[j + s + three])
+                    )
+                k += 4
+            while k < side:
+                a0, j = a[k], np.uintp(k)
+                for s in range(np.uintp(LANES)):
+                    total[s] = np.uint16(total[s] + difference(a0, b[j + s]))
+                k += 1
+            for s in range(LANES):
+                costs[first + s] += total[s]
+
+
+@inline
+def difference(a, b):
+    """Absolute difference of two bytes: in bytes, so that a register takes many."""
+    return np.uint16(np.uint8(max(a, b) - min(a, b)))
 
 
 @inner_kernel

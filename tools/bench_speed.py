@@ -43,17 +43,28 @@ The command at the end of this page writes it. It runs one process at a time. *L
 of the machine when the command began. *Whole process* is the time from the start of Python to \
 its end, including the vocabulary, the kernels from Numba's cache and all files written. *Frame \
 loop* is the time from the first image to the last pose. vslam runs with the detector `bow`, \
-because ORB-SLAM3 always looks for loops. *Reading images* is the CPU time of `cv2.imread` on \
-both images of a frame; it is measured in a separate process and subtracted from both systems \
-alike. The real-time run and the run along a drive are done once per case.
+because ORB-SLAM3 always looks for loops. *Reading images* is the CPU time that decoding both \
+images of a frame takes, measured in separate processes: vslam's own reader for vslam, \
+`cv2.imread` for ORB-SLAM3; it is subtracted from each system's time. The real-time run and the \
+run along a drive are done once per case, and so is the profile, in one thread, by \
+`tools/profile_frame.py`.
 """
 READING = """
 import sys, time, cv2
+from pathlib import Path
 cv2.setNumThreads(1)
 files = sys.stdin.read().splitlines()
+if sys.argv[1] == "vslam":
+    from vslam.datasets.image_files import read_grey
+    def read(file):
+        read_grey(Path(file))
+else:
+    def read(file):
+        cv2.imread(file, cv2.IMREAD_GRAYSCALE)
+read(files[0])  # imports, and kernels from the cache
 start = time.process_time()
 for file in files:
-    cv2.imread(file, cv2.IMREAD_GRAYSCALE)
+    read(file)
 print(time.process_time() - start)
 """
 
@@ -101,10 +112,11 @@ def sides(case: Case) -> list[Path]:
     return [case.data / "sequences" / case.seq / f"image_{side}" for side in (0, 1)]
 
 
-def reading_ms(case: Case) -> float:
-    """CPU milliseconds that decoding both images of a frame takes, in one thread."""
+def reading_ms(case: Case, system: str) -> float:
+    """CPU milliseconds that decoding both images of a frame takes a system, in one thread."""
     files = [str(path) for side in sides(case) for path in sorted(side.iterdir())[: case.frames]]
-    command = [sys.executable, "-c", READING]
+    reader = "opencv" if system == ORBSLAM3 else "vslam"
+    command = [sys.executable, "-c", READING, reader]
     done = subprocess.run(
         command, input="\n".join(files), capture_output=True, text=True, check=True
     )
@@ -280,13 +292,25 @@ def draw(everything: list[float], in_turn: list[float], path: Path) -> None:
 
 def section(case: Case, runs: dict[str, list[Run]]) -> str:
     """All that is said of a case."""
-    reading = reading_ms(case)
-    measured = {s: [figures(run, case, reading) for run in runs[s]] for s in runs if s != LIVE}
+    reading = {system: reading_ms(case, system) for system in (FULL, ORBSLAM3)}
+    measured = {
+        s: [figures(run, case, reading[ORBSLAM3 if s == ORBSLAM3 else FULL]) for run in runs[s]]
+        for s in runs
+        if s != LIVE
+    }
     return (
-        f"## {case.title}\n\n{case.frames} frames. Reading both images: {reading:.1f} ms CPU.\n\n"
+        f"## {case.title}\n\n{case.frames} frames. "
+        f"Reading both images: {reading[FULL]:.1f} ms CPU, by OpenCV {reading[ORBSLAM3]:.1f}.\n\n"
         f"{comparison(measured)}\n\n{latency(runs, case)}\n\n{stages(runs[FULL][-1].report)}\n\n"
-        f"{memory(runs[LEAN][-1])}\n"
+        f"{memory(runs[LEAN][-1])}\n\n{profile(case)}"
     )
+
+
+def profile(case: Case) -> str:
+    """Where the CPU time of a frame goes."""
+    tool = str(Path(__file__).with_name("profile_frame.py"))
+    command = [sys.executable, tool, str(case.data), case.seq, str(case.frames)]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
 def parse_options() -> argparse.Namespace:

@@ -1,0 +1,128 @@
+"""Where the CPU time of a run goes, as a Markdown table: ms per frame of each stage.
+
+    python tools/profile_frame.py DATA SEQ FRAMES [--detector bow] [--report]
+
+DATA is a folder in KITTI's format. One thread does all, so that its CPU clock sees every stage;
+what a stage calls of another one counts for that one alone. The whole is the process, from the
+start of Python to the last file written, with the kernels from Numba's cache: run it twice.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import importlib
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+# Stage, and the functions whose time it is: module, and name or Class.name there.
+STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
+    ("start: kernels from the cache", (("vslam.run.warmup", "compile_kernels"),)),
+    ("start: vocabulary", (("vslam.run.pipeline", "create_detector"),)),
+    ("read both images", (("vslam.datasets.kitti", "KittiImages.read"),)),
+    ("pyramids", (("vslam.frontend.orb", "build_pyramid"),)),
+    ("corners, orientations, smoothing, descriptors", (("vslam.frontend.orb", "extract_levels"),)),
+    ("extraction, the rest", (("vslam.frontend.tracking", "extract"),)),
+    ("stereo", (("vslam.frontend.tracking", "match_stereo"),)),
+    ("track the previous frame", (("vslam.slam", "Slam._track_previous_frame"),)),
+    ("track the local map", (("vslam.slam", "Slam._track_local_map"),)),
+    ("insert keyframes", (("vslam.mapping", "MappingThread.insert"),)),
+    ("triangulation", (("vslam.backend.local_mapping", "triangulate_with_neighbours"),)),
+    ("fusion", (("vslam.backend.local_mapping", "fuse_neighbourhood"),)),
+    ("local bundle adjustment", (("vslam.backend.local_mapping", "adjust_locally"),)),
+    ("cull keyframes", (("vslam.backend.local_mapping", "cull_keyframes"),)),
+    ("local mapping, the rest", (("vslam.mapping", "map_keyframe"),)),
+    ("loops", (("vslam.closing", "LoopClosing.process"), ("vslam.closing", "LoopClosing.finish"))),
+    ("merge", (("vslam.mapping", "MappingThread.merge"),)),
+    ("frame loop, the rest", (("vslam.run.pipeline", "run_sequence"),)),
+    ("results", (("vslam.report.folder", "write_results"),)),
+)
+
+
+# Of these all is counted that they call: kernels are loaded by running the whole method once.
+UNDIVIDED = {"start: kernels from the cache"}
+
+
+class StageClock:
+    """CPU seconds of this thread by stage; a stage within a stage is taken out of the outer one."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        self._inner = [0.0]
+        self._undivided = False
+
+    def timed(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def call(*args: Any, **named: Any) -> Any:
+            if self._undivided:
+                return function(*args, **named)
+            self._undivided = stage in UNDIVIDED
+            self._inner.append(0.0)
+            start = time.thread_time()
+            try:
+                return function(*args, **named)
+            finally:
+                self._undivided = False
+                passed = time.thread_time() - start
+                self.seconds[stage] += passed - self._inner.pop()
+                self._inner[-1] += passed
+
+        return call
+
+    def measure(self, stage: str, module_name: str, name: str) -> None:
+        """Put the clock around a function, where its module or class finds it."""
+        owner: Any = importlib.import_module(module_name)
+        *classes, last = name.split(".")
+        for each in classes:
+            owner = getattr(owner, each)
+        setattr(owner, last, self.timed(stage, getattr(owner, last)))
+
+
+def table(seconds: dict[str, float], frames: int) -> str:
+    """Milliseconds per frame of each stage, and its share of the process."""
+    whole = time.process_time()
+    rows = [(stage, seconds[stage]) for stage, _ in STAGES]
+    rows += [("imports and the rest of the start", whole - sum(s for _, s in rows))]
+    lines = ["| stage | CPU ms/frame | share |", "|---|---|---|"]
+    for stage, spent in [*rows, ("**whole process**", whole)]:
+        lines.append(f"| {stage} | {1e3 * spent / frames:.2f} | {spent / whole:.1%} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("seq")
+    parser.add_argument("frames", type=int)
+    parser.add_argument("--detector", default="bow")
+    parser.add_argument("--report", action="store_true", help="write pages and figures, too")
+    options = parser.parse_args()
+
+    clock = StageClock()
+    for stage, functions in STAGES:
+        for module, name in functions:
+            clock.measure(stage, module, name)
+
+    from vslam.cli.main import main as run
+
+    with tempfile.TemporaryDirectory(prefix="vslam-profile-") as out:
+        sys.argv = [
+            "vslam", "run", "--data", str(options.data), "--seq", options.seq, "--dataset", "kitti",
+            "--max-frames", str(options.frames), "--detector", options.detector, "--threads", "1",
+            "--no-record", "--quiet", "--out", out, "--report" if options.report else "--no-report",
+        ]  # fmt: skip
+        try:
+            run()
+        except SystemExit as end:
+            if end.code:
+                raise
+    print(table(clock.seconds, options.frames))
+
+
+if __name__ == "__main__":
+    main()

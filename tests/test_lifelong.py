@@ -24,6 +24,7 @@ from laps import BLACK, find_seam, is_right, plan_laps
 RING = Ring.create()
 PLACES = [float(k % LAP) for k in range(5 * LAP)]
 NEVER_KNOWN = 1e9
+LOOK_ALIKES = 100
 
 
 @cache
@@ -104,6 +105,52 @@ def test_only_a_frame_after_a_gap_that_tracks_little_is_doubtful(seconds, share,
     assert slam.frame is not None
     frame = slam._next_frame(view(12), slam.frame.timestamp + seconds, None)
     assert slam._is_doubtful(frame, int(share * slam._mapping.n_reference)) == doubtful
+
+
+def with_some_of(features: Features, other: Features, n: int) -> Features:
+    """Features and n of another view, as where a street repeats itself."""
+    some = np.linspace(0, len(other) - 1, n).astype(int)
+    columns = zip(vars(features).values(), vars(other).values(), strict=True)
+    return Features(*(np.concatenate([mine, theirs[some]]) for mine, theirs in columns))
+
+
+def drive_to_a_cut(places: list[float], busy: bool) -> Slam:
+    """Drive the ring to the last place but one; at the last some things look like those of the
+    place that was due. ``busy``: a keyframe is being mapped when it comes."""
+    slam = Slam(CAMERA, None, Oracle(RING, places), threads=1)
+    for i, place in enumerate(places):
+        image = np.array([[i & 255, i >> 8]], np.uint8)
+        features = view(int(place))
+        if i == len(places) - 1:
+            features = with_some_of(features, view(int(places[i - 1]) + 1), LOOK_ALIKES)
+            slam._merge()
+            if busy:
+                assert slam.frame is not None
+                slam._insert_keyframe(slam.frame)
+        slam.step_features(features, 0.1 * i, image)
+    return slam
+
+
+@pytest.mark.parametrize("busy", [False, True])
+def test_a_camera_that_is_carried_on_is_not_left_where_little_agrees(busy):
+    """Of 100 things that look like those expected enough agree on a pose, a wrong one."""
+    slam = drive_to_a_cut([*map(float, range(40)), 20.0], busy)
+    if busy:  # No keyframe is made in doubt, and the doubt outlasts the mapping.
+        assert slam._mapping.busy
+        keyframes = slam._mapping.n_keyframes
+        places = [20.0, 21.0, 22.0]
+        for step, place in enumerate(places[1:], start=41):
+            slam.detector.frames.append(place)  # type: ignore[attr-defined]
+            before = with_some_of(view(int(place)), view(step), LOOK_ALIKES)
+            slam.step_features(before, 0.1 * step, np.array([[step, 0]], np.uint8))
+        assert slam._mapping.n_keyframes == keyframes
+        place = places[-1]
+    else:
+        place = 20.0
+    slam.finish()
+    truth = inverse(RING.pose(0)) @ RING.pose(place)
+    off = inverse(truth) @ slam.trajectory().T_wc[-1]
+    assert np.linalg.norm(off[:3, 3]) < 0.2
 
 
 def circle(n: int, frames: int) -> np.ndarray:

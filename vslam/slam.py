@@ -130,6 +130,8 @@ class Slam:
             self._mapping.last_timestamp = self._mapping.map.timestamps[newest]
         self._velocity: Matrix | None = None  # twist per second, None if unknown
         self._lost_frames = 0
+        self._n_tracked = 0  # landmarks, in the last frame tracked
+        self._in_doubt = False  # the last frame was doubtful, and the map was busy
         self._initialiser = Initialiser(self.context)  # of monocular maps
         if before is not None and len(before.tracked) > 1 and before.tracked[-2:].all():
             self._move_on(before)
@@ -294,10 +296,13 @@ class Slam:
             state = self._state_of(inliers, matches)
             relocalised = state != TrackingState.LOST
             clock.lap("relocalise")
-        elif self._is_doubtful(frame, inliers) and (found := self._find_better(frame, inliers)):
+        certain = relocalised or state == TrackingState.LOST
+        doubtful = not certain and self._is_doubtful(frame, inliers)
+        if doubtful and (found := self._find_better(frame, inliers)):
             matches, inliers, visible = found, found, np.empty(0, np.int32)
             state, relocalised = self._state_of(inliers, matches), True
             clock.lap("relocalise")
+        self._in_doubt = doubtful and self._mapping.busy
         if state == TrackingState.LOST:
             frame.T_cw = T_cw
             restarted = self._lose(frame)
@@ -459,8 +464,9 @@ class Slam:
         return self._relocalise_learned(frame, candidates)
 
     def _is_doubtful(self, frame: Frame, inliers: int) -> bool:
-        """Whether a frame whose pose could hardly be predicted, after a gap or next to one found
-        in the map, tracks so little that it may be matched with other things."""
+        """Whether a frame tracks so little that it may be matched with other things: one whose pose
+        could hardly be predicted, after a gap or next to one found in the map, or that has lost
+        most of what the frame before tracked, as where the camera was carried."""
         assert self.frame is not None
         usual = self._poses.timestamp(-1) - self._poses.timestamp(-2) if len(self._poses) > 1 else 0
         config = self.config.relocalization
@@ -468,7 +474,8 @@ class Slam:
         old = self._mapping.n_keyframes > self.config.tracking.young_keyframes
         unpredicted = self._velocity is None and old
         few = inliers < config.doubtful_share * self._mapping.n_reference
-        return few and (gap or unpredicted)
+        sudden = inliers < config.doubtful_share * self._n_tracked and old
+        return (few and (gap or unpredicted)) or sudden or self._in_doubt
 
     def _find_better(self, frame: Frame, inliers: int) -> int:
         """Look for a frame in the whole map, and leave it as it is unless it tracks more there;
@@ -526,6 +533,7 @@ class Slam:
         """Keep the pose of a frame that was tracked."""
         self._initialiser.reset()
         self._lost_frames = 0
+        self._n_tracked = int(np.count_nonzero(frame.landmark >= 0))
         self._poses.append(frame.timestamp, frame.T_cw, tracked=True)
         self.frame = frame
 
@@ -594,7 +602,8 @@ class Slam:
             self._look_around(frame)
             return False
         self._mapping.count(visible, frame.landmark[frame.landmark >= 0])
-        is_keyframe = self._needs_keyframe(frame, inliers) and not self._follow_known(frame)
+        is_keyframe = not self._in_doubt and self._needs_keyframe(frame, inliers)
+        is_keyframe = is_keyframe and not self._follow_known(frame)
         if is_keyframe:
             self._insert_keyframe(frame)
         return is_keyframe

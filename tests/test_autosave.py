@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import os
 import signal
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from vslam.loops import LoopCorrection, LoopEdge
 from vslam.maps.storage import load_map
 from vslam.run import autosave as saving
 from vslam.run.autosave import (
+    LOCK,
     MAP,
     ONLINE,
     PROGRESS,
@@ -31,6 +33,7 @@ from vslam.run.autosave import (
     Progress,
     Unfinished,
     find_unfinished,
+    lock_run,
     read_progress,
     write_progress,
 )
@@ -209,6 +212,11 @@ def test_options_come_back_with_absolute_paths(tmp_path, monkeypatch):
     assert read.model_copy(update={"data": "images", "calib": options.calib}) == options
 
 
+def test_where_no_lock_can_be_made_a_run_goes_on(tmp_path):
+    with lock_run(tmp_path / "gone"):
+        assert not list(tmp_path.iterdir())
+
+
 def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     brief = ("--no-record", "--no-report", "--quiet")
     done = vslam("run", "--data", kitti_tree, "--max-frames", 12, *brief, cwd=tmp_path)
@@ -226,8 +234,17 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     # As if it had been cut off after these frames, of more to come.
     drive_until(kitti_tree, folder, 11)
     write_options(folder, read_options(folder).model_copy(update={"max_frames": None}))
+    with lock_run(folder):
+        busy = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
+    assert busy.returncode == 2
+    assert busy.stderr == (
+        f"error: {folder}: process {os.getpid()} runs here still; wait until it is done, or "
+        f"delete {folder / LOCK} if that process is not vslam.\n"
+    )
+    (folder / LOCK).write_text("999999999")  # killed
     resumed = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
     assert resumed.returncode == 0, resumed.stderr
+    assert not (folder / LOCK).exists()
     assert len(read_trajectory(folder / "trajectory.tum")) == FRAMES
     frames = load_map(folder / "map.npz").frames
     assert frames is not None

@@ -26,7 +26,7 @@ FOLDERS = {
 # together on one level may not import each other, save where SIBLINGS says so.
 LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.errors", "vslam.machine", "vslam.kernels"),
-    ("vslam.plugins", "vslam.untrusted"),
+    ("vslam.plugins", "vslam.untrusted", "vslam.lock_file"),
     ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.features", "vslam.camera"),
     (
         "vslam.loops",

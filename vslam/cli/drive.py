@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
@@ -39,6 +40,19 @@ def drive(
         out: where to make the folder of the run.
         resume: the folder of the run to go on with instead.
     """
+    with ExitStack() as lock:
+        _drive(options, output, out, resume, lock, compare_loops=compare_loops)
+
+
+def _drive(
+    options: RunOptions,
+    output: Output,
+    out: Path,
+    resume: Path | None,
+    lock: ExitStack,
+    *,
+    compare_loops: bool,
+) -> None:
     from vslam.cli.options import SourceName, kind_of_source, source_options
     from vslam.cli.progress import announce, progress_bar, render_bar
     from vslam.datasets.perturbation import parse_perturbation
@@ -70,7 +84,7 @@ def drive(
     # Bad input has been refused by now; what follows takes a second to import.
     from vslam.cli.summary import print_summary
     from vslam.report.folder import create_run_folder, write_results
-    from vslam.run.autosave import FolderAutosave, find_unfinished, remove_autosave
+    from vslam.run.autosave import FolderAutosave, find_unfinished, lock_run, remove_autosave
     from vslam.run.moments import MomentRecorder
     from vslam.run.options import write_options
     from vslam.run.outcome import RunSettings
@@ -104,11 +118,15 @@ def drive(
     )
     if o.map_file is not None and resume is None:
         require_camera(o.map_file, source.camera)
-    unfinished = None if resume is None else find_unfinished(resume)
+    unfinished = None
+    if resume is not None:
+        lock.enter_context(lock_run(resume))
+        unfinished = find_unfinished(resume)
     viewer = None if output.view is None else open_viewer(output.view)
     recording = "recording.rrd"
     if resume is None or unfinished is None:
         folder = create_run_folder(out, kind, source.name, perturbation.name, o.detector)
+        lock.enter_context(lock_run(folder))
         write_options(folder, o)
     else:
         folder = resume

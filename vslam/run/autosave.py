@@ -13,9 +13,9 @@ import json
 import logging
 import time
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, TextIO
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError
 from vslam.features import TrackingState, TrackResult
+from vslam.lock_file import locked
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.map import Map
 from vslam.maps.new_output import replaced_file
@@ -35,6 +36,7 @@ from vslam.slam import Slam
 from vslam.trajectory import tum_line
 
 MAP, PROGRESS, ONLINE = "autosave.npz", "autosave_progress.npz", "trajectory_online.tum"
+LOCK = ".lock"
 SCHEMA = 1
 _BEGIN = 0.75  # of the period: writing, and waiting for a merge, take the rest
 _PATIENCE = 0.95  # of the period: until then no global bundle adjustment is cut off
@@ -79,6 +81,20 @@ class Unfinished:
 
     map: Path
     progress: Progress
+
+
+@contextmanager
+def lock_run(folder: Path) -> Iterator[None]:
+    """Keep a run from being resumed while it goes on. Where no lock can be made, on a full disk
+    for example, it goes on without.
+
+    Raises:
+        InputError: another living process runs in the folder.
+    """
+    with ExitStack() as lock:
+        with suppress(OSError):
+            lock.enter_context(locked(folder / LOCK, folder, "runs here still"))
+        yield
 
 
 def find_unfinished(folder: Path) -> Unfinished:

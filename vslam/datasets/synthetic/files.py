@@ -6,16 +6,16 @@ import hashlib
 import os
 import shutil
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import psutil
 from numpy.typing import NDArray
 
 from vslam.errors import InputError
+from vslam.lock_file import locked
 
 _IMAGE_BYTES, _DEPTH_BYTES = 450_000, 330_000  # of one file, generous
 _RESERVE = 200_000_000  # bytes left free
@@ -79,47 +79,14 @@ def write_png(path: Path, image: NDArray[Any], level: int) -> None:
     write(path, data.tobytes())
 
 
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def lock_of(folder: Path) -> AbstractContextManager[None]:
     """Keep other processes from writing to a sequence's folder.
 
     Raises:
         InputError: another living process writes to it.
     """
-    lock = folder.with_name(f".{folder.name}.lock")
-    lock.parent.mkdir(parents=True, exist_ok=True)
-    mine = lock.with_name(f"{lock.name}.{os.getpid()}")
-    mine.write_text(str(os.getpid()))
-    while True:
-        try:
-            os.link(mine, lock)  # with its contents from the first moment
-            break
-        except FileExistsError:
-            owner = _owner(lock)
-            if owner is None:
-                continue
-            if owner and psutil.pid_exists(owner):
-                mine.unlink()
-                raise InputError(
-                    f"{folder}: process {owner} is rendering it; wait until it is done, or delete "
-                    f"{lock} if that process is not vslam."
-                ) from None
-            lock.unlink(missing_ok=True)  # left by a process that was killed
-    mine.unlink()
-    try:
-        yield
-    finally:
-        lock.unlink(missing_ok=True)
-
-
-def _owner(lock: Path) -> int | None:
-    """Process that holds a lock; 0 if the file does not say, None if it is gone by now."""
-    try:
-        return int(lock.read_text() or 0)
-    except FileNotFoundError:
-        return None
-    except ValueError:
-        return 0
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    return locked(folder.with_name(f".{folder.name}.lock"), folder, "is rendering it")
 
 
 def check_disk(cache: Path, frames: int, depth: bool) -> None:

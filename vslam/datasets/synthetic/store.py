@@ -23,7 +23,7 @@ from vslam.datasets.synthetic.files import (
     checksum,
     damaged_frames,
     frame_files,
-    locked,
+    lock_of,
     size,
     write,
     write_png,
@@ -158,7 +158,7 @@ def render_sequence(
     else:
         missing = list(range(n)) if found is None else _missing(folder, n, depth)
     check_disk(cache, len(missing), depth)
-    with writing(cache), locked(folder):
+    with writing(cache), lock_of(folder):
         if found is None and folder.exists():
             shutil.rmtree(folder)
         for name in ("image_0", "image_1", *(("depth_0",) if depth else ())):

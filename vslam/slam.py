@@ -475,7 +475,7 @@ class Slam:
         unpredicted = self._velocity is None and old
         few = inliers < config.doubtful_share * self._mapping.n_reference
         sudden = inliers < config.doubtful_share * self._n_tracked and old
-        return (few and (gap or unpredicted)) or sudden or self._in_doubt
+        return few and (gap or unpredicted or sudden or self._in_doubt)
 
     def _find_better(self, frame: Frame, inliers: int) -> int:
         """Look for a frame in the whole map, and leave it as it is unless it tracks more there;

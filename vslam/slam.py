@@ -131,7 +131,6 @@ class Slam:
         self._velocity: Matrix | None = None  # twist per second, None if unknown
         self._lost_frames = 0
         self._n_tracked = 0  # landmarks, in the last frame tracked
-        self._in_doubt = False  # the last frame was doubtful, and the map was busy
         self._initialiser = Initialiser(self.context)  # of monocular maps
         if before is not None and len(before.tracked) > 1 and before.tracked[-2:].all():
             self._move_on(before)
@@ -296,13 +295,10 @@ class Slam:
             state = self._state_of(inliers, matches)
             relocalised = state != TrackingState.LOST
             clock.lap("relocalise")
-        certain = relocalised or state == TrackingState.LOST
-        doubtful = not certain and self._is_doubtful(frame, inliers)
-        if doubtful and (found := self._find_better(frame, inliers)):
+        elif self._is_doubtful(frame, inliers) and (found := self._find_better(frame, inliers)):
             matches, inliers, visible = found, found, np.empty(0, np.int32)
             state, relocalised = self._state_of(inliers, matches), True
             clock.lap("relocalise")
-        self._in_doubt = doubtful and self._mapping.busy
         if state == TrackingState.LOST:
             frame.T_cw = T_cw
             restarted = self._lose(frame)
@@ -475,11 +471,13 @@ class Slam:
         unpredicted = self._velocity is None and old
         few = inliers < config.doubtful_share * self._mapping.n_reference
         sudden = inliers < config.doubtful_share * self._n_tracked and old
-        return few and (gap or unpredicted or sudden or self._in_doubt)
+        return few and (gap or unpredicted or sudden)
 
     def _find_better(self, frame: Frame, inliers: int) -> int:
         """Look for a frame in the whole map, and leave it as it is unless it tracks more there;
-        returns inliers or 0."""
+        returns inliers or 0. That is worth waiting for mapping: a doubtful frame asks for a
+        keyframe."""
+        self._merge_before(frame)
         T_cw, landmark, xyz = frame.T_cw, frame.landmark.copy(), frame.xyz.copy()
         reference = self._mapping.reference
         found = self._relocalise(frame)
@@ -602,8 +600,7 @@ class Slam:
             self._look_around(frame)
             return False
         self._mapping.count(visible, frame.landmark[frame.landmark >= 0])
-        is_keyframe = not self._in_doubt and self._needs_keyframe(frame, inliers)
-        is_keyframe = is_keyframe and not self._follow_known(frame)
+        is_keyframe = self._needs_keyframe(frame, inliers) and not self._follow_known(frame)
         if is_keyframe:
             self._insert_keyframe(frame)
         return is_keyframe
@@ -664,6 +661,17 @@ class Slam:
         self._follow_map(self.frame)
         if current is not self.frame:
             self._follow_map(current)
+
+    def _merge_before(self, frame: Frame) -> None:
+        """Merge when a frame is tracked and not placed yet: it keeps its pose to the reference."""
+        if not self._mapping.busy:
+            return
+        unit, reference = self._poses.unit, self._mapping.reference
+        T_c_reference = frame.T_cw @ inverse(self._mapping.keyframe_pose(reference))
+        self._merge()
+        T_c_reference[:3, 3] *= self._poses.unit / unit
+        frame.T_cw = orthonormalised(T_c_reference @ self._mapping.keyframe_pose(reference))
+        self._mapping.update(frame)
 
     def _follow_map(self, frame: Frame | None) -> None:
         """Bring a frame to where the map has moved."""

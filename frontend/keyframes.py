@@ -88,7 +88,9 @@ def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
 
     Few close points are no reason to map the place once more: mapping it has not made them more.
     """
+    # At the edge of a map hardly a landmark of a keyframe is seen by two others.
+    n_place = max(evidence.n_place, config.known_min)
     return (
-        evidence.n_inliers >= config.max_tracked_ratio * evidence.n_place
-        and evidence.n_shared >= config.known_ratio * evidence.n_place
+        evidence.n_inliers >= config.max_tracked_ratio * n_place
+        and evidence.n_shared >= config.known_ratio * n_place
     )

@@ -423,7 +423,7 @@ class Slam:
             restarted = self._lose(frame)
             return _result(frame, state, matches, inliers, restarted, clock)
         if not relocalised:
-            step = se3_log(orthonormalised(frame.T_cw @ inverse(T_cw)))
+            step = se3_log(orthonormalised(frame.T_cw @ inverse(self._poses.pose(-1))))
             self._velocity = step / (frame.timestamp - self._poses.timestamp(-1))
         self._place(frame)
         is_keyframe = self._extend_map(frame, inliers, visible)

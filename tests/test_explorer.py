@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from base64 import b64decode
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -275,12 +276,17 @@ def test_the_command_serves_until_it_is_interrupted(run: Path):
     import signal
 
     command = [sys.executable, "-u", "-m", "vslam", "report", str(run.parent), "--serve"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        port = int(re.match(r"http://127\.0\.0\.1:(\d+)/ shows", line)[1])
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
-        connection.request("GET", "/")
-        assert connection.getresponse().status == 200
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
+    # What a shell starts in the background ignores SIGINT, and so do its children.
+    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=listen) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            port = int(re.match(r"http://127\.0\.0\.1:(\d+)/ shows", line)[1])
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+            connection.request("GET", "/")
+            assert connection.getresponse().status == 200
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 0
+        finally:
+            process.kill()

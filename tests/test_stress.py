@@ -375,6 +375,7 @@ rows = [f"1 0 0 {0.1 * (i % 3) + (i > 6)} 0 1 0 0 0 0 1 {i}" for i in k]
     ("script", "said"),
     [
         ("sys.exit('no vocabulary')", "exit code 1: no vocabulary"),
+        ("sys.stdout.buffer.write(b'\\xff'); sys.stdout.flush(); sys.exit(3)", "exit code 3"),
         ("", "no trajectory.txt"),
         (DRIVES + "(out / 'states.txt').write_text('OK')", "1 states of 12 frames"),
         ("(out / 'trajectory.txt').write_text('a b')", "trajectory.txt"),
@@ -399,7 +400,11 @@ def test_the_exported_folder_is_read_again(tmp_path):
     np.testing.assert_array_equal(right, np.rint(sequence.read(3)[1] / 2.0))
 
 
-@pytest.mark.parametrize("template", ["slam {folder}", "slam {out}", "slam {folder} {oot}", "{"])
+@pytest.mark.parametrize(
+    "template",
+    ["slam {folder}", "slam {out}", "slam {folder} {oot}", "{", "slam {folder.x} {out}",
+     "slam '{folder} {out}"],
+)  # fmt: skip
 def test_a_template_must_hold_both_places(template):
     with pytest.raises(InputError, match="--system slam"):
         check_template("slam", template)

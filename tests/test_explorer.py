@@ -254,11 +254,26 @@ def test_runs_side_by_side(server):
 
 def test_nothing_but_reports_is_served_and_to_nobody_else(server):
     for path in ("/secret.html", "/../secret.html", "/run/../secret.html", "/run/-1", "/run/9",
-                 "/run/%2e%2e/secret.html", "/run/1/report.json"):  # fmt: skip
+                 "/run/%2e%2e/secret.html", "/run/1/report.json",
+                 "/run/" + 5000 * "9"):  # fmt: skip
         assert ask(server, path)[0] == 404, path
     assert ask(server, "/", "evil.example:80")[0] == 403
+    assert ask(server, "/compare?run=0&run=" + 5000 * "9")[0] == 400
     assert ask(server, "/", f"localhost:{server.server_port}")[0] == 200
+    assert ask(server, "/", "localhost")[0] == 200  # as at port 80
     assert server.server_address[0] == "127.0.0.1"
+
+
+def test_runs_may_go_while_they_are_served(tmp_path: Path):
+    folder = tmp_path / "runs" / "one"
+    folder.mkdir(parents=True)
+    write_results(folder, make_outcome(20), pages=False)
+    with make_server([tmp_path / "runs"]) as made:
+        threading.Thread(target=made.serve_forever, daemon=True).start()
+        assert ask(made, "/")[0] == 200
+        shutil.rmtree(tmp_path / "runs")
+        assert ask(made, "/") == (404, "the runs are gone")
+        made.shutdown()
 
 
 def test_what_cannot_be_served_is_said(tmp_path: Path, server):

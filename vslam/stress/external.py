@@ -51,12 +51,19 @@ def check_template(name: str, template: str) -> None:
     """
     try:
         filled = template.format(folder="F", out="O")
-    except (KeyError, IndexError, ValueError) as error:
+    except (KeyError, IndexError, ValueError, AttributeError) as error:
         raise InputError(
             f"--system {name}={template}: unknown placeholder {error}; write {{folder}} and "
             "{out}."
         ) from error
-    if "{folder}" not in template or "{out}" not in template or not shlex.split(filled):
+    try:
+        shlex.split(filled)
+    except ValueError as error:
+        raise InputError(
+            f"--system {name}={template}: cannot be split into words ({error}); quote it as in a "
+            "shell."
+        ) from error
+    if "{folder}" not in template or "{out}" not in template:
         raise InputError(
             f"--system {name}={template}: must hold {{folder}} and {{out}}, see docs/stress.md."
         )
@@ -150,6 +157,7 @@ def _call(template: str, sequence: Path, out: Path) -> None:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
+            errors="replace",
         ) as child:
             assert child.stdout is not None
             log = child.stdout.read()

@@ -25,7 +25,7 @@ from vslam.camera import Camera
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import timed_frames
-from vslam.errors import DroppedFrameError, InputError
+from vslam.errors import DroppedFrameError, InputError, ResultsError
 from vslam.features import TrackingState, TrackResult
 from vslam.report.folder import write_results
 from vslam.report.schema import ReportJson
@@ -116,7 +116,8 @@ def export_kitti(sequence: Sequence, perturbation: Perturbation, folder: Path) -
         for side, image in enumerate(images):
             if image is not None and image.dtype == np.uint8:
                 path = folder / f"image_{side}" / f"{len(kept):06d}.png"
-                cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+                if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+                    raise ResultsError(f"{path}: cannot be written; is the disk full?")
         kept.append(index)
         times.append(frame.timestamp - float(sequence.timestamps[0]))
     (folder / "times.txt").write_text("".join(f"{t:.9e}\n" for t in times))

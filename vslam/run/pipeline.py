@@ -115,6 +115,7 @@ def run_sequence(
             corrections=before.corrections + corrections,
         )
 
+    slam.on_merge = lambda: autosave.offer_amid(slam, so_far)
     with _stop_on_interrupt() as interrupted:
         frames = perturbed(_until_broken(timed_frames(sequence), broken), perturbation)
         if tracks:

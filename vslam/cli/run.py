@@ -220,7 +220,8 @@ def _refuse_beside_resume(context: typer.Context) -> None:
 
 
 def _map_to_go_on_in(file: Path, detector: DetectorName | None) -> tuple[Path, DetectorName]:
-    """The map of a file or of the folder of a run, and the detector that it was made with."""
+    """The map of a file or of the folder of a run, and the detector that it was made with. The path
+    is absolute: ``runs/latest`` will be another folder once this run has one."""
     from vslam.maps.storage import map_file_of, read_header
 
     file = map_file_of(file)
@@ -229,4 +230,4 @@ def _map_to_go_on_in(file: Path, detector: DetectorName | None) -> tuple[Path, D
         raise InputError(
             f"--detector {detector}: {file} was made with the detector {made_with}; leave it out."
         )
-    return file, made_with
+    return file.resolve(), made_with

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 from pathlib import Path
@@ -13,11 +14,12 @@ from typer.testing import CliRunner
 
 from vslam.cli.main import app
 from vslam.config import Config
-from vslam.errors import InputError
+from vslam.errors import InputError, ResultsError
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.geometry import inverse
 from vslam.loopclosure.registry import create_detector
 from vslam.maps.storage import load_map
+from vslam.report import folder
 from vslam.slam import Slam
 
 CONFIG = Config()
@@ -199,6 +201,9 @@ def test_a_drive_without_a_keyframe_yet_is_resumed(ring, tmp_path):
     second = Slam.load(tmp_path / "empty.npz", threads=1, resume=True)
     assert states(drive(second, ring, range(10), seed=1, start=0.2)) == "O" * 10
     assert len(second.trajectory()) == 12
+    again = Slam.load(tmp_path / "empty.npz", threads=1)
+    drive(again, ring, range(2), seed=1)
+    assert again.stored_map("ring").drives == ("ring",)  # as many as keyframes are of
 
 
 def test_a_drive_through_known_places_is_resumed_by_its_own_clock(file, ring, tmp_path):
@@ -283,6 +288,31 @@ def test_localise_by_the_command_line(kitti_tree, mapped, tmp_path):
     assert "In the map" in page
 
 
+@pytest.mark.parametrize("name", ["camera", "detector"])
+def test_a_damaged_header_gets_a_sentence(kitti_tree, mapped, tmp_path, name):
+    with np.load(mapped / "map.npz") as file:
+        arrays = dict(file)
+    header = json.loads(bytes(arrays["header"])) | {name: {"x": 1}}
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    np.savez(tmp_path / "m.npz", **arrays)
+    run = ("run", "--data", kitti_tree, "--out", tmp_path / "out", "--map", tmp_path / "m.npz")
+    assert "the map is damaged" in refusal(*run)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_map_that_cannot_be_written_elsewhere_is_in_the_folder(kitti_tree, tmp_path, monkeypatch):
+    def full(path):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(folder, "replaced_file", full)
+    words = ("run", "--data", kitti_tree, "--no-record", "--no-report", "--quiet")
+    to = tmp_path / "town.npz"
+    result = vslam(*words, "--out", tmp_path, "--max-frames", 3, "--save-map", to)
+    assert isinstance(result.exception, ResultsError)
+    assert str(result.exception).startswith(f"{to}: cannot be written (No space left on device)")
+    assert load_map(tmp_path / "latest" / "map.npz").map.n_keyframes
+
+
 def test_the_latest_run_is_that_before_this_one(kitti_tree, tmp_path):
     words = ("run", "--data", kitti_tree, "--no-record", "--no-report", "--quiet")
     words = (*words, "--out", tmp_path, "--max-frames", 6)
@@ -320,4 +350,6 @@ def test_refusals(kitti_tree, mapped, tmp_path):
     config = tmp_path / "config.json"
     config.write_text(json.dumps({"orb": {"n_levels": 4}}))
     assert "another pyramid" in refusal(*run, "--map", mapped, "--config", config)
+    assert "there is no folder" in refusal(*run, "--save-map", tmp_path / "gone" / "m.npz")
+    assert "is a folder" in refusal(*run, "--save-map", tmp_path)
     assert not list((tmp_path / "out").glob("*/report.json"))

@@ -369,6 +369,8 @@ class Slam:
             self._closing.images.restore(start.images, self.camera.width)
         self._closing.closed = list(start.loops)
         self._drives, self.world = start.drives, start.world
+        if not start.map.n_keyframes:
+            self._drives = ()
         if resume:
             self._drives = self._drives[:-1]
             return start.frames

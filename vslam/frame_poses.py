@@ -57,7 +57,7 @@ class FrameTable(NamedTuple):
 
     def until(self, frames: int) -> FrameTable:
         """The first ones."""
-        return FrameTable(*(values[:frames] for values in self))
+        return FrameTable._make(values[:frames] for values in self)
 
 
 class FramePoses:

@@ -23,6 +23,7 @@ from vslam.loops import LoopEdge
 from vslam.report import figures
 from vslam.run import pipeline as run_pipeline
 from vslam.run import recorder, warmup
+from vslam.run.moments import MomentRecorder
 from vslam.run.outcome import RunOutcome
 from vslam.trajectory import Trajectory, read_kitti_poses, write_kitti, write_tum
 
@@ -130,7 +131,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--config nothing.json", ["nothing.json", "configuration"]),
         ("--compare-loops --detector none", ["--compare-loops", "--detector none"]),
         ("--data nowhere", ["nowhere", "no such file or folder", "--data"]),
-        ("--data .", ["no data set that is known", "sequences", "mav0", "rgb.txt"]),
+        ("--data .", ["the folder is empty", "--data"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
         ("--topics /a,/b", ["--topics", "only for --dataset bag"]),
@@ -259,7 +260,9 @@ def test_run_writes_its_folder_and_a_summary(call, root, pipeline):
     assert folder.name.endswith("-kitti-00-blur0.5-bow")
     assert pipeline.settings.threads == 3
     assert pipeline.settings.perturb == "blur:0.5"
-    assert pipeline.recorder == str(Path("runs") / folder.name / "recording.rrd")
+    recording, moments = pipeline.recorder.recorders
+    assert recording == str(Path("runs") / folder.name / "recording.rrd")
+    assert isinstance(moments, MomentRecorder)
     assert pipeline.evaluation.ate_rmse_m < 1e-9
     assert len(read_kitti_poses(folder / "ground_truth_kitti.txt")) == 10
 
@@ -295,7 +298,7 @@ def test_compare_loops_runs_twice_and_prints_both(call, root, with_detector):
     code, out, err = call(*words)
     assert code == 0, err
     assert [run[0] for run in with_detector.runs] == ["bow", "none"]
-    assert with_detector.runs[0][1].endswith("recording.rrd")
+    assert with_detector.runs[0][1].recorders[0].endswith("recording.rrd")
     assert with_detector.runs[1][1] == "null"
     table = {line.split("  ")[0]: line.split()[-4:] for line in out.splitlines()[-6:]}
     assert table["ATE rmse"][:2] == ["0.000", "m"]
@@ -338,7 +341,7 @@ def test_a_monocular_run_says_that_its_scale_is_arbitrary(call, root, pipeline):
 
 def test_quiet_run_says_nothing(call, root, pipeline):
     assert call("run", "--data", root, "--max-frames", 10, "--no-record", "--quiet") == (0, "", "")
-    assert pipeline.recorder == "null"
+    assert pipeline.recorder.recorders[0] == "null"
 
 
 def test_clip_too_short_to_evaluate_is_reported_all_the_same(call, root, pipeline):

@@ -137,12 +137,14 @@ def test_images_of_absurd_size_are_refused_by_their_header(tmp_path: Path, width
     (tmp_path / "a.png").write_bytes(png(width, height))
     script = (
         "import sys, resource\n"
+        "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024\n"
+        "before = peak()\n"  # that of the parent, which the process was forked from
         "from pathlib import Path\n"
         "from vslam.datasets.image_files import read_grey\n"
         "from vslam.errors import UnreadableImageError\n"
         "try: read_grey(Path(sys.argv[1]))\n"
         "except UnreadableImageError as error: print(error)\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)\n"
+        "print(peak() - before)\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", script, str(tmp_path / "a.png")], capture_output=True, text=True

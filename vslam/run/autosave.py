@@ -5,6 +5,8 @@ so often the map is copied where no keyframe is being mapped, and a thread write
 the report tells of the frames so far: ``autosave_progress.npz``, then ``autosave.npz``, a map file
 as any other. Each takes the place of the one before in one step. A run killed between the two finds
 the progress of a few frames more than the map has, and passes over them.
+
+One file because what is written is read together with what reads it again.
 """
 
 from __future__ import annotations

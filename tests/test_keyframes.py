@@ -110,7 +110,8 @@ KNOWN = PlaceEvidence(n_inliers=150, n_shared=100, n_place=200)
     ({}, True),
     ({"n_inliers": 149}, False),
     ({"n_shared": 99}, False),
-    ({"n_place": 0, "n_inliers": 0, "n_shared": 0}, True),
+    ({"n_place": 10, "n_inliers": 50, "n_shared": 5}, True),
+    ({"n_place": 10, "n_inliers": 49, "n_shared": 49}, False),  # the end of a map
 ])  # fmt: skip
 def test_a_place_is_known_that_is_tracked_like_its_old_keyframe(changes, known):
     config = KeyframeConfig(max_tracked_ratio=0.75, known_ratio=0.5)

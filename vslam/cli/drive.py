@@ -105,6 +105,8 @@ def drive(
     if o.map_file is not None and resume is None:
         require_camera(o.map_file, source.camera)
     unfinished = None if resume is None else find_unfinished(resume)
+    if unfinished is not None:
+        require_camera(unfinished.map, source.camera)
     viewer = None if output.view is None else open_viewer(output.view)
     recording = "recording.rrd"
     if resume is None or unfinished is None:

@@ -23,7 +23,9 @@ RUN pip install --no-cache-dir torch --index-url https://download.pytorch.org/wh
 ENV NUMBA_CACHE_DIR=/cache/numba VSLAM_CACHE=/cache/vslam MPLCONFIGDIR=/cache/matplotlib
 USER vslam
 WORKDIR /work
-# Kernels are compiled here, once, and not in the first run.
-RUN python -c "from vslam.run.warmup import compile_kernels; compile_kernels(processes=2)"
+# Kernels are compiled here, once, and not in the first run. Numba refuses a cache that it cannot
+# write to: with --user somebody else must.
+RUN python -c "from vslam.run.warmup import compile_kernels; compile_kernels(processes=2)" \
+    && chmod -R a+rwX /cache/*
 ENTRYPOINT ["vslam"]
 CMD ["--help"]

@@ -87,10 +87,11 @@ def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
     may that is next to that keyframe, and a good part of it is that keyframe's.
 
     Few close points are no reason to map the place once more: mapping it has not made them more.
+    At the end of a map its last keyframe has few landmarks that three keyframes see; there the
+    camera would be taken for somewhere known until it is lost, so that it must track some at least.
     """
-    # At the edge of a map hardly a landmark of a keyframe is seen by two others.
-    n_place = max(evidence.n_place, config.known_min)
     return (
-        evidence.n_inliers >= config.max_tracked_ratio * n_place
-        and evidence.n_shared >= config.known_ratio * n_place
+        evidence.n_inliers >= config.known_min_inliers
+        and evidence.n_inliers >= config.max_tracked_ratio * evidence.n_place
+        and evidence.n_shared >= config.known_ratio * evidence.n_place
     )

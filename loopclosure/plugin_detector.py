@@ -122,6 +122,10 @@ def _wrong(found: object, query: int, map_: Map) -> str:
     for candidate in found:
         if not isinstance(candidate, LoopCandidate):
             return f"gave {type(candidate).__name__} in its list, no LoopCandidate"
+        numbers = candidate.query, candidate.match, candidate.score
+        kinds = (int, np.integer), (int, np.integer), (int, float, np.integer, np.floating)
+        if not all(isinstance(x, kind) for x, kind in zip(numbers, kinds, strict=True)):
+            return f"gave a LoopCandidate of {', '.join(type(x).__name__ for x in numbers)}"
         if candidate.query != query or not isfinite(candidate.score):
             return f"gave query {candidate.query} with score {candidate.score} for keyframe {query}"
         inside = 0 <= candidate.match < map_.n_keyframes

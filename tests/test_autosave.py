@@ -35,6 +35,7 @@ from vslam.run.autosave import (
     find_unfinished,
     lock_run,
     read_progress,
+    remove_autosave,
     write_progress,
 )
 from vslam.run.options import RunOptions, read_options, write_options
@@ -62,11 +63,15 @@ drive(Path(sys.argv[1]), Path(sys.argv[2]), on_frame=on_frame)
 
 
 def drive(
-    root: Path, folder: Path | None, resume: Unfinished | None = None, **options: object
+    root: Path,
+    folder: Path | None,
+    resume: Unfinished | None = None,
+    config: Config = Config(),  # noqa: B008
+    **options: object,
 ) -> RunOutcome:
     """Run over the corridor; with a folder, saving whenever that is possible."""
     sequence = open_sequence("kitti", root, "00")
-    settings = RunSettings("kitti", "00", "none", "bow", "stereo", 0, 2, 0, 1, None, Config())
+    settings = RunSettings("kitti", "00", "none", "bow", "stereo", 0, 2, 0, 1, None, config)
     autosave = {} if folder is None else {"autosave": FolderAutosave(folder, 1e-6, "kitti 00")}
     law = parse_perturbation("none", 0)
     return run_sequence(
@@ -120,6 +125,41 @@ def test_an_interrupted_run_is_saved_at_its_end(kitti_tree, tmp_path):
 
     drive(kitti_tree, tmp_path, on_frame=interrupt)
     assert len(find_unfinished(tmp_path).progress.tracks) == 13
+
+
+def test_a_map_is_saved_where_every_frame_becomes_a_keyframe(kitti_tree, tmp_path):
+    config = Config.model_validate({"keyframes": {"max_interval_s": 0.01}})
+    saved: list[int] = []
+
+    def look(result: TrackResult) -> None:
+        if (tmp_path / MAP).exists():
+            # The writer may be between the two files: the map is of no later frame than the rest.
+            frames = load_map(tmp_path / MAP).frames
+            assert frames is not None
+            saved.append(len(frames.timestamp))
+            assert saved[-1] <= len(read_progress(tmp_path / PROGRESS).tracks)
+
+    outcome = drive(kitti_tree, tmp_path, config=config, on_frame=look)
+    assert sum(track.is_keyframe for track in outcome.tracks) > FRAMES - 3
+    assert len(set(saved)) > 2
+    assert saved[-1] > FRAMES - 12
+    undisturbed = drive(kitti_tree, None, config=config)
+    assert outcome.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
+
+
+def test_half_written_files_of_killed_runs_go_with_the_rest(tmp_path):
+    for name in (MAP, PROGRESS, f".{MAP}.123.part", f".{PROGRESS}.7.part", "map.npz"):
+        (tmp_path / name).write_bytes(b"")
+    remove_autosave(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["map.npz"]
+
+
+def test_images_of_another_camera_do_not_resume_a_run(kitti_tree, tmp_path):
+    drive_until(kitti_tree, tmp_path, 5)
+    write_options(tmp_path, RunOptions(data=str(kitti_tree), seq="00", sensor="mono"))
+    done = vslam("run", "--resume", tmp_path, "--no-record", "--no-report", "--quiet", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "camera is not that of the images" in done.stderr
 
 
 def test_a_full_disk_is_told_once_and_the_run_goes_on(

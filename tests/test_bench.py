@@ -101,11 +101,20 @@ def test_a_cell_is_finished_only_by_a_whole_run_of_the_same_settings(run_folder:
     assert not grid.is_finished(cell, run_folder.parent, CONFIG)
 
 
-@pytest.mark.parametrize(("sensor", "finished"), [("rgbd", True), ("mono", False)])
-def test_runs_with_depth_count_and_those_of_one_camera_do_not(stub, tmp_path, sensor, finished):
+@pytest.mark.parametrize(
+    ("sensor", "asked", "finished"),
+    [
+        ("rgbd", None, True),
+        ("mono", None, True),  # of a reader of another package: the data has one camera
+        ("mono", "mono", True),
+        ("stereo", "mono", False),
+        ("mono", "stereo", False),
+    ],
+)
+def test_a_run_counts_if_it_is_of_the_sensor_asked_for(stub, tmp_path, sensor, asked, finished):
     report = json.loads((stub / "report.json").read_text())
     (stub / "report.json").write_text(json.dumps(report | {"sensor": sensor}))
-    cell = Cell("tum", "desk", "none", "none", 0)
+    cell = Cell("tum", "desk", "none", "none", 0, sensor=asked)
     out = tmp_path / "bench"
     list(execute.run_here([cell], options_for(out), 1, out))
     assert execute.finished_cells([cell], out, CONFIG) == [cell] * finished

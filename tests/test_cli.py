@@ -130,7 +130,8 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--config nothing.json", ["nothing.json", "configuration"]),
         ("--compare-loops --detector none", ["--compare-loops", "--detector none"]),
         ("--data nowhere", ["nowhere", "no such file or folder", "--data"]),
-        ("--data .", ["no data set that is known", "sequences", "mav0", "rgb.txt"]),
+        ("--data .", ["the folder is empty", "--data"]),
+        ("--data ..", ["no data set that is known", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
         ("--topics /a,/b", ["--topics", "only for --dataset bag"]),
@@ -240,6 +241,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
     monkeypatch.setattr(recorder, "NullRecorder", lambda: "null")
     monkeypatch.setattr(recorder, "RerunRecorder", str)
     monkeypatch.setattr(run_pipeline, "NullRecorder", lambda: "null")
+    monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[0])
     monkeypatch.setattr(figures, "draw_figures", draw_figures)
     monkeypatch.setattr(warmup, "is_cold", lambda: False)
     monkeypatch.setattr(warmup, "compile_kernels", lambda processes: None)

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from base64 import b64decode
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -253,11 +254,26 @@ def test_runs_side_by_side(server):
 
 def test_nothing_but_reports_is_served_and_to_nobody_else(server):
     for path in ("/secret.html", "/../secret.html", "/run/../secret.html", "/run/-1", "/run/9",
-                 "/run/%2e%2e/secret.html", "/run/1/report.json"):  # fmt: skip
+                 "/run/%2e%2e/secret.html", "/run/1/report.json",
+                 "/run/" + 5000 * "9"):  # fmt: skip
         assert ask(server, path)[0] == 404, path
     assert ask(server, "/", "evil.example:80")[0] == 403
+    assert ask(server, "/compare?run=0&run=" + 5000 * "9")[0] == 400
     assert ask(server, "/", f"localhost:{server.server_port}")[0] == 200
+    assert ask(server, "/", "localhost")[0] == 200  # as at port 80
     assert server.server_address[0] == "127.0.0.1"
+
+
+def test_runs_may_go_while_they_are_served(tmp_path: Path):
+    folder = tmp_path / "runs" / "one"
+    folder.mkdir(parents=True)
+    write_results(folder, make_outcome(20), pages=False)
+    with make_server([tmp_path / "runs"]) as made:
+        threading.Thread(target=made.serve_forever, daemon=True).start()
+        assert ask(made, "/")[0] == 200
+        shutil.rmtree(tmp_path / "runs")
+        assert ask(made, "/") == (404, "the runs are gone")
+        made.shutdown()
 
 
 def test_what_cannot_be_served_is_said(tmp_path: Path, server):
@@ -275,12 +291,17 @@ def test_the_command_serves_until_it_is_interrupted(run: Path):
     import signal
 
     command = [sys.executable, "-u", "-m", "vslam", "report", str(run.parent), "--serve"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        port = int(re.match(r"http://127\.0\.0\.1:(\d+)/ shows", line)[1])
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
-        connection.request("GET", "/")
-        assert connection.getresponse().status == 200
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
+    # What a shell starts in the background ignores SIGINT, and so do its children.
+    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=listen) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            port = int(re.match(r"http://127\.0\.0\.1:(\d+)/ shows", line)[1])
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+            connection.request("GET", "/")
+            assert connection.getresponse().status == 200
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 0
+        finally:
+            process.kill()

@@ -110,10 +110,9 @@ KNOWN = PlaceEvidence(n_inliers=150, n_shared=100, n_place=200)
     ({}, True),
     ({"n_inliers": 149}, False),
     ({"n_shared": 99}, False),
-    ({"n_place": 4, "n_inliers": 75, "n_shared": 50}, True),
-    ({"n_place": 4, "n_inliers": 74, "n_shared": 74}, False),  # about to leave the map
-    ({"n_place": 4, "n_inliers": 75, "n_shared": 49}, False),
+    ({"n_place": 10, "n_inliers": 50, "n_shared": 5}, True),
+    ({"n_place": 10, "n_inliers": 49, "n_shared": 49}, False),  # the end of a map
 ])  # fmt: skip
 def test_a_place_is_known_that_is_tracked_like_its_old_keyframe(changes, known):
-    config = KeyframeConfig(max_tracked_ratio=0.75, known_ratio=0.5, known_min=100)
+    config = KeyframeConfig(max_tracked_ratio=0.75, known_ratio=0.5)
     assert is_known_place(replace(KNOWN, **changes), config) == known

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 from pathlib import Path
@@ -13,10 +14,12 @@ from typer.testing import CliRunner
 
 from vslam.cli.main import app
 from vslam.config import Config
-from vslam.errors import InputError
+from vslam.errors import InputError, ResultsError
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.geometry import inverse
 from vslam.loopclosure.registry import create_detector
+from vslam.maps.storage import load_map
+from vslam.report import folder
 from vslam.slam import Slam
 
 CONFIG = Config()
@@ -191,6 +194,39 @@ def test_a_drive_without_a_detector_resumes_where_it_was(ring, tmp_path):
     assert off(second, ring, range(60)).max() < 0.3
 
 
+def test_a_drive_without_a_keyframe_yet_is_resumed(ring, tmp_path):
+    first = new()
+    drive(first, ring, [None, None], seed=1)
+    first.save(tmp_path / "empty.npz", "ring")
+    second = Slam.load(tmp_path / "empty.npz", threads=1, resume=True)
+    assert states(drive(second, ring, range(10), seed=1, start=0.2)) == "O" * 10
+    assert len(second.trajectory()) == 12
+    again = Slam.load(tmp_path / "empty.npz", threads=1)
+    drive(again, ring, range(2), seed=1)
+    assert again.stored_map("ring").drives == ("ring",)  # as many as keyframes are of
+
+
+def test_a_drive_through_known_places_is_resumed_by_its_own_clock(file, ring, tmp_path):
+    first = Slam.load(file, threads=1)
+    assert not any(result.is_keyframe for result in drive(first, ring, range(10, 14), seed=2))
+    first.save(tmp_path / "second.npz", "ring")
+    second = Slam.load(tmp_path / "second.npz", threads=1, resume=True)
+    # The map's last keyframe is of another drive, and of a later time of day.
+    results = drive(second, ring, [*range(14, 120)], seed=2, start=0.4)
+    assert states(results) == "O" * 106
+
+
+def test_the_first_frame_after_a_cut_tells_the_speed(ring, tmp_path):
+    first = new()
+    drive(first, ring, range(60), seed=8)
+    first.save(tmp_path / "half.npz", "half")
+    second = Slam.load(tmp_path / "half.npz", threads=1, resume=True)
+    before = first.trajectory().T_wc[-1]
+    now = second.step_features(ring.see(60, seed=8), 6.0).T_wc
+    expected = now @ inverse(before) @ now
+    np.testing.assert_allclose(inverse(second._predict(6.1)), expected, atol=0.05)
+
+
 @pytest.mark.parametrize("localize", [False, True])
 def test_the_same_bytes_with_one_thread_and_two(file, ring, localize):
     places = [*range(60, 120), None, None, None, None, *range(20, 50)]
@@ -252,6 +288,42 @@ def test_localise_by_the_command_line(kitti_tree, mapped, tmp_path):
     assert "In the map" in page
 
 
+@pytest.mark.parametrize("name", ["camera", "detector"])
+def test_a_damaged_header_gets_a_sentence(kitti_tree, mapped, tmp_path, name):
+    with np.load(mapped / "map.npz") as file:
+        arrays = dict(file)
+    header = json.loads(bytes(arrays["header"])) | {name: {"x": 1}}
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    np.savez(tmp_path / "m.npz", **arrays)
+    run = ("run", "--data", kitti_tree, "--out", tmp_path / "out", "--map", tmp_path / "m.npz")
+    assert "the map is damaged" in refusal(*run)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_map_that_cannot_be_written_elsewhere_is_in_the_folder(kitti_tree, tmp_path, monkeypatch):
+    def full(path):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(folder, "replaced_file", full)
+    words = ("run", "--data", kitti_tree, "--no-record", "--no-report", "--quiet")
+    to = tmp_path / "town.npz"
+    result = vslam(*words, "--out", tmp_path, "--max-frames", 3, "--save-map", to)
+    assert isinstance(result.exception, ResultsError)
+    assert str(result.exception).startswith(f"{to}: cannot be written (No space left on device)")
+    assert load_map(tmp_path / "latest" / "map.npz").map.n_keyframes
+
+
+def test_the_latest_run_is_that_before_this_one(kitti_tree, tmp_path):
+    words = ("run", "--data", kitti_tree, "--no-record", "--no-report", "--quiet")
+    words = (*words, "--out", tmp_path, "--max-frames", 6)
+    assert vslam(*words).exit_code == 0
+    first = (tmp_path / "latest").resolve()
+    assert vslam(*words, "--map", tmp_path / "latest").exit_code == 0
+    options = json.loads((tmp_path / "latest" / "run.json").read_text())
+    assert options["map_file"] == str(first / "map.npz")
+    assert len(load_map(tmp_path / "latest" / "map.npz").drives) == 2
+
+
 def test_go_on_by_the_command_line(kitti_tree, mapped, tmp_path):
     words = ("run", "--data", kitti_tree, "--no-record", "--no-report", "--quiet")
     result = vslam(*words, "--out", tmp_path, "--start", 16, "--map", mapped / "map.npz")
@@ -278,4 +350,6 @@ def test_refusals(kitti_tree, mapped, tmp_path):
     config = tmp_path / "config.json"
     config.write_text(json.dumps({"orb": {"n_levels": 4}}))
     assert "another pyramid" in refusal(*run, "--map", mapped, "--config", config)
+    assert "there is no folder" in refusal(*run, "--save-map", tmp_path / "gone" / "m.npz")
+    assert "is a folder" in refusal(*run, "--save-map", tmp_path)
     assert not list((tmp_path / "out").glob("*/report.json"))

@@ -284,6 +284,8 @@ def test_a_detector_that_fails_ends_the_run_with_what_it_has(broken, kitti_tree,
         ("[LoopCandidate(0, 5, 1.0)]", "gave keyframe 5, which the map does not have"),
         ("[LoopCandidate(0, 0, float('nan'))]", "with score nan"),
         ("[LoopCandidate(4, 0, 1.0)]", "gave query 4"),
+        ("[LoopCandidate(0, 0.5, 1.0)]", "gave a LoopCandidate of int, float, float"),
+        ("[LoopCandidate(0, 0, '1')]", "gave a LoopCandidate of int, int, str"),
     ],
 )
 def test_candidates_that_are_none_are_caught_before_kernels_see_them(broken, answer, says):

@@ -94,6 +94,18 @@ def test_other_forms_are_left_to_opencv():
     assert decode_png(cv2.imencode(".bmp", image)[1].tobytes()) is None
 
 
+def test_a_file_without_a_header_is_none():
+    assert decode_png(SIGNATURE + chunk(b"IEND", b"")) is None
+
+
+def test_a_line_too_wide_for_the_buffers_is_left_to_opencv():
+    for width, found in ((1 << 15, True), ((1 << 15) + 1, False)):
+        image = np.full((1, width), 7, np.uint8)
+        data = png(image, zlib.compress(b"\0" + image.tobytes()))
+        np.testing.assert_array_equal(by_opencv(data), image)
+        assert (decode_png(data) is not None) is found
+
+
 def test_damaged_image_data_is_not_taken_for_an_image():
     image = picture(20, 30)
     lines = filtered(image, np.full(20, 4))

@@ -16,7 +16,7 @@ from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.config import Config
 from vslam.datasets.kitti import open_kitti
-from vslam.datasets.perturbation import LAWS, parse_perturbation
+from vslam.datasets.perturbation import LAWS, parse_perturbation, sheet_of_laws
 from vslam.errors import InputError
 from vslam.report.schema import Machine, ReportJson
 from vslam.run.outcome import RunSettings
@@ -26,7 +26,7 @@ from vslam.stress.figures import draw_curves
 from vslam.stress.kitti_c import CORRUPTIONS
 from vslam.stress.plan import Plan, parse_laws
 from vslam.stress.report import cell as cell_text
-from vslam.stress.report import render_boundaries, render_csv, write_report
+from vslam.stress.report import render_boundaries, render_csv, title, write_report
 from vslam.stress.run import Results, run_all
 from vslam.stress.search import boundary, next_position, strength_at
 from vslam.stress.summary import corruption_entries, mean_error, summarise
@@ -237,6 +237,24 @@ def test_the_report_says_it_in_every_form(tmp_path):
     assert "| night | stops | 10 " in render_boundaries(report)
 
 
+def test_the_title_is_a_sentence(tmp_path):
+    _, report = conducted(tmp_path)
+    assert title(report) == "Where do bow, other break? kitti 00"
+    alone = report.model_copy(update={"clean": report.clean[:1]})
+    assert title(alone) == "Where does bow break? kitti 00"
+
+
+def test_a_sheet_of_laws_has_no_empty_half_for_one(tmp_path):
+    sequence = open_kitti(make_kitti(tmp_path), "00")
+    one, two, three = (
+        sheet_of_laws(sequence, ["blur:1", "night:3", "yaw:5"][:n], 0, 0) for n in (1, 2, 3)
+    )
+    height, width = one.shape
+    assert two.shape == (height, 2 * width)
+    assert three.shape == (2 * height, 2 * width)
+    np.testing.assert_array_equal(one, two[:, :width])
+
+
 def test_a_cell_of_the_table_tells_median_and_spread(tmp_path):
     _, report = conducted(tmp_path)
     mine = [e for e in report.boundaries if (e.law, e.system) == ("night", "other")]
@@ -375,6 +393,7 @@ rows = [f"1 0 0 {0.1 * (i % 3) + (i > 6)} 0 1 0 0 0 0 1 {i}" for i in k]
     ("script", "said"),
     [
         ("sys.exit('no vocabulary')", "exit code 1: no vocabulary"),
+        ("sys.stdout.buffer.write(b'\\xff'); sys.stdout.flush(); sys.exit(3)", "exit code 3"),
         ("", "no trajectory.txt"),
         (DRIVES + "(out / 'states.txt').write_text('OK')", "1 states of 12 frames"),
         ("(out / 'trajectory.txt').write_text('a b')", "trajectory.txt"),
@@ -399,7 +418,11 @@ def test_the_exported_folder_is_read_again(tmp_path):
     np.testing.assert_array_equal(right, np.rint(sequence.read(3)[1] / 2.0))
 
 
-@pytest.mark.parametrize("template", ["slam {folder}", "slam {out}", "slam {folder} {oot}", "{"])
+@pytest.mark.parametrize(
+    "template",
+    ["slam {folder}", "slam {out}", "slam {folder} {oot}", "{", "slam {folder.x} {out}",
+     "slam '{folder} {out}"],
+)  # fmt: skip
 def test_a_template_must_hold_both_places(template):
     with pytest.raises(InputError, match="--system slam"):
         check_template("slam", template)
@@ -444,6 +467,7 @@ rows = [f"1 0 0 {0.1 * (i % 3) + far * (i % 2)} 0 1 0 0 0 0 1 {i}" for i in k]
         ("--systems orbslam3", "--vocabulary"),
         ("--systems dso", "--systems dso: unknown"),
         ("--system x", "write NAME=COMMAND"),
+        ("--system bow={folder}{out}", "--system bow: a detector of this test has that name"),
         ("--preset kitti-c --baseline capsule", "--baseline capsule: not tested"),
     ],
 )

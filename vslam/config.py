@@ -303,8 +303,8 @@ class KeyframeConfig(_Section):
         gt=0,
         description="Tracked share of an old keyframe's points; above, its place is known. [own]",
     )
-    known_min: int = Field(
-        100, ge=0, description="Points that such a keyframe is taken to have at least. [own]"
+    known_min_inliers: int = Field(
+        50, ge=0, description="Landmarks tracked; fewer, and no place is known. [own]"
     )
     merge_after_frames: int = Field(
         2, ge=1, description="Frames after which local mapping is merged. [own]"

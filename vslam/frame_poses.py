@@ -55,6 +55,10 @@ class FrameTable(NamedTuple):
     tracked: NDArray[np.bool_]
     unit_scale: NDArray[np.float64]
 
+    def until(self, frames: int) -> FrameTable:
+        """The first ones."""
+        return FrameTable._make(values[:frames] for values in self)
+
 
 class FramePoses:
     """The poses of all frames, in order; those before the first keyframe are in the world."""

@@ -75,6 +75,12 @@ class MappingThread:
             self.n_keyframes = self._map.n_keyframes
             self.set_reference(int(self._map.living_keyframes()[-1]))
 
+    def resume(self) -> None:
+        """Take the newest keyframe for the last one made, unless an earlier drive made it."""
+        map_, newest = self._map, self.reference
+        if map_.n_keyframes and map_.sessions[newest] == map_.session:
+            self.last_frame, self.last_timestamp = map_.frames[newest], map_.timestamps[newest]
+
     @property
     def busy(self) -> bool:
         """Whether a keyframe is being mapped."""

@@ -6,6 +6,7 @@ One file because the step and the decisions that it calls are read together.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -67,6 +68,8 @@ class Slam:
         frame: the last frame tracked, for drawing; None before the first.
         context: camera, thresholds and pyramid scales, as ``extract_features`` takes them.
         world: where the map that was loaded lies in that of a ground truth, None if unknown.
+        on_merge: called where local mapping was merged, also in the middle of a step: the frame
+            of that step may be placed, and the map can be read.
     """
 
     def __init__(
@@ -110,6 +113,7 @@ class Slam:
         self._localize = localize
         self._drives: tuple[str, ...] = ()
         self.world: World | None = None
+        self.on_merge: Callable[[], None] = lambda: None
         self._closing = LoopClosing(
             self._detector, camera, self.config, threads=threads, images=images
         )
@@ -125,9 +129,7 @@ class Slam:
         self._poses = FramePoses(self._mapping, before)
         self._resumed = before is not None and len(before.timestamp) > 0
         if self._resumed:
-            newest = self._mapping.reference
-            self._mapping.last_frame = self._mapping.map.frames[newest]
-            self._mapping.last_timestamp = self._mapping.map.timestamps[newest]
+            self._mapping.resume()
         self._velocity: Matrix | None = None  # twist per second, None if unknown
         self._lost_frames = 0
         self._n_tracked = 0  # landmarks, in the last frame tracked
@@ -368,6 +370,8 @@ class Slam:
             self._closing.images.restore(start.images, self.camera.width)
         self._closing.closed = list(start.loops)
         self._drives, self.world = start.drives, start.world
+        if not start.map.n_keyframes:
+            self._drives = ()
         if resume:
             self._drives = self._drives[:-1]
             return start.frames
@@ -661,6 +665,7 @@ class Slam:
         self._follow_map(self.frame)
         if current is not self.frame:
             self._follow_map(current)
+        self.on_merge()
 
     def _merge_before(self, frame: Frame) -> None:
         """Merge when a frame is tracked and not placed yet: it keeps its pose to the reference."""

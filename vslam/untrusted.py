@@ -9,19 +9,18 @@ from __future__ import annotations
 import os
 import zipfile
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from vslam.errors import InputError
+
+if TYPE_CHECKING:  # `vslam --help` loads this, but not NumPy
+    from numpy.typing import NDArray
 
 MOST_PIXELS = 2**27
 """Of an image file: 11,585 x 11,585; OpenCV itself allows eight times as many."""
 
 _OPENCV_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
 _DAMAGED = (OSError, EOFError, ValueError, KeyError, NotImplementedError, RuntimeError)
-_READ = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def limit_images() -> None:
@@ -80,11 +79,15 @@ def _check_memory(path: Path, archive: zipfile.ZipFile, what: str) -> None:
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
     """An array, after a look at its header: it must not be larger than its member."""
+    import numpy as np
+
+    layout = np.lib.format
+    readers = {(1, 0): layout.read_array_header_1_0, (2, 0): layout.read_array_header_2_0}
     with archive.open(member) as file:
-        version = np.lib.format.read_magic(file)
-        if version not in _READ:
+        version = layout.read_magic(file)
+        if version not in readers:
             raise ValueError(f"npy format {version} in {member.filename}")
-        shape, fortran, dtype = _READ[version](file)
+        shape, fortran, dtype = readers[version](file)
         if dtype.hasobject:
             raise ValueError(f"{member.filename} holds Python objects")
         count = 1

@@ -189,6 +189,6 @@ def is_finished(cell: Cell, folder: Path, config: str) -> bool:
         cell.sensor,
         tuple(map(str, report.calib)),
     )
-    as_asked = (report.sensor == "mono") == (cell.sensor == "mono")
+    as_asked = cell.sensor in (None, report.sensor)
     whole = (report.start, report.every) == (0, 1)
     return same_config and as_asked and whole and found == cell

@@ -122,6 +122,7 @@ def _drive(
     if resume is not None:
         lock.enter_context(lock_run(resume))
         unfinished = find_unfinished(resume)
+        require_camera(unfinished.map, source.camera)
     viewer = None if output.view is None else open_viewer(output.view)
     recording = "recording.rrd"
     if resume is None or unfinished is None:

@@ -123,6 +123,9 @@ def merge(
     _require_free(out)
     thresholds = Config() if config is None else load_config(config)
     files = [map_file_of(path) for path in maps]
+    for number, file in enumerate(files):
+        if file.resolve() in [other.resolve() for other in files[:number]]:
+            raise InputError(f"{file}: named twice; a map meets itself everywhere.")
     stored = [load_map(file) for file in files]
     if not stored[0].map.n_keyframes:
         raise InputError(f"{files[0]}: the map is empty; name one that others can be joined to.")
@@ -204,8 +207,11 @@ def _numbers(option: str, text: str, n: int, separator: str = ",") -> list[float
 
 
 def _require_free(out: Path) -> None:
+    from vslam.maps.new_output import require_place
+
     if out.exists():
         raise InputError(f"{out}: exists already; remove it, or name another place with --out.")
+    require_place(out, "--out")
 
 
 def _save(save_map: Callable[[Path, StoredMap], None], out: Path, stored: StoredMap) -> None:

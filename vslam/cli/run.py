@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
@@ -159,6 +159,10 @@ def run(
         raise InputError("--localize: name the map to localise in with --map.")
     if localize and save_map is not None:
         raise InputError("--save-map: localising changes no map; leave it out.")
+    if save_map is not None:
+        from vslam.maps.new_output import require_place
+
+        require_place(save_map, "--save-map")
     if map_file is not None:
         if compare_loops:
             raise InputError("--compare-loops: not for a run that goes on in a map; leave it out.")
@@ -220,13 +224,14 @@ def _refuse_beside_resume(context: typer.Context) -> None:
 
 
 def _map_to_go_on_in(file: Path, detector: DetectorName | None) -> tuple[Path, DetectorName]:
-    """The map of a file or of the folder of a run, and the detector that it was made with."""
-    from vslam.maps.storage import map_file_of, read_header
+    """The map of a file or of the folder of a run, and the detector that it was made with. The path
+    is absolute: ``runs/latest`` will be another folder once this run has one."""
+    from vslam.maps.storage import made_with, map_file_of
 
     file = map_file_of(file)
-    made_with: DetectorName = read_header(file)["detector"]["name"]
-    if detector not in (None, made_with):
+    _, of_map = made_with(file)
+    if detector not in (None, of_map):
         raise InputError(
-            f"--detector {detector}: {file} was made with the detector {made_with}; leave it out."
+            f"--detector {detector}: {file} was made with the detector {of_map}; leave it out."
         )
-    return file, made_with
+    return file.resolve(), cast("DetectorName", of_map)

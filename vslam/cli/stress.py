@@ -123,6 +123,8 @@ def stress(
     for name in chosen:
         require_detector(name, None, option="--detectors")
     names, sequences = [*chosen, *others], parse_sequences(seqs)
+    if clash := [name for name in chosen if name in others]:
+        raise InputError(f"--system {clash[0]}: a detector of this test has that name; rename it.")
     if not names:
         raise InputError("--systems: no system; name vslam, orbslam3 or one of --system.")
     if baseline is not None and baseline not in names:

@@ -21,6 +21,7 @@ GREY_8_BITS = (8, 0, 0, 0, 0)  # depth, colour type, compression, filter method,
 # Chunks that change no pixel. Others may (transparency, orientation, animation).
 WITHOUT_EFFECT = {b"gAMA", b"cHRM", b"sRGB", b"pHYs", b"tIME", b"tEXt", b"bKGD"}
 LANES = 32  # lines decoded at once
+_WIDEST = 1 << 15  # pixels: the buffers hold 65 bytes for each, of a line of any image
 
 
 def decode_png(data: bytes) -> NDArray[np.uint8] | None:
@@ -51,10 +52,12 @@ def _contents(data: bytes) -> tuple[tuple[int, int], bytes]:
         ValueError: not a file of this kind, or damaged.
     """
     chunks = _chunks(data)
-    kind, header = next(chunks)
+    kind, header = next(chunks, (b"", b""))
     width, height, *form = struct.unpack(">II5B", header)
-    if kind != b"IHDR" or tuple(form) != GREY_8_BITS or not 0 < width * height <= MOST_PIXELS:
+    if kind != b"IHDR" or tuple(form) != GREY_8_BITS:
         raise ValueError("not a PNG of 8-bit grey levels, not interlaced")
+    if not 0 < width * height <= MOST_PIXELS or width > _WIDEST:
+        raise ValueError("too large, or without a pixel")
     parts: list[memoryview] = []
     for kind, body in chunks:
         if kind == b"IDAT":

@@ -78,7 +78,7 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
     world = header["world"]
     return StoredMap(
         map=map_,
-        camera=_camera(header["camera"]),
+        camera=camera_of(header),
         loops=_loops(data, n),
         detector=DetectorMemory(str(detector["name"]), str(detector["fingerprint"]), tables),
         images=images,
@@ -223,8 +223,13 @@ def _per_keyframe(data: dict[str, NDArray], name: str, n: int) -> PerKeyframe:
     return PerKeyframe(first, values)
 
 
-def _camera(fields: dict[str, Any]) -> Camera:
-    camera = Camera(**fields)
+def camera_of(header: dict[str, Any]) -> Camera:
+    """The camera of a map file.
+
+    Raises:
+        DamagedMapError, KeyError, TypeError, ValueError: as ``checked_map``.
+    """
+    camera = Camera(**header["camera"])
     numbers = [camera.fx, camera.fy, camera.width, camera.height]
     sound = all(isinstance(x, int | float) and 0 < x < 1e6 for x in numbers)
     sound = sound and bool(np.isfinite([camera.cx, camera.cy, camera.baseline]).all())

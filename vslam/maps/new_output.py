@@ -78,6 +78,18 @@ def replaced_file(path: Path) -> Iterator[BinaryIO]:
             os.close(folder)
 
 
+def require_place(path: Path, option: str) -> None:
+    """Refuse what cannot be written, before hours of work for it.
+
+    Raises:
+        InputError: ``path``, the value of an option, is a folder or lies in none.
+    """
+    if path.is_dir():
+        raise InputError(f"{option} {path}: is a folder; name a file.")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{option} {path}: there is no folder {path.parent}; make it first.")
+
+
 def _refuse_existing(path: Path) -> None:
     if os.path.lexists(path):
         raise InputError(f"{path}: exists already; remove it, or name another place with --out.")

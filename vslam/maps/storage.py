@@ -17,12 +17,13 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.camera import Camera
 from vslam.errors import InputError
 from vslam.frame_poses import FrameTable
 from vslam.machine import versions
 from vslam.map import LANDMARK_FIELDS, ROW_FIELDS
 from vslam.map_kernels import gather_observations
-from vslam.maps.checked_map import ARRAYS, DamagedMapError, checked_map
+from vslam.maps.checked_map import ARRAYS, DamagedMapError, camera_of, checked_map
 from vslam.maps.new_output import replaced_file
 from vslam.maps.stored_map import StoredMap
 from vslam.untrusted import require_memory
@@ -64,8 +65,14 @@ def load_map(path: Path) -> StoredMap:
         InputError: no such file, no map, damaged, or of another schema.
     """
     data, header = _read(path)
-    try:
+    with _as_damage(path):
         return checked_map(data, header)
+
+
+@contextmanager
+def _as_damage(path: Path) -> Iterator[None]:
+    try:
+        yield
     except (DamagedMapError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: the map is damaged ({error}); save it again.") from error
 
@@ -147,14 +154,14 @@ def map_file_of(path: Path) -> Path:
     return path / "map.npz" if path.is_dir() else path
 
 
-def read_header(path: Path) -> dict[str, Any]:
-    """What a map file says of itself, its arrays unread.
+def made_with(path: Path) -> tuple[Camera, str]:
+    """The camera and the name of the detector that a map was made with, its arrays unread.
 
     Raises:
         InputError: as ``load_map``.
     """
-    with _opened(path) as (_, header):
-        return header
+    with _opened(path) as (_, header), _as_damage(path):
+        return camera_of(header), str(header["detector"]["name"])
 
 
 def _read(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:

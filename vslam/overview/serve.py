@@ -8,6 +8,8 @@ browser (DNS rebinding).
 from __future__ import annotations
 
 import http.server
+import re
+import threading
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +23,7 @@ from vslam.report.schema import ReportJson
 HOST = "127.0.0.1"
 _NAMES = (HOST, "localhost")
 _MOST_BESIDE = 4
+_NUMBER = re.compile("[0-9]{1,9}")
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ def make_server(folders: Sequence[Path], port: int = 0) -> http.server.Threading
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            host = (self.headers.get("Host") or "").rpartition(":")[0]
+            host = (self.headers.get("Host") or "").partition(":")[0]
             status, text = pages.answer(self.path) if host in _NAMES else (403, "forbidden")
             body = text.encode()
             self.send_response(status)
@@ -104,19 +107,24 @@ class _Pages:
         self._numbers: dict[Path, int] = {}
         self._pages: list[Path] = []
         self._names: list[str] = []
+        self._lock = threading.Lock()  # each request has its own thread
         self._list()
 
     def answer(self, request: str) -> tuple[int, str]:
         """Status and page for a path with its query."""
         url = urlsplit(request)
         if url.path == "/":
-            return 200, self._list()
+            try:
+                with self._lock:
+                    return 200, self._list()
+            except InputError:
+                return 404, "the runs are gone"
         kind, _, number = url.path.strip("/").partition("/")
-        if kind == "run" and number.isascii() and number.isdecimal():
+        if kind == "run" and _NUMBER.fullmatch(number):
             return self._run(int(number))
         if url.path == "/compare":
-            chosen = [int(n) for n in parse_qs(url.query).get("run", []) if n.isdecimal()]
-            known = [n for n in dict.fromkeys(chosen) if n < len(self._pages)][:_MOST_BESIDE]
+            chosen = [int(n) for n in parse_qs(url.query).get("run", []) if _NUMBER.fullmatch(n)]
+            known = [n for n in dict.fromkeys(chosen) if n < len(self._names)][:_MOST_BESIDE]
             if len(known) > 1:
                 beside = [(n, self._names[n]) for n in known]
                 return 200, render_page("compare.html.jinja", runs=beside)

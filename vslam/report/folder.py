@@ -15,6 +15,7 @@ from vslam.errors import InputError, ResultsError
 from vslam.evaluation.loops import evaluate_loops
 from vslam.evaluation.trajectories import Evaluation, evo_command
 from vslam.evaluation.worlds import world_of
+from vslam.maps.new_output import replaced_file
 from vslam.maps.ply import save_ply
 from vslam.maps.storage import save_map
 from vslam.report.frame_table import write_frames
@@ -103,8 +104,6 @@ def write_results(
             if outcome.settings.map is None and evaluation is not None:
                 stored = replace(stored, world=world_of(outcome, evaluation))
             save_map(folder / "map.npz", stored)
-            if map_file is not None:
-                save_map(map_file, stored)
     except OSError as error:
         files = sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime_ns)
         raise ResultsError(
@@ -112,7 +111,19 @@ def write_results(
             f"{', '.join(file.name for file in files)}, the last of them incomplete. Free some "
             "space or name another folder with --out."
         ) from error
+    if map_file is not None and outcome.stored is not None:
+        _copy_map(folder / "map.npz", map_file)
     return report
+
+
+def _copy_map(file: Path, to: Path) -> None:
+    try:
+        with replaced_file(to) as copy:
+            copy.write(file.read_bytes())
+    except OSError as error:
+        raise ResultsError(
+            f"{to}: cannot be written ({error.strerror or error}); the map is in {file}."
+        ) from error
 
 
 def write_trajectories(folder: Path, outcome: RunOutcome) -> None:

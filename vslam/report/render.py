@@ -54,7 +54,11 @@ def headlines(report: ReportJson) -> list[Headline]:
         Headline("RPE", _number(report.rpe_m, "m"), f"a frame; rotation {rotation}"),
         Headline("t_rel", _number(report.t_rel_percent, "%"), "KITTI drift over 100-800 m"),
         Headline("r_rel", _number(report.r_rel_deg_per_100m, "°"), "every 100 m"),
-        Headline("Speed", f"{report.fps:.1f} fps", f"{report.threads} threads"),
+        Headline(
+            "Speed",
+            f"{report.fps:.1f} fps",
+            f"{report.threads} thread{'s' * (report.threads != 1)}",
+        ),
         *_latency(report),
         Headline(
             "CPU",

@@ -5,6 +5,8 @@ so often the map is copied where no keyframe is being mapped, and a thread write
 the report tells of the frames so far: ``autosave_progress.npz``, then ``autosave.npz``, a map file
 as any other. Each takes the place of the one before in one step. A run killed between the two finds
 the progress of a few frames more than the map has, and passes over them.
+
+One file because what is written is read together with what reads it again.
 """
 
 from __future__ import annotations
@@ -40,6 +42,7 @@ LOCK = ".lock"
 SCHEMA = 1
 _BEGIN = 0.75  # of the period: writing, and waiting for a merge, take the rest
 _PATIENCE = 0.95  # of the period: until then no global bundle adjustment is cut off
+_MISSED = 5  # frames without a moment to save, until one amid a frame is taken
 _STATES = tuple(TrackingState)
 _NUMBERS = 7  # of a frame beside its pose
 
@@ -137,6 +140,11 @@ class Autosave(Protocol):
         """The frame is done with: this is the moment to save, if it is time."""
         ...
 
+    def offer_amid(self, slam: Slam, progress: Callable[[], Progress]) -> None:
+        """Mapping was merged in the middle of a frame: the last resort where no moment is left
+        between frames, since every frame becomes a keyframe."""
+        ...
+
     def close(self, slam: Slam, progress: Callable[[], Progress], *, whole: bool) -> None:
         """The run is over, and finished; if not ``whole``, it may be resumed."""
         ...
@@ -149,6 +157,9 @@ class NoAutosave:
         pass
 
     def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
+        pass
+
+    def offer_amid(self, slam: Slam, progress: Callable[[], Progress]) -> None:
         pass
 
     def close(self, slam: Slam, progress: Callable[[], Progress], *, whole: bool) -> None:
@@ -175,6 +186,7 @@ class FolderAutosave:
         self._last = time.monotonic()
         self._writer = ThreadPoolExecutor(1, "autosave")
         self._writing: Future[None] | None = None
+        self._missed = 0  # frames since it is time at whose end a keyframe was being mapped
         self._warned: set[str] = set()
         self._online: TextIO | None = None
         try:
@@ -194,12 +206,19 @@ class FolderAutosave:
 
     def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
         waited = time.monotonic() - self._last
-        if not self._seconds or waited < _BEGIN * self._seconds or slam.is_mapping:
+        if not self._seconds or waited < _BEGIN * self._seconds:
+            return
+        if slam.is_mapping:
+            self._missed += 1
             return
         if slam.is_adjusting and waited < _PATIENCE * self._seconds:
             return
         if self._writing is None or self._writing.done():
             self._save(slam, progress)
+
+    def offer_amid(self, slam: Slam, progress: Callable[[], Progress]) -> None:
+        if self._missed >= _MISSED:
+            self.offer(slam, progress)
 
     def close(self, slam: Slam, progress: Callable[[], Progress], *, whole: bool) -> None:
         if self._seconds and not whole:
@@ -209,9 +228,11 @@ class FolderAutosave:
             self._online.close()
 
     def _save(self, slam: Slam, progress: Callable[[], Progress]) -> None:
-        self._last = time.monotonic()
-        stored = _copy(slam.stored_map(self._drive))
-        self._writing = self._writer.submit(self._write, stored, progress())
+        self._last, self._missed = time.monotonic(), 0
+        stored, done = _copy(slam.stored_map(self._drive)), progress()
+        if stored.frames is not None:  # one more in the middle of a step
+            stored = replace(stored, frames=stored.frames.until(len(done.tracks)))
+        self._writing = self._writer.submit(self._write, stored, done)
 
     def _write(self, stored: StoredMap, progress: Progress) -> None:
         try:
@@ -231,9 +252,12 @@ class FolderAutosave:
 
 
 def remove_autosave(folder: Path) -> None:
-    """Remove what only a run that was cut off needs; its results are written."""
+    """Remove what only a run that was cut off needs, half-written files of killed runs included;
+    its results are written."""
     for name in (MAP, PROGRESS):
         (folder / name).unlink(missing_ok=True)
+        for part in folder.glob(f".{name}.*.part"):
+            part.unlink(missing_ok=True)
 
 
 def frames_of(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[LoopEdge]:

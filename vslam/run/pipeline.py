@@ -42,7 +42,7 @@ from vslam.loopclosure.registry import create_detector, create_images, problem_o
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.machine import peak_memory_mb, process_age
 from vslam.map import Map
-from vslam.maps.storage import read_header
+from vslam.maps.storage import made_with
 from vslam.run.autosave import NO_AUTOSAVE, Autosave, Progress, Unfinished, in_frames
 from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
 from vslam.run.realtime import Played, play
@@ -115,6 +115,7 @@ def run_sequence(
             corrections=before.corrections + corrections,
         )
 
+    slam.on_merge = lambda: autosave.offer_amid(slam, so_far)
     with _stop_on_interrupt() as interrupted:
         frames = perturbed(_until_broken(timed_frames(sequence), broken), perturbation)
         if tracks:
@@ -245,12 +246,12 @@ def require_camera(map_file: Path, camera: Camera) -> None:
     Raises:
         InputError: it is another one, or there is no such map.
     """
-    made_with = Camera(**read_header(map_file)["camera"])
-    if not same_camera(made_with, camera):
+    of_map, _ = made_with(map_file)
+    if not same_camera(of_map, camera):
         raise InputError(
-            f"{map_file}: the map's camera is not that of the images ({made_with.sensor}, "
-            f"{made_with.width}x{made_with.height}, fx {made_with.fx:.1f}); go on with images of "
-            "the same camera, rectified alike."
+            f"{map_file}: the map's camera is not that of the images ({of_map.sensor}, "
+            f"{of_map.width}x{of_map.height}, fx {of_map.fx:.1f}); go on with images of the same "
+            "camera, rectified alike."
         )
 
 

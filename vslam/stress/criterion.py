@@ -27,8 +27,8 @@ class Criterion:
         return (
             f"A run fails if more than {self.lost_percent:g} % of its frames are lost, if its ATE "
             f"is above {self.ate_factor:g} times that of the same system on the images as they are "
-            f"and above {self.ate_least_m:g} m, if a loop is wrong, if it misses a revisit that it "
-            "then finds, or if it ends with an error."
+            f"and above {self.ate_least_m:g} m, if it closes more wrong loops or finds fewer "
+            "revisits than on these, or if it ends with an error."
         )
 
     def verdict(self, report: ReportJson, clean: ReportJson) -> str:

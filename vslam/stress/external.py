@@ -25,7 +25,7 @@ from vslam.camera import Camera
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import timed_frames
-from vslam.errors import DroppedFrameError, InputError
+from vslam.errors import DroppedFrameError, InputError, ResultsError
 from vslam.features import TrackingState, TrackResult
 from vslam.report.folder import write_results
 from vslam.report.schema import ReportJson
@@ -51,12 +51,19 @@ def check_template(name: str, template: str) -> None:
     """
     try:
         filled = template.format(folder="F", out="O")
-    except (KeyError, IndexError, ValueError) as error:
+    except (KeyError, IndexError, ValueError, AttributeError) as error:
         raise InputError(
             f"--system {name}={template}: unknown placeholder {error}; write {{folder}} and "
             "{out}."
         ) from error
-    if "{folder}" not in template or "{out}" not in template or not shlex.split(filled):
+    try:
+        shlex.split(filled)
+    except ValueError as error:
+        raise InputError(
+            f"--system {name}={template}: cannot be split into words ({error}); quote it as in a "
+            "shell."
+        ) from error
+    if "{folder}" not in template or "{out}" not in template:
         raise InputError(
             f"--system {name}={template}: must hold {{folder}} and {{out}}, see docs/stress.md."
         )
@@ -109,7 +116,8 @@ def export_kitti(sequence: Sequence, perturbation: Perturbation, folder: Path) -
         for side, image in enumerate(images):
             if image is not None and image.dtype == np.uint8:
                 path = folder / f"image_{side}" / f"{len(kept):06d}.png"
-                cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+                if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+                    raise ResultsError(f"{path}: cannot be written; is the disk full?")
         kept.append(index)
         times.append(frame.timestamp - float(sequence.timestamps[0]))
     (folder / "times.txt").write_text("".join(f"{t:.9e}\n" for t in times))
@@ -150,6 +158,7 @@ def _call(template: str, sequence: Path, out: Path) -> None:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
+            errors="replace",
         ) as child:
             assert child.stdout is not None
             log = child.stdout.read()

@@ -85,7 +85,8 @@ def title(report: StressJson) -> str:
     systems = list(dict.fromkeys(entry.system for entry in report.clean))
     places = list(dict.fromkeys(f"{entry.dataset} {entry.sequence}" for entry in report.clean))
     excerpt = f", {report.max_frames} frames" if report.max_frames else ""
-    return f"Where do {', '.join(systems)} break? {', '.join(places)}{excerpt}"
+    does = "does" if len(systems) == 1 else "do"
+    return f"Where {does} {', '.join(systems)} break? {', '.join(places)}{excerpt}"
 
 
 def render_markdown(report: StressJson) -> str:

@@ -132,7 +132,9 @@ def _corruption(
                 and isinstance(report := reports(cell), ReportJson)
             ]
             known = [report.ate_rmse_m for report in found if report.ate_rmse_m is not None]
-            ates.append(statistics.median(known) if known else None)
+            # Without its failed seeds a system that breaks would look better than one that holds.
+            all_known = bool(known) and len(known) == len(found)
+            ates.append(statistics.median(known) if all_known else None)
             losses += [lost_percent(report) for report in found]
         complete = bool(ates) and None not in ates
         sums[system] = sum(a for a in ates if a is not None) if complete else None

@@ -133,14 +133,18 @@ def contact_sheet(
 
 def sheet_of_laws(sequence: Sequence, specs: Collection[str], index: int, seed: int) -> Image:
     """A grey image with a row for each perturbation: a frame as it is, both its images perturbed.
+    The rows stand in two columns where there are several.
 
     Raises:
+        InputError: the sequence lacks what a law needs.
         UnreadableImageError: the frame cannot be read.
     """
     rows = [
         _row(sequence, parse_perturbation(spec, seed).bound_to(sequence), index, spec, width=480)
         for spec in specs
     ]
+    if len(rows) == 1:
+        return rows[0]
     if len(rows) % 2:
         rows.append(np.zeros_like(rows[0]))
     half = len(rows) // 2

@@ -238,16 +238,16 @@ class FolderAutosave:
         try:
             write_progress(self._folder / PROGRESS, progress)
             write_map(self._folder / MAP, stored.compact())
-        except OSError as error:
+        except Exception as error:  # whatever it is, it must not end a run, nor be lost
             self._warn(MAP, error)
 
-    def _warn(self, name: str, error: OSError) -> None:
+    def _warn(self, name: str, error: Exception) -> None:
         if name not in self._warned:
             self._warned.add(name)
             _log.warning(
                 "%s: cannot be written (%s); the run goes on without.",
                 self._folder / name,
-                error.strerror or error,
+                getattr(error, "strerror", None) or str(error) or type(error).__name__,
             )
 
 

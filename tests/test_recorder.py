@@ -54,8 +54,9 @@ def _result(frame: int) -> TrackResult:
         stage_ms["bundle"] = 15.0
     state = TrackingState.LOST if 40 <= frame < 44 else TrackingState.OK
     return TrackResult(
-        frame, 0.1 * frame, _pose(frame), state, 2000, 1100, 500, 400, is_keyframe, stage_ms
-    )
+        frame, 0.1 * frame, _pose(frame), state, 2000, 1100, 500, 400, is_keyframe,
+        stage_ms=stage_ms,
+    )  # fmt: skip
 
 
 def _image(rng: np.random.Generator) -> NDArray[np.uint8]:

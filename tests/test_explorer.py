@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import http.client
 import http.server
 import json
@@ -18,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from browser import chromium, dumped
 from test_report import make_outcome
 
 from vslam.errors import InputError
@@ -152,23 +152,6 @@ page.src = "report.html";
 </script>"""
 
 
-def chromium() -> str:
-    found = next(
-        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-    )
-    if found is None:
-        pytest.skip("no Chromium here: apt-get install chromium")
-    return found
-
-
-def dumped(address: str, profile: Path) -> str:
-    flags = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run "
-    flags += "--disable-background-networking --disable-component-update --disable-sync "
-    flags += "--virtual-time-budget=40000 --dump-dom"
-    command = [chromium(), *flags.split(), f"--user-data-dir={profile}", address]
-    return subprocess.run(command, capture_output=True, text=True, timeout=180).stdout
-
-
 @pytest.mark.parametrize("width", [400, 1200])
 def test_the_explorer_in_a_browser(run: Path, tmp_path: Path, width: int):
     """The slider moves through time, buttons zoom, nothing is asked for."""
@@ -176,22 +159,14 @@ def test_the_explorer_in_a_browser(run: Path, tmp_path: Path, width: int):
     shutil.copy(run / "report.html", tmp_path)
     (tmp_path / "probe.html").write_text(_PROBE.replace("WIDTH", str(width)))
 
-    class Handler(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, format, *arguments):
-            pass
-
-    handler = functools.partial(Handler, directory=str(tmp_path))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        address = f"http://127.0.0.1:{server.server_port}/probe.html"
-        for attempt in range(3):  # the browser's virtual time may outrun a busy machine
-            text = dumped(address, tmp_path / f"profile{attempt}")
-            if (answer := re.search("FOUND(.*)END</pre>", text)) is None:
-                continue
-            found = json.loads(answer[1].replace("&amp;", "&"))
-            if found["moved"] and found["zoomed"] and found["back"] and min(found["ink"]) > 200:
-                break
-        server.shutdown()
+    for attempt in range(3):  # the browser's virtual time may outrun a busy machine
+        profile = tmp_path / f"profile{attempt}"
+        text = dumped(tmp_path, "probe.html", profile, milliseconds=40000)
+        if (answer := re.search("FOUND(.*)END</pre>", text)) is None:
+            continue
+        found = json.loads(answer[1].replace("&amp;", "&"))
+        if found["moved"] and found["zoomed"] and found["back"] and min(found["ink"]) > 200:
+            break
     assert found["frames"] == FRAMES - 1
     assert found["first"].startswith("frame 0 · 0.0 s · OK")
     assert found["second"].startswith("frame 21 · ")

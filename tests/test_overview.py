@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import csv
-import functools
-import http.server
 import json
 import re
 import shutil
-import subprocess
 import sys
-import threading
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import chromium, dumped
 
 from vslam.cli import main as cli
 from vslam.errors import InputError
@@ -438,34 +435,24 @@ page.src = "report.html";
 
 def test_report_in_a_browser_as_wide_as_a_phone(written, tmp_path: Path):
     """Chromium, 400 px: all figures are drawn, nothing sticks out, nothing is asked for."""
-    browser = next(
-        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-    )
-    if browser is None:
-        pytest.skip("no Chromium here: apt-get install chromium")
+    chromium()
     served = tmp_path / "served"
     served.mkdir()
     shutil.copy(written[1] / "report.html", served)
     (served / "probe.html").write_text(_PROBE)
     asked: list[str] = []
 
-    class Handler(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, format, *arguments):
-            asked.append(self.path)
-
-    handler = functools.partial(Handler, directory=str(served))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        flags = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run "
-        flags += "--disable-background-networking --disable-component-update --disable-sync "
-        flags += "--virtual-time-budget=8000 --dump-dom"
-        command = [browser, *flags.split(), f"--user-data-dir={tmp_path / 'profile'}"]
-        address = f"http://127.0.0.1:{server.server_port}/probe.html"
-        done = subprocess.run([*command, address], capture_output=True, text=True, timeout=120)
-        server.shutdown()
-    dumped = re.search("FOUND(.*)END</pre>", done.stdout)
-    assert dumped, done.stdout[-2000:] + done.stderr[-2000:]
-    found = json.loads(dumped[1].replace("&amp;", "&"))
+    text = dumped(
+        served,
+        "probe.html",
+        tmp_path / "profile",
+        milliseconds=8000,
+        timeout=120,
+        on_request=asked.append,
+    )
+    answer = re.search("FOUND(.*)END</pre>", text)
+    assert answer, text[-4000:]
+    found = json.loads(answer[1].replace("&amp;", "&"))
     assert len(found["figures"]) == len(FIGURES)
     assert all(
         0 <= left < right <= 400 and height > 100 for left, right, height in found["figures"]

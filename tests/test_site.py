@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import http.server
 import json
 import os
 import re
@@ -11,7 +9,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import threading
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import get_args
@@ -19,6 +16,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
+from browser import chromium, dumped
 from source_files import write_calibration, write_video
 
 from vslam.calibration.files import read_calibration
@@ -207,33 +205,16 @@ next();
 
 def test_pages_in_a_browser_as_wide_as_a_phone(site: Path, tmp_path: Path):
     """Chromium, 400 px: nothing sticks out, letters are large enough, no other host is asked."""
-    browser = next(
-        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-    )
-    if browser is None:
-        pytest.skip("no Chromium here: apt-get install chromium")
+    chromium()
     shown = ["index", "tutorial/first_run", "reference/commands", "thresholds", "design", "plugins",
              "reference/generated/vslam.slam", "results"]  # fmt: skip
     probe = _PROBE.replace("PAGES", json.dumps([f"{name}.html" for name in shown]))
     (site / "probe.html").write_text(probe)
 
-    class Handler(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, format, *arguments):
-            pass
-
-    handler = functools.partial(Handler, directory=str(site))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        flags = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run "
-        flags += "--disable-background-networking --disable-component-update --disable-sync "
-        flags += "--virtual-time-budget=20000 --dump-dom"
-        command = [browser, *flags.split(), f"--user-data-dir={tmp_path / 'profile'}"]
-        address = f"http://127.0.0.1:{server.server_port}/probe.html"
-        done = subprocess.run([*command, address], capture_output=True, text=True, timeout=240)
-        server.shutdown()
-    dumped = re.search("FOUND(.*)END</pre>", done.stdout)
-    assert dumped, done.stdout[-2000:] + done.stderr[-2000:]
-    found = json.loads(dumped[1].replace("&amp;", "&"))
+    text = dumped(site, "probe.html", tmp_path / "profile", milliseconds=20000, timeout=240)
+    answer = re.search("FOUND(.*)END</pre>", text)
+    assert answer, text[-4000:]
+    found = json.loads(answer[1].replace("&amp;", "&"))
     assert len(found) == len(shown)
     for page in found:
         assert page["needed"] <= page["shown"] <= 400, page

@@ -24,11 +24,12 @@ from vslam.machine import versions
 from vslam.map import LANDMARK_FIELDS, ROW_FIELDS
 from vslam.map_kernels import gather_observations
 from vslam.maps.checked_map import ARRAYS, DamagedMapError, camera_of, checked_map
+from vslam.maps.moment import moment_arrays, moment_entry
 from vslam.maps.new_output import replaced_file
 from vslam.maps.stored_map import StoredMap
 from vslam.untrusted import require_memory
 
-SCHEMA = 2
+SCHEMA = 3
 _FOREIGN = "not a map of vslam; name a map.npz, or the folder of a run"
 
 
@@ -47,8 +48,8 @@ def save_map(path: Path, stored: StoredMap) -> None:
 
 
 def write_map(path: Path, stored: StoredMap) -> None:
-    """``save_map`` of a map that is compact already: ``StoredMap.compact`` is a copy, which one
-    thread can write while another goes on in the map.
+    """``save_map`` of a map that is compact already, or that is at a ``moment``: all of it then.
+    ``StoredMap.compact`` is a copy, which one thread can write while another goes on in the map.
 
     Raises:
         OSError: it cannot be written.
@@ -59,10 +60,20 @@ def write_map(path: Path, stored: StoredMap) -> None:
 
 
 def load_map(path: Path) -> StoredMap:
-    """Read a map written by ``save_map``, and check all that kernels rely on.
+    """Read a map, and check all that kernels rely on. It is compact.
 
     Raises:
         InputError: no such file, no map, damaged, or of another schema.
+    """
+    stored = load_moment(path)
+    return stored if stored.moment is None else stored.compact()
+
+
+def load_moment(path: Path) -> StoredMap:
+    """``load_map``, but a map that was written at a ``moment`` as it was then.
+
+    Raises:
+        InputError: as ``load_map``.
     """
     data, header = _read(path)
     with _as_damage(path):
@@ -78,10 +89,10 @@ def _as_damage(path: Path) -> Iterator[None]:
 
 
 def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
-    map_, a = stored.map, stored.map.arrays
-    n_landmarks, n_rows = map_.n_landmarks, map_.n_rows
+    map_, a, moment = stored.map, stored.map.arrays, stored.moment
+    n, n_landmarks, n_rows = map_.n_keyframes, map_.n_landmarks, map_.n_rows
     landmarks = np.arange(n_landmarks, dtype=np.int32)
-    index = np.arange(map_.n_keyframes, dtype=np.int64)
+    index = np.arange(n, dtype=np.int64)
     first, rows = gather_observations(a, landmarks, index)
     loops = stored.loops
     T = [loop.T_query_match for loop in loops]
@@ -102,6 +113,7 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
         "images": stored.images is not None,
         "frames": stored.frames is not None,
         "session": map_.session,
+        "moment": None if moment is None else moment_entry(moment),
         "world": None
         if stored.world is None
         else {
@@ -114,6 +126,10 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
         "scales": map_.scales,
         "keyframe_T_cw": a.T_cw[: map_.n_keyframes],
         "keyframe_first_row": a.first_row[: map_.n_keyframes + 1],
+        "keyframe_alive": a.keyframe_alive[:n],
+        "keyframe_T_c_parent": np.array(
+            [map_.T_c_parent.get(k, np.eye(4)) for k in range(n)], np.float64
+        ).reshape(-1, 4, 4),
         "keyframe_timestamp": np.array(map_.timestamps, np.float64),
         "keyframe_frame": np.array(map_.frames, np.int64),
         "keyframe_parent": np.array(map_.parents, np.int64),
@@ -132,16 +148,19 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
         ).reshape(-1, 2),
         "loop_learned": np.array([loop.matched_by == "learned" for loop in loops], np.bool_),
     }
-    for prefix, fields, n in (
+    for prefix, fields, size in (
         ("landmark", LANDMARK_FIELDS, n_landmarks),
         ("row", ROW_FIELDS, n_rows),
     ):
         for name in fields:
             if f"{prefix}_{name.removeprefix('landmark_')}" in ARRAYS:
-                arrays[f"{prefix}_{name.removeprefix('landmark_')}"] = getattr(a, name)[:n]
+                arrays[f"{prefix}_{name.removeprefix('landmark_')}"] = getattr(a, name)[:size]
     for name in FrameTable._fields:
         arrays[f"frame_{name}"] = getattr(frames, name)
+    if moment is not None:
+        arrays |= {f"moment_{name}": array for name, array in moment_arrays(moment).items()}
     for name, table in stored.detector.tables.items():
+        table = table.select(index)
         arrays[f"detector_{name}_first"] = table.first
         arrays[f"detector_{name}_values"] = table.values
     if stored.images is not None:

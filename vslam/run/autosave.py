@@ -193,7 +193,7 @@ class FolderAutosave:
     def _write(self, stored: StoredMap, progress: Progress) -> None:
         try:
             write_progress(self._folder / PROGRESS, progress)
-            write_map(self._folder / MAP, stored.compact())
+            write_map(self._folder / MAP, stored if stored.moment else stored.compact())
         except Exception as error:  # whatever it is, it must not end a run, nor be lost
             self._warn(MAP, error)
 

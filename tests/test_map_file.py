@@ -26,7 +26,7 @@ from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe
 from vslam.map import KEYFRAME_FIELDS, LANDMARK_FIELDS, ROW_FIELDS, Map
 from vslam.map_kernels import link_many, refresh_landmarks
 from vslam.maps import new_output
-from vslam.maps.storage import load_map, load_moment, save_map, write_map
+from vslam.maps.storage import load_map, load_moment, save_map
 from vslam.maps.stored_map import StoredMap, World
 from vslam.slam import Slam
 
@@ -354,7 +354,7 @@ def test_damage_by_hand_is_refused(apply, file, tmp_path):
 @pytest.fixture(scope="module")
 def at_moment(slam, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("moment") / "ring.npz"
-    write_map(path, slam.stored_map())
+    slam.save(path, resumable=True)
     return path
 
 

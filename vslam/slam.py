@@ -181,17 +181,19 @@ class Slam:
         except (ValueError, KeyError) as error:
             raise InputError(f"{path}: {error}; go on with the options of its run.") from error
 
-    def save(self, path: Path, drive: str = "") -> None:
+    def save(self, path: Path, drive: str = "", *, resumable: bool = False) -> None:
         """Write the map to a file, in place of what is there: all that ``load`` needs to go on.
 
         Args:
             drive: what the images since the start were, "kitti 06" for example.
+            resumable: with what tracking remembers and what died in the map, too. Loaded with
+                ``resume=True``, it then gives the poses of a run that was not stopped, to the byte.
 
         Raises:
             RuntimeError: a keyframe is being mapped: look at ``is_mapping``, or call ``finish()``.
             OSError: the file cannot be written; one that was there is as it was.
         """
-        save_map(path, self.stored_map(drive))
+        save_map(path, self.stored_map(drive), resumable=resumable)
 
     def stored_map(self, drive: str = "") -> StoredMap:
         """The map, between two frames at a ``moment``; ``save`` writes what lives of it. Its arrays

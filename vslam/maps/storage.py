@@ -33,8 +33,9 @@ SCHEMA = 3
 _FOREIGN = "not a map of vslam; name a map.npz, or the folder of a run"
 
 
-def save_map(path: Path, stored: StoredMap) -> None:
-    """Write the living part of a map, in place of what is there.
+def save_map(path: Path, stored: StoredMap, *, resumable: bool = False) -> None:
+    """Write a map, in place of what is there: what lives of it, or, of one that is at a ``moment``
+    and is to be ``resumable``, all.
 
     The file is complete or, after an error or a power cut, what it was before. Its ``header`` is
     JSON (schema, camera, detector, drives, versions); the arrays are those of ``ARRAYS``, and
@@ -44,17 +45,8 @@ def save_map(path: Path, stored: StoredMap) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    write_map(path, stored.compact())
-
-
-def write_map(path: Path, stored: StoredMap) -> None:
-    """``save_map`` of a map that is compact already, or that is at a ``moment``: all of it then.
-    ``StoredMap.compact`` is a copy, which one thread can write while another goes on in the map.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    arrays = _as_arrays(stored)
+    whole = resumable and stored.moment is not None
+    arrays = _as_arrays(stored if whole else stored.compact())
     with replaced_file(path) as file:
         np.savez(file, allow_pickle=False, **arrays)
 

@@ -212,7 +212,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
     calls = SimpleNamespace(interrupted=None, interrupted_without=None, loops=[], runs=[])
 
     def run_sequence(
-        sequence, perturbation, settings, recorder, on_frame, autosave=None, resume=None
+        sequence, perturbation, settings, recorder, on_frame, autosave=None, resume=None, slam=None
     ):
         looped = settings.detector != "none" or not calls.runs
         calls.runs.append((settings.detector, recorder))
@@ -238,6 +238,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
         return []  # drawing takes a second
 
     monkeypatch.setattr(run_pipeline, "run_sequence", run_sequence)
+    monkeypatch.setattr(run_pipeline, "begin", lambda camera, settings, saved=None: None)
     monkeypatch.setattr(recorder, "NullRecorder", lambda: "null")
     monkeypatch.setattr(recorder, "RerunRecorder", str)
     monkeypatch.setattr(run_pipeline, "NullRecorder", lambda: "null")

@@ -22,7 +22,8 @@ from pathlib import Path
 
 from vslam.errors import InputError
 from vslam.maps.storage import load_map
-from vslam.run.autosave import MAP, ONLINE, PROGRESS, read_progress
+from vslam.run.autosave import MAP, ONLINE, PROGRESS
+from vslam.run.progress import read_progress
 from vslam.trajectory import read_trajectory
 
 RUN = (sys.executable, "-m", "vslam", "run")

@@ -22,7 +22,7 @@ from vslam.datasets.stream import timed_frames
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.loopclosure.registry import create_detector, create_images
 from vslam.run.outcome import alignment_of
-from vslam.run.pipeline import prepared_frames
+from vslam.run.preparation import prepared_frames
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory
 

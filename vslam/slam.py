@@ -283,33 +283,18 @@ class Slam:
         clock.lap("wait_for_mapping")
         if self._mapping.n_keyframes == 0:
             return self._start(frame, clock)
-        if self.frame is None:
-            return self._find_in_map(frame, clock)
 
         T_cw = self._predict(timestamp)
-        inliers = self._track_previous_frame(frame, T_cw)
-        clock.lap("track_frame")
-        matches, inliers, visible = self._track_local_map(frame, inliers)
-        clock.lap("track_local_map")
-        state, relocalised = self._state_of(inliers, matches), False
-        if state == TrackingState.LOST:
-            matches = inliers = self._relocalise(frame)
-            state = self._state_of(inliers, matches)
-            relocalised = state != TrackingState.LOST
-            clock.lap("relocalise")
-        elif self._is_doubtful(frame, inliers) and (found := self._find_better(frame, inliers)):
-            matches, inliers, visible = found, found, np.empty(0, np.int32)
-            state, relocalised = self._state_of(inliers, matches), True
-            clock.lap("relocalise")
-        if state == TrackingState.LOST:
+        found = self._locate(frame, T_cw, clock)
+        if found.state == TrackingState.LOST:
             frame.T_cw = T_cw
             restarted = self._lose(frame)
-            return _result(frame, state, matches, inliers, restarted, clock)
+            return _result(frame, found, restarted, clock)
 
-        self._update_motion(frame, relocalised)
-        is_keyframe = self._extend_map(frame, inliers, visible)
+        self._update_motion(frame, found.relocalised)
+        is_keyframe = self._extend_map(frame, found.inliers, found.visible)
         clock.lap("keyframe")
-        return _result(frame, state, matches, inliers, is_keyframe, clock, relocalised=relocalised)
+        return _result(frame, found, is_keyframe, clock)
 
     def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
         """Account for a frame without images, at the predicted pose: it is LOST, or DROPPED if
@@ -321,7 +306,7 @@ class Slam:
             self._lost_frames += 1
         self._poses.append(timestamp, frame.T_cw, tracked=False)
         state = TrackingState.DROPPED if dropped else TrackingState.LOST
-        return _result(frame, state, 0, 0, False, _Clock())
+        return _result(frame, _Found(state), False, _Clock())
 
     def finish(self) -> None:
         """Complete pending mapping. Call before reading the map or the final trajectory."""
@@ -407,35 +392,32 @@ class Slam:
         elapsed = timestamp - self._poses.timestamp(-1)
         return orthonormalised(se3_exp(self._velocity * elapsed) @ T_last)
 
-    def _find_in_map(self, frame: Frame, clock: _Clock) -> TrackResult:
-        """A frame in a map that was loaded, before the camera was found in it. In a drive that is
-        resumed it is not far from where the last frame was."""
-        T_cw = self._predict(frame.timestamp)
-        matches, inliers, visible = 0, 0, np.empty(0, np.int32)
-        if self._resumed and self._lost_frames == 0:
-            inliers = track_descriptors(frame, self._mapping.reference_view, T_cw, self.context)
-            matches, inliers, visible = self._track_local_map(frame, inliers)
-            clock.lap("track_local_map")
-        state, relocalised = self._state_of(inliers, matches), False
+    def _locate(self, frame: Frame, T_cw: Matrix, clock: _Clock) -> _Found:
+        """The pose of a frame, expected at ``T_cw``: by tracking or, where that fails or is
+        doubtful, in the whole map."""
+        inliers = self._track_previous_frame(frame, T_cw)
+        clock.lap("track_frame")
+        matches, inliers, visible = self._track_local_map(frame, inliers)
+        clock.lap("track_local_map")
+        state = self._state_of(inliers, matches)
         if state == TrackingState.LOST:
-            matches = inliers = self._relocalise(frame)
-            state = self._state_of(inliers, matches)
-            relocalised = state != TrackingState.LOST
+            elsewhere = self._relocalise(frame)
+        elif self._is_doubtful(frame, inliers):
+            elsewhere = self._find_better(frame, inliers)
+        else:
+            return _Found(state, matches, inliers, visible)
+        if state == TrackingState.LOST or elsewhere:
             clock.lap("relocalise")
-        if state == TrackingState.LOST:
-            frame.T_cw = T_cw
-            restarted = self._lose(frame)
-            return _result(frame, state, matches, inliers, restarted, clock)
-        if not relocalised:
-            step = se3_log(orthonormalised(frame.T_cw @ inverse(self._poses.pose(-1))))
-            self._velocity = step / (frame.timestamp - self._poses.timestamp(-1))
-        self._place(frame)
-        is_keyframe = self._extend_map(frame, inliers, visible)
-        clock.lap("keyframe")
-        return _result(frame, state, matches, inliers, is_keyframe, clock, relocalised=relocalised)
+            state = self._state_of(elsewhere, elsewhere)
+            relocalised = state != TrackingState.LOST
+            return _Found(state, elsewhere, elsewhere, relocalised=relocalised)
+        return _Found(state, matches, inliers, visible)
 
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix) -> int:
-        """Along the prediction; where there is none or it fails, against the reference keyframe."""
+        """Along the prediction; where there is none or it fails, against the reference keyframe. A
+        map that was loaded has no frame to go on from, but a drive that is resumed has gone on."""
+        if self.frame is None and (self._lost_frames or not self._resumed):
+            return 0
         if self._velocity is not None and self.frame is not None:
             matches, inliers = track_motion(frame, self.frame, T_cw, self.context)
             config = self.config.tracking
@@ -467,7 +449,8 @@ class Slam:
         """Whether a frame tracks so little that it may be matched with other things: one whose pose
         could hardly be predicted, after a gap or next to one found in the map, or that has lost
         most of what the frame before tracked, as where the camera was carried."""
-        assert self.frame is not None
+        if self.frame is None:
+            return False
         usual = self._poses.timestamp(-1) - self._poses.timestamp(-2) if len(self._poses) > 1 else 0
         config = self.config.relocalization
         gap = frame.timestamp - self.frame.timestamp > config.doubtful_gap * usual > 0.0
@@ -524,11 +507,11 @@ class Slam:
 
     def _update_motion(self, frame: Frame, relocalised: bool) -> None:
         """Place the frame; the velocity is that since the last frame tracked."""
-        assert self.frame is not None
-        step = se3_log(orthonormalised(frame.T_cw @ inverse(self._poses.pose(self.frame.index))))
-        # A leap to where the camera was found again is no motion.
-        elapsed = frame.timestamp - self.frame.timestamp
-        self._velocity = None if relocalised else step / elapsed
+        self._velocity = None
+        if not relocalised:  # a leap to where the camera was found again is no motion
+            last = -1 if self.frame is None else self.frame.index
+            step = se3_log(orthonormalised(frame.T_cw @ inverse(self._poses.pose(last))))
+            self._velocity = step / (frame.timestamp - self._poses.timestamp(last))
         self._place(frame)
 
     def _place(self, frame: Frame) -> None:
@@ -574,7 +557,7 @@ class Slam:
         inliers = int(np.count_nonzero(frame.landmark >= 0))
         state = TrackingState.OK if started else TrackingState.LOST
         clock.lap("keyframe")
-        return _result(frame, state, inliers, inliers, started, clock)
+        return _result(frame, _Found(state, inliers, inliers), started, clock)
 
     def _start_monocular(self, frame: Frame) -> bool:
         """Begin a map, or a sub-map where tracking was lost, if an earlier frame forms a pair with
@@ -698,27 +681,29 @@ class _Clock:
         self.last = now
 
 
-def _result(
-    frame: Frame,
-    state: TrackingState,
-    matches: int,
-    inliers: int,
-    is_keyframe: bool,
-    clock: _Clock,
-    *,
-    relocalised: bool = False,
-) -> TrackResult:
+@dataclass(frozen=True)
+class _Found:
+    """Where a frame was found: ``visible`` are the landmarks that it should see."""
+
+    state: TrackingState
+    matches: int = 0
+    inliers: int = 0
+    visible: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    relocalised: bool = False
+
+
+def _result(frame: Frame, found: _Found, is_keyframe: bool, clock: _Clock) -> TrackResult:
     return TrackResult(
         index=frame.index,
         timestamp=frame.timestamp,
         T_wc=inverse(frame.T_cw),
-        state=state,
+        state=found.state,
         n_features=len(frame.features),
         n_stereo=frame.n_stereo,
-        n_matches=matches,
-        n_inliers=inliers,
+        n_matches=found.matches,
+        n_inliers=found.inliers,
         is_keyframe=is_keyframe,
-        relocalised=relocalised,
+        relocalised=found.relocalised,
         stage_ms=clock.laps,
     )
 

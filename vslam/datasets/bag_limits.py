@@ -32,22 +32,23 @@ class _Decompressor(Protocol):
 def limit_bags() -> None:
     """Let rosbags refuse chunks, messages and files beyond the limits; the second call is idle."""
     import lz4.frame
-    import rosbags.rosbag1.reader as ros1
-    import rosbags.rosbag2.reader as ros2
-    import rosbags.rosbag2.storage_mcap as mcap
+    from rosbags.rosbag1 import reader as ros1
+    from rosbags.rosbag2 import reader, storage_mcap
 
+    ros2: Any = reader
     try:
         zstd = ros2.zstd
         if isinstance(zstd, SimpleNamespace):
             return
-        of_ros1, of_mcap = ros1.decompressors, mcap.DECOMPRESSORS
         kinds: dict[str, Callable[[], Any]] = {
             "bz2": bz2.BZ2Decompressor,
             "lz4": lz4.frame.LZ4FrameDecompressor,
             "zstd": zstd.ZstdDecompressor,
         }
-        of_ros1 |= {name: _limited(kinds[name]) for name in ("bz2", "lz4")}
-        of_mcap |= {name: _limited_by_size(kinds[name]) for name in ("lz4", "zstd")}
+        ros1.decompressors.update({name: _limited(kinds[name]) for name in ("bz2", "lz4")})
+        storage_mcap.DECOMPRESSORS.update(
+            {name: _limited_by_size(kinds[name]) for name in ("lz4", "zstd")}
+        )
 
         def opened(file: Any, mode: str) -> _LimitedFile:
             return _LimitedFile(zstd.open(file, mode))

@@ -188,13 +188,13 @@ def _write_calibrations(folder: Path) -> None:
         (folder / name).write_text(text)
 
 
-def _write_bag(kind: str, encoding: str, folder: Path) -> None:
+def _write_bag(kind: str, encoding: str, folder: Path, compression: str = "") -> None:
     from source_files import LEFT, RIGHT, write_bag
 
     sides = {LEFT: _images(), RIGHT: _images()}
     name = {"ros1": "a.bag"}.get(kind, "a")
     write_bag(folder / name, kind, sides, [10**8 * (k + 1) for k in range(3)], encoding=encoding,
-              camera=_camera())  # fmt: skip
+              camera=_camera(), compression=compression)  # fmt: skip
 
 
 def _write_video(folder: Path) -> None:
@@ -400,8 +400,9 @@ def _read_weights(folder: Path) -> None:
     load_network(folder / "net.safetensors")
 
 
-def _bag(kind: str, encoding: str, data: str, changed: str) -> Reader:
-    return Reader(partial(_write_bag, kind, encoding), partial(_read_source, "bag", data), changed)
+def _bag(kind: str, encoding: str, data: str, changed: str, compression: str = "") -> Reader:
+    write = partial(_write_bag, kind, encoding, compression=compression)
+    return Reader(write, partial(_read_source, "bag", data), changed)
 
 
 READERS: dict[str, Reader] = {
@@ -420,6 +421,8 @@ READERS: dict[str, Reader] = {
     "bag-ros1": _bag("ros1", "mono8", "a.bag", "a.bag"),
     "bag-ros2": _bag("ros2", "png", "a", "a/*"),
     "bag-mcap": _bag("folder", "mono16", "a", "a/*"),
+    "bag-lz4": _bag("ros1", "mono8", "a.bag", "a.bag", "lz4"),
+    "bag-zstd": _bag("folder", "mono8", "a", "a/*", "storage"),
     "video": Reader(_write_video, _read_video, "*.*"),
     "map": Reader(_write_map, _read_map, "map.npz"),
     "config": Reader(partial(_write_json, "config"), _read_config, "config.json"),

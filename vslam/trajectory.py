@@ -175,9 +175,7 @@ def write_kitti(path: Path, T_wc: NDArray[np.float64]) -> None:
 
 def tum_line(timestamp: float, T_wc: NDArray[np.float64]) -> str:
     """One ``(4, 4)`` pose as a line of TUM's format."""
-    from scipy.spatial.transform import Rotation
-
-    quaternion = Rotation.from_matrix(T_wc[:3, :3]).as_quat(canonical=True)
+    (quaternion,) = quaternions(T_wc[None, :3, :3])
     # Twelve digits keep the quaternion on the unit sphere to the rounding of the poses.
     numbers = [f"{x:.9f}" for x in T_wc[:3, 3]] + [f"{x:.12f}" for x in quaternion]
     return " ".join([f"{timestamp:.9f}", *numbers]) + "\n"
@@ -185,10 +183,8 @@ def tum_line(timestamp: float, T_wc: NDArray[np.float64]) -> str:
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory in TUM's format: nanoseconds, nanometres, quaternions with qw >= 0."""
-    from scipy.spatial.transform import Rotation
-
-    rotations = Rotation.from_matrix(trajectory.T_wc[:, :3, :3])
-    rows = np.column_stack([trajectory.T_wc[:, :3, 3], rotations.as_quat(canonical=True)])
+    T_wc = trajectory.T_wc
+    rows = np.column_stack([T_wc[:, :3, 3], quaternions(T_wc[:, :3, :3])])
     path.write_text(
         "".join(
             f"{t:.9f} "
@@ -202,18 +198,49 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     )
 
 
+def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``(N, 4)`` unit quaternions x, y, z, w of ``(N, 3, 3)`` rotations; of the two that are the
+    same rotation the one whose w, or else x, y or z is positive.
+
+    From the largest component, which no rounding spoils [Shepperd, J. Guidance and Control 1978].
+    As scipy's, whose import would take longer than all files of a run.
+    """
+    skew = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-12
+    if skew.any():
+        U, _, Vt = np.linalg.svd(R[skew])
+        R = R.copy()
+        R[skew] = U @ Vt
+    trace = np.trace(R, axis1=1, axis2=2)
+    diagonal = np.diagonal(R, axis1=1, axis2=2)
+    largest = np.argmax(np.column_stack([diagonal, trace]), axis=1)
+    found = np.empty((len(R), 4))
+    for i in range(3):
+        n, j, k = largest == i, (i + 1) % 3, (i + 2) % 3
+        found[n, i] = 1.0 - trace[n] + 2.0 * R[n, i, i]
+        found[n, j] = R[n, j, i] + R[n, i, j]
+        found[n, k] = R[n, k, i] + R[n, i, k]
+        found[n, 3] = R[n, k, j] - R[n, j, k]
+    n = largest == 3
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        found[n, i] = R[n, k, j] - R[n, j, k]
+    found[n, 3] = 1.0 + trace[n]
+    found /= np.linalg.norm(found, axis=1, keepdims=True)
+    wxyz = found[:, [3, 0, 1, 2]]
+    first = wxyz[np.arange(len(R)), np.argmax(wxyz != 0.0, axis=1)]
+    return np.where(first[:, None] < 0.0, -found, found) + 0.0
+
+
 def write_euroc(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory as EuRoC's ground truth is written, without velocities and biases.
 
     Times are whole nanoseconds, but no better than float64 seconds: 0.2 us in Unix time.
     """
-    from scipy.spatial.transform import Rotation
-
     names = ("x [m]", "y [m]", "z [m]"), ("w []", "x []", "y []", "z []")
     columns = [*(f"p_RS_R_{name}" for name in names[0]), *(f"q_RS_{name}" for name in names[1])]
     lines = [",".join(["#timestamp [ns]", *columns]) + "\n"]
-    quaternions = Rotation.from_matrix(trajectory.T_wc[:, :3, :3]).as_quat(canonical=True)
-    rows = np.column_stack([trajectory.T_wc[:, :3, 3], quaternions[:, 3], quaternions[:, :3]])
+    xyzw = quaternions(trajectory.T_wc[:, :3, :3])
+    rows = np.column_stack([trajectory.T_wc[:, :3, 3], xyzw[:, 3], xyzw[:, :3]])
     for seconds, row in zip(trajectory.timestamps.tolist(), rows.tolist(), strict=True):
         lines.append(",".join([str(round(seconds * 1e9)), *(f"{x:.12f}" for x in row)]) + "\n")
     path.write_text("".join(lines))

@@ -54,12 +54,15 @@ def _drive(
     compare_loops: bool,
 ) -> None:
     from vslam.cli.options import SourceName, kind_of_source, source_options
-    from vslam.cli.progress import announce, progress_bar, render_bar
     from vslam.datasets.perturbation import parse_perturbation
     from vslam.datasets.sources import open_source
     from vslam.datasets.stream import count_expected, is_live
 
     o, shown = options, not output.quiet
+    if shown:
+        from vslam.cli.progress import announce, progress_bar, render_bar
+    else:
+        from vslam.cli.quiet import announce, progress_bar, render_bar
     kind = kind_of_source(cast("SourceName | None", o.dataset), o.data)
     perturbation = parse_perturbation(o.perturb, o.seed)
     of_source = source_options(
@@ -142,7 +145,7 @@ def _drive(
             announce(f"live at {viewer.address}", shown=shown)
     if is_cold():
         announce("first run: compiling the kernels, less than a minute ...", shown=shown)
-    compile_kernels(processes=min(settings.threads, 2))
+    compile_kernels(processes=min(settings.threads, 2), load=settings.realtime)
     # When only localising there is nothing to save but the poses.
     autosave = FolderAutosave(
         folder, 0.0 if o.localize else o.autosave, f"{settings.dataset} {source.name}"

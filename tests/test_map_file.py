@@ -26,7 +26,7 @@ from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe
 from vslam.map import KEYFRAME_FIELDS, LANDMARK_FIELDS, ROW_FIELDS, Map
 from vslam.map_kernels import link_many, refresh_landmarks
 from vslam.maps import new_output
-from vslam.maps.storage import load_map, load_moment, save_map
+from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, World
 from vslam.slam import Slam
 
@@ -352,14 +352,14 @@ def test_damage_by_hand_is_refused(apply, file, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def at_moment(slam, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("moment") / "ring.npz"
+def at_checkpoint(slam, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("checkpoint") / "ring.npz"
     slam.save(path, resumable=True)
     return path
 
 
-def test_a_map_at_a_moment_comes_back_with_what_died(slam, at_moment, tmp_path):
-    stored, moment = load_moment(at_moment), slam.stored_map().moment
+def test_a_map_at_a_checkpoint_comes_back_with_what_died(slam, at_checkpoint, tmp_path):
+    stored, checkpoint = load_checkpoint(at_checkpoint), slam.stored_map().checkpoint
     before, after = slam.map, stored.map
     assert not after.arrays.keyframe_alive.all() or not after.arrays.landmark_alive.all()
     for fields, size in (
@@ -371,10 +371,10 @@ def test_a_map_at_a_moment_comes_back_with_what_died(slam, at_moment, tmp_path):
             mine, theirs = (getattr(one.arrays, name)[:size] for one in (before, after))
             assert np.array_equal(mine, theirs, equal_nan=mine.dtype.kind == "f"), name
     assert sorted(after.T_c_parent) == sorted(before.T_c_parent)
-    assert moment is not None
-    assert stored.moment is not None
-    for name, value in vars(moment).items():
-        found = getattr(stored.moment, name)
+    assert checkpoint is not None
+    assert stored.checkpoint is not None
+    for name, value in vars(checkpoint).items():
+        found = getattr(stored.checkpoint, name)
         if name == "features":
             assert all(
                 np.array_equal(vars(value)[one], vars(found)[one], equal_nan=one == "u_right")
@@ -385,21 +385,21 @@ def test_a_map_at_a_moment_comes_back_with_what_died(slam, at_moment, tmp_path):
         else:
             assert value == found, name
     save_map(tmp_path / "one.npz", slam.stored_map())
-    save_map(tmp_path / "again.npz", load_map(at_moment))
+    save_map(tmp_path / "again.npz", load_map(at_checkpoint))
     assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "one.npz").read_bytes()
 
 
 def entry(**fields: object):
     def apply(file: Path, to: Path) -> Path:
         header = header_of(file)
-        header["moment"] |= fields
+        header["checkpoint"] |= fields
         return changed(file, to, header=as_header(header))
 
     return pytest.param(apply, id=next(iter(fields)))
 
 
-def without_moment(file: Path, to: Path) -> Path:
-    return changed(file, to, header=as_header(header_of(file) | {"moment": None}))
+def without_checkpoint(file: Path, to: Path) -> Path:
+    return changed(file, to, header=as_header(header_of(file) | {"checkpoint": None}))
 
 
 def merged_in_a_circle(file: Path, to: Path) -> Path:
@@ -418,9 +418,9 @@ def alive_that_died(file: Path, to: Path) -> Path:
 @pytest.mark.parametrize(
     "apply",
     [
-        damage("moment_landmark", (3,), 10**6),
-        damage("moment_landmark", (3,), -2),
-        damage("moment_xy", (3, 0), np.nan),
+        damage("checkpoint_landmark", (3,), 10**6),
+        damage("checkpoint_landmark", (3,), -2),
+        damage("checkpoint_xy", (3, 0), np.nan),
         damage("keyframe_alive", (1,), False),
         damage("landmark_merged_into", (0,), 10**6),
         entry(reference=10**6),
@@ -428,13 +428,13 @@ def alive_that_died(file: Path, to: Path) -> Path:
         entry(T_cw=[[1.0]]),
         entry(closing={}),
         entry(n_tracked="many"),
-        pytest.param(without_moment, id="none"),
+        pytest.param(without_checkpoint, id="none"),
         pytest.param(merged_in_a_circle, id="circle"),
         pytest.param(alive_that_died, id="alive"),
     ],
 )
-def test_a_damaged_moment_is_refused(apply, at_moment, tmp_path):
-    assert "damaged" in refusal(apply(at_moment, tmp_path / "hand.npz"))
+def test_a_damaged_checkpoint_is_refused(apply, at_checkpoint, tmp_path):
+    assert "damaged" in refusal(apply(at_checkpoint, tmp_path / "hand.npz"))
 
 
 def test_observations_that_contradict_each_other_are_refused(file, tmp_path):

@@ -27,7 +27,7 @@ from vslam.frontend.tracking import Frame
 from vslam.geometry import Matrix
 from vslam.map import LocalMap, Map, local_map
 from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
-from vslam.maps.moment import Moment
+from vslam.maps.checkpoint import Checkpoint
 from vslam.monocular import TwoViewStart
 
 
@@ -82,10 +82,10 @@ class MappingThread:
         if map_.n_keyframes and map_.sessions[newest] == map_.session:
             self.last_frame, self.last_timestamp = map_.frames[newest], map_.timestamps[newest]
 
-    def return_to(self, moment: Moment) -> None:
+    def return_to(self, checkpoint: Checkpoint) -> None:
         """Go on as from there, in the map as it was then."""
-        self.last_frame, self.last_timestamp = moment.last_frame, moment.last_timestamp
-        self.set_reference(moment.reference)
+        self.last_frame, self.last_timestamp = checkpoint.last_frame, checkpoint.last_timestamp
+        self.set_reference(checkpoint.reference)
 
     @property
     def busy(self) -> bool:

@@ -44,8 +44,8 @@ from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map, local_map
 from vslam.mapping import MappingThread
-from vslam.maps.moment import Moment
-from vslam.maps.storage import load_map, load_moment, save_map
+from vslam.maps.checkpoint import Checkpoint
+from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, World
 from vslam.monocular import Initialiser
 from vslam.trajectory import Trajectory
@@ -136,8 +136,8 @@ class Slam:
         self._n_tracked = 0  # landmarks, in the last frame tracked
         self._initialiser = Initialiser(self.context)  # of monocular maps
         self._is_between = True  # frames: nothing of the next one is tracked yet
-        if resume and start is not None and start.moment is not None:
-            self._return_to(start.moment)
+        if resume and start is not None and start.checkpoint is not None:
+            self._return_to(start.checkpoint)
         elif before is not None and len(before.tracked) > 1 and before.tracked[-2:].all():
             self._move_on(before)
 
@@ -163,7 +163,7 @@ class Slam:
             InputError: no map, a damaged one, or one of another detector or pyramid.
         """
         config = config or Config()
-        stored = load_moment(path) if resume else load_map(path)
+        stored = load_checkpoint(path) if resume else load_map(path)
         try:
             if detector is None:
                 images = create_images(stored.detector.name, config)
@@ -196,8 +196,8 @@ class Slam:
         save_map(path, self.stored_map(drive), resumable=resumable)
 
     def stored_map(self, drive: str = "") -> StoredMap:
-        """The map, between two frames at a ``moment``; ``save`` writes what lives of it. Its arrays
-        are those of the map: ``compact()``, which copies them, before the next step.
+        """The map, with a checkpoint if there can be one now; ``save`` writes what lives of it. Its
+        arrays are those of the map: ``compact()``, which copies them, before the next step.
 
         Raises:
             RuntimeError: a keyframe is being mapped.
@@ -213,10 +213,10 @@ class Slam:
             frames=self._poses.table(),
             drives=self._drives if self._localize else (*self._drives, drive),
             world=self.world,
-            moment=self._moment(),
+            checkpoint=self._checkpoint(),
         )
 
-    def _moment(self) -> Moment | None:
+    def _checkpoint(self) -> Checkpoint | None:
         """What goes on from here to the byte; None where that takes more than is kept: in the
         middle of a frame, before the first one is tracked, while a monocular map begins, and
         while a global bundle adjustment is under way."""
@@ -225,7 +225,7 @@ class Slam:
             return None
         if self.is_adjusting or not self._initialiser.is_idle:
             return None
-        return Moment(
+        return Checkpoint(
             index=frame.index,
             timestamp=frame.timestamp,
             features=frame.features,
@@ -240,15 +240,16 @@ class Slam:
             closing=self._closing.memory(),
         )
 
-    def _return_to(self, moment: Moment) -> None:
-        self._mapping.return_to(moment)
-        self._closing.restore(moment.closing)
-        self._velocity = moment.velocity
-        self._lost_frames, self._n_tracked = moment.lost_frames, moment.n_tracked
-        frame = Frame.untracked(moment.features, self.camera, moment.index, moment.timestamp)
-        tracked = moment.landmark >= 0
-        frame.T_cw, frame.landmark = moment.T_cw, moment.landmark
-        frame.xyz[tracked] = self.map.arrays.xyz[moment.landmark[tracked]]
+    def _return_to(self, checkpoint: Checkpoint) -> None:
+        self._mapping.return_to(checkpoint)
+        self._closing.restore(checkpoint.closing)
+        self._velocity = checkpoint.velocity
+        self._lost_frames, self._n_tracked = checkpoint.lost_frames, checkpoint.n_tracked
+        index, timestamp = checkpoint.index, checkpoint.timestamp
+        frame = Frame.untracked(checkpoint.features, self.camera, index, timestamp)
+        tracked = checkpoint.landmark >= 0
+        frame.T_cw, frame.landmark = checkpoint.T_cw, checkpoint.landmark
+        frame.xyz[tracked] = self.map.arrays.xyz[checkpoint.landmark[tracked]]
         self.frame = frame
 
     @property

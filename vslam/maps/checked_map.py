@@ -12,8 +12,8 @@ from vslam.camera import Camera
 from vslam.frame_poses import FrameTable
 from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe
 from vslam.map import NONE, Arrays, Map
-from vslam.maps.moment import ARRAYS as MOMENT_ARRAYS
-from vslam.maps.moment import checked_moment
+from vslam.maps.checkpoint import ARRAYS as CHECKPOINT_ARRAYS
+from vslam.maps.checkpoint import checked_checkpoint
 from vslam.maps.stored_map import StoredMap, World, observations
 
 # K keyframes, L landmarks, R keypoints, O observations, E loops, F frames of the last drive.
@@ -76,10 +76,10 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
     """
     sizes = _check_shapes(data)
     map_ = _build_map(data, sizes, int(header["session"]))
-    moment = None
-    if header["moment"] is not None:
-        arrays = {name: data[f"moment_{name}"] for name in MOMENT_ARRAYS}
-        moment = checked_moment(arrays, header["moment"], sizes["K"], sizes["L"])
+    checkpoint = None
+    if header["checkpoint"] is not None:
+        arrays = {name: data[f"checkpoint_{name}"] for name in CHECKPOINT_ARRAYS}
+        checkpoint = checked_checkpoint(arrays, header["checkpoint"], sizes["K"], sizes["L"])
     else:
         a = map_.arrays
         _require(bool(a.keyframe_alive.all() and a.landmark_alive.all()), "what died is in it")
@@ -99,7 +99,7 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
         frames=_frames(data, n) if header["frames"] else None,
         drives=tuple(str(drive) for drive in header["drives"]),
         world=None if world is None else _world(world),
-        moment=moment,
+        checkpoint=checkpoint,
     )
 
 

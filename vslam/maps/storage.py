@@ -24,7 +24,7 @@ from vslam.machine import versions
 from vslam.map import LANDMARK_FIELDS, ROW_FIELDS
 from vslam.map_kernels import gather_observations
 from vslam.maps.checked_map import ARRAYS, DamagedMapError, camera_of, checked_map
-from vslam.maps.moment import moment_arrays, moment_entry
+from vslam.maps.checkpoint import checkpoint_arrays, checkpoint_entry
 from vslam.maps.new_output import replaced_file
 from vslam.maps.stored_map import StoredMap
 from vslam.untrusted import require_memory
@@ -34,8 +34,8 @@ _FOREIGN = "not a map of vslam; name a map.npz, or the folder of a run"
 
 
 def save_map(path: Path, stored: StoredMap, *, resumable: bool = False) -> None:
-    """Write a map, in place of what is there: what lives of it, or, of one that is at a ``moment``
-    and is to be ``resumable``, all.
+    """Write a map, in place of what is there: what lives of it; all, if it has a checkpoint and is
+    to be ``resumable``.
 
     The file is complete or, after an error or a power cut, what it was before. Its ``header`` is
     JSON (schema, camera, detector, drives, versions); the arrays are those of ``ARRAYS``, and
@@ -45,7 +45,7 @@ def save_map(path: Path, stored: StoredMap, *, resumable: bool = False) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    whole = resumable and stored.moment is not None
+    whole = resumable and stored.checkpoint is not None
     arrays = _as_arrays(stored if whole else stored.compact())
     with replaced_file(path) as file:
         np.savez(file, allow_pickle=False, **arrays)
@@ -57,12 +57,12 @@ def load_map(path: Path) -> StoredMap:
     Raises:
         InputError: no such file, no map, damaged, or of another schema.
     """
-    stored = load_moment(path)
-    return stored if stored.moment is None else stored.compact()
+    stored = load_checkpoint(path)
+    return stored if stored.checkpoint is None else stored.compact()
 
 
-def load_moment(path: Path) -> StoredMap:
-    """``load_map``, but a map that was written at a ``moment`` as it was then.
+def load_checkpoint(path: Path) -> StoredMap:
+    """``load_map``, but one that was written with a checkpoint comes as it was then.
 
     Raises:
         InputError: as ``load_map``.
@@ -81,7 +81,7 @@ def _as_damage(path: Path) -> Iterator[None]:
 
 
 def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
-    map_, a, moment = stored.map, stored.map.arrays, stored.moment
+    map_, a, checkpoint = stored.map, stored.map.arrays, stored.checkpoint
     n, n_landmarks, n_rows = map_.n_keyframes, map_.n_landmarks, map_.n_rows
     landmarks = np.arange(n_landmarks, dtype=np.int32)
     index = np.arange(n, dtype=np.int64)
@@ -105,7 +105,7 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
         "images": stored.images is not None,
         "frames": stored.frames is not None,
         "session": map_.session,
-        "moment": None if moment is None else moment_entry(moment),
+        "checkpoint": None if checkpoint is None else checkpoint_entry(checkpoint),
         "world": None
         if stored.world is None
         else {
@@ -149,8 +149,9 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
                 arrays[f"{prefix}_{name.removeprefix('landmark_')}"] = getattr(a, name)[:size]
     for name in FrameTable._fields:
         arrays[f"frame_{name}"] = getattr(frames, name)
-    if moment is not None:
-        arrays |= {f"moment_{name}": array for name, array in moment_arrays(moment).items()}
+    if checkpoint is not None:
+        for name, array in checkpoint_arrays(checkpoint).items():
+            arrays[f"checkpoint_{name}"] = array
     for name, table in stored.detector.tables.items():
         table = table.select(index)
         arrays[f"detector_{name}_first"] = table.first

@@ -21,7 +21,7 @@ from vslam.map import (
     loop_of_living,
 )
 from vslam.map_kernels import gather_observations
-from vslam.maps.moment import Moment
+from vslam.maps.checkpoint import Checkpoint
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class StoredMap:
         frames: of the last drive, None if they are not kept.
         drives: what the images of each drive were, "kitti 06" for example.
         world: where the map lies, None where there is no ground truth.
-        moment: between two frames of the last drive, with which that goes on to the byte; then
-            the map has what died, too, numbered as ever.
+        checkpoint: with which the last drive goes on to the byte; then the map has what died,
+            too, numbered as ever. None where there is none, or the map is compact.
     """
 
     map: Map
@@ -64,7 +64,7 @@ class StoredMap:
     frames: FrameTable | None = None
     drives: tuple[str, ...] = ()
     world: World | None = None
-    moment: Moment | None = None
+    checkpoint: Checkpoint | None = None
 
     def compact(self) -> StoredMap:
         """A copy with the living keyframes and landmarks alone, numbered without gaps.
@@ -99,7 +99,7 @@ class StoredMap:
             detector=replace(self.detector, tables=tables),
             images=None if self.images is None else self.images.select(keyframes),
             frames=None if self.frames is None or not whole else _moved(self.frames, map_, new_id),
-            moment=None,
+            checkpoint=None,
         )
 
 

@@ -26,7 +26,7 @@ _NUMBERS = ("index", "timestamp", "reference", "last_frame", "last_timestamp", "
 
 
 @dataclass(frozen=True)
-class Moment:
+class Checkpoint:
     """What tracking and loop closing remember between two frames: with it, and with the map as it
     was, a run goes on to the byte as if it had not stopped.
 
@@ -57,17 +57,17 @@ class Moment:
     closing: ClosingMemory
 
 
-def moment_arrays(moment: Moment) -> dict[str, NDArray]:
+def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
     """Those of ``ARRAYS``."""
-    return {**vars(moment.features), "landmark": moment.landmark}
+    return {**vars(checkpoint.features), "landmark": checkpoint.landmark}
 
 
-def moment_entry(moment: Moment) -> dict[str, Any]:
-    """All else of a moment, for JSON, which keeps every bit of a number."""
-    closing = moment.closing
-    return {name: getattr(moment, name) for name in _NUMBERS} | {
-        "T_cw": moment.T_cw.tolist(),
-        "velocity": None if moment.velocity is None else moment.velocity.tolist(),
+def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
+    """All else of a checkpoint, for JSON, which keeps every bit of a number."""
+    closing = checkpoint.closing
+    return {name: getattr(checkpoint, name) for name in _NUMBERS} | {
+        "T_cw": checkpoint.T_cw.tolist(),
+        "velocity": None if checkpoint.velocity is None else checkpoint.velocity.tolist(),
         "closing": {
             **asdict(closing),
             "places": [[sorted(one.keyframes), one.length, one.age] for one in closing.places],
@@ -76,10 +76,10 @@ def moment_entry(moment: Moment) -> dict[str, Any]:
     }
 
 
-def checked_moment(
+def checked_checkpoint(
     arrays: dict[str, NDArray], entry: dict[str, Any], n_keyframes: int, n_landmarks: int
-) -> Moment:
-    """The moment of a file, which may hold anything.
+) -> Checkpoint:
+    """The checkpoint of a file, which may hold anything.
 
     Raises:
         KeyError, TypeError, ValueError: in a few words what is wrong with it.
@@ -89,7 +89,7 @@ def checked_moment(
         array = arrays[name]
         wanted = tuple(n if size is None else size for size in shape)
         if array.dtype != dtype or array.shape != wanted or not array.flags.c_contiguous:
-            raise ValueError(f"moment_{name} is {array.dtype} {array.shape}")
+            raise ValueError(f"checkpoint_{name} is {array.dtype} {array.shape}")
     landmark = arrays["landmark"]
     closing = _closing_of(entry["closing"], n_keyframes)
     T_cw = np.array(entry["T_cw"], np.float64)
@@ -108,7 +108,7 @@ def checked_moment(
     if not sound:
         raise ValueError("the last frame is out of range")
     features = Features(**{name: arrays[name] for name in ARRAYS if name != "landmark"})
-    return Moment(
+    return Checkpoint(
         **numbers,
         features=features,
         landmark=landmark,

@@ -210,21 +210,17 @@ def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
         U, _, Vt = np.linalg.svd(R[skew])
         R = R.copy()
         R[skew] = U @ Vt
-    trace = np.trace(R, axis1=1, axis2=2)
-    diagonal = np.diagonal(R, axis1=1, axis2=2)
-    largest = np.argmax(np.column_stack([diagonal, trace]), axis=1)
-    found = np.empty((len(R), 4))
-    for i in range(3):
-        n, j, k = largest == i, (i + 1) % 3, (i + 2) % 3
-        found[n, i] = 1.0 - trace[n] + 2.0 * R[n, i, i]
-        found[n, j] = R[n, j, i] + R[n, i, j]
-        found[n, k] = R[n, k, i] + R[n, i, k]
-        found[n, 3] = R[n, k, j] - R[n, j, k]
-    n = largest == 3
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        found[n, i] = R[n, k, j] - R[n, j, k]
-    found[n, 3] = 1.0 + trace[n]
+    r = R.reshape(-1, 9).T
+    trace = r[0] + r[4] + r[8]
+    # Each row is the quaternion, times four times one of its components.
+    products = np.empty((len(R), 4, 4))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        products[:, i, i] = 1.0 - trace + 2.0 * r[4 * i]
+        products[:, i, j] = products[:, j, i] = r[3 * j + i] + r[3 * i + j]
+        products[:, i, 3] = products[:, 3, i] = r[3 * k + j] - r[3 * j + k]
+    products[:, 3, 3] = 1.0 + trace
+    largest = np.argmax(np.stack([r[0], r[4], r[8], trace]), axis=0)
+    found = products[np.arange(len(R)), largest]
     found /= np.linalg.norm(found, axis=1, keepdims=True)
     wxyz = found[:, [3, 0, 1, 2]]
     first = wxyz[np.arange(len(R)), np.argmax(wxyz != 0.0, axis=1)]

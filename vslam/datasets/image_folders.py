@@ -164,10 +164,23 @@ def _find_sides(
             else ("that of the right ones with --right")
         )
         raise InputError(
-            f"{folder}: images of a pair are looked for in {pairs}; name the folder of the first "
-            f"ones with --data and {option}, or run with --sensor mono."
+            f"{folder}: images of a pair are looked for in {pairs}{_near_miss(folder)}; name the "
+            f"folder of the first ones with --data and {option}, or run with --sensor mono."
         )
     return [folder], False
+
+
+def _near_miss(folder: Path) -> str:
+    """What somebody may have overlooked who names one side of a pair, or has only one."""
+    above = folder.resolve().parent
+    for names in PAIRS + DEPTH_PAIRS:
+        if all(list_images(above / name) for name in names) and folder.resolve().name in names:
+            return f", and {above} has both (name that with --data)"
+        sides = [bool(list_images(folder / name)) for name in names]
+        if any(sides):
+            there, missing = names if sides[0] else names[::-1]
+            return f", but only {there} has images, {missing} has none"
+    return ""
 
 
 def _sorted_images(folder: Path) -> dict[str, Path]:

@@ -204,6 +204,8 @@ def test_folders_of_images(folder, corridor, tmp_path):
     times = tmp_path / "times.txt"
     times.write_text("0.0\n0.1\n")
     refused("times.txt: 2 times for 3 images", "images", tmp_path, options)
+    times.write_text("0\n100\n200\n")
+    refused("100 s from image to image, as if .* milliseconds", "images", tmp_path, options)
     times.write_text("0.0\n0.2\n0.1\n")
     refused("left/2.png: its time is not later", "images", tmp_path, options)
     refused("no such folder", "images", tmp_path / "none", options)

@@ -38,6 +38,7 @@ PAIRS = (
     ("cam0/data", "cam1/data"),
 )
 DEPTH_PAIRS = (("rgb", "depth"), ("color", "depth"), ("colour", "depth"), ("image", "depth"))
+_SLOWEST_S = 10.0  # between images: nothing could be tracked
 _NEAR_S = 0.02  # as TUM's associate.py
 _TIME_FILES = ("times.txt", "timestamps.txt")
 _EXIF = 0x8769  # tags of EXIF 2.32
@@ -256,6 +257,11 @@ def _times_of_file(path: Path, n: int) -> NDArray[np.float64]:
     times = read_table(path, (1,), "a time in seconds")[:, 0]
     if len(times) != n:
         raise InputError(f"{path}: {len(times)} times for {n} images; write one a line for each.")
+    if n > 1 and (interval := float(np.median(np.diff(times)))) > _SLOWEST_S:
+        raise InputError(
+            f"{path}: {interval:g} s from image to image, as if the times were in milliseconds or "
+            "nanoseconds; write seconds, or give --fps."
+        )
     return times
 
 

@@ -66,9 +66,9 @@ def read_calibration(files: Sequence[Path], size: Size | None = None) -> Calibra
                     f"{'one' if most == 1 else 'at most two'}."
                 )
             return reader(documents, size)
-    keys = ", ".join(" ".join(key.split())[:20] for key in sorted(documents[0].values)[:6])
+    there = ", ".join(" ".join(key.split())[:20] for key in sorted(documents[0].values)[:6])
     raise InputError(
-        f"{paths[0]}: no known calibration (it has the keys {keys}); it must be vslam's own "
+        f"{paths[0]}: no known calibration (it has the keys {there}); it must be vslam's own "
         "(docs/cameras.md), Kalibr's camchain, OpenCV's, EuRoC's sensor.yaml, "
         "ROS's camera_info or settings of ORB-SLAM."
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration
-from vslam.datasets import open_sequence
+from vslam.datasets import DATASETS, open_plugin_source, open_sequence
 from vslam.datasets.rectified import rectified
 from vslam.datasets.rectified_stream import rectified_stream
 from vslam.datasets.sequence import Sequence
@@ -83,6 +83,11 @@ def open_source(
     source: Sequence | Stream
     if dataset in SOURCES:
         source = _open_images(dataset, data, options, start, every, max_frames, sensor)
+    elif dataset not in DATASETS:
+        source = open_plugin_source(
+            dataset, Path(data), name, start=start, every=every, max_frames=max_frames,
+            monocular=monocular, calib=options.calibration,
+        )  # fmt: skip
     else:
         source = open_sequence(
             dataset, Path(data), name, start=start, every=every, max_frames=max_frames,

@@ -159,8 +159,9 @@
     const moment = drawPicture();
     const parts = [`frame ${now}`, `${t[now].toFixed(2)} s`, stateOf(now), `${inliers[now]} inliers`];
     if (!Number.isNaN(error[now])) parts.push(`error ${error[now].toPrecision(3)} m`);
-    const position = [xs, ys, zs].map((values) => values[now].toFixed(2)).join(", ");
-    parts.push(`at (${position})${data.unit}`, `heading ${heading[now].toFixed(1)}°`);
+    const fixed = (value, decimals) => (+value.toFixed(decimals) || 0).toFixed(decimals);  // no -0
+    const position = [xs, ys, zs].map((values) => fixed(values[now], 2)).join(", ");
+    parts.push(`at (${position})${data.unit}`, `heading ${fixed(heading[now], 1)}°`);
     if (moment) {
       const apart = moment.frame - now, plural = Math.abs(apart) === 1 ? "" : "s";
       const when = `${Math.abs(apart)} frame${plural} ${apart < 0 ? "earlier" : "later"}`;

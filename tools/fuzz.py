@@ -211,8 +211,10 @@ def _write_video(folder: Path) -> None:
 
 def _write_map(folder: Path) -> None:
     from vslam.features import Features
+    from vslam.loops import ClosingMemory, LoopEdge, ResembledPlace
     from vslam.map import Map
-    from vslam.map_kernels import link_many, refresh_landmarks
+    from vslam.map_kernels import link_many, merge_landmarks, refresh_landmarks
+    from vslam.maps.checkpoint import Checkpoint
     from vslam.maps.storage import save_map
     from vslam.maps.stored_map import StoredMap
 
@@ -235,7 +237,25 @@ def _write_map(folder: Path) -> None:
         rows = np.arange(n * k, n * (k + 1))
         link_many(map_.arrays, rows, ids.astype(np.int32))
     refresh_landmarks(map_.arrays, ids, map_.scales)
-    save_map(folder / "map.npz", StoredMap(map_, _camera()))
+    merge_landmarks(map_.arrays, 0, 1)
+    map_.cull_keyframe(1)
+    waits = LoopEdge(2, 0, 0.5, True, "", T_query_match=np.eye(4))
+    checkpoint = Checkpoint(
+        index=2,
+        timestamp=0.2,
+        features=features,
+        landmark=ids.astype(np.int32),
+        T_cw=np.eye(4),
+        velocity=np.zeros(6),
+        reference=2,
+        last_frame=2,
+        last_timestamp=0.2,
+        lost_frames=0,
+        n_tracked=n,
+        closing=ClosingMemory((ResembledPlace(frozenset((0,)), 1),), ((3, waits),), 3),
+    )
+    stored = StoredMap(map_, _camera(), checkpoint=checkpoint)
+    save_map(folder / "map.npz", stored, resumable=True)
 
 
 def _write_json(kind: str, folder: Path) -> None:
@@ -350,11 +370,16 @@ def _read_calibrations(folder: Path) -> None:
 
 
 def _read_map(folder: Path) -> None:
-    from vslam.maps.storage import load_map
+    from vslam.map_kernels import resolve
+    from vslam.maps.storage import load_checkpoint
 
-    map_ = load_map(folder / "map.npz").map
-    for k in range(map_.n_keyframes):
-        map_.covisible(k)
+    stored = load_checkpoint(folder / "map.npz")
+    for map_ in (stored.map, stored.compact().map):
+        for k in range(map_.n_keyframes):
+            map_.covisible(k)
+            map_.keyframe_pose(k)
+    if stored.checkpoint is not None:
+        resolve(stored.map.arrays, stored.checkpoint.landmark)
 
 
 def _read_config(folder: Path) -> None:

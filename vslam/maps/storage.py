@@ -7,6 +7,7 @@ be there in a second.
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -30,6 +31,9 @@ from vslam.maps.stored_map import StoredMap
 from vslam.untrusted import require_memory
 
 SCHEMA = 3
+_NO_MAP = (
+    ValueError, KeyError, EOFError, TypeError, AttributeError, MemoryError, RuntimeError
+)  # fmt: skip
 _FOREIGN = "not a map of vslam; name a map.npz, or the folder of a run"
 
 
@@ -209,6 +213,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
         ) from error
     except BadZipFile as error:
         raise InputError(f"{path}: {_FOREIGN}, or the file is damaged ({error}).") from error
-    except (ValueError, KeyError, EOFError, TypeError, AttributeError, MemoryError) as error:
-        # np.load tells of pickles and of what is no npz by ValueError; a plain array is no archive.
+    except (*_NO_MAP, zlib.error) as error:
+        # np.load tells of pickles and of what is no npz by ValueError, zipfile of encryption by
+        # RuntimeError; a plain array is no archive.
         raise InputError(f"{path}: {_FOREIGN}.") from error

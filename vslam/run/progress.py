@@ -7,6 +7,7 @@ written down as they come: saving them copies arrays, however many there are.
 from __future__ import annotations
 
 import json
+import zlib
 from array import array
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,6 +23,9 @@ from vslam.loops import LoopCorrection, LoopEdge, loop_entry, loop_of
 from vslam.maps.new_output import replaced_file
 
 SCHEMA = 2
+_DAMAGED = (
+    BadZipFile, ValueError, KeyError, TypeError, EOFError, IndexError, MemoryError, RuntimeError
+)  # fmt: skip
 _STATES = tuple(TrackingState)
 _BLACK = ("", "left", "right")
 _POSE, _NUMBERS = 16, 9  # of a frame: its pose, then what else is known of it
@@ -230,7 +234,7 @@ def read_progress(path: Path) -> Progress:
         raise InputError(
             f"{path}: cannot be read ({error.strerror or error}); there is nothing to resume."
         ) from error
-    except (BadZipFile, ValueError, KeyError, TypeError, EOFError, IndexError) as error:
+    except (*_DAMAGED, zlib.error) as error:
         raise InputError(f"{path}: damaged ({error}); there is nothing to resume.") from error
 
 

@@ -181,7 +181,7 @@ def loosest_keyframe(map_: Map, first: int, last: int, config: PoseGraphConfig) 
         return None
     strength = held_by(map_)[between]
     loosest = int(between[np.argmin(strength)])
-    weakest, next_weakest, *_ = *np.sort(strength).tolist(), config.min_shared
+    weakest, next_weakest = np.sort(np.append(strength, config.min_shared))[:2].tolist()
     thread = 2 * weakest <= min(next_weakest, config.min_shared)
     return loosest if thread and loosest not in map_.restarts else None
 

@@ -155,31 +155,35 @@ def essential_graph(
     )
 
 
+def held_by(map_: Map) -> NDArray[np.int64]:
+    """``(n_keyframes,)`` what holds the map together at each keyframe: the most landmarks that a
+    keyframe before it shares with one that is not; 0 at the first one."""
+    living = map_.living_keyframes()
+    pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, 1)
+    held = np.zeros(map_.n_keyframes, np.int64)
+    order = np.argsort(shared, kind="stable")  # greater numbers are written last
+    for (one, other), n in zip(pairs[order].tolist(), shared[order].tolist(), strict=True):
+        held[one + 1 : other + 1] = n
+    return held
+
+
 def loosest_keyframe(map_: Map, first: int, last: int, config: PoseGraphConfig) -> int | None:
     """The keyframe behind ``first``, and not behind ``last``, at which the map hangs by a thread.
 
-    What holds the map together there is the most landmarks that a keyframe before it shares with
-    one that is not. Where a camera sees what it saw a moment ago these are hundreds; a pose after a
-    cut or a gap that wrong matches agreed on has no more than those. None if it is as many as a
-    strong covisibility edge has, if a second place is not twice as strong, or where mapping began
-    anew.
+    Where a camera sees what it saw a moment ago hundreds of landmarks hold the map together
+    (``held_by``); at a pose after a cut or a gap that wrong matches agreed on, no more than those.
+    None if there are as many as a strong covisibility edge has, if a second place is not twice as
+    strong, or where mapping began anew.
     """
     living = map_.living_keyframes()
-    pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, 1)
-    strong = pairs[shared >= config.min_shared]
-    bridges = np.zeros(map_.n_keyframes + 1, np.int64)
-    np.add.at(bridges, strong[:, 0] + 1, 1)
-    np.add.at(bridges, strong[:, 1] + 1, -1)
     between = living[(first < living) & (living <= last)]
-    loose = between[np.cumsum(bridges)[between] == 0]
-    strength = [
-        int(shared[(pairs[:, 0] < k) & (k <= pairs[:, 1])].max(initial=0)) for k in loose.tolist()
-    ]
-    if not strength:
+    if not len(between):
         return None
-    weakest, next_weakest, *_ = *sorted(strength), config.min_shared
-    loosest = int(loose[np.argmin(strength)])
-    return loosest if 2 * weakest <= next_weakest and loosest not in map_.restarts else None
+    strength = held_by(map_)[between]
+    loosest = int(between[np.argmin(strength)])
+    weakest, next_weakest = np.sort(np.append(strength, config.min_shared))[:2].tolist()
+    thread = 2 * weakest <= min(next_weakest, config.min_shared)
+    return loosest if thread and loosest not in map_.restarts else None
 
 
 def _passes(pair: tuple[int, int], keyframes: NDArray[np.int64]) -> bool:

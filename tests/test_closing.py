@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from ring import CAMERA, LAP, Oracle, Ring
 
-from vslam.backend.pose_graph import GAP
+from vslam.backend.pose_graph import GAP, held_by
 from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.features import Features, TrackingState
@@ -233,6 +233,15 @@ def test_a_wrong_keyframe_bends_the_map_and_the_loops_that_tell_are_refused():
     assert found[60:].min() > 40.0
     assert sum("contradicted" in edge.reason for edge in slam.loops) > 4
     assert not slam.corrections
+    wrong = slam.map.frames.index(60)
+    held = held_by(slam.map)
+    assert int(held[1:].argmin()) + 1 == wrong
+    expected = max(
+        len(set(slam.map.landmarks_of(i).tolist()) & set(slam.map.landmarks_of(j).tolist()))
+        for i in range(wrong)
+        for j in range(wrong, slam.map.n_keyframes)
+    )
+    assert held[wrong] == expected < 30
 
 
 def test_loops_that_agree_against_a_wrong_keyframe_heal_the_map(check_map):

@@ -15,7 +15,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -311,13 +311,16 @@ def law(found: Figures, key: str) -> Law:
     return Law(float(exponent), float(np.exp(at)))
 
 
-def table(found: Figures) -> str:
+def table(found: Figures, keys: Collection[str] = ()) -> str:
+    """Rows of the figures named, all by default; what was not measured stands in parentheses."""
     sizes = list(found)
     lines = [
         "| | " + " | ".join(f"{n:,}" for n in sizes) + " | grows as |",
         "|---|" + "---|" * (len(sizes) + 1),
     ]
     for _, key, title, unit in ROWS:
+        if keys and key not in keys:
+            continue
         fitted = law(found, key)
         cells = [
             number(figures[key]) if (figures := found[n]).get(key) is not None

@@ -280,6 +280,7 @@ class Slam:
         frame = self._next_frame(features, timestamp, image)
         if self._mapping.is_due(frame.index):
             self._merge()
+        frame.correct_disparities(self._mapping.disparity_offset)
         clock.lap("wait_for_mapping")
         if self._mapping.n_keyframes == 0:
             return self._start(frame, clock)

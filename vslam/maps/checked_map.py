@@ -55,10 +55,19 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
 }
 _MAY_BE_NAN = {"row_u_right"}
 _ROTATION_TOLERANCE = 1e-6
+_MAX_OFFSET = 100.0  # pixels
 
 
 class DamagedMapError(Exception):
     """What is wrong with the arrays of a file."""
+
+
+def _set_offset(map_: Map, header: dict[str, Any]) -> None:
+    """The disparity offset; maps from before it was measured have none."""
+    offset, information = (float(value) for value in header.get("disparity_offset", (0.0, 0.0)))
+    _require(abs(offset) < _MAX_OFFSET and 0.0 <= information < np.inf, "the disparity offset")
+    map_.disparity_offset, map_.offset_information = offset, information
+    map_.calibrated_until = map_.n_keyframes - 1
 
 
 def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
@@ -70,6 +79,7 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
     """
     sizes = _check_shapes(data)
     map_ = _build_map(data, sizes, int(header["session"]))
+    _set_offset(map_, header)
     detector, n = header["detector"], sizes["K"]
     tables = {str(name): _per_keyframe(data, f"detector_{name}", n) for name in detector["tables"]}
     images = _per_keyframe(data, "image", n) if header["images"] else None

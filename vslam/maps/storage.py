@@ -102,6 +102,7 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
         "images": stored.images is not None,
         "frames": stored.frames is not None,
         "session": map_.session,
+        "disparity_offset": [map_.disparity_offset, map_.offset_information],
         "world": None
         if stored.world is None
         else {

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.config import StereoConfig
+from vslam.features import MIN_DISPARITY
 from vslam.frontend.orb import Extraction
 from vslam.kernels import hamming, inline, inner_kernel, kernel
 
@@ -123,7 +124,7 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
         # The left feature keeps its sub-pixel offset within the level's pixel.
         disparity = (x_l - x_r - shift) * scales[level]
         if disparity < max_disparity and disparity > -1.0:
-            u_right[i] = u - max(disparity, 0.01)
+            u_right[i] = u - max(disparity, MIN_DISPARITY)
             sad[i] = score
     return u_right, sad
 

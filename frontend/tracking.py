@@ -46,6 +46,7 @@ class Frame:
         T_cw: ``(4, 4)`` pose estimate.
         landmark: ``(N,)`` int32, landmark that each feature tracks, or -1.
         xyz: ``(N, 3)`` float64, its position; NaN without one.
+        disparity_offset: pixels that the disparities of the features were corrected by.
     """
 
     index: int
@@ -56,6 +57,7 @@ class Frame:
     T_cw: NDArray[np.float64]
     landmark: NDArray[np.int32]
     xyz: NDArray[np.float64]
+    disparity_offset: float = 0.0
 
     @classmethod
     def untracked(
@@ -78,6 +80,13 @@ class Frame:
             landmark=np.full(n, -1, np.int32),
             xyz=np.full((n, 3), np.nan),
         )
+
+    def correct_disparities(self, offset: float) -> None:
+        """Correct the features by the whole offset of the pair (``Map.disparity_offset``)."""
+        if offset != self.disparity_offset:
+            change = offset - self.disparity_offset
+            self.features = self.features.with_larger_disparities(change)
+            self.disparity_offset = offset
 
     @property
     def n_stereo(self) -> int:

@@ -80,6 +80,15 @@ class StereoConfig(_Section):
         gt=0,
         description="Depth below which a point is close, baselines. [OS2 III-A, printed]",
     )
+    offset_sigma: float = Field(
+        0.0,
+        ge=0,
+        description="Sigma of the offset of all disparities before the camera's motion tells it, "
+        "pixels; 0: not looked for (docs/motorway.md). [own]",
+    )
+    offset_keyframes: int = Field(
+        12, ge=3, description="Keyframes after which that offset is measured anew. [own]"
+    )
 
 
 class DepthConfig(_Section):

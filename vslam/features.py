@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from vslam.kernels import kernel
 
+MIN_DISPARITY = 0.01  # pixels; a point farther away counts as so far
 CELL = 16  # pixels of a FeatureGrid cell; search windows are 5 to 60 px wide
 
 
@@ -35,6 +36,10 @@ class Features:
     def __len__(self) -> int:
         return len(self.xy)
 
+    def with_larger_disparities(self, change: float) -> Features:
+        """The same with ``change`` pixels added to the disparity of each stereo match."""
+        return replace(self, u_right=shifted_columns(self.u_right, self.xy[:, 0], change))
+
     @classmethod
     def none(cls) -> Features:
         """Those of a frame without images."""
@@ -45,6 +50,14 @@ class Features:
             np.empty((0, 32), np.uint8),
             np.empty(0, np.float32),
         )
+
+
+def shifted_columns(
+    u_right: NDArray[np.float32], u: NDArray[np.float32], change: float
+) -> NDArray[np.float32]:
+    """``(N,)`` columns in the right image, ``change`` pixels further to the left, but never so far
+    to the right that the point would lie behind the camera. NaN stays NaN."""
+    return np.minimum(u_right - np.float32(change), u - np.float32(MIN_DISPARITY))
 
 
 class FeatureGrid(NamedTuple):

@@ -89,6 +89,10 @@ class Map:
             is the root of a sub-map, its pose relative to its parent only a prediction.
         unpredicted_restarts: those of them whose pose is not even that, since the speed of the
             camera was not known.
+        disparity_offset: pixels that the pair sees too little of every disparity; ``u_right`` of
+            all rows is free of it (``backend/disparity_offset.py``).
+        offset_information: what measured it, an inverse variance.
+        calibrated_until: the newest keyframe that did.
     """
 
     def __init__(self, scales: NDArray[np.float64]) -> None:
@@ -106,6 +110,9 @@ class Map:
         self.unit_scale: list[float] = []
         self.restarts: list[int] = []
         self.unpredicted_restarts: list[int] = []
+        self.disparity_offset = 0.0
+        self.offset_information = 0.0
+        self.calibrated_until = -1
         k, n, r = 64, 8192, 65536
         self.arrays = Arrays(
             T_cw=np.zeros((k, 4, 4)),

@@ -16,7 +16,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.backend.local_mapping import map_keyframe, refresh_keyframe
+from vslam.backend.disparity_offset import map_and_calibrate
+from vslam.backend.local_mapping import refresh_keyframe
 from vslam.backend.triangulation import map_stereo_points
 from vslam.backend.two_views import map_two_views
 from vslam.camera import Camera
@@ -41,11 +42,13 @@ class MappingThread:
         local: landmarks around the reference keyframe, as of the last merge.
         reference_view: landmarks of the reference keyframe alone.
         n_reference: of these, those that at least three keyframes see (all in a young map).
+        disparity_offset: ``Map.disparity_offset``.
     """
 
     local: LocalMap
     reference_view: LocalMap
     n_reference: int
+    disparity_offset: float
 
     def __init__(
         self,
@@ -60,6 +63,7 @@ class MappingThread:
         """``map_``: to go on in; an empty one by default."""
         self.reference = 0
         self.n_keyframes = 0
+        self.disparity_offset = 0.0
         self.last_frame = -1
         self.last_timestamp = -np.inf
         self._map = map_ or Map(scales)
@@ -220,6 +224,7 @@ class MappingThread:
         Two landmarks may have become one: the first feature keeps it.
         """
         arrays = self.map.arrays
+        frame.correct_disparities(self.disparity_offset)
         ids = resolve(arrays, frame.landmark)
         _, first = np.unique(ids, return_index=True)
         repeated = np.ones(len(ids), np.bool_)
@@ -288,7 +293,7 @@ class MappingThread:
     def _map_keyframe(
         self, keyframe: int, features: Features, image: NDArray[np.uint8] | None
     ) -> None:
-        map_keyframe(self._map, keyframe, self._camera, self._config)
+        map_and_calibrate(self._map, keyframe, self._camera, self._config)
         self._closing.process(self._map, keyframe, features, image)
 
     def _start(self, work: Callable[[], None]) -> Callable[[], None]:
@@ -299,6 +304,7 @@ class MappingThread:
 
     def _copy_view(self) -> None:
         map_, reference = self._map, self.reference
+        self.disparity_offset = map_.disparity_offset
         self.local = local_map(map_, reference, self._config.tracking.local_keyframes)
         self.reference_view = local_map(map_, reference, 1)
         living = map_.living_keyframes()

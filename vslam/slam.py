@@ -249,6 +249,7 @@ class Slam:
         frame = Frame.untracked(checkpoint.features, self.camera, index, timestamp)
         tracked = checkpoint.landmark >= 0
         frame.T_cw, frame.landmark = checkpoint.T_cw, checkpoint.landmark
+        frame.disparity_offset = self._mapping.disparity_offset
         frame.xyz[tracked] = self.map.arrays.xyz[checkpoint.landmark[tracked]]
         self.frame = frame
 
@@ -323,6 +324,7 @@ class Slam:
         frame = self._next_frame(features, timestamp, image)
         if self._mapping.is_due(frame.index):
             self._merge()
+        frame.correct_disparities(self._mapping.disparity_offset)
         clock.lap("wait_for_mapping")
         self._is_between = False
         result = (

@@ -61,10 +61,19 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
 }
 _MAY_BE_NAN = {"row_u_right"}
 _ROTATION_TOLERANCE = 1e-6
+_MAX_OFFSET = 100.0  # pixels
 
 
 class DamagedMapError(Exception):
     """What is wrong with the arrays of a file."""
+
+
+def _set_offset(map_: Map, header: dict[str, Any]) -> None:
+    """The disparity offset, and what measured it."""
+    offset, information, until = header["disparity_offset"]
+    _require(abs(offset) < _MAX_OFFSET and 0.0 <= information < np.inf, "the disparity offset")
+    map_.disparity_offset, map_.offset_information = float(offset), float(information)
+    map_.calibrated_until = int(until)
 
 
 def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
@@ -76,6 +85,7 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
     """
     sizes = _check_shapes(data)
     map_ = _build_map(data, sizes, int(header["session"]))
+    _set_offset(map_, header)
     checkpoint = None
     if header["checkpoint"] is not None:
         arrays = {name: data[f"checkpoint_{name}"] for name in CHECKPOINT_ARRAYS}

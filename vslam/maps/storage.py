@@ -110,6 +110,11 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
         "frames": stored.frames is not None,
         "session": map_.session,
         "checkpoint": None if checkpoint is None else checkpoint_entry(checkpoint),
+        "disparity_offset": [
+            map_.disparity_offset,
+            map_.offset_information,
+            map_.calibrated_until,
+        ],
         "world": None
         if stored.world is None
         else {

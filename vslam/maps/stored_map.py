@@ -137,6 +137,8 @@ def selected(map_: Map, keyframes: NDArray[np.int64]) -> Map:
     )
     found = Map(map_.scales)
     found.n_keyframes, found.n_landmarks, found.n_rows = n, len(landmarks), len(kept_rows)
+    found.disparity_offset = map_.disparity_offset
+    found.offset_information, found.calibrated_until = map_.offset_information, n - 1
     found.arrays = Arrays(
         T_cw=a.T_cw[keyframes],
         first_row=first_row,
@@ -204,6 +206,9 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
     n, n_landmarks, n_rows = a.n_keyframes, a.n_landmarks, a.n_rows
     found = Map(a.scales)
     found.n_keyframes = n + b.n_keyframes
+    found.disparity_offset = a.disparity_offset
+    found.offset_information = a.offset_information
+    found.calibrated_until = found.n_keyframes - 1
     found.n_landmarks, found.n_rows = n_landmarks + b.n_landmarks, n_rows + b.n_rows
     shift = {
         "first_keyframe": n, "keyframe": n, "merged_into": 0, "landmark": n_landmarks,

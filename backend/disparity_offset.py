@@ -1,0 +1,77 @@
+"""The disparity that a stereo pair sees too little or too much, found from its own motion.
+
+Calibrations leave the right camera turned by some hundredths of a degree against the left one, or
+a principal point off by a tenth of a pixel. Every disparity is then off by about the same, which
+makes near points a little and far points much too near or too far. From one pair nobody can tell;
+but a camera that moves sees how far a point moves in the image, too, and one motion must explain
+near and far points alike. So the offset is one more unknown of bundle adjustment, common to all
+keyframes (self-calibration: Triggs et al., "Bundle adjustment - a modern synthesis", section 10).
+
+It is found in windows of keyframes that no window before shares, and what they say is joined by
+their information, beginning with a prior of mean 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from vslam.backend.bundle_adjustment import BundleProblem, adjust
+from vslam.backend.local_mapping import adjust_locally, assemble, map_keyframe
+from vslam.camera import Camera
+from vslam.config import Config
+from vslam.features import shifted_columns
+from vslam.map import Map
+from vslam.map_kernels import collect_landmarks
+
+STEP = 0.2  # pixels between the costs through which a parabola is laid
+ITERATIONS = 15
+TOLERANCE = 1e-5  # relative; a step changes the cost by some thousandths
+
+
+def map_and_calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
+    """`map_keyframe`, and after every few keyframes a better disparity offset."""
+    map_keyframe(map_, keyframe, camera, config)
+    if config.stereo.offset_sigma > 0.0 and camera.sensor == "stereo":
+        _calibrate(map_, keyframe, camera, config)
+
+
+def _calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
+    window = map_.living_keyframes()
+    window = window[window > max([map_.calibrated_until, *(k - 1 for k in map_.restarts)])]
+    if len(window) < config.stereo.offset_keyframes:
+        return
+    map_.calibrated_until = keyframe
+    landmarks = collect_landmarks(map_.arrays, window, map_.n_landmarks)
+    problem, _ = assemble(map_, window[1:], window[:1], landmarks, camera)
+    found, information = remaining_offset(problem)
+    if information <= 0.0:
+        return
+    prior = config.stereo.offset_sigma**-2.0
+    map_.offset_information += information
+    change = found * information / (prior + map_.offset_information)
+    map_.disparity_offset += change
+    a, n = map_.arrays, map_.n_rows
+    a.u_right[:n] = shifted_columns(a.u_right[:n], a.xy[:n, 0], change)
+    adjust_locally(map_, keyframe, camera, config)
+
+
+def remaining_offset(problem: BundleProblem) -> tuple[float, float]:
+    """What is to be added to all disparities of a bundle problem, in pixels, and the information
+    (inverse variance) of that; 0, 0 if the problem does not tell.
+
+    The cost of the adjusted problem is nearly a parabola of the offset.
+    """
+    first = adjust(problem, iterations=5)
+    start = replace(problem, T_cw=first.T_cw, points=first.points)
+
+    def cost(offset: float) -> float:
+        uvr = problem.uvr.copy()
+        uvr[:, 2] -= offset
+        shifted = replace(start, uvr=uvr)
+        return adjust(shifted, iterations=ITERATIONS, use=first.inlier, tolerance=TOLERANCE).cost
+
+    below, here, above = cost(-STEP), cost(0.0), cost(STEP)
+    bend = below + above - 2.0 * here
+    if not bend > 0.0:
+        return 0.0, 0.0
+    return 0.5 * STEP * (below - above) / bend, bend / STEP**2

@@ -1,0 +1,86 @@
+"""The offset of all disparities that the camera's own motion tells."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vslam.backend.bundle_adjustment import BundleProblem
+from vslam.backend.disparity_offset import remaining_offset
+from vslam.camera import Camera
+from vslam.features import MIN_DISPARITY, Features, shifted_columns
+from vslam.frontend.tracking import Frame
+
+CAMERA = Camera(700.0, 700.0, 600.0, 180.0, 0.54, 1200, 370)
+N_CAMERAS = 8
+
+
+def drive(offset: float, speed: float = 1.1, noise: float = 0.0, seed: int = 0) -> BundleProblem:
+    """A street seen from a car that drives ahead; its pair sees ``offset`` px too little. The map
+    is what such a pair would make: its depths come from the wrong disparities of one frame."""
+    rng = np.random.default_rng(seed)
+    points = np.column_stack(
+        [rng.uniform(-12, 12, 400), rng.uniform(-4, 1.6, 400), rng.uniform(16, 70, 400)]
+    )
+    T_cw = np.tile(np.eye(4), (N_CAMERAS, 1, 1))
+    T_cw[:, 2, 3] = -speed * np.arange(N_CAMERAS)
+    in_camera = points[:, None] + T_cw[None, :, :3, 3]
+    uvr = CAMERA.project(in_camera.reshape(-1, 3))
+    uvr[:, 2] += offset
+    uvr[:, :2] += noise * rng.standard_normal((len(uvr), 2))
+    uvr[:, 2] += uvr[:, 0] - CAMERA.project(in_camera.reshape(-1, 3))[:, 0]
+    seen = uvr[::N_CAMERAS].copy()
+    first = CAMERA.backproject(seen[:, :2], CAMERA.bf / np.maximum(seen[:, 0] - seen[:, 2], 0.5))
+    order = np.r_[1:N_CAMERAS, 0]  # the first camera is held: it comes last
+    return BundleProblem(
+        T_cw=T_cw[order],
+        n_free=N_CAMERAS - 1,
+        points=first,
+        first=np.arange(0, len(uvr) + 1, N_CAMERAS, dtype=np.int64),
+        camera=np.tile(np.argsort(order), len(points)).astype(np.int64),
+        uvr=uvr,
+        inverse_sigma2=np.ones(len(uvr)),
+        intrinsics=CAMERA.intrinsics,
+    )
+
+
+@pytest.mark.parametrize("offset", [-0.3, -0.05, 0.0, 0.12, 0.4])
+def test_a_drive_tells_what_the_pair_sees_too_little(offset: float) -> None:
+    found, information = remaining_offset(drive(offset))
+    assert found == pytest.approx(offset, abs=0.01)
+    assert information > 100.0
+
+
+def test_with_noise_the_error_is_of_the_size_that_the_information_says() -> None:
+    errors = []
+    for seed in range(12):
+        found, information = remaining_offset(drive(0.15, noise=0.5, seed=seed))
+        errors.append((found - 0.15) * np.sqrt(information))
+    # The disparities have no noise here, and all is smaller than the pixel that is assumed.
+    assert np.sqrt(np.mean(np.square(errors))) < 1.0
+
+
+def test_a_standing_camera_tells_nearly_nothing() -> None:
+    _, information = remaining_offset(drive(0.2, speed=0.0))
+    assert information < 1.0
+
+
+def test_columns_move_left_but_no_point_gets_behind_the_camera() -> None:
+    u = np.array([100.0, 100.0, 100.0], np.float32)
+    u_right = np.array([90.0, 99.9, np.nan], np.float32)
+    moved = shifted_columns(u_right, u, -0.5)
+    np.testing.assert_allclose(moved, [90.5, 100.0 - MIN_DISPARITY, np.nan], atol=1e-5)
+    np.testing.assert_allclose(shifted_columns(u_right, u, 0.5), [89.5, 99.4, np.nan], atol=1e-5)
+
+
+def test_a_frame_is_corrected_once_whatever_it_was_corrected_by_before() -> None:
+    xy = np.array([[50.0, 50.0]], np.float32)
+    features = Features(
+        xy, np.zeros(1, np.uint8), np.zeros(1, np.float32), np.zeros((1, 32), np.uint8),
+        np.array([40.0], np.float32),
+    )  # fmt: skip
+    frame = Frame.untracked(features, CAMERA)
+    for offset in (0.1, 0.1, 0.3):
+        frame.correct_disparities(offset)
+    assert frame.features.u_right[0] == pytest.approx(40.0 - 0.3, abs=1e-5)
+    assert features.u_right[0] == 40.0

@@ -131,6 +131,8 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--compare-loops --detector none", ["--compare-loops", "--detector none"]),
         ("--data nowhere", ["nowhere", "no such file or folder", "--data"]),
         ("--data .", ["the folder is empty", "--data"]),
+        ("nowhere", ["nowhere", "no such file or folder", "--data"]),
+        ("nowhere --data .", ["nowhere: --data says what to run on, too"]),
         ("--data ..", ["no data set that is known", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
@@ -245,7 +247,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
     monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[0])
     monkeypatch.setattr(figures, "draw_figures", draw_figures)
     monkeypatch.setattr(warmup, "is_cold", lambda: False)
-    monkeypatch.setattr(warmup, "compile_kernels", lambda processes: None)
+    monkeypatch.setattr(warmup, "compile_kernels", lambda processes, load: None)
     return calls
 
 

@@ -356,8 +356,11 @@ def draw(found: Figures, path: Path) -> None:
             for key in keys:
                 known = [(n, figures[key]) for n, figures in found.items() if key in figures]
                 exponent = law(found, key).exponent
-                label = f"{titles[key].split(', a')[0]}: n^{exponent:.2f}"
+                label = f"{titles[key].removesuffix(', a keyframe')}: n^{exponent:.2f}"
                 axes.loglog(*zip(*known, strict=True), "o-", markersize=3, label=label)
+            measured = [n for n, figures in found.items() if figures]
+            axes.set_xticks(measured, [f"{n:,}" for n in measured])
+            axes.minorticks_off()
             axes.set_xlabel("keyframes")
             axes.set_title(title)
             axes.legend(fontsize=7)

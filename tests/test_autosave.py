@@ -25,7 +25,7 @@ from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.features import TrackingState, TrackResult
 from vslam.frontend.sides import Sides
 from vslam.loops import LoopCorrection, LoopEdge
-from vslam.maps.storage import load_map
+from vslam.maps.storage import load_checkpoint, load_map
 from vslam.run import autosave as saving
 from vslam.run.autosave import (
     LOCK,
@@ -123,8 +123,8 @@ def test_a_killed_run_goes_on_at_the_next_frame(kitti_tree, tmp_path, undisturbe
     assert len(read_trajectory(tmp_path / ONLINE)) == FRAMES
     before = whole.tracks[n_saved - 1].T_wc
     assert np.array_equal(before, undisturbed.tracks[n_saved - 1].T_wc)
-    # The moment of the last save hangs on the disk; at each of 24 the ATE was 0.009 to 0.020 m.
-    assert ate(whole) < 2.0 * ate(undisturbed)
+    assert load_checkpoint(unfinished.map).checkpoint is not None
+    assert whole.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
 
 
 def test_an_interrupted_run_is_saved_at_its_end(kitti_tree, tmp_path):

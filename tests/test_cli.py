@@ -247,7 +247,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
     monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[0])
     monkeypatch.setattr(figures, "draw_figures", draw_figures)
     monkeypatch.setattr(warmup, "is_cold", lambda: False)
-    monkeypatch.setattr(warmup, "compile_kernels", lambda processes: None)
+    monkeypatch.setattr(warmup, "compile_kernels", lambda processes, load: None)
     return calls
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evo.core.metrics import APE, RPE, PoseRelation
+from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation
 
 from vslam.errors import InputError
@@ -70,6 +72,28 @@ def test_a_rigid_motion_is_no_error():
     assert result.r_rel_deg_per_100m < 1e-6
     np.testing.assert_allclose(result.T_wc_aligned, truth.T_wc, atol=1e-9)
     np.testing.assert_allclose(result.distances_m, 0.5 * np.arange(2001))
+
+
+@pytest.mark.parametrize("alignment", ["se3", "sim3", "none"])
+def test_errors_are_those_of_evo(alignment):
+    truth = drive(400)
+    estimate = moved(scaled(noisy(truth, 0.05), 1.02), RIGID)
+    turns = Rotation.from_rotvec(np.random.default_rng(1).normal(0, 0.02, (400, 3)))
+    estimate.T_wc[:, :3, :3] = estimate.T_wc[:, :3, :3] @ turns.as_matrix()
+    theirs, reference = (
+        PoseTrajectory3D(poses_se3=list(t.T_wc), timestamps=t.timestamps) for t in (estimate, truth)
+    )
+    if alignment != "none":
+        theirs.align(reference, correct_scale=alignment == "sim3")
+    expected = [APE(PoseRelation.translation_part)]
+    expected += [RPE(PoseRelation.translation_part), RPE(PoseRelation.rotation_angle_deg)]
+    for metric in expected:
+        metric.process_data((reference, theirs))
+    ours = evaluate_trajectory(estimate, truth, alignment)
+    np.testing.assert_allclose(ours.T_wc_aligned, theirs.poses_se3, atol=1e-10)
+    np.testing.assert_allclose(ours.errors_m, expected[0].error, atol=1e-10)
+    rmse = [metric.get_all_statistics()["rmse"] for metric in expected]
+    assert [ours.ate_rmse_m, ours.rpe_m, ours.rpe_deg] == pytest.approx(rmse, abs=1e-9)
 
 
 def test_without_alignment_a_constant_offset_is_the_error():

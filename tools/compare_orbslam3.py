@@ -79,9 +79,13 @@ def measure(command: list[str], folder: Path) -> Process:
     """Run a command to its end and account for it. Nothing heavy may be imported before: the
     peak memory of a child starts at that of its parent."""
     log = folder / "output.txt"
+    # Modules are compiled once, as when pip installs them.
+    environment = {key: os.environ[key] for key in os.environ if key != "PYTHONDONTWRITEBYTECODE"}
     start = time.perf_counter()
     with log.open("wb") as output:
-        child = subprocess.Popen(command, cwd=folder, stdout=output, stderr=subprocess.STDOUT)
+        child = subprocess.Popen(
+            command, cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT
+        )
         ended, held = threading.Event(), []
         watch = threading.Thread(target=sample_memory, args=(child.pid, ended, start, held))
         watch.start()

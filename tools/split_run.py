@@ -56,7 +56,7 @@ def compare(sequence: Sequence, detector: str, at: float, threads: int, folder: 
     whole.save(folder / "whole.npz")
     split = begin(sequence, detector, threads)
     drive(split, sequence, range(half), threads)
-    split.save(folder / "half.npz")
+    split.save(folder / "half.npz", resumable=True)
     split = Slam.load(folder / "half.npz", threads=threads, resume=True)
     lost = drive(split, sequence, range(half, n), threads)
     found = Slam.load(folder / "whole.npz", threads=threads, localize=True)

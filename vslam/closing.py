@@ -47,7 +47,7 @@ from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_verification import LearnedTrials, shows_known, verify_learned
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verification import verify
-from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
+from vslam.loops import ClosingMemory, LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map
 
 
@@ -125,6 +125,21 @@ class LoopClosing:
                 self._consistency.reset()
                 self.edges += [_superseded(other) for other in verified[number + 1 :]]
                 break
+
+    def memory(self) -> ClosingMemory:
+        """What is remembered of recent keyframes, for a file."""
+        return replace(
+            self._consistency.memory(),
+            resting_until=self._trials.resting_until,
+            in_vain=self._trials.in_vain,
+            followed=self._followed,
+        )
+
+    def restore(self, memory: ClosingMemory) -> None:
+        """Remember what ``memory`` gave."""
+        self._consistency.restore(memory)
+        self._trials.resting_until, self._trials.in_vain = memory.resting_until, memory.in_vain
+        self._followed = memory.followed
 
     @property
     def is_adjusting(self) -> bool:

@@ -27,6 +27,7 @@ from vslam.frontend.tracking import Frame
 from vslam.geometry import Matrix
 from vslam.map import LocalMap, Map, local_map
 from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
+from vslam.maps.checkpoint import Checkpoint
 from vslam.monocular import TwoViewStart
 
 
@@ -80,6 +81,11 @@ class MappingThread:
         map_, newest = self._map, self.reference
         if map_.n_keyframes and map_.sessions[newest] == map_.session:
             self.last_frame, self.last_timestamp = map_.frames[newest], map_.timestamps[newest]
+
+    def return_to(self, checkpoint: Checkpoint) -> None:
+        """Go on as from there, in the map as it was then."""
+        self.last_frame, self.last_timestamp = checkpoint.last_frame, checkpoint.last_timestamp
+        self.set_reference(checkpoint.reference)
 
     @property
     def busy(self) -> bool:

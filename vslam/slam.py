@@ -44,7 +44,8 @@ from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map, local_map
 from vslam.mapping import MappingThread
-from vslam.maps.storage import load_map, save_map
+from vslam.maps.checkpoint import Checkpoint
+from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, World
 from vslam.monocular import Initialiser
 from vslam.trajectory import Trajectory
@@ -134,7 +135,10 @@ class Slam:
         self._lost_frames = 0
         self._n_tracked = 0  # landmarks, in the last frame tracked
         self._initialiser = Initialiser(self.context)  # of monocular maps
-        if before is not None and len(before.tracked) > 1 and before.tracked[-2:].all():
+        self._is_between = True  # frames: nothing of the next one is tracked yet
+        if resume and start is not None and start.checkpoint is not None:
+            self._return_to(start.checkpoint)
+        elif before is not None and len(before.tracked) > 1 and before.tracked[-2:].all():
             self._move_on(before)
 
     @classmethod
@@ -159,7 +163,7 @@ class Slam:
             InputError: no map, a damaged one, or one of another detector or pyramid.
         """
         config = config or Config()
-        stored = load_map(path)
+        stored = load_checkpoint(path) if resume else load_map(path)
         try:
             if detector is None:
                 images = create_images(stored.detector.name, config)
@@ -177,21 +181,23 @@ class Slam:
         except (ValueError, KeyError) as error:
             raise InputError(f"{path}: {error}; go on with the options of its run.") from error
 
-    def save(self, path: Path, drive: str = "") -> None:
+    def save(self, path: Path, drive: str = "", *, resumable: bool = False) -> None:
         """Write the map to a file, in place of what is there: all that ``load`` needs to go on.
 
         Args:
             drive: what the images since the start were, "kitti 06" for example.
+            resumable: with what tracking remembers and what died in the map, too. Loaded with
+                ``resume=True``, it then gives the poses of a run that was not stopped, to the byte.
 
         Raises:
             RuntimeError: a keyframe is being mapped: look at ``is_mapping``, or call ``finish()``.
             OSError: the file cannot be written; one that was there is as it was.
         """
-        save_map(path, self.stored_map(drive))
+        save_map(path, self.stored_map(drive), resumable=resumable)
 
     def stored_map(self, drive: str = "") -> StoredMap:
-        """What ``save`` writes. Its arrays are those of the map: ``compact()``, which copies them,
-        before the next step.
+        """The map, with a checkpoint if there can be one now; ``save`` writes what lives of it. Its
+        arrays are those of the map: ``compact()``, which copies them, before the next step.
 
         Raises:
             RuntimeError: a keyframe is being mapped.
@@ -207,7 +213,44 @@ class Slam:
             frames=self._poses.table(),
             drives=self._drives if self._localize else (*self._drives, drive),
             world=self.world,
+            checkpoint=self._checkpoint(),
         )
+
+    def _checkpoint(self) -> Checkpoint | None:
+        """What goes on from here to the byte; None where that takes more than is kept: in the
+        middle of a frame, before the first one is tracked, while a monocular map begins, and
+        while a global bundle adjustment is under way."""
+        frame = self.frame
+        if not self._is_between or frame is None or self._localize:
+            return None
+        if self.is_adjusting or not self._initialiser.is_idle:
+            return None
+        return Checkpoint(
+            index=frame.index,
+            timestamp=frame.timestamp,
+            features=frame.features,
+            landmark=frame.landmark.copy(),
+            T_cw=frame.T_cw.copy(),
+            velocity=self._velocity,
+            reference=self._mapping.reference,
+            last_frame=self._mapping.last_frame,
+            last_timestamp=self._mapping.last_timestamp,
+            lost_frames=self._lost_frames,
+            n_tracked=self._n_tracked,
+            closing=self._closing.memory(),
+        )
+
+    def _return_to(self, checkpoint: Checkpoint) -> None:
+        self._mapping.return_to(checkpoint)
+        self._closing.restore(checkpoint.closing)
+        self._velocity = checkpoint.velocity
+        self._lost_frames, self._n_tracked = checkpoint.lost_frames, checkpoint.n_tracked
+        index, timestamp = checkpoint.index, checkpoint.timestamp
+        frame = Frame.untracked(checkpoint.features, self.camera, index, timestamp)
+        tracked = checkpoint.landmark >= 0
+        frame.T_cw, frame.landmark = checkpoint.T_cw, checkpoint.landmark
+        frame.xyz[tracked] = self.map.arrays.xyz[checkpoint.landmark[tracked]]
+        self.frame = frame
 
     @property
     def map(self) -> Map:
@@ -281,10 +324,16 @@ class Slam:
         if self._mapping.is_due(frame.index):
             self._merge()
         clock.lap("wait_for_mapping")
-        if self._mapping.n_keyframes == 0:
-            return self._start(frame, clock)
+        self._is_between = False
+        result = (
+            self._track(frame, clock) if self._mapping.n_keyframes else self._start(frame, clock)
+        )
+        self._is_between = True
+        return result
 
-        T_cw = self._predict(timestamp)
+    def _track(self, frame: Frame, clock: _Clock) -> TrackResult:
+        """Where the camera is, and what is new there."""
+        T_cw = self._predict(frame.timestamp)
         found = self._locate(frame, T_cw, clock)
         if found.state == TrackingState.LOST:
             frame.T_cw = T_cw

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Literal, cast
 
 import typer
@@ -47,11 +48,11 @@ def drive(
         resume: the folder of the run to go on with instead.
     """
     shown = not output.quiet
+    console = _console(shown=shown)
     kind, source, perturbation = _open(options, shown=shown)
     _refuse_camera(source, resume, compare_loops=compare_loops)
 
     # Bad input has been refused by now; what follows takes a second to import.
-    from vslam.cli.progress import progress_bar
     from vslam.cli.summary import print_summary
     from vslam.datasets.stream import count_expected
     from vslam.report.folder import write_results
@@ -63,7 +64,7 @@ def drive(
     settings = settings_of(options, kind, source, perturbation.name)
     with ExitStack() as lock:
         unfinished = _unfinished(options, source, resume, lock)
-        _compile(settings.threads, shown=shown)
+        _compile(settings, shown=shown)
         slam = begin(source.camera, settings, None if unfinished is None else unfinished.map)
         viewer = _viewer(output)
         folder = resume or _new_folder(options, settings, out, lock)
@@ -72,13 +73,13 @@ def drive(
         # When only localising there is nothing to save but the poses.
         period = 0.0 if options.localize else options.autosave
         autosave = FolderAutosave(folder, period, f"{settings.dataset} {source.name}")
-        with progress_bar(count_expected(source), shown=shown) as on_frame:
+        with console.progress_bar(count_expected(source), shown=shown) as on_frame:
             outcome = run_sequence(
                 source, perturbation, settings, recorder,
                 on_frame=on_frame, autosave=autosave, resume=unfinished, slam=slam,
             )  # fmt: skip
         if compare_loops and not outcome.interrupted:
-            with progress_bar(count_expected(source), shown=shown) as on_frame:
+            with console.progress_bar(count_expected(source), shown=shown) as on_frame:
                 outcome = with_comparison(outcome, perturbation, on_frame=on_frame)
         report = write_results(
             folder, outcome, moments.moments,
@@ -92,10 +93,18 @@ def drive(
         raise typer.Exit(1)
 
 
+def _console(*, shown: bool) -> ModuleType:
+    """What tells how far a run is; where nothing is shown, without what takes time to import."""
+    if shown:
+        from vslam.cli import progress as console
+    else:
+        from vslam.cli import quiet as console
+    return console
+
+
 def _open(options: RunOptions, *, shown: bool) -> tuple[str, Sequence | Stream, Perturbation]:
     """The images and what is done to them. Refuses laws that the data cannot serve."""
     from vslam.cli.options import SourceName, kind_of_source, source_options
-    from vslam.cli.progress import render_bar
     from vslam.datasets.perturbation import parse_perturbation
     from vslam.datasets.sources import open_source
 
@@ -105,7 +114,7 @@ def _open(options: RunOptions, *, shown: bool) -> tuple[str, Sequence | Stream, 
     of_source = source_options(
         list(o.calib), o.right, o.depth, o.fps, o.side_by_side, o.topics, o.depth_scale
     )
-    with render_bar(shown=shown) as on_render:
+    with _console(shown=shown).render_bar(shown=shown) as on_render:
         source = open_source(
             kind, o.data, o.seq, of_source,
             start=o.start, every=o.every, max_frames=o.max_frames, sensor=o.sensor,
@@ -149,22 +158,22 @@ def _unfinished(
 def _viewer(output: Output) -> Viewer | None:
     if output.view is None:
         return None
-    from vslam.cli.progress import announce
     from vslam.run.recorder import open_viewer
 
     viewer = open_viewer(output.view)
     if viewer.address:
-        announce(f"live at {viewer.address}", shown=not output.quiet)
+        shown = not output.quiet
+        _console(shown=shown).announce(f"live at {viewer.address}", shown=shown)
     return viewer
 
 
-def _compile(threads: int, *, shown: bool) -> None:
-    from vslam.cli.progress import announce
+def _compile(settings: RunSettings, *, shown: bool) -> None:
     from vslam.run.warmup import compile_kernels, is_cold
 
     if is_cold():
-        announce("first run: compiling the kernels, less than a minute ...", shown=shown)
-    compile_kernels(processes=min(threads, 2))
+        message = "first run: compiling the kernels, less than a minute ..."
+        _console(shown=shown).announce(message, shown=shown)
+    compile_kernels(processes=min(settings.threads, 2), load=settings.realtime)
 
 
 def _new_folder(options: RunOptions, settings: RunSettings, out: Path, lock: ExitStack) -> Path:

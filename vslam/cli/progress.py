@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import (
@@ -18,7 +19,8 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from vslam.features import TrackResult
+if TYPE_CHECKING:
+    from vslam.features import TrackResult
 
 
 class _FramesPerSecond(ProgressColumn):

@@ -23,7 +23,7 @@ from vslam.features import TrackResult
 from vslam.lock_file import locked
 from vslam.map import Map
 from vslam.maps.new_output import replaced_file
-from vslam.maps.storage import load_map, write_map
+from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap
 from vslam.run.progress import Progress, read_progress, write_progress
 from vslam.slam import Slam
@@ -193,7 +193,7 @@ class FolderAutosave:
     def _write(self, stored: StoredMap, progress: Progress) -> None:
         try:
             write_progress(self._folder / PROGRESS, progress)
-            write_map(self._folder / MAP, stored.compact())
+            save_map(self._folder / MAP, stored, resumable=True)
         except Exception as error:  # whatever it is, it must not end a run, nor be lost
             self._warn(MAP, error)
 

@@ -10,7 +10,6 @@ import json
 from array import array
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from vslam.errors import InputError
 from vslam.features import TrackingState, TrackResult
 from vslam.frontend.sides import Sides
-from vslam.loops import LoopCorrection, LoopEdge
+from vslam.loops import LoopCorrection, LoopEdge, loop_entry, loop_of
 from vslam.maps.new_output import replaced_file
 
 SCHEMA = 2
@@ -176,9 +175,9 @@ def write_progress(path: Path, progress: Progress) -> None:
         "schema": SCHEMA,
         "stages": progress.tracks.stages,
         "skipped": progress.skipped,
-        "loops": [_loop_entry(loop) for loop in progress.loops],
+        "loops": [loop_entry(loop) for loop in progress.loops],
         "corrections": [
-            {"edge": _loop_entry(one.edge), "seconds": one.seconds} for one in progress.corrections
+            {"edge": loop_entry(one.edge), "seconds": one.seconds} for one in progress.corrections
         ],
     }
     arrays: dict[str, NDArray] = {
@@ -214,7 +213,7 @@ def read_progress(path: Path) -> Progress:
             for number, entry in enumerate(header["corrections"]):
                 before, after = file[f"correction_{number}_T_cw"]
                 keyframes = file[f"correction_{number}_keyframes"]
-                edge = _loop_of(entry["edge"])
+                edge = loop_of(entry["edge"])
                 corrections.append(
                     LoopCorrection(edge, keyframes, before, after, float(entry["seconds"]))
                 )
@@ -224,7 +223,7 @@ def read_progress(path: Path) -> Progress:
                 latency_ms=file["latency_ms"].tolist(),
                 wall_s=wall_s,
                 cpu_s=cpu_s,
-                loops=[_loop_of(entry) for entry in header["loops"]],
+                loops=[loop_of(entry) for entry in header["loops"]],
                 corrections=corrections,
             )
     except OSError as error:
@@ -261,18 +260,3 @@ def _track(index: int, row: NDArray[np.float64], stage_ms: dict[str, float]) -> 
         relocalised=bool(int(flags) & 2),
         stage_ms={name: ms for name, ms in stage_ms.items() if np.isfinite(ms)},
     )
-
-
-def _loop_entry(loop: LoopEdge) -> dict[str, Any]:
-    entry = {name: value for name, value in vars(loop).items() if name not in _LEFT_OUT}
-    T = loop.T_query_match
-    return entry | {"T_query_match": None if T is None else T.tolist()}
-
-
-_LEFT_OUT = ("features", "landmarks")
-
-
-def _loop_of(entry: dict[str, Any]) -> LoopEdge:
-    T = entry["T_query_match"]
-    T_query_match = None if T is None else np.array(T, np.float64).reshape(4, 4)
-    return LoopEdge(**{**entry, "T_query_match": T_query_match})

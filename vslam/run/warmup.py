@@ -4,7 +4,7 @@ Compiling takes longer than anything else in a first run, and one process compil
 time: Numba holds a lock. Two processes, ``python -m vslam.run.warmup first`` and ``... second``,
 share the work and find each other's in Numba's cache. The process that is to run then calls
 ``EVERYTHING``: it loads what was compiled, and compiles what the two did not, all of it if there
-were none. It holds no compiler's memory.
+were none. It holds no compiler's memory. Later runs load a kernel when they first call it.
 
 A module with new kernels adds a function that calls them to the shorter of ``COMPILE_SHARES`` (and
 to ``EVERYTHING``, if the small SLAM there does not reach them; and its last kernel to
@@ -73,16 +73,17 @@ CAMERA = Camera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
 PATIENCE_S = 300.0
 
 
-def compile_kernels(*, processes: int = 2) -> None:
-    """Call every kernel once; Numba caches what it compiles.
+def compile_kernels(*, processes: int = 2, load: bool = False) -> None:
+    """Call every kernel once, unless all are compiled; Numba caches what it compiles.
 
     Args:
-        processes: with 1 no other process is started, nor if the kernels are compiled already or
-            there is one core only.
+        processes: with 1 no other process is started, nor if there is one core only.
+        load: where all are compiled, load those of tracking and mapping now. Each takes 2 ms when
+            it is first called, and the small SLAM 150 ms: worth it where no frame may wait.
     """
     if not is_cold():
-        # Kernels of loop closing need not be loaded now: few runs close a loop at once.
-        EVERYTHING[0]()
+        if load:
+            EVERYTHING[0]()
         return
     if processes > 1 and available_cores() > 1:
         compile_shares()

@@ -78,6 +78,7 @@ def essential_graph(
     weak: Collection[int] = (),
     unpredicted: Collection[int] = (),
     driven: bool = False,
+    broken: int | None = None,
 ) -> PoseGraph:
     """The essential graph of a map, *before* anything of the new loop has been written to it.
 
@@ -96,6 +97,8 @@ def essential_graph(
         unpredicted: those of them that not even a prediction led to: always WEAK.
         driven: trust such an edge as far as a car's motion can be predicted over that time (GAP);
             otherwise the camera may have been carried anywhere (WEAK).
+        broken: a keyframe (``loosest_keyframe``) whose place is taken to be wrong: tree edges that
+            lead past it are WEAK.
 
     Raises:
         ValueError: a loop has no pose.
@@ -113,7 +116,9 @@ def essential_graph(
         parent = map_.parents[child]
         if parent >= 0:
             pair = (min(parent, child), max(parent, child))
-            if not _passes(pair, restarts) or pair in seen:
+            if broken is not None and pair[0] < broken <= pair[1]:
+                kind[pair] = WEAK
+            elif not _passes(pair, restarts) or pair in seen:
                 kind[pair] = TREE
             else:
                 kind[pair] = GAP if driven and not _passes(pair, unpredicted_restarts) else WEAK
@@ -148,6 +153,33 @@ def essential_graph(
         fixed=_first_of_parts(edges, len(living)),
         scale=scales,
     )
+
+
+def loosest_keyframe(map_: Map, first: int, last: int, config: PoseGraphConfig) -> int | None:
+    """The keyframe behind ``first``, and not behind ``last``, at which the map hangs by a thread.
+
+    What holds the map together there is the most landmarks that a keyframe before it shares with
+    one that is not. Where a camera sees what it saw a moment ago these are hundreds; a pose after a
+    cut or a gap that wrong matches agreed on has no more than those. None if it is as many as a
+    strong covisibility edge has, if a second place is not twice as strong, or where mapping began
+    anew.
+    """
+    living = map_.living_keyframes()
+    pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, 1)
+    strong = pairs[shared >= config.min_shared]
+    bridges = np.zeros(map_.n_keyframes + 1, np.int64)
+    np.add.at(bridges, strong[:, 0] + 1, 1)
+    np.add.at(bridges, strong[:, 1] + 1, -1)
+    between = living[(first < living) & (living <= last)]
+    loose = between[np.cumsum(bridges)[between] == 0]
+    strength = [
+        int(shared[(pairs[:, 0] < k) & (k <= pairs[:, 1])].max(initial=0)) for k in loose.tolist()
+    ]
+    if not strength:
+        return None
+    weakest, next_weakest, *_ = *sorted(strength), config.min_shared
+    loosest = int(loose[np.argmin(strength)])
+    return loosest if 2 * weakest <= next_weakest and loosest not in map_.restarts else None
 
 
 def _passes(pair: tuple[int, int], keyframes: NDArray[np.int64]) -> bool:

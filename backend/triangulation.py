@@ -14,6 +14,7 @@ from vslam.map_kernels import link_many
 from vslam.reprojection import chi_square_ratio, unpacked
 
 EPIPOLAR_CHI2 = 3.84  # 95 % quantile with 1 degree of freedom
+SECTIONS = 512  # of the directions of epipolar planes
 MIN_CLOSE = 100  # stereo points mapped even if none is close (ORB-SLAM2, III-E)
 
 
@@ -100,7 +101,7 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
     xyz = np.empty((n1, 3))
     out_1, out_2 = np.empty(n1, np.int64), np.empty(n1, np.int64)
     count = 0
-    if dot3(gap, gap) < min_baseline**2 or n2 == 0:
+    if dot3(gap, gap) < min_baseline**2 or dot3(gap, gap) == 0.0 or n2 == 0:
         return xyz[:0], out_1[:0], out_2[:0]
     # Camera 1's centre in camera 2: the epipole.
     t, d, point = np.empty(3), np.empty(3), np.empty(3)
@@ -113,9 +114,8 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
         x2[j], y2[j] = a.xy[rows_2[j], 0], a.xy[rows_2[j], 1]
         gate[j] = EPIPOLAR_CHI2 * scales[a.octave[rows_2[j]]] ** 2
     taken = np.zeros(n2, np.bool_)
-    # One byte for each candidate, read eight at a time: a line passes few.
-    near = np.zeros((n2 + 7) // 8 * 8, np.uint8)
-    words = near.view(np.uint64)
+    across = perpendicular(t)
+    start, items = sorted_about_epipole(x2, y2, gate, intrinsics, across)
     for i in range(n1):
         row_1 = rows_1[i]
         world_ray(T1, a.xy[row_1], intrinsics, ray_1)
@@ -130,26 +130,23 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
             continue
         p, q = np.float32(l_x / norm), np.float32(l_y / norm)
         s = np.float32((n_z - l_x * cx - l_y * cy) / norm)
-        for j in range(np.uintp(n2)):
-            off = p * x2[j] + q * y2[j] + s
-            near[j] = off * off < gate[j]
         stereo_1 = not np.isnan(a.u_right[row_1])
         best, best_distance = -1, max_distance + 1
-        for w in range(len(words)):
-            if words[w] == 0:
+        along = direction(dot3(d, across[0]), dot3(d, across[1]))
+        section = int(along * (0.5 * SECTIONS)) % SECTIONS
+        for j in items[start[section] : start[section + 1]]:
+            off = p * x2[j] + q * y2[j] + s
+            if off * off >= gate[j] or taken[j]:
                 continue
-            for j in range(8 * w, 8 * w + 8):
-                if not near[j] or taken[j]:
+            distance = hamming(a.descriptor[row_1], a.descriptor[rows_2[j]])
+            if distance >= best_distance:
+                continue
+            if not stereo_1 and np.isnan(a.u_right[rows_2[j]]) and t[2] > 0.0:
+                # Near the epipole two monocular rays have no parallax.
+                e_x, e_y = fx * t[0] / t[2] + cx - x2[j], fy * t[1] / t[2] + cy - y2[j]
+                if e_x * e_x + e_y * e_y < 100.0 * scales[a.octave[rows_2[j]]]:
                     continue
-                distance = hamming(a.descriptor[row_1], a.descriptor[rows_2[j]])
-                if distance >= best_distance:
-                    continue
-                if not stereo_1 and np.isnan(a.u_right[rows_2[j]]) and t[2] > 0.0:
-                    # Near the epipole two monocular rays have no parallax.
-                    e_x, e_y = fx * t[0] / t[2] + cx - x2[j], fy * t[1] / t[2] + cy - y2[j]
-                    if e_x * e_x + e_y * e_y < 100.0 * scales[a.octave[rows_2[j]]]:
-                        continue
-                best, best_distance = j, distance
+            best, best_distance = j, distance
         if best < 0:
             continue
         row_2 = rows_2[best]
@@ -187,6 +184,98 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
                 out_1[count], out_2[count] = row_1, row_2
                 count += 1
     return xyz[:count], out_1[:count], out_2[:count]
+
+
+@kernel
+def perpendicular(t):
+    """Two vectors at right angles to ``t`` (3,) and to each other, ``(2, 3)``."""
+    across = np.zeros((2, 3))
+    least = 0
+    for i in range(1, 3):
+        if abs(t[i]) < abs(t[least]):
+            least = i
+    j, k = (least + 1) % 3, (least + 2) % 3
+    across[0, j], across[0, k] = -t[k], t[j]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        across[1, i] = t[j] * across[0, k] - t[k] * across[0, j]
+    for m in range(2):
+        norm = np.sqrt(dot3(across[m], across[m]))
+        for i in range(3):
+            across[m, i] /= norm
+    return across
+
+
+@kernel
+def direction(u, v):
+    """Direction of a line through the origin, from 0 to 2, which are the same: grows with its
+    angle, and takes no trigonometric function."""
+    if v < 0.0 or (v == 0.0 and u < 0.0):
+        u, v = -u, -v
+    if u > 0.0:
+        return v / (u + v)
+    return 1.0 - u / (v - u) if v > 0.0 else 0.0
+
+
+@kernel
+def sorted_about_epipole(x, y, gate, intrinsics, across):
+    """Features that an epipolar line may pass within their gate, by the direction of its plane.
+
+    All epipolar planes contain the baseline. Seen along it, a plane is a line through the origin
+    and the square around a feature, as wide as its gate, a parallelogram that spans some
+    directions, or all of them where the epipole is in it.
+
+    Args:
+        x, y: ``(n,)`` float32, pixels.
+        gate: ``(n,)`` float32, squared distance from the line.
+        across: ``(2, 3)``, the axes seen along the baseline.
+
+    Returns:
+        start: ``(SECTIONS + 1,)``, where each section of directions begins in ``items``, the
+        indices of its features in rising order.
+    """
+    n = len(x)
+    low, high = np.empty(n, np.int64), np.empty(n, np.int64)
+    start = np.zeros(SECTIONS + 1, np.int64)
+    for j in range(n):
+        u, v = seen_along(x[j], y[j], intrinsics, across)
+        middle = direction(u, v)
+        reach = 1.01 * np.sqrt(gate[j]) + 0.01  # no rounding may lose one
+        least, most = 0.0, 0.0
+        for corner in range(4):
+            x_k = x[j] + (reach if corner % 2 else -reach)
+            y_k = y[j] + (reach if corner // 2 else -reach)
+            u_k, v_k = seen_along(x_k, y_k, intrinsics, across)
+            if u * u_k + v * v_k <= 0.0:
+                least, most = -1.0, 1.0  # a right angle or more: the epipole may be inside
+                break
+            apart = direction(u_k, v_k) - middle
+            apart += 2.0 * ((apart < -1.0) - (apart > 1.0))
+            least, most = min(least, apart), max(most, apart)
+        low[j] = int(np.floor((middle + least) * (0.5 * SECTIONS)))
+        high[j] = int(np.floor((middle + most) * (0.5 * SECTIONS)))
+        high[j] = min(high[j], low[j] + SECTIONS - 1)
+        for section in range(low[j], high[j] + 1):
+            start[section % SECTIONS + 1] += 1
+    for section in range(SECTIONS):
+        start[section + 1] += start[section]
+    items = np.empty(start[SECTIONS], np.int32)
+    cursor = start[:SECTIONS].copy()
+    for j in range(n):
+        for section in range(low[j], high[j] + 1):
+            items[cursor[section % SECTIONS]] = j
+            cursor[section % SECTIONS] += 1
+    return start, items
+
+
+@inner_kernel
+def seen_along(x, y, intrinsics, across):
+    """The ray of a pixel along the two axes."""
+    fx, fy, cx, cy, _ = intrinsics
+    d_x, d_y = (x - cx) / fx, (y - cy) / fy
+    u = d_x * across[0, 0] + d_y * across[0, 1] + across[0, 2]
+    v = d_x * across[1, 0] + d_y * across[1, 1] + across[1, 2]
+    return u, v
 
 
 @inner_kernel

@@ -103,7 +103,9 @@ def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
     shapes = np.round(np.array(image.shape) / scales[:, None]).astype(np.int64).clip(min=1)
     sizes = shapes.prod(axis=1)
     offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
-    pyramid = Pyramid(np.zeros(sizes.sum() + SPARE, np.uint8), offsets, shapes, scales)
+    pixels = np.empty(sizes.sum() + SPARE, np.uint8)
+    pixels[-SPARE:] = 0
+    pyramid = Pyramid(pixels, offsets, shapes, scales)
     previous = pyramid.level(0)
     previous[:] = image
     for level in range(1, config.n_levels):

@@ -52,9 +52,15 @@ def compare_sides(left: Grey, right: Grey, config: StereoConfig) -> Sides:
     return Sides(stops if abs(stops) > config.balance_from else 0.0)
 
 
-def balanced(left: Grey, right: Grey, config: StereoConfig) -> tuple[Grey, Grey]:
-    """Both images, the darker one brightened where a gain sets them apart; else as they are."""
-    stops = compare_sides(left, right, config).darker_stops
+def balanced(
+    left: Grey, right: Grey, config: StereoConfig, sides: Sides | None = None
+) -> tuple[Grey, Grey]:
+    """Both images, the darker one brightened where a gain sets them apart; else as they are.
+
+    Args:
+        sides: what ``compare_sides`` says of them, if that is known.
+    """
+    stops = (sides or compare_sides(left, right, config)).darker_stops
     if stops > 0:
         return left, _brightened(right, left, stops)
     if stops < 0:

@@ -36,11 +36,7 @@ def match_stereo(
         config.sad_window,
         config.sad_search,
     )
-    for octave in range(len(left.pyramid.scales)):
-        matched = np.flatnonzero((sad >= 0) & (left.octave == octave))
-        if len(matched):
-            limit = MEDIAN_FACTOR * np.median(sad[matched])
-            u_right[matched[sad[matched] > limit]] = np.nan
+    drop_outliers(u_right, sad, left.octave)
     return u_right
 
 
@@ -130,6 +126,32 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
             u_right[i] = u - max(disparity, 0.01)
             sad[i] = score
     return u_right, sad
+
+
+@kernel
+def drop_outliers(u_right, sad, octave):
+    """Unmatch what differs more than ``MEDIAN_FACTOR`` times the median of its octave.
+
+    Args:
+        u_right: ``(N,)`` float32, NaN is written.
+        sad: ``(N,)`` float32 of each match, -1 without one.
+        octave: ``(N,)`` uint8, sorted.
+    """
+    first = 0
+    while first < len(octave):
+        last = first
+        while last < len(octave) and octave[last] == octave[first]:
+            last += 1
+        costs = sad[first:last]
+        costs = np.sort(costs[costs >= 0])
+        n = len(costs)
+        if n > 0:
+            median = np.float32(0.5) * (costs[n // 2] + costs[(n - 1) // 2])
+            limit = np.float32(MEDIAN_FACTOR) * median
+            for i in range(first, last):
+                if sad[i] > limit:
+                    u_right[i] = np.nan
+        first = last
 
 
 @kernel

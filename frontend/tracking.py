@@ -25,7 +25,7 @@ from vslam.frontend.matching import (
 )
 from vslam.frontend.orb import extract, scale_factors
 from vslam.frontend.pose import optimise_pose
-from vslam.frontend.sides import balanced
+from vslam.frontend.sides import Sides, balanced
 from vslam.frontend.stereo import match_stereo
 from vslam.geometry import compose, inverse, transform
 from vslam.map import LocalMap
@@ -120,6 +120,7 @@ def extract_features(
     second: NDArray[np.uint8] | NDArray[np.float32] | None,
     context: TrackingContext,
     image_map: ImageMap = map,
+    sides: Sides | None = None,
 ) -> Features:
     """ORB features of the left image with their columns in the right one.
 
@@ -128,6 +129,7 @@ def extract_features(
     Args:
         second: right image; with ``camera.depth`` that of the depth in metres; or None, and no
             feature has a column in a right image.
+        sides: what ``compare_sides`` says of both images, if that is known.
     """
     camera, config = context.camera, context.config
     if second is None or camera.depth:
@@ -138,7 +140,7 @@ def extract_features(
             scale, depth = context.scales[found.octave], np.asarray(second, np.float32)
             u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
     else:
-        pair = balanced(left, np.asarray(second, np.uint8), config.stereo)
+        pair = balanced(left, np.asarray(second, np.uint8), config.stereo, sides)
         found, right = image_map(lambda image: extract(image, config.orb), pair)
         u_right = match_stereo(found, right, camera, config.stereo)
     return Features(found.xy, found.octave, found.angle, found.descriptors, u_right)

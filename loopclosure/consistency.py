@@ -85,6 +85,15 @@ class LoopConsistency:
             return edge
         oldest = self._turn - self.config.verified_memory
         self._verified = [(turn, e) for turn, e in self._verified if turn >= oldest]
+        votes = self.votes(edge, map_)
+        self._verified.append((self._turn, edge))
+        if votes >= self.config.min_verified:
+            return edge
+        reason = f"verified by {votes} of {self.config.min_verified} keyframes"
+        return replace(edge, accepted=False, reason=reason)
+
+    def votes(self, edge: LoopEdge, map_: Map) -> int:
+        """How many recent keyframes, that of the edge included, were verified with its drift."""
         drift = implied_drift(edge, map_)
         where = inverse(map_.keyframe_pose(edge.query))[:3, 3]
         agreeing = {
@@ -92,12 +101,7 @@ class LoopConsistency:
             for _, other in self._verified
             if other.query != edge.query and self._agree(drift, implied_drift(other, map_), where)
         }
-        self._verified.append((self._turn, edge))
-        votes = 1 + len(agreeing)
-        if votes >= self.config.min_verified:
-            return edge
-        reason = f"verified by {votes} of {self.config.min_verified} keyframes"
-        return replace(edge, accepted=False, reason=reason)
+        return 1 + len(agreeing)
 
     def memory(self) -> ClosingMemory:
         """What is remembered, for a file."""

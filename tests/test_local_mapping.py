@@ -19,7 +19,11 @@ from vslam.backend.local_mapping import (
     remove_observations,
 )
 from vslam.backend.triangulation import (
+    SECTIONS,
+    direction,
     map_stereo_points,
+    perpendicular,
+    sorted_about_epipole,
     triangulate_pair,
     triangulate_with_neighbours,
 )
@@ -216,6 +220,34 @@ def test_triangulation_finds_the_right_pairs_and_positions(mono, T_2):
     assert len(np.unique(rows_1)) == len(np.unique(rows_2)) == len(xyz)
     error = np.linalg.norm(xyz - world.points[points], axis=1) / world.points[points, 2]
     assert error.max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    "t",
+    [[0.0, 0.0, 1.0], [0.1, -0.05, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.8, 0.1, -0.5]],
+    ids=["ahead", "ahead and aside", "to the right", "up", "back"],
+)
+def test_features_near_an_epipolar_line_are_in_its_section(t):
+    rng = np.random.default_rng(0)
+    t, n = np.array(t), 1000
+    x = rng.uniform(0, CAMERA.width, n).astype(np.float32)
+    y = rng.uniform(0, CAMERA.height, n).astype(np.float32)
+    x[:2], y[:2] = CAMERA.cx, CAMERA.cy  # the epipole of "ahead"
+    gate = (3.84 * SCALES[rng.integers(0, 8, n)] ** 2).astype(np.float32)
+    across = perpendicular(t)
+    np.testing.assert_allclose(across @ t, 0.0, atol=1e-12)
+    np.testing.assert_allclose(across @ across.T, np.eye(2), atol=1e-12)
+    start, items = sorted_about_epipole(x, y, gate, CAMERA.intrinsics, across)
+    assert len(items) < 20 * n  # of 512: most are in few
+    pixels = np.column_stack([x, y, np.ones(n)])
+    for d in np.column_stack([rng.uniform(-1, 1, (300, 2)), np.ones(300)]):
+        normal = np.cross(t, d) / [CAMERA.fx, CAMERA.fy, 1.0]
+        normal[2] -= normal[0] * CAMERA.cx + normal[1] * CAMERA.cy
+        off = pixels @ normal / np.hypot(normal[0], normal[1])
+        section = int(direction(*(across @ d)) * SECTIONS / 2) % SECTIONS
+        found = items[start[section] : start[section + 1]]
+        assert (np.diff(found) > 0).all()
+        assert set(np.flatnonzero(off**2 < gate)) <= set(found.tolist())
 
 
 def test_triangulation_along_the_axis_spares_the_epipole():

@@ -14,9 +14,10 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from vslam.config import Config
+from vslam.config import Config, KeyframeConfig
 from vslam.frontend.tracking import TrackingContext, extract_features
 from vslam.kernels import kernel
+from vslam.run.warmup import map_synthetic
 from vslam.slam import Slam
 
 REPEATS = 7
@@ -65,7 +66,26 @@ def units(call: Callable[[], object]) -> float:
 def test_extraction_of_a_pair(corridor):
     context = TrackingContext.create(corridor.camera, Config())
     ratio = units(lambda: extract_features(corridor.left[0], corridor.right[0], context))
-    assert ratio < 2.5 * 0.68
+    assert ratio < 2.5 * 0.36
+
+
+def test_a_frame_tracked(corridor):
+    context = TrackingContext.create(corridor.camera, Config())
+    pairs = zip(corridor.left, corridor.right, strict=True)
+    features = [extract_features(left, right, context) for left, right in pairs]
+    seldom = KeyframeConfig(max_interval_s=1e9, max_tracked_ratio=1e-6, min_tracked_close=0)
+
+    def drive() -> None:
+        slam = Slam(corridor.camera, Config(keyframes=seldom), threads=1)
+        for k in range(len(features)):
+            slam.step_features(features[k], corridor.timestamps[k], corridor.left[k], {})
+
+    assert units(drive) / len(features) < 2.5 * 0.112
+
+
+def test_a_keyframe_mapped():
+    keyframes = 8
+    assert units(lambda: map_synthetic(keyframes)) / keyframes < 2.5 * 0.109
 
 
 def test_a_frame_tracked_and_mapped(corridor):
@@ -76,4 +96,4 @@ def test_a_frame_tracked_and_mapped(corridor):
         slam.finish()
 
     ratio = units(drive) / len(corridor.left)
-    assert ratio < 2.5 * 0.87
+    assert ratio < 2.5 * 0.56

@@ -684,13 +684,15 @@ class Slam:
         self._mapping.insert(frame, predicted=predicted)
         self._poses.replace(frame.index, self._mapping.reference)
 
-    def _merge(self, current: Frame | None = None) -> None:
+    def _merge(self, current: Frame | None = None, *, renumber: bool = True) -> None:
         """Show tracking what local mapping has done: poses, landmarks, merged identities.
 
-        ``current`` is the frame placed last, if it is not ``self.frame`` yet.
+        ``current`` is the frame placed last, if it is not ``self.frame`` yet. Landmarks may get
+        other ids; not with ``renumber=False``, for a caller that holds some.
         """
         unit = self._poses.unit
-        if not self._mapping.merge():
+        frames = {id(one): one for one in (self.frame, current) if one is not None}
+        if not self._mapping.merge(frames.values() if renumber else None):
             return
         if self._velocity is not None:
             self._velocity[:3] *= self._poses.unit / unit
@@ -705,7 +707,7 @@ class Slam:
             return
         unit, reference = self._poses.unit, self._mapping.reference
         T_c_reference = frame.T_cw @ inverse(self._mapping.keyframe_pose(reference))
-        self._merge()
+        self._merge(renumber=False)
         T_c_reference[:3, 3] *= self._poses.unit / unit
         frame.T_cw = orthonormalised(T_c_reference @ self._mapping.keyframe_pose(reference))
         self._mapping.update(frame)

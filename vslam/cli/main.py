@@ -26,6 +26,7 @@ from vslam.cli import (
 )
 from vslam.cli import map as map_
 from vslam.errors import InputError, ResultsError
+from vslam.machine import keep_memory
 
 app = typer.Typer(
     help="Visual SLAM in pure Python.",
@@ -58,6 +59,7 @@ def main() -> None:
     # Imports and kernels from the cache make a million objects that stay: to look through them for
     # garbage again and again is a tenth of the start.
     gc.set_threshold(50_000, 20, 100)
+    keep_memory()
     # OpenBLAS's threads spin while they wait, and no product of a run is large enough to share.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:

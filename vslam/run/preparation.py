@@ -91,10 +91,11 @@ def prepare_frame(
         dropped = isinstance(error, DroppedFrameError)
         return PreparedFrame(None, None, {}, str(error), dropped)
     read = time.perf_counter()
-    features = extract_features(left, second, context, image_map)
+    sides = _sides(left, second, context)
+    features = extract_features(left, second, context, image_map, sides)
     done = time.perf_counter()
     stage_ms = {"read": 1e3 * (read - start), "extract": 1e3 * (done - read)}
-    return PreparedFrame(left, features, stage_ms, sides=_sides(left, second, context))
+    return PreparedFrame(left, features, stage_ms, sides=sides)
 
 
 def _sides(left: Image, second: Image | DepthImage | None, context: TrackingContext) -> Sides:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import re
 import shutil
 from pathlib import Path
 
@@ -59,6 +60,17 @@ def test_what_unpacks_to_too_much_is_refused(tmp_path, monkeypatch, kind: str, c
     monkeypatch.setattr(shutil, "disk_usage", lambda path: free)
     with pytest.raises((InputError, BrokenSourceError), match=r"unpacks to more|does not fit"):
         read_all(path)
+
+
+@pytest.mark.parametrize("count", ["many", "-3", "0", "2.5"])
+def test_metadata_that_counts_no_messages(tmp_path: Path, count: str):
+    path = write_bag(tmp_path / "a", "folder", {LEFT: images(), RIGHT: images()}, STAMPS)
+    file = path / "metadata.yaml"
+    text = re.sub(r"(?m)^(  - message_count:) 3$", rf"\1 {count}", file.read_text())
+    assert text != file.read_text()
+    file.write_text(text)
+    assert open_bag(path).n_expected is None
+    assert len(read_all(path)) == 3
 
 
 @pytest.mark.parametrize(

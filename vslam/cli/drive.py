@@ -96,10 +96,12 @@ def drive(
 def _console(*, shown: bool) -> ModuleType:
     """What tells how far a run is; where nothing is shown, without what takes time to import."""
     if shown:
-        from vslam.cli import progress as console
-    else:
-        from vslam.cli import quiet as console
-    return console
+        from vslam.cli import progress
+
+        return progress
+    from vslam.cli import quiet
+
+    return quiet
 
 
 def _open(options: RunOptions, *, shown: bool) -> tuple[str, Sequence | Stream, Perturbation]:

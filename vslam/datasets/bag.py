@@ -158,7 +158,7 @@ def open_bag(
             path=path,
             topics=chosen,
             sizes=tuple((image.shape[1], image.shape[0]) for image in images),
-            n_expected=min(bag.topics[topic].msgcount for topic in chosen) or None,
+            n_expected=_count(bag, chosen),
             depth=depth,
             depth_scale=depth_scale,
         )
@@ -300,6 +300,15 @@ def _choose_topics(
         )
     depth = n == 2 and (sensor == "rgbd" or (sensor is None and topics[1] in with_depth))
     return topics[:n], depth
+
+
+def _count(bag: Bag, topics: tuple[str, ...]) -> int | None:
+    """About how many frames there are, None where ``metadata.yaml`` says no number."""
+    try:
+        n = min(bag.topics[topic].msgcount for topic in topics)
+    except TypeError:
+        return None
+    return n if isinstance(n, int) and n > 0 else None
 
 
 def _has_depth(bag: Bag, path: Path, topic: str) -> bool:

@@ -10,8 +10,8 @@ turn, one at a time, after one round that is not counted; vslam with its report,
 ``--no-report``, and in the last round with ``--realtime``, which takes as long as the drive; with
 ``--also`` once more without a report and with another detector than ``bow``. Of a ``--flat`` case
 vslam runs once, and the time of its frames is drawn along the drive. What the script of ORB-SLAM3
-takes and prints is said in compare_orbslam3.py; ``track_ms_median`` and ``track_ms_p95`` are taken where it prints
-them.
+takes and prints is said in compare_orbslam3.py; ``track_ms_median`` and ``track_ms_p95`` are taken
+where it prints them. What people wrote on the page, from "Limits" on, is kept.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ images of a frame takes, measured in separate processes: vslam's own reader for 
 run along a drive are done once per case, and so is the profile, in one thread, by \
 `tools/profile_frame.py`.
 """
+BY_HAND = "\n## Limits\n"
 READING = """
 import sys, time, cv2
 from pathlib import Path
@@ -350,6 +351,12 @@ def anonymous(command: str) -> str:
     return command
 
 
+def written(page: Path) -> str:
+    """What is on a page from ``BY_HAND`` on."""
+    text = page.read_text(encoding="utf-8") if page.exists() else ""
+    return text[text.index(BY_HAND) :] if BY_HAND in text else ""
+
+
 def main() -> None:
     options = parse_options()
     load = os.getloadavg()[0]
@@ -366,7 +373,7 @@ def main() -> None:
     parts.append(f"```sh\npython {anonymous(shlex.join(sys.argv))}\n```\n")
     text = "\n".join(parts)
     if options.write:
-        options.write.write_text(text, encoding="utf-8")
+        options.write.write_text(f"{text}{written(options.write)}", encoding="utf-8")
     else:
         print(text)
 

@@ -7,6 +7,7 @@ Follows Rublee et al. (ICCV 2011) with the even distribution of ORB-SLAM (Mur-Ar
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -71,7 +72,7 @@ def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
         pyramid.offsets,
         pyramid.shapes,
         pyramid.scales,
-        features_per_level(config),
+        _quota(config.n_features, config.n_levels, config.scale_factor),
         config.fast_threshold,
         config.fast_threshold_min,
         config.cell_size,
@@ -83,27 +84,45 @@ def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
     """``(L,)`` scale of each level; level 0 is 1."""
-    return config.scale_factor ** np.arange(config.n_levels, dtype=np.float64)
+    return _scales(config.n_levels, config.scale_factor)
+
+
+def _scales(n_levels: int, scale_factor: float) -> NDArray[np.float64]:
+    return scale_factor ** np.arange(n_levels, dtype=np.float64)
 
 
 def features_per_level(config: OrbConfig) -> NDArray[np.int64]:
     """Share ``n_features`` among the levels in proportion to 1 / scale (ORB-SLAM, V-A)."""
-    weights = 1.0 / scale_factors(config)
-    share = config.n_features * weights / weights.sum()
+    return _quota(config.n_features, config.n_levels, config.scale_factor).copy()
+
+
+@cache
+def _quota(n_features: int, n_levels: int, scale_factor: float) -> NDArray[np.int64]:
+    weights = 1.0 / _scales(n_levels, scale_factor)
+    share = n_features * weights / weights.sum()
     quota = np.floor(share).astype(np.int64)
     # What rounding down leaves goes to the levels that it cost most.
-    left = config.n_features - quota.sum()
+    left = n_features - quota.sum()
     quota[np.argsort(quota - share, kind="stable")[:left]] += 1
     return quota
 
 
-def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
-    """Shrink the image level by level, bilinearly."""
-    scales = scale_factors(config)
-    shapes = np.round(np.array(image.shape) / scales[:, None]).astype(np.int64).clip(min=1)
+@cache
+def _layout(
+    height: int, width: int, n_levels: int, scale_factor: float
+) -> tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Bytes of a pyramid, and its offsets, shapes and scales."""
+    scales = _scales(n_levels, scale_factor)
+    shapes = np.round(np.array([height, width]) / scales[:, None]).astype(np.int64).clip(min=1)
     sizes = shapes.prod(axis=1)
     offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
-    pixels = np.empty(sizes.sum() + SPARE, np.uint8)
+    return int(sizes.sum()), offsets, shapes, scales
+
+
+def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
+    """Shrink the image level by level, bilinearly."""
+    size, offsets, shapes, scales = _layout(*image.shape, config.n_levels, config.scale_factor)
+    pixels = np.empty(size + SPARE, np.uint8)
     pixels[-SPARE:] = 0
     pyramid = Pyramid(pixels, offsets, shapes, scales)
     previous = pyramid.level(0)

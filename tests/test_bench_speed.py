@@ -85,3 +85,10 @@ def test_frames_are_averaged_by_blocks(speed):
     everything, in_turn = speed.blocks(table)
     assert everything == pytest.approx([12.0, 12.0 - 2 / 50])
     assert in_turn == pytest.approx([2.0, 2.0 - 2 / 50])
+
+
+def test_what_people_wrote_stays_on_the_page(speed, tmp_path):
+    page = tmp_path / "performance.md"
+    assert speed.written(page) == ""
+    page.write_text("# Performance\n\nTables.\n\n## Limits\n\nBy hand.\n")
+    assert speed.written(page) == "\n## Limits\n\nBy hand.\n"

@@ -8,10 +8,10 @@
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run in
 turn, one at a time, after one round that is not counted; vslam with its report, with
 ``--no-report``, and in the last round with ``--realtime``, which takes as long as the drive; with
-``--also`` once more with another detector than ``bow``. Of a ``--flat`` case vslam runs once, and
-the time of its frames is drawn along the drive. What the script of ORB-SLAM3 takes and prints is
-said in compare_orbslam3.py; ``track_ms_median`` and ``track_ms_p95`` are taken where it prints
-them.
+``--also`` once more without a report and with another detector than ``bow``. Of a ``--flat`` case
+vslam runs once, and the time of its frames is drawn along the drive. What the script of ORB-SLAM3
+takes and prints is said in compare_orbslam3.py; ``track_ms_median`` and ``track_ms_p95`` are taken
+where it prints them. What people wrote on the page, from "Limits" on, is kept.
 """
 
 from __future__ import annotations
@@ -43,12 +43,14 @@ The command at the end of this page writes it. It runs one process at a time. *L
 of the machine when the command began. *Whole process* is the time from the start of Python to \
 its end, including the vocabulary, the kernels from Numba's cache and all files written. *Frame \
 loop* is the time from the first image to the last pose. vslam runs with the detector `bow`, \
-because ORB-SLAM3 always looks for loops. *Reading images* is the CPU time that decoding both \
+because ORB-SLAM3 always looks for loops; its report is the page with its figures, which ORB-SLAM3 \
+does not draw. *Reading images* is the CPU time that decoding both \
 images of a frame takes, measured in separate processes: vslam's own reader for vslam, \
 `cv2.imread` for ORB-SLAM3; it is subtracted from each system's time. The real-time run and the \
 run along a drive are done once per case, and so is the profile, in one thread, by \
 `tools/profile_frame.py`.
 """
+BY_HAND = "\n## Limits\n"
 READING = """
 import sys, time, cv2
 from pathlib import Path
@@ -138,8 +140,9 @@ def measure_case(case: Case, options: argparse.Namespace) -> dict[str, list[Run]
     runs: dict[str, list[Run]] = {FULL: [], ORBSLAM3: [], LEAN: [], LIVE: []}
     words = {FULL: (), LEAN: ("--no-report",), LIVE: ("--no-report", "--realtime")}
     for name in options.also:
-        runs[title := f"{FULL} --detector {name}"] = []
-        words[title] = ("--detector", name)  # the last one on the command line counts
+        runs[title := f"{LEAN} --detector {name}"] = []
+        # Of two detectors on the command line the last one counts.
+        words[title] = ("--no-report", "--detector", name)
     if options.ours_only:
         del runs[ORBSLAM3]
     for repeat in range(options.repeats + 1):
@@ -348,6 +351,12 @@ def anonymous(command: str) -> str:
     return command
 
 
+def written(page: Path) -> str:
+    """What is on a page from ``BY_HAND`` on."""
+    text = page.read_text(encoding="utf-8") if page.exists() else ""
+    return text[text.index(BY_HAND) :] if BY_HAND in text else ""
+
+
 def main() -> None:
     options = parse_options()
     load = os.getloadavg()[0]
@@ -364,7 +373,7 @@ def main() -> None:
     parts.append(f"```sh\npython {anonymous(shlex.join(sys.argv))}\n```\n")
     text = "\n".join(parts)
     if options.write:
-        options.write.write_text(text, encoding="utf-8")
+        options.write.write_text(f"{text}{written(options.write)}", encoding="utf-8")
     else:
         print(text)
 

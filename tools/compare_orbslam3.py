@@ -120,6 +120,8 @@ def run_vslam(options: argparse.Namespace, folder: Path, *words: str) -> Run:
     command += ["--detector", options.detector, "--sensor", options.sensor]
     if options.threads:
         command += ["--threads", str(options.threads)]
+    if getattr(options, "no_report", False):
+        command.append("--no-report")
     process = measure([*command, *words], folder)
     results = folder / "runs" / "latest"
     report = json.loads((results / "report.json").read_text())
@@ -229,6 +231,9 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--repeats", type=int, default=3, help="counted runs of each system")
     parser.add_argument("--threads", type=int, help="of vslam; its default unless given")
     parser.add_argument("--detector", default="none", help="loop detector of vslam")
+    parser.add_argument(
+        "--no-report", action="store_true", help="vslam draws no page either; its figures as JSON"
+    )
     parser.add_argument("--sensor", default="stereo", choices=("stereo", "mono"))
     parser.add_argument("--vslam", default=str(Path(sys.executable).with_name("vslam")))
     parser.add_argument("--orbslam3-python", type=Path, required=True)

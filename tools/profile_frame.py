@@ -4,7 +4,8 @@
 
 DATA is a folder in KITTI's format. One thread does all, so that its CPU clock sees every stage;
 what a stage calls of another one counts for that one alone. The whole is the process, from the
-start of Python to the last file written, with the kernels from Numba's cache: run it twice.
+start of Python to the last file written, with the kernels from Numba's cache: run it twice. A
+kernel is loaded in the stage that calls it first.
 """
 
 from __future__ import annotations
@@ -22,7 +23,6 @@ from typing import Any
 
 # Stage, and the functions whose time it is: module, and name or Class.name there.
 STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
-    ("start: kernels from the cache", (("vslam.run.warmup", "compile_kernels"),)),
     ("start: vocabulary", (("vslam.run.pipeline", "create_detector"),)),
     ("read both images", (("vslam.datasets.kitti", "KittiImages.read"),)),
     ("pyramids", (("vslam.frontend.orb", "build_pyramid"),)),
@@ -44,30 +44,21 @@ STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
 )
 
 
-# Of these all is counted that they call: kernels are loaded by running the whole method once.
-UNDIVIDED = {"start: kernels from the cache"}
-
-
 class StageClock:
     """CPU seconds of this thread by stage; a stage within a stage is taken out of the outer one."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
         self._inner = [0.0]
-        self._undivided = False
 
     def timed(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
         def call(*args: Any, **named: Any) -> Any:
-            if self._undivided:
-                return function(*args, **named)
-            self._undivided = stage in UNDIVIDED
             self._inner.append(0.0)
             start = time.thread_time()
             try:
                 return function(*args, **named)
             finally:
-                self._undivided = False
                 passed = time.thread_time() - start
                 self.seconds[stage] += passed - self._inner.pop()
                 self._inner[-1] += passed

@@ -21,6 +21,7 @@ GREY_8_BITS = (8, 0, 0, 0, 0)  # depth, colour type, compression, filter method,
 # Chunks that change no pixel. Others may (transparency, orientation, animation).
 WITHOUT_EFFECT = {b"gAMA", b"cHRM", b"sRGB", b"pHYs", b"tIME", b"tEXt", b"bKGD"}
 LANES = 32  # lines decoded at once
+_CHECK_SUM, _CHUNK, _NEXT_CHUNK = map(struct.Struct, (">I", ">I4s", ">II4s"))
 _WIDEST = 1 << 15  # pixels: the buffers hold 65 bytes for each, of a line of any image
 
 
@@ -79,16 +80,18 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
         raise ValueError("no PNG")
     view = memoryview(data)
     at = len(SIGNATURE)
+    length, kind = _CHUNK.unpack_from(data, at)
     while True:
-        length, kind = struct.unpack_from(">I4s", data, at)
         end = at + 8 + length
-        (expected,) = struct.unpack_from(">I", data, end)
+        if kind == b"IEND":
+            if _CHECK_SUM.unpack_from(data, end) != (deflate.crc32(view[at + 4 : end]),):
+                raise ValueError("wrong check sum")
+            return
+        expected, next_length, next_kind = _NEXT_CHUNK.unpack_from(data, end)
         if deflate.crc32(view[at + 4 : end]) != expected:
             raise ValueError("wrong check sum")
-        if kind == b"IEND":
-            return
         yield kind, view[at + 8 : end]
-        at = end + 4
+        at, length, kind = end + 4, next_length, next_kind
 
 
 @kernel

@@ -44,7 +44,7 @@ from vslam.backend.fusion import fuse_loop
 from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.global_mapping import merge_solution, take_snapshot
 from vslam.backend.loop_correction import move_keyframes
-from vslam.backend.pose_graph import check_pose_graph, essential_graph
+from vslam.backend.pose_graph import check_pose_graph, essential_graph, load_optimiser
 from vslam.camera import Camera
 from vslam.closing import LoopClosing
 from vslam.config import Config, DepthConfig, KeyframeConfig, MappingConfig
@@ -78,12 +78,14 @@ def compile_kernels(*, processes: int = 2, load: bool = False) -> None:
 
     Args:
         processes: with 1 no other process is started, nor if there is one core only.
-        load: where all are compiled, load those of tracking and mapping now. Each takes 2 ms when
-            it is first called, and the small SLAM 150 ms: worth it where no frame may wait.
+        load: where all are compiled, load them now, and GTSAM, too. A kernel takes 2 ms when it is
+            first called, calling all here 0.3 s: worth it where no frame may wait.
     """
+    if load:
+        load_optimiser()
     if not is_cold():
-        if load:
-            EVERYTHING[0]()
+        for share in EVERYTHING if load else ():
+            share()
         return
     if processes > 1 and available_cores() > 1:
         compile_shares()

@@ -59,7 +59,9 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@if [ -n "$(TORCH_INDEX)" ] && $(BIN)/python -m pip install --quiet --dry-run --no-deps \
 	    --report - torch -c constraints.txt | grep -qE '"(nvidia|cuda)-'; then \
 	  $(BIN)/python -m pip install --quiet --no-deps --retries 0 --timeout 20 \
-	    torch -c constraints.txt --index-url $(TORCH_INDEX) || true; \
+	    torch -c constraints.txt --index-url $(TORCH_INDEX) 2>/dev/null || \
+	    echo "$(TORCH_INDEX) does not answer: torch comes from PyPI, with gigabytes of CUDA" >&2; \
 	fi
-	$(BIN)/python -m pip install --quiet -e '.[dev]' -c constraints.txt
+	@echo 'Installing vslam and its tools into $(VENV): a few minutes'
+	@$(BIN)/python -m pip install --quiet -e '.[dev]' -c constraints.txt
 	@touch $@

@@ -143,27 +143,56 @@ def working_order(first, rank, n_cameras):
 @kernel
 def coupled_cameras(first, camera, used, n_free):
     """Pairs of free cameras that observe a common point, ``(M, 2)`` int64, each once."""
-    coupled = np.zeros((n_free, n_free), np.bool_)
-    for p in range(len(first) - 1):
-        for o in range(first[p], first[p + 1]):
-            if camera[o] >= n_free or not used[o]:
-                continue
-            for other in range(o + 1, first[p + 1]):
-                if camera[other] < n_free and used[other]:
-                    i, j = camera[o], camera[other]
-                    coupled[min(i, j), max(i, j)] = True
+    start, points = points_of_cameras(first, camera, used, n_free)
+    met = np.empty(n_free, np.int64)
+    last = np.full(n_free, -1)  # the camera that each was last met by
     count = 0
     for i in range(n_free):
-        for j in range(i + 1, n_free):
-            count += coupled[i, j]
+        count += cameras_met(i, start, points, first, camera, used, n_free, last, met)
+    last[:] = -1
     pairs = np.empty((count, 2), np.int64)
     count = 0
     for i in range(n_free):
-        for j in range(i + 1, n_free):
-            if coupled[i, j]:
-                pairs[count, 0], pairs[count, 1] = i, j
-                count += 1
+        n = cameras_met(i, start, points, first, camera, used, n_free, last, met)
+        met[:n].sort()
+        for k in range(n):
+            pairs[count, 0], pairs[count, 1] = i, met[k]
+            count += 1
     return pairs
+
+
+@inner_kernel
+def points_of_cameras(first, camera, used, n_free):
+    """Points that each free camera observes: those of ``k`` are ``points[start[k]:start[k + 1]]``;
+    ``(n_free + 1,)`` int64, ``(N,)`` int32."""
+    start = np.zeros(n_free + 2, np.int64)
+    for o in range(len(camera)):
+        if camera[o] < n_free and used[o]:
+            start[camera[o] + 2] += 1
+    for k in range(n_free + 1):
+        start[k + 1] += start[k]
+    points = np.empty(start[n_free + 1], np.int32)
+    for p in range(len(first) - 1):
+        for o in range(first[p], first[p + 1]):
+            if camera[o] < n_free and used[o]:
+                points[start[camera[o] + 1]] = p
+                start[camera[o] + 1] += 1
+    return start, points
+
+
+@inner_kernel
+def cameras_met(i, start, points, first, camera, used, n_free, last, met):
+    """Fill ``met`` with the free cameras after ``i`` that observe a point with it; returns how
+    many."""
+    n = 0
+    for p in points[start[i] : start[i + 1]]:
+        for o in range(first[p], first[p + 1]):
+            j = camera[o]
+            if i < j < n_free and used[o] and last[j] != i:
+                last[j] = i
+                met[n] = j
+                n += 1
+    return n
 
 
 @kernel

@@ -19,10 +19,11 @@ from vslam.config import StereoConfig
 Grey = NDArray[np.uint8]
 
 _STRIDE = 8  # a few thousand pixels tell quantiles to a grey level
-_LOW, _MIDDLE, _HIGH = 0.05, 0.5, 0.95
-_CLIPPED = 250.0  # where the upper quantile is white, the lower half tells the gain
+_LOW, _HIGH = 0.05, 0.95
+_CLIPPED = 250  # from that grey value on pixels tell nothing; those below it in both sides do
+_WITHIN = 0.98  # of their share, so that no quantile lies on its edge
+_LEAST_SHARE = 0.25  # of the pixels, for a gain to be told by
 _LEAST_RANGE = 4.0  # grey levels: below that a quantile's rounding is the gain
-_LEAST_HALF = 2.0  # of a dark side beside one that reaches white
 _BLACK, _SEES = 6.0, 16.0  # upper quantile of a black side, range of grey values of one that sees
 
 
@@ -42,7 +43,7 @@ class Sides:
 
 def compare_sides(left: Grey, right: Grey, config: StereoConfig) -> Sides:
     """Compare the light of both ``(H, W)`` images of a rectified pair."""
-    ours, theirs = _quantiles(left), _quantiles(right)
+    ours, theirs = _shares(left), _shares(right)
     if _is_black(ours, theirs):
         return Sides(black="left")
     if _is_black(theirs, ours):
@@ -67,27 +68,36 @@ def balanced(
     return left, right
 
 
-def _quantiles(image: Grey) -> tuple[float, float, float]:
+def _shares(image: Grey) -> NDArray[np.float64]:
+    """``(256,)`` share of the pixels that are at most as bright."""
     counts = np.bincount(image[::_STRIDE, ::_STRIDE].ravel(), minlength=256)
-    share = np.cumsum(counts) / counts.sum()
+    return np.cumsum(counts) / counts.sum()
+
+
+def _quantiles(shares: NDArray[np.float64], *at: float) -> list[float]:
     # Within a grey value pixels are spread evenly: quantiles of few grey values stay smooth.
-    low, middle, high = np.interp((_LOW, _MIDDLE, _HIGH), share, np.arange(256) + 0.5)
-    return float(low), float(middle), float(high)
+    values: list[float] = np.interp(at, shares, np.arange(256) + 0.5).tolist()
+    return values
 
 
-def _is_black(side: tuple[float, float, float], other: tuple[float, float, float]) -> bool:
-    return side[2] < _BLACK and other[2] - other[0] > max(_SEES, 10.0 * (side[2] - side[0]))
+def _is_black(side: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    low, high = _quantiles(side, _LOW, _HIGH)
+    other_low, other_high = _quantiles(other, _LOW, _HIGH)
+    return high < _BLACK and other_high - other_low > max(_SEES, 10.0 * (high - low))
 
 
-def _stops(
-    ours: tuple[float, float, float], theirs: tuple[float, float, float], tolerance: float
-) -> float:
-    """Logarithm of the gain from theirs to ours, 0 where no gain explains both halves."""
-    halves = [(q[1] - q[0], q[2] - q[1]) for q in (ours, theirs)]
-    if max(ours[2], theirs[2]) >= _CLIPPED:
-        (a, _), (b, _) = halves
-        return log2(a / b) if min(a, b) > _LEAST_HALF else 0.0
-    (a_low, a_high), (b_low, b_high) = halves
+def _stops(ours: NDArray[np.float64], theirs: NDArray[np.float64], tolerance: float) -> float:
+    """Logarithm of the gain from theirs to ours, 0 where no gain explains dark and bright pixels
+    alike. What is white on either side is left out of both."""
+    top, dull = _HIGH, float(min(ours[_CLIPPED - 1], theirs[_CLIPPED - 1]))
+    if dull <= top:
+        top = _WITHIN * dull
+    if top < _LOW + _LEAST_SHARE:
+        return 0.0
+    (a_low, a_high), (b_low, b_high) = (
+        np.diff(_quantiles(shares, _LOW, (_LOW + top) / 2, top)).tolist()
+        for shares in (ours, theirs)
+    )
     least = min(a_low, b_low, a_high, b_high)
     if min(a_low + a_high, b_low + b_high) < _LEAST_RANGE or least <= 0:
         return 0.0
@@ -99,6 +109,6 @@ def _stops(
 
 def _brightened(dark: Grey, bright: Grey, stops: float) -> Grey:
     """Multiplied so, and shifted to the lower quantile of the bright side."""
-    low, target = _quantiles(dark)[0], _quantiles(bright)[0]
+    (low,), (target,) = _quantiles(_shares(dark), _LOW), _quantiles(_shares(bright), _LOW)
     table = (np.arange(256) + 0.5 - low) * 2.0**stops + target - 0.5
     return np.clip(np.rint(table), 0, 255).astype(np.uint8)[dark]

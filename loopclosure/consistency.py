@@ -8,27 +8,15 @@ the same idea: verify first, then ask other keyframes to confirm).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import ConsistencyConfig
 from vslam.geometry import inverse, se3_log
-from vslam.loops import LoopCandidate, LoopEdge
+from vslam.loops import ClosingMemory, LoopCandidate, LoopEdge, ResembledPlace
 from vslam.map import Map
-
-
-@dataclass(frozen=True)
-class _Group:
-    """A place that resembled recent keyframes: a candidate with its covisible keyframes.
-
-    ``length`` keyframes in a row resembled it, ``age`` keyframes ago the last of them.
-    """
-
-    keyframes: frozenset[int]
-    length: int
-    age: int = 0
 
 
 class LoopConsistency:
@@ -40,7 +28,7 @@ class LoopConsistency:
 
     def __init__(self, config: ConsistencyConfig) -> None:
         self.config = config
-        self._groups: list[_Group] = []
+        self._groups: list[ResembledPlace] = []
         self._verified: list[tuple[int, LoopEdge]] = []  # turn, edge
         self._turn = 0
 
@@ -59,7 +47,7 @@ class LoopConsistency:
         with one and the same group count once.
         """
         self._turn += 1
-        groups: dict[frozenset[int], _Group] = {}
+        groups: dict[frozenset[int], ResembledPlace] = {}
         consistent, rejected = [], []
         continued: set[int] = set()
         for candidate in candidates:
@@ -68,7 +56,7 @@ class LoopConsistency:
             before = [i for i, g in enumerate(self._groups) if not place.isdisjoint(g.keyframes)]
             continued.update(before)
             length = 1 + max((self._groups[i].length for i in before), default=0)
-            groups[place] = _Group(place, length)
+            groups[place] = ResembledPlace(place, length)
             if length >= self.config.min_keyframes:
                 consistent.append(candidate)
             else:
@@ -97,6 +85,15 @@ class LoopConsistency:
             return edge
         oldest = self._turn - self.config.verified_memory
         self._verified = [(turn, e) for turn, e in self._verified if turn >= oldest]
+        votes = self.votes(edge, map_)
+        self._verified.append((self._turn, edge))
+        if votes >= self.config.min_verified:
+            return edge
+        reason = f"verified by {votes} of {self.config.min_verified} keyframes"
+        return replace(edge, accepted=False, reason=reason)
+
+    def votes(self, edge: LoopEdge, map_: Map) -> int:
+        """How many recent keyframes, that of the edge included, were verified with its drift."""
         drift = implied_drift(edge, map_)
         where = inverse(map_.keyframe_pose(edge.query))[:3, 3]
         agreeing = {
@@ -104,12 +101,16 @@ class LoopConsistency:
             for _, other in self._verified
             if other.query != edge.query and self._agree(drift, implied_drift(other, map_), where)
         }
-        self._verified.append((self._turn, edge))
-        votes = 1 + len(agreeing)
-        if votes >= self.config.min_verified:
-            return edge
-        reason = f"verified by {votes} of {self.config.min_verified} keyframes"
-        return replace(edge, accepted=False, reason=reason)
+        return 1 + len(agreeing)
+
+    def memory(self) -> ClosingMemory:
+        """What is remembered, for a file."""
+        return ClosingMemory(tuple(self._groups), tuple(self._verified), self._turn)
+
+    def restore(self, memory: ClosingMemory) -> None:
+        """Remember that, in place of ``update`` and ``confirm`` for each keyframe."""
+        self._groups, self._verified = list(memory.places), list(memory.verified)
+        self._turn = memory.turn
 
     def reset(self) -> None:
         """Forget everything: closing a loop has moved the map."""

@@ -47,18 +47,21 @@ class LearnedTrials:
 
     Those whose images local descriptors find most alike, and alike enough; and after a try in
     vain, for some keyframes, only what is clearly more alike than that was.
+
+    Attributes:
+        resting_until, in_vain: those keyframes end here, and how alike that was.
     """
 
     def __init__(self, config: LearnedMatchingConfig) -> None:
         self._config = config
-        self._resting_until, self._in_vain = 0, 0.0
+        self.resting_until, self.in_vain = 0, 0.0
 
     def choose(self, keyframe: int, candidates: Collection[LoopCandidate]) -> set[int]:
         """Keyframes that are matches to try; none of a detector without a network."""
         config = self._config
         least = config.min_alike
-        if keyframe < self._resting_until:
-            least = max(least, config.more_alike * self._in_vain)
+        if keyframe < self.resting_until:
+            least = max(least, config.more_alike * self.in_vain)
         alike = [(one.alike, one.match) for one in candidates if one.alike is not None]
         best = sorted(alike, reverse=True)[: config.max_candidates]
         return {match for likeness, match in best if likeness >= least}
@@ -66,10 +69,10 @@ class LearnedTrials:
     def record(self, candidate: LoopCandidate, *, located: bool) -> None:
         """Whether a try found a pose, be it refused later on."""
         if located:
-            self._resting_until = 0
+            self.resting_until = 0
         else:
-            self._resting_until = candidate.query + 1 + self._config.rest
-            self._in_vain = candidate.alike or 0.0
+            self.resting_until = candidate.query + 1 + self._config.rest
+            self.in_vain = candidate.alike or 0.0
 
 
 def shows_known(

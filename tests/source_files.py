@@ -95,6 +95,7 @@ def write_bag(
     calibrated: bool = True,
     lag: int = 0,
     padding: int = 0,
+    compression: str = "",
 ) -> Path:
     """A bag with one topic for each side; returns what to open.
 
@@ -108,15 +109,20 @@ def write_bag(
         calibrated: it is not all zero.
         lag: nanoseconds that the second side's stamps are late.
         padding: bytes behind each row.
+        compression: ``bz2`` or ``lz4`` of ROS 1; ``file``, ``message`` or ``storage`` of ROS 2.
     """
     from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
     plugin = StoragePlugin.SQLITE3 if kind == "ros2" else StoragePlugin.MCAP
     writer = Writer1(path) if kind == "ros1" else Writer2(path, version=8, storage_plugin=plugin)
+    if compression and kind == "ros1":
+        writer.set_compression(writer.CompressionFormat[compression.upper()])
+    elif compression:
+        writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
     serialize = store.serialize_ros1 if kind == "ros1" else store.serialize_cdr
     wanted = ("builtin_interfaces/msg/", "std_msgs/msg/", "sensor_msgs/msg/")
     types = {

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,11 +19,13 @@ from test_pipeline import vslam
 from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import parse_perturbation
+from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.features import TrackingState, TrackResult
+from vslam.frontend.sides import Sides
 from vslam.loops import LoopCorrection, LoopEdge
-from vslam.maps.storage import load_map
+from vslam.maps.storage import load_checkpoint, load_map
 from vslam.run import autosave as saving
 from vslam.run.autosave import (
     LOCK,
@@ -30,17 +33,15 @@ from vslam.run.autosave import (
     ONLINE,
     PROGRESS,
     FolderAutosave,
-    Progress,
     Unfinished,
     find_unfinished,
     lock_run,
-    read_progress,
     remove_autosave,
-    write_progress,
 )
 from vslam.run.options import RunOptions, read_options, write_options
 from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
 from vslam.run.pipeline import _with_earlier, run_sequence
+from vslam.run.progress import Progress, TrackLog, TrackTable, read_progress, write_progress
 from vslam.run.recorder import NullRecorder
 from vslam.slam import Slam
 from vslam.trajectory import read_trajectory
@@ -67,15 +68,22 @@ def drive(
     folder: Path | None,
     resume: Unfinished | None = None,
     config: Config = Config(),  # noqa: B008
+    law: str = "none",
+    change: Callable[[Sequence], Sequence] = lambda sequence: sequence,
     **options: object,
 ) -> RunOutcome:
     """Run over the corridor; with a folder, saving whenever that is possible."""
-    sequence = open_sequence("kitti", root, "00")
+    sequence = change(open_sequence("kitti", root, "00"))
     settings = RunSettings("kitti", "00", "none", "bow", "stereo", 0, 2, 0, 1, None, config)
     autosave = {} if folder is None else {"autosave": FolderAutosave(folder, 1e-6, "kitti 00")}
-    law = parse_perturbation("none", 0)
     return run_sequence(
-        sequence, law, settings, NullRecorder(), resume=resume, **autosave, **options
+        sequence,
+        parse_perturbation(law, 0),
+        settings,
+        NullRecorder(),
+        resume=resume,
+        **autosave,
+        **options,
     )
 
 
@@ -107,7 +115,7 @@ def test_a_killed_run_goes_on_at_the_next_frame(kitti_tree, tmp_path, undisturbe
     assert len(read_trajectory(tmp_path / ONLINE)) == frame + 1
     unfinished = find_unfinished(tmp_path)
     n_saved = len(unfinished.progress.tracks)
-    assert 1 < n_saved <= frame + 1
+    assert 1 <= n_saved <= frame + 1
     whole = drive(kitti_tree, tmp_path, unfinished)
     assert [track.index for track in whole.tracks] == list(range(FRAMES))
     assert all(track.state == TrackingState.OK for track in whole.tracks)
@@ -115,8 +123,8 @@ def test_a_killed_run_goes_on_at_the_next_frame(kitti_tree, tmp_path, undisturbe
     assert len(read_trajectory(tmp_path / ONLINE)) == FRAMES
     before = whole.tracks[n_saved - 1].T_wc
     assert np.array_equal(before, undisturbed.tracks[n_saved - 1].T_wc)
-    # The moment of the last save hangs on the disk; at each of 24 the ATE was 0.009 to 0.020 m.
-    assert ate(whole) < 2.0 * ate(undisturbed)
+    assert load_checkpoint(unfinished.map).checkpoint is not None
+    assert whole.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
 
 
 def test_an_interrupted_run_is_saved_at_its_end(kitti_tree, tmp_path):
@@ -126,6 +134,66 @@ def test_an_interrupted_run_is_saved_at_its_end(kitti_tree, tmp_path):
 
     drive(kitti_tree, tmp_path, on_frame=interrupt)
     assert len(find_unfinished(tmp_path).progress.tracks) == 13
+
+
+def test_ctrl_c_ends_a_run_and_a_save_is_offered_while_frames_are_dropped(kitti_tree, tmp_path):
+    def interrupt(result: TrackResult) -> None:
+        if result.state == TrackingState.DROPPED and result.index > 8:
+            ended.append(result.index)
+            signal.raise_signal(signal.SIGINT)
+
+    ended: list[int] = []
+    outcome = drive(kitti_tree, tmp_path, law="drop:60", on_frame=interrupt)
+    assert outcome.interrupted == "Ctrl-C"
+    assert outcome.tracks[-1].index == ended[0]
+    assert len(ended) == 1
+    assert len(find_unfinished(tmp_path).progress.tracks) == ended[0] + 1
+
+
+class Changed:
+    """A sequence with other times, or whose right side is black until a frame."""
+
+    def __init__(self, sequence, times=None, black_until=0):
+        self._sequence, self._black_until = sequence, black_until
+        self.timestamps = sequence.timestamps if times is None else times
+        self.ground_truth = None if times is not None else sequence.ground_truth
+
+    def __getattr__(self, name):
+        return getattr(self._sequence, name)
+
+    def __len__(self):
+        return len(self.timestamps)
+
+    def read(self, index, image_map=map):
+        left, right = self._sequence.read(index, image_map)
+        return left, right * (index >= self._black_until)
+
+
+@pytest.mark.parametrize(("moved_s", "frames", "named"), [(1e-4, FRAMES, 7), (0.0, 9, 9)])
+def test_other_images_do_not_resume_a_run(kitti_tree, tmp_path, moved_s, frames, named):
+    drive_until(kitti_tree, tmp_path, 12)
+    times = open_sequence("kitti", kitti_tree, "00").timestamps[:frames].copy()
+    times[7] += moved_s
+    unfinished = find_unfinished(tmp_path)
+    with pytest.raises(InputError, match=rf"frame {named} had the time .* put those back"):
+        drive(kitti_tree, tmp_path, unfinished, change=lambda source: Changed(source, times))
+    assert len(find_unfinished(tmp_path).progress.tracks) == 13
+
+
+def test_warnings_of_the_rig_cover_both_parts(kitti_tree, tmp_path):
+    def interrupt(result: TrackResult) -> None:
+        if result.index == 12:
+            signal.raise_signal(signal.SIGINT)
+
+    def change(sequence):
+        return Changed(sequence, black_until=5)
+
+    drive(kitti_tree, tmp_path, on_frame=interrupt, change=change)
+    whole = drive(kitti_tree, tmp_path, find_unfinished(tmp_path), change=change)
+    assert [line for line in whole.warnings if "black" in line] == [
+        f"The right side was black in 5 of {FRAMES} frames while the left one was not: they were "
+        "tracked with the left side alone. Check its cable, shutter and lens cap."
+    ]
 
 
 def test_a_map_is_saved_where_every_frame_becomes_a_keyframe(kitti_tree, tmp_path):
@@ -185,22 +253,31 @@ def some_progress() -> Progress:
     tracks = [
         TrackResult(0, 1.5, np.eye(4), TrackingState.OK, 9, 8, 7, 6, True, False, {"extract": 2.5}),
         TrackResult(1, 1.6, T, TrackingState.LOST, 5, 4, 3, 2, False, True, {"relocalise": 1.25}),
-        TrackResult(2, 1.7, T, TrackingState.DROPPED, 0, 0, 0, 0, False),
+        TrackResult(2, 1.7, T, TrackingState.OK, 0, 0, 0, 0, False),
+        TrackResult(3, 1.8, T, TrackingState.DROPPED, 0, 0, 0, 0, False),
     ]
+    log = TrackLog(TrackTable())
+    sides = [Sides(), Sides(1.25), Sides(black="right"), Sides()]
+    for track, compared in zip(tracks, sides, strict=True):
+        log.append(track, compared)
     early = LoopEdge(1, 0, 0.5, True, "closed", 40, 30, T)
     late = LoopEdge(2, -1, 0.25, False, "too few matches")
     correction = LoopCorrection(early, np.array([0, 1]), np.stack([T, T]), np.stack([T, T]), 0.125)
     skipped = ["frame 1: a.png: damaged", "frame 2: b.png: damaged"]
-    return Progress(tracks, skipped, [3.0], 60.5, 42.25, [early, late], [correction])
+    return Progress(log.table(), skipped, [3.0], 60.5, 42.25, [early, late], [correction])
 
 
 def test_progress_is_read_as_it_was_written(tmp_path):
     progress = some_progress()
     write_progress(tmp_path / PROGRESS, progress)
     read = read_progress(tmp_path / PROGRESS)
-    for was, now in zip(progress.tracks, read.tracks, strict=True):
+    tracks = read.tracks.results()
+    for was, now in zip(progress.tracks.results(), tracks, strict=True):
         assert np.array_equal(was.T_wc, now.T_wc)
         assert replace(was, T_wc=now.T_wc) == now
+    assert [track.stage_ms for track in tracks] == [{"extract": 2.5}, {"relocalise": 1.25}, {}, {}]
+    assert [track.state for track in tracks] == ["OK", "LOST", "OK", "DROPPED"]
+    assert read.tracks.sides() == [Sides(), Sides(1.25), Sides(black="right")]
     assert (read.skipped, read.latency_ms) == (progress.skipped, progress.latency_ms)
     assert (read.wall_s, read.cpu_s) == (60.5, 42.25)
     assert [vars(loop).keys() for loop in read.loops]
@@ -212,7 +289,7 @@ def test_progress_is_read_as_it_was_written(tmp_path):
 
 def test_progress_until_a_frame_knows_nothing_later():
     two = some_progress().until(2)
-    assert [track.index for track in two.tracks] == [0, 1]
+    assert [track.index for track in two.tracks.results()] == [0, 1]
     assert [loop.query for loop in two.loops] == [1]
     assert len(two.corrections) == 1
     assert two.skipped == ["frame 1: a.png: damaged"]
@@ -291,6 +368,16 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     assert frames is not None
     assert len(frames.timestamp) == FRAMES
     assert not (folder / MAP).exists()
+
+
+def test_a_run_that_cannot_begin_leaves_no_folder(kitti_tree, tmp_path):
+    weights = tmp_path / "weights.safetensors"
+    weights.write_bytes(b"damaged")
+    words = ("--detector", "capsule-pruned", "--weights", weights, "--quiet")
+    done = vslam("run", "--data", kitti_tree, *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert str(weights) in done.stderr
+    assert not (tmp_path / "runs").exists()
 
 
 def drive_until(root: Path, folder: Path, frame: int) -> None:

@@ -193,6 +193,7 @@ def test_folders_of_images(folder, corridor, tmp_path):
     options = SourceOptions((folder / "stereo.yaml",))
     write_images(tmp_path, {"left": corridor.left[:3]}, ["0.png", "1.png", "2.png"])
     refused("left and right, image_0 and image_1", "images", tmp_path, options)
+    refused("but only left has images, right has none", "images", tmp_path, options)
     write_images(tmp_path, {"right": corridor.right[:2]}, ["0.png", "1.png"])
     refused("2 images but 3 in .* 2 on one side only", "images", tmp_path, options)
     write_images(tmp_path, {"right": corridor.right[2:3]}, ["3.png"])
@@ -203,9 +204,14 @@ def test_folders_of_images(folder, corridor, tmp_path):
     times = tmp_path / "times.txt"
     times.write_text("0.0\n0.1\n")
     refused("times.txt: 2 times for 3 images", "images", tmp_path, options)
+    times.write_text("0\n100\n200\n")
+    refused("100 s from image to image, as if .* milliseconds", "images", tmp_path, options)
     times.write_text("0.0\n0.2\n0.1\n")
     refused("left/2.png: its time is not later", "images", tmp_path, options)
     refused("no such folder", "images", tmp_path / "none", options)
+    refused(f"and {tmp_path} has both .name that", "images", tmp_path / "left", options)
+    (tmp_path / "calib.txt").write_text("P0: 1")
+    refused("sequence of KITTI; .* --seq", "images", tmp_path, SourceOptions(fps=10.0))
     options = SourceOptions((folder / "stereo.yaml",), right=tmp_path)
     refused("no images in this folder", "images", tmp_path / "left", options)
 

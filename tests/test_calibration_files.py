@@ -262,6 +262,9 @@ def edited(tmp_path: Path, write: Callable, pattern: str, by: str) -> list[Path]
         (own, "left:", "links:", "no known calibration"),
         (own, "# ours", "[", "no YAML at line"),
         (own, "[\\s\\S]+", "words", "must be a list of keys with values"),
+        (own, "[\\s\\S]+", "", "is empty"),
+        (own, "left:", "links:", r"it has the keys T_left_right, links, right"),
+        (own, "[\\s\\S]+", "<?xml version='1.0'?>", "XML, which is not read; .* .yml"),
     ],
 )  # fmt: skip
 def test_bad_files(tmp_path, write, pattern, by, words):
@@ -347,6 +350,24 @@ def test_a_rectified_pair_by_its_baseline(tmp_path):
     settings = read_calibration([path])
     assert settings.left == found.left
     np.testing.assert_allclose(settings.T_left_right, found.T_left_right)
+
+
+def test_the_names_of_the_manual_of_opencv(tmp_path):
+    given = opencv(tmp_path, (LEFT, RIGHT))
+    wanted, file = read_calibration(given, SIZE), given[0]
+    text = re.sub(r"^[MK]([12]):", r"cameraMatrix\1:", file.read_text(), flags=re.MULTILINE)
+    file.write_text(re.sub(r"^D([12]):", r"distCoeffs\1:", text, flags=re.MULTILINE))
+    assert "cameraMatrix2" in file.read_text()
+    assert "distCoeffs1" in file.read_text()
+    found = read_calibration(given, SIZE)
+    assert (found.left, found.right) == (wanted.left, wanted.right)
+
+
+def test_a_file_without_a_size_of_another_resolution(tmp_path):
+    given = opencv(tmp_path, (LEFT, RIGHT))
+    for size in ((376, 240), (480, 752), (1504, 960)):
+        with pytest.raises(InputError, match=r"far from the centre of the \d+x\d+ images"):
+            read_calibration(given, size)
 
 
 def test_one_camera_of_opencv(tmp_path):

@@ -131,6 +131,8 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--compare-loops --detector none", ["--compare-loops", "--detector none"]),
         ("--data nowhere", ["nowhere", "no such file or folder", "--data"]),
         ("--data .", ["the folder is empty", "--data"]),
+        ("nowhere", ["nowhere", "no such file or folder", "--data"]),
+        ("nowhere --data .", ["nowhere: --data says what to run on, too"]),
         ("--data ..", ["no data set that is known", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
@@ -212,7 +214,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
     calls = SimpleNamespace(interrupted=None, interrupted_without=None, loops=[], runs=[])
 
     def run_sequence(
-        sequence, perturbation, settings, recorder, on_frame, autosave=None, resume=None
+        sequence, perturbation, settings, recorder, on_frame, autosave=None, resume=None, slam=None
     ):
         looped = settings.detector != "none" or not calls.runs
         calls.runs.append((settings.detector, recorder))
@@ -238,6 +240,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
         return []  # drawing takes a second
 
     monkeypatch.setattr(run_pipeline, "run_sequence", run_sequence)
+    monkeypatch.setattr(run_pipeline, "begin", lambda camera, settings, saved=None: None)
     monkeypatch.setattr(recorder, "NullRecorder", lambda: "null")
     monkeypatch.setattr(recorder, "RerunRecorder", str)
     monkeypatch.setattr(run_pipeline, "NullRecorder", lambda: "null")

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from ring import CAMERA, LAP, Oracle, Ring
 
-from vslam.backend.pose_graph import GAP
+from vslam.backend.pose_graph import GAP, held_by
 from vslam.closing import LoopClosing
+from vslam.config import Config
 from vslam.features import Features, TrackingState
 from vslam.geometry import inverse
 from vslam.loopclosure.detector import NoDetector
@@ -32,9 +33,29 @@ class Deceived(Oracle):
         return [LoopCandidate(keyframe, opposite, 1.0)]
 
 
-def run(ring, frames, detector=None, *, threads=1, dark=(), finish=True):
+class Sticker(Ring):
+    """Where the camera is carried from one place to another, the first image shows, beside what is
+    there, a few things that look just like those it saw before."""
+
+    def see(self, k, seed):
+        features = super().see(k, seed)
+        if k != CARRIED_TO:
+            return features
+        before = super().see(CARRIED_FROM, seed)
+        chosen = np.linspace(0, len(before) - 1, 60).astype(int)
+        return Features(*(
+            np.concatenate([getattr(before, name)[chosen], getattr(features, name)])
+            for name in ("xy", "octave", "angle", "descriptors", "u_right")
+        ))  # fmt: skip
+
+
+CARRIED_FROM, CARRIED_TO = 60.0, 90.0
+CARRIED = [*ROUND[:60], *ROUND[90:]]
+
+
+def run(ring, frames, detector=None, *, threads=1, dark=(), finish=True, config=None):
     """Drive along ``frames`` of the ring, ten a second; ``dark`` ones show nothing."""
-    slam = Slam(CAMERA, None, detector, threads=threads)
+    slam = Slam(CAMERA, config, detector, threads=threads)
     results = []
     for i, k in enumerate(frames):
         image = np.array([[i & 255, i >> 8]], np.uint8)  # tells the oracle which frame it is
@@ -193,3 +214,85 @@ def test_past_an_unpredicted_restart_the_second_hypothesis_is_tried_too(monkeypa
     assert slam.map.unpredicted_restarts == [1]
     assert tried == [True, False]
     assert len(slam.corrections) == 1
+
+
+@cache
+def carried(*, heal=True, threads=1):
+    """A camera carried 45 m on, whose next image agrees with wrong landmarks: a wrong keyframe."""
+    config = Config.model_validate({"consistency": {"min_against": 4 if heal else 1000}})
+    ring = Sticker(EXACT.points, EXACT.descriptors)
+    return run(ring, CARRIED, Oracle(ring, CARRIED), threads=threads, config=config)
+
+
+def test_a_wrong_keyframe_bends_the_map_and_the_loops_that_tell_are_refused():
+    slam, results = carried(heal=False)
+    assert results[60].state == TrackingState.WEAK
+    assert results[60].is_keyframe
+    found = errors(slam, EXACT, CARRIED)
+    assert found[:60].max() < 0.3
+    assert found[60:].min() > 40.0
+    assert sum("contradicted" in edge.reason for edge in slam.loops) > 4
+    assert not slam.corrections
+    wrong = slam.map.frames.index(60)
+    held = held_by(slam.map)
+    assert int(held[1:].argmin()) + 1 == wrong
+    expected = max(
+        len(set(slam.map.landmarks_of(i).tolist()) & set(slam.map.landmarks_of(j).tolist()))
+        for i in range(wrong)
+        for j in range(wrong, slam.map.n_keyframes)
+    )
+    assert held[wrong] == expected < 30
+
+
+def test_loops_that_agree_against_a_wrong_keyframe_heal_the_map(check_map):
+    slam, _ = carried()
+    wrong = slam.map.frames.index(60)
+    assert slam.map.restarts == slam.map.unpredicted_restarts == [wrong]
+    assert errors(slam, EXACT, CARRIED).max() < 0.5
+    check_map(slam.map)
+    edge = slam.corrections[0].edge
+    refused = {one.query for one in slam.loops if "contradicted" in one.reason}
+    assert len(refused | {edge.query}) >= 3  # the first of them was one that none agreed with yet
+    assert edge.match < wrong < edge.query
+    assert len({*slam.map.submaps()}) == 2
+    assert (slam._closing.joined_submaps(slam.map) == 0).all()
+    # What lay on both sides of it were not the same things.
+    observed = [set(slam.map.landmarks_of(k).tolist()) for k in range(wrong + 3)]
+    assert not set.union(*observed[:wrong]) & set.union(*observed[wrong:])
+
+
+def test_healing_gives_the_same_bytes_with_one_thread_and_two():
+    one, two = (carried(threads=threads)[0].trajectory() for threads in (1, 2))
+    assert one.T_wc.tobytes() == two.T_wc.tobytes()
+
+
+def twofold() -> Ring:
+    """A ring whose second half looks exactly like its first."""
+    first = EXACT.points[:, 2] > 0.0
+    points, descriptors = EXACT.points[first], EXACT.descriptors[first]
+    return Ring(np.concatenate([points, points * [-1, 1, -1]]), np.tile(descriptors, (2, 1)))
+
+
+class Confused(Oracle):
+    """Takes what looks the same for the same."""
+
+    def _near(self, frame, query, map_, last):
+        here = self.frames[frame] % (LAP / 2)
+        found = [
+            LoopCandidate(query, int(k), -abs(here - self.frames[map_.frames[k]] % (LAP / 2)))
+            for k in map_.living_keyframes()
+        ]
+        found = [one for one in found if one.match < last and one.score > -2.0]
+        return sorted(found, key=lambda one: -one.score)
+
+
+def test_a_sound_map_is_not_doubted_whatever_many_keyframes_resemble():
+    frames = ROUND[: LAP // 2 + 60]
+    slam, _ = run(twofold(), frames, Confused(twofold(), frames))
+    against = [
+        edge for edge in slam.loops if "contradicted" in edge.reason or "drift" in edge.reason
+    ]
+    assert len({edge.query for edge in against}) >= 4
+    assert not slam.corrections
+    assert not slam.map.restarts
+    assert errors(slam, EXACT, frames).max() < 0.5

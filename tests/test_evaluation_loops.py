@@ -8,11 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from vslam.evaluation.loops import judge_loops, metres_per_unit, revisits
-from vslam.evaluation.nearby import near_pairs
 from vslam.loops import LoopEdge
 
 Poses = NDArray[np.float64]
@@ -38,20 +36,6 @@ def pose(x: float, z: float, heading: float, y: float = 0.0) -> Poses:
     T_wc[:3, :3] = Rotation.from_rotvec([0.0, heading, 0.0]).as_matrix()
     T_wc[:3, 3] = x, y, z
     return T_wc
-
-
-@pytest.mark.parametrize("extent", [(300.0, 2.0, 40.0), (3.0, 2.0, 400.0), (0.0, 0.0, 0.0)])
-def test_near_pairs_are_those_of_a_tree(extent: tuple[float, float, float]) -> None:
-    position = np.random.default_rng(0).uniform(-1.0, 1.0, (700, 3)) * extent
-    found = np.column_stack(near_pairs(position, 5.0))
-    expected = cKDTree(position).query_pairs(5.0, output_type="ndarray")
-    assert set(map(tuple, found.tolist())) == set(map(tuple, expected.tolist()))
-    assert len(found) == len(expected) > 0
-
-
-def test_without_positions_there_are_no_near_pairs() -> None:
-    start, query = near_pairs(np.empty((0, 3)), 5.0)
-    assert len(start) == len(query) == 0
 
 
 def laps(count: float, radius: float = 40.0, step: float = STEP_M) -> Poses:

@@ -69,6 +69,21 @@ def test_the_ring_is_sparse_and_closed():
     assert (pairs[:, 1] - pairs[:, 0] > n - 4).any()
 
 
+@pytest.mark.parametrize("n_free", [0, 1, 5, 30])
+def test_coupled_cameras_are_those_with_a_common_point(n_free):
+    rng = np.random.default_rng(n_free)
+    seen = [rng.permutation(n_free + 3)[: rng.integers(1, 5)] for _ in range(60)]
+    first = np.concatenate([[0], np.cumsum([len(cameras) for cameras in seen])])
+    camera = np.concatenate(seen).astype(np.int64)
+    used = rng.random(len(camera)) > 0.2
+    expected = set()
+    for p in range(len(seen)):
+        cameras = [int(camera[o]) for o in range(first[p], first[p + 1]) if used[o]]
+        expected |= {(i, j) for i in cameras for j in cameras if i < j < n_free}
+    pairs = coupled_cameras(first, camera, used, n_free)
+    assert list(map(tuple, pairs.tolist())) == sorted(expected)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_same_optimum_as_the_dense_one(seed):
     problem, truth = loop_problem(seed=seed)

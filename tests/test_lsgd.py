@@ -64,6 +64,13 @@ def test_a_centre_goes_where_the_image_differs_least():
     assert centres(image).tolist() == [[45, 46]]
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (2, 2), (2, 250), (250, 1)])
+def test_centres_of_tiny_images_lie_within_them(shape):
+    image = textured(0, *shape)
+    assert ((centres(image) >= 0) & (centres(image) < shape)).all()
+    assert lsgd(image).sum() == image.size
+
+
 @pytest.mark.parametrize("rounds", [1, 3])
 def test_superpixels_are_those_of_the_definition(rounds):
     image = textured(1)

@@ -23,10 +23,10 @@ from vslam.geometry import se3_exp
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.registry import create_detector, create_images
 from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe
-from vslam.map import Map
+from vslam.map import KEYFRAME_FIELDS, LANDMARK_FIELDS, ROW_FIELDS, Map
 from vslam.map_kernels import link_many, refresh_landmarks
 from vslam.maps import new_output
-from vslam.maps.storage import load_map, save_map
+from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, World
 from vslam.slam import Slam
 
@@ -302,13 +302,13 @@ def test_foreign_files_are_refused(tmp_path):
 
 
 def test_other_schemas_are_named(file, tmp_path):
-    newer = as_header(header_of(file) | {"schema": 3})
-    assert "schema 3, this version reads 2" in refusal(
+    newer = as_header(header_of(file) | {"schema": 4})
+    assert "schema 4, this version reads 3" in refusal(
         changed(file, tmp_path / "n.npz", header=newer)
     )
     old = tmp_path / "old.npz"
     np.savez(old, schema=1, keyframe_first_row=np.zeros(1, np.int64))
-    assert "schema 1, this version reads 2; run again" in refusal(old)
+    assert "schema 1, this version reads 3; run again" in refusal(old)
 
 
 def damage(name: str, position: tuple[int, ...], value: float):
@@ -349,6 +349,92 @@ def damage(name: str, position: tuple[int, ...], value: float):
 )
 def test_damage_by_hand_is_refused(apply, file, tmp_path):
     assert "damaged" in refusal(apply(file, tmp_path / "hand.npz"))
+
+
+@pytest.fixture(scope="module")
+def at_checkpoint(slam, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("checkpoint") / "ring.npz"
+    slam.save(path, resumable=True)
+    return path
+
+
+def test_a_map_at_a_checkpoint_comes_back_with_what_died(slam, at_checkpoint, tmp_path):
+    stored, checkpoint = load_checkpoint(at_checkpoint), slam.stored_map().checkpoint
+    before, after = slam.map, stored.map
+    assert not after.arrays.keyframe_alive.all() or not after.arrays.landmark_alive.all()
+    for fields, size in (
+        (KEYFRAME_FIELDS, before.n_keyframes),
+        (LANDMARK_FIELDS, before.n_landmarks),
+        (ROW_FIELDS, before.n_rows),
+    ):
+        for name in fields:
+            mine, theirs = (getattr(one.arrays, name)[:size] for one in (before, after))
+            assert np.array_equal(mine, theirs, equal_nan=mine.dtype.kind == "f"), name
+    assert sorted(after.T_c_parent) == sorted(before.T_c_parent)
+    assert checkpoint is not None
+    assert stored.checkpoint is not None
+    for name, value in vars(checkpoint).items():
+        found = getattr(stored.checkpoint, name)
+        if name == "features":
+            assert all(
+                np.array_equal(vars(value)[one], vars(found)[one], equal_nan=one == "u_right")
+                for one in vars(value)
+            )
+        elif isinstance(value, np.ndarray):
+            assert np.array_equal(value, found), name
+        else:
+            assert value == found, name
+    save_map(tmp_path / "one.npz", slam.stored_map())
+    save_map(tmp_path / "again.npz", load_map(at_checkpoint))
+    assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "one.npz").read_bytes()
+
+
+def entry(**fields: object):
+    def apply(file: Path, to: Path) -> Path:
+        header = header_of(file)
+        header["checkpoint"] |= fields
+        return changed(file, to, header=as_header(header))
+
+    return pytest.param(apply, id=next(iter(fields)))
+
+
+def without_checkpoint(file: Path, to: Path) -> Path:
+    return changed(file, to, header=as_header(header_of(file) | {"checkpoint": None}))
+
+
+def merged_in_a_circle(file: Path, to: Path) -> Path:
+    with np.load(file) as data:
+        merged, dead = data["landmark_merged_into"].copy(), np.flatnonzero(~data["landmark_alive"])
+    merged[dead[:2]] = dead[[1, 0]]
+    return changed(file, to, landmark_merged_into=merged)
+
+
+def alive_that_died(file: Path, to: Path) -> Path:
+    with np.load(file) as data:
+        alive = np.ones_like(data["landmark_alive"])
+    return changed(file, to, landmark_alive=alive)
+
+
+@pytest.mark.parametrize(
+    "apply",
+    [
+        damage("checkpoint_landmark", (3,), 10**6),
+        damage("checkpoint_landmark", (3,), -2),
+        damage("checkpoint_xy", (3, 0), np.nan),
+        damage("keyframe_alive", (1,), False),
+        damage("landmark_merged_into", (0,), 10**6),
+        entry(reference=10**6),
+        entry(velocity=[1.0, 2.0]),
+        entry(T_cw=[[1.0]]),
+        entry(closing={}),
+        entry(n_tracked="many"),
+        pytest.param(without_checkpoint, id="none"),
+        pytest.param(merged_in_a_circle, id="circle"),
+        pytest.param(alive_that_died, id="alive"),
+    ],
+)
+def test_a_damaged_checkpoint_is_refused(apply, at_checkpoint, tmp_path):
+    assert "damaged" in refusal(apply(at_checkpoint, tmp_path / "hand.npz"))
 
 
 def test_observations_that_contradict_each_other_are_refused(file, tmp_path):

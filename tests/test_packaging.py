@@ -42,7 +42,7 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     for number in range(2):
         source = root / f"source{number}"
         source.mkdir()
-        for name in ("pyproject.toml", "README.md", "LICENSE"):
+        for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
             shutil.copyfile(ROOT / name, source / name)
         for name in PARTS:
             ignored = shutil.ignore_patterns("__pycache__")
@@ -94,6 +94,36 @@ def test_its_metadata_are_complete(wheels):
     assert {"bag", "cluster", "docs", "dev"} == set(metadata.get_all("Provides-Extra") or [])
     assert "vslam = vslam.cli.main:main" in points
     assert "# vslam" in str(metadata.get_payload())
+
+
+def readme_for(source: str, tmp_path: Path) -> str:
+    """As setup.py makes it where pyproject.toml names this page of the repository."""
+    for name in ("setup.py", "README.md"):
+        shutil.copyfile(ROOT / name, tmp_path / name)
+    urls = f"[project.urls]\nSource = '{source}'\n" if source else ""
+    (tmp_path / "pyproject.toml").write_text(
+        f"[project]\nname = 'vslam'\nversion = '1'\ndynamic = ['readme']\n{urls}"
+    )
+    command = [sys.executable, "setup.py", "--long-description"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_readme_of_a_registry_has_no_link_that_leads_nowhere(wheels, tmp_path: Path):
+    with zipfile.ZipFile(wheels[0]) as archive:
+        (name,) = (n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
+        shown = str(email.message_from_string(archive.read(name).decode()).get_payload())
+    source = PROJECT.get("urls", {}).get("Source", "")
+    link = re.compile(r"\]\((?!https?:|#)")
+    assert link.search((ROOT / "README.md").read_text())
+    for text in (shown, readme_for("", tmp_path), readme_for("https://example.org/v/", tmp_path)):
+        assert not link.search(text)
+    assert "](https://example.org/v/blob/main/docs/cameras.md)" in text
+    assert "![" not in readme_for("", tmp_path)
+    assert "![A rendered frame" in text
+    assert "](https://example.org/v/raw/main/docs/images/demo.jpg)" in text
+    assert ("![" in shown) == bool(source)
 
 
 def test_a_plain_installation_stays_lean():

@@ -364,8 +364,9 @@ def test_what_the_data_lack_is_said():
         parse_perturbation("fog", 0).bound_to(mono)
     with pytest.raises(InputError, match="--perturb yaw: needs the images of both sides"):
         parse_perturbation("brightness,yaw:3", 0).bound_to(mono)
-    assert laws_for(Drive()) == (list(LAWS), [])
-    assert len(unfit) == 8
+    assert laws_for(Drive()) == (list(LAWS), {})
+    assert list(unfit) == [law for law in LAWS if law not in fit]
+    assert unfit["fog"].startswith("--perturb fog: needs depth")
 
 
 def test_a_stream_has_no_next_frame():

@@ -33,7 +33,8 @@ from vslam.maps.stored_map import StoredMap
 from vslam.report.schema import LoopFigures
 from vslam.report.summary import summarize
 from vslam.run.outcome import RunOutcome, RunSettings
-from vslam.run.pipeline import _tell_loops, prepare_frame, run_sequence, with_comparison
+from vslam.run.pipeline import _tell_loops, run_sequence, with_comparison
+from vslam.run.preparation import prepare_frame
 from vslam.run.recorder import NullRecorder
 from vslam.trajectory import Trajectory, read_kitti_poses
 

@@ -16,7 +16,9 @@ from vslam.cli import main as cli
 from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import Perturbation, parse_perturbation
-from vslam.errors import InputError, UnreadableImageError
+from vslam.datasets.sources import SourceOptions, open_source
+from vslam.datasets.stream import Stream
+from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 from vslam.features import Features
 from vslam.loopclosure.registry import create_detector, problem_of, require_detector
 from vslam.map import Map
@@ -322,6 +324,67 @@ def test_a_reader_that_fails_costs_one_frame(broken, kitti_tree):
     with pytest.raises(UnreadableImageError, match=r"gave uint8 \(159, 480\) and .* at frame 3"):
         sequence.read(3)
     assert np.array_equal(sequence.read(1)[0], open_sequence("kitti", kitti_tree, "00").read(1)[0])
+
+
+STREAM = (
+    "from vslam.datasets import open_sequence\n"
+    "from vslam.datasets.stream import timed_frames\n"
+    "class Reader:\n"
+    "    name, live, n_expected = 'x', LIVE, None\n"
+    "    def __init__(self, root, name):\n"
+    "        self.inner = open_sequence('kitti', root, name)\n"
+    "        self.camera = self.inner.camera\n"
+    "    def frames(self):\n"
+    "        for k, frame in enumerate(timed_frames(self.inner)):\n"
+    "            if k == 8: raise OSError('unplugged')\n"
+    "            yield frame\n"
+)
+
+
+def test_a_reader_that_streams(broken, kitti_tree):
+    """Frames are selected, a failure ends the stream, and what takes all frames refuses it."""
+    broken(STREAM.replace("LIVE", "True"), "[vslam.readers]\nmine = broken:Reader\n")
+    with pytest.raises(InputError, match="a stream, whose length nobody knows"):
+        open_sequence("mine", kitti_tree, "00")
+    source = open_source(
+        "mine", str(kitti_tree), "00", SourceOptions(), start=1, every=2, sensor="mono"
+    )
+    assert isinstance(source, Stream)
+    assert (source.live, source.n_expected, source.camera.monocular) == (True, None, True)
+    inner = open_sequence("kitti", kitti_tree, "00")
+    frames = source.frames()
+    several = [next(frames) for _ in range(4)]
+    with pytest.raises(BrokenSourceError, match=r"broken 2.0 failed \(OSError: unplugged\)"):
+        next(frames)
+    times = [frame.timestamp for frame in several]
+    images = [frame.read(map) for frame in several]
+    assert times == inner.timestamps[1:8:2].tolist()
+    assert all(right is None for _, right in images)
+    assert np.array_equal(images[1][0], inner.read(3)[0])
+    few = open_source("mine", str(kitti_tree), "00", SourceOptions(), max_frames=3)
+    assert few.n_expected == len(list(few.frames())) == 3
+
+
+def test_a_run_on_a_reader_that_streams(broken, kitti_tree):
+    broken(STREAM.replace("LIVE", "False"), "[vslam.readers]\nmine = broken:Reader\n")
+    source = open_source("mine", str(kitti_tree), "00", SourceOptions(), max_frames=6)
+    settings = RunSettings("mine", "x", "none", "none", "stereo", 0, 1, 0, 1, 6, Config())
+    outcome = run_sequence(source, Perturbation("none"), settings, NullRecorder())
+    assert len(outcome.trajectory) == 6
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("self.camera = self.inner.camera", "pass"), "Reader has no camera"),
+        (("self.inner.camera", "3"), "camera is int, no vslam.camera.Camera"),
+        (("n_expected = 'x', LIVE, None", "n_expected = 'x', True, -1"), "n_expected is no number"),
+    ],
+)
+def test_what_is_no_stream_is_refused(broken, kitti_tree, change, says):
+    broken(STREAM.replace(*change).replace("LIVE", "True"), "[vslam.readers]\nmine = broken:Reader")
+    with pytest.raises(InputError, match=says):
+        open_source("mine", str(kitti_tree), "00", SourceOptions())
 
 
 def test_a_perturbation_that_fails_costs_one_frame(broken):

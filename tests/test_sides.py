@@ -58,10 +58,27 @@ def test_a_shift_of_the_black_level_is_undone_with_the_gain():
 def test_a_clipped_side_is_measured_by_its_dark_half():
     left, right = scene(mean=200.0)
     found = compare_sides(np.minimum(2.0 * left, 255).astype(np.uint8), right, CONFIG)
-    assert found.darker_stops == 0.0 or found.darker_stops == pytest.approx(1.0, abs=0.1)
+    assert found.darker_stops == 0.0  # nearly all of it is white
     left, right = scene(mean=110.0)
     bright = np.minimum(2.0 * left, 255).astype(np.uint8)
     assert compare_sides(bright, right, CONFIG).darker_stops == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("columns", [100, 160, 240, 400])
+def test_a_side_that_is_white_in_part_is_no_brighter_one(columns):
+    left, right = scene()
+    glare = left.copy()
+    glare[:, :columns] = 255
+    for ours, theirs in ((glare, right), (right, glare)):
+        assert compare_sides(ours, theirs, CONFIG) == Sides()
+    assert balanced(glare, right, CONFIG)[0] is glare
+
+
+def test_a_gain_is_told_beside_glare_on_both_sides():
+    left, right = scene()
+    left[:, :100], right[:, :100] = 255, 255
+    dimmed = np.where(right == 255, 255, darker(right, 1.0)).astype(np.uint8)
+    assert compare_sides(left, dimmed, CONFIG).darker_stops == pytest.approx(1.0, abs=0.1)
 
 
 def test_what_is_no_gain_is_left_alone():
@@ -100,6 +117,19 @@ def test_disparities_stay_true_when_a_side_is_dark(stops):
         assert np.mean(np.abs(d[found] - DISPARITY) < 0.5) > 0.95
 
 
+def test_drives_have_clocks_of_their_own():
+    """A second drive through the same places, a second later by its own clock, is no motion."""
+    two = driven(delay_s=5e-3)
+    n = two.n_keyframes
+    alone = measure_rig(two, CAMERA)
+    two.sessions = [k % 2 for k in range(n)]
+    two.timestamps = [t - 3.0 * (k % 2) for k, t in enumerate(two.timestamps)]
+    both = measure_rig(two, CAMERA)
+    assert alone is not None
+    assert both is not None
+    assert both.delay_s == pytest.approx(alone.delay_s, rel=0.1)
+
+
 def test_warnings_say_what_was_seen_and_done():
     dark, black, fine = Sides(darker_stops=-1.5), Sides(black="right"), Sides()
     assert rig_warnings([fine] * 100) == []
@@ -135,7 +165,7 @@ def driven(delay_s: float = 0.0, turned_px: float = 0.0, n: int = 5000) -> Simpl
         xy=np.stack([u, u], axis=1), u_right=u_right + rng.normal(0.0, 0.2, n),
     )  # fmt: skip
     return SimpleNamespace(
-        arrays=arrays, n_rows=n, n_keyframes=10, timestamps=times.tolist(),
+        arrays=arrays, n_rows=n, n_keyframes=10, timestamps=times.tolist(), sessions=[0] * 10,
         living_keyframes=lambda: np.arange(10),
     )  # fmt: skip
 

@@ -13,6 +13,7 @@ from vslam.config import Config, KeyframeConfig, MappingConfig, OrbConfig, Track
 from vslam.datasets.kitti import open_kitti
 from vslam.features import TrackResult
 from vslam.geometry import inverse, se3_log
+from vslam.map import Map
 from vslam.map_kernels import detach_keyframe
 from vslam.slam import Slam
 
@@ -144,6 +145,20 @@ def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, mon
     late = bytes_of(*run(corridor, config, threads=1))
     monkeypatch.setattr("vslam.mapping.ThreadPoolExecutor", InstantExecutor)
     assert bytes_of(*run(corridor, config, threads=2)) == late
+
+
+@pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
+@pytest.mark.parametrize("dark", [(), range(9, 14)])
+def test_dropping_dead_landmarks_changes_no_byte(corridor, config, dark, monkeypatch, check_map):
+    sizes, bytes_ = [], []
+    for drop in (False, True):
+        monkeypatch.setattr(Map, "many_dead_landmarks", drop)
+        slam, results = run(corridor, config, black=dark)
+        check_map(slam.map)
+        sizes.append(slam.map.n_landmarks)
+        bytes_.append(bytes_of(slam, results))
+    assert sizes[1] < 0.9 * sizes[0]
+    assert bytes_[1] == bytes_[0]
 
 
 def test_the_map_cannot_be_read_while_a_keyframe_is_mapped(corridor):

@@ -9,7 +9,6 @@ from vslam.geometry import se3_exp
 from vslam.trajectory import (
     Trajectory,
     bridge_gaps,
-    quaternions,
     read_kitti_poses,
     read_trajectory,
     trajectory_format,
@@ -25,18 +24,6 @@ def trajectory() -> Trajectory:
     T_wc[:, :3, :3] = Rotation.random(20, rng=rng).as_matrix()
     T_wc[:, :3, 3] = rng.normal(0, 300, (20, 3))
     return Trajectory(1305031102.175304 + 0.1 * np.arange(20), T_wc)
-
-
-def test_quaternions_are_scipys():
-    R = Rotation.random(4000, rng=np.random.default_rng(0)).as_matrix()
-    halves = Rotation.from_rotvec(np.pi * np.eye(3)[[0, 1, 2, 0]] * [[1], [1], [1], [-1]])
-    R = np.concatenate([R, np.eye(3)[None], np.round(halves.as_matrix())])
-    expected = Rotation.from_matrix(R).as_quat(canonical=True)
-    np.testing.assert_allclose(quaternions(R), expected, atol=1e-15)
-    skew = R + 1e-8 * np.random.default_rng(1).standard_normal(R.shape)
-    expected = Rotation.from_matrix(skew).as_quat(canonical=True)
-    np.testing.assert_allclose(np.abs(quaternions(skew)), np.abs(expected), atol=1e-14)
-    assert quaternions(R[:0]).shape == (0, 4)
 
 
 def test_kitti_round_trip(tmp_path, trajectory):

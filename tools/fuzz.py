@@ -1,7 +1,7 @@
 """Feed damaged files to every reader: an answer or one sentence must come, and soon.
 
 Each input is a valid small file, changed by a seeded mutation. Success and `InputError` are right.
-Everything else is a failure: another exception, a crash, more than SECONDS, or more than MEGABYTES
+Everything else is a failure: another exception, a crash, more than SECONDS of CPU time or MEGABYTES
 of memory. Readers run in a process of their own, so that a crash is a line in the table.
 
 usage: python tools/fuzz.py [--inputs 1000] [--seed 0] [--readers kitti,video] [--keep FOLDER]
@@ -18,6 +18,7 @@ import logging
 import re
 import resource
 import shutil
+import signal
 import struct
 import subprocess
 import sys
@@ -36,6 +37,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 SECONDS, MEGABYTES = 20, 600
+WALL_SECONDS = 300  # for what waits and does nothing; a busy machine is slow
 ADDRESS_SPACE = 8 * 2**30  # beyond it there is a MemoryError: this machine stays usable
 _NUMBERS = ["nan", "inf", "-inf", "1e999", "-1", "0", "1e-320", "9" * 30, "2147483648", "0x10", ""]
 _SPECIAL = [0, 1, 0x7F, 0xFF, 0x7FFFFFFF, 0xFFFFFFFF, 0x80000000, 0x7FFFFFFFFFFFFFFF]
@@ -188,13 +190,13 @@ def _write_calibrations(folder: Path) -> None:
         (folder / name).write_text(text)
 
 
-def _write_bag(kind: str, encoding: str, folder: Path) -> None:
+def _write_bag(kind: str, encoding: str, folder: Path, compression: str = "") -> None:
     from source_files import LEFT, RIGHT, write_bag
 
     sides = {LEFT: _images(), RIGHT: _images()}
     name = {"ros1": "a.bag"}.get(kind, "a")
     write_bag(folder / name, kind, sides, [10**8 * (k + 1) for k in range(3)], encoding=encoding,
-              camera=_camera())  # fmt: skip
+              camera=_camera(), compression=compression)  # fmt: skip
 
 
 def _write_video(folder: Path) -> None:
@@ -209,8 +211,10 @@ def _write_video(folder: Path) -> None:
 
 def _write_map(folder: Path) -> None:
     from vslam.features import Features
+    from vslam.loops import ClosingMemory, LoopEdge, ResembledPlace
     from vslam.map import Map
-    from vslam.map_kernels import link_many, refresh_landmarks
+    from vslam.map_kernels import link_many, merge_landmarks, refresh_landmarks
+    from vslam.maps.checkpoint import Checkpoint
     from vslam.maps.storage import save_map
     from vslam.maps.stored_map import StoredMap
 
@@ -233,7 +237,25 @@ def _write_map(folder: Path) -> None:
         rows = np.arange(n * k, n * (k + 1))
         link_many(map_.arrays, rows, ids.astype(np.int32))
     refresh_landmarks(map_.arrays, ids, map_.scales)
-    save_map(folder / "map.npz", StoredMap(map_, _camera()))
+    merge_landmarks(map_.arrays, 0, 1)
+    map_.cull_keyframe(1)
+    waits = LoopEdge(2, 0, 0.5, True, "", T_query_match=np.eye(4))
+    checkpoint = Checkpoint(
+        index=2,
+        timestamp=0.2,
+        features=features,
+        landmark=ids.astype(np.int32),
+        T_cw=np.eye(4),
+        velocity=np.zeros(6),
+        reference=2,
+        last_frame=2,
+        last_timestamp=0.2,
+        lost_frames=0,
+        n_tracked=n,
+        closing=ClosingMemory((ResembledPlace(frozenset((0,)), 1),), ((3, waits),), 3),
+    )
+    stored = StoredMap(map_, _camera(), checkpoint=checkpoint)
+    save_map(folder / "map.npz", stored, resumable=True)
 
 
 def _write_json(kind: str, folder: Path) -> None:
@@ -348,11 +370,16 @@ def _read_calibrations(folder: Path) -> None:
 
 
 def _read_map(folder: Path) -> None:
-    from vslam.maps.storage import load_map
+    from vslam.map_kernels import resolve
+    from vslam.maps.storage import load_checkpoint
 
-    map_ = load_map(folder / "map.npz").map
-    for k in range(map_.n_keyframes):
-        map_.covisible(k)
+    stored = load_checkpoint(folder / "map.npz")
+    for map_ in (stored.map, stored.compact().map):
+        for k in range(map_.n_keyframes):
+            map_.covisible(k)
+            map_.keyframe_pose(k)
+    if stored.checkpoint is not None:
+        resolve(stored.map.arrays, stored.checkpoint.landmark)
 
 
 def _read_config(folder: Path) -> None:
@@ -400,8 +427,9 @@ def _read_weights(folder: Path) -> None:
     load_network(folder / "net.safetensors")
 
 
-def _bag(kind: str, encoding: str, data: str, changed: str) -> Reader:
-    return Reader(partial(_write_bag, kind, encoding), partial(_read_source, "bag", data), changed)
+def _bag(kind: str, encoding: str, data: str, changed: str, compression: str = "") -> Reader:
+    write = partial(_write_bag, kind, encoding, compression=compression)
+    return Reader(write, partial(_read_source, "bag", data), changed)
 
 
 READERS: dict[str, Reader] = {
@@ -420,6 +448,8 @@ READERS: dict[str, Reader] = {
     "bag-ros1": _bag("ros1", "mono8", "a.bag", "a.bag"),
     "bag-ros2": _bag("ros2", "png", "a", "a/*"),
     "bag-mcap": _bag("folder", "mono16", "a", "a/*"),
+    "bag-lz4": _bag("ros1", "mono8", "a.bag", "a.bag", "lz4"),
+    "bag-zstd": _bag("folder", "mono8", "a", "a/*", "storage"),
     "video": Reader(_write_video, _read_video, "*.*"),
     "map": Reader(_write_map, _read_map, "map.npz"),
     "config": Reader(partial(_write_json, "config"), _read_config, "config.json"),
@@ -617,6 +647,7 @@ def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
 
     logging.disable(logging.CRITICAL)
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
+    faulthandler.register(signal.SIGPROF, chain=True)  # says where, then ends the process
     reader = READERS[name]
     valid = scratch / "valid"
     valid.mkdir(parents=True, exist_ok=True)
@@ -635,8 +666,9 @@ def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
         (folder / file.relative_to(valid)).write_bytes(data)
         gc.collect()
         _forget_peak()
-        before, start = _peak_mb(), time.perf_counter()
-        faulthandler.dump_traceback_later(SECONDS, exit=True)
+        before, start = _peak_mb(), time.process_time()
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
+        faulthandler.dump_traceback_later(WALL_SECONDS, exit=True)
         said = None
         try:
             reader.read(folder)
@@ -647,8 +679,9 @@ def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
                 outcome, said = "more than a line", said
         except BaseException as error:
             outcome, said = type(error).__name__, traceback.format_exc()
+        signal.setitimer(signal.ITIMER_PROF, 0)
         faulthandler.cancel_dump_traceback_later()
-        seconds, grown = time.perf_counter() - start, _peak_mb() - before
+        seconds, grown = time.process_time() - start, _peak_mb() - before
         if outcome in ("read", "refused") and grown > MEGABYTES:
             outcome, said = "memory", f"{grown:.0f} MB"
         line = {"reader": name, "number": number, "file": file.name, "outcome": outcome}
@@ -681,7 +714,8 @@ def fuzz(name: str, inputs: int, seed: int, keep: Path | None = None) -> dict[st
                     failures.append(line)
             if not begun or len(begun) > len(ended):
                 number = begun[-1] if begun else first
-                why = "hang" if "Timeout" in done.stderr else f"exit code {done.returncode}"
+                slow = "Timeout" in done.stderr or done.returncode == -signal.SIGPROF
+                why = "hang" if slow else f"exit code {done.returncode}"
                 failures.append({"number": number, "outcome": why, "said": done.stderr[-3000:]})
                 if not begun:
                     break

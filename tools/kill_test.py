@@ -2,7 +2,8 @@
 
 Each time ``kill -9`` ends the run once it has done a number of frames drawn from a seed, or in the
 middle of the next autosave. All that it left is read, and the run resumed. The table has the frame
-of the kill, the frames saved, the seconds of the run that are lost, and the ATE of the whole run.
+of the kill, the frames saved, the seconds of the run that are lost, the ATE of the whole run, and
+whether its trajectory is that of the undisturbed run, byte for byte.
 
     python tools/kill_test.py --kills 10 --autosave 4 -- --dataset synthetic --seq demo
 """
@@ -22,7 +23,8 @@ from pathlib import Path
 
 from vslam.errors import InputError
 from vslam.maps.storage import load_map
-from vslam.run.autosave import MAP, ONLINE, PROGRESS, read_progress
+from vslam.run.autosave import MAP, ONLINE, PROGRESS
+from vslam.run.progress import read_progress
 from vslam.trajectory import read_trajectory
 
 RUN = (sys.executable, "-m", "vslam", "run")
@@ -32,6 +34,11 @@ BRIEF = ("--no-record", "--no-report", "--quiet")
 def report_of(folder: Path) -> dict[str, float]:
     """The report of a finished run."""
     return json.loads((folder / "report.json").read_text())
+
+
+def trajectory_of(folder: Path) -> bytes:
+    """The trajectory of a finished run."""
+    return (folder / "trajectory.tum").read_bytes()
 
 
 def frames_done(folder: Path) -> int:
@@ -87,9 +94,10 @@ def main() -> None:
         out = Path(name)
         subprocess.run([*RUN, *options.words, *BRIEF, "--out", str(out / "whole")], check=True)
         whole = report_of(out / "whole" / "latest")
+        undisturbed = trajectory_of(out / "whole" / "latest")
         frames = int(whole["frames"])
         print(f"undisturbed: {frames} frames, ATE {whole['ate_rmse_m']:.4f} m", flush=True)
-        print("kill\tduring\tframe\tsaved\tlost_s\tate_m\tframes", flush=True)
+        print("kill\tduring\tframe\tsaved\tlost_s\tate_m\tframes\tsame", flush=True)
         for number in range(options.kills):
             saving = number % 2 == 1
             at = random_.randrange(1, frames - 1)
@@ -108,8 +116,9 @@ def main() -> None:
                 print(f"{row}\tnothing saved yet", flush=True)
                 continue
             subprocess.run([*RUN, "--resume", str(folder), *BRIEF], check=True)
-            report = report_of(folder)
-            print(f"{row}\t{report['ate_rmse_m']:.4f}\t{report['frames']}", flush=True)
+            report, same = report_of(folder), trajectory_of(folder) == undisturbed
+            ate, frames_in_all = report["ate_rmse_m"], report["frames"]
+            print(f"{row}\t{ate:.4f}\t{frames_in_all}\t{'yes' if same else 'no'}", flush=True)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ from vslam.geometry import inverse, se3_log
 from vslam.loopclosure.registry import create_detector
 from vslam.loops import LoopEdge
 from vslam.machine import available_cores
-from vslam.run.pipeline import prepared_frames
+from vslam.run.preparation import prepared_frames
 from vslam.run.warmup import compile_kernels
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory

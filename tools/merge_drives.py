@@ -29,7 +29,7 @@ from vslam.loops import LoopEdge
 from vslam.map import Map
 from vslam.maps.stored_map import StoredMap
 from vslam.merging import MergedMaps, merge_maps
-from vslam.run.pipeline import prepared_frames
+from vslam.run.preparation import prepared_frames
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory
 

@@ -22,7 +22,7 @@ from vslam.datasets.stream import timed_frames
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.loopclosure.registry import create_detector, create_images
 from vslam.run.outcome import alignment_of
-from vslam.run.pipeline import prepared_frames
+from vslam.run.preparation import prepared_frames
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory
 
@@ -56,7 +56,7 @@ def compare(sequence: Sequence, detector: str, at: float, threads: int, folder: 
     whole.save(folder / "whole.npz")
     split = begin(sequence, detector, threads)
     drive(split, sequence, range(half), threads)
-    split.save(folder / "half.npz")
+    split.save(folder / "half.npz", resumable=True)
     split = Slam.load(folder / "half.npz", threads=threads, resume=True)
     lost = drive(split, sequence, range(half, n), threads)
     found = Slam.load(folder / "whole.npz", threads=threads, localize=True)

@@ -4,19 +4,26 @@ What the tests cannot see: files left out of the wheel, dependencies that only t
 environment has, imports that work only in the checkout. The sequence is a textured wall that a
 stereo camera passes; shifts are whole pixels, so that its true trajectory is exact.
 
-usage: python tools/wheel_test.py
+Other Pythons get an environment each. Where pip would bring CUDA with torch (gigabytes), torch is
+left out: it trains, runs do without it. With ``--runners`` the wheel is also started by pipx and
+uvx, of those that are installed.
+
+usage: python tools/wheel_test.py [--python python3.12 ...] [--runners]
 """
 
 from __future__ import annotations
 
+import argparse
+import email
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-import venv
+import zipfile
 from pathlib import Path
 
 import cv2
@@ -29,10 +36,13 @@ FRAMES, STEP = 12, 4  # pixels a frame to the right, and up and down in turn
 MAX_ATE_M = 0.02
 
 
-def run(*command: str | Path, cwd: Path) -> str:
+def run(*command: str | Path, cwd: Path, **environment: str) -> str:
     """Standard output of a command; ends the test with what it said if it fails."""
     start = time.perf_counter()
-    done = subprocess.run(list(map(str, command)), cwd=cwd, capture_output=True, text=True)
+    done = subprocess.run(
+        list(map(str, command)), cwd=cwd, capture_output=True, text=True,
+        env=os.environ | environment,
+    )  # fmt: skip
     shown = " ".join([Path(command[0]).name, *map(str, command[1:4])])
     print(f"wheel test: {time.perf_counter() - start:5.1f} s  {shown}", flush=True)
     if done.returncode:
@@ -83,7 +93,75 @@ def check_run(folder: Path) -> None:
         sys.exit(f"wheel test: failed; missing or empty: {missing or 'nothing'}")
 
 
+def requirements(wheel: Path) -> list[str]:
+    """What a plain installation needs."""
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
+        metadata = email.message_from_string(archive.read(name).decode())
+    return [r for r in metadata.get_all("Requires-Dist") or [] if "extra ==" not in r]
+
+
+def brings_cuda(pip: Path, scratch: Path) -> bool:
+    """Whether pip would take a torch that needs CUDA's libraries."""
+    report = scratch / "torch.json"
+    run(pip, "install", "--quiet", "--dry-run", "--no-deps", "--ignore-installed", "--report",
+        report, "torch", "-c", ROOT / "constraints.txt", cwd=scratch)  # fmt: skip
+    (torch,) = json.loads(report.read_text())["install"]
+    needed = torch["metadata"].get("requires_dist", [])
+    return any(re.match("nvidia|cuda", name) for name in needed)
+
+
+def try_environment(python: str, wheel: Path, scratch: Path) -> None:
+    """Install the wheel for a Python, and run it where nothing else of the checkout is."""
+    run(python, "-m", "venv", scratch / "env", cwd=scratch)
+    binaries = scratch / "env" / "bin"
+    pip = binaries / "pip"
+    constraints = ("-c", ROOT / "constraints.txt")
+    if brings_cuda(pip, scratch):
+        print("wheel test: without torch, which would bring CUDA", flush=True)
+        needed = [r for r in requirements(wheel) if not re.match(r"torch\b", r)]
+        run(pip, "install", "--quiet", *needed, *constraints, cwd=scratch)
+        run(pip, "install", "--quiet", "--no-deps", wheel, cwd=scratch)
+    else:
+        run(pip, "install", "--quiet", wheel, *constraints, cwd=scratch)
+    write_sequence(scratch / "kitti")
+
+    vslam = binaries / "vslam"
+    if "run" not in run(vslam, "--help", cwd=scratch):
+        sys.exit("wheel test: failed; vslam --help does not name its commands")
+    print(run(vslam, "info", "--data", scratch / "kitti", cwd=scratch))
+    if "100000" not in run(vslam, "vocabulary", "info", cwd=scratch):
+        sys.exit("wheel test: failed; the vocabulary of 100000 words is not in the wheel")
+    run(vslam, "run", "--data", scratch / "kitti", "--perturb", "brightness:0.5", cwd=scratch)
+    check_run(scratch / "runs" / "latest")
+
+
+def try_runners(wheel: Path, scratch: Path) -> None:
+    """``pipx run`` and ``uvx``, with folders of their own; both install the wheel by themselves."""
+    constraints = str(ROOT / "constraints.txt")
+    commands = {
+        "uvx": ["--no-python-downloads", "--from", wheel, "vslam", "--version"],
+        "pipx": ["run", "--no-cache", "--spec", wheel, "vslam", "--version"],
+    }
+    for name, words in commands.items():
+        beside = Path(sys.executable).with_name(name)
+        command = str(beside) if beside.exists() else shutil.which(name)
+        if command is None:
+            print(f"wheel test: {name} is not installed: not tried")
+            continue
+        said = run(
+            command, *words, cwd=scratch, PIP_CONSTRAINT=constraints, UV_CONSTRAINT=constraints,
+            PIPX_HOME=str(scratch / "pipx"), UV_CACHE_DIR=str(scratch / "uv"),
+            PIPX_DEFAULT_PYTHON=sys.executable, UV_PYTHON=sys.executable,
+        )  # fmt: skip
+        print(f"wheel test: {name} starts vslam {said.strip()}")
+
+
 def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--python", nargs="+", default=[sys.executable], help="each is tried")
+    parser.add_argument("--runners", action="store_true", help="try pipx and uvx, too")
+    given = parser.parse_args()
     os.environ.pop("PYTHONPATH", None)
     shutil.rmtree(ROOT / "build" / "lib", ignore_errors=True)  # old builds' files would be packed
     with tempfile.TemporaryDirectory(prefix="vslam-wheel-") as name:
@@ -91,20 +169,13 @@ def main() -> None:
         pip = (sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check")
         run(*pip, "wheel", "--no-deps", "--wheel-dir", scratch, ROOT, cwd=scratch)
         (wheel,) = scratch.glob("vslam-*.whl")
-        venv.create(scratch / "env", with_pip=True)
-        binaries = scratch / "env" / "bin"
-        constraints = ROOT / "constraints.txt"
-        run(binaries / "pip", "install", "--quiet", wheel, "-c", constraints, cwd=scratch)
-        write_sequence(scratch / "kitti")
-
-        vslam = binaries / "vslam"
-        if "run" not in run(vslam, "--help", cwd=scratch):
-            sys.exit("wheel test: failed; vslam --help does not name its commands")
-        print(run(vslam, "info", "--data", scratch / "kitti", cwd=scratch))
-        if "100000" not in run(vslam, "vocabulary", "info", cwd=scratch):
-            sys.exit("wheel test: failed; the vocabulary of 100000 words is not in the wheel")
-        run(vslam, "run", "--data", scratch / "kitti", "--perturb", "brightness:0.5", cwd=scratch)
-        check_run(scratch / "runs" / "latest")
+        for number, python in enumerate(given.python):
+            (scratch / str(number)).mkdir()
+            print(f"wheel test: {run(python, '--version', cwd=scratch).strip()}", flush=True)
+            try_environment(python, wheel, scratch / str(number))
+            shutil.rmtree(scratch / str(number))  # a gigabyte each
+        if given.runners:
+            try_runners(wheel, scratch)
     print("wheel test: ok")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,27 @@ class LoopEdge:
     landmarks: NDArray[np.int32] | None = None
     scale: float = 1.0
     matched_by: Literal["orb", "learned"] = "orb"
+
+
+def loop_entry(loop: LoopEdge) -> dict[str, Any]:
+    """An edge for JSON, without its features and landmarks."""
+    entry = {name: value for name, value in vars(loop).items() if name not in _LEFT_OUT}
+    T = loop.T_query_match
+    return entry | {"T_query_match": None if T is None else T.tolist()}
+
+
+_LEFT_OUT = ("features", "landmarks")
+
+
+def loop_of(entry: dict[str, Any]) -> LoopEdge:
+    """The edge of an entry.
+
+    Raises:
+        KeyError, TypeError, ValueError: it is none.
+    """
+    T = entry["T_query_match"]
+    T_query_match = None if T is None else np.array(T, np.float64).reshape(4, 4)
+    return LoopEdge(**{**entry, "T_query_match": T_query_match})
 
 
 @dataclass(frozen=True)
@@ -130,3 +151,36 @@ class DetectorMemory:
     name: str = "none"
     fingerprint: str = ""
     tables: Mapping[str, PerKeyframe] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ResembledPlace:
+    """A place that resembled recent keyframes: a candidate with its covisible keyframes.
+
+    ``length`` keyframes in a row resembled it, ``age`` keyframes ago the last of them.
+    """
+
+    keyframes: frozenset[int]
+    length: int
+    age: int = 0
+
+
+@dataclass(frozen=True)
+class ClosingMemory:
+    """What loop closing remembers of recent keyframes, for a file.
+
+    Attributes:
+        places: that resembled them.
+        verified: loops that wait for others to agree, each with the ``turn`` of its keyframe.
+        turn: keyframes asked about so far.
+        resting_until, in_vain: the keyframe until which learned descriptors rest after a try in
+            vain, and how alike the images of that were.
+        followed: times that an old keyframe served instead of a new one.
+    """
+
+    places: tuple[ResembledPlace, ...] = ()
+    verified: tuple[tuple[int, LoopEdge], ...] = ()
+    turn: int = 0
+    resting_until: int = 0
+    in_vain: float = 0.0
+    followed: int = 0

@@ -3,8 +3,8 @@
 A *row* is one keypoint of one keyframe; rows of a keyframe are consecutive. The table of rows is
 the table of observations too: ``landmark[row]`` names the landmark that the keypoint observes, and
 ``next_row`` chains the rows of each landmark. Nothing is derived twice: covisibility is counted
-from the rows when it is needed (after DPVO's PatchGraph, arrays instead of objects). Ids are
-never reused; arrays grow by half.
+from the rows when it is needed (after DPVO's PatchGraph, arrays instead of objects). Ids of
+keyframes are never reused, those of landmarks until dead ones are dropped; arrays grow by half.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from vslam.features import Features
 from vslam.geometry import compose, inverse, orthonormalised
 from vslam.loops import LoopEdge
-from vslam.map_kernels import collect_landmarks, count_shared, detach_keyframe
+from vslam.map_kernels import collect_landmarks, count_shared, detach_keyframe, resolve, unlink
 
 NONE = -1
+_FEW_LANDMARKS = 8192  # 1 MB
 
 
 class Arrays(NamedTuple):
@@ -136,11 +137,9 @@ class Map:
         if used + extra <= capacity:
             return
         target = max(used + extra, capacity + capacity // 2)
-        grown = {
-            name: _grown(getattr(self.arrays, name), target + (name == "first_row"))
-            for name in fields
-        }
-        self.arrays = self.arrays._replace(**grown)
+        for name in fields:  # one after the other: two copies of all of them are much memory
+            grown = _grown(getattr(self.arrays, name), target + (name == "first_row"))
+            self.arrays = self.arrays._replace(**{name: grown})
 
     def add_keyframe(
         self, features: Features, T_cw: NDArray[np.float64], timestamp: float, frame: int
@@ -189,6 +188,33 @@ class Map:
         self.n_landmarks += n
         return np.arange(start, start + n, dtype=np.int32)
 
+    @property
+    def many_dead_landmarks(self) -> bool:
+        """Whether dead landmarks take so much room that ``drop_dead_landmarks`` is worth it."""
+        living = int(np.count_nonzero(self.arrays.landmark_alive[: self.n_landmarks]))
+        return self.n_landmarks - living > max(_FEW_LANDMARKS, living // 2)
+
+    def drop_dead_landmarks(self) -> NDArray[np.int32]:
+        """Forget the landmarks that are dead; the others are numbered anew, in their order.
+
+        Most landmarks die within a few keyframes of their birth.
+
+        Returns:
+            ``(n_landmarks,)`` by old id, the new one of the landmark that it stands for
+            (``resolve``), or -1.
+        """
+        a, living = self.arrays, self.living_landmarks()
+        stands_for = resolve(a, np.arange(self.n_landmarks, dtype=np.int32))
+        new_id = np.full(self.n_landmarks + 1, NONE, np.int32)  # the last one is that of -1
+        new_id[living] = np.arange(len(living))
+        for name in LANDMARK_FIELDS:
+            values = getattr(a, name)
+            values[: len(living)] = values[living]
+            values[len(living) : self.n_landmarks] = 0
+        a.landmark[: self.n_rows] = new_id[a.landmark[: self.n_rows]]
+        self.n_landmarks = len(living)
+        return new_id[stands_for]
+
     def rows(self, keyframe: int) -> slice:
         """Rows of one keyframe."""
         first = self.arrays.first_row
@@ -204,8 +230,8 @@ class Map:
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Keyframes sharing at least ``minimum`` landmarks, most first, and how many they share."""
         counts = count_shared(self.arrays, keyframe, self.n_keyframes)
-        order = np.argsort(-counts, kind="stable")
-        order = order[counts[order] >= max(1, minimum)]
+        enough = np.flatnonzero(counts >= max(1, minimum))  # of many thousands that share none
+        order = enough[np.argsort(-counts[enough], kind="stable")]
         return order, counts[order]
 
     def keyframe_pose(self, keyframe: int) -> NDArray[np.float64]:
@@ -237,6 +263,31 @@ class Map:
         self.restarts.append(keyframe)
         if not predicted:
             self.unpredicted_restarts.append(keyframe)
+
+    def tear(self, keyframe: int) -> None:
+        """Make what was mapped from a keyframe on a sub-map of its own: its place was wrong, and
+        the landmarks that both sides observe are not the same things. The later side loses them."""
+        a = self.arrays
+        rows = np.arange(int(a.first_row[keyframe]), self.n_rows)
+        rows = rows[a.landmark[rows] != NONE]
+        first = np.full(self.n_landmarks, self.n_keyframes, np.int32)
+        observing = np.flatnonzero(a.landmark[: self.n_rows] != NONE)
+        np.minimum.at(first, a.landmark[observing], a.keyframe[observing])
+        for row in rows[first[a.landmark[rows]] < keyframe].tolist():
+            unlink(a, row)
+        for child in range(keyframe + 1, self.n_keyframes):
+            if self.parents[child] >= keyframe:
+                continue
+            if not a.keyframe_alive[child]:
+                T = compose(self.keyframe_pose(child), inverse(a.T_cw[keyframe]))
+                self.T_c_parent[child], self.parents[child] = orthonormalised(T), keyframe
+                continue
+            shared = count_shared(a, child, self.n_keyframes)
+            shared[child:] = 0
+            best = int(np.argmax(shared))
+            self.parents[child] = best if shared[best] else keyframe
+        self.restarts = sorted({*self.restarts, keyframe})
+        self.unpredicted_restarts = sorted({*self.unpredicted_restarts, keyframe})
 
     def submaps(self) -> NDArray[np.int64]:
         """``(n_keyframes,)`` the sub-map of each keyframe, by the keyframe at which it began."""

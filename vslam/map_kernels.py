@@ -245,11 +245,13 @@ def covisible_pairs(a, keyframes, n_keyframes, minimum):
     listed = np.zeros(n_keyframes, np.bool_)
     for keyframe in keyframes:
         listed[keyframe] = True
+    met = np.empty(n_keyframes, np.int64)
     pairs, shared = np.empty((64, 2), np.int64), np.empty(64, np.int64)
     n = 0
     for keyframe in range(n_keyframes):
         if not listed[keyframe]:
             continue
+        n_met = 0
         for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
             if a.landmark[row] < 0:
                 continue
@@ -257,9 +259,13 @@ def covisible_pairs(a, keyframes, n_keyframes, minimum):
             while other >= 0:
                 k = a.keyframe[other]
                 if k > keyframe and listed[k]:
+                    if counts[k] == 0:
+                        met[n_met] = k
+                        n_met += 1
                     counts[k] += 1
                 other = a.next_row[other]
-        for k in range(keyframe + 1, n_keyframes):
+        met[:n_met].sort()
+        for k in met[:n_met]:
             if counts[k] >= max(1, minimum):
                 if n == len(pairs):
                     pairs = np.concatenate((pairs, np.empty_like(pairs)))

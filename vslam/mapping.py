@@ -9,7 +9,7 @@ last merge left.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 
@@ -27,6 +27,7 @@ from vslam.frontend.tracking import Frame
 from vslam.geometry import Matrix
 from vslam.map import LocalMap, Map, local_map
 from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
+from vslam.maps.checkpoint import Checkpoint
 from vslam.monocular import TwoViewStart
 
 
@@ -80,6 +81,11 @@ class MappingThread:
         map_, newest = self._map, self.reference
         if map_.n_keyframes and map_.sessions[newest] == map_.session:
             self.last_frame, self.last_timestamp = map_.frames[newest], map_.timestamps[newest]
+
+    def return_to(self, checkpoint: Checkpoint) -> None:
+        """Go on as from there, in the map as it was then."""
+        self.last_frame, self.last_timestamp = checkpoint.last_frame, checkpoint.last_timestamp
+        self.set_reference(checkpoint.reference)
 
     @property
     def busy(self) -> bool:
@@ -158,13 +164,22 @@ class MappingThread:
         self._observe(start.second, two)
         return one, two
 
-    def merge(self) -> bool:
-        """Wait for the pending mapping and show its result; returns whether there was one."""
+    def merge(self, frames: Collection[Frame] | None = None) -> bool:
+        """Wait for the pending mapping and show its result; returns whether there was one.
+
+        Args:
+            frames: all that hold ids of landmarks, which may get others; None: nothing must.
+        """
         if self._pending is None:
             return False
         pending, self._pending = self._pending, None
         pending()
         self.write_counts()
+        # A global bundle adjustment under way knows its landmarks by their ids.
+        if frames is not None and not self._closing.is_adjusting and self._map.many_dead_landmarks:
+            new_id = self._map.drop_dead_landmarks()
+            for frame in frames:
+                frame.landmark = np.where(frame.landmark >= 0, new_id[frame.landmark], -1)
         self._copy_view()
         return True
 

@@ -63,6 +63,11 @@ class Initialiser:
         self._context = context
         self._first: Frame | None = None
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether no frame is kept."""
+        return self._first is None
+
     def reset(self) -> None:
         """Forget the frame kept."""
         self._first = None

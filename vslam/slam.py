@@ -44,7 +44,8 @@ from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map, local_map
 from vslam.mapping import MappingThread
-from vslam.maps.storage import load_map, save_map
+from vslam.maps.checkpoint import Checkpoint
+from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, World
 from vslam.monocular import Initialiser
 from vslam.trajectory import Trajectory
@@ -134,7 +135,10 @@ class Slam:
         self._lost_frames = 0
         self._n_tracked = 0  # landmarks, in the last frame tracked
         self._initialiser = Initialiser(self.context)  # of monocular maps
-        if before is not None and len(before.tracked) > 1 and before.tracked[-2:].all():
+        self._is_between = True  # frames: nothing of the next one is tracked yet
+        if resume and start is not None and start.checkpoint is not None:
+            self._return_to(start.checkpoint)
+        elif before is not None and len(before.tracked) > 1 and before.tracked[-2:].all():
             self._move_on(before)
 
     @classmethod
@@ -159,7 +163,7 @@ class Slam:
             InputError: no map, a damaged one, or one of another detector or pyramid.
         """
         config = config or Config()
-        stored = load_map(path)
+        stored = load_checkpoint(path) if resume else load_map(path)
         try:
             if detector is None:
                 images = create_images(stored.detector.name, config)
@@ -177,21 +181,23 @@ class Slam:
         except (ValueError, KeyError) as error:
             raise InputError(f"{path}: {error}; go on with the options of its run.") from error
 
-    def save(self, path: Path, drive: str = "") -> None:
+    def save(self, path: Path, drive: str = "", *, resumable: bool = False) -> None:
         """Write the map to a file, in place of what is there: all that ``load`` needs to go on.
 
         Args:
             drive: what the images since the start were, "kitti 06" for example.
+            resumable: with what tracking remembers and what died in the map, too. Loaded with
+                ``resume=True``, it then gives the poses of a run that was not stopped, to the byte.
 
         Raises:
             RuntimeError: a keyframe is being mapped: look at ``is_mapping``, or call ``finish()``.
             OSError: the file cannot be written; one that was there is as it was.
         """
-        save_map(path, self.stored_map(drive))
+        save_map(path, self.stored_map(drive), resumable=resumable)
 
     def stored_map(self, drive: str = "") -> StoredMap:
-        """What ``save`` writes. Its arrays are those of the map: ``compact()``, which copies them,
-        before the next step.
+        """The map, with a checkpoint if there can be one now; ``save`` writes what lives of it. Its
+        arrays are those of the map: ``compact()``, which copies them, before the next step.
 
         Raises:
             RuntimeError: a keyframe is being mapped.
@@ -207,7 +213,44 @@ class Slam:
             frames=self._poses.table(),
             drives=self._drives if self._localize else (*self._drives, drive),
             world=self.world,
+            checkpoint=self._checkpoint(),
         )
+
+    def _checkpoint(self) -> Checkpoint | None:
+        """What goes on from here to the byte; None where that takes more than is kept: in the
+        middle of a frame, before the first one is tracked, while a monocular map begins, and
+        while a global bundle adjustment is under way."""
+        frame = self.frame
+        if not self._is_between or frame is None or self._localize:
+            return None
+        if self.is_adjusting or not self._initialiser.is_idle:
+            return None
+        return Checkpoint(
+            index=frame.index,
+            timestamp=frame.timestamp,
+            features=frame.features,
+            landmark=frame.landmark.copy(),
+            T_cw=frame.T_cw.copy(),
+            velocity=self._velocity,
+            reference=self._mapping.reference,
+            last_frame=self._mapping.last_frame,
+            last_timestamp=self._mapping.last_timestamp,
+            lost_frames=self._lost_frames,
+            n_tracked=self._n_tracked,
+            closing=self._closing.memory(),
+        )
+
+    def _return_to(self, checkpoint: Checkpoint) -> None:
+        self._mapping.return_to(checkpoint)
+        self._closing.restore(checkpoint.closing)
+        self._velocity = checkpoint.velocity
+        self._lost_frames, self._n_tracked = checkpoint.lost_frames, checkpoint.n_tracked
+        index, timestamp = checkpoint.index, checkpoint.timestamp
+        frame = Frame.untracked(checkpoint.features, self.camera, index, timestamp)
+        tracked = checkpoint.landmark >= 0
+        frame.T_cw, frame.landmark = checkpoint.T_cw, checkpoint.landmark
+        frame.xyz[tracked] = self.map.arrays.xyz[checkpoint.landmark[tracked]]
+        self.frame = frame
 
     @property
     def map(self) -> Map:
@@ -281,35 +324,26 @@ class Slam:
         if self._mapping.is_due(frame.index):
             self._merge()
         clock.lap("wait_for_mapping")
-        if self._mapping.n_keyframes == 0:
-            return self._start(frame, clock)
-        if self.frame is None:
-            return self._find_in_map(frame, clock)
+        self._is_between = False
+        result = (
+            self._track(frame, clock) if self._mapping.n_keyframes else self._start(frame, clock)
+        )
+        self._is_between = True
+        return result
 
-        T_cw = self._predict(timestamp)
-        inliers = self._track_previous_frame(frame, T_cw)
-        clock.lap("track_frame")
-        matches, inliers, visible = self._track_local_map(frame, inliers)
-        clock.lap("track_local_map")
-        state, relocalised = self._state_of(inliers, matches), False
-        if state == TrackingState.LOST:
-            matches = inliers = self._relocalise(frame)
-            state = self._state_of(inliers, matches)
-            relocalised = state != TrackingState.LOST
-            clock.lap("relocalise")
-        elif self._is_doubtful(frame, inliers) and (found := self._find_better(frame, inliers)):
-            matches, inliers, visible = found, found, np.empty(0, np.int32)
-            state, relocalised = self._state_of(inliers, matches), True
-            clock.lap("relocalise")
-        if state == TrackingState.LOST:
+    def _track(self, frame: Frame, clock: _Clock) -> TrackResult:
+        """Where the camera is, and what is new there."""
+        T_cw = self._predict(frame.timestamp)
+        found = self._locate(frame, T_cw, clock)
+        if found.state == TrackingState.LOST:
             frame.T_cw = T_cw
             restarted = self._lose(frame)
-            return _result(frame, state, matches, inliers, restarted, clock)
+            return _result(frame, found, restarted, clock)
 
-        self._update_motion(frame, relocalised)
-        is_keyframe = self._extend_map(frame, inliers, visible)
+        self._update_motion(frame, found.relocalised)
+        is_keyframe = self._extend_map(frame, found.inliers, found.visible)
         clock.lap("keyframe")
-        return _result(frame, state, matches, inliers, is_keyframe, clock, relocalised=relocalised)
+        return _result(frame, found, is_keyframe, clock)
 
     def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
         """Account for a frame without images, at the predicted pose: it is LOST, or DROPPED if
@@ -321,7 +355,7 @@ class Slam:
             self._lost_frames += 1
         self._poses.append(timestamp, frame.T_cw, tracked=False)
         state = TrackingState.DROPPED if dropped else TrackingState.LOST
-        return _result(frame, state, 0, 0, False, _Clock())
+        return _result(frame, _Found(state), False, _Clock())
 
     def finish(self) -> None:
         """Complete pending mapping. Call before reading the map or the final trajectory."""
@@ -407,35 +441,32 @@ class Slam:
         elapsed = timestamp - self._poses.timestamp(-1)
         return orthonormalised(se3_exp(self._velocity * elapsed) @ T_last)
 
-    def _find_in_map(self, frame: Frame, clock: _Clock) -> TrackResult:
-        """A frame in a map that was loaded, before the camera was found in it. In a drive that is
-        resumed it is not far from where the last frame was."""
-        T_cw = self._predict(frame.timestamp)
-        matches, inliers, visible = 0, 0, np.empty(0, np.int32)
-        if self._resumed and self._lost_frames == 0:
-            inliers = track_descriptors(frame, self._mapping.reference_view, T_cw, self.context)
-            matches, inliers, visible = self._track_local_map(frame, inliers)
-            clock.lap("track_local_map")
-        state, relocalised = self._state_of(inliers, matches), False
+    def _locate(self, frame: Frame, T_cw: Matrix, clock: _Clock) -> _Found:
+        """The pose of a frame, expected at ``T_cw``: by tracking or, where that fails or is
+        doubtful, in the whole map."""
+        inliers = self._track_previous_frame(frame, T_cw)
+        clock.lap("track_frame")
+        matches, inliers, visible = self._track_local_map(frame, inliers)
+        clock.lap("track_local_map")
+        state = self._state_of(inliers, matches)
         if state == TrackingState.LOST:
-            matches = inliers = self._relocalise(frame)
-            state = self._state_of(inliers, matches)
-            relocalised = state != TrackingState.LOST
+            elsewhere = self._relocalise(frame)
+        elif self._is_doubtful(frame, inliers):
+            elsewhere = self._find_better(frame, inliers)
+        else:
+            return _Found(state, matches, inliers, visible)
+        if state == TrackingState.LOST or elsewhere:
             clock.lap("relocalise")
-        if state == TrackingState.LOST:
-            frame.T_cw = T_cw
-            restarted = self._lose(frame)
-            return _result(frame, state, matches, inliers, restarted, clock)
-        if not relocalised:
-            step = se3_log(orthonormalised(frame.T_cw @ inverse(self._poses.pose(-1))))
-            self._velocity = step / (frame.timestamp - self._poses.timestamp(-1))
-        self._place(frame)
-        is_keyframe = self._extend_map(frame, inliers, visible)
-        clock.lap("keyframe")
-        return _result(frame, state, matches, inliers, is_keyframe, clock, relocalised=relocalised)
+            state = self._state_of(elsewhere, elsewhere)
+            relocalised = state != TrackingState.LOST
+            return _Found(state, elsewhere, elsewhere, relocalised=relocalised)
+        return _Found(state, matches, inliers, visible)
 
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix) -> int:
-        """Along the prediction; where there is none or it fails, against the reference keyframe."""
+        """Along the prediction; where there is none or it fails, against the reference keyframe. A
+        map that was loaded has no frame to go on from, but a drive that is resumed has gone on."""
+        if self.frame is None and (self._lost_frames or not self._resumed):
+            return 0
         if self._velocity is not None and self.frame is not None:
             matches, inliers = track_motion(frame, self.frame, T_cw, self.context)
             config = self.config.tracking
@@ -467,7 +498,8 @@ class Slam:
         """Whether a frame tracks so little that it may be matched with other things: one whose pose
         could hardly be predicted, after a gap or next to one found in the map, or that has lost
         most of what the frame before tracked, as where the camera was carried."""
-        assert self.frame is not None
+        if self.frame is None:
+            return False
         usual = self._poses.timestamp(-1) - self._poses.timestamp(-2) if len(self._poses) > 1 else 0
         config = self.config.relocalization
         gap = frame.timestamp - self.frame.timestamp > config.doubtful_gap * usual > 0.0
@@ -524,11 +556,11 @@ class Slam:
 
     def _update_motion(self, frame: Frame, relocalised: bool) -> None:
         """Place the frame; the velocity is that since the last frame tracked."""
-        assert self.frame is not None
-        step = se3_log(orthonormalised(frame.T_cw @ inverse(self._poses.pose(self.frame.index))))
-        # A leap to where the camera was found again is no motion.
-        elapsed = frame.timestamp - self.frame.timestamp
-        self._velocity = None if relocalised else step / elapsed
+        self._velocity = None
+        if not relocalised:  # a leap to where the camera was found again is no motion
+            last = -1 if self.frame is None else self.frame.index
+            step = se3_log(orthonormalised(frame.T_cw @ inverse(self._poses.pose(last))))
+            self._velocity = step / (frame.timestamp - self._poses.timestamp(last))
         self._place(frame)
 
     def _place(self, frame: Frame) -> None:
@@ -574,7 +606,7 @@ class Slam:
         inliers = int(np.count_nonzero(frame.landmark >= 0))
         state = TrackingState.OK if started else TrackingState.LOST
         clock.lap("keyframe")
-        return _result(frame, state, inliers, inliers, started, clock)
+        return _result(frame, _Found(state, inliers, inliers), started, clock)
 
     def _start_monocular(self, frame: Frame) -> bool:
         """Begin a map, or a sub-map where tracking was lost, if an earlier frame forms a pair with
@@ -652,13 +684,15 @@ class Slam:
         self._mapping.insert(frame, predicted=predicted)
         self._poses.replace(frame.index, self._mapping.reference)
 
-    def _merge(self, current: Frame | None = None) -> None:
+    def _merge(self, current: Frame | None = None, *, renumber: bool = True) -> None:
         """Show tracking what local mapping has done: poses, landmarks, merged identities.
 
-        ``current`` is the frame placed last, if it is not ``self.frame`` yet.
+        ``current`` is the frame placed last, if it is not ``self.frame`` yet. Landmarks may get
+        other ids; not with ``renumber=False``, for a caller that holds some.
         """
         unit = self._poses.unit
-        if not self._mapping.merge():
+        frames = {id(one): one for one in (self.frame, current) if one is not None}
+        if not self._mapping.merge(frames.values() if renumber else None):
             return
         if self._velocity is not None:
             self._velocity[:3] *= self._poses.unit / unit
@@ -673,7 +707,7 @@ class Slam:
             return
         unit, reference = self._poses.unit, self._mapping.reference
         T_c_reference = frame.T_cw @ inverse(self._mapping.keyframe_pose(reference))
-        self._merge()
+        self._merge(renumber=False)
         T_c_reference[:3, 3] *= self._poses.unit / unit
         frame.T_cw = orthonormalised(T_c_reference @ self._mapping.keyframe_pose(reference))
         self._mapping.update(frame)
@@ -698,27 +732,29 @@ class _Clock:
         self.last = now
 
 
-def _result(
-    frame: Frame,
-    state: TrackingState,
-    matches: int,
-    inliers: int,
-    is_keyframe: bool,
-    clock: _Clock,
-    *,
-    relocalised: bool = False,
-) -> TrackResult:
+@dataclass(frozen=True)
+class _Found:
+    """Where a frame was found: ``visible`` are the landmarks that it should see."""
+
+    state: TrackingState
+    matches: int = 0
+    inliers: int = 0
+    visible: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    relocalised: bool = False
+
+
+def _result(frame: Frame, found: _Found, is_keyframe: bool, clock: _Clock) -> TrackResult:
     return TrackResult(
         index=frame.index,
         timestamp=frame.timestamp,
         T_wc=inverse(frame.T_cw),
-        state=state,
+        state=found.state,
         n_features=len(frame.features),
         n_stereo=frame.n_stereo,
-        n_matches=matches,
-        n_inliers=inliers,
+        n_matches=found.matches,
+        n_inliers=found.inliers,
         is_keyframe=is_keyframe,
-        relocalised=relocalised,
+        relocalised=found.relocalised,
         stage_ms=clock.laps,
     )
 

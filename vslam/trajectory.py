@@ -175,7 +175,9 @@ def write_kitti(path: Path, T_wc: NDArray[np.float64]) -> None:
 
 def tum_line(timestamp: float, T_wc: NDArray[np.float64]) -> str:
     """One ``(4, 4)`` pose as a line of TUM's format."""
-    (quaternion,) = quaternions(T_wc[None, :3, :3])
+    from scipy.spatial.transform import Rotation
+
+    quaternion = Rotation.from_matrix(T_wc[:3, :3]).as_quat(canonical=True)
     # Twelve digits keep the quaternion on the unit sphere to the rounding of the poses.
     numbers = [f"{x:.9f}" for x in T_wc[:3, 3]] + [f"{x:.12f}" for x in quaternion]
     return " ".join([f"{timestamp:.9f}", *numbers]) + "\n"
@@ -183,8 +185,10 @@ def tum_line(timestamp: float, T_wc: NDArray[np.float64]) -> str:
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory in TUM's format: nanoseconds, nanometres, quaternions with qw >= 0."""
-    T_wc = trajectory.T_wc
-    rows = np.column_stack([T_wc[:, :3, 3], quaternions(T_wc[:, :3, :3])])
+    from scipy.spatial.transform import Rotation
+
+    rotations = Rotation.from_matrix(trajectory.T_wc[:, :3, :3])
+    rows = np.column_stack([trajectory.T_wc[:, :3, 3], rotations.as_quat(canonical=True)])
     path.write_text(
         "".join(
             f"{t:.9f} "
@@ -198,45 +202,18 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     )
 
 
-def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``(N, 4)`` unit quaternions x, y, z, w of ``(N, 3, 3)`` rotations; of the two that are the
-    same rotation the one whose w, or else x, y or z is positive.
-
-    From the largest component, which no rounding spoils [Shepperd, J. Guidance and Control 1978].
-    As scipy's, whose import would take longer than all files of a run.
-    """
-    skew = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-12
-    if skew.any():
-        U, _, Vt = np.linalg.svd(R[skew])
-        R = R.copy()
-        R[skew] = U @ Vt
-    r = R.reshape(-1, 9).T
-    trace = r[0] + r[4] + r[8]
-    # Each row is the quaternion, times four times one of its components.
-    products = np.empty((len(R), 4, 4))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        products[:, i, i] = 1.0 - trace + 2.0 * r[4 * i]
-        products[:, i, j] = products[:, j, i] = r[3 * j + i] + r[3 * i + j]
-        products[:, i, 3] = products[:, 3, i] = r[3 * k + j] - r[3 * j + k]
-    products[:, 3, 3] = 1.0 + trace
-    largest = np.argmax(np.stack([r[0], r[4], r[8], trace]), axis=0)
-    found = products[np.arange(len(R)), largest]
-    found /= np.linalg.norm(found, axis=1, keepdims=True)
-    wxyz = found[:, [3, 0, 1, 2]]
-    first = wxyz[np.arange(len(R)), np.argmax(wxyz != 0.0, axis=1)]
-    return np.where(first[:, None] < 0.0, -found, found) + 0.0
-
-
 def write_euroc(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory as EuRoC's ground truth is written, without velocities and biases.
 
     Times are whole nanoseconds, but no better than float64 seconds: 0.2 us in Unix time.
     """
+    from scipy.spatial.transform import Rotation
+
     names = ("x [m]", "y [m]", "z [m]"), ("w []", "x []", "y []", "z []")
     columns = [*(f"p_RS_R_{name}" for name in names[0]), *(f"q_RS_{name}" for name in names[1])]
     lines = [",".join(["#timestamp [ns]", *columns]) + "\n"]
-    xyzw = quaternions(trajectory.T_wc[:, :3, :3])
-    rows = np.column_stack([trajectory.T_wc[:, :3, 3], xyzw[:, 3], xyzw[:, :3]])
+    quaternions = Rotation.from_matrix(trajectory.T_wc[:, :3, :3]).as_quat(canonical=True)
+    rows = np.column_stack([trajectory.T_wc[:, :3, 3], quaternions[:, 3], quaternions[:, :3]])
     for seconds, row in zip(trajectory.timestamps.tolist(), rows.tolist(), strict=True):
         lines.append(",".join([str(round(seconds * 1e9)), *(f"{x:.12f}" for x in row)]) + "\n")
     path.write_text("".join(lines))

@@ -112,6 +112,7 @@ def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4  # what it says of damaged files is in the exception, too
     options.enable_mem_pattern = False  # it saves no time here, and takes 10 MB
+    options.enable_cpu_mem_arena = False  # activations are given back after each image
     try:
         given = model if isinstance(model, bytes) else model.read_bytes()
     except OSError as error:

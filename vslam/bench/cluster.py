@@ -33,11 +33,13 @@ def run_on_cluster(
     """
     try:
         from distributed import Client, Event, as_completed
+        from distributed.comm import resolve_address
     except ImportError as error:
         raise InputError(
             "--scheduler: dask is not installed; pip install 'vslam[cluster]'."
         ) from error
     try:
+        resolve_address(scheduler)  # a client of no address would not close without a traceback
         client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(

@@ -94,8 +94,23 @@ def read_document(path: Path) -> Document:
 
     try:
         text = path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: the calibration is missing or no text; name another.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: the calibration is no text; name the file with the cameras' numbers."
+        ) from error
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: the calibration is missing; name another file.") from error
+    except OSError as error:
+        raise InputError(
+            f"{path}: the calibration cannot be read ({error.strerror}); name another."
+        ) from error
+    if not text.strip():
+        raise InputError(f"{path}: the calibration is empty; name another.")
+    if text.lstrip("\ufeff \n").startswith("<?xml"):
+        raise InputError(
+            f"{path}: the calibration is XML, which is not read; write it with a name that ends in "
+            ".yml (cv2.FileStorage then writes YAML)."
+        )
     text = _NO_SPACE.sub(r"\1: ", _HEADER.sub("", text))
     try:
         values = yaml.load(text, yaml.BaseLoader)

@@ -32,6 +32,7 @@ _FORMATS: tuple[tuple[set[str], _Reader, int], ...] = (
     ({"camera_matrix"}, read_opencv, 1),
     ({"M1"}, read_opencv, 2),
     ({"K1"}, read_opencv, 2),
+    ({"cameraMatrix1"}, read_opencv, 2),
 )
 _PAIRS = (  # in a folder
     ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml"),
@@ -65,9 +66,11 @@ def read_calibration(files: Sequence[Path], size: Size | None = None) -> Calibra
                     f"{'one' if most == 1 else 'at most two'}."
                 )
             return reader(documents, size)
+    there = ", ".join(" ".join(key.split())[:20] for key in sorted(documents[0].values)[:6])
     raise InputError(
-        f"{paths[0]}: no known calibration; it must be vslam's own (docs/cameras.md), Kalibr's "
-        "camchain, OpenCV's, EuRoC's sensor.yaml, ROS's camera_info or settings of ORB-SLAM."
+        f"{paths[0]}: no known calibration (it has the keys {there}); it must be vslam's own "
+        "(docs/cameras.md), Kalibr's camchain, OpenCV's, EuRoC's sensor.yaml, "
+        "ROS's camera_info or settings of ORB-SLAM."
     )
 
 

@@ -35,6 +35,7 @@ _LENSES: dict[str, Lens] = {
 }
 _OWN_KEYS = {"left", "right", "T_left_right", "baseline", "depth_scale", "virtual_baseline"}
 _OWN_CAMERA_KEYS = {"lens", "size", "focal", "centre", "distortion"}
+_OFF_CENTRE = 0.2  # of the size: at half the resolution it is 0.5, at twice 0.25
 _ROUNDED = 1e-3  # rotations in files are rounded
 
 
@@ -119,18 +120,17 @@ def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
 
 def read_opencv(documents: Sequence[Document], size: Size | None) -> Calibration:
     """What OpenCV's samples write by ``FileStorage``: ``camera_matrix``, or ``M1 D1 M2 D2 R T`` in
-    one file or two."""
+    one file or two; for M also K, or the names of its manual, ``cameraMatrix1 distCoeffs1``."""
     source = _sources(documents)
     document = Document(source, {k: v for each in documents for k, v in each.values.items()})
     lens: Lens = "fisheye" if _flag(document, "fisheye_model") else "pinhole"
     if "camera_matrix" in document:
         names = ("camera_matrix", "distortion_coefficients")
         return Calibration(_matrix_camera(document, source, *names, lens, size), source=source)
+    kinds = (("M", "D"), ("K", "D"), ("cameraMatrix", "distCoeffs"))
+    matrix, distortion = next((kind for kind in kinds if kind[0] + "1" in document), kinds[0])
     left, right = (
-        _matrix_camera(
-            document, source, ("K" if f"K{n}" in document else "M") + n, "D" + n, lens, size
-        )
-        for n in "12"
+        _matrix_camera(document, source, matrix + n, distortion + n, lens, size) for n in "12"
     )
     T_right_left = _rigid(document.matrix("R", 3, 3), np.array(document.numbers("T", 3)))
     return _pair(source, left, right, _inverse(T_right_left))
@@ -210,6 +210,12 @@ def _matrix_camera(
     numbers = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     if "image_width" in document or size is None:
         size = int(document.number("image_width")), int(document.number("image_height"))
+    elif max(abs(c / n - 0.5) for c, n in zip(numbers[2:], size, strict=True)) > _OFF_CENTRE:
+        raise InputError(
+            f"{source}: the principal point ({numbers[2]:.1f}, {numbers[3]:.1f}) is far from the "
+            f"centre of the {size[0]}x{size[1]} images; take the calibration of these images, of "
+            "their resolution and not turned, or add image_width and image_height if it is theirs."
+        )
     return _camera(source, lens, tuple(map(float, numbers)), document.numbers(D), size)
 
 

@@ -25,6 +25,7 @@ Pixels = TypeVar("Pixels", bound=NDArray[np.generic])
 # At 60 degrees off the axis a pinhole image is four times as long as at its centre: what a wider
 # fisheye image shows there would be blown up, and its centre shrunk.
 _MAX_HALF_VIEW = np.tan(np.radians(60.0))
+_FARTHEST_M = 20.0  # that one camera of a pair stands from the other
 _SAME = 1e-5  # radians; with focal lengths below 2000 px, rows are true to 0.02 px
 _SAME_PX = 1e-3
 
@@ -130,6 +131,12 @@ def _between(R_left_right: Array, centre: Array, source: str) -> Array:
     if baseline < 1e-6:
         raise InputError(
             f"{source}: the baseline is 0 m; give the translation between the cameras in metres."
+        )
+    if baseline > _FARTHEST_M:
+        raise InputError(
+            f"{source}: the cameras stand {baseline:.4g} m apart, as if a length in millimetres or "
+            "centimetres were in the file; write the translation between them in metres (a "
+            "checkerboard calibration has the unit of the squares)."
         )
     x = centre / baseline
     across = float(half[:, 0] @ x)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -112,9 +113,7 @@ def bench(
     from vslam.bench.grid import make_grid, parse_perturbations
     from vslam.bench.table import GridProgress, shown_live
     from vslam.cli.progress import announce
-    from vslam.config import Config, load_config
     from vslam.loopclosure.registry import parse_weights, require_detector
-    from vslam.machine import available_cores
 
     files = parse_weights(weights or [], chosen)
     for name in chosen or [""]:
@@ -130,15 +129,11 @@ def bench(
         None if depth is None else depth.absolute(),
         fps, side_by_side, topics, depth_scale,
     )  # fmt: skip
-    thresholds = Config() if config is None else load_config(config)
-    options = execute.RunOptions(
-        data=root if kind != "synthetic" else None,
-        config=thresholds.model_dump_json(indent=2) + "\n",  # as a run writes it
-        threads=threads or max(1, min(available_cores() // jobs, 4)),
-        scratch=None if scheduler else execute.scratch_folder(out.absolute()),
+    out = out.absolute()
+    options = replace(
+        cell_options(kind, root, config, threads, jobs, scheduler, out),
         source=tuple(_words_of(given)),
     )
-    out = out.absolute()
     frames, identity = open_all(kind, root, seqs, given, max_frames, sensor, shown=not quiet)
     cells = make_grid(
         kind, frames, laws, chosen, runs, max_frames, files,
@@ -179,6 +174,29 @@ def bench(
         typer.echo(f"{'stopped: ' if stopped else ''}{counts}{again}")
     if stopped or progress.failed:
         raise typer.Exit(1)
+
+
+def cell_options(
+    kind: str,
+    root: Path,
+    config: Path | None,
+    threads: int | None,
+    jobs: int,
+    scheduler: str | None,
+    out: Path,
+) -> RunOptions:
+    """What is the same for all cells of a data set below ``root``, by the options of a command."""
+    from vslam.bench.execute import RunOptions, scratch_folder
+    from vslam.config import Config, load_config
+    from vslam.machine import available_cores
+
+    thresholds = Config() if config is None else load_config(config)
+    return RunOptions(
+        data=root if kind != "synthetic" else None,
+        config=thresholds.model_dump_json(indent=2) + "\n",  # as a run writes it
+        threads=threads or max(1, min(available_cores() // jobs, 4)),
+        scratch=None if scheduler else scratch_folder(out),
+    )
 
 
 def _words_of(options: SourceOptions) -> list[str]:

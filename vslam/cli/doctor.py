@@ -87,6 +87,7 @@ def doctor(
         typer.echo(f"{finding.verdict:<8} {finding.check:<16} {finding.measured}")
         if finding.fix:
             typer.echo(f"{'':<8} {'':<16} fix: {finding.fix}")
-    typer.echo(f"{out}: {len(diagnosis.faults)} faults")
+    n = len(diagnosis.faults)
+    typer.echo(f"{out}: {n or 'no'} fault{'' if n == 1 else 's'}")
     if diagnosis.faults:
         raise typer.Exit(1)

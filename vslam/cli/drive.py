@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Literal, cast
 
 import typer
@@ -12,7 +13,13 @@ import typer
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
+    from vslam.datasets.perturbation import Perturbation
+    from vslam.datasets.sequence import Sequence
+    from vslam.datasets.stream import Stream
+    from vslam.run.autosave import Unfinished
     from vslam.run.options import RunOptions
+    from vslam.run.outcome import RunSettings
+    from vslam.run.recorder import Recorder, Viewer
 
 
 @dataclass(frozen=True)
@@ -40,130 +47,163 @@ def drive(
         out: where to make the folder of the run.
         resume: the folder of the run to go on with instead.
     """
+    shown = not output.quiet
+    console = _console(shown=shown)
+    kind, source, perturbation = _open(options, shown=shown)
+    _refuse_camera(source, resume, compare_loops=compare_loops)
+
+    # Bad input has been refused by now; what follows takes a second to import.
+    from vslam.cli.summary import print_summary
+    from vslam.datasets.stream import count_expected
+    from vslam.report.folder import write_results
+    from vslam.run.autosave import FolderAutosave, remove_autosave
+    from vslam.run.moments import MomentRecorder
+    from vslam.run.options import settings_of
+    from vslam.run.pipeline import begin, run_sequence, with_comparison
+
+    settings = settings_of(options, kind, source, perturbation.name)
     with ExitStack() as lock:
-        _drive(options, output, out, resume, lock, compare_loops=compare_loops)
+        unfinished = _unfinished(options, source, resume, lock)
+        _compile(settings, shown=shown)
+        slam = begin(source.camera, settings, None if unfinished is None else unfinished.map)
+        viewer = _viewer(output)
+        folder = resume or _new_folder(options, settings, out, lock)
+        moments = MomentRecorder()
+        recorder = _recorder(folder, output, unfinished, viewer, moments)
+        # When only localising there is nothing to save but the poses.
+        period = 0.0 if options.localize else options.autosave
+        autosave = FolderAutosave(folder, period, f"{settings.dataset} {source.name}")
+        with console.progress_bar(count_expected(source), shown=shown) as on_frame:
+            outcome = run_sequence(
+                source, perturbation, settings, recorder,
+                on_frame=on_frame, autosave=autosave, resume=unfinished, slam=slam,
+            )  # fmt: skip
+        if compare_loops and not outcome.interrupted:
+            with console.progress_bar(count_expected(source), shown=shown) as on_frame:
+                outcome = with_comparison(outcome, perturbation, on_frame=on_frame)
+        report = write_results(
+            folder, outcome, moments.moments,
+            pages=output.pages, ply=output.ply, map_file=options.save_map,
+        )  # fmt: skip
+        if not outcome.interrupted:
+            remove_autosave(folder)
+    if shown:
+        print_summary(report, folder)
+    if outcome.interrupted:
+        raise typer.Exit(1)
 
 
-def _drive(
-    options: RunOptions,
-    output: Output,
-    out: Path,
-    resume: Path | None,
-    lock: ExitStack,
-    *,
-    compare_loops: bool,
-) -> None:
+def _console(*, shown: bool) -> ModuleType:
+    """What tells how far a run is; where nothing is shown, without what takes time to import."""
+    if shown:
+        from vslam.cli import progress as console
+    else:
+        from vslam.cli import quiet as console
+    return console
+
+
+def _open(options: RunOptions, *, shown: bool) -> tuple[str, Sequence | Stream, Perturbation]:
+    """The images and what is done to them. Refuses laws that the data cannot serve."""
     from vslam.cli.options import SourceName, kind_of_source, source_options
     from vslam.datasets.perturbation import parse_perturbation
     from vslam.datasets.sources import open_source
-    from vslam.datasets.stream import count_expected, is_live
 
-    o, shown = options, not output.quiet
-    if shown:
-        from vslam.cli.progress import announce, progress_bar, render_bar
-    else:
-        from vslam.cli.quiet import announce, progress_bar, render_bar
+    o = options
     kind = kind_of_source(cast("SourceName | None", o.dataset), o.data)
     perturbation = parse_perturbation(o.perturb, o.seed)
     of_source = source_options(
         list(o.calib), o.right, o.depth, o.fps, o.side_by_side, o.topics, o.depth_scale
     )
-    with render_bar(shown=shown) as on_render:
+    with _console(shown=shown).render_bar(shown=shown) as on_render:
         source = open_source(
             kind, o.data, o.seq, of_source,
             start=o.start, every=o.every, max_frames=o.max_frames, sensor=o.sensor,
             on_render=on_render,
         )  # fmt: skip
-    perturbation.bound_to(source)  # refuses laws that the data cannot serve
-    if is_live(source):
-        if compare_loops:
-            raise InputError("--compare-loops: a camera cannot be seen twice; leave it out.")
-        if resume is not None:
-            raise InputError(
-                f"--resume {resume}: what a camera has shown is gone; go on in its map with "
-                "--map FOLDER/autosave.npz."
-            )
+    perturbation.bound_to(source)
+    return kind, source, perturbation
 
-    # Bad input has been refused by now; what follows takes a second to import.
-    from vslam.cli.summary import print_summary
-    from vslam.report.folder import create_run_folder, write_results
-    from vslam.run.autosave import FolderAutosave, find_unfinished, lock_run, remove_autosave
-    from vslam.run.moments import MomentRecorder
-    from vslam.run.options import write_options
-    from vslam.run.outcome import RunSettings
-    from vslam.run.pipeline import require_camera, run_sequence, with_comparison
-    from vslam.run.recorder import (
-        NullRecorder,
-        Recorder,
-        RerunRecorder,
-        SeveralRecorders,
-        open_viewer,
-    )
+
+def _refuse_camera(source: Sequence | Stream, resume: Path | None, *, compare_loops: bool) -> None:
+    """What a camera has shown is gone."""
+    from vslam.datasets.stream import is_live
+
+    if is_live(source) and compare_loops:
+        raise InputError("--compare-loops: a camera cannot be seen twice; leave it out.")
+    if is_live(source) and resume is not None:
+        raise InputError(
+            f"--resume {resume}: what a camera has shown is gone; go on in its map with "
+            "--map FOLDER/autosave.npz."
+        )
+
+
+def _unfinished(
+    options: RunOptions, source: Sequence | Stream, resume: Path | None, lock: ExitStack
+) -> Unfinished | None:
+    """What to go on from, of a run that is resumed. Refuses images of another camera than that of
+    the map to go on in."""
+    from vslam.run.autosave import find_unfinished, lock_run
+    from vslam.run.pipeline import require_camera
+
+    if resume is None:
+        if options.map_file is not None:
+            require_camera(options.map_file, source.camera)
+        return None
+    lock.enter_context(lock_run(resume))
+    unfinished = find_unfinished(resume)
+    require_camera(unfinished.map, source.camera)
+    return unfinished
+
+
+def _viewer(output: Output) -> Viewer | None:
+    if output.view is None:
+        return None
+    from vslam.run.recorder import open_viewer
+
+    viewer = open_viewer(output.view)
+    if viewer.address:
+        shown = not output.quiet
+        _console(shown=shown).announce(f"live at {viewer.address}", shown=shown)
+    return viewer
+
+
+def _compile(settings: RunSettings, *, shown: bool) -> None:
     from vslam.run.warmup import compile_kernels, is_cold
 
-    settings = RunSettings(
-        dataset=kind,
-        sequence=source.name,
-        perturb=perturbation.name,
-        detector=o.detector,
-        sensor=source.camera.sensor,
-        seed=o.seed,
-        threads=o.threads,
-        start=o.start,
-        every=o.every,
-        max_frames=o.max_frames,
-        config=o.thresholds,
-        weights=o.weights,
-        realtime=o.realtime or is_live(source),
-        calib=o.calib,
-        map=o.map_file,
-        localize=o.localize,
-    )
-    if o.map_file is not None and resume is None:
-        require_camera(o.map_file, source.camera)
-    unfinished = None
-    if resume is not None:
-        lock.enter_context(lock_run(resume))
-        unfinished = find_unfinished(resume)
-        require_camera(unfinished.map, source.camera)
-    viewer = None if output.view is None else open_viewer(output.view)
-    recording = "recording.rrd"
-    if resume is None or unfinished is None:
-        folder = create_run_folder(out, kind, source.name, perturbation.name, o.detector)
-        lock.enter_context(lock_run(folder))
-        write_options(folder, o)
-    else:
-        folder = resume
-        recording = f"recording-from-{len(unfinished.progress.tracks)}.rrd"
-    recorder: Recorder = RerunRecorder(folder / recording) if output.record else NullRecorder()
-    moments = MomentRecorder()
+    if is_cold():
+        message = "first run: compiling the kernels, less than a minute ..."
+        _console(shown=shown).announce(message, shown=shown)
+    compile_kernels(processes=min(settings.threads, 2), load=settings.realtime)
+
+
+def _new_folder(options: RunOptions, settings: RunSettings, out: Path, lock: ExitStack) -> Path:
+    from vslam.report.folder import create_run_folder
+    from vslam.run.autosave import lock_run
+    from vslam.run.options import write_options
+
+    s = settings
+    folder = create_run_folder(out, s.dataset, s.sequence, s.perturb, s.detector)
+    lock.enter_context(lock_run(folder))
+    write_options(folder, options)
+    return folder
+
+
+def _recorder(
+    folder: Path,
+    output: Output,
+    unfinished: Unfinished | None,
+    viewer: Viewer | None,
+    moments: Recorder,
+) -> Recorder:
+    """All that is to be told of the run: a file, ``moments`` for the report, and a viewer."""
+    from vslam.run.recorder import NullRecorder, RerunRecorder, SeveralRecorders
+
+    name = "recording.rrd"
+    if unfinished is not None:
+        name = f"recording-from-{len(unfinished.progress.tracks)}.rrd"
+    recorder: Recorder = RerunRecorder(folder / name) if output.record else NullRecorder()
     if output.pages:
         recorder = SeveralRecorders((recorder, moments))
     if viewer is not None:
         recorder = SeveralRecorders((recorder, RerunRecorder(viewer)))
-        if viewer.address:
-            announce(f"live at {viewer.address}", shown=shown)
-    if is_cold():
-        announce("first run: compiling the kernels, less than a minute ...", shown=shown)
-    compile_kernels(processes=min(settings.threads, 2), load=settings.realtime)
-    # When only localising there is nothing to save but the poses.
-    autosave = FolderAutosave(
-        folder, 0.0 if o.localize else o.autosave, f"{settings.dataset} {source.name}"
-    )
-    with progress_bar(count_expected(source), shown=shown) as on_frame:
-        outcome = run_sequence(
-            source, perturbation, settings, recorder,
-            on_frame=on_frame, autosave=autosave, resume=unfinished,
-        )  # fmt: skip
-    if compare_loops and not outcome.interrupted:
-        with progress_bar(count_expected(source), shown=shown) as on_frame:
-            outcome = with_comparison(outcome, perturbation, on_frame=on_frame)
-    report = write_results(
-        folder, outcome, moments.moments, pages=output.pages, ply=output.ply, map_file=o.save_map
-    )
-    if not outcome.interrupted:
-        remove_autosave(folder)
-    if shown:
-        print_summary(report, folder)
-    if outcome.interrupted:
-        raise typer.Exit(1)
+    return recorder

@@ -84,7 +84,20 @@ def _contents(map_: Map, reconstruction: Reconstruction) -> Rows:
         ("observations", observations),
         ("extent", ", ".join(_extent(r.T_wc))),
         ("length", f"{path:.1f} {unit} in {np.ptp(r.timestamps):.1f} s"),
+        *_weakest_place(map_),
     ]
+
+
+def _weakest_place(map_: Map) -> Rows:
+    """Where the fewest landmarks hold the map together."""
+    from vslam.backend.pose_graph import held_by
+
+    living = map_.living_keyframes()[1:]
+    if not len(living):
+        return []
+    held = held_by(map_)[living]
+    at = int(held.argmin())
+    return [("weakest place", f"frame {map_.frames[living[at]]}, held by {held[at]} landmarks")]
 
 
 def _extent(T_wc: NDArray[np.float64]) -> list[str]:

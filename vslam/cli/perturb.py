@@ -56,7 +56,7 @@ def preview(
     sequence = open_sequence(dataset, data, seq, start=start, every=every, max_frames=max_frames)
     if perturb == "all":
         fit, unfit = laws_for(sequence)
-        for why in unfit:
+        for why in unfit.values():
             typer.echo(f"left out: {why}", err=True)
         shown = [min(10, len(sequence) - 1)]
         specs = [f"{law}:{law_kind(law).default:g}" for law in fit]

@@ -47,7 +47,7 @@ _EXAMPLES = """
 
   vslam run --resume runs/20261123-101500-kitti-00-none-bow
 
-  vslam run --data drive.mp4 --side-by-side --calib stereo.yaml
+  vslam run drive.mp4 --side-by-side --calib stereo.yaml
 
   vslam run --data ~/kitti --seq 00 --map runs/latest --localize
 """
@@ -60,6 +60,9 @@ def register(app: typer.Typer) -> None:
 
 def run(
     context: typer.Context,
+    source: Annotated[
+        str | None, typer.Argument(help="What to run on; the same as --data.", show_default=False)
+    ] = None,
     data: Source = str(KITTI_ROOT),
     dataset: SourceKind = None,
     seq: Seq = None,
@@ -155,6 +158,11 @@ def run(
 
         drive(read_options(resume), output, resume=resume)
         return
+    if source is not None:
+        given = context.get_parameter_source("data")
+        if given is not None and given.name == "COMMANDLINE":
+            raise InputError(f"{source}: --data says what to run on, too; leave one of them out.")
+        data = source
     if localize and map_file is None:
         raise InputError("--localize: name the map to localise in with --map.")
     if localize and save_map is not None:

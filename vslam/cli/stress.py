@@ -5,12 +5,13 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Collection, Generator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from vslam.cli.bench import open_all, outcomes_of
+from vslam.cli.bench import cell_options, open_all, outcomes_of
 from vslam.cli.options import KITTI_ROOT, Data, Dataset, MaxFrames, Sensor, Thresholds, names_in
 from vslam.errors import InputError
 
@@ -107,11 +108,9 @@ def stress(
     from vslam.bench import execute
     from vslam.bench.grid import parse_sequences
     from vslam.cli.progress import announce
-    from vslam.config import Config, load_config
     from vslam.datasets import open_sequence
     from vslam.datasets.sources import SourceOptions
     from vslam.loopclosure.registry import require_detector
-    from vslam.machine import available_cores
     from vslam.stress.criterion import Criterion
     from vslam.stress.plan import Plan, parse_laws
     from vslam.stress.report import render_boundaries, write_report
@@ -131,13 +130,9 @@ def stress(
         raise InputError(f"--baseline {baseline}: not tested; choose from {', '.join(names)}.")
     if sensor == "mono" and others:
         raise InputError("--sensor mono: of vslam alone; other systems get both sides.")
-    thresholds = Config() if config is None else load_config(config)
     out = out.absolute()
-    options = execute.RunOptions(
-        data=data.absolute() if dataset != "synthetic" else None,
-        config=thresholds.model_dump_json(indent=2) + "\n",
-        threads=threads or max(1, min(available_cores() // jobs, 4)),
-        scratch=None if scheduler else execute.scratch_folder(out),
+    options = replace(
+        cell_options(dataset, data.absolute(), config, threads, jobs, scheduler, out),
         others={name: _program(name, command) for name, command in others.items()},
     )
     _, identity = open_all(
@@ -204,24 +199,16 @@ def foreign(
     from vslam.datasets import open_sequence
     from vslam.datasets.perturbation import parse_perturbation
     from vslam.report.folder import create_run_folder
-    from vslam.run.outcome import RunSettings
+    from vslam.run.options import RunOptions, settings_of
     from vslam.stress.external import run_external
 
+    options = RunOptions(
+        data=str(data), dataset=dataset, seq=seq, perturb=perturb, seed=seed, threads=threads,
+        max_frames=max_frames, detector=name, thresholds=load_config(config),
+    )  # fmt: skip
     sequence = open_sequence(dataset, data, seq, max_frames=max_frames)
     perturbation = parse_perturbation(perturb, seed)
-    settings = RunSettings(
-        dataset=dataset,
-        sequence=seq,
-        perturb=perturbation.name,
-        detector=name,
-        sensor=sequence.camera.sensor,
-        seed=seed,
-        threads=threads,
-        start=0,
-        every=1,
-        max_frames=max_frames,
-        config=load_config(config),
-    )
+    settings = settings_of(options, dataset, sequence, perturbation.name)
     folder = create_run_folder(out, dataset, seq, perturbation.name, name)
     run_external(sequence, perturbation, settings, template, folder)
 
@@ -269,7 +256,7 @@ def _fitting(laws: list[str], opened: Mapping[str, Sequence]) -> tuple[list[str]
     notes: dict[str, None] = {}
     for sequence in opened.values():
         fit, unfit = laws_for(sequence)
-        notes |= {why: None for why in unfit if why.split()[1].rstrip(":") in laws}
+        notes |= {why: None for law, why in unfit.items() if law in laws}
         laws = [law for law in laws if law in fit]
     if not laws:
         raise InputError(f"--laws: none of them can be tested here. {next(iter(notes))}")

@@ -77,8 +77,9 @@ def in_map_rows(report: ReportJson) -> Rows:
         return []
     fix = "never" if found.first_fix_s is None else f"after {found.first_fix_s:.2f} s"
     error = "" if found.error_m is None else f", {found.error_m:.3f} m off by its alignment"
+    weak = f" ({found.weak_percent:.1f} % by few inliers)" if found.weak_percent else ""
     return [
-        ("in the map", f"{found.in_map_percent:.1f} % of the frames{error}"),
+        ("in the map", f"{found.in_map_percent:.1f} % of the frames{weak}{error}"),
         (
             "found in it",
             f"first {fix}; {found.found} of the {found.sought} times it was looked for",

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from vslam import plugins
 from vslam.datasets.sequence import Sequence
+from vslam.datasets.stream import Stream
 from vslam.errors import InputError
 
 _FIRST = "00"  # KITTI's, and the town rendered after it
@@ -97,6 +98,34 @@ def open_sequence(
             monocular=monocular,
             on_frame=on_render,
         )
+    source = open_plugin_source(
+        dataset, root, name, start=start, every=every, max_frames=max_frames, monocular=monocular,
+        calib=calib,
+    )  # fmt: skip
+    if isinstance(source, Stream):
+        raise InputError(
+            f"--dataset {dataset}: a stream, whose length nobody knows, which only 'vslam run', "
+            "'vslam doctor' and 'vslam bench' read."
+        )
+    return source
+
+
+def open_plugin_source(
+    dataset: str,
+    root: Path,
+    name: str | None,
+    *,
+    start: int,
+    every: int,
+    max_frames: int | None,
+    monocular: bool,
+    calib: Several[Path],
+) -> Sequence | Stream:
+    """What a reader of another package opens.
+
+    Raises:
+        InputError: unknown data set, a broken package, or bad input as the reader says.
+    """
     others = plugins.find_plugins(plugins.READERS)
     if dataset not in others:
         known = ", ".join((*DATASETS, *others))

@@ -5,7 +5,7 @@ headers. Images of two topics belong together when their stamps lie within 5 ms,
 depth within 20 ms, and none is nearer; others are left out. Where the bag holds the
 ``camera_info`` of its image topics, that is their calibration.
 
-One file because it is the only one that imports rosbags.
+One file because it is the only one that knows rosbags' readers.
 """
 
 from __future__ import annotations
@@ -196,10 +196,13 @@ def _opened(path: Path) -> Iterator[Bag]:
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
+
+        from vslam.datasets.bag_limits import limit_bags
     except ImportError as error:
         raise InputError(
             f"{path}: bags are read by rosbags, which is not installed; pip install 'vslam[bag]'."
         ) from error
+    limit_bags()
     try:
         bag = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
         bag.open()

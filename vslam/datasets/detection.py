@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from vslam.datasets.euroc import is_euroc
@@ -12,6 +13,8 @@ from vslam.datasets.image_folders import has_images
 from vslam.errors import InputError
 
 _BAG_SUFFIXES = {".bag", ".mcap", ".db3"}
+_TEXTS = {".txt", ".csv", ".yaml", ".yml", ".json", ".md", ".py", ".html"}
+_ARCHIVES = {".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".7z", ".rar"}
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 
 
@@ -42,7 +45,7 @@ _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
         f"a file {', '.join(sorted(_BAG_SUFFIXES))} or metadata.yaml",
         lambda path: path.suffix.lower() in _BAG_SUFFIXES or (path / "metadata.yaml").is_file(),
     ),
-    ("images", "images, in it or in left/ and right/", has_images),
+    ("images", "images (png, jpg, ...), in it or in left/ and right/", has_images),
     ("video", "any other file, as a video", Path.is_file),
 )
 
@@ -58,15 +61,22 @@ def detect_dataset(data: str) -> str:
     path = Path(data)
     if path.is_file() and is_image(path):
         raise InputError(f"{data}: one image; name the folder that it is in with --data.")
+    if path.is_file() and path.suffix.lower() in _ARCHIVES:
+        raise InputError(f"{data}: an archive; unpack it and name the folder with --data.")
+    if path.is_file() and path.suffix.lower() in _TEXTS:
+        raise InputError(
+            f"{data}: no images; name the folder or video that holds them with --data."
+        )
     if path.is_dir() and not any(path.iterdir()):
         raise InputError(f"{data}: the folder is empty; name another one with --data.")
     if path.exists():
-        for kind, _, holds in _KINDS:
-            if holds(path):
-                return kind
+        kind = _kind_of(path)
+        if kind is not None:
+            return kind
         looked = "; ".join(f"{what} ({kind})" for kind, what, _ in _KINDS)
         raise InputError(
-            f"{data}: no data set that is known; name its kind with --dataset; looked for {looked}."
+            f"{data}: no data set that is known{_nearest(path)}; name its kind with --dataset; "
+            f"looked for {looked}."
         )
     if data.isdecimal():
         return "camera"
@@ -74,3 +84,18 @@ def detect_dataset(data: str) -> str:
         f"{data}: no such file or folder; name with --data a data set, a folder of images, a "
         "video, a bag, the number of a camera or a URL."
     )
+
+
+def _kind_of(path: Path) -> str | None:
+    return next((kind for kind, _, holds in _KINDS if holds(path)), None)
+
+
+def _nearest(path: Path) -> str:
+    """Where somebody may be a level too high or too low."""
+    if path.resolve().name == "sequences":
+        return f", but {path.resolve().parent} looks like KITTI's (name that)"
+    for inside in sorted(path.glob("*")):
+        with suppress(OSError):  # a folder of somebody else's
+            if inside.is_dir() and (kind := _kind_of(inside)) is not None:
+                return f", but {inside} is one of {kind} (name that)"
+    return ""

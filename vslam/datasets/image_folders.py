@@ -38,6 +38,7 @@ PAIRS = (
     ("cam0/data", "cam1/data"),
 )
 DEPTH_PAIRS = (("rgb", "depth"), ("color", "depth"), ("colour", "depth"), ("image", "depth"))
+_SLOWEST_S = 10.0  # between images: nothing could be tracked
 _NEAR_S = 0.02  # as TUM's associate.py
 _TIME_FILES = ("times.txt", "timestamps.txt")
 _EXIF = 0x8769  # tags of EXIF 2.32
@@ -164,10 +165,23 @@ def _find_sides(
             else ("that of the right ones with --right")
         )
         raise InputError(
-            f"{folder}: images of a pair are looked for in {pairs}; name the folder of the first "
-            f"ones with --data and {option}, or run with --sensor mono."
+            f"{folder}: images of a pair are looked for in {pairs}{_near_miss(folder)}; name the "
+            f"folder of the first ones with --data and {option}, or run with --sensor mono."
         )
     return [folder], False
+
+
+def _near_miss(folder: Path) -> str:
+    """What somebody may have overlooked who names one side of a pair, or has only one."""
+    above = folder.resolve().parent
+    for names in PAIRS + DEPTH_PAIRS:
+        if all(list_images(above / name) for name in names) and folder.resolve().name in names:
+            return f", and {above} has both (name that with --data)"
+        sides = [bool(list_images(folder / name)) for name in names]
+        if any(sides):
+            there, missing = names if sides[0] else names[::-1]
+            return f", but only {there} has images, {missing} has none"
+    return ""
 
 
 def _sorted_images(folder: Path) -> dict[str, Path]:
@@ -243,6 +257,11 @@ def _times_of_file(path: Path, n: int) -> NDArray[np.float64]:
     times = read_table(path, (1,), "a time in seconds")[:, 0]
     if len(times) != n:
         raise InputError(f"{path}: {len(times)} times for {n} images; write one a line for each.")
+    if n > 1 and (interval := float(np.median(np.diff(times)))) > _SLOWEST_S:
+        raise InputError(
+            f"{path}: {interval:g} s from image to image, as if the times were in milliseconds or "
+            "nanoseconds; write seconds, or give --fps."
+        )
     return times
 
 

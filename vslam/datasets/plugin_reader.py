@@ -1,8 +1,11 @@
-"""Sequences that a reader of another package opens, checked as vslam's own are."""
+"""Sequences and streams that a reader of another package opens, checked as vslam's own are."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +15,8 @@ from numpy.typing import NDArray
 from vslam.camera import Camera, DepthImage, Image, ImageMap
 from vslam.datasets.image_files import select_frames
 from vslam.datasets.sequence import Sequence
-from vslam.errors import InputError, UnreadableImageError
+from vslam.datasets.stream import Stream, TimedFrame, increasing
+from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 from vslam.plugins import PlugIn, reason
 
 
@@ -57,19 +61,92 @@ class PlugInSequence:
     ) -> tuple[Image, Image | DepthImage | None]:
         """See `Sequence.read`; whatever fails in the package costs this frame alone."""
         number = int(self.frames[index])
-        try:
-            left, second = self.raw.read(number, image_map)
-        except UnreadableImageError:
-            raise
-        except Exception as error:  # a package of other people raises what it likes
-            raise UnreadableImageError(
-                self.root, f"{self.plugin} failed at frame {number} ({reason(error)})."
-            ) from error
-        second = None if self.camera.monocular else second
-        wrong = _wrong_images(left, second, self.camera)
-        if wrong:
-            raise UnreadableImageError(self.root, f"{self.plugin} gave {wrong} at frame {number}.")
-        return left, second
+        read = partial(self.raw.read, number)
+        return _read(self.plugin, self.root, self.camera, read, f"frame {number}", image_map)
+
+
+@dataclass(frozen=True)
+class PlugInStream:
+    """The selected frames of a stream that a package has opened; see `Stream`."""
+
+    plugin: PlugIn
+    root: Path
+    raw: Stream
+    camera: Camera
+    start: int
+    every: int
+    max_frames: int | None
+
+    @property
+    def dataset(self) -> str:
+        return self.plugin.name
+
+    @property
+    def name(self) -> str:
+        return str(self.raw.name)
+
+    @property
+    def live(self) -> bool:
+        return bool(self.raw.live)
+
+    @property
+    def n_expected(self) -> int | None:
+        whole = self.raw.n_expected
+        if whole is None:
+            return self.max_frames
+        n = len(range(self.start, int(whole), self.every))
+        return n if self.max_frames is None else min(n, self.max_frames)
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """See `Stream.frames`; where the package fails, the stream ends."""
+        stop = None if self.max_frames is None else self.start + self.every * self.max_frames
+        frame = None
+        for frame in islice(increasing(self._all(), self.name), self.start, stop, self.every):
+            at = f"{frame.timestamp:.3f} s"
+            read = partial(_read, self.plugin, self.root, self.camera, frame.read, at)
+            yield TimedFrame(frame.timestamp, read)
+        if frame is None:
+            raise InputError(
+                f"--start {self.start}: {self.name} has no frame there; choose a smaller one."
+            )
+
+    def _all(self) -> Iterator[TimedFrame]:
+        frames = self.plugin.guarded(self.raw.frames)
+        while True:
+            try:
+                frame = next(frames)
+                timestamp, read = float(frame.timestamp), frame.read
+            except StopIteration:
+                return
+            except (InputError, BrokenSourceError):
+                raise
+            except Exception as error:  # a package of other people raises what it likes
+                raise BrokenSourceError(f"{self.plugin} failed ({reason(error)}).") from error
+            if not np.isfinite(timestamp):
+                raise BrokenSourceError(f"{self.plugin} gave a frame of {timestamp} s.")
+            yield TimedFrame(timestamp, read)
+
+
+def _read(
+    plugin: PlugIn,
+    root: Path,
+    camera: Camera,
+    read: Callable[[ImageMap], tuple[Image, Image | DepthImage | None]],
+    at: str,
+    image_map: ImageMap,
+) -> tuple[Image, Image | DepthImage | None]:
+    """A frame as the package gives it, if it has the camera's size and type."""
+    try:
+        left, second = read(image_map)
+    except UnreadableImageError:
+        raise
+    except Exception as error:  # a package of other people raises what it likes
+        raise UnreadableImageError(root, f"{plugin} failed at {at} ({reason(error)}).") from error
+    second = None if camera.monocular else second
+    wrong = _wrong_images(left, second, camera)
+    if wrong:
+        raise UnreadableImageError(root, f"{plugin} gave {wrong} at {at}.")
+    return left, second
 
 
 def open_plugin(
@@ -81,17 +158,23 @@ def open_plugin(
     every: int,
     max_frames: int | None,
     monocular: bool,
-) -> PlugInSequence:
-    """Let the package open a sequence, and select frames of it.
+) -> PlugInSequence | PlugInStream:
+    """Let the package open a sequence or a stream, and select frames of it.
 
     Raises:
         InputError: as the reader says; the package is broken, or what it gives is no sequence.
         UnreadableImageError: the first frame cannot be read.
     """
     raw = plugin.call(root, name)
-    wrong = plugin.guarded(_wrong_sequence, raw)
+    streams = hasattr(raw, "frames") and not hasattr(raw, "read")
+    wrong = plugin.guarded(_wrong_stream if streams else _wrong_sequence, raw)
     if wrong:
         raise InputError(f"{plugin}: {wrong}; repair or uninstall the package.")
+    if streams:
+        if start < 0 or every < 1 or (max_frames is not None and max_frames < 1):
+            raise InputError("--start must be at least 0, --every and --max-frames at least 1.")
+        camera = raw.camera.left_camera() if monocular else raw.camera
+        return PlugInStream(plugin, root, raw, camera, start, every, max_frames)
     chosen = select_frames(root, len(raw), start, every, max_frames)
     camera = raw.camera.left_camera() if monocular else raw.camera
     sequence = PlugInSequence(plugin, root, raw, chosen, camera)
@@ -114,6 +197,19 @@ def _wrong_sequence(raw: Sequence) -> str:
     if truth is not None and np.shape(truth) != (n, 4, 4):
         return f"ground_truth is of shape {np.shape(truth)}, not ({n}, 4, 4)"
     return "" if n else "the sequence has no frame"
+
+
+def _wrong_stream(raw: Stream) -> str:
+    """What is wrong with a stream; empty if nothing is."""
+    for name in ("name", "camera", "live", "n_expected"):
+        if not hasattr(raw, name):
+            return f"{type(raw).__name__} has no {name}"
+    if not isinstance(raw.camera, Camera):
+        return f"camera is {type(raw.camera).__name__}, no vslam.camera.Camera"
+    n = raw.n_expected
+    return (
+        "" if n is None or (isinstance(n, int) and n > 0) else "n_expected is no number of frames"
+    )
 
 
 def _wrong_images(left: Image, second: Image | DepthImage | None, camera: Camera) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration
-from vslam.datasets import open_sequence
+from vslam.datasets import DATASETS, open_plugin_source, open_sequence
 from vslam.datasets.rectified import rectified
 from vslam.datasets.rectified_stream import rectified_stream
 from vslam.datasets.sequence import Sequence
@@ -83,6 +83,11 @@ def open_source(
     source: Sequence | Stream
     if dataset in SOURCES:
         source = _open_images(dataset, data, options, start, every, max_frames, sensor)
+    elif dataset not in DATASETS:
+        source = open_plugin_source(
+            dataset, Path(data), name, start=start, every=every, max_frames=max_frames,
+            monocular=monocular, calib=options.calibration,
+        )  # fmt: skip
     else:
         source = open_sequence(
             dataset, Path(data), name, start=start, every=every, max_frames=max_frames,
@@ -113,7 +118,7 @@ def _open_images(
             Path(data), options.right, depth=options.depth, fps=options.fps, start=start,
             every=every, max_frames=max_frames, sensor=sensor,
         )  # fmt: skip
-        calibration = _calibration(dataset, options, found.size)
+        calibration = _calibration(dataset, data, options, found.size)
         if not found.depth:
             return rectified(found.images(), calibration)
         raw = found.with_depth(options.depth_scale or calibration.depth_scale)
@@ -140,7 +145,7 @@ def _open_images(
         stream = open_camera(data, side_by_side=options.side_by_side, monocular=monocular)
     return rectified_stream(
         stream,
-        _calibration(dataset, options, stream.sizes[0], own),
+        _calibration(dataset, data, options, stream.sizes[0], own),
         start=start,
         every=every,
         max_frames=max_frames,
@@ -167,6 +172,7 @@ def _check_options(
 
 def _calibration(
     dataset: str,
+    data: str,
     options: SourceOptions,
     size: tuple[int, int],
     own: Calibration | None = None,
@@ -174,6 +180,13 @@ def _calibration(
     if options.calibration:
         return read_calibration(options.calibration, size)
     if own is None:
+        folder = Path(data).resolve()
+        if dataset == "images" and (folder / "calib.txt").is_file():
+            raise InputError(
+                f"{data}: a sequence of KITTI; name the folder that holds 'sequences' and the "
+                f"sequence in it, --data {folder.parent.parent} --seq {folder.name}, or a "
+                "calibration with --calib."
+            )
         where = " (nor camera_info in the bag)" if dataset == "bag" else ""
         raise InputError(
             f"--calib: no calibration{where}; name a file with the cameras' focal lengths, "

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.camera import Camera
 from vslam.config import OrbConfig
 from vslam.datasets.sequence import Image
 from vslam.doctor.findings import Finding, judge
@@ -44,6 +45,7 @@ DEPTH_AT_ZERO = 0.6
 DEPTH_SECOND = 0.8
 _ANOTHER_PX = 8.0  # what lies so far from the best is another peak
 DEPTH_VIEWS = 2  # that do not share half of what they show: one scene may fit elsewhere by chance
+NEAREST_M, FARTHEST_M = 0.01, 3.0  # that the cameras of a pair stand apart on what drives or flies
 _BORDER = 2  # px; a best so near the end of the search may lie behind it
 _REACH = 16, 48  # px that depth edges are looked for, down and across: sensors lie side by side
 
@@ -76,6 +78,34 @@ def check_sides(matches: Matches) -> Finding:
         "left and right are swapped, or the baseline has the wrong sign: exchange the cameras"
         if middle < 0
         else "many matches lie behind infinity: the cameras are turned outwards; calibrate again",
+    )
+
+
+def check_scale(camera: Camera, matches: Matches | None) -> Finding:
+    """What the calibration says of lengths and angles, for people to compare with what they see: no
+    image shows a wrong one. A baseline of another unit is told by its size.
+
+    Args:
+        matches: of the pair, None of a single camera or of one with depth.
+    """
+    angles = (
+        2 * np.degrees(np.arctan(size / (2 * focal)))
+        for size, focal in ((camera.width, camera.fx), (camera.height, camera.fy))
+    )
+    across, down = angles
+    measured = f"{camera.width}x{camera.height} pixels see {across:.0f} x {down:.0f} degrees"
+    if matches is None:
+        return Finding("scale", "good", measured)
+    disparity = matches.left[:, 0] - matches.right[:, 0]
+    measured += f"; baseline {camera.baseline:.3f} m"
+    if (disparity > 0).any():
+        middle = camera.fx * camera.baseline / float(np.median(disparity[disparity > 0]))
+        measured += f", half of the matches nearer than {middle:.3g} m"
+    return judge(
+        "scale",
+        not NEAREST_M <= camera.baseline <= FARTHEST_M,
+        measured,
+        "give the baseline in metres: a checkerboard calibration has the unit of the squares",
     )
 
 

@@ -71,12 +71,12 @@ def examine(sequence: Sequence, config: OrbConfig) -> Diagnosis:
     findings += checks.check_times(sequence.timestamps)
     seconds = [second for _, second in read.values() if second is not None]
     if not seconds:
-        return Diagnosis(findings)
+        return Diagnosis([*findings, checks.check_scale(sequence.camera, None)])
     if seconds[0].dtype == np.uint8:
         blind = any(f.check == "features" and f.verdict == "fault" for f in findings)
         found, pictures = _examine_stereo(sequence, lefts, blind=blind)
     else:
-        found = checks.check_depth(images, seconds)
+        found = [*checks.check_depth(images, seconds), checks.check_scale(sequence.camera, None)]
         pictures = [_depth_picture(images[0], seconds[0])]
     return Diagnosis(findings + found, pictures)
 
@@ -129,6 +129,7 @@ def _examine_stereo(
         synchronised,
         checks.check_rectification(matches),
         checks.check_sides(matches),
+        checks.check_scale(sequence.camera, matches),
         checks.check_exposure(
             [(pair.left, pair.right) for pair in pairs], [pair.matches for pair in pairs]
         ),

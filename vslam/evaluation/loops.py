@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.evaluation.nearby import near_pairs
 from vslam.evaluation.trajectories import path_length
 from vslam.geometry import inverses
 from vslam.loops import LoopEdge
@@ -247,6 +246,8 @@ def _earlier_passage(
     T_wc: Poses, timestamps: NDArray[np.float64], path: NDArray[np.float64], limits: LoopLimits
 ) -> Indices:
     """``(S,)`` for each sample the nearest one of an earlier passage, -1 without one."""
+    from scipy.spatial import cKDTree
+
     position, axis = T_wc[:, :3, 3], T_wc[:, :3, 2]
     forward = np.diff(position, axis=0, append=position[-1:])  # to the next sample
     length = np.linalg.norm(forward, axis=1)
@@ -255,7 +256,8 @@ def _earlier_passage(
 
     # The nearest point of a step lies beside it, or at an end: no farther than this from its start.
     radius = float(np.hypot(limits.max_lateral_m, length.max()))
-    start, query = near_pairs(position, radius)
+    pairs = cKDTree(position).query_pairs(radius, output_type="ndarray")
+    start, query = pairs[:, 0], pairs[:, 1]
     kept = _long_ago(path, timestamps, query, start, limits)
     start, query = start[kept], query[kept]
 

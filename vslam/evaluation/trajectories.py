@@ -1,8 +1,7 @@
 """How good a trajectory is: ATE, RPE and KITTI's drift, in the definitions that papers use.
 
-ATE and RPE are those of evo (Grupp, 2017), so that anyone can repeat them with its command line:
-the tests hold them to its results. It is imported where times must be matched alone, because its
-import takes longer than all files of a run.
+ATE and RPE come from evo (Grupp, 2017), so that anyone can repeat them with its command line; this
+is the only module that imports it.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError
-from vslam.geometry import inverses
 from vslam.trajectory import Trajectory, read_table, read_trajectory, trajectory_format
 
 MAX_TIME_DIFFERENCE_S = 0.01  # evo's default
@@ -76,23 +74,37 @@ def evaluate_trajectory(
     Raises:
         InputError: unknown alignment, no frames in common, or too little motion to align.
     """
+    from evo import EvoException
+    from evo.core.metrics import APE, RPE, PoseRelation
+    from evo.core.trajectory import PoseTrajectory3D
+
     if alignment not in _EVO_FLAGS:
         raise InputError(
             f"--align {alignment}: unknown alignment; choose one of {', '.join(_EVO_FLAGS)}."
         )
     estimate, ground_truth = _associate(estimate, ground_truth)
-    truth = ground_truth.T_wc
+    reference, aligned = (
+        PoseTrajectory3D(poses_se3=list(t.T_wc), timestamps=t.timestamps)
+        for t in (ground_truth, estimate)
+    )
     try:
-        T_wc_aligned = _aligned(estimate.T_wc, truth, alignment)
-    except _TooLittleMotionError as error:
+        if alignment != "none":
+            aligned.align(reference, correct_scale=alignment == "sim3")
+        ape = APE(PoseRelation.translation_part)
+        ape.process_data((reference, aligned))
+        rpe_m, rpe_deg = RPE(PoseRelation.translation_part), RPE(PoseRelation.rotation_angle_deg)
+        for rpe in (rpe_m, rpe_deg):
+            rpe.process_data((reference, aligned))
+    except EvoException as error:
         raise InputError(
             f"--align {alignment}: {len(estimate)} frames with too little motion to compare; "
             "alignment takes three that are not on one line, --align none takes two."
         ) from error
-    errors = np.linalg.norm(T_wc_aligned[:, :3, 3] - truth[:, :3, 3], axis=1)
-    step = inverses(T_wc_aligned[:-1]) @ T_wc_aligned[1:]
-    off = inverses(inverses(truth[:-1]) @ truth[1:]) @ step
-    drift = kitti_drift(T_wc_aligned, truth)
+
+    T_wc_aligned = np.array(aligned.poses_se3)
+    errors = np.asarray(ape.error)
+    distances = path_length(ground_truth.T_wc)
+    drift = kitti_drift(T_wc_aligned, ground_truth.T_wc)
     return Evaluation(
         frames=len(errors),
         alignment=alignment,
@@ -102,47 +114,12 @@ def evaluate_trajectory(
         ate_max_m=float(errors.max()),
         errors_m=errors,
         T_wc_aligned=T_wc_aligned,
-        distances_m=path_length(truth),
-        rpe_m=_rmse(np.linalg.norm(off[:, :3, 3], axis=1)),
-        rpe_deg=_rmse(np.degrees(_angles(off[:, :3, :3]))),
+        distances_m=distances,
+        rpe_m=_rmse(np.asarray(rpe_m.error)),
+        rpe_deg=_rmse(np.asarray(rpe_deg.error)),
         t_rel_percent=None if drift is None else drift[0],
         r_rel_deg_per_100m=None if drift is None else drift[1],
     )
-
-
-class _TooLittleMotionError(Exception):
-    pass
-
-
-def _aligned(
-    T_wc: NDArray[np.float64], truth: NDArray[np.float64], alignment: str
-) -> NDArray[np.float64]:
-    """Poses after the rotation, translation and, with ``sim3``, scale that bring the positions
-    closest to the true ones [Umeyama, TPAMI 1991, eq. 34 to 43]."""
-    if len(T_wc) < 2:
-        raise _TooLittleMotionError
-    if alignment == "none":
-        return T_wc
-    here, there = T_wc[:, :3, 3], truth[:, :3, 3]
-    centre, true_centre = here.mean(axis=0), there.mean(axis=0)
-    spread = here - centre
-    U, d, Vt = np.linalg.svd((there - true_centre).T @ spread / len(here))
-    if np.count_nonzero(d > np.finfo(np.float64).eps) < 2:
-        raise _TooLittleMotionError
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
-    R = (U * sign) @ Vt
-    scale = float(d @ sign) / float((spread**2).sum() / len(here)) if alignment == "sim3" else 1.0
-    moved = T_wc.copy()
-    moved[:, :3, :3] = R @ T_wc[:, :3, :3]
-    moved[:, :3, 3] = scale * spread @ R.T + true_centre
-    return moved
-
-
-def _angles(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``(N,)`` radians that ``(N, 3, 3)`` rotations turn by; the sine tells small ones apart."""
-    axis = R - R.transpose(0, 2, 1)
-    sine = np.linalg.norm(axis, axis=(1, 2)) / np.sqrt(8.0)
-    return np.arctan2(sine, (np.trace(R, axis1=1, axis2=2) - 1.0) / 2.0)
 
 
 def path_length(T_wc: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -220,14 +197,13 @@ def evo_command(
 
 
 def _associate(estimate: Trajectory, ground_truth: Trajectory) -> tuple[Trajectory, Trajectory]:
+    from evo.core.sync import matching_time_indices
+
     times, true_times = estimate.timestamps, ground_truth.timestamps
     if len(times) == len(true_times) and np.allclose(
         times, true_times, rtol=0.0, atol=MAX_TIME_DIFFERENCE_S
     ):
         return estimate, ground_truth
-
-    from evo.core.sync import matching_time_indices
-
     if len(true_times) > len(times):  # evo looks up the poses of the shorter one in the longer
         mine, true = matching_time_indices(times, true_times, MAX_TIME_DIFFERENCE_S)
     else:

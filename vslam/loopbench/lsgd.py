@@ -104,10 +104,12 @@ def _settle(image, rows, columns, found):
     for r in range(rows):
         for c in range(columns):
             y, x = int((r + 0.5) * height / rows), int((c + 0.5) * width / columns)
+            found[r * columns + c, 0], found[r * columns + c, 1] = y, x
             least = np.inf
             for dy in range(-1, 2):
                 for dx in range(-1, 2):
-                    if dy == 0 and dx == 0:
+                    inside = 0 <= y + dy < height and 0 <= x + dx < width
+                    if not inside or (dy == 0 and dx == 0):
                         continue
                     far = np.sqrt(float(dy * dy + dx * dx))
                     differs = abs(np.int64(image[y + dy, x + dx]) - np.int64(image[y, x])) / far

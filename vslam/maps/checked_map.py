@@ -12,6 +12,8 @@ from vslam.camera import Camera
 from vslam.frame_poses import FrameTable
 from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe
 from vslam.map import NONE, Arrays, Map
+from vslam.maps.checkpoint import ARRAYS as CHECKPOINT_ARRAYS
+from vslam.maps.checkpoint import checked_checkpoint
 from vslam.maps.stored_map import StoredMap, World, observations
 
 # K keyframes, L landmarks, R keypoints, O observations, E loops, F frames of the last drive.
@@ -20,6 +22,8 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "scales": (np.float64, ("levels",)),
     "keyframe_T_cw": (np.float64, ("K", 4, 4)),
     "keyframe_first_row": (np.int64, ("K+1",)),
+    "keyframe_alive": (np.bool_, ("K",)),
+    "keyframe_T_c_parent": (np.float64, ("K", 4, 4)),
     "keyframe_timestamp": (np.float64, ("K",)),
     "keyframe_frame": (np.int64, ("K",)),
     "keyframe_parent": (np.int64, ("K",)),
@@ -34,6 +38,8 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "landmark_first_keyframe": (np.int32, ("L",)),
     "landmark_visible": (np.int32, ("L",)),
     "landmark_found": (np.int32, ("L",)),
+    "landmark_alive": (np.bool_, ("L",)),
+    "landmark_merged_into": (np.int32, ("L",)),
     "landmark_first_observation": (np.int64, ("L+1",)),
     "observation_row": (np.int64, ("O",)),
     "row_xy": (np.float32, ("R", 2)),
@@ -70,6 +76,14 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
     """
     sizes = _check_shapes(data)
     map_ = _build_map(data, sizes, int(header["session"]))
+    checkpoint = None
+    if header["checkpoint"] is not None:
+        arrays = {name: data[f"checkpoint_{name}"] for name in CHECKPOINT_ARRAYS}
+        checkpoint = checked_checkpoint(arrays, header["checkpoint"], sizes["K"], sizes["L"])
+    else:
+        a = map_.arrays
+        _require(bool(a.keyframe_alive.all() and a.landmark_alive.all()), "what died is in it")
+        _require(bool((np.diff(a.first_keyframe) >= 0).all()), "order of landmarks")
     detector, n = header["detector"], sizes["K"]
     tables = {str(name): _per_keyframe(data, f"detector_{name}", n) for name in detector["tables"]}
     images = _per_keyframe(data, "image", n) if header["images"] else None
@@ -85,6 +99,7 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
         frames=_frames(data, n) if header["frames"] else None,
         drives=tuple(str(drive) for drive in header["drives"]),
         world=None if world is None else _world(world),
+        checkpoint=checkpoint,
     )
 
 
@@ -124,7 +139,8 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) ->
     _require(bool(scales[0] > 0), "scales are not positive")
     first_row = data["keyframe_first_row"]
     _check_first("keyframe_first_row", first_row, n_rows)
-    _check_rigid("keyframe_T_cw", data["keyframe_T_cw"])
+    for name in ("keyframe_T_cw", "keyframe_T_c_parent"):
+        _check_rigid(name, data[name])
     _require(bool((parent[1:] >= 0).all() and (parent < np.arange(n)).all()), "keyframe_parent")
     _check_ids("keyframe_parent", parent, n, least=NONE)
     _require(bool((data["keyframe_unit_scale"] > 0).all()), "keyframe_unit_scale")
@@ -135,21 +151,25 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) ->
 
     first, rows = data["landmark_first_observation"], data["observation_row"]
     _check_first("landmark_first_observation", first, sizes["O"])
-    _require(bool((np.diff(first) > 0).all()), "a landmark that nothing observes")
+    alive = data["landmark_alive"]
+    _require(bool(((np.diff(first) > 0) == alive).all()), "a landmark that nothing observes")
+    _check_merges(data["landmark_merged_into"], alive)
     _check_ids("observation_row", rows, n_rows)
     _require(_all_differ(rows), "a keypoint that observes two landmarks")
     _check_ids("landmark_first_keyframe", data["landmark_first_keyframe"], n)
-    _require(bool((np.diff(data["landmark_first_keyframe"]) >= 0).all()), "order of landmarks")
 
     keyframe = np.repeat(np.arange(n, dtype=np.int32), np.diff(first_row))
     pairs = np.repeat(np.arange(n_landmarks, dtype=np.int64), np.diff(first)) * n + keyframe[rows]
     _require(_all_differ(pairs), "a keyframe that observes a landmark twice")
+    living = data["keyframe_alive"]
+    _require(bool(living[keyframe[rows]].all()), "a keyframe that was culled observes something")
+    _require(bool(living[parent[parent >= 0]].all() and living[parent < 0].all()), "family tree")
     map_ = Map(scales)
     map_.n_keyframes, map_.n_landmarks, map_.n_rows = n, n_landmarks, n_rows
     map_.arrays = Arrays(
         T_cw=data["keyframe_T_cw"],
         first_row=first_row,
-        keyframe_alive=np.ones(n, np.bool_),
+        keyframe_alive=living,
         xyz=data["landmark_xyz"],
         normal=data["landmark_normal"],
         distance_range=data["landmark_distance_range"],
@@ -157,8 +177,8 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) ->
         first_keyframe=data["landmark_first_keyframe"],
         visible=data["landmark_visible"],
         found=data["landmark_found"],
-        landmark_alive=np.ones(n_landmarks, np.bool_),
-        merged_into=np.full(n_landmarks, NONE, np.int32),
+        landmark_alive=alive,
+        merged_into=data["landmark_merged_into"],
         xy=data["row_xy"],
         u_right=data["row_u_right"],
         octave=data["row_octave"],
@@ -170,12 +190,25 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) ->
     map_.timestamps = data["keyframe_timestamp"].tolist()
     map_.frames = data["keyframe_frame"].tolist()
     map_.parents = parent.tolist()
+    map_.T_c_parent = {int(k): data["keyframe_T_c_parent"][k] for k in np.flatnonzero(~living)}
     map_.sessions = data["keyframe_session"].tolist()
     map_.session = session
     map_.unit_scale = data["keyframe_unit_scale"].tolist()
     map_.restarts = data["restarts"].tolist()
     map_.unpredicted_restarts = data["unpredicted_restarts"].tolist()
     return map_
+
+
+def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> None:
+    """That following merges ends: where it is followed, it leads to one that lives or to none."""
+    n = len(merged_into)
+    _check_ids("landmark_merged_into", merged_into, n, least=NONE)
+    _require(bool((merged_into[alive] == NONE).all()), "a living landmark that was merged")
+    # By twice as many steps each time.
+    reached = np.append(np.where(merged_into >= 0, merged_into, n), n)
+    for _ in range(n.bit_length()):
+        reached = reached[reached]
+    _require(bool((reached == n).all()), "landmarks merged in a circle")
 
 
 def _loops(data: dict[str, NDArray], n: int) -> tuple[LoopEdge, ...]:

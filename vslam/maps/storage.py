@@ -7,6 +7,7 @@ be there in a second.
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -24,16 +25,21 @@ from vslam.machine import versions
 from vslam.map import LANDMARK_FIELDS, ROW_FIELDS
 from vslam.map_kernels import gather_observations
 from vslam.maps.checked_map import ARRAYS, DamagedMapError, camera_of, checked_map
+from vslam.maps.checkpoint import checkpoint_arrays, checkpoint_entry
 from vslam.maps.new_output import replaced_file
 from vslam.maps.stored_map import StoredMap
 from vslam.untrusted import require_memory
 
-SCHEMA = 2
+SCHEMA = 3
+_NO_MAP = (
+    ValueError, KeyError, EOFError, TypeError, AttributeError, MemoryError, RuntimeError
+)  # fmt: skip
 _FOREIGN = "not a map of vslam; name a map.npz, or the folder of a run"
 
 
-def save_map(path: Path, stored: StoredMap) -> None:
-    """Write the living part of a map, in place of what is there.
+def save_map(path: Path, stored: StoredMap, *, resumable: bool = False) -> None:
+    """Write a map, in place of what is there: what lives of it; all, if it has a checkpoint and is
+    to be ``resumable``.
 
     The file is complete or, after an error or a power cut, what it was before. Its ``header`` is
     JSON (schema, camera, detector, drives, versions); the arrays are those of ``ARRAYS``, and
@@ -43,26 +49,27 @@ def save_map(path: Path, stored: StoredMap) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    write_map(path, stored.compact())
-
-
-def write_map(path: Path, stored: StoredMap) -> None:
-    """``save_map`` of a map that is compact already: ``StoredMap.compact`` is a copy, which one
-    thread can write while another goes on in the map.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    arrays = _as_arrays(stored)
+    whole = resumable and stored.checkpoint is not None
+    arrays = _as_arrays(stored if whole else stored.compact())
     with replaced_file(path) as file:
         np.savez(file, allow_pickle=False, **arrays)
 
 
 def load_map(path: Path) -> StoredMap:
-    """Read a map written by ``save_map``, and check all that kernels rely on.
+    """Read a map, and check all that kernels rely on. It is compact.
 
     Raises:
         InputError: no such file, no map, damaged, or of another schema.
+    """
+    stored = load_checkpoint(path)
+    return stored if stored.checkpoint is None else stored.compact()
+
+
+def load_checkpoint(path: Path) -> StoredMap:
+    """``load_map``, but one that was written with a checkpoint comes as it was then.
+
+    Raises:
+        InputError: as ``load_map``.
     """
     data, header = _read(path)
     with _as_damage(path):
@@ -78,10 +85,10 @@ def _as_damage(path: Path) -> Iterator[None]:
 
 
 def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
-    map_, a = stored.map, stored.map.arrays
-    n_landmarks, n_rows = map_.n_landmarks, map_.n_rows
+    map_, a, checkpoint = stored.map, stored.map.arrays, stored.checkpoint
+    n, n_landmarks, n_rows = map_.n_keyframes, map_.n_landmarks, map_.n_rows
     landmarks = np.arange(n_landmarks, dtype=np.int32)
-    index = np.arange(map_.n_keyframes, dtype=np.int64)
+    index = np.arange(n, dtype=np.int64)
     first, rows = gather_observations(a, landmarks, index)
     loops = stored.loops
     T = [loop.T_query_match for loop in loops]
@@ -102,6 +109,7 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
         "images": stored.images is not None,
         "frames": stored.frames is not None,
         "session": map_.session,
+        "checkpoint": None if checkpoint is None else checkpoint_entry(checkpoint),
         "world": None
         if stored.world is None
         else {
@@ -114,6 +122,10 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
         "scales": map_.scales,
         "keyframe_T_cw": a.T_cw[: map_.n_keyframes],
         "keyframe_first_row": a.first_row[: map_.n_keyframes + 1],
+        "keyframe_alive": a.keyframe_alive[:n],
+        "keyframe_T_c_parent": np.array(
+            [map_.T_c_parent.get(k, np.eye(4)) for k in range(n)], np.float64
+        ).reshape(-1, 4, 4),
         "keyframe_timestamp": np.array(map_.timestamps, np.float64),
         "keyframe_frame": np.array(map_.frames, np.int64),
         "keyframe_parent": np.array(map_.parents, np.int64),
@@ -132,16 +144,20 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
         ).reshape(-1, 2),
         "loop_learned": np.array([loop.matched_by == "learned" for loop in loops], np.bool_),
     }
-    for prefix, fields, n in (
+    for prefix, fields, size in (
         ("landmark", LANDMARK_FIELDS, n_landmarks),
         ("row", ROW_FIELDS, n_rows),
     ):
         for name in fields:
             if f"{prefix}_{name.removeprefix('landmark_')}" in ARRAYS:
-                arrays[f"{prefix}_{name.removeprefix('landmark_')}"] = getattr(a, name)[:n]
+                arrays[f"{prefix}_{name.removeprefix('landmark_')}"] = getattr(a, name)[:size]
     for name in FrameTable._fields:
         arrays[f"frame_{name}"] = getattr(frames, name)
+    if checkpoint is not None:
+        for name, array in checkpoint_arrays(checkpoint).items():
+            arrays[f"checkpoint_{name}"] = array
     for name, table in stored.detector.tables.items():
+        table = table.select(index)
         arrays[f"detector_{name}_first"] = table.first
         arrays[f"detector_{name}_values"] = table.values
     if stored.images is not None:
@@ -197,6 +213,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
         ) from error
     except BadZipFile as error:
         raise InputError(f"{path}: {_FOREIGN}, or the file is damaged ({error}).") from error
-    except (ValueError, KeyError, EOFError, TypeError, AttributeError, MemoryError) as error:
-        # np.load tells of pickles and of what is no npz by ValueError; a plain array is no archive.
+    except (*_NO_MAP, zlib.error) as error:
+        # np.load tells of pickles and of what is no npz by ValueError, zipfile of encryption by
+        # RuntimeError; a plain array is no archive.
         raise InputError(f"{path}: {_FOREIGN}.") from error

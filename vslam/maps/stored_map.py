@@ -21,6 +21,7 @@ from vslam.map import (
     loop_of_living,
 )
 from vslam.map_kernels import gather_observations
+from vslam.maps.checkpoint import Checkpoint
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,8 @@ class StoredMap:
         frames: of the last drive, None if they are not kept.
         drives: what the images of each drive were, "kitti 06" for example.
         world: where the map lies, None where there is no ground truth.
+        checkpoint: with which the last drive goes on to the byte; then the map has what died,
+            too, numbered as ever. None where there is none, or the map is compact.
     """
 
     map: Map
@@ -61,6 +64,7 @@ class StoredMap:
     frames: FrameTable | None = None
     drives: tuple[str, ...] = ()
     world: World | None = None
+    checkpoint: Checkpoint | None = None
 
     def compact(self) -> StoredMap:
         """A copy with the living keyframes and landmarks alone, numbered without gaps.
@@ -95,6 +99,7 @@ class StoredMap:
             detector=replace(self.detector, tables=tables),
             images=None if self.images is None else self.images.select(keyframes),
             frames=None if self.frames is None or not whole else _moved(self.frames, map_, new_id),
+            checkpoint=None,
         )
 
 
@@ -169,24 +174,27 @@ def observations(
 
     Args:
         rows: ``(O,)`` those of each landmark, one landmark after the other, none twice.
-        first: ``(L + 1,)`` where those of each landmark begin.
+        first: ``(L + 1,)`` where those of each landmark begin; one that died has none.
         u_right: ``(R,)`` of all rows.
     """
     count = np.diff(first)
     landmark, next_row = (np.full(len(u_right), NONE, np.int32) for _ in range(2))
     landmark[rows] = np.repeat(np.arange(len(count), dtype=np.int32), count)
+    seen = np.flatnonzero(count)
     last = np.zeros(len(rows), np.bool_)
-    last[first[1:] - 1] = True
+    last[first[seen + 1] - 1] = True
     following = np.flatnonzero(~last)
     next_row[rows[following]] = rows[following + 1]
     votes = np.where(np.isnan(u_right[rows]), 1, 2)
+    head, n_observations = np.full(len(count), NONE, np.int32), np.zeros(len(count), np.int32)
+    if len(seen):
+        head[seen] = rows[first[seen]]
+        n_observations[seen] = np.add.reduceat(votes, first[seen])
     return {
         "landmark": landmark,
         "next_row": next_row,
-        "head": rows[first[:-1]].astype(np.int32),
-        "n_observations": np.add.reduceat(votes, first[:-1]).astype(np.int32)
-        if len(count)
-        else np.zeros(0, np.int32),
+        "head": head,
+        "n_observations": n_observations,
     }
 
 

@@ -6,13 +6,20 @@
   const find = (name) => box.querySelector("." + name);
   const map = find("map"), strip = find("strip"), picture = find("picture");
   const slider = find("time"), play = find("play"), said = find("said");
-  const n = data.frame.length;
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  const floats = (text) => new Float32Array(bytes(text).buffer);
+  const { t, x: xs, y: ys, z: zs, heading, error } = Object.fromEntries(
+    Object.entries(data.floats).map(([name, text]) => [name, floats(text)]));
+  const truth = { x: floats(data.truth.x), z: floats(data.truth.z) };
+  const inliers = new Uint16Array(bytes(data.inliers).buffer), states = bytes(data.state);
+  const n = xs.length;
+  const stateOf = (k) => data.states[states[k]];
   const moments = data.moments.map((m) => ({
     frame: m.frame, image: null, jpeg: m.jpeg, n: m.n,
     points: bytes(m.points), tracked: bytes(m.tracked),
   }));
-  const greatest = data.error.reduce((a, b) => (b === null ? a : Math.max(a, b)), 0);
+  const most = (values) => values.reduce((a, b) => (b > a ? b : a), 0);  // NaN is not greater
+  const greatest = most(error), mostInliers = Math.max(most(inliers), 1);
   const colour = (name) => getComputedStyle(box).getPropertyValue("--" + name).trim();
   const ofState = { WEAK: "#f59e0b", LOST: "#ef4444", DROPPED: "#8b5cf6" };
   let now = 0, view = null, timer = null, wanted = false;
@@ -32,10 +39,15 @@
 
   // view: the metres at the middle of the canvas, and pixels per metre
   const whole = () => {
-    const xs = data.x.concat(data.truth.x), zs = data.z.concat(data.truth.z);
-    const range = (values) => values.reduce(
-      ([a, b], v) => (v === null ? [a, b] : [Math.min(a, v), Math.max(b, v)]), [Infinity, -Infinity]);
-    const [x0, x1] = range(xs), [z0, z1] = range(zs);
+    const range = (...several) => {
+      let low = Infinity, high = -Infinity;
+      several.forEach((values) => values.forEach((v) => {
+        if (v < low) low = v;
+        if (v > high) high = v;
+      }));
+      return [low, high];
+    };
+    const [x0, x1] = range(xs, truth.x), [z0, z1] = range(zs, truth.z);
     const width = map.clientWidth, height = map.clientHeight;
     const scale = 0.88 * Math.min(width / Math.max(x1 - x0, 1e-6), height / Math.max(z1 - z0, 1e-6));
     view = { x: (x0 + x1) / 2, z: (z0 + z1) / 2, scale: Math.min(scale, 1e5) };
@@ -44,31 +56,43 @@
     map.clientWidth / 2 + (x - view.x) * view.scale,
     map.clientHeight / 2 - (z - view.z) * view.scale,
   ];
-  const line = (c, xs, zs) => {
+  const line = (c, lineX, lineZ) => {
+    let lastX = NaN, lastY = NaN;
     c.beginPath();
-    xs.forEach((x, k) => { if (x !== null) c.lineTo(...place(x, zs[k])); });
+    lineX.forEach((x, k) => {
+      const [px, py] = place(x, lineZ[k]);  // a step of less than half a pixel is not seen
+      if (Number.isNaN(px) || (k + 1 < n && Math.abs(px - lastX) + Math.abs(py - lastY) < 0.5)) return;
+      c.lineTo(px, py);
+      lastX = px; lastY = py;
+    });
     c.stroke();
   };
+  const eachBad = (visit) => states.forEach((_, k) => {
+    const colourOf = ofState[stateOf(k)];
+    if (colourOf) visit(k, colourOf);
+  });
 
   const drawMap = () => {
     const [c, width, height] = context(map);
     c.lineJoin = "round";
     c.strokeStyle = "#94a3b8"; c.globalAlpha = 0.65; c.lineWidth = 4;
-    line(c, data.truth.x, data.truth.z);
+    line(c, truth.x, truth.z);
     c.globalAlpha = 1; c.strokeStyle = "#3b82f6"; c.lineWidth = 1.6;
-    line(c, data.x, data.z);
-    data.state.forEach((state, k) => {
-      if (!ofState[state]) return;
-      c.fillStyle = ofState[state];
-      c.beginPath(); c.arc(...place(data.x[k], data.z[k]), 2.5, 0, 7); c.fill();
+    line(c, xs, zs);
+    eachBad((k, colourOf) => {
+      c.fillStyle = colourOf;
+      c.beginPath(); c.arc(...place(xs[k], zs[k]), 2.5, 0, 7); c.fill();
     });
-    if (data.truth.x.length === n) {  // the error, as a line to where the camera really was
+    const [px, py] = place(xs[now], zs[now]);
+    if (truth.x.length === n) {  // the error, as a line to where the camera really was
       c.strokeStyle = "#ef4444"; c.lineWidth = 1.5;
-      c.beginPath(); c.moveTo(...place(data.x[now], data.z[now]));
-      c.lineTo(...place(data.truth.x[now], data.truth.z[now])); c.stroke();
+      c.beginPath(); c.moveTo(px, py); c.lineTo(...place(truth.x[now], truth.z[now])); c.stroke();
     }
-    c.fillStyle = colour("ink");
-    c.beginPath(); c.arc(...place(data.x[now], data.z[now]), 5, 0, 7); c.fill();
+    c.fillStyle = c.strokeStyle = colour("ink"); c.lineWidth = 2.5;
+    c.beginPath(); c.arc(px, py, 5, 0, 7); c.fill();
+    const angle = heading[now] * Math.PI / 180;  // where the camera looks
+    c.beginPath(); c.moveTo(px, py); c.lineTo(px + 15 * Math.sin(angle), py - 15 * Math.cos(angle));
+    c.stroke();
     // a bar of a round length
     const about = 90 / view.scale, power = 10 ** Math.floor(Math.log10(about));
     const length = [5, 2, 1].map((f) => f * power).find((v) => v <= about) || power;
@@ -82,16 +106,17 @@
   const drawStrip = () => {
     const [c, width, height] = context(strip);
     const at = (k) => (k / Math.max(n - 1, 1)) * (width - 2) + 1;
-    data.state.forEach((state, k) => {
-      if (!ofState[state]) return;
-      c.fillStyle = ofState[state]; c.globalAlpha = 0.5;
+    c.globalAlpha = 0.5;
+    eachBad((k, colourOf) => {
+      c.fillStyle = colourOf;
       c.fillRect(at(k) - 1, 0, Math.max(2, width / n), height);
     });
     c.globalAlpha = 1;
+    c.fillStyle = colour("muted");
+    moments.forEach((moment) => c.fillRect(at(moment.frame), height - 3, 1, 3));
     c.strokeStyle = greatest > 0 ? "#ef4444" : "#3b82f6"; c.lineWidth = 1.3; c.beginPath();
-    const most = greatest || Math.max(...data.inliers, 1);
-    (greatest > 0 ? data.error : data.inliers).forEach((v, k) => {
-      if (v !== null) c.lineTo(at(k), height - 3 - (v / most) * (height - 8));
+    (greatest > 0 ? error : inliers).forEach((v, k) => {
+      if (!Number.isNaN(v)) c.lineTo(at(k), height - 5 - (v / (greatest || mostInliers)) * (height - 10));
     });
     c.stroke();
     c.strokeStyle = colour("ink"); c.lineWidth = 1;
@@ -106,7 +131,7 @@
     return best;
   };
   const drawPicture = () => {
-    const moment = nearest(data.frame[now]);
+    const moment = nearest(now);
     if (!moment) { picture.hidden = true; return null; }
     if (!moment.image) {
       moment.image = new Image();
@@ -132,11 +157,16 @@
     if (!view) whole();
     drawMap(); drawStrip();
     const moment = drawPicture();
-    const error = data.error[now];
-    const parts = [`frame ${data.frame[now]}`, `${data.t[now].toFixed(1)} s`, data.state[now],
-      `${data.inliers[now]} inliers`];
-    if (error !== null) parts.push(`error ${error.toPrecision(3)} m`);
-    if (moment) parts.push(`image of keyframe ${moment.frame}`);
+    const parts = [`frame ${now}`, `${t[now].toFixed(2)} s`, stateOf(now), `${inliers[now]} inliers`];
+    if (!Number.isNaN(error[now])) parts.push(`error ${error[now].toPrecision(3)} m`);
+    const fixed = (value, decimals) => (+value.toFixed(decimals) || 0).toFixed(decimals);  // no -0
+    const position = [xs, ys, zs].map((values) => fixed(values[now], 2)).join(", ");
+    parts.push(`at (${position})${data.unit}`, `heading ${fixed(heading[now], 1)}°`);
+    if (moment) {
+      const apart = moment.frame - now, plural = Math.abs(apart) === 1 ? "" : "s";
+      const when = `${Math.abs(apart)} frame${plural} ${apart < 0 ? "earlier" : "later"}`;
+      parts.push(`image of frame ${moment.frame}${apart ? ", " + when : ""}`);
+    }
     said.textContent = parts.join(" · ");
     slider.value = now;
     slider.setAttribute("aria-valuetext", parts.slice(0, 3).join(", "));
@@ -155,6 +185,15 @@
 
   slider.max = n - 1;
   slider.addEventListener("input", () => go(+slider.value));
+  find("before").addEventListener("click", () => go(now - 1));
+  find("after").addEventListener("click", () => go(now + 1));
+  const framesOfImages = moments.map((m) => m.frame).sort((a, b) => a - b);
+  find("image-before").addEventListener("click", () => {
+    go(framesOfImages.findLast((frame) => frame < now) ?? now);
+  });
+  find("image-after").addEventListener("click", () => {
+    go(framesOfImages.find((frame) => frame > now) ?? now);
+  });
   find("closer").addEventListener("click", () => middle(1.5));
   find("farther").addEventListener("click", () => middle(1 / 1.5));
   find("all").addEventListener("click", () => { whole(); later(); });
@@ -196,8 +235,8 @@
   const up = (event) => {
     if (fingers.delete(event.pointerId) && moved < 4 && event.type === "pointerup") {
       let best = 0, least = Infinity;
-      data.x.forEach((x, k) => {
-        const [px, py] = place(x, data.z[k]);
+      xs.forEach((x, k) => {
+        const [px, py] = place(x, zs[k]);
         const d = Math.hypot(px - event.offsetX, py - event.offsetY);
         if (d < least) { least = d; best = k; }
       });

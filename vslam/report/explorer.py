@@ -1,4 +1,6 @@
-"""What the page's explorer shows: the path, and image, keypoints and error at every moment.
+"""What the page's explorer shows: pose, state and error of every frame, images of some keyframes.
+
+A frame takes 47 bytes of the page, an image with its keypoints about 10,000.
 
 The program is ``explorer.js``, written by hand: a library that draws (Plotly: 4.7 MB) would be
 larger than all else in the page.
@@ -20,8 +22,6 @@ from vslam.trajectory import Trajectory
 if TYPE_CHECKING:
     from vslam.run.moments import Moment
 
-_MOST_FRAMES = 3000  # that the path is drawn of
-
 
 def explorer_data(
     outcome: RunOutcome,
@@ -30,6 +30,9 @@ def explorer_data(
     moments: Collection[Moment],
 ) -> dict[str, Any] | None:
     """Numbers and images for ``explorer.js``, as JSON takes them; None without two frames.
+
+    ``floats`` holds seconds, metres, the heading in degrees (0 looks along z, 90 along x) and the
+    error, NaN where there is none.
 
     Args:
         outcome: the run.
@@ -40,30 +43,30 @@ def explorer_data(
     n = len(outcome.trajectory)
     if n < 2 or len(outcome.tracks) != n:
         return None
-    shown = np.unique(np.append(np.arange(0, n, -(-n // _MOST_FRAMES)), n - 1))
     times = outcome.trajectory.timestamps
-    path, errors = outcome.trajectory.T_wc[:, :3, 3], np.full(n, np.nan)
+    T_wc, errors = outcome.trajectory.T_wc, np.full(n, np.nan)
     truth = np.zeros((0, 3))
     if evaluation is not None and ground_truth is not None:
         at = np.searchsorted(times, evaluation.timestamps).clip(0, n - 1)
         errors[at] = evaluation.errors_m
-        truth = ground_truth.T_wc[:, :3, 3]
-        if evaluation.frames == n:
-            path = evaluation.T_wc_aligned[:, :3, 3]
-        else:
-            truth = np.zeros((0, 3))  # the whole path is in another frame than the evaluated part
-        truth = truth[shown] if len(truth) == n else truth
-    tracks = [outcome.tracks[k] for k in shown]
+        if evaluation.frames == n:  # else the whole path is in another frame than the ground truth
+            T_wc, truth = evaluation.T_wc_aligned, ground_truth.T_wc[:, :3, 3]
+    states = sorted({str(track.state) for track in outcome.tracks})
+    floats = {
+        "t": times - times[0],
+        **dict(zip("xyz", T_wc[:, :3, 3].T, strict=True)),
+        "heading": np.rad2deg(np.arctan2(T_wc[:, 0, 2], T_wc[:, 2, 2])),
+        "error": errors,
+    }
+    inliers = np.array([track.n_inliers for track in outcome.tracks]).clip(0, 65535)
+    state = np.array([states.index(str(track.state)) for track in outcome.tracks])
     return {
         "unit": "" if outcome.settings.sensor == "mono" and evaluation is None else " m",
-        "frame": shown.tolist(),
-        "t": _rounded(times[shown] - times[0], 2),
-        "x": _rounded(path[shown, 0], 3),
-        "z": _rounded(path[shown, 2], 3),
-        "truth": {"x": _rounded(truth[:, 0], 3), "z": _rounded(truth[:, 2], 3)},
-        "error": _rounded(errors[shown], 4),
-        "state": [str(track.state) for track in tracks],
-        "inliers": [track.n_inliers for track in tracks],
+        "floats": {name: _packed(values, "<f4") for name, values in floats.items()},
+        "truth": {"x": _packed(truth[:, 0], "<f4"), "z": _packed(truth[:, 2], "<f4")},
+        "states": states,
+        "state": _packed(state, "u1"),
+        "inliers": _packed(inliers, "<u2"),
         "moments": [_shown(moment) for moment in moments],
     }
 
@@ -78,8 +81,6 @@ def _shown(moment: Moment) -> dict[str, Any]:
     }
 
 
-def _rounded(values: NDArray[np.float64], decimals: int) -> list[float | None]:
-    """NaN and infinity become None: JSON has neither."""
-    return [
-        x if np.isfinite(x) else None for x in np.round(values.astype(float), decimals).tolist()
-    ]
+def _packed(values: NDArray[Any], kind: str) -> str:
+    """Base64 of an array: a third of the bytes of its numbers in JSON, and NaN can be said."""
+    return b64encode(values.astype(kind).tobytes()).decode()

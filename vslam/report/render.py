@@ -84,8 +84,10 @@ def _in_map(report: ReportJson) -> list[Headline]:
     fix = "no fix" if found.first_fix_s is None else f"first fix after {found.first_fix_s:.2f} s"
     times = f"found {found.found} of the {found.sought} times it was looked for"
     error = _number(found.error_m, "m")
+    weak = f", {found.weak_percent:.1f} % by few inliers" if found.weak_percent else ""
+    note = f"of the frames{weak}; {fix}, {times}"
     return [
-        Headline("In the map", f"{found.in_map_percent:.1f} %", f"of the frames; {fix}, {times}"),
+        Headline("In the map", f"{found.in_map_percent:.1f} %", note),
         Headline("Error in the map", error, "RMSE of these frames, with the map's own alignment"),
     ]
 

@@ -72,7 +72,8 @@ class LoopFigures(_Model):
 class MapFigures(_Model):
     """How a run found itself in the map that it went on in.
 
-    ``in_map_percent`` of the frames are placed in it at the end. ``first_fix_s`` is the time from
+    ``in_map_percent`` of the frames are placed in it at the end, ``weak_percent`` of the frames
+    only by few inliers (WEAK), which count. ``first_fix_s`` is the time from
     the first frame to the first that was found in it, None if none was. The camera was looked for
     in the whole map at ``sought`` frames and found at ``found`` of them. ``error_m`` is the RMSE of
     the positions of those frames, each as the map says, with the alignment that the drives of the
@@ -81,6 +82,7 @@ class MapFigures(_Model):
     """
 
     in_map_percent: float
+    weak_percent: float = 0.0
     first_fix_s: float | None
     sought: int
     found: int

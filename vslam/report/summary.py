@@ -146,9 +146,11 @@ def _figures_in_map(outcome: RunOutcome) -> MapFigures | None:
     lost = [track for track in tracks if track.state == TrackingState.LOST]
     found = [track for track in tracks if track.relocalised]
     sought = sum("relocalise" in track.stage_ms for track in lost) + len(found)
+    weak = [track.state == TrackingState.WEAK for track in tracks]
     fix = found[0].timestamp - tracks[0].timestamp if found else None
     return MapFigures(
         in_map_percent=100.0 * float(inside.mean()) if len(inside) else 0.0,
+        weak_percent=100.0 * float((inside & weak).mean()) if len(inside) else 0.0,
         first_fix_s=fix,
         sought=sought,
         found=len(found),

@@ -5,77 +5,37 @@ so often the map is copied where no keyframe is being mapped, and a thread write
 the report tells of the frames so far: ``autosave_progress.npz``, then ``autosave.npz``, a map file
 as any other. Each takes the place of the one before in one step. A run killed between the two finds
 the progress of a few frames more than the map has, and passes over them.
-
-One file because what is written is read together with what reads it again.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import time
-from array import array
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TextIO
-from zipfile import BadZipFile
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Protocol, TextIO
 
 from vslam.errors import InputError
-from vslam.features import TrackingState, TrackResult
+from vslam.features import TrackResult
 from vslam.lock_file import locked
-from vslam.loops import LoopCorrection, LoopEdge
 from vslam.map import Map
 from vslam.maps.new_output import replaced_file
-from vslam.maps.storage import load_map, write_map
+from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap
+from vslam.run.progress import Progress, read_progress, write_progress
 from vslam.slam import Slam
 from vslam.trajectory import tum_line
 
 MAP, PROGRESS, ONLINE = "autosave.npz", "autosave_progress.npz", "trajectory_online.tum"
 LOCK = ".lock"
-SCHEMA = 1
 _BEGIN = 0.75  # of the period: writing, and waiting for a merge, take the rest
 _PATIENCE = 0.95  # of the period: until then no global bundle adjustment is cut off
 _MISSED = 5  # frames without a moment to save, until one amid a frame is taken
-_STATES = tuple(TrackingState)
-_NUMBERS = 7  # of a frame beside its pose
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a report tells of the first frames of a run.
-
-    Attributes:
-        tracks, skipped, latency_ms, wall_s, cpu_s: as of ``RunOutcome``.
-        loops: with frames of the run in the place of keyframes, -1 where that is none of its own.
-        corrections: of some of these loops, alike.
-    """
-
-    tracks: list[TrackResult] = field(default_factory=list)
-    skipped: list[str] = field(default_factory=list)
-    latency_ms: list[float] = field(default_factory=list)
-    wall_s: float = 0.0
-    cpu_s: float = 0.0
-    loops: list[LoopEdge] = field(default_factory=list)
-    corrections: list[LoopCorrection] = field(default_factory=list)
-
-    def until(self, frames: int) -> Progress:
-        """What it was after so many frames."""
-        return replace(
-            self,
-            tracks=self.tracks[:frames],
-            skipped=[line for line in self.skipped if _frame_of(line) < frames],
-            loops=[loop for loop in self.loops if loop.query < frames],
-            corrections=[one for one in self.corrections if one.edge.query < frames],
-        )
 
 
 @dataclass(frozen=True)
@@ -123,10 +83,6 @@ def _forget_poses(path: Path, frames: int) -> None:
         lines = path.read_text(encoding="utf-8").splitlines(keepends=True)[:frames]
         with replaced_file(path) as file:
             file.write("".join(lines).encode())
-
-
-def _frame_of(message: str) -> int:
-    return int(message.removeprefix("frame ").partition(":")[0])
 
 
 class Autosave(Protocol):
@@ -237,7 +193,7 @@ class FolderAutosave:
     def _write(self, stored: StoredMap, progress: Progress) -> None:
         try:
             write_progress(self._folder / PROGRESS, progress)
-            write_map(self._folder / MAP, stored.compact())
+            save_map(self._folder / MAP, stored, resumable=True)
         except Exception as error:  # whatever it is, it must not end a run, nor be lost
             self._warn(MAP, error)
 
@@ -260,32 +216,6 @@ def remove_autosave(folder: Path) -> None:
             part.unlink(missing_ok=True)
 
 
-def frames_of(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[LoopEdge]:
-    """Loops with the frames ``(K,)`` of keyframes in their place, and without features."""
-    return [
-        replace(
-            loop,
-            query=int(frames[loop.query]) if loop.query >= 0 else -1,
-            match=int(frames[loop.match]),
-            features=None,
-            landmarks=None,
-        )
-        for loop in loops
-    ]
-
-
-def in_frames(
-    loops: list[LoopEdge], corrections: list[LoopCorrection], frames: NDArray[np.int64]
-) -> tuple[list[LoopEdge], list[LoopCorrection]]:
-    """``frames_of`` loops and of what they corrected."""
-    edges = frames_of([one.edge for one in corrections], frames)
-    moved = [
-        replace(one, edge=edge, keyframes=frames[one.keyframes])
-        for one, edge in zip(corrections, edges, strict=True)
-    ]
-    return frames_of(loops, frames), moved
-
-
 def _copy(stored: StoredMap) -> StoredMap:
     """A copy of the map as it is, for another thread to make compact."""
     map_ = stored.map
@@ -304,116 +234,3 @@ def _copy(stored: StoredMap) -> StoredMap:
         for name, table in stored.detector.tables.items()
     }
     return replace(stored, map=copy, detector=replace(stored.detector, tables=tables))
-
-
-def write_progress(path: Path, progress: Progress) -> None:
-    """Write an ``.npz``, in place of what is there.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    tracks = progress.tracks
-    stages = list(dict.fromkeys(name for track in tracks for name in track.stage_ms))
-    rows = array("d")
-    for t in tracks:
-        rows.extend(t.T_wc.ravel())
-        rows.extend((t.timestamp, _STATES.index(t.state), t.n_features, t.n_stereo, t.n_matches,
-                     t.n_inliers, t.is_keyframe + 2 * t.relocalised))  # fmt: skip
-        rows.extend(t.stage_ms.get(name, np.nan) for name in stages)
-    header = {
-        "kind": "vslam progress",
-        "schema": SCHEMA,
-        "stages": stages,
-        "skipped": progress.skipped,
-        "loops": [_loop_entry(loop) for loop in progress.loops],
-        "corrections": [
-            {"edge": _loop_entry(one.edge), "seconds": one.seconds} for one in progress.corrections
-        ],
-    }
-    arrays: dict[str, NDArray] = {
-        "header": np.frombuffer(
-            json.dumps(header, default=lambda number: number.item()).encode(), np.uint8
-        ),
-        "frames": np.array(rows, np.float64).reshape(len(tracks), 16 + _NUMBERS + len(stages)),
-        "latency_ms": np.array(progress.latency_ms, np.float64),
-        "seconds": np.array([progress.wall_s, progress.cpu_s], np.float64),
-    }
-    for number, one in enumerate(progress.corrections):
-        arrays[f"correction_{number}_keyframes"] = one.keyframes
-        arrays[f"correction_{number}_T_cw"] = np.stack([one.T_cw_before, one.T_cw_after])
-    with replaced_file(path) as file:
-        np.savez(file, allow_pickle=False, **arrays)
-
-
-def read_progress(path: Path) -> Progress:
-    """Read what ``write_progress`` wrote.
-
-    Raises:
-        InputError: no such file, a damaged one, or of another version.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            header = json.loads(bytes(file["header"]))
-            if header["kind"] != "vslam progress" or header["schema"] != SCHEMA:
-                raise InputError(f"{path}: of another version of vslam; resume with that.")
-            tracks = [
-                _track(index, row, header["stages"]) for index, row in enumerate(file["frames"])
-            ]
-            wall_s, cpu_s = file["seconds"].tolist()
-            corrections = []
-            for number, entry in enumerate(header["corrections"]):
-                before, after = file[f"correction_{number}_T_cw"]
-                keyframes = file[f"correction_{number}_keyframes"]
-                edge = _loop_of(entry["edge"])
-                corrections.append(
-                    LoopCorrection(edge, keyframes, before, after, float(entry["seconds"]))
-                )
-            return Progress(
-                tracks=tracks,
-                skipped=[str(line) for line in header["skipped"]],
-                latency_ms=file["latency_ms"].tolist(),
-                wall_s=wall_s,
-                cpu_s=cpu_s,
-                loops=[_loop_of(entry) for entry in header["loops"]],
-                corrections=corrections,
-            )
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror or error}); there is nothing to resume."
-        ) from error
-    except (BadZipFile, ValueError, KeyError, TypeError, EOFError, IndexError) as error:
-        raise InputError(f"{path}: damaged ({error}); there is nothing to resume.") from error
-
-
-def _track(index: int, row: NDArray[np.float64], stages: list[str]) -> TrackResult:
-    timestamp, state, *counts, flags = row[16 : 16 + _NUMBERS].tolist()
-    n_features, n_stereo, n_matches, n_inliers = map(int, counts)
-    ms = row[16 + _NUMBERS :].tolist()
-    return TrackResult(
-        index=index,
-        timestamp=timestamp,
-        T_wc=row[:16].reshape(4, 4),
-        state=_STATES[int(state)],
-        n_features=n_features,
-        n_stereo=n_stereo,
-        n_matches=n_matches,
-        n_inliers=n_inliers,
-        is_keyframe=bool(int(flags) & 1),
-        relocalised=bool(int(flags) & 2),
-        stage_ms={name: t for name, t in zip(stages, ms, strict=True) if np.isfinite(t)},
-    )
-
-
-def _loop_entry(loop: LoopEdge) -> dict[str, Any]:
-    entry = {name: value for name, value in vars(loop).items() if name not in _LEFT_OUT}
-    T = loop.T_query_match
-    return entry | {"T_query_match": None if T is None else T.tolist()}
-
-
-_LEFT_OUT = ("features", "landmarks")
-
-
-def _loop_of(entry: dict[str, Any]) -> LoopEdge:
-    T = entry["T_query_match"]
-    T_query_match = None if T is None else np.array(T, np.float64).reshape(4, 4)
-    return LoopEdge(**{**entry, "T_query_match": T_query_match})

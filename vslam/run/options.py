@@ -7,7 +7,10 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from vslam.config import Config
+from vslam.datasets.sequence import Sequence
+from vslam.datasets.stream import Stream, is_live
 from vslam.errors import InputError
+from vslam.run.outcome import RunSettings
 
 OPTIONS = "run.json"
 
@@ -42,6 +45,35 @@ class RunOptions(BaseModel):
     save_map: Path | None = None
     realtime: bool = False
     autosave: float = 60.0
+
+
+def settings_of(
+    options: RunOptions, dataset: str, source: Sequence | Stream, perturb: str
+) -> RunSettings:
+    """What a run of a source with these options tells of itself.
+
+    Args:
+        dataset: what kind of source it is.
+        perturb: name of the perturbation, laws with their strengths.
+    """
+    return RunSettings(
+        dataset=dataset,
+        sequence=source.name,
+        perturb=perturb,
+        detector=options.detector,
+        sensor=source.camera.sensor,
+        seed=options.seed,
+        threads=options.threads,
+        start=options.start,
+        every=options.every,
+        max_frames=options.max_frames,
+        config=options.thresholds,
+        weights=options.weights,
+        realtime=options.realtime or is_live(source),
+        calib=options.calib,
+        map=options.map_file,
+        localize=options.localize,
+    )
 
 
 def write_options(folder: Path, options: RunOptions) -> None:

@@ -1,10 +1,4 @@
-"""From a sequence or stream to an outcome: frames are prepared ahead, tracked in order, recorded.
-
-Decoding, perturbing and extracting are pure functions of a frame, done by a small pool a few
-frames ahead. Their order is kept, so that the result does not depend on the number of threads.
-In real time frames are prepared when they come, both images at once, and those that come too soon
-are dropped; then the result depends on the machine.
-"""
+"""From a sequence or stream to an outcome: frames are prepared, tracked in order, recorded."""
 
 from __future__ import annotations
 
@@ -12,58 +6,37 @@ import logging
 import signal
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from functools import partial
-from itertools import dropwhile
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, DepthImage, Image, ImageMap, same_camera
+from vslam.camera import Camera, same_camera
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import Stream, TimedFrame, is_live, timed_frames
-from vslam.errors import (
-    BrokenSourceError,
-    DroppedFrameError,
-    InputError,
-    UnreadableImageError,
-)
-from vslam.features import Features, TrackResult
-from vslam.frontend.sides import Sides, compare_sides
-from vslam.frontend.tracking import TrackingContext, extract_features
+from vslam.errors import BrokenSourceError, InputError
+from vslam.features import TrackingState, TrackResult
+from vslam.frontend.sides import Sides
 from vslam.loopclosure.registry import create_detector, create_images, problem_of
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.machine import peak_memory_mb, process_age
 from vslam.map import Map
 from vslam.maps.storage import made_with
-from vslam.run.autosave import NO_AUTOSAVE, Autosave, Progress, Unfinished, in_frames
+from vslam.run.autosave import NO_AUTOSAVE, Autosave, Unfinished
 from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
-from vslam.run.realtime import Played, play
+from vslam.run.preparation import PreparedFrame, in_their_time
+from vslam.run.progress import Progress, TrackLog, in_frames
+from vslam.run.realtime import Played
 from vslam.run.recorder import NullRecorder, Recorder
 from vslam.run.rig import measure_rig, residual_warnings, rig_warnings
 from vslam.slam import Slam
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class PreparedFrame:
-    """A frame ready to be tracked, or the reason why it cannot be read; ``dropped`` by a
-    perturbation."""
-
-    left: NDArray[np.uint8] | None
-    features: Features | None
-    stage_ms: dict[str, float]
-    problem: str | None = None
-    dropped: bool = False
-    sides: Sides = field(default_factory=Sides)
 
 
 def run_sequence(
@@ -75,6 +48,7 @@ def run_sequence(
     on_frame: Callable[[TrackResult], None] = lambda result: None,
     autosave: Autosave = NO_AUTOSAVE,
     resume: Unfinished | None = None,
+    slam: Slam | None = None,
 ) -> RunOutcome:
     """Run SLAM over a whole sequence, or over a stream until it ends.
 
@@ -87,65 +61,29 @@ def run_sequence(
         autosave: saves what is done while the run goes on.
         resume: what such a run left; this one goes on at the next frame, and its outcome covers
             both.
+        slam: what ``begin`` gave for the same settings, if that was called before.
+
+    Raises:
+        InputError: the images are not those that the resumed run began with; as ``begin``.
     """
     cv2.setNumThreads(1)  # the pool uses the cores
-    slam = begin(sequence.camera, settings, None if resume is None else resume.map)
-    before = Progress() if resume is None else resume.progress
-    tracks = list(before.tracks)
-    skipped = list(before.skipped)
-    sides: list[Sides] = []
-    latency_ms = list(before.latency_ms)
-    n_told = 0  # loops that the recorder knows of
+    slam = slam or begin(sequence.camera, settings, None if resume is None else resume.map)
     perturbation = perturbation.bound_to(sequence)
     recorder.begin(sequence.camera, ground_truth_of(sequence))
-    startup = process_age()
-    wall, cpu = time.perf_counter(), time.process_time()
+    account = _Account(slam, Progress() if resume is None else resume.progress)
+    slam.on_merge = lambda: autosave.offer_amid(slam, account.so_far)
+    n_told = 0  # loops that the recorder knows of
     broken: list[str] = []
-
-    def so_far() -> Progress:
-        frames = _frames_of_this_run(slam.map)
-        loops, corrections = in_frames(slam.loops, slam.corrections, frames)
-        return Progress(
-            tracks=tracks.copy(),
-            skipped=skipped.copy(),
-            latency_ms=latency_ms.copy(),
-            wall_s=before.wall_s + time.perf_counter() - wall,
-            cpu_s=before.cpu_s + time.process_time() - cpu,
-            loops=before.loops + loops,
-            corrections=before.corrections + corrections,
-        )
-
-    slam.on_merge = lambda: autosave.offer_amid(slam, so_far)
     with _stop_on_interrupt() as interrupted:
         frames = perturbed(_until_broken(timed_frames(sequence), broken), perturbation)
-        if tracks:
-            frames = dropwhile(partial(_not_later, tracks[-1].timestamp), frames)
-        for played in _prepared(frames, slam.context, settings, live=is_live(sequence)):
-            timestamp, frame = played.timestamp, played.made
-            if frame is None or frame.dropped:
-                tracks.append(slam.skip(timestamp, dropped=True))
-                autosave.frame(tracks[-1])
-                on_frame(tracks[-1])
-                continue
-            sides.append(frame.sides)
-            if frame.features is None or frame.left is None:
-                skipped.append(f"frame {len(tracks)}: {frame.problem}")
-                _log.warning("frame %d skipped: %s", len(tracks), frame.problem)
-                result = slam.skip(timestamp)
-            else:
-                result = slam.step_features(frame.features, timestamp, frame.left, frame.stage_ms)
-                if settings.realtime:
-                    latency_ms.append(1e3 * (time.perf_counter() - played.came))
-            tracks.append(result)
+        frames = _following(frames, account.before.tracks.timestamps)
+        for played in in_their_time(frames, slam.context, settings, live=is_live(sequence)):
+            result = _track(slam, played, account, realtime=settings.realtime)
             autosave.frame(result)
-            recorder.frame(result, result.T_wc)
-            if result.is_keyframe and slam.frame is not None and frame.left is not None:
-                recorder.keyframe(result, frame.left, slam.frame.features, slam.frame.landmark >= 0)
-            if not slam.is_mapping:
-                recorder.map(slam.map)
-                n_told = _tell_loops(recorder, slam, n_told)
+            if result.state != TrackingState.DROPPED:
+                n_told = _show(recorder, slam, result, played, n_told)
             on_frame(result)
-            autosave.offer(slam, so_far)
+            autosave.offer(slam, account.so_far)
             if problem := problem_of(slam.detector):
                 broken.append(problem)
                 break
@@ -156,29 +94,138 @@ def run_sequence(
         slam.finish()
     if not broken and (problem := problem_of(slam.detector)):
         broken.append(problem)
-    autosave.close(slam, so_far, whole=not broken)
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    autosave.close(slam, account.so_far, whole=not broken)
+    seconds = account.seconds()
     _tell_loops(recorder, slam, n_told)
-    loops, corrections, keyframe_frames = _with_earlier(before, slam)
-    trajectory = slam.trajectory()
+    recorder.finish(slam.trajectory(), slam.map)
+    return _outcome(sequence, settings, slam, account, seconds, broken[0] if broken else None)
+
+
+class _Account:
+    """What becomes of the frames of a run, those before it was resumed included."""
+
+    def __init__(self, slam: Slam, before: Progress) -> None:
+        self.before = before
+        self.tracks = before.tracks.results()
+        self.sides = before.tracks.sides()
+        self.skipped = list(before.skipped)
+        self.latency_ms = list(before.latency_ms)
+        self.startup_s = process_age()
+        self._slam = slam
+        self._log = TrackLog(before.tracks)
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def add(self, result: TrackResult, sides: Sides | None = None) -> None:
+        """The next frame; without ``sides`` it was dropped."""
+        self.tracks.append(result)
+        self._log.append(result, sides or Sides())
+        if sides is not None:
+            self.sides.append(sides)
+
+    def seconds(self) -> tuple[float, float]:
+        """Wall and CPU time of all frames."""
+        wall, cpu = time.perf_counter() - self._wall, time.process_time() - self._cpu
+        return self.before.wall_s + wall, self.before.cpu_s + cpu
+
+    def so_far(self) -> Progress:
+        """A copy of what is known, for an autosave."""
+        slam, before = self._slam, self.before
+        frames = _frames_of_this_run(slam.map)
+        loops, corrections = in_frames(slam.loops, slam.corrections, frames)
+        wall_s, cpu_s = self.seconds()
+        return Progress(
+            tracks=self._log.table(),
+            skipped=self.skipped.copy(),
+            latency_ms=self.latency_ms.copy(),
+            wall_s=wall_s,
+            cpu_s=cpu_s,
+            loops=before.loops + loops,
+            corrections=before.corrections + corrections,
+        )
+
+
+def _track(
+    slam: Slam, played: Played[PreparedFrame], account: _Account, *, realtime: bool
+) -> TrackResult:
+    """Track a frame that was prepared, or pass over one that was dropped or cannot be read."""
+    timestamp, frame = played.timestamp, played.made
+    if frame is None or frame.dropped:
+        result = slam.skip(timestamp, dropped=True)
+        account.add(result)
+        return result
+    if frame.features is None or frame.left is None:
+        index = len(account.tracks)
+        account.skipped.append(f"frame {index}: {frame.problem}")
+        _log.warning("frame %d skipped: %s", index, frame.problem)
+        result = slam.skip(timestamp)
+    else:
+        result = slam.step_features(frame.features, timestamp, frame.left, frame.stage_ms)
+        if realtime:
+            account.latency_ms.append(1e3 * (time.perf_counter() - played.came))
+    account.add(result, frame.sides)
+    return result
+
+
+def _show(
+    recorder: Recorder,
+    slam: Slam,
+    result: TrackResult,
+    played: Played[PreparedFrame],
+    n_told: int,
+) -> int:
+    """Show the recorder a frame, and the map while it can be read; returns the loops told."""
+    recorder.frame(result, result.T_wc)
+    left = None if played.made is None else played.made.left
+    if result.is_keyframe and slam.frame is not None and left is not None:
+        recorder.keyframe(result, left, slam.frame.features, slam.frame.landmark >= 0)
+    if slam.is_mapping:
+        return n_told
+    recorder.map(slam.map)
+    return _tell_loops(recorder, slam, n_told)
+
+
+def _following(frames: Iterator[TimedFrame], before: NDArray[np.float64]) -> Iterator[TimedFrame]:
+    """The frames after those of a run that is resumed, whose times were ``before`` ``(N,)``.
+
+    Raises:
+        InputError: they are others.
+    """
+    for index, timestamp in enumerate(before.tolist()):
+        frame = next(frames, None)
+        if frame is None or frame.timestamp != timestamp:
+            now = "there is none" if frame is None else f"it has {frame.timestamp:.6f} s"
+            raise InputError(
+                f"--resume: frame {index} had the time {timestamp:.6f} s, now {now}: these are not "
+                "the images that the run began with; put those back, or run anew."
+            )
+    yield from frames
+
+
+def _outcome(
+    sequence: Sequence | Stream,
+    settings: RunSettings,
+    slam: Slam,
+    account: _Account,
+    seconds: tuple[float, float],
+    interrupted: str | None,
+) -> RunOutcome:
+    """All that is known at the end; ``seconds`` of wall and CPU time of all frames."""
+    loops, corrections, keyframe_frames = _with_earlier(account.before, slam)
+    residuals = measure_rig(slam.map, sequence.camera)
     drive = f"{settings.dataset} {sequence.name}"
-    recorder.finish(trajectory, slam.map)
     return RunOutcome(
         settings=settings,
         sequence=sequence,
-        trajectory=trajectory,
+        trajectory=slam.trajectory(),
         keyframes=slam.keyframe_trajectory(),
-        tracks=tracks,
-        skipped=skipped,
-        warnings=[
-            *rig_warnings(sides),
-            *residual_warnings(measure_rig(slam.map, sequence.camera), sequence.camera),
-        ],
-        wall_s=before.wall_s + wall,
-        cpu_s=before.cpu_s + cpu,
-        startup_s=startup,
+        tracks=account.tracks,
+        skipped=account.skipped,
+        warnings=[*rig_warnings(account.sides), *residual_warnings(residuals, sequence.camera)],
+        wall_s=seconds[0],
+        cpu_s=seconds[1],
+        startup_s=account.startup_s,
         peak_memory_mb=peak_memory_mb(),
-        latency_ms=latency_ms,
+        latency_ms=account.latency_ms,
         n_keyframes=len(slam.map.living_keyframes()),
         n_landmarks=len(slam.map.living_landmarks()),
         map=slam.map,
@@ -189,12 +236,8 @@ def run_sequence(
         corrections=corrections,
         keyframe_frames=keyframe_frames,
         n_submaps=len({0, *slam.map.restarts}) if slam.map.n_keyframes else 0,
-        interrupted=broken[0] if broken else None,
+        interrupted=interrupted,
     )
-
-
-def _not_later(timestamp: float, frame: TimedFrame) -> bool:
-    return frame.timestamp <= timestamp
 
 
 def _with_earlier(
@@ -287,73 +330,6 @@ def _until_broken(frames: Iterator[TimedFrame], broken: list[str]) -> Iterator[T
         yield from frames
     except BrokenSourceError as error:
         broken.append(str(error).rstrip("."))
-
-
-def _prepared(
-    frames: Iterator[TimedFrame], context: TrackingContext, settings: RunSettings, *, live: bool
-) -> Iterator[Played[PreparedFrame]]:
-    """Prepared frames and when they came: all of them at the start, or each in its time."""
-    if settings.realtime:
-        with ThreadPoolExecutor(2, "side") as pool:
-            image_map = map if settings.threads == 1 else pool.map
-            yield from play(
-                frames,
-                lambda frame: prepare_frame(frame, context, image_map),
-                settings.threads,
-                live=live,
-            )
-        return
-    start = time.perf_counter()
-    for timestamp, prepared in prepared_frames(frames, context, settings.threads):
-        yield Played(timestamp, prepared, start)
-
-
-def prepared_frames(
-    frames: Iterator[TimedFrame], context: TrackingContext, threads: int
-) -> Iterator[tuple[float, PreparedFrame]]:
-    """Frames in order with their times; with more than one thread, prepared a few frames ahead."""
-    if threads == 1:
-        for frame in frames:
-            yield frame.timestamp, prepare_frame(frame, context)
-        return
-    ahead: deque[tuple[float, Future[PreparedFrame]]] = deque()
-    with ThreadPoolExecutor(threads, "extraction") as pool:
-        try:
-            for frame in frames:
-                ahead.append((frame.timestamp, pool.submit(prepare_frame, frame, context)))
-                if len(ahead) == 2 * threads:
-                    timestamp, prepared = ahead.popleft()
-                    yield timestamp, prepared.result()
-            for timestamp, prepared in ahead:
-                yield timestamp, prepared.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def prepare_frame(
-    frame: TimedFrame, context: TrackingContext, image_map: ImageMap = map
-) -> PreparedFrame:
-    """Read one frame and extract its features."""
-    start = time.perf_counter()
-    try:
-        left, second = frame.read(image_map)
-    except UnreadableImageError as error:
-        dropped = isinstance(error, DroppedFrameError)
-        return PreparedFrame(None, None, {}, str(error), dropped)
-    read = time.perf_counter()
-    sides = _sides(left, second, context)
-    features = extract_features(left, second, context, image_map, sides)
-    done = time.perf_counter()
-    stage_ms = {"read": 1e3 * (read - start), "extract": 1e3 * (done - read)}
-    return PreparedFrame(left, features, stage_ms, sides=sides or Sides())
-
-
-def _sides(
-    left: Image, second: Image | DepthImage | None, context: TrackingContext
-) -> Sides | None:
-    if second is None or second.dtype != np.uint8:
-        return None
-    return compare_sides(left, np.asarray(second, np.uint8), context.config.stereo)
 
 
 def _tell_loops(recorder: Recorder, slam: Slam, n_told: int) -> int:

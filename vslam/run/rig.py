@@ -83,16 +83,20 @@ def fit(
 
 
 def _twists(map_: Map) -> NDArray[np.float64]:
-    """``(K, 6)`` motion of each keyframe per second, NaN beside a gap."""
-    living = map_.living_keyframes()
+    """``(K, 6)`` motion of each keyframe per second, NaN beside a gap. Each drive has a clock of
+    its own."""
     T_cw, times = map_.arrays.T_cw, map_.timestamps
     twists = np.full((map_.n_keyframes, 6), np.nan)
-    for k, keyframe in enumerate(living):
-        before, behind = living[max(0, k - 1)], living[min(len(living) - 1, k + 1)]
-        elapsed = times[behind] - times[before]
-        if 0 < elapsed < _LONGEST_GAP_S:
-            step = compose(T_cw[behind], inverse(T_cw[before]))
-            twists[keyframe] = se3_log(orthonormalised(step)) / elapsed
+    living = map_.living_keyframes()
+    sessions = np.array(map_.sessions)[living]
+    for session in np.unique(sessions):
+        drive = living[sessions == session]
+        for k, keyframe in enumerate(drive):
+            before, behind = drive[max(0, k - 1)], drive[min(len(drive) - 1, k + 1)]
+            elapsed = times[behind] - times[before]
+            if 0 < elapsed < _LONGEST_GAP_S:
+                step = compose(T_cw[behind], inverse(T_cw[before]))
+                twists[keyframe] = se3_log(orthonormalised(step)) / elapsed
     return twists
 
 

@@ -28,7 +28,12 @@ if TYPE_CHECKING:
     from vslam.stress.schema import BoundaryEntry, StressJson
 
 _COLORS = (BLUE, AMBER, GREEN, VIOLET, RED)
-_PANELS = (("lost_percent", "lost (%)"), ("ate_rmse_m", "ATE (m)"), ("loops_closed", "loops"))
+# What is drawn, its title, and what an axis reaches at least: nothing lost is no line across it.
+_PANELS = (
+    ("lost_percent", "lost (%)", 5.0),
+    ("ate_rmse_m", "ATE (m)", 0.1),
+    ("loops_closed", "loops", 1.2),
+)
 
 
 def draw_curves(report: StressJson) -> list[ReportFigure]:
@@ -55,7 +60,7 @@ def _curves(
     named: set[str] = set()
     for entry in entries:
         color = colors[entry.system]
-        for panel, (name, _) in zip(panels, _PANELS, strict=True):
+        for panel, (name, *_) in zip(panels, _PANELS, strict=True):
             some = [test for test in entry.tested if getattr(test, name) is not None]
             at = [test.strength for test in some]
             values = [getattr(test, name) for test in some]
@@ -69,11 +74,10 @@ def _curves(
                 )  # fmt: skip
         named.add(entry.system)
     kind = law_kind(law)
-    for panel, (_, title) in zip(panels, _PANELS, strict=True):
+    for panel, (_, title, least) in zip(panels, _PANELS, strict=True):
         panel.set_ylabel(title)
-        panel.set_ylim(0, max(1e-9, 1.05 * panel.get_ylim()[1]))
+        panel.set_ylim(0, max(least, 1.05 * panel.get_ylim()[1]))
         panel.tick_params(length=3)
-    panels[2].set_ylim(0, max(1.2, panels[2].get_ylim()[1]))
     panels[2].yaxis.set_major_locator(MaxNLocator(3, integer=True))
     panels[2].set_xlabel("strength" if kind.unit == "x" else kind.unit)
     if kind.logarithmic:

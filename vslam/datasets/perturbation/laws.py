@@ -151,14 +151,14 @@ def sheet_of_laws(sequence: Sequence, specs: Collection[str], index: int, seed: 
     return np.hstack([np.vstack(rows[:half]), np.vstack(rows[half:])])
 
 
-def laws_for(sequence: Sequence | Stream) -> tuple[list[str], list[str]]:
-    """Names of the laws that a source has the data for, and why the others do not apply."""
-    fit, unfit = [], []
+def laws_for(sequence: Sequence | Stream) -> tuple[list[str], dict[str, str]]:
+    """Names of the laws that a source has the data for, and of the others why they do not apply."""
+    fit, unfit = [], {}
     for name in all_laws():
         try:
             parse_perturbation(name, 0).bound_to(sequence)
         except InputError as error:
-            unfit.append(str(error))
+            unfit[name] = str(error)
         else:
             fit.append(name)
     return fit, unfit

@@ -1,0 +1,108 @@
+"""How much a compressed chunk of a bag may unpack to: rosbags itself sets no limit.
+
+A few kilobytes can speak of gigabytes. rosbags unpacks with functions that it looks up in tables of
+its modules; these are replaced by ones that stop.
+"""
+
+from __future__ import annotations
+
+import bz2
+import logging
+import shutil
+import tempfile
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any, Protocol
+
+MOST_BYTES = 2**29
+"""Of a chunk or a message: an image of `vslam.untrusted.MOST_PIXELS` with four bytes a pixel.
+Recorders write chunks of 0.8 to 4 MB."""
+
+_FREE_BYTES = 2**30  # of the disk, left by a bag that is unpacked as a whole
+_log = logging.getLogger(__name__)
+
+
+class _Decompressor(Protocol):
+    eof: bool
+    unused_data: bytes
+
+    def decompress(self, data: bytes, max_length: int = -1) -> bytes: ...
+
+
+def limit_bags() -> None:
+    """Let rosbags refuse chunks, messages and files beyond the limits; the second call is idle."""
+    import lz4.frame
+    from rosbags.rosbag1 import reader as ros1
+    from rosbags.rosbag2 import reader, storage_mcap
+
+    ros2: Any = reader
+    try:
+        zstd = ros2.zstd
+        if isinstance(zstd, SimpleNamespace):
+            return
+        kinds: dict[str, Callable[[], Any]] = {
+            "bz2": bz2.BZ2Decompressor,
+            "lz4": lz4.frame.LZ4FrameDecompressor,
+            "zstd": zstd.ZstdDecompressor,
+        }
+        ros1.decompressors.update({name: _limited(kinds[name]) for name in ("bz2", "lz4")})
+        storage_mcap.DECOMPRESSORS.update(
+            {name: _limited_by_size(kinds[name]) for name in ("lz4", "zstd")}
+        )
+
+        def opened(file: Any, mode: str) -> _LimitedFile:
+            return _LimitedFile(zstd.open(file, mode))
+
+        ros2.zstd = SimpleNamespace(decompress=_limited(kinds["zstd"]), open=opened)
+    except AttributeError as error:
+        _log.warning("this rosbags cannot be limited (%s): a bag may take all memory", error)
+
+
+def unpack(make: Callable[[], _Decompressor], data: bytes, most: int) -> bytes:
+    """All frames of compressed data, one behind the other.
+
+    Raises:
+        ValueError: more than ``most`` bytes, or cut off.
+    """
+    parts: list[bytes] = []
+    room = most
+    while data:
+        decompressor = make()
+        parts.append(decompressor.decompress(data, max_length=room + 1))
+        room -= len(parts[-1])
+        if room < 0:
+            raise ValueError(f"a chunk unpacks to more than {most / 2**20:.0f} MB")
+        if not decompressor.eof:
+            raise ValueError("a compressed chunk is cut off")
+        data = decompressor.unused_data or b""
+    return parts[0] if len(parts) == 1 else b"".join(parts)
+
+
+def _limited(make: Callable[[], _Decompressor]) -> Callable[[bytes], bytes]:
+    return lambda data: unpack(make, data, MOST_BYTES)
+
+
+def _limited_by_size(make: Callable[[], _Decompressor]) -> Callable[[bytes, int], bytes]:
+    """Of chunks that say how large they are; another size is refused by rosbags."""
+    return lambda data, size: unpack(make, data, min(size, MOST_BYTES))
+
+
+class _LimitedFile:
+    """A compressed file that rosbags unpacks into a temporary folder."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self._left = shutil.disk_usage(tempfile.gettempdir()).free - _FREE_BYTES
+
+    def __enter__(self) -> _LimitedFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def read(self, size: int = -1) -> bytes:
+        data: bytes = self._file.read(size)
+        self._left -= len(data)
+        if self._left < 0:
+            raise ValueError(f"unpacked, it does not fit into {tempfile.gettempdir()}")
+        return data

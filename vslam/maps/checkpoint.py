@@ -1,0 +1,138 @@
+"""What SLAM remembers between two frames besides the map, and what of it a file holds."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.features import Features
+from vslam.geometry import Matrix
+from vslam.loops import ClosingMemory, ResembledPlace, loop_entry, loop_of
+
+# N features of the last frame tracked; a velocity is there or not.
+ARRAYS: dict[str, tuple[type, tuple[int | None, ...]]] = {
+    "xy": (np.float32, (None, 2)),
+    "octave": (np.uint8, (None,)),
+    "angle": (np.float32, (None,)),
+    "descriptors": (np.uint8, (None, 32)),
+    "u_right": (np.float32, (None,)),
+    "landmark": (np.int32, (None,)),
+}
+_NUMBERS = ("index", "timestamp", "reference", "last_frame", "last_timestamp", "lost_frames",
+            "n_tracked")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What tracking and loop closing remember between two frames: with it, and with the map as it
+    was, a run goes on to the byte as if it had not stopped.
+
+    Attributes:
+        index, timestamp: of the last frame tracked.
+        features: its N features.
+        landmark: ``(N,)`` int32, the landmark that each of them tracks, or -1.
+        T_cw: ``(4, 4)`` its pose.
+        velocity: ``(6,)`` twist per second; None if unknown.
+        reference: the keyframe that frames are tracked and placed by.
+        last_frame, last_timestamp: when the last keyframe was made.
+        lost_frames: since the last frame tracked.
+        n_tracked: landmarks in it when it was tracked.
+        closing: what loop closing remembers.
+    """
+
+    index: int
+    timestamp: float
+    features: Features
+    landmark: NDArray[np.int32]
+    T_cw: Matrix
+    velocity: Matrix | None
+    reference: int
+    last_frame: int
+    last_timestamp: float
+    lost_frames: int
+    n_tracked: int
+    closing: ClosingMemory
+
+
+def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
+    """Those of ``ARRAYS``."""
+    return {**vars(checkpoint.features), "landmark": checkpoint.landmark}
+
+
+def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
+    """All else of a checkpoint, for JSON, which keeps every bit of a number."""
+    closing = checkpoint.closing
+    return {name: getattr(checkpoint, name) for name in _NUMBERS} | {
+        "T_cw": checkpoint.T_cw.tolist(),
+        "velocity": None if checkpoint.velocity is None else checkpoint.velocity.tolist(),
+        "closing": {
+            **asdict(closing),
+            "places": [[sorted(one.keyframes), one.length, one.age] for one in closing.places],
+            "verified": [[turn, loop_entry(edge)] for turn, edge in closing.verified],
+        },
+    }
+
+
+def checked_checkpoint(
+    arrays: dict[str, NDArray], entry: dict[str, Any], n_keyframes: int, n_landmarks: int
+) -> Checkpoint:
+    """The checkpoint of a file, which may hold anything.
+
+    Raises:
+        KeyError, TypeError, ValueError: in a few words what is wrong with it.
+    """
+    n = len(arrays["landmark"])
+    for name, (dtype, shape) in ARRAYS.items():
+        array = arrays[name]
+        wanted = tuple(n if size is None else size for size in shape)
+        if array.dtype != dtype or array.shape != wanted or not array.flags.c_contiguous:
+            raise ValueError(f"checkpoint_{name} is {array.dtype} {array.shape}")
+    landmark = arrays["landmark"]
+    closing = _closing_of(entry["closing"], n_keyframes)
+    T_cw = np.array(entry["T_cw"], np.float64)
+    velocity = entry["velocity"]
+    velocity = None if velocity is None else np.array(velocity, np.float64)
+    numbers = {name: entry[name] for name in _NUMBERS}
+    sound = (
+        T_cw.shape == (4, 4)
+        and (velocity is None or velocity.shape == (6,))
+        and all(np.isfinite(x).all() for x in (T_cw, 0.0 if velocity is None else velocity))
+        and np.isfinite(arrays["xy"]).all()
+        and all(isinstance(number, int | float) for number in numbers.values())
+        and 0 <= numbers["reference"] < n_keyframes
+        and ((landmark >= -1) & (landmark < n_landmarks)).all()
+    )
+    if not sound:
+        raise ValueError("the last frame is out of range")
+    features = Features(**{name: arrays[name] for name in ARRAYS if name != "landmark"})
+    return Checkpoint(
+        **numbers,
+        features=features,
+        landmark=landmark,
+        T_cw=T_cw,
+        velocity=velocity,
+        closing=closing,
+    )
+
+
+def _closing_of(entry: dict[str, Any], n_keyframes: int) -> ClosingMemory:
+    verified = tuple((int(turn), loop_of(edge)) for turn, edge in entry["verified"])
+    for _, edge in verified:
+        T = edge.T_query_match
+        known = min(edge.query, edge.match) >= 0 and max(edge.query, edge.match) < n_keyframes
+        if not known or T is None or not np.isfinite(T).all() or not edge.scale > 0:
+            raise ValueError("a loop that waits is out of range")
+    return ClosingMemory(
+        places=tuple(
+            ResembledPlace(frozenset(map(int, keyframes)), int(length), int(age))
+            for keyframes, length, age in entry["places"]
+        ),
+        verified=verified,
+        turn=int(entry["turn"]),
+        resting_until=int(entry["resting_until"]),
+        in_vain=float(entry["in_vain"]),
+        followed=int(entry["followed"]),
+    )

@@ -1,0 +1,104 @@
+"""From frames yet to be read to features: decoded, perturbed and extracted a few frames ahead.
+
+All of that is a pure function of a frame, done by a small pool. The order is kept, so that the
+result does not depend on the number of threads. In real time frames are prepared when they come,
+both images at once, and those that come too soon are dropped; then it depends on the machine.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import DepthImage, Image, ImageMap
+from vslam.datasets.stream import TimedFrame
+from vslam.errors import DroppedFrameError, UnreadableImageError
+from vslam.features import Features
+from vslam.frontend.sides import Sides, compare_sides
+from vslam.frontend.tracking import TrackingContext, extract_features
+from vslam.run.outcome import RunSettings
+from vslam.run.realtime import Played, play
+
+
+@dataclass(frozen=True)
+class PreparedFrame:
+    """A frame ready to be tracked, or the reason why it cannot be read; ``dropped`` by a
+    perturbation."""
+
+    left: NDArray[np.uint8] | None
+    features: Features | None
+    stage_ms: dict[str, float]
+    problem: str | None = None
+    dropped: bool = False
+    sides: Sides = field(default_factory=Sides)
+
+
+def in_their_time(
+    frames: Iterator[TimedFrame], context: TrackingContext, settings: RunSettings, *, live: bool
+) -> Iterator[Played[PreparedFrame]]:
+    """Prepared frames and when they came: all of them at the start, or each in its time."""
+    if settings.realtime:
+        with ThreadPoolExecutor(2, "side") as pool:
+            image_map = map if settings.threads == 1 else pool.map
+            yield from play(
+                frames,
+                lambda frame: prepare_frame(frame, context, image_map),
+                settings.threads,
+                live=live,
+            )
+        return
+    start = time.perf_counter()
+    for timestamp, prepared in prepared_frames(frames, context, settings.threads):
+        yield Played(timestamp, prepared, start)
+
+
+def prepared_frames(
+    frames: Iterator[TimedFrame], context: TrackingContext, threads: int
+) -> Iterator[tuple[float, PreparedFrame]]:
+    """Frames in order with their times; with more than one thread, prepared a few frames ahead."""
+    if threads == 1:
+        for frame in frames:
+            yield frame.timestamp, prepare_frame(frame, context)
+        return
+    ahead: deque[tuple[float, Future[PreparedFrame]]] = deque()
+    with ThreadPoolExecutor(threads, "extraction") as pool:
+        try:
+            for frame in frames:
+                ahead.append((frame.timestamp, pool.submit(prepare_frame, frame, context)))
+                if len(ahead) == 2 * threads:
+                    timestamp, prepared = ahead.popleft()
+                    yield timestamp, prepared.result()
+            for timestamp, prepared in ahead:
+                yield timestamp, prepared.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def prepare_frame(
+    frame: TimedFrame, context: TrackingContext, image_map: ImageMap = map
+) -> PreparedFrame:
+    """Read one frame and extract its features."""
+    start = time.perf_counter()
+    try:
+        left, second = frame.read(image_map)
+    except UnreadableImageError as error:
+        dropped = isinstance(error, DroppedFrameError)
+        return PreparedFrame(None, None, {}, str(error), dropped)
+    read = time.perf_counter()
+    sides = _sides(left, second, context)
+    features = extract_features(left, second, context, image_map, sides)
+    done = time.perf_counter()
+    stage_ms = {"read": 1e3 * (read - start), "extract": 1e3 * (done - read)}
+    return PreparedFrame(left, features, stage_ms, sides=sides)
+
+
+def _sides(left: Image, second: Image | DepthImage | None, context: TrackingContext) -> Sides:
+    if second is None or second.dtype != np.uint8:
+        return Sides()
+    return compare_sides(left, np.asarray(second, np.uint8), context.config.stereo)

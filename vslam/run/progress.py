@@ -1,0 +1,266 @@
+"""What a run has done so far, as arrays: what its report tells of the frames, for a file.
+
+A run that is cut off leaves it beside its map, and one that is resumed begins with it. Frames are
+written down as they come: saving them copies arrays, however many there are.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from array import array
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError
+from vslam.features import TrackingState, TrackResult
+from vslam.frontend.sides import Sides
+from vslam.loops import LoopCorrection, LoopEdge, loop_entry, loop_of
+from vslam.maps.new_output import replaced_file
+
+SCHEMA = 2
+_DAMAGED = (
+    BadZipFile, ValueError, KeyError, TypeError, EOFError, IndexError, MemoryError, RuntimeError
+)  # fmt: skip
+_STATES = tuple(TrackingState)
+_BLACK = ("", "left", "right")
+_POSE, _NUMBERS = 16, 9  # of a frame: its pose, then what else is known of it
+
+
+@dataclass(frozen=True)
+class TrackTable:
+    """What became of N frames, in order.
+
+    Attributes:
+        rows: ``(N, 25)`` float64: ``T_wc`` row by row; time, state, features, stereo features,
+            matches, inliers, flags (1 keyframe, 2 relocalised), darker stops, black side.
+        stages: names of the stages that took time.
+        stage_ms: ``(N, S)`` float64 milliseconds, NaN for a stage that a frame did not pass.
+    """
+
+    rows: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, _POSE + _NUMBERS)))
+    stages: tuple[str, ...] = ()
+    stage_ms: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def timestamps(self) -> NDArray[np.float64]:
+        """``(N,)`` seconds."""
+        return self.rows[:, _POSE]
+
+    def until(self, frames: int) -> TrackTable:
+        """The first frames."""
+        return replace(self, rows=self.rows[:frames], stage_ms=self.stage_ms[:frames])
+
+    def results(self) -> list[TrackResult]:
+        """The frames as tracking gave them."""
+        return [
+            _track(index, row, dict(zip(self.stages, ms, strict=True)))
+            for index, (row, ms) in enumerate(zip(self.rows, self.stage_ms.tolist(), strict=True))
+        ]
+
+    def sides(self) -> list[Sides]:
+        """How the sides compared, of the frames that were not dropped."""
+        came = self.rows[:, _POSE + 1] != _STATES.index(TrackingState.DROPPED)
+        told = self.rows[came, _POSE + 7 :].tolist()
+        return [Sides(stops, _BLACK[int(black)]) for stops, black in told]  # type: ignore[arg-type]
+
+
+class TrackLog:
+    """A ``TrackTable`` that grows."""
+
+    def __init__(self, before: TrackTable) -> None:
+        self._rows = array("d", before.rows.tobytes())
+        self._stage_ms = {
+            name: array("d", np.ascontiguousarray(before.stage_ms[:, k]).tobytes())
+            for k, name in enumerate(before.stages)
+        }
+        self._n = len(before)
+
+    def append(self, track: TrackResult, sides: Sides) -> None:
+        """Write the next frame down."""
+        self._rows.extend(track.T_wc.ravel())
+        self._rows.extend((
+            track.timestamp, _STATES.index(track.state), track.n_features, track.n_stereo,
+            track.n_matches, track.n_inliers, track.is_keyframe + 2 * track.relocalised,
+            sides.darker_stops, _BLACK.index(sides.black),
+        ))  # fmt: skip
+        for name in track.stage_ms:
+            if name not in self._stage_ms:
+                self._stage_ms[name] = array("d", [np.nan] * self._n)
+        for name, column in self._stage_ms.items():
+            column.append(track.stage_ms.get(name, np.nan))
+        self._n += 1
+
+    def table(self) -> TrackTable:
+        """A copy of all frames."""
+        columns = [np.array(column) for column in self._stage_ms.values()]
+        return TrackTable(
+            np.array(self._rows).reshape(self._n, _POSE + _NUMBERS),
+            tuple(self._stage_ms),
+            np.stack(columns, axis=1) if columns else np.empty((self._n, 0)),
+        )
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a report tells of the first frames of a run.
+
+    Attributes:
+        tracks: the frames.
+        skipped, latency_ms, wall_s, cpu_s: as of ``RunOutcome``.
+        loops: with frames of the run in the place of keyframes, -1 where that is none of its own.
+        corrections: of some of these loops, alike.
+    """
+
+    tracks: TrackTable = field(default_factory=TrackTable)
+    skipped: list[str] = field(default_factory=list)
+    latency_ms: list[float] = field(default_factory=list)
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    loops: list[LoopEdge] = field(default_factory=list)
+    corrections: list[LoopCorrection] = field(default_factory=list)
+
+    def until(self, frames: int) -> Progress:
+        """What it was after so many frames."""
+        return replace(
+            self,
+            tracks=self.tracks.until(frames),
+            skipped=[line for line in self.skipped if _frame_of(line) < frames],
+            loops=[loop for loop in self.loops if loop.query < frames],
+            corrections=[one for one in self.corrections if one.edge.query < frames],
+        )
+
+
+def _frame_of(message: str) -> int:
+    return int(message.removeprefix("frame ").partition(":")[0])
+
+
+def frames_of(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[LoopEdge]:
+    """Loops with the frames ``(K,)`` of keyframes in their place, and without features."""
+    return [
+        replace(
+            loop,
+            query=int(frames[loop.query]) if loop.query >= 0 else -1,
+            match=int(frames[loop.match]),
+            features=None,
+            landmarks=None,
+        )
+        for loop in loops
+    ]
+
+
+def in_frames(
+    loops: list[LoopEdge], corrections: list[LoopCorrection], frames: NDArray[np.int64]
+) -> tuple[list[LoopEdge], list[LoopCorrection]]:
+    """``frames_of`` loops and of what they corrected."""
+    edges = frames_of([one.edge for one in corrections], frames)
+    moved = [
+        replace(one, edge=edge, keyframes=frames[one.keyframes])
+        for one, edge in zip(corrections, edges, strict=True)
+    ]
+    return frames_of(loops, frames), moved
+
+
+def write_progress(path: Path, progress: Progress) -> None:
+    """Write an ``.npz``, in place of what is there.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    header = {
+        "kind": "vslam progress",
+        "schema": SCHEMA,
+        "stages": progress.tracks.stages,
+        "skipped": progress.skipped,
+        "loops": [loop_entry(loop) for loop in progress.loops],
+        "corrections": [
+            {"edge": loop_entry(one.edge), "seconds": one.seconds} for one in progress.corrections
+        ],
+    }
+    arrays: dict[str, NDArray] = {
+        "header": np.frombuffer(
+            json.dumps(header, default=lambda number: number.item()).encode(), np.uint8
+        ),
+        "frames": progress.tracks.rows,
+        "stage_ms": progress.tracks.stage_ms,
+        "latency_ms": np.array(progress.latency_ms, np.float64),
+        "seconds": np.array([progress.wall_s, progress.cpu_s], np.float64),
+    }
+    for number, one in enumerate(progress.corrections):
+        arrays[f"correction_{number}_keyframes"] = one.keyframes
+        arrays[f"correction_{number}_T_cw"] = np.stack([one.T_cw_before, one.T_cw_after])
+    with replaced_file(path) as file:
+        np.savez(file, allow_pickle=False, **arrays)
+
+
+def read_progress(path: Path) -> Progress:
+    """Read what ``write_progress`` wrote.
+
+    Raises:
+        InputError: no such file, a damaged one, or of another version.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            header = json.loads(bytes(file["header"]))
+            if header["kind"] != "vslam progress" or header["schema"] != SCHEMA:
+                raise InputError(f"{path}: of another version of vslam; resume with that.")
+            tracks = _checked_table(file["frames"], header["stages"], file["stage_ms"])
+            wall_s, cpu_s = file["seconds"].tolist()
+            corrections = []
+            for number, entry in enumerate(header["corrections"]):
+                before, after = file[f"correction_{number}_T_cw"]
+                keyframes = file[f"correction_{number}_keyframes"]
+                edge = loop_of(entry["edge"])
+                corrections.append(
+                    LoopCorrection(edge, keyframes, before, after, float(entry["seconds"]))
+                )
+            return Progress(
+                tracks=tracks,
+                skipped=[str(line) for line in header["skipped"]],
+                latency_ms=file["latency_ms"].tolist(),
+                wall_s=wall_s,
+                cpu_s=cpu_s,
+                loops=[loop_of(entry) for entry in header["loops"]],
+                corrections=corrections,
+            )
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror or error}); there is nothing to resume."
+        ) from error
+    except (*_DAMAGED, zlib.error) as error:
+        raise InputError(f"{path}: damaged ({error}); there is nothing to resume.") from error
+
+
+def _checked_table(rows: NDArray, stages: list[str], stage_ms: NDArray) -> TrackTable:
+    if rows.dtype != np.float64 or rows.ndim != 2 or rows.shape[1] != _POSE + _NUMBERS:
+        raise ValueError("its frames are not rows of numbers")
+    if stage_ms.dtype != np.float64 or stage_ms.shape != (len(rows), len(stages)):
+        raise ValueError("the stages are not those of its frames")
+    table = TrackTable(rows, tuple(map(str, stages)), stage_ms)
+    table.results(), table.sides()  # every state and side is one that there is
+    return table
+
+
+def _track(index: int, row: NDArray[np.float64], stage_ms: dict[str, float]) -> TrackResult:
+    timestamp, state, *counts, flags, _, _ = row[_POSE:].tolist()
+    n_features, n_stereo, n_matches, n_inliers = map(int, counts)
+    return TrackResult(
+        index=index,
+        timestamp=timestamp,
+        T_wc=row[:_POSE].reshape(4, 4),
+        state=_STATES[int(state)],
+        n_features=n_features,
+        n_stereo=n_stereo,
+        n_matches=n_matches,
+        n_inliers=n_inliers,
+        is_keyframe=bool(int(flags) & 1),
+        relocalised=bool(int(flags) & 2),
+        stage_ms={name: ms for name, ms in stage_ms.items() if np.isfinite(ms)},
+    )

@@ -95,11 +95,9 @@ def drive(
 
 def _console(*, shown: bool) -> ModuleType:
     """What tells how far a run is; where nothing is shown, without what takes time to import."""
-    if shown:
-        from vslam.cli import progress as console
-    else:
-        from vslam.cli import quiet as console
-    return console
+    from importlib import import_module
+
+    return import_module("vslam.cli.progress" if shown else "vslam.cli.quiet")
 
 
 def _open(options: RunOptions, *, shown: bool) -> tuple[str, Sequence | Stream, Perturbation]:

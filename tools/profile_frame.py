@@ -36,7 +36,7 @@ STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("fusion", (("vslam.backend.local_mapping", "fuse_neighbourhood"),)),
     ("local bundle adjustment", (("vslam.backend.local_mapping", "adjust_locally"),)),
     ("cull keyframes", (("vslam.backend.local_mapping", "cull_keyframes"),)),
-    ("local mapping, the rest", (("vslam.mapping", "map_keyframe"),)),
+    ("local mapping, the rest", (("vslam.mapping", "map_and_calibrate"),)),
     ("loops", (("vslam.closing", "LoopClosing.process"), ("vslam.closing", "LoopClosing.finish"))),
     ("merge", (("vslam.mapping", "MappingThread.merge"),)),
     ("frame loop, the rest", (("vslam.run.pipeline", "run_sequence"),)),

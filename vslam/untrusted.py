@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import zipfile
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,12 @@ MOST_PIXELS = 2**27
 """Of an image file: 11,585 x 11,585; OpenCV itself allows eight times as many."""
 
 _OPENCV_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
-_DAMAGED = (OSError, EOFError, ValueError, KeyError, NotImplementedError, RuntimeError)
+ARCHIVE_ERRORS = (
+    EOFError, ValueError, KeyError, RuntimeError, zlib.error,
+    zipfile.BadZipFile, zipfile.LargeZipFile,
+)  # fmt: skip
+"""What NumPy, zipfile and zlib raise for an archive of arrays that is damaged, encrypted, packed in
+an unknown way, or none."""
 
 
 def limit_images() -> None:
@@ -47,7 +53,7 @@ def read_npz(path: Path, what: str, fix: str = "name another file") -> dict[str,
             }
     except InputError:
         raise
-    except (*_DAMAGED, zipfile.BadZipFile, zipfile.LargeZipFile, _zlib_error()) as error:
+    except (OSError, *ARCHIVE_ERRORS) as error:
         why = error.strerror if isinstance(error, OSError) else None
         raise InputError(
             f"{path}: not {what} ({why or error or type(error).__name__}); {fix}."
@@ -98,9 +104,3 @@ def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[A
         array = np.frombuffer(file.read(), dtype, count) if count else np.zeros(0, dtype)
     ordered = array.reshape(shape[::-1]).T if fortran else array.reshape(shape)
     return ordered.copy()  # writable, and in the order of C
-
-
-def _zlib_error() -> type[Exception]:
-    import zlib
-
-    return zlib.error

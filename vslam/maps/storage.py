@@ -7,7 +7,6 @@ be there in a second.
 from __future__ import annotations
 
 import json
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -28,12 +27,9 @@ from vslam.maps.checked_map import ARRAYS, DamagedMapError, camera_of, checked_m
 from vslam.maps.checkpoint import checkpoint_arrays, checkpoint_entry
 from vslam.maps.new_output import replaced_file
 from vslam.maps.stored_map import StoredMap
-from vslam.untrusted import require_memory
+from vslam.untrusted import ARCHIVE_ERRORS, require_memory
 
 SCHEMA = 3
-_NO_MAP = (
-    ValueError, KeyError, EOFError, TypeError, AttributeError, MemoryError, RuntimeError
-)  # fmt: skip
 _FOREIGN = "not a map of vslam; name a map.npz, or the folder of a run"
 
 
@@ -218,7 +214,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
         ) from error
     except BadZipFile as error:
         raise InputError(f"{path}: {_FOREIGN}, or the file is damaged ({error}).") from error
-    except (*_NO_MAP, zlib.error) as error:
+    except (*ARCHIVE_ERRORS, TypeError, AttributeError, MemoryError) as error:
         # np.load tells of pickles and of what is no npz by ValueError, zipfile of encryption by
         # RuntimeError; a plain array is no archive.
         raise InputError(f"{path}: {_FOREIGN}.") from error

@@ -7,11 +7,9 @@ written down as they come: saving them copies arrays, however many there are.
 from __future__ import annotations
 
 import json
-import zlib
 from array import array
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +19,9 @@ from vslam.features import TrackingState, TrackResult
 from vslam.frontend.sides import Sides
 from vslam.loops import LoopCorrection, LoopEdge, loop_entry, loop_of
 from vslam.maps.new_output import replaced_file
+from vslam.untrusted import ARCHIVE_ERRORS
 
 SCHEMA = 2
-_DAMAGED = (
-    BadZipFile, ValueError, KeyError, TypeError, EOFError, IndexError, MemoryError, RuntimeError
-)  # fmt: skip
 _STATES = tuple(TrackingState)
 _BLACK = ("", "left", "right")
 _POSE, _NUMBERS = 16, 9  # of a frame: its pose, then what else is known of it
@@ -234,7 +230,7 @@ def read_progress(path: Path) -> Progress:
         raise InputError(
             f"{path}: cannot be read ({error.strerror or error}); there is nothing to resume."
         ) from error
-    except (*_DAMAGED, zlib.error) as error:
+    except (*ARCHIVE_ERRORS, TypeError, IndexError, MemoryError) as error:
         raise InputError(f"{path}: damaged ({error}); there is nothing to resume.") from error
 
 

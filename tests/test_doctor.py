@@ -21,7 +21,7 @@ from vslam.datasets.kitti import open_kitti
 from vslam.datasets.tum import open_tum
 from vslam.doctor.checks import check_depth, check_times
 from vslam.doctor.examine import examine
-from vslam.errors import UnreadableImageError
+from vslam.errors import ResultsError, UnreadableImageError
 
 REAL = Path(__file__).parents[2] / "shared/data"
 FEW = OrbConfig(n_features=500)  # for images of 480x160
@@ -354,3 +354,10 @@ def test_nothing_is_wrong_with_euroc():
     assert diagnosis.faults == []
     (rows,) = [f.measured for f in diagnosis.findings if f.check == "rectification"]
     assert float(rows.split()[3]) < 0.3
+
+
+def test_what_was_found_is_said_where_the_page_cannot_be_written(kitti_tree):
+    options = ["--seq", "00", "--out", str(kitti_tree / "poses" / "00.txt" / "page.html")]
+    done = CliRunner().invoke(app, ["doctor", str(kitti_tree), *options])
+    assert "rectification" in done.output
+    assert isinstance(done.exception, ResultsError)

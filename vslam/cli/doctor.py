@@ -82,11 +82,11 @@ def doctor(
     except InputError as error:
         measured, _, fix = str(error).rstrip(".").rpartition("; ")
         diagnosis = Diagnosis([Finding("input", "fault", measured or fix, fix if measured else "")])
-    write_page(diagnosis, f"Doctor: {source}", out)
     for finding in diagnosis.findings:
         typer.echo(f"{finding.verdict:<8} {finding.check:<16} {finding.measured}")
         if finding.fix:
             typer.echo(f"{'':<8} {'':<16} fix: {finding.fix}")
+    write_page(diagnosis, f"Doctor: {source}", out)  # after what it says: a disk may be full
     n = len(diagnosis.faults)
     typer.echo(f"{out}: {n or 'no'} fault{'' if n == 1 else 's'}")
     if diagnosis.faults:

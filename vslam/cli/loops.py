@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
@@ -112,6 +113,7 @@ def bench(
     if protocol == "retrieval" and window != WINDOW:
         raise InputError("--window: is of --protocol online; add that or leave it out.")
 
+    _require_writable(out)
     from vslam.cli.console import console
     from vslam.loopclosure.vocabulary import load
     from vslam.machine import available_cores
@@ -210,6 +212,18 @@ def _on_sets(
                 advance()
         write(cells=scores, gains=gains, costs=costs)
     return f"{len(sets)} sets of images"
+
+
+def _require_writable(out: Path) -> None:
+    """Refuse what cannot be written before the work, not after."""
+    try:
+        there = next(path for path in (out, *out.absolute().parents) if path.exists())
+        with TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"{out}: cannot be written ({error.strerror}); name another folder with --out."
+        ) from error
 
 
 def _write(out: Path, seed: int, **found: object) -> None:

@@ -23,7 +23,7 @@ from source_files import (
 
 from vslam.datasets import live_camera, video
 from vslam.datasets.sources import SourceOptions, open_source
-from vslam.datasets.stream import timed_frames
+from vslam.datasets.stream import Selection, timed_frames
 from vslam.errors import InputError
 
 FRAMES = 12
@@ -88,7 +88,8 @@ def test_a_useless_camera_info_is_not_read_where_there_is_a_calibration(
 @pytest.mark.parametrize("realtime", [False, True])
 def test_a_stream_that_ends_before_its_first_frame(folder, side_by_side, realtime):
     whole = open_source("video", str(folder / "pair.mkv"), "", side_by_side)
-    source = replace(whole, raw=replace(whole.raw, n_expected=None), start=FRAMES)
+    raw = replace(whole.raw, n_expected=None)
+    source = replace(whole, raw=raw, selection=Selection(start=FRAMES))
     with pytest.raises(InputError, match=f"--start {FRAMES}: pair has no frame there"):
         run_source(source, realtime=realtime)
 

@@ -361,3 +361,24 @@ def test_what_was_found_is_said_where_the_page_cannot_be_written(kitti_tree):
     done = CliRunner().invoke(app, ["doctor", str(kitti_tree), *options])
     assert "rectification" in done.output
     assert isinstance(done.exception, ResultsError)
+
+
+@pytest.mark.parametrize("factor", [0.7, 0.9, 1.1, 1.3])
+def test_a_wrong_focal_length_shows_when_the_camera_turns(clean, factor):
+    c = clean.camera
+    wrong = replace(clean, camera=replace(c, fx=factor * c.fx, fy=factor * c.fy))
+    (found,) = examine(wrong, FEW).faults
+    assert found.check == "focal length"
+    assert found.measured.endswith(f"the calibration says {factor * c.fx:.0f}")
+    said = float(re.findall(r"fit (\d+) px", found.measured)[0])
+    assert said == pytest.approx(c.fx, rel=0.03)
+
+
+def test_straight_ahead_no_focal_length_shows(clean):
+    """Frames 0 to 7 go straight on."""
+    straight = replace(
+        clean, left=clean.left[:8], second=clean.second[:8], timestamps=clean.timestamps[:8],
+        camera=replace(clean.camera, fx=1.3 * clean.camera.fx, fy=1.3 * clean.camera.fy),
+    )  # fmt: skip
+    (found,) = [f for f in examine(straight, FEW).findings if f.check == "focal length"]
+    assert found.verdict == "unknown"

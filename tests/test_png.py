@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import resource
 import struct
 import zlib
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from vslam.datasets.image_files import read_grey
-from vslam.datasets.png import SIGNATURE, decode_png
+from vslam.datasets.image_files import check_not_empty, read_grey
+from vslam.datasets.png import SIGNATURE, decode_png, is_cut_off
 from vslam.errors import UnreadableImageError
 
 
@@ -170,3 +172,26 @@ def test_an_image_with_a_wrong_check_sum_is_named(tmp_path):
     path.write_bytes(data)
     with pytest.raises(UnreadableImageError, match=r"000008\.png: cannot be decoded"):
         read_grey(path)
+
+
+def test_a_chunk_that_is_longer_than_the_file_is_seen_and_takes_no_memory(tmp_path):
+    """OpenCV would take 2 GB for it."""
+    grey = np.random.default_rng(0).integers(0, 256, (48, 64), dtype=np.uint8)
+    data = cv2.imencode(".png", grey)[1].tobytes()
+    at = data.index(b"IDAT") - 4
+    promising = data[:at] + (2**31 - 1).to_bytes(4, "big") + data[at + 4 :]
+    assert [is_cut_off(x) for x in (data, data + b"more", promising, data[:-1])] == [
+        False, False, True, True,
+    ]  # fmt: skip
+    path = tmp_path / "a.png"
+    path.write_bytes(promising)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(UnreadableImageError, match="cannot be decoded"):
+        read_grey(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+
+
+def test_a_path_with_a_zero_byte_is_no_file():
+    for read in (read_grey, check_not_empty):
+        with pytest.raises(UnreadableImageError):
+            read(Path("a\0.png"))

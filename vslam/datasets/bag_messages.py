@@ -51,9 +51,12 @@ def grey_of(message: Message) -> Image:
     """
     import cv2
 
+    from vslam.datasets.png import is_cut_off
+
     if not hasattr(message, "encoding"):
         try:
-            image = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+            data = np.asarray(message.data, np.uint8)
+            image = None if is_cut_off(data.tobytes()) else cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
         except cv2.error:
             image = None
         if image is None:
@@ -107,10 +110,13 @@ def _compressed_depth(message: Message, scale: float | None) -> DepthImage:
     (``compressed_depth_image_transport``, ``ConfigHeader``)."""
     import cv2
 
+    from vslam.datasets.png import is_cut_off
+
     data = np.asarray(message.data, np.uint8)
     header = np.dtype([("kind", "<i4"), ("a", "<f4"), ("b", "<f4")])
     try:
-        image = cv2.imdecode(data[header.itemsize :], cv2.IMREAD_UNCHANGED)
+        file = data[header.itemsize :]
+        image = None if is_cut_off(file.tobytes()) else cv2.imdecode(file, cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if _COMPRESSED_DEPTH not in message.format or image is None or image.dtype != np.uint16:

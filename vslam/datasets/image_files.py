@@ -142,7 +142,7 @@ def check_not_empty(path: Path) -> None:
     """
     try:
         empty = path.stat().st_size == 0
-    except OSError:
+    except (OSError, ValueError):  # ValueError: a path with a zero byte
         empty = True
     if empty:
         raise UnreadableImageError(path, "the file is empty; download it again.")
@@ -157,20 +157,21 @@ def read_grey(path: Path) -> Image:
     """
     import cv2
 
-    from vslam.datasets.png import decode_png
+    from vslam.datasets.png import decode_png, is_cut_off
 
     try:
         data = path.read_bytes()
         if (image := decode_png(data)) is not None:
             return image
-        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        pixels = np.frombuffer(data, np.uint8)
+        decoded = None if is_cut_off(data) else cv2.imdecode(pixels, cv2.IMREAD_GRAYSCALE)
     except cv2.error as error:
         if "MAX_IMAGE" in str(error):
             raise UnreadableImageError(
                 path, f"larger than {MOST_PIXELS / 1e6:.0f} million pixels; scale it down."
             ) from error
         decoded = None
-    except OSError:
+    except (OSError, ValueError):  # ValueError: a time file may name a path that none can be
         decoded = None
     if decoded is None:
         raise UnreadableImageError(path, "cannot be decoded; download the file again.")

@@ -94,6 +94,20 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
         at, length, kind = end + 4, next_length, next_kind
 
 
+def is_cut_off(data: bytes) -> bool:
+    """Whether a file is a PNG with a chunk that says it is longer than what is left: libpng would
+    take memory for all of it, up to 2 GB, before it reads on."""
+    at = len(SIGNATURE)
+    while data.startswith(SIGNATURE) and at + _CHUNK.size <= len(data):
+        length, kind = _CHUNK.unpack_from(data, at)
+        at += _CHUNK.size + length + _CHECK_SUM.size
+        if at > len(data):
+            return True
+        if kind == b"IEND":
+            return False
+    return False
+
+
 @kernel
 def unfilter(lines, image):
     """Undo the filters of ``(H, W + 1)`` uint8 lines, which begin with the number of their filter.

@@ -16,6 +16,7 @@ from vslam.camera import Camera
 from vslam.config import OrbConfig
 from vslam.datasets.sequence import Image
 from vslam.doctor.findings import Finding, judge
+from vslam.doctor.focal_length import FocalFit
 from vslam.doctor.matching import Matches, count_views
 from vslam.frontend.orb import extract
 
@@ -46,6 +47,11 @@ DEPTH_SECOND = 0.8
 _ANOTHER_PX = 8.0  # what lies so far from the best is another peak
 DEPTH_VIEWS = 2  # that do not share half of what they show: one scene may fit elsewhere by chance
 NEAREST_M, FARTHEST_M = 0.01, 3.0  # that the cameras of a pair stand apart on what drives or flies
+# Motion fits 0.975 to 1.026 of the right focal length (KITTI 00 0.98, three parts of fr1/desk, six
+# rendered drives), and 0.89 to 0.93 of one that is 10 % too long.
+FOCAL = 0.05
+FOCAL_SIGMA = 0.01  # straight roads give 0.05 and more
+TURNED = 2.0  # degrees: straight roads have up to 1.6 from frame to fourth frame
 _BORDER = 2  # px; a best so near the end of the search may lie behind it
 _REACH = 16, 48  # px that depth edges are looked for, down and across: sensors lie side by side
 
@@ -83,7 +89,7 @@ def check_sides(matches: Matches) -> Finding:
 
 def check_scale(camera: Camera, matches: Matches | None) -> Finding:
     """What the calibration says of lengths and angles, for people to compare with what they see: no
-    image shows a wrong one. A baseline of another unit is told by its size.
+    image shows a wrong baseline. One of another unit is told by its size.
 
     Args:
         matches: of the pair, None of a single camera or of one with depth.
@@ -106,6 +112,25 @@ def check_scale(camera: Camera, matches: Matches | None) -> Finding:
         not NEAREST_M <= camera.baseline <= FARTHEST_M,
         measured,
         "give the baseline in metres: a checkerboard calibration has the unit of the squares",
+    )
+
+
+def check_focal_length(fit: FocalFit | None, camera: Camera) -> Finding:
+    """Whether turns of the camera fit the calibration's focal length.
+
+    Args:
+        fit: None where too few frames have points in common.
+    """
+    if fit is None:
+        return Finding("focal length", "unknown", "too few frames have points in common")
+    if fit.turned < TURNED or fit.sigma > FOCAL_SIGMA:
+        return Finding("focal length", "unknown", "the camera hardly turns in the frames looked at")
+    return judge(
+        "focal length",
+        abs(np.log(fit.factor)) > FOCAL,
+        f"turns of up to {fit.turned:.0f} degrees fit {fit.factor * camera.fx:.0f} px, the "
+        f"calibration says {camera.fx:.0f}",
+        "the calibration is of another zoom, size or crop of the images: calibrate again",
     )
 
 

@@ -6,17 +6,23 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from vslam.camera import Camera
 from vslam.config import OrbConfig
 from vslam.datasets.sequence import DepthImage, Image, Sequence
 from vslam.doctor import checks
 from vslam.doctor.findings import Finding, judge
+from vslam.doctor.focal_length import FocalFit, Moved, fit_focal_length
 from vslam.doctor.matching import Matches, joined, match_images
 from vslam.errors import UnreadableImageError
 
 _FRAMES = 8  # looked at, spread over the sequence
 _LAGS = range(-2, 3)  # frames that the right side may be early or late
+_TURNS, _LATER = 16, 4  # pairs of frames looked at for the focal length; frames between them
+_FEWEST, _MOST = 30, 200  # points that they must have in common, and that are taken of these
 _PICTURES = 2
+_LEAST_DISPARITY = 1.0  # px
 _DRAWN = 60  # matches in a picture
 _GREEN, _RED, _BLUE = (80, 200, 60), (60, 60, 230), (230, 150, 50)  # BGR
 
@@ -77,6 +83,7 @@ def examine(sequence: Sequence, config: OrbConfig) -> Diagnosis:
         found, pictures = _examine_stereo(sequence, lefts, blind=blind)
     else:
         found = [*checks.check_depth(images, seconds), checks.check_scale(sequence.camera, None)]
+        found += _examine_focal_length(sequence, found)
         pictures = [_depth_picture(images[0], seconds[0])]
     return Diagnosis(findings + found, pictures)
 
@@ -134,8 +141,60 @@ def _examine_stereo(
             [(pair.left, pair.right) for pair in pairs], [pair.matches for pair in pairs]
         ),
     ]
+    findings += _examine_focal_length(sequence, findings)
     shown = sorted(pairs, key=lambda pair: -len(pair.matches))[:_PICTURES]
     return findings, [_stereo_picture(pair) for pair in shown]
+
+
+def _examine_focal_length(sequence: Sequence, found: list[Finding]) -> list[Finding]:
+    """Nothing where the second images have a fault, which would be blamed on the focal length."""
+    if any(finding.verdict == "fault" for finding in found):
+        return []
+    last = len(sequence) - 1 - _LATER
+    frames = np.unique(np.linspace(0, last, _TURNS).round().astype(int)) if last >= 0 else []
+    several = [moved for frame in frames if (moved := _moved(sequence, int(frame))) is not None]
+    fit: FocalFit | None = None
+    if several:
+        fit = fit_focal_length(several, sequence.camera)
+    return [checks.check_focal_length(fit, sequence.camera)]
+
+
+def _moved(sequence: Sequence, frame: int) -> Moved | None:
+    """Points of a frame with their disparity, and where they are a few frames later; None where
+    there are too few, or an image cannot be read."""
+    try:
+        left, second = sequence.read(frame)
+        later, _ = sequence.read(frame + _LATER)
+    except UnreadableImageError:
+        return None
+    if second is None:
+        return None
+    matches = match_images(left, later)
+    disparity = _disparities(matches.left, left, second, sequence.camera)
+    kept = np.flatnonzero(disparity > _LEAST_DISPARITY)
+    if len(kept) < _FEWEST:
+        return None
+    kept = kept[np.unique(np.linspace(0, len(kept) - 1, _MOST).astype(int))]
+    before, after = (xy[kept].astype(np.float64) for xy in (matches.left, matches.right))
+    return Moved(before, disparity[kept], after)
+
+
+def _disparities(
+    xy: NDArray[np.float32], left: Image, second: Image | DepthImage, camera: Camera
+) -> NDArray[np.float64]:
+    """Of keypoints of the left image; 0 where the pair or the depth has none."""
+    if second.dtype != np.uint8:
+        x, y = np.rint(xy).astype(int).T
+        depth = np.asarray(second, np.float64)[y, x]
+        near = np.isfinite(depth) & (depth > 0)
+        return np.where(near, camera.bf / np.where(near, depth, 1.0), 0.0)
+    pair = match_images(left, np.asarray(second, np.uint8))
+    of_keypoint = {
+        tuple(a): a[0] - b[0]
+        for a, b in zip(pair.left.tolist(), pair.right.tolist(), strict=True)
+        if abs(a[1] - b[1]) < 2.0 * checks.ROWS_PX
+    }
+    return np.array([of_keypoint.get(tuple(a), 0.0) for a in xy.tolist()], np.float64)
 
 
 def _rows_by_lag(by_lag: dict[int, list[_Pair]]) -> dict[int, float]:

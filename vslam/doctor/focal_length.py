@@ -1,0 +1,163 @@
+"""The focal length that the motion of the camera fits.
+
+A pair with a wrong focal length sees a world that is stretched along its axis. While the camera
+only moves on, nothing contradicts that; when it turns about another axis, the stretched world would
+have to bend. So the focal length is searched that leaves the least error of reprojection, with the
+best pose of each frame for each focal length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Camera
+
+Vectors = NDArray[np.float64]
+
+_PIXEL, _DISPARITY = 0.35, 0.3  # px, standard deviations of matches refined by optical flow
+_CAUCHY = 5.0  # squared errors that weigh half, in variances: 95 % of two dimensions are below 6
+_ITERATIONS = 12
+_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)  # searched at first
+_SECTIONS = 12  # of the bracket, golden ones: to 1e-3
+_STEP = 0.02  # of the logarithm, for the curvature at the best
+
+
+@dataclass(frozen=True)
+class Moved:
+    """Points of a frame that a later one sees, too.
+
+    Attributes:
+        before, after: ``(N, 2)`` pixels in both left images.
+        disparity: ``(N,)`` in the first frame, pixels.
+    """
+
+    before: Vectors
+    disparity: Vectors
+    after: Vectors
+
+
+@dataclass(frozen=True)
+class FocalFit:
+    """``factor`` times the focal length of the calibration fits best; ``sigma`` is the standard
+    deviation of its logarithm, ``turned`` the largest turn about an axis across the view
+    (degrees) of frames whose points agree with it."""
+
+    factor: float
+    sigma: float
+    turned: float
+
+
+def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
+    """The factor between half and twice that motion fits best.
+
+    Args:
+        several: at least one, each of at least three points.
+        camera: of the pair, or with depth: its disparities are those of its virtual baseline.
+    """
+    poses = [np.zeros(6) for _ in several]
+
+    def cost(log: float) -> float:
+        total = 0.0
+        for k, moved in enumerate(several):
+            poses[k], error = _best_pose(moved, camera, float(np.exp(log)), poses[k])
+            total += error
+        return total
+
+    logs = np.log(_FACTORS)
+    best = int(np.argmin([cost(log) for log in logs]))
+    log = _least(cost, logs[max(best - 1, 0)], logs[min(best + 1, len(logs) - 1)])
+    around = cost(log + _STEP), cost(log - _STEP)
+    least = cost(log)
+    curvature = (sum(around) - 2.0 * least) / _STEP**2
+    variance = least / (2.0 * sum(len(moved.before) for moved in several))  # of a unit of cost
+    turned = [
+        float(np.linalg.norm(pose[:2]))
+        for moved, pose in zip(several, poses, strict=True)
+        if _fits(moved, camera, float(np.exp(log)), pose)
+    ]
+    return FocalFit(
+        float(np.exp(log)),
+        float(np.sqrt(2.0 * variance / max(curvature, 1e-12))),
+        float(np.degrees(max(turned, default=0.0))),
+    )
+
+
+def _least(cost: Callable[[float], float], low: float, high: float) -> float:
+    """Where a function with one minimum between is least, by the golden section."""
+    golden = (np.sqrt(5.0) - 1.0) / 2.0
+    x = [high - golden * (high - low), low + golden * (high - low)]
+    y = [cost(x[0]), cost(x[1])]
+    for _ in range(_SECTIONS):
+        if y[0] < y[1]:
+            high, x[1], y[1] = x[1], x[0], y[0]
+            x[0] = high - golden * (high - low)
+            y[0] = cost(x[0])
+        else:
+            low, x[0], y[0] = x[0], x[1], y[1]
+            x[1] = low + golden * (high - low)
+            y[1] = cost(x[1])
+    return 0.5 * (low + high)
+
+
+def _best_pose(
+    moved: Moved, camera: Camera, factor: float, start: Vectors
+) -> tuple[Vectors, float]:
+    """Rotation vector and translation by Gauss-Newton under Cauchy's loss, and that loss."""
+    pose = start
+    for _ in range(_ITERATIONS):
+        error, variance, points = _errors(moved, camera, factor, pose)
+        weight = 1.0 / variance / (1.0 + (error**2).sum(axis=1) / variance / _CAUCHY)
+        J = _jacobian(points, camera, factor, pose)
+        A = np.einsum("nij,n,nik->jk", J, weight, J) + 1e-9 * np.eye(6)
+        step = np.linalg.solve(A, np.einsum("nij,n,ni->j", J, weight, error))
+        R = cv2.Rodrigues(step[:3])[0] @ cv2.Rodrigues(pose[:3])[0]
+        pose = np.concatenate([cv2.Rodrigues(R)[0].ravel(), pose[3:] + step[3:]])
+        if np.abs(step).max() < 1e-6:
+            break
+    error, variance, _ = _errors(moved, camera, factor, pose)
+    loss = _CAUCHY * np.log1p((error**2).sum(axis=1) / variance / _CAUCHY).sum()
+    return (pose, float(loss)) if np.isfinite(loss) else (np.zeros(6), 1e12)
+
+
+def _fits(moved: Moved, camera: Camera, factor: float, pose: Vectors) -> bool:
+    """Whether a pose was found that most points agree with."""
+    error, variance, _ = _errors(moved, camera, factor, pose)
+    return float(np.median((error**2).sum(axis=1) / variance)) < _CAUCHY
+
+
+def _errors(
+    moved: Moved, camera: Camera, factor: float, pose: Vectors
+) -> tuple[Vectors, Vectors, Vectors]:
+    """``(N, 2)`` errors of reprojection, their ``(N,)`` variance, ``(N, 3)`` points as the later
+    frame sees them. Far points are known badly, which shows where the camera moves."""
+    seen, points = _project(moved.before, moved.disparity, camera, factor, pose)
+    nearer, _ = _project(moved.before, moved.disparity + _DISPARITY, camera, factor, pose)
+    return moved.after - seen, _PIXEL**2 + ((nearer - seen) ** 2).sum(axis=1), points
+
+
+def _project(
+    xy: Vectors, disparity: Vectors, camera: Camera, factor: float, pose: Vectors
+) -> tuple[Vectors, Vectors]:
+    f, centre = factor * np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    z = f[0] * camera.baseline / disparity
+    points = np.column_stack([(xy - centre) / f * z[:, None], z])
+    points = points @ cv2.Rodrigues(pose[:3])[0].T + pose[3:]
+    ahead = np.maximum(points[:, 2:], 1e-3 * camera.baseline)  # what passes behind errs much
+    return points[:, :2] / ahead * f + centre, points
+
+
+def _jacobian(points: Vectors, camera: Camera, factor: float, pose: Vectors) -> Vectors:
+    """``(N, 2, 6)``: pixels by a turn and a shift of the points."""
+    x, y, z = points.T
+    z = np.maximum(z, 1e-3 * camera.baseline)
+    none = np.zeros_like(z)
+    u = factor * camera.fx * np.column_stack([1.0 / z, none, -x / z**2])
+    v = factor * camera.fy * np.column_stack([none, 1.0 / z, -y / z**2])
+    by_shift = np.stack([u, v], axis=1)
+    turned = (points - pose[3:])[:, None, :]
+    return np.concatenate([np.cross(turned, by_shift), by_shift], axis=2)

@@ -382,3 +382,10 @@ def test_straight_ahead_no_focal_length_shows(clean):
     )  # fmt: skip
     (found,) = [f for f in examine(straight, FEW).findings if f.check == "focal length"]
     assert found.verdict == "unknown"
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_depth_of_another_unit(depth_images, factor):
+    (found,) = examine(right(depth_images, lambda d: d * np.float32(factor)), FEW).faults
+    assert found.check == "depth"
+    assert "--depth-scale" in found.fix

@@ -52,6 +52,7 @@ NEAREST_M, FARTHEST_M = 0.01, 3.0  # that the cameras of a pair stand apart on w
 FOCAL = 0.05
 FOCAL_SIGMA = 0.01  # straight roads give 0.05 and more
 TURNED = 2.0  # degrees: straight roads have up to 1.6 from frame to fourth frame
+NEAREST_DEPTH_M, FARTHEST_DEPTH_M = 0.05, 100.0  # that half of the depths of a sensor lie between
 _BORDER = 2  # px; a best so near the end of the search may lie behind it
 _REACH = 16, 48  # px that depth edges are looked for, down and across: sensors lie side by side
 
@@ -259,10 +260,16 @@ def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Findin
     """
     depths = [np.nan_to_num(depth.astype(np.float32)) for depth in depths]
     share = float(np.mean([np.mean(depth > 0) for depth in depths]))
+    middle = float(np.median(np.concatenate([d[d > 0].ravel() for d in depths]))) if share else 0.0
+    measured = f"{100 * share:.0f} % of the pixels have a depth"
+    if share and not NEAREST_DEPTH_M <= middle <= FARTHEST_DEPTH_M:
+        unit = "the depth factor is wrong: --depth-scale says what depth images count in a metre"
+        half = f"{measured}, half of them nearer than {middle:.3g} m"
+        return [Finding("depth", "fault", half, unit)]
     there = judge(
         "depth",
         share < DEPTH_SHARE,
-        f"{100 * share:.0f} % of the pixels have a depth",
+        f"{measured}, half of them nearer than {middle:.3g} m",
         "the sensor sees little within its range: check the depth factor, or move closer",
     )
     fit = np.sum([_edge_fit(*pair) for pair in zip(images, depths, strict=True)], axis=0)

@@ -13,7 +13,7 @@ from vslam.config import OrbConfig
 from vslam.datasets.sequence import DepthImage, Image, Sequence
 from vslam.doctor import checks
 from vslam.doctor.findings import Finding, judge
-from vslam.doctor.focal_length import FocalFit, Moved, fit_focal_length
+from vslam.doctor.focal_length import Moved, fit_focal_length
 from vslam.doctor.matching import Matches, joined, match_images
 from vslam.errors import UnreadableImageError
 
@@ -151,11 +151,9 @@ def _examine_focal_length(sequence: Sequence, found: list[Finding]) -> list[Find
     if any(finding.verdict == "fault" for finding in found):
         return []
     last = len(sequence) - 1 - _LATER
-    frames = np.unique(np.linspace(0, last, _TURNS).round().astype(int)) if last >= 0 else []
-    several = [moved for frame in frames if (moved := _moved(sequence, int(frame))) is not None]
-    fit: FocalFit | None = None
-    if several:
-        fit = fit_focal_length(several, sequence.camera)
+    frames = np.unique(np.linspace(0, last, _TURNS if last >= 0 else 0).round().astype(int))
+    several = [moved for k in frames.tolist() if (moved := _moved(sequence, k)) is not None]
+    fit = fit_focal_length(several, sequence.camera) if several else None
     return [checks.check_focal_length(fit, sequence.camera)]
 
 

@@ -307,10 +307,9 @@ def write_progress(out: Path, results: list[Result]) -> None:
         ("way", "network", "images_shown", "loss", "validation_ap")
     ]
     for one in results:
-        log = out / Path(one.weights).parent / "log.csv"
-        if not log.exists():  # PCANet has no epochs
+        if one.network == "pcanet":  # learns once
             continue
-        with log.open() as file:
+        with (out / Path(one.weights).parent / "log.csv").open() as file:
             for number, row in enumerate(csv.DictReader(file), 1):
                 figures = (f"{float(row[key]):.4f}" for key in ("loss", "average_precision"))
                 shown = one.images_shown * number // one.epochs

@@ -74,6 +74,17 @@ def test_a_side_that_is_white_in_part_is_no_brighter_one(columns):
     assert balanced(glare, right, CONFIG)[0] is glare
 
 
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_bright_strip_that_one_side_sees_is_no_gain(side):
+    left, right = scene(mean=90.0, spread=20.0)
+    pair = [left.copy(), right.copy()]
+    for image in pair:
+        image[:50] = 255  # the sky
+    pair[side][50:66] = 150  # beyond the edge of the other image
+    assert compare_sides(*pair, CONFIG) == Sides()
+    assert balanced(*pair, CONFIG)[side] is pair[side]
+
+
 def test_a_gain_is_told_beside_glare_on_both_sides():
     left, right = scene()
     left[:, :100], right[:, :100] = 255, 255
@@ -140,7 +151,7 @@ def test_warnings_say_what_was_seen_and_done():
     assert "right side was black in 4 of 10 frames" in said
     assert "left side alone" in said
     (said,) = rig_warnings([Sides(black="left")] * 4)
-    assert "could not be tracked" in said
+    assert "right side alone" in said
 
 
 TWIST = np.array([0.3, 0.0, -8.0, 0.0, -0.3, 0.0])  # per second: ahead and to the right

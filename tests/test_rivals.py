@@ -252,11 +252,11 @@ def test_every_network_can_be_named_on_the_command_line():
 
 def test_the_script_plans_trains_and_goes_on(tmp_path, monkeypatch):
     tool = script("tools/training/train_rivals.py")
-    monkeypatch.setattr(tool, "TRAINED", ("capsule", "capsule-pruned"))
-    seconds = {"capsule": 0.5, "capsule-pruned": 0.25}
+    seconds = {"capsule": 0.5, "capsule-pruned": 0.25, "vgg16": 3.0}
     monkeypatch.setattr(tool, "seconds_of_a_step", lambda name, *_: seconds[name])
-    settings = small_settings(epochs=2)
-    jobs = tool.plan(tmp_path / "plan.json", settings, 64, 0.1, "cpu")
+    settings, file = small_settings(epochs=2), tmp_path / "plan.json"
+    networks = ["capsule", "capsule-pruned", "pcanet"]
+    jobs = tool.plan(file, settings, networks, 64, 0.1, "cpu")
     assert [(job.way, job.network) for job in jobs] == [
         ("images", "capsule"), ("images", "capsule-pruned"), ("minutes", "capsule"),
         ("minutes", "capsule-pruned"), ("images", "pcanet"),
@@ -264,17 +264,29 @@ def test_the_script_plans_trains_and_goes_on(tmp_path, monkeypatch):
     steps = 16 // settings.batch  # of an epoch that shows 32 images; the pruned one has one epoch
     assert [job.pairs for job in jobs] == [16, 16, 6 * settings.batch, 12 * settings.batch, 0]
     assert [job.core_seconds for job in jobs] == [2 * steps * 0.5, steps * 0.25, 6.0, 3.0, 0.0]
-    assert tool.plan(tmp_path / "plan.json", settings, 64, 0.1, "cpu") == jobs
+    seconds["capsule"] = 5.0  # what is planned stays, and what joins is added
+    joined = tool.plan(file, settings, ["vgg16", "capsule"], 64, 0.0, "cpu")
+    assert [(job.way, job.network, job.pairs) for job in joined] == [
+        ("images", "vgg16", 16), ("images", "capsule", 16)
+    ]  # fmt: skip
+    assert joined[1] == jobs[0]
+    assert tool.plan(file, settings, networks, 64, 0.1, "cpu") == jobs
     results = [tool.run(jobs[0], views(20), settings, tmp_path, "cpu")]
     assert results[0].images_shown == 64
     assert (tmp_path / results[0].weights).exists()
     tool.write_results(tmp_path / "rivals.csv", results)
     assert tool.read_results(tmp_path / "rivals.csv") == results
+    tool.write_progress(tmp_path, results)
+    head, *rows = (tmp_path / "progress.csv").read_text().splitlines()
+    assert head == "way,network,images_shown,loss,validation_ap"
+    assert [row.split(",")[:3] for row in rows] == [
+        ["images", "capsule", "32"], ["images", "capsule", "64"]
+    ]  # fmt: skip
+    assert float(rows[-1].split(",")[-1]) == results[0].ap_last
 
 
 def test_a_folder_of_rivals_keeps_to_its_options(tmp_path, monkeypatch):
     tool = script("tools/training/train_rivals.py")
-    monkeypatch.setattr(tool, "TRAINED", ("capsule",))
     monkeypatch.setattr(tool, "seconds_of_a_step", lambda *_: 0.5)
     words = ["train_rivals.py", "--data", "photos:x", "--out", str(tmp_path), "--dry-run"]
     monkeypatch.setattr("sys.argv", words)
@@ -283,6 +295,10 @@ def test_a_folder_of_rivals_keeps_to_its_options(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", [*words, "--images", "999"])
     with pytest.raises(SystemExit, match=r"was made with --images 65536, not 999; name another"):
         tool.main()
+    for names, why in (("lsgd", "lsgd is none of"), ("capsule-pruned", "name that before it")):
+        monkeypatch.setattr("sys.argv", [*words, "--networks", names])
+        with pytest.raises(SystemExit, match=why):
+            tool.main()
 
 
 @pytest.mark.parametrize("option", ["--resume", "--epochs=2", "--pairs=8", "--max-minutes=1"])
@@ -383,8 +399,30 @@ def test_the_tables_of_the_page(tmp_path, monkeypatch):
         "capsule": Path("d/minutes/c.onnx"), "pcanet": Path("d/images/p.onnx")
     }  # fmt: skip
     assert tool.weights_of("shipped", training, Path("d")) == dict.fromkeys(tool.SHIPPED)
-    (tmp_path / "minutes" / "c.onnx").write_text("trained again")
+    # A section of its own: the other one stays, the figure of validation joins.
+    (tmp_path / "progress.csv").write_text(
+        "way,network,images_shown,loss,validation_ap\n"
+        "images,capsule,2048,2.5,0.4\nimages,capsule,4096,1.5,0.5\n"
+    )
+    words += ["--section", "longer", "--ways", "images"]
+    monkeypatch.setattr("sys.argv", words)
+    with pytest.raises(SystemExit, match="has no marks <!-- longer --> and <!-- end of longer"):
+        tool.main()
+    page.write_text(f"{text}\n<!-- longer --><!-- end of longer -->")
+    tool.main()
+    assert page.read_text().startswith(text)
+    added = page.read_text().removeprefix(text)
+    assert "(page/longer/precision_recall_1.png)" in added
+    assert "(page/longer/progress.png)" in added
+    assert tool.WAYS["minutes"] not in added
+    assert tool.WAYS["shipped"] not in added
+    assert (tmp_path / "page" / "longer" / "progress.csv").read_text().endswith("1.5,0.5\n")
+    monkeypatch.setattr("sys.argv", [*words, "--ways", "hours"])
+    with pytest.raises(SystemExit, match="--ways: hours is none of images, minutes"):
+        tool.main()
+    monkeypatch.setattr("sys.argv", words)
+    (tmp_path / "images" / "c.onnx").write_text("trained again")
     with pytest.raises(
-        SystemExit, match=r"bench: was made with weights of minutes/capsule \w+, not"
+        SystemExit, match=r"bench: was made with weights of images/capsule \w+, not"
     ):
         tool.main()

@@ -1,7 +1,7 @@
 """Write Table 6 of the paper and its companions, for all networks of docs/rivals.md.
 
 python tools/rivals_table.py --trained DIR --data SOURCE [--data SOURCE ...]
-        [--page docs/rivals.md] [--retime]
+        [--page docs/rivals.md] [--section NAME] [--ways NAMES] [--retime]
 
 DIR is what tools/training/train_rivals.py wrote, SOURCE as of ``vslam loops bench``. Measured are,
 as that command does, descriptors alone: of the networks that were shown the same images, of those
@@ -9,7 +9,8 @@ that computed for the same time, of what is trained on nothing, and of what vsla
 keeps what is measured, a file for each of the four; a network that is there is not measured again,
 save its times with --retime. It also keeps --data and digests of the weights, and is refused with
 others. Tables take the place of what is between the marks in the page, their numbers are written as
-CSV, precision-recall curves as PNG to a folder beside the page, of its name.
+CSV, precision-recall curves and validation AP after each epoch as PNG to a folder beside the page,
+of its name. Another training has a section of its own: marks of that name, a folder in that folder.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import style
 
 from vslam.cli.progress import count_bar
 from vslam.datasets.synthetic import store
@@ -43,6 +45,19 @@ from vslam.loopclosure.siamese.inference import OnnxNetwork, open_network
 from vslam.loopclosure.siamese.weights import NETWORKS, find_weights
 from vslam.loopclosure.vocabulary import load
 from vslam.machine import versions
+from vslam.report.drawing import (
+    AMBER,
+    BLUE,
+    GREEN,
+    GREY,
+    LOW,
+    RED,
+    STYLE,
+    VIOLET,
+    ReportFigure,
+    new_figure,
+    save,
+)
 from vslam.report.page import markdown_table
 from vslam.report.summary import this_machine
 
@@ -66,7 +81,8 @@ NOTES = {
 NOTES["minutes"] = NOTES["images"]
 PAIR = ("capsule", "capsule-pruned")
 _REPEATS = 200
-_BEGIN, _END = "<!-- tables -->", "<!-- end of tables -->"
+_COLORS = (BLUE, RED, GREEN, AMBER, VIOLET, GREY)
+_DASHES = ("-", "--")  # of the first six networks, of the rest
 Row = tuple[str, ...]
 
 
@@ -76,11 +92,20 @@ def main() -> None:
     parser.add_argument("--trained", type=Path, required=True, help="folder with rivals.csv")
     parser.add_argument("--data", action="append", required=True, help="images to test on")
     parser.add_argument("--page", type=Path, default=Path("docs/rivals.md"))
+    parser.add_argument("--section", default="tables", help="of the page, to be written")
+    parser.add_argument("--ways", default=",".join(WAYS), help="what the section shows")
     parser.add_argument("--retime", action="store_true", help="measure all times again")
     args = parser.parse_args()
 
     training, bench = read_training(args.trained / "rivals.csv"), args.trained / "bench"
-    detectors = {way: weights_of(way, training, args.trained) for way in WAYS}
+    ways = args.ways.split(",")
+    if unknown := [way for way in ways if way not in WAYS]:
+        sys.exit(f"--ways: {unknown[0]} is none of {', '.join(WAYS)}.")
+    text = args.page.read_text()
+    marks = (f"<!-- {args.section} -->", f"<!-- end of {args.section} -->")
+    if any(mark not in text for mark in marks):
+        sys.exit(f"{args.page}: has no marks {marks[0]} and {marks[1]}; add them where tables go.")
+    detectors = {way: weights_of(way, training, args.trained) for way in ways}
     try:
         keep_conditions(bench / "conditions.json", conditions(detectors, args.data))
     except InputError as error:
@@ -91,25 +116,54 @@ def main() -> None:
     }
     pruned = pruning(bench / "pruning.json", detectors, args.retime)
     folder = args.page.with_suffix("")
-    folder.mkdir(exist_ok=True)
+    if args.section != "tables":
+        folder = folder / args.section
+    folder.mkdir(parents=True, exist_ok=True)
+    figures = draw(reports["images"]) if "images" in reports else []
+    if (args.trained / "progress.csv").exists():
+        progress = read_training(args.trained / "progress.csv")
+        figures.append(draw_progress(progress))
+        write_csv(folder / "progress.csv", table_of(progress))
     images = []
-    for figure in draw(reports["images"]):
-        (folder / f"{figure.name}.png").write_bytes(figure.png)
-        images.append(f"![{figure.caption}]({folder.name}/{figure.name}.png)")
+    for figure in figures:
+        file = folder / f"{figure.name}.png"
+        file.write_bytes(figure.png)
+        images.append(f"![{figure.caption}]({file.relative_to(args.page.parent)})")
     write_csv(folder / "table6.csv", table_6(reports, digits=4))
     write_csv(folder / "conditions.csv", every_score(reports))
-    write_csv(folder / "training.csv", [tuple(training[0]), *(tuple(r.values()) for r in training)])
-    text = args.page.read_text()
-    before, _, rest = text.partition(_BEGIN)
-    after = rest.partition(_END)[2]
+    write_csv(folder / "training.csv", table_of(training))
+    before, _, rest = text.partition(marks[0])
+    after = rest.partition(marks[1])[2]
     found = tables(reports, training, pruned, images)
-    args.page.write_text(f"{before}{_BEGIN}\n\n{found}\n{_END}{after}")
+    args.page.write_text(f"{before}{marks[0]}\n\n{found}\n{marks[1]}{after}")
 
 
 def read_training(path: Path) -> list[dict[str, str]]:
     """Rows of rivals.csv."""
     with path.open() as file:
         return list(csv.DictReader(file))
+
+
+def table_of(rows: list[dict[str, str]]) -> list[Row]:
+    """Head and rows."""
+    return [tuple(rows[0]), *(tuple(row.values()) for row in rows)]
+
+
+def draw_progress(progress: list[dict[str, str]]) -> ReportFigure:
+    """Validation AP over the images shown, of the networks that were shown the same."""
+    rows = [row for row in progress if row["way"] == "images" and row["network"] not in PAIR[1:]]
+    with style.context(STYLE, after_reset=True):
+        figure, axes = new_figure("Validation after each epoch", "images shown", "AP", LOW)
+        for number, name in enumerate(dict.fromkeys(row["network"] for row in rows)):
+            mine = [row for row in rows if row["network"] == name]
+            axes.plot(
+                [int(row["images_shown"]) for row in mine],
+                [float(row["validation_ap"]) for row in mine],
+                _DASHES[number // len(_COLORS)], color=_COLORS[number % len(_COLORS)], label=name,
+            )  # fmt: skip
+        axes.set_ylim(0, 1)
+        axes.legend(loc="lower right", ncols=2)
+        return save("progress", "Average precision in validation after each epoch.", figure)
 
 
 def weights_of(way: str, training: list[dict[str, str]], folder: Path) -> dict[str, Path | None]:
@@ -205,7 +259,8 @@ def tables(
     lines: list[str] = []
     head, *rows = table_6(reports, digits=3)
     lost_head, *lost = condition_table(reports)
-    for way, title in WAYS.items():
+    for way in reports:
+        title = WAYS[way]
         mine = [row[1:] for row in rows if row[0] == way]
         if way in ("images", "minutes"):
             without = dict.fromkeys(NETWORKS, "not trained") | ABSENT

@@ -1,19 +1,21 @@
 """Train every architecture of docs/rivals.md under equal conditions, in both of its ways.
 
 python tools/training/train_rivals.py --data SOURCE [--data SOURCE ...] --out DIR
-        [--pixels N] [--images N] [--core-minutes M] [--epochs N] [--device cuda] [--dry-run]
+        [--networks NAMES] [--pixels N] [--images N] [--core-minutes M] [--epochs N]
+        [--device cuda] [--dry-run]
 
 SOURCE is as of ``vslam train``. All networks have the preset ``rivals``: random weights, the same
 augmentation, loss, head and learning rate. In DIR/images each is shown the same number of images,
 as the same pairs in the same order, in DIR/minutes each computes for the same time of a core:
-validation and export come on top. DIR/rivals.csv has a row for each. ``capsule-pruned`` begins with
-the weights of ``capsule`` beside it and trains for one epoch more; its row counts that one alone.
+validation and export come on top; ``--core-minutes 0`` leaves DIR/minutes out. DIR/rivals.csv has a
+row for each, DIR/progress.csv one for each of its epochs. ``capsule-pruned`` begins with the
+weights of ``capsule`` beside it and trains for one epoch more; its row counts that one alone.
 PCANet learns once, without gradients.
 
 How long a step takes is measured first and kept in DIR/plan.json. ``--dry-run`` only does that and
 prints what would follow. What is finished is skipped, a killed training goes on from its
-checkpoint: the same command resumes everything. DIR/conditions.json keeps its options; with others
-DIR is refused.
+checkpoint: the same command resumes everything, and other ``--networks`` join. DIR/conditions.json
+keeps the other options; with others DIR is refused.
 """
 
 from __future__ import annotations
@@ -113,9 +115,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--data", action="append", required=True, help="source of images")
     parser.add_argument("--out", type=Path, default=Path("training/rivals"))
+    parser.add_argument(
+        "--networks", default=",".join((*TRAINED, "pcanet")), help="in the order of training"
+    )
     parser.add_argument("--pixels", help="of the images; without: the preset's")
     parser.add_argument("--images", type=int, default=65536, help="shown to each network")
-    parser.add_argument("--core-minutes", type=float, default=60.0, help="for each network")
+    parser.add_argument("--core-minutes", type=float, default=60.0, help="of each; 0: none")
     parser.add_argument("--epochs", type=int, help="that these are divided into")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--dry-run", action="store_true", help="print the plan only")
@@ -129,10 +134,13 @@ def main() -> None:
     if args.epochs:
         settings = settings.model_copy(update={"epochs": args.epochs})
     try:
+        networks = known_networks(args.networks)
         keep_conditions(args.out / "conditions.json", conditions(args))
     except InputError as error:
         sys.exit(str(error))
-    jobs = plan(args.out / "plan.json", settings, args.images, args.core_minutes, args.device)
+    jobs = plan(
+        args.out / "plan.json", settings, networks, args.images, args.core_minutes, args.device
+    )
     for job in jobs:
         epochs = 1 if job.network == "capsule-pruned" else settings.epochs
         print(
@@ -152,6 +160,22 @@ def main() -> None:
         results.append(run(job, collection, settings, args.out, args.device))
         print(results[-1], flush=True)
         write_results(table, results)
+        write_progress(args.out, results)
+
+
+def known_networks(names: str) -> list[str]:
+    """Names between commas.
+
+    Raises:
+        InputError: one is unknown, or the pruned network without what it continues.
+    """
+    found = names.split(",")
+    for name in found:
+        if name not in (*TRAINED, "pcanet"):
+            raise InputError(f"--networks: {name} is none of {', '.join((*TRAINED, 'pcanet'))}.")
+    if "capsule-pruned" in found and "capsule" not in found[: found.index("capsule-pruned")]:
+        raise InputError("--networks: capsule-pruned continues from capsule; name that before it.")
+    return found
 
 
 def conditions(args: argparse.Namespace) -> dict[str, Any]:
@@ -161,30 +185,43 @@ def conditions(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def plan(
-    path: Path, settings: TrainSettings, images: int, minutes: float, device: str
+    path: Path,
+    settings: TrainSettings,
+    networks: list[str],
+    images: int,
+    minutes: float,
+    device: str,
 ) -> list[Job]:
-    """The jobs of a file, or those that follow from the time of a step, written to it."""
-    if path.exists():
-        return [Job(**job) for job in json.loads(path.read_text())]
-    step = {name: seconds_of_a_step(name, settings, device) for name in TRAINED}
-    fewest = settings.batch
-    jobs = []
-    for way in ("images", "minutes"):
-        for name in TRAINED:
-            shown = images if way == "images" else 60 * minutes / step[name] * 2 * settings.batch
-            batches = max(1, round(shown / 2 / settings.epochs / fewest))
-            steps = batches * (1 if name == "capsule-pruned" else settings.epochs)
-            jobs.append(Job(way, name, batches * fewest, step[name] * steps))
-    jobs.append(Job("images", "pcanet", 0, 0.0))
-    path.write_text(json.dumps([asdict(job) for job in jobs], indent=1) + "\n")
-    return jobs
+    """The jobs of these networks: those of a file, and those that it lacks, added to it.
+
+    How many pairs an epoch has follows from the number of images or from the time of a step.
+    """
+    known = [Job(**job) for job in json.loads(path.read_text())] if path.exists() else []
+    ways = ("images", "minutes") if minutes else ("images",)
+    wanted = [(way, name) for way in ways for name in networks if name != "pcanet"]
+    wanted += [("images", "pcanet")] if "pcanet" in networks else []
+    planned = {(job.way, job.network) for job in known}
+    missing = [one for one in wanted if one not in planned]
+    timed = dict.fromkeys(name for _, name in missing if name != "pcanet")
+    step = {name: seconds_of_a_step(name, settings, device) for name in timed}
+    for way, name in missing:
+        if name == "pcanet":
+            known.append(Job(way, name, 0, 0.0))
+            continue
+        shown = images if way == "images" else 60 * minutes / step[name] * 2 * settings.batch
+        batches = max(1, round(shown / 2 / settings.epochs / settings.batch))
+        steps = batches * (1 if name == "capsule-pruned" else settings.epochs)
+        known.append(Job(way, name, batches * settings.batch, step[name] * steps))
+    path.write_text(json.dumps([asdict(job) for job in known], indent=1) + "\n")
+    found = {(job.way, job.network): job for job in known}
+    return [found[one] for one in wanted]
 
 
 def seconds_of_a_step(name: str, settings: TrainSettings, device: str) -> float:
     """Core seconds of a step of training, without reading and augmenting its images."""
     torch.manual_seed(0)
     network = build_network(name, settings.shape, settings.head).to(device).train()
-    optimiser = torch.optim.Adam(network.parameters())
+    optimiser = torch.optim.Adam(network.parameters(), fused=True)
     images = torch.rand(2 * settings.batch, 3, *settings.shape.input, device=device)
     taken = []
     for _ in range(_TIMED_STEPS):
@@ -262,6 +299,23 @@ def write_results(path: Path, results: list[Result]) -> None:
         rows = csv.DictWriter(file, list(asdict(results[0])), lineterminator="\n")
         rows.writeheader()
         rows.writerows(asdict(one) for one in results)
+
+
+def write_progress(out: Path, results: list[Result]) -> None:
+    """Write progress.csv from the logs of all finished trainings."""
+    rows: list[tuple[str | int, ...]] = [
+        ("way", "network", "images_shown", "loss", "validation_ap")
+    ]
+    for one in results:
+        if one.network == "pcanet":  # learns once
+            continue
+        with (out / Path(one.weights).parent / "log.csv").open() as file:
+            for number, row in enumerate(csv.DictReader(file), 1):
+                figures = (f"{float(row[key]):.4f}" for key in ("loss", "average_precision"))
+                shown = one.images_shown * number // one.epochs
+                rows.append((one.way, one.network, shown, *figures))
+    with (out / "progress.csv").open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 if __name__ == "__main__":

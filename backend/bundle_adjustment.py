@@ -30,7 +30,7 @@ class BundleProblem:
         camera: ``(O,)`` int64, camera of each observation.
         uvr: ``(O, 3)`` float64, NaN u_right for monocular ones.
         inverse_sigma2: ``(O,)`` float64.
-        intrinsics: ``(5,)`` fx, fy, cx, cy, bf.
+        intrinsics: ``(7,)``, see ``Camera.intrinsics``.
     """
 
     T_cw: NDArray[np.float64]
@@ -200,7 +200,7 @@ def linearise(T_cw, n_free, points, observations, equations):
     first, camera, uvr, inverse_sigma2, used, intrinsics = observations
     W, V, g, U, b = equations
     pinhole = unpacked(intrinsics)
-    fx, fy, _, _, bf = intrinsics  # not shared: that would fuse other products, and change bits
+    fx, fy, _, _, bf, disparity_weight, column_weight = intrinsics
     U[:] = 0.0
     b[:] = 0.0
     q = np.empty(3)
@@ -222,12 +222,13 @@ def linearise(T_cw, n_free, points, observations, equations):
             if chi2 > limit:
                 weight *= np.sqrt(limit / chi2)
             iz = 1.0 / q[2]
-            a = fx * iz
-            c = -fx * q[0] * iz * iz
+            s = column_weight if stereo else 1.0
+            a = s * fx * iz
+            c = -s * fx * q[0] * iz * iz
             e = fy * iz
             f = -fy * q[1] * iz * iz
-            h = c + bf * iz * iz if stereo else 0.0
-            m = a if stereo else 0.0
+            h = disparity_weight * bf * iz * iz if stereo else 0.0
+            m = 0.0
             # Rows of d(u, v, u_right)/d(point): projection times rotation.
             for i in range(3):
                 P[0, i] = a * T[0, i] + c * T[2, i]

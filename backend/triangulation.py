@@ -89,7 +89,7 @@ def unmapped_rows(a, keyframe):
 @kernel
 def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, max_cosine):
     """New landmarks of two keyframes: ``xyz`` ``(N, 3)`` and the rows of both, ``(N,)`` int64."""
-    fx, fy, cx, cy, bf = intrinsics
+    fx, fy, cx, cy, bf, _, _ = intrinsics
     T1, T2 = a.T_cw[k1], a.T_cw[k2]
     centre_1, centre_2, gap = np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):

@@ -24,14 +24,14 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
         points: ``(N, 3)`` float64 landmarks in the world.
         uvr: ``(N, 3)`` float64 observations u, v, u_right; NaN u_right: monocular.
         inverse_sigma2: ``(N,)`` float64, inverse variance of a pixel coordinate.
-        intrinsics: ``(5,)`` fx, fy, cx, cy, bf.
+        intrinsics: ``(7,)``, see ``Camera.intrinsics``.
 
     Returns:
         ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers.
     """
     n = len(points)
     pinhole = unpacked(intrinsics)
-    fx, fy, _, _, bf = intrinsics  # not shared: that would fuse other products, and change bits
+    fx, fy, _, _, bf, disparity_weight, column_weight = intrinsics
     T = T_cw.copy()
     inlier = np.ones(n, np.bool_)
     for turn in range(ROUNDS):
@@ -62,9 +62,10 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
                     weight *= np.sqrt(limit / chi2)
                 used += 1
                 # d(u, v)/d(v, w) for T <- exp([v, w]) T.
-                J[0, 0], J[0, 1], J[0, 2] = fx * iz, 0.0, -fx * x * iz * iz
+                s = column_weight if stereo else 1.0
+                J[0, 0], J[0, 1], J[0, 2] = s * fx * iz, 0.0, -s * fx * x * iz * iz
                 J[1, 0], J[1, 1], J[1, 2] = 0.0, fy * iz, -fy * y * iz * iz
-                J[2, 0], J[2, 1], J[2, 2] = J[0, 0], 0.0, J[0, 2] + bf * iz * iz
+                J[2, 0], J[2, 1], J[2, 2] = 0.0, 0.0, disparity_weight * bf * iz * iz
                 for k in range(3 if stereo else 2):
                     J[k, 3] = -J[k, 1] * z + J[k, 2] * y
                     J[k, 4] = J[k, 0] * z - J[k, 2] * x

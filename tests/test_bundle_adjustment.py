@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 
 from vslam.backend.bundle_adjustment import BundleProblem, adjust, cholesky_solve
-from vslam.camera import Camera
+from vslam.camera import COLUMN_WEIGHT, DISPARITY_WEIGHT, Camera
 from vslam.geometry import se3_exp, se3_log, transform
 from vslam.reprojection import CHI2_MONO, CHI2_STEREO
 
 CAMERA = Camera(400.0, 410.0, 320.0, 120.0, 0.5, 640, 240)
 N_FREE, N_FIXED = 4, 2
+WHITENING = np.array(  # of the errors of u, v, u_right
+    [[COLUMN_WEIGHT, 0.0, 0.0], [0.0, 1.0, 0.0], [-DISPARITY_WEIGHT, 0.0, DISPARITY_WEIGHT]]
+)
 
 
 def make_problem(
@@ -42,7 +45,10 @@ def make_problem(
         first.append(len(camera))
     uvr = np.array(uvr)
     sigma = 1.2 ** rng.integers(0, 8, len(uvr))
-    uvr += noise * sigma[:, None] * rng.normal(size=uvr.shape)
+    error = rng.normal(size=uvr.shape)
+    stereo = ~np.isnan(uvr[:, 2])
+    error[stereo] = error[stereo] @ np.linalg.inv(WHITENING).T
+    uvr += noise * sigma[:, None] * error
     wrong = rng.permutation(len(uvr))[:outliers]
     uvr[wrong, :2] += rng.choice([-1, 1], (outliers, 2)) * rng.uniform(20, 60, (outliers, 2))
     start = truth.copy()
@@ -71,6 +77,8 @@ def robust_cost(problem: BundleProblem, T_cw: np.ndarray, points: np.ndarray) ->
     T = T_cw[problem.camera]
     in_camera = np.einsum("oij,oj->oi", T[:, :3, :3], points[p]) + T[:, :3, 3]
     error = np.nan_to_num(problem.uvr - CAMERA.project(in_camera))
+    stereo = ~np.isnan(problem.uvr[:, 2])
+    error[stereo] = error[stereo] @ WHITENING.T
     norm = np.sqrt((error**2).sum(axis=1) * problem.inverse_sigma2)
     k = np.sqrt(np.where(np.isnan(problem.uvr[:, 2]), CHI2_MONO, CHI2_STEREO))
     return float(np.where(norm <= k, 0.5 * norm**2, k * norm - 0.5 * k**2).sum())
@@ -92,7 +100,11 @@ def gtsam_graph(problem: BundleProblem):
 
     def robust(dimensions: int, limit: float, weight: float):
         huber = gtsam.noiseModel.mEstimator.Huber.Create(np.sqrt(limit))
-        plain = gtsam.noiseModel.Isotropic.Sigma(dimensions, weight**-0.5)
+        if dimensions == 2:
+            plain = gtsam.noiseModel.Isotropic.Sigma(dimensions, weight**-0.5)
+        else:
+            turned = WHITENING[:, [0, 2, 1]]  # GTSAM's order: u, u_right, v
+            plain = gtsam.noiseModel.Gaussian.Information(weight * turned.T @ turned)
         return gtsam.noiseModel.Robust.Create(huber, plain)
 
     owner = landmark_of_observation(problem) + n_cameras
@@ -171,6 +183,8 @@ def test_inliers_are_those_of_the_chi_square_test_at_the_solution():
     T = solution.T_cw[problem.camera]
     in_camera = np.einsum("oij,oj->oi", T[:, :3, :3], solution.points[p]) + T[:, :3, 3]
     error = np.nan_to_num(problem.uvr - CAMERA.project(in_camera))
+    stereo = ~np.isnan(problem.uvr[:, 2])
+    error[stereo] = error[stereo] @ WHITENING.T
     chi2 = (error**2).sum(axis=1) * problem.inverse_sigma2
     limit = np.where(np.isnan(problem.uvr[:, 2]), CHI2_MONO, CHI2_STEREO)
     np.testing.assert_array_equal(solution.inlier, chi2 <= limit)

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from vslam.camera import Camera
+from vslam.camera import COLUMN_WEIGHT, DISPARITY_WEIGHT, Camera
 from vslam.frontend.pose import optimise_pose
 from vslam.geometry import inverse, se3_exp, se3_log, solve_positive, transform
 
@@ -14,6 +14,10 @@ CAMERA = Camera(400.0, 410.0, 320.0, 120.0, 0.5, 640, 240)
 TRUTH = se3_exp(np.array([0.4, -0.2, 1.1, 0.05, -0.1, 0.02]))
 START = se3_exp(np.array([0.1, -0.08, 0.2, 0.02, 0.03, -0.02])) @ TRUTH
 KINDS = ["mono", "stereo", "mixed"]
+
+WHITENING = np.array(  # of the errors of u, v, u_right
+    [[COLUMN_WEIGHT, 0.0, 0.0], [0.0, 1.0, 0.0], [-DISPARITY_WEIGHT, 0.0, DISPARITY_WEIGHT]]
+)
 
 
 def observations(kind: str, n: int = 120, noise: float = 0.0, seed: int = 0):
@@ -24,9 +28,12 @@ def observations(kind: str, n: int = 120, noise: float = 0.0, seed: int = 0):
     in_camera = CAMERA.backproject(pixels, depth)
     uvr = CAMERA.project(in_camera)
     sigma = 1.2 ** rng.integers(0, 8, n)
-    uvr += noise * sigma[:, None] * rng.normal(size=(n, 3))
+    error = rng.normal(size=(n, 3))
     if kind != "stereo":
         uvr[:: 1 if kind == "mono" else 2, 2] = np.nan
+    seen_twice = ~np.isnan(uvr[:, 2])
+    error[seen_twice] = error[seen_twice] @ np.linalg.inv(WHITENING).T
+    uvr += noise * sigma[:, None] * error
     return transform(inverse(TRUTH), in_camera), uvr, sigma**-2.0
 
 
@@ -36,6 +43,8 @@ def pose_difference(A: np.ndarray, B: np.ndarray) -> float:
 
 def chi2(T: np.ndarray, points, uvr, inverse_sigma2) -> np.ndarray:
     error = np.nan_to_num(uvr - CAMERA.project(transform(T, points)))
+    stereo = ~np.isnan(uvr[:, 2])
+    error[stereo] = error[stereo] @ WHITENING.T
     return (error**2).sum(axis=1) * inverse_sigma2
 
 
@@ -90,7 +99,8 @@ def gtsam_pose(points, uvr, inverse_sigma2) -> np.ndarray:
             pixel = np.array([u, v])
             graph.add(gtsam.GenericProjectionFactorCal3_S2(pixel, noise, 0, i, mono))
         else:
-            noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
+            turned = WHITENING[:, [0, 2, 1]]  # GTSAM's order: u, u_right, v
+            noise = gtsam.noiseModel.Gaussian.Information(sigma**-2.0 * turned.T @ turned)
             graph.add(gtsam.GenericStereoFactor3D(gtsam.StereoPoint2(u, r, v), noise, 0, i, stereo))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-14)

@@ -48,8 +48,7 @@ def compare_sides(left: Grey, right: Grey, config: StereoConfig) -> Sides:
         return Sides(black="left")
     if _is_black(theirs, ours):
         return Sides(black="right")
-    stops = _stops(ours, theirs, config.max_gain_disagreement)
-    return Sides(stops if abs(stops) > config.balance_from else 0.0)
+    return Sides(_stops(ours, theirs, config))
 
 
 def balanced(
@@ -86,9 +85,11 @@ def _is_black(side: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
     return high < _BLACK and other_high - other_low > max(_SEES, 10.0 * (high - low))
 
 
-def _stops(ours: NDArray[np.float64], theirs: NDArray[np.float64], tolerance: float) -> float:
-    """Logarithm of the gain from theirs to ours, 0 where no gain explains dark and bright pixels
-    alike. What is white on either side is left out of both."""
+def _stops(
+    ours: NDArray[np.float64], theirs: NDArray[np.float64], config: StereoConfig
+) -> float:
+    """Logarithm of the gain from theirs to ours, 0 where it is below the threshold or no gain
+    explains dark and bright pixels alike. What is white on either side is left out of both."""
     top, dull = _HIGH, float(min(ours[_CLIPPED - 1], theirs[_CLIPPED - 1]))
     if dull <= top:
         top = _WITHIN * dull
@@ -101,10 +102,17 @@ def _stops(ours: NDArray[np.float64], theirs: NDArray[np.float64], tolerance: fl
     least = min(a_low, b_low, a_high, b_high)
     if min(a_low + a_high, b_low + b_high) < _LEAST_RANGE or least <= 0:
         return 0.0
-    disagreement = abs(log2(a_low / b_low) - log2(a_high / b_high))
-    if least >= _LEAST_RANGE and disagreement > tolerance:  # below, halves differ by rounding
+    gain = log2((a_low + a_high) / (b_low + b_high))
+    if abs(gain) <= config.balance_from:
         return 0.0
-    return log2((a_low + a_high) / (b_low + b_high))
+    if least >= _LEAST_RANGE:  # below, halves differ by rounding
+        low, high = log2(a_low / b_low), log2(a_high / b_high)
+        # A few bright pixels more on one side stretch its upper half alone: that is no gain.
+        if min(low * np.sign(gain), high * np.sign(gain)) <= config.balance_from:
+            return 0.0
+        if abs(low - high) > config.max_gain_disagreement:
+            return 0.0
+    return gain
 
 
 def _brightened(dark: Grey, bright: Grey, stops: float) -> Grey:

@@ -271,7 +271,7 @@ def sorted_about_epipole(x, y, gate, intrinsics, across):
 @inner_kernel
 def seen_along(x, y, intrinsics, across):
     """The ray of a pixel along the two axes."""
-    fx, fy, cx, cy, _ = intrinsics
+    fx, fy, cx, cy, _, _, _ = intrinsics
     d_x, d_y = (x - cx) / fx, (y - cy) / fy
     u = d_x * across[0, 0] + d_y * across[0, 1] + across[0, 2]
     v = d_x * across[1, 0] + d_y * across[1, 1] + across[1, 2]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stereo_noise import white_noise
 
-from vslam.camera import COLUMN_WEIGHT, DISPARITY_WEIGHT, Camera
+from vslam.camera import Camera
 from vslam.frontend.pnp import ransac_pose, solve_p3p
 from vslam.geometry import inverse, se3_exp, se3_log, transform
 
@@ -45,11 +46,7 @@ def scene(seed: int, *, n: int = 100, outliers: float = 0.7, mono: bool = False)
     T = se3_exp(np.r_[3 * rng.normal(size=3), rng.normal(size=3)])
     xy = rng.uniform([0, 0], [CAMERA.width, CAMERA.height], (n, 2))
     in_camera = CAMERA.backproject(xy, rng.uniform(5, 40, n))
-    error = rng.normal(size=(n, 3))
-    if not mono:
-        error[:, 0] /= COLUMN_WEIGHT
-        error[:, 2] = error[:, 0] + error[:, 2] / DISPARITY_WEIGHT
-    uvr = CAMERA.project(in_camera) + 0.7 * error
+    uvr = CAMERA.project(in_camera) + 0.7 * white_noise(rng, np.full(n, not mono))
     if mono:
         uvr[:, 2] = np.nan
     points = transform(inverse(T), in_camera)

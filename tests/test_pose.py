@@ -5,8 +5,9 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
+from stereo_noise import WHITENING, white_noise
 
-from vslam.camera import COLUMN_WEIGHT, DISPARITY_WEIGHT, Camera
+from vslam.camera import Camera
 from vslam.frontend.pose import optimise_pose
 from vslam.geometry import inverse, se3_exp, se3_log, solve_positive, transform
 
@@ -14,10 +15,6 @@ CAMERA = Camera(400.0, 410.0, 320.0, 120.0, 0.5, 640, 240)
 TRUTH = se3_exp(np.array([0.4, -0.2, 1.1, 0.05, -0.1, 0.02]))
 START = se3_exp(np.array([0.1, -0.08, 0.2, 0.02, 0.03, -0.02])) @ TRUTH
 KINDS = ["mono", "stereo", "mixed"]
-
-WHITENING = np.array(  # of the errors of u, v, u_right
-    [[COLUMN_WEIGHT, 0.0, 0.0], [0.0, 1.0, 0.0], [-DISPARITY_WEIGHT, 0.0, DISPARITY_WEIGHT]]
-)
 
 
 def observations(kind: str, n: int = 120, noise: float = 0.0, seed: int = 0):
@@ -28,12 +25,9 @@ def observations(kind: str, n: int = 120, noise: float = 0.0, seed: int = 0):
     in_camera = CAMERA.backproject(pixels, depth)
     uvr = CAMERA.project(in_camera)
     sigma = 1.2 ** rng.integers(0, 8, n)
-    error = rng.normal(size=(n, 3))
     if kind != "stereo":
         uvr[:: 1 if kind == "mono" else 2, 2] = np.nan
-    seen_twice = ~np.isnan(uvr[:, 2])
-    error[seen_twice] = error[seen_twice] @ np.linalg.inv(WHITENING).T
-    uvr += noise * sigma[:, None] * error
+    uvr += noise * sigma[:, None] * white_noise(rng, ~np.isnan(uvr[:, 2]))
     return transform(inverse(TRUTH), in_camera), uvr, sigma**-2.0
 
 

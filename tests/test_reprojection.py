@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stereo_noise import WHITENING, white_noise
 
-from vslam.camera import COLUMN_WEIGHT, DISPARITY_WEIGHT, Camera
+from vslam.camera import Camera
 from vslam.kernels import kernel
 from vslam.reprojection import (
     CHI2_MONO,
@@ -48,8 +49,7 @@ def test_residual_and_test_are_those_of_the_camera(mono):
     ratio, r, chi2, limit = errors_of(points, uvr, weight, CAMERA.intrinsics)
     expected = noise.copy()
     if not mono:
-        expected[:, 0] *= COLUMN_WEIGHT
-        expected[:, 2] = DISPARITY_WEIGHT * (noise[:, 2] - noise[:, 0])
+        expected = noise @ WHITENING.T
     np.testing.assert_allclose(r, expected, atol=1e-9)
     np.testing.assert_allclose(chi2, weight * (expected**2).sum(axis=1), rtol=1e-9)
     assert set(limit) == {CHI2_MONO if mono else CHI2_STEREO}
@@ -60,13 +60,9 @@ def test_residual_and_test_are_those_of_the_camera(mono):
 def test_the_limits_hold_19_of_20_true_observations():
     rng = np.random.default_rng(1)
     points = np.tile([1.0, 0.5, 10.0], (20000, 1))
-    error = rng.normal(size=(20000, 3))
     for columns in (3, 2):
-        uvr = CAMERA.project(points) + error
-        if columns == 3:
-            uvr[:, 0] = CAMERA.project(points)[:, 0] + error[:, 0] / COLUMN_WEIGHT
-            disparity_error = error[:, 2] / DISPARITY_WEIGHT
-            uvr[:, 2] = CAMERA.project(points)[:, 2] + error[:, 0] / COLUMN_WEIGHT + disparity_error
+        noise = white_noise(rng, np.full(len(points), columns == 3))
+        uvr = CAMERA.project(points) + noise
         uvr[:, columns:] = np.nan
         ratio, *_ = errors_of(points, uvr, np.ones(20000), CAMERA.intrinsics)
         assert np.mean(ratio <= 1.0) == pytest.approx(0.95, abs=0.005)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stereo_noise import white_noise
 
-from vslam.camera import COLUMN_WEIGHT, DISPARITY_WEIGHT, Camera
+from vslam.camera import Camera
 from vslam.geometry import inverse, se3_exp, se3_log, symmetric_eigen, transform
 from vslam.loopclosure.sim3_ransac import Sightings, align, fit_motion, is_degenerate
 from vslam.ransac import draw_three, draws_needed, random_index
@@ -27,10 +28,7 @@ def scene(seed: int, n: int, outliers: float, scale: float = 1.0, noise: float =
     in_b = transform(inverse(T), in_a)
     views = []
     for p in (in_a, in_b):
-        error = rng.normal(size=(n, 3))
-        error[:, 0] /= COLUMN_WEIGHT
-        error[:, 2] = error[:, 0] + error[:, 2] / DISPARITY_WEIGHT
-        uvr = CAMERA.project(p) + noise * error
+        uvr = CAMERA.project(p) + noise * white_noise(rng, np.ones(n, bool))
         depth_error = 1 + p[:, 2:] / CAMERA.bf * (0.1 if noise else 0.0) * rng.normal(size=(n, 1))
         views.append((p * depth_error, uvr))
     wrong = rng.permutation(n)[: round(outliers * n)]

@@ -16,9 +16,9 @@ Image = NDArray[np.uint8]  # (H, W) grey
 DepthImage = NDArray[np.float32]  # (H, W) metres along z, 0 where unknown
 Sensor = Literal["stereo", "mono", "rgbd"]
 
-# How much surer the disparity and the column of a stereo observation are than its row: factors on
-# their reprojection errors (docs/motorway.md).
-DISPARITY_WEIGHT, COLUMN_WEIGHT = 3.0, 2.0
+# How much surer the disparity of a stereo observation is than its column and row: the factor on its
+# reprojection error (docs/motorway.md, tools/noise_model.py).
+DISPARITY_WEIGHT = 3.0
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,11 @@ class Camera:
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """``(7,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight, column_weight]``, the form
-        that the kernels take."""
+        """``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``, the form that the kernels
+        take."""
         # A depth camera has its virtual baseline to say how sure its depths are.
-        weights = (1.0, 2.0**0.5) if self.depth else (DISPARITY_WEIGHT, COLUMN_WEIGHT)
-        return np.array([self.fx, self.fy, self.cx, self.cy, self.bf, *weights])
+        weight = 1.0 if self.depth else DISPARITY_WEIGHT
+        return np.array([self.fx, self.fy, self.cx, self.cy, self.bf, weight])
 
     def project(self, p_c: NDArray[np.float64]) -> NDArray[np.float64]:
         """Project ``(N, 3)`` points of the left camera to ``(N, 3)`` rows ``u, v, u_right``."""

@@ -80,8 +80,7 @@ def variance_components(
     J[~good] = 0.0
     V = np.zeros((len(problem.points), 3, 3))
     np.add.at(V, owner, np.einsum("oki,okj->oij", J, J))
-    V += 1e-12 * np.eye(3)
-    lever = np.einsum("oki,oij,okj->ok", J, np.linalg.inv(V)[owner], J)
+    lever = np.einsum("oki,oij,okj->ok", J, np.linalg.pinv(V, hermitian=True)[owner], J)
     counted = good & stereo
     redundancy = (1.0 - lever[counted]).sum(axis=0)
     found = np.sqrt((error[counted] ** 2).sum(axis=0) / redundancy)

@@ -16,7 +16,7 @@ Image = NDArray[np.uint8]  # (H, W) grey
 DepthImage = NDArray[np.float32]  # (H, W) metres along z, 0 where unknown
 Sensor = Literal["stereo", "mono", "rgbd"]
 
-# How much surer the disparity of a stereo observation is than its column and row: the factor on its
+# How much surer the disparity of an observation is than its column and row: the factor on its
 # reprojection error (docs/motorway.md, tools/noise_model.py).
 DISPARITY_WEIGHT = 3.0
 
@@ -71,9 +71,7 @@ class Camera:
     def intrinsics(self) -> NDArray[np.float64]:
         """``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``, the form that the kernels
         take."""
-        # A depth camera has its virtual baseline to say how sure its depths are.
-        weight = 1.0 if self.depth else DISPARITY_WEIGHT
-        return np.array([self.fx, self.fy, self.cx, self.cy, self.bf, weight])
+        return np.array([self.fx, self.fy, self.cx, self.cy, self.bf, DISPARITY_WEIGHT])
 
     def project(self, p_c: NDArray[np.float64]) -> NDArray[np.float64]:
         """Project ``(N, 3)`` points of the left camera to ``(N, 3)`` rows ``u, v, u_right``."""

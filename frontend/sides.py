@@ -85,9 +85,7 @@ def _is_black(side: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
     return high < _BLACK and other_high - other_low > max(_SEES, 10.0 * (high - low))
 
 
-def _stops(
-    ours: NDArray[np.float64], theirs: NDArray[np.float64], config: StereoConfig
-) -> float:
+def _stops(ours: NDArray[np.float64], theirs: NDArray[np.float64], config: StereoConfig) -> float:
     """Logarithm of the gain from theirs to ours, 0 where it is below the threshold or no gain
     explains dark and bright pixels alike. What is white on either side is left out of both."""
     top, dull = _HIGH, float(min(ours[_CLIPPED - 1], theirs[_CLIPPED - 1]))

@@ -51,8 +51,7 @@ class Ring:
         return T
 
     def see(self, k: float, seed: int) -> Features:
-        """Features at frame k, 0.3 px of noise, 0.1 px of it in disparities, six bits of each
-        descriptor wrong."""
+        """Features at frame k, 0.3 px of noise, six bits of each descriptor wrong."""
         rng = np.random.default_rng((seed, round(10 * k)))
         T_cw = inverse(self.pose(k))
         p = self.points @ T_cw[:3, :3].T + T_cw[:3, 3]
@@ -65,7 +64,7 @@ class Ring:
         n = len(seen)
         xy = np.stack([u[seen], v[seen]], axis=1) + rng.normal(0, 0.3, (n, 2))
         u_right = xy[:, 0] - CAMERA.bf * (1.0 + self.focal_error) / z[seen]
-        u_right += rng.normal(0, 0.1, n)
+        u_right += rng.normal(0, 0.3, n)
         bits = np.unpackbits(self.descriptors[seen], axis=1)
         for _ in range(6):
             bits[np.arange(n), rng.integers(0, 256, n)] ^= 1

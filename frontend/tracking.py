@@ -25,7 +25,7 @@ from vslam.frontend.matching import (
 )
 from vslam.frontend.orb import extract, scale_factors
 from vslam.frontend.pose import optimise_pose
-from vslam.frontend.sides import Sides, balanced
+from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import match_stereo
 from vslam.geometry import compose, inverse, transform
 from vslam.map import LocalMap
@@ -42,8 +42,9 @@ class Frame:
         index: number of the frame in the run, from 0.
         timestamp: seconds.
         image: ``(H, W)`` uint8 left image, for loop detectors that look at it, or None.
-        features, grid: of the left image.
-        T_cw: ``(4, 4)`` pose estimate.
+        features, grid: of the left image, or of the right one (``Features.from_right``).
+        T_cw: ``(4, 4)`` pose estimate, of the left camera once the frame is tracked; while it is,
+            of the camera that its features are of.
         landmark: ``(N,)`` int32, landmark that each feature tracks, or -1.
         xyz: ``(N, 3)`` float64, its position; NaN without one.
         disparity_offset: pixels that the disparities of the features were corrected by.
@@ -131,7 +132,8 @@ def extract_features(
     image_map: ImageMap = map,
     sides: Sides | None = None,
 ) -> Features:
-    """ORB features of the left image with their columns in the right one.
+    """ORB features of the left image with their columns in the right one. Where the left image is
+    black, those of the right one, without columns in the other.
 
     A pure function, whatever ``image_map`` is.
 
@@ -149,10 +151,20 @@ def extract_features(
             scale, depth = context.scales[found.octave], np.asarray(second, np.float32)
             u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
     else:
-        pair = balanced(left, np.asarray(second, np.uint8), config.stereo, sides)
+        right_image = np.asarray(second, np.uint8)
+        sides = sides or compare_sides(left, right_image, config.stereo)
+        if sides.black == "left":
+            return _features_of_right(right_image, config)
+        pair = balanced(left, right_image, config.stereo, sides)
         found, right = image_map(lambda image: extract(image, config.orb), pair)
         u_right = match_stereo(found, right, camera, config.stereo)
     return Features(found.xy, found.octave, found.angle, found.descriptors, u_right)
+
+
+def _features_of_right(right: NDArray[np.uint8], config: Config) -> Features:
+    found = extract(right, config.orb)
+    alone = np.full(len(found.xy), np.nan, np.float32)
+    return Features(found.xy, found.octave, found.angle, found.descriptors, alone, from_right=True)
 
 
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:

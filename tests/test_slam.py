@@ -30,6 +30,7 @@ def run(
     threads: int = 1,
     frames: Iterable[int] | None = None,
     black: Iterable[int] = (),
+    left_black: Iterable[int] = (),
     skipped: Iterable[int] = (),
 ) -> tuple[Slam, list[TrackResult]]:
     """Track some frames, black or missing ones among them."""
@@ -41,7 +42,7 @@ def run(
             results.append(slam.skip(sequence.timestamps[k]))
             continue
         dark = k in black
-        left = nothing if dark else sequence.left[k]
+        left = nothing if dark or k in left_black else sequence.left[k]
         right = nothing if dark else sequence.right[k]
         results.append(slam.step(left, right, sequence.timestamps[k]))
     slam.finish()
@@ -81,6 +82,20 @@ def test_tracks_every_frame_to_centimetres(corridor, check_map):
     assert errors.max() < 0.08
     for T, truth in zip(slam.trajectory().T_wc, corridor.T_wc, strict=True):
         assert np.abs(se3_log(T @ inverse(truth))[3:]).max() < 0.006
+    check_map(slam.map)
+
+
+def test_while_the_left_side_is_black_the_right_one_tracks(corridor, check_map):
+    """A pose that were that of the right camera would be half a baseline off and more."""
+    dark = range(10, 16)
+    slam, results = run(corridor, EAGER, left_black=dark)
+    assert states(results) == "O" * len(corridor)
+    assert not any(results[k].is_keyframe or results[k].n_stereo for k in dark)
+    assert all(result.is_keyframe for result in results[16:18])
+    errors = position_errors(slam, corridor)
+    assert errors[list(dark)].max() < 0.1 * corridor.camera.baseline + errors[9]
+    online = np.array([results[k].T_wc[:3, 3] - corridor.T_wc[k, :3, 3] for k in dark])
+    assert np.linalg.norm(online, axis=1).max() < 0.2 * corridor.camera.baseline
     check_map(slam.map)
 
 

@@ -77,7 +77,7 @@ def drive(sequence: Sequence, frames: range, detector: str, perturb: str, seed: 
     light = parse_perturbation(perturb, seed)
     every = (frame for k, frame in enumerate(timed_frames(sequence)) if k in frames)
     for timestamp, prepared in prepared_frames(perturbed(every, light), slam.context, 2):
-        slam.step_features(prepared.features, timestamp, prepared.left)
+        slam.step_features(prepared.features, timestamp, prepared.image)
     slam.finish()
     stored = slam.stored_map(f"{sequence.name} {frames.start}-{frames[-1]}").compact()
     stored.map.frames = [frames[k] for k in stored.map.frames]

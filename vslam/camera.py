@@ -63,6 +63,13 @@ class Camera:
         return replace(self, baseline=0.0, depth=False)
 
     @property
+    def T_right_left(self) -> NDArray[np.float64]:
+        """``(4, 4)`` pose of the left camera in the right one."""
+        T = np.eye(4)
+        T[0, 3] = -self.baseline
+        return T
+
+    @property
     def bf(self) -> float:
         """Baseline times focal length: disparity in pixels is ``bf / z``."""
         return self.baseline * self.fx

@@ -17,7 +17,8 @@ CELL = 16  # pixels of a FeatureGrid cell; search windows are 5 to 60 px wide
 
 @dataclass(frozen=True)
 class Features:
-    """ORB features of one left image, with the stereo match of each where there is one.
+    """ORB features of one left image, with the stereo match of each where there is one; or of the
+    right image, where the left one is black.
 
     Attributes:
         xy: ``(N, 2)`` float32, position at full resolution (pixels).
@@ -25,6 +26,8 @@ class Features:
         angle: ``(N,)`` float32, orientation in radians.
         descriptors: ``(N, 32)`` uint8, 256-bit rotated BRIEF.
         u_right: ``(N,)`` float32, column of the match in the right image, NaN without one.
+        from_right: whether the image is the right one; ``xy`` is in it then, and all ``u_right``
+            are NaN.
     """
 
     xy: NDArray[np.float32]
@@ -32,6 +35,7 @@ class Features:
     angle: NDArray[np.float32]
     descriptors: NDArray[np.uint8]
     u_right: NDArray[np.float32]
+    from_right: bool = False
 
     def __len__(self) -> int:
         return len(self.xy)

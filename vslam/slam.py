@@ -306,7 +306,8 @@ class Slam:
         start = time.perf_counter()
         features = extract_features(left, second, self.context)
         stage_ms = {"extract": 1e3 * (time.perf_counter() - start)}
-        return self.step_features(features, timestamp, left, stage_ms)
+        image = np.asarray(second, np.uint8) if features.from_right else left
+        return self.step_features(features, timestamp, image, stage_ms)
 
     def step_features(
         self,
@@ -318,7 +319,7 @@ class Slam:
         """``step`` for a pair whose features were extracted elsewhere (``extract_features``).
 
         Args:
-            image: the left image, for loop detectors that look at it.
+            image: what the features are of, for loop detectors that look at it.
         """
         clock = _Clock(dict(stage_ms or {}))
         frame = self._next_frame(features, timestamp, image)
@@ -336,7 +337,11 @@ class Slam:
     def _track(self, frame: Frame, clock: _Clock) -> TrackResult:
         """Where the camera is, and what is new there."""
         T_cw = self._predict(frame.timestamp)
-        found = self._locate(frame, T_cw, clock)
+        if frame.features.from_right:
+            found = self._locate(frame, self.camera.T_right_left @ T_cw, clock)
+            frame.T_cw = inverse(self.camera.T_right_left) @ frame.T_cw
+        else:
+            found = self._locate(frame, T_cw, clock)
         if found.state == TrackingState.LOST:
             frame.T_cw = T_cw
             restarted = self._lose(frame)
@@ -638,7 +643,12 @@ class Slam:
             self._look_around(frame)
             return False
         self._mapping.count(visible, frame.landmark[frame.landmark >= 0])
-        is_keyframe = self._needs_keyframe(frame, inliers) and not self._follow_known(frame)
+        # The map is made of left images.
+        is_keyframe = (
+            not frame.features.from_right
+            and self._needs_keyframe(frame, inliers)
+            and not self._follow_known(frame)
+        )
         if is_keyframe:
             self._insert_keyframe(frame)
         return is_keyframe

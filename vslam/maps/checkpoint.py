@@ -59,7 +59,8 @@ class Checkpoint:
 
 def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
     """Those of ``ARRAYS``."""
-    return {**vars(checkpoint.features), "landmark": checkpoint.landmark}
+    features = vars(checkpoint.features)
+    return {name: features.get(name, checkpoint.landmark) for name in ARRAYS}
 
 
 def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
@@ -107,7 +108,13 @@ def checked_checkpoint(
     )
     if not sound:
         raise ValueError("the last frame is out of range")
-    features = Features(**{name: arrays[name] for name in ARRAYS if name != "landmark"})
+    features = Features(
+        xy=arrays["xy"],
+        octave=arrays["octave"],
+        angle=arrays["angle"],
+        descriptors=arrays["descriptors"],
+        u_right=arrays["u_right"],
+    )
     return Checkpoint(
         **numbers,
         features=features,

@@ -153,13 +153,13 @@ def _track(
         result = slam.skip(timestamp, dropped=True)
         account.add(result)
         return result
-    if frame.features is None or frame.left is None:
+    if frame.features is None or frame.image is None:
         index = len(account.tracks)
         account.skipped.append(f"frame {index}: {frame.problem}")
         _log.warning("frame %d skipped: %s", index, frame.problem)
         result = slam.skip(timestamp)
     else:
-        result = slam.step_features(frame.features, timestamp, frame.left, frame.stage_ms)
+        result = slam.step_features(frame.features, timestamp, frame.image, frame.stage_ms)
         if realtime:
             account.latency_ms.append(1e3 * (time.perf_counter() - played.came))
     account.add(result, frame.sides)
@@ -175,7 +175,7 @@ def _show(
 ) -> int:
     """Show the recorder a frame, and the map while it can be read; returns the loops told."""
     recorder.frame(result, result.T_wc)
-    left = None if played.made is None else played.made.left
+    left = None if played.made is None else played.made.image
     if result.is_keyframe and slam.frame is not None and left is not None:
         recorder.keyframe(result, left, slam.frame.features, slam.frame.landmark >= 0)
     if slam.is_mapping:

@@ -28,10 +28,10 @@ from vslam.run.realtime import Played, play
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame ready to be tracked, or the reason why it cannot be read; ``dropped`` by a
-    perturbation."""
+    """A frame ready to be tracked, with the image that its features are of, or the reason why it
+    cannot be read; ``dropped`` by a perturbation."""
 
-    left: NDArray[np.uint8] | None
+    image: NDArray[np.uint8] | None
     features: Features | None
     stage_ms: dict[str, float]
     problem: str | None = None
@@ -95,7 +95,8 @@ def prepare_frame(
     features = extract_features(left, second, context, image_map, sides)
     done = time.perf_counter()
     stage_ms = {"read": 1e3 * (read - start), "extract": 1e3 * (done - read)}
-    return PreparedFrame(left, features, stage_ms, sides=sides)
+    image = np.asarray(second, np.uint8) if features.from_right else left
+    return PreparedFrame(image, features, stage_ms, sides=sides)
 
 
 def _sides(left: Image, second: Image | DepthImage | None, context: TrackingContext) -> Sides:

@@ -125,15 +125,13 @@ def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
 def rig_warnings(sides: Sequence[Sides]) -> list[str]:
     """What set the sides apart during a run, nothing for a rig without a fault."""
     found = []
-    for side, other, effect in (
-        ("left", "right", "they could not be tracked"),
-        ("right", "left", "they were tracked with the left side alone"),
-    ):
+    for side, other in (("left", "right"), ("right", "left")):
         black = sum(pair.black == side for pair in sides)
         if black >= _FEWEST:
             found.append(
                 f"The {side} side was black in {black} of {len(sides)} frames while the {other} "
-                f"one was not: {effect}. Check its cable, shutter and lens cap."
+                f"one was not: they were tracked with the {other} side alone. Check its cable, "
+                "shutter and lens cap."
             )
     darker = [pair.darker_stops for pair in sides if pair.darker_stops]
     if len(darker) >= _FEWEST:

@@ -121,11 +121,12 @@ def export_kitti(sequence: Sequence, perturbation: Perturbation, folder: Path) -
         kept.append(index)
         times.append(frame.timestamp - float(sequence.timestamps[0]))
     (folder / "times.txt").write_text("".join(f"{t:.9e}\n" for t in times))
-    (folder / "calib.txt").write_text(_calibration(sequence.camera))
+    (folder / "calib.txt").write_text(calibration_text(sequence.camera))
     return np.array(kept, np.int64)
 
 
-def _calibration(camera: Camera) -> str:
+def calibration_text(camera: Camera) -> str:
+    """``calib.txt`` of KITTI, for cameras that are grey."""
     lines = []
     for k in range(4):
         row = [

@@ -74,6 +74,17 @@ def test_a_side_that_is_white_in_part_is_no_brighter_one(columns):
     assert balanced(glare, right, CONFIG)[0] is glare
 
 
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_bright_strip_that_one_side_sees_is_no_gain(side):
+    left, right = scene(mean=90.0, spread=20.0)
+    pair = [left.copy(), right.copy()]
+    for image in pair:
+        image[:50] = 255  # the sky
+    pair[side][50:66] = 150  # beyond the edge of the other image
+    assert compare_sides(*pair, CONFIG) == Sides()
+    assert balanced(*pair, CONFIG)[side] is pair[side]
+
+
 def test_a_gain_is_told_beside_glare_on_both_sides():
     left, right = scene()
     left[:, :100], right[:, :100] = 255, 255

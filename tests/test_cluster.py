@@ -103,17 +103,21 @@ def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
         next(running)
 
 
-def test_an_address_of_no_kind_leaves_no_client_behind(tmp_path: Path):
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [("foo://bar", "nothing answers there"), ("tls://127.0.0.1:9", "Dask has no certificates")],
+)
+def test_an_address_that_cannot_be_used_leaves_no_client_behind(address: str, said: str):
     """A client that never began cannot close: that took 20 s, and ended in a traceback."""
     code = (
         "from vslam.bench.cluster import run_on_cluster\n"
         "from vslam.bench.execute import RunOptions\n"
         "from vslam.errors import InputError\n"
         "try:\n"
-        "    next(run_on_cluster([], RunOptions(None, '', 1), 'foo://bar', None))\n"
+        f"    next(run_on_cluster([], RunOptions(None, '', 1), {address!r}, None))\n"
         "except InputError as error:\n"
         "    print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert "--scheduler foo://bar: nothing answers there" in done.stdout
+    assert f"--scheduler {address}: {said}" in done.stdout
     assert not done.stderr

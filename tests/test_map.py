@@ -9,7 +9,7 @@ import pytest
 
 from vslam.features import Features
 from vslam.geometry import se3_exp
-from vslam.map import LANDMARK_FIELDS, ROW_FIELDS, Map, local_map
+from vslam.map import KEYFRAME_FIELDS, LANDMARK_FIELDS, ROW_FIELDS, Map, local_map
 from vslam.map_kernels import (
     collect_landmarks,
     count_seen_by,
@@ -409,3 +409,17 @@ def test_submaps_begin_at_restarts_and_pass_to_children():
     map_.restarts.append(3)
     map_.parents[5] = 1
     assert map_.submaps().tolist() == [0, 0, 0, 3, 3, 0]
+
+
+def test_used_arrays_are_a_copy_without_spare_capacity():
+    map_, rng = Map(SCALES), np.random.default_rng(5)
+    keyframe = map_.add_keyframe(random_features(rng, 7), np.eye(4), 0.0, 0)
+    map_.add_landmarks(rng.uniform(1, 9, (3, 3)), np.zeros((3, 4), np.uint64), keyframe)
+    used = map_.used_arrays()
+    lengths = {name: len(getattr(used, name)) for name in used._fields}
+    assert lengths == {
+        name: 1 if name in KEYFRAME_FIELDS else 3 if name in LANDMARK_FIELDS else 7
+        for name in used._fields
+    } | {"first_row": 2}
+    map_.arrays.xyz[:] = 0.0
+    assert (used.xyz >= 1.0).all()

@@ -1,14 +1,17 @@
 from __future__ import annotations
 
+import errno
 import re
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from test_report import make_outcome
 
-from vslam.errors import InputError
-from vslam.report.folder import create_run_folder, write_trajectories
+from vslam.errors import InputError, ResultsError
+from vslam.report import folder
+from vslam.report.folder import Results, create_run_folder, write_results, write_trajectories
 from vslam.run.outcome import matched_ground_truth
 from vslam.trajectory import Trajectory, read_kitti_poses, read_trajectory
 
@@ -61,7 +64,7 @@ def test_ground_truth_of_just_the_frames_done(tmp_path):
     )
     matched = matched_ground_truth(outcome)
     np.testing.assert_array_equal(matched.timestamps, outcome.trajectory.timestamps)
-    write_trajectories(tmp_path, outcome)
+    write_trajectories(Results(tmp_path), outcome)
     for name in ("trajectory_kitti.txt", "ground_truth_kitti.txt"):
         np.testing.assert_array_equal(read_kitti_poses(tmp_path / name)[:, 2, 3], done)
     np.testing.assert_allclose(
@@ -76,7 +79,7 @@ def test_ground_truth_of_some_frames_keeps_their_times(tmp_path):
     known[[0, 3]] = np.nan
     sequence = _Sequence(ground_truth=known)
     outcome = SimpleNamespace(sequence=sequence, trajectory=Trajectory(sequence.timestamps, poses))
-    write_trajectories(tmp_path, outcome)
+    write_trajectories(Results(tmp_path), outcome)
     assert not (tmp_path / "ground_truth_kitti.txt").exists()
     truth = read_trajectory(tmp_path / "ground_truth.tum")
     np.testing.assert_allclose(truth.timestamps, [0.1, 0.2, 0.4])
@@ -89,5 +92,23 @@ def test_no_ground_truth(tmp_path):
         sequence=sequence, trajectory=Trajectory(sequence.timestamps, np.tile(np.eye(4), (5, 1, 1)))
     )
     assert matched_ground_truth(outcome) is None
-    write_trajectories(tmp_path, outcome)
+    write_trajectories(Results(tmp_path), outcome)
     assert not (tmp_path / "ground_truth_kitti.txt").exists()
+
+
+@pytest.mark.parametrize("saved", [False, True])
+def test_on_a_full_disk_all_is_tried_and_nothing_is_incomplete(tmp_path, monkeypatch, saved):
+    def half_written(path, T_wc):
+        path.write_text("1 0 0")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(folder, "write_kitti", half_written)
+    for name in ("autosave.npz", "run.json") if saved else ():
+        (tmp_path / name).touch()
+    names = r"trajectory_kitti\.txt, ground_truth_kitti\.txt could not be written \(No space left"
+    remedy = f"then vslam run --resume {tmp_path}" if saved else "name another folder with --out"
+    with pytest.raises(ResultsError, match=f"{names}.*{remedy}"):
+        write_results(tmp_path, make_outcome(20), pages=False)
+    there = {path.name for path in tmp_path.iterdir()}
+    assert there >= {"trajectory.tum", "keyframes.tum", "frames.csv", "config.json", "report.json"}
+    assert not there & {"trajectory_kitti.txt", "ground_truth_kitti.txt"}

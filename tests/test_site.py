@@ -17,8 +17,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 from browser import chromium, dumped
-from conftest import corridor_depth
-from source_files import write_calibration, write_images, write_video
+from source_files import write_calibration, write_video
 
 from vslam.calibration.files import read_calibration
 
@@ -177,71 +176,6 @@ def test_commands_of_the_tutorials_run(path: Path, corridor, tmp_path: Path):
             cwd=tmp_path, env=environment, capture_output=True, text=True,
         )  # fmt: skip
         assert done.returncode == 0, block + done.stdout + done.stderr
-
-
-@pytest.fixture(scope="module")
-def home(corridor, kitti_tree: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the data sets that the how-to pages name; each sequence is the corridor."""
-    root = tmp_path_factory.mktemp("home")
-    c, n = corridor.camera, 6
-    for name in ("00", "05", "06"):
-        for kind, file in (("sequences", "00"), ("poses", "00.txt")):
-            link = root / "kitti" / kind / file.replace("00", name)
-            link.parent.mkdir(parents=True, exist_ok=True)
-            link.symlink_to(kitti_tree / kind / file)
-    shutil.copy(kitti_tree / "poses" / "00.txt", root / "orbslam3.txt")
-    for name in ("V1_01_easy", "MH_03_medium", "V2_02_medium"):
-        for side, images in enumerate((corridor.left, corridor.right)):
-            folder = root / "euroc" / name / "mav0" / f"cam{side}"
-            stamps = [10**18 + 10**8 * k for k in range(n)]
-            write_images(folder, {"data": images[:n]}, [f"{stamp}.png" for stamp in stamps])
-            lines = "".join(f"{stamp},{stamp}.png\n" for stamp in stamps)
-            (folder / "data.csv").write_text(f"#timestamp [ns],filename\n{lines}")
-            T = f"[1, 0, 0, {c.baseline * side}, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"
-            (folder / "sensor.yaml").write_text(
-                f"T_BS:\n  rows: 4\n  cols: 4\n  data: {T}\ncamera_model: pinhole\n"
-                f"resolution: [{c.width}, {c.height}]\nintrinsics: [{c.fx}, {c.fy}, {c.cx}, {c.cy}]"
-                "\ndistortion_model: radial-tangential\ndistortion_coefficients: [0, 0, 0, 0]\n"
-            )
-    for name in ("freiburg1_desk", "freiburg3_long_office_household", "freiburg1_xyz"):
-        folder = root / "tum" / f"rgbd_dataset_{name}"
-        depth = [
-            (5000 * corridor_depth(c, T_wc)).clip(0, 65535).astype(np.uint16)
-            for T_wc in corridor.T_wc[:n]
-        ]
-        names = [f"{100 + 0.1 * k:.1f}.png" for k in range(n)]
-        write_images(folder, {"rgb": corridor.left[:n], "depth": depth}, names)
-        for side in ("rgb", "depth"):
-            lines = "".join(f"{Path(name).stem} {side}/{name}\n" for name in names)
-            (folder / f"{side}.txt").write_text(lines)
-        write_calibration(folder / "calibration.yaml", c, mono=True)
-    return root
-
-
-@pytest.mark.parametrize("name", ["kitti", "euroc", "tum"])
-def test_commands_of_the_data_set_pages_run(home: Path, tmp_path: Path, monkeypatch, name: str):
-    from vslam.cli import main as cli
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HOME", str(home))
-    shutil.copy(home / "orbslam3.txt", tmp_path)
-    text = (DOCS / "howto" / f"{name}.md").read_text()
-    for key, value in re.findall(r"^export (\w+)=(\S+)", text, re.MULTILINE):
-        monkeypatch.setenv(key, os.path.expanduser(value))
-    commands = vslam_commands(text)
-    assert len(commands) >= 3
-    for words in commands:
-        words = [os.path.expanduser(word) for word in words]
-        words = re.sub(r" --max-frames \d+", "", shlex.join(words)).split()
-        if words[1] == "run":
-            words += ["--max-frames", "5", "--no-record", "--no-report", "--quiet"]
-        monkeypatch.setattr(sys, "argv", words)
-        try:
-            cli.main()
-            code = 0
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        assert code == 0, words
 
 
 _PROBE = """<!doctype html><meta charset="utf-8"><pre id="found"></pre>

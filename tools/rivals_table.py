@@ -22,7 +22,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -160,10 +159,9 @@ def measured(detectors: dict[str, Path | None], data: list[str]) -> list[Score]:
     vocabulary = load()
     scorers = [comparable_scorer(name, file, vocabulary) for name, file in detectors.items()]
     features = vocabulary if "bow" in detectors else None
-    bar = partial(count_bar, shown=True)
     cells = []
     for spec in data:
-        for test_set in open_set(spec, store.cache_folder(), threads=1, progress_bar=bar):
+        for test_set in open_set(spec, store.cache_folder(), threads=1, progress_bar=count_bar):
             compared = DetectorSet(scorers, features, 1)
             for condition in parse_conditions(",".join(CONDITIONS), "1"):
                 cells += measure(test_set, condition, compared, 0, descriptors_only=True)[0]

@@ -195,6 +195,18 @@ class Map:
         self.n_landmarks += n
         return np.arange(start, start + n, dtype=np.int32)
 
+    def used_arrays(self) -> Arrays:
+        """A copy of ``arrays`` without the capacity that is not in use."""
+        used = {"first_row": self.n_keyframes + 1}
+        for fields, size in (
+            (KEYFRAME_FIELDS, self.n_keyframes),
+            (LANDMARK_FIELDS, self.n_landmarks),
+            (ROW_FIELDS, self.n_rows),
+        ):
+            used |= {name: size for name in fields if name not in used}
+        a = self.arrays
+        return Arrays(*(getattr(a, name)[: used[name]].copy() for name in Arrays._fields))
+
     @property
     def many_dead_landmarks(self) -> bool:
         """Whether dead landmarks take so much room that ``drop_dead_landmarks`` is worth it."""

@@ -69,7 +69,7 @@ class SiameseDetector:
         p = self._similarities(self._descriptors[keyframe], eligible)
         p[p < threshold] = -1.0
         order = p
-        if self._images is not None and keyframe in self._images:
+        if self._images is not None and keyframe in self._images and (p >= 0).any():
             order = self._reranked(p, self._images.glance(keyframe))
         return self._best(keyframe, p, order, map_)
 

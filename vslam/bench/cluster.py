@@ -38,6 +38,7 @@ def run_on_cluster(
         raise InputError(
             "--scheduler: dask is not installed; pip install 'vslam[cluster]'."
         ) from error
+    _require_certificates(scheduler)
     try:
         resolve_address(scheduler)  # a client of no address would not close without a traceback
         client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
@@ -60,6 +61,23 @@ def run_on_cluster(
         with suppress(OSError):  # the scheduler is gone, and all that it ran with it
             stop.set()
         client.close()
+
+
+def _require_certificates(scheduler: str) -> None:
+    """Refuse an address of TLS where Dask's client would have none, and not close."""
+    from distributed.security import Security
+
+    if not scheduler.startswith("tls://"):
+        return
+    try:
+        context = Security().get_connection_args("client")["ssl_context"]
+    except (OSError, ValueError):  # files that are missing, or no certificates
+        context = None
+    if context is None:
+        raise InputError(
+            f"--scheduler {scheduler}: Dask has no certificates for it; name them in its "
+            "configuration (distributed.comm.tls), or start the scheduler with tcp://."
+        )
 
 
 def _run_on_worker(cell: Cell, options: RunOptions, stop: str) -> CellOutcome:

@@ -112,7 +112,7 @@ def bench(
     from vslam.bench.estimate import check_disk, duration, estimate, size
     from vslam.bench.grid import make_grid, parse_perturbations
     from vslam.bench.table import GridProgress, shown_live
-    from vslam.cli.progress import announce
+    from vslam.cli.console import console
     from vslam.loopclosure.registry import parse_weights, require_detector
 
     files = parse_weights(weights or [], chosen)
@@ -145,11 +145,10 @@ def bench(
     missing = progress.missing
     needed = estimate(missing, progress.reports, frames, jobs)
     check_disk(needed, out)
-    announce(
+    console(shown=not quiet).announce(
         f"{len(cells)} cells, {len(missing)} to do: about {duration(needed.seconds)} with "
         f"{jobs} at a time ({needed.basis}), {size(needed.kept)} in {out} and "
-        f"{size(needed.scratch)} while it runs",
-        shown=not quiet,
+        f"{size(needed.scratch)} while it runs"
     )
     stopped = False
     try:
@@ -228,7 +227,7 @@ def open_all(
     Rendered ones are rendered here: two runs cannot render one sequence at a time.
     """
     from vslam.bench.grid import parse_sequences
-    from vslam.cli.progress import render_bar
+    from vslam.cli.console import console
     from vslam.datasets.sources import open_source
     from vslam.datasets.stream import count_expected
 
@@ -236,7 +235,7 @@ def open_all(
         seqs = _FIRST_SEQUENCES
     frames = {}
     for name in [None] if seqs is None else parse_sequences(seqs):
-        with render_bar(shown=shown) as on_render:
+        with console(shown=shown).render_bar() as on_render:
             found = open_source(
                 kind, str(root), name, options,
                 max_frames=max_frames, sensor=sensor, on_render=on_render,
@@ -264,11 +263,12 @@ def outcomes_of(
 
         return run_on_cluster(cells, options, scheduler, out)
     from vslam.bench.execute import run_here
-    from vslam.cli.progress import announce
+    from vslam.cli.console import console
     from vslam.machine import available_cores
     from vslam.run.warmup import compile_kernels, is_cold
 
     if cells and is_cold():  # once, not once in each run
-        announce("first run: compiling the kernels, less than a minute ...", shown=shown)
+        message = "first run: compiling the kernels, less than a minute ..."
+        console(shown=shown).announce(message)
         compile_kernels(processes=min(available_cores(), 2))
     return run_here(cells, options, jobs, out)

@@ -5,14 +5,15 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Literal, cast
 
 import typer
 
+from vslam.cli.console import console
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
+    from vslam.cli.console import Console
     from vslam.datasets.perturbation import Perturbation
     from vslam.datasets.sequence import Sequence
     from vslam.datasets.stream import Stream
@@ -47,9 +48,8 @@ def drive(
         out: where to make the folder of the run.
         resume: the folder of the run to go on with instead.
     """
-    shown = not output.quiet
-    console = _console(shown=shown)
-    kind, source, perturbation = _open(options, shown=shown)
+    told = console(shown=not output.quiet)
+    kind, source, perturbation = _open(options, told)
     _refuse_camera(source, resume, compare_loops=compare_loops)
 
     # Bad input has been refused by now; what follows takes a second to import.
@@ -64,22 +64,22 @@ def drive(
     settings = settings_of(options, kind, source, perturbation.name)
     with ExitStack() as lock:
         unfinished = _unfinished(options, source, resume, lock)
-        _compile(settings, shown=shown)
+        _compile(settings, told)
         slam = begin(source.camera, settings, None if unfinished is None else unfinished.map)
-        viewer = _viewer(output)
+        viewer = _viewer(output, told)
         folder = resume or _new_folder(options, settings, out, lock)
         moments = MomentRecorder()
         recorder = _recorder(folder, output, unfinished, viewer, moments)
         # When only localising there is nothing to save but the poses.
         period = 0.0 if options.localize else options.autosave
         autosave = FolderAutosave(folder, period, f"{settings.dataset} {source.name}")
-        with console.progress_bar(count_expected(source), shown=shown) as on_frame:
+        with told.progress_bar(count_expected(source)) as on_frame:
             outcome = run_sequence(
                 source, perturbation, settings, recorder,
                 on_frame=on_frame, autosave=autosave, resume=unfinished, slam=slam,
             )  # fmt: skip
         if compare_loops and not outcome.interrupted:
-            with console.progress_bar(count_expected(source), shown=shown) as on_frame:
+            with told.progress_bar(count_expected(source)) as on_frame:
                 outcome = with_comparison(outcome, perturbation, on_frame=on_frame)
         report = write_results(
             folder, outcome, moments.moments,
@@ -87,24 +87,13 @@ def drive(
         )  # fmt: skip
         if not outcome.interrupted:
             remove_autosave(folder)
-    if shown:
+    if not output.quiet:
         print_summary(report, folder)
     if outcome.interrupted:
         raise typer.Exit(1)
 
 
-def _console(*, shown: bool) -> ModuleType:
-    """What tells how far a run is; where nothing is shown, without what takes time to import."""
-    if shown:
-        from vslam.cli import progress
-
-        return progress
-    from vslam.cli import quiet
-
-    return quiet
-
-
-def _open(options: RunOptions, *, shown: bool) -> tuple[str, Sequence | Stream, Perturbation]:
+def _open(options: RunOptions, told: Console) -> tuple[str, Sequence | Stream, Perturbation]:
     """The images and what is done to them. Refuses laws that the data cannot serve."""
     from vslam.cli.options import SourceName, kind_of_source, source_options
     from vslam.datasets.perturbation import parse_perturbation
@@ -116,7 +105,7 @@ def _open(options: RunOptions, *, shown: bool) -> tuple[str, Sequence | Stream, 
     of_source = source_options(
         list(o.calib), o.right, o.depth, o.fps, o.side_by_side, o.topics, o.depth_scale
     )
-    with _console(shown=shown).render_bar(shown=shown) as on_render:
+    with told.render_bar() as on_render:
         source = open_source(
             kind, o.data, o.seq, of_source,
             start=o.start, every=o.every, max_frames=o.max_frames, sensor=o.sensor,
@@ -157,24 +146,22 @@ def _unfinished(
     return unfinished
 
 
-def _viewer(output: Output) -> Viewer | None:
+def _viewer(output: Output, told: Console) -> Viewer | None:
     if output.view is None:
         return None
     from vslam.run.recorder import open_viewer
 
     viewer = open_viewer(output.view)
     if viewer.address:
-        shown = not output.quiet
-        _console(shown=shown).announce(f"live at {viewer.address}", shown=shown)
+        told.announce(f"live at {viewer.address}")
     return viewer
 
 
-def _compile(settings: RunSettings, *, shown: bool) -> None:
+def _compile(settings: RunSettings, told: Console) -> None:
     from vslam.run.warmup import compile_kernels, is_cold
 
     if is_cold():
-        message = "first run: compiling the kernels, less than a minute ..."
-        _console(shown=shown).announce(message, shown=shown)
+        told.announce("first run: compiling the kernels, less than a minute ...")
     compile_kernels(processes=min(settings.threads, 2), load=settings.realtime)
 
 

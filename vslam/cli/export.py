@@ -205,19 +205,19 @@ def _read(run: Path) -> tuple[FinishedRun, Reconstruction]:
 
 
 def _open(finished: FinishedRun, data: Path, *, quiet: bool) -> Sequence:
-    from vslam.cli.progress import render_bar
+    from vslam.cli.console import console
     from vslam.report.finished_run import open_images
 
-    with render_bar(shown=not quiet) as on_render:
+    with console(shown=not quiet).render_bar() as on_render:
         return open_images(finished, data, on_render)
 
 
 def _left_images(
     sequence: Sequence, frames: list[int], *, quiet: bool
 ) -> Iterator[NDArray[np.uint8]]:
-    from vslam.cli.progress import count_bar
+    from vslam.cli.console import console
 
-    with count_bar("images", len(frames), shown=not quiet) as advance:
+    with console(shown=not quiet).count_bar("images", len(frames)) as advance:
         for frame in frames:
             yield sequence.read(frame)[0]
             advance()

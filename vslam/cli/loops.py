@@ -112,7 +112,7 @@ def bench(
     if protocol == "retrieval" and window != WINDOW:
         raise InputError("--window: is of --protocol online; add that or leave it out.")
 
-    from vslam.cli.progress import count_bar
+    from vslam.cli.console import console
     from vslam.loopclosure.vocabulary import load
     from vslam.machine import available_cores
 
@@ -122,7 +122,7 @@ def bench(
         load(),
         seed,
         threads or available_cores(),
-        partial(count_bar, shown=not quiet),
+        console(shown=not quiet).count_bar,
     )
     write = partial(_write, out, seed)
     # Both write after every set, so that a run that is stopped has told what it found.
@@ -180,7 +180,7 @@ def _on_sets(
     quiet: bool,
 ) -> str:
     """Measure queries against galleries; says on what."""
-    from vslam.cli.progress import announce
+    from vslam.cli.console import console
     from vslam.datasets.synthetic import store
     from vslam.loopbench.cost import cost
     from vslam.loopbench.detectors import DetectorSet
@@ -197,7 +197,7 @@ def _on_sets(
         for spec in data
         for found in open_set(spec, store.cache_folder(), threads=threads, progress_bar=bar)
     ]
-    announce("time and memory of each detector ...", shown=not quiet)
+    console(shown=not quiet).announce("time and memory of each detector ...")
     costs = [cost(name, asked.files.get(name)) for name in asked.names]
     scores: list[Score] = []
     gains: list[Gain] = []

@@ -125,7 +125,7 @@ def merge(
     A map that meets no other is left out and named; if none meets the first, nothing is written
     and the exit code is 1. The files of the maps stay as they are.
     """
-    from vslam.cli.progress import count_bar
+    from vslam.cli.console import console
     from vslam.config import Config, load_config
     from vslam.loopclosure.registry import create_detector, create_images
     from vslam.maps.storage import load_map, map_file_of, save_map
@@ -152,7 +152,7 @@ def merge(
 
     keyframes = sum(one.map.n_keyframes for one in stored[1:])
     try:
-        with count_bar("keyframes", keyframes, shown=not quiet) as advance:
+        with console(shown=not quiet).count_bar("keyframes", keyframes) as advance:
             merged = merge_maps(stored, thresholds, create, advance)
     except ValueError as error:
         raise InputError(f"{files[0]} and the others are not to be merged: {error}.") from error

@@ -29,7 +29,7 @@ class _FramesPerSecond(ProgressColumn):
 
 
 @contextmanager
-def progress_bar(total: int | None, *, shown: bool) -> Iterator[Callable[[TrackResult], None]]:
+def progress_bar(total: int | None) -> Iterator[Callable[[TrackResult], None]]:
     """Yield the callable to give each tracked frame to: frames, fps, tracking state, time left.
 
     ``total`` is about how many frames there are, None where nobody knows.
@@ -43,7 +43,7 @@ def progress_bar(total: int | None, *, shown: bool) -> Iterator[Callable[[TrackR
         TextColumn("{task.fields[state]}"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
+    with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task("", total=total, state="starting")
 
         def on_frame(result: TrackResult) -> None:
@@ -53,7 +53,7 @@ def progress_bar(total: int | None, *, shown: bool) -> Iterator[Callable[[TrackR
 
 
 @contextmanager
-def render_bar(*, shown: bool) -> Iterator[Callable[[int, int], None]]:
+def render_bar() -> Iterator[Callable[[int, int], None]]:
     """Yield the callable that takes frames rendered and in all; no bar until its first call."""
     columns = (
         TextColumn("rendering"),
@@ -62,7 +62,7 @@ def render_bar(*, shown: bool) -> Iterator[Callable[[int, int], None]]:
         _FramesPerSecond(),
         TimeRemainingColumn(),
     )
-    progress = Progress(*columns, console=Console(stderr=True), disable=not shown)
+    progress = Progress(*columns, console=Console(stderr=True))
     tasks: list[TaskID] = []
 
     def on_frame(done: int, total: int) -> None:
@@ -79,7 +79,7 @@ def render_bar(*, shown: bool) -> Iterator[Callable[[int, int], None]]:
 
 
 @contextmanager
-def training_bar(*, shown: bool) -> Iterator[Callable[[int, int, int, float], None]]:
+def training_bar() -> Iterator[Callable[[int, int, int, float], None]]:
     """Yield the callable that takes epoch, step, steps of the epoch and loss of a training."""
     columns = (
         TextColumn("epoch {task.fields[epoch]}"),
@@ -88,7 +88,7 @@ def training_bar(*, shown: bool) -> Iterator[Callable[[int, int, int, float], No
         TextColumn("loss {task.fields[loss]:.3f}"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
+    with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task("", total=None, epoch=0, loss=float("nan"))
 
         def on_step(epoch: int, step: int, steps: int, loss: float) -> None:
@@ -100,15 +100,14 @@ def training_bar(*, shown: bool) -> Iterator[Callable[[int, int, int, float], No
 
 
 @contextmanager
-def count_bar(what: str, total: int, *, shown: bool) -> Iterator[Callable[[], None]]:
+def count_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
     """Yield the callable to call after each of ``total`` things."""
     columns = (TextColumn(what), MofNCompleteColumn(), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
+    with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task("", total=total)
         yield lambda: progress.advance(task)
 
 
-def announce(message: str, *, shown: bool) -> None:
+def announce(message: str) -> None:
     """Say on stderr what takes a while."""
-    if shown:
-        Console(stderr=True).print(message)
+    Console(stderr=True).print(message)

@@ -12,16 +12,28 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def progress_bar(total: int | None, *, shown: bool) -> Iterator[Callable[[TrackResult], None]]:
+def progress_bar(total: int | None) -> Iterator[Callable[[TrackResult], None]]:
     """Yield a callable that does nothing."""
     yield lambda result: None
 
 
 @contextmanager
-def render_bar(*, shown: bool) -> Iterator[Callable[[int, int], None]]:
+def render_bar() -> Iterator[Callable[[int, int], None]]:
     """Yield a callable that does nothing."""
     yield lambda done, total: None
 
 
-def announce(message: str, *, shown: bool) -> None:
+@contextmanager
+def training_bar() -> Iterator[Callable[[int, int, int, float], None]]:
+    """Yield a callable that does nothing."""
+    yield lambda epoch, step, steps, loss: None
+
+
+@contextmanager
+def count_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
+    """Yield a callable that does nothing."""
+    yield lambda: None
+
+
+def announce(message: str) -> None:
     """Say nothing."""

@@ -107,7 +107,7 @@ def stress(
     """Find the strength of each perturbation at which a run fails, and report on it."""
     from vslam.bench import execute
     from vslam.bench.grid import parse_sequences
-    from vslam.cli.progress import announce
+    from vslam.cli.console import console
     from vslam.datasets import open_sequence
     from vslam.datasets.sources import SourceOptions
     from vslam.loopclosure.registry import require_detector
@@ -154,12 +154,13 @@ def stress(
     def run(cells: Collection[Cell]) -> Generator[CellOutcome, None, None]:
         return outcomes_of(list(cells), options, jobs, scheduler, out, shown=not quiet)
 
-    announce(plan.criterion.words, shown=not quiet)
+    announce = console(shown=not quiet).announce
+    announce(plan.criterion.words)
     stopped = False
     try:
         run_all(
             plan.clean_cells(), searches, plan.preset_cells(), results, plan.criterion, run,
-            lambda line: announce(line, shown=not quiet),
+            announce,
         )  # fmt: skip
     except KeyboardInterrupt:
         stopped = True

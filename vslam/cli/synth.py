@@ -114,7 +114,7 @@ def synth(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
     """Render a town in KITTI format, with exact ground truth."""
-    from vslam.cli.progress import render_bar
+    from vslam.cli.console import console
     from vslam.datasets.synthetic import ROUTES, built_in_route, route_of_poses, store
     from vslam.datasets.synthetic.site import Variation
     from vslam.machine import available_cores
@@ -149,7 +149,7 @@ def synth(
             )
     variation = Variation(seed, aliased, change, dynamic)
     threads = threads or min(available_cores(), 4)
-    with render_bar(shown=not quiet) as on_frame:
+    with console(shown=not quiet).render_bar() as on_frame:
         if pairs:
             from vslam.datasets.synthetic.pairs import Moves, render_pairs
 

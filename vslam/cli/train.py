@@ -187,7 +187,7 @@ def _train(
     until: float | None,
     quiet: bool,
 ) -> TrainingOutcome:
-    from vslam.cli.progress import training_bar
+    from vslam.cli.console import console
     from vslam.loopclosure.siamese.checkpoint import CHECKPOINT
     from vslam.loopclosure.siamese.component_training import learn_components
     from vslam.loopclosure.siamese.export import export_onnx
@@ -204,7 +204,7 @@ def _train(
     if settings.network == "pcanet":
         outcome = learn_components(collection, settings, folder, device=device)
     else:
-        with training_bar(shown=not quiet) as on_step:
+        with console(shown=not quiet).training_bar() as on_step:
             outcome = run(
                 collection, settings, folder, device=device, threads=threads, resume=resume,
                 start=start, on_step=on_step,

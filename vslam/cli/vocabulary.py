@@ -44,7 +44,7 @@ def train(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
     """Train a vocabulary on images: better on many places than on many views of one."""
-    from vslam.cli.progress import announce, count_bar
+    from vslam.cli.console import console
     from vslam.config import OrbConfig
     from vslam.loopclosure import vocabulary_training
     from vslam.loopclosure.vocabulary_text import is_text, write_vocabulary
@@ -54,7 +54,8 @@ def train(
         raise InputError(f"{out}: there is no folder {out.parent}; make it or choose another.")
     paths = _find(images)
     descriptors, unreadable = [], 0
-    with count_bar("images", len(paths), shown=not quiet) as advance:
+    shown = console(shown=not quiet)
+    with shown.count_bar("images", len(paths)) as advance:
         for path, found in zip(paths, _extract_all(paths, OrbConfig()), strict=True):
             if found is None:
                 typer.echo(f"{path}: cannot be read as an image; skipped", err=True)
@@ -63,10 +64,10 @@ def train(
                 descriptors.append(found)
             advance()
     n = sum(map(len, descriptors))
-    announce(f"{n} descriptors of {len(descriptors)} images", shown=not quiet)
+    shown.announce(f"{n} descriptors of {len(descriptors)} images")
 
     def on_level(level: int, nodes: int) -> None:
-        announce(f"level {level}: {nodes} nodes", shown=not quiet)
+        shown.announce(f"level {level}: {nodes} nodes")
 
     try:
         trained = vocabulary_training.train(descriptors, k, levels, seed, on_level)

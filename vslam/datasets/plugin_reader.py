@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,25 +14,25 @@ from numpy.typing import NDArray
 from vslam.camera import Camera, DepthImage, Image, ImageMap
 from vslam.datasets.image_files import select_frames
 from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import Stream, TimedFrame, increasing
+from vslam.datasets.stream import Selection, Stream, TimedFrame
 from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 from vslam.plugins import PlugIn, reason
 
+_Raw = TypeVar("_Raw", Sequence, Stream)
+
 
 @dataclass(frozen=True)
-class PlugInSequence:
-    """The selected frames of what a package has opened; see `Sequence`.
+class _Opened(Generic[_Raw]):
+    """What a package has opened.
 
     Attributes:
         raw: as the package opened it.
-        frames: ``(N,)`` int64, those selected.
         camera: its own, or the left one of it.
     """
 
     plugin: PlugIn
     root: Path
-    raw: Sequence
-    frames: NDArray[np.int64]
+    raw: _Raw
     camera: Camera
 
     @property
@@ -44,46 +43,43 @@ class PlugInSequence:
     def name(self) -> str:
         return str(self.raw.name)
 
+
+@dataclass(frozen=True)
+class PlugInSequence(_Opened[Sequence]):
+    """The selected frames of a sequence that a package has opened; see `Sequence`.
+
+    Attributes:
+        chosen: ``(N,)`` int64, those selected.
+    """
+
+    chosen: NDArray[np.int64]
+
     @property
     def timestamps(self) -> NDArray[np.float64]:
-        return np.asarray(self.raw.timestamps, np.float64)[self.frames]
+        return np.asarray(self.raw.timestamps, np.float64)[self.chosen]
 
     @property
     def ground_truth(self) -> NDArray[np.float64] | None:
         truth = self.raw.ground_truth
-        return None if truth is None else np.asarray(truth, np.float64)[self.frames]
+        return None if truth is None else np.asarray(truth, np.float64)[self.chosen]
 
     def __len__(self) -> int:
-        return len(self.frames)
+        return len(self.chosen)
 
     def read(
         self, index: int, image_map: ImageMap = map
     ) -> tuple[Image, Image | DepthImage | None]:
         """See `Sequence.read`; whatever fails in the package costs this frame alone."""
-        number = int(self.frames[index])
+        number = int(self.chosen[index])
         read = partial(self.raw.read, number)
         return _read(self.plugin, self.root, self.camera, read, f"frame {number}", image_map)
 
 
 @dataclass(frozen=True)
-class PlugInStream:
+class PlugInStream(_Opened[Stream]):
     """The selected frames of a stream that a package has opened; see `Stream`."""
 
-    plugin: PlugIn
-    root: Path
-    raw: Stream
-    camera: Camera
-    start: int
-    every: int
-    max_frames: int | None
-
-    @property
-    def dataset(self) -> str:
-        return self.plugin.name
-
-    @property
-    def name(self) -> str:
-        return str(self.raw.name)
+    selection: Selection
 
     @property
     def live(self) -> bool:
@@ -92,23 +88,14 @@ class PlugInStream:
     @property
     def n_expected(self) -> int | None:
         whole = self.raw.n_expected
-        if whole is None:
-            return self.max_frames
-        n = len(range(self.start, int(whole), self.every))
-        return n if self.max_frames is None else min(n, self.max_frames)
+        return self.selection.count(None if whole is None else int(whole))
 
     def frames(self) -> Iterator[TimedFrame]:
         """See `Stream.frames`; where the package fails, the stream ends."""
-        stop = None if self.max_frames is None else self.start + self.every * self.max_frames
-        frame = None
-        for frame in islice(increasing(self._all(), self.name), self.start, stop, self.every):
+        for frame in self.selection.of(self._all(), self.name):
             at = f"{frame.timestamp:.3f} s"
             read = partial(_read, self.plugin, self.root, self.camera, frame.read, at)
             yield TimedFrame(frame.timestamp, read)
-        if frame is None:
-            raise InputError(
-                f"--start {self.start}: {self.name} has no frame there; choose a smaller one."
-            )
 
     def _all(self) -> Iterator[TimedFrame]:
         frames = self.plugin.guarded(self.raw.frames)
@@ -174,10 +161,10 @@ def open_plugin(
         if start < 0 or every < 1 or (max_frames is not None and max_frames < 1):
             raise InputError("--start must be at least 0, --every and --max-frames at least 1.")
         camera = raw.camera.left_camera() if monocular else raw.camera
-        return PlugInStream(plugin, root, raw, camera, start, every, max_frames)
+        return PlugInStream(plugin, root, raw, camera, Selection(start, every, max_frames))
     chosen = select_frames(root, len(raw), start, every, max_frames)
     camera = raw.camera.left_camera() if monocular else raw.camera
-    sequence = PlugInSequence(plugin, root, raw, chosen, camera)
+    sequence = PlugInSequence(plugin, root, raw, camera, chosen)
     sequence.read(0)
     return sequence
 

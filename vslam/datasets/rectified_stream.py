@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 
 from vslam.calibration.models import Calibration
 from vslam.calibration.rectification import Rectification
 from vslam.camera import Camera, ImageMap
 from vslam.datasets.rectified import rectification_for, rectify_images
 from vslam.datasets.sequence import DepthImage, Image
-from vslam.datasets.stream import RawStream, TimedFrame, increasing
+from vslam.datasets.stream import RawStream, Selection, TimedFrame
 from vslam.errors import InputError
 
 
@@ -22,9 +21,7 @@ class RectifiedStream:
 
     raw: RawStream
     rectification: Rectification
-    start: int
-    every: int
-    max_frames: int | None
+    selection: Selection
 
     @property
     def dataset(self) -> str:
@@ -44,11 +41,7 @@ class RectifiedStream:
 
     @property
     def n_expected(self) -> int | None:
-        whole = self.raw.n_expected
-        if whole is None:
-            return self.max_frames
-        n = len(range(self.start, whole, self.every))
-        return n if self.max_frames is None else min(n, self.max_frames)
+        return self.selection.count(self.raw.n_expected)
 
     def frames(self) -> Iterator[TimedFrame]:
         """See `vslam.datasets.stream.Stream.frames`.
@@ -56,14 +49,8 @@ class RectifiedStream:
         Raises:
             InputError: the stream ends before ``start``.
         """
-        frame = None
-        stop = None if self.max_frames is None else self.start + self.every * self.max_frames
-        for frame in islice(increasing(self.raw.frames(), self.name), self.start, stop, self.every):
+        for frame in self.selection.of(self.raw.frames(), self.name):
             yield TimedFrame(frame.timestamp, partial(_read, frame, self.rectification))
-        if frame is None:
-            raise InputError(
-                f"--start {self.start}: {self.name} has no frame there; choose a smaller one."
-            )
 
 
 def rectified_stream(
@@ -88,7 +75,7 @@ def rectified_stream(
             f"--start {start}: {raw.name} has about {raw.n_expected} frames; choose a smaller one."
         )
     rectification = rectification_for(calibration, raw.sizes, depth=depth)
-    return RectifiedStream(raw, rectification, start, every, max_frames)
+    return RectifiedStream(raw, rectification, Selection(start, every, max_frames))
 
 
 def _read(

@@ -6,10 +6,12 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from typing import Protocol, runtime_checkable
 
 from vslam.camera import Camera, DepthImage, Image, ImageMap
 from vslam.datasets.sequence import Sequence
+from vslam.errors import InputError
 
 _log = logging.getLogger(__name__)
 
@@ -84,6 +86,37 @@ class Stream(Protocol):
             BrokenSourceError: after the last good frame of a file cut off or a device unplugged.
         """
         ...
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The frames of a stream that ``--start``, ``--every`` and ``--max-frames`` select."""
+
+    start: int = 0
+    every: int = 1
+    max_frames: int | None = None
+
+    def count(self, whole: int | None) -> int | None:
+        """About how many of ``whole`` frames they are, None where nobody knows."""
+        if whole is None:
+            return self.max_frames
+        n = len(range(self.start, whole, self.every))
+        return n if self.max_frames is None else min(n, self.max_frames)
+
+    def of(self, frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]:
+        """Hand them out, with increasing times; see `increasing`.
+
+        Raises:
+            InputError: the stream ends before ``start``.
+        """
+        frame = None
+        stop = None if self.max_frames is None else self.start + self.every * self.max_frames
+        for frame in islice(increasing(frames, name), self.start, stop, self.every):
+            yield frame
+        if frame is None:
+            raise InputError(
+                f"--start {self.start}: {name} has no frame there; choose a smaller one."
+            )
 
 
 def timed_frames(source: Sequence | Stream) -> Iterator[TimedFrame]:

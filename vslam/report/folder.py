@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Collection
+import shutil
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from datetime import datetime
 from itertools import count
@@ -86,34 +87,69 @@ def write_results(
         map_file: where to write the map, too.
 
     Raises:
-        ResultsError: a file could not be written; those before it are complete.
+        ResultsError: files could not be written; none is incomplete, and all others are there.
     """
-    try:
-        write_trajectories(folder, outcome)
-        write_tum(folder / "trajectory_causal.tum", causal_trajectory(outcome))
-        write_tum(folder / "keyframes.tum", outcome.keyframes)
-        write_frames(folder / "frames.csv", outcome.tracks)
-        config = outcome.settings.config.model_dump_json(indent=2) + "\n"
-        (folder / "config.json").write_text(config)
-        evaluation, remark = evaluate_run(outcome)
-        report = _write_report(folder, outcome, config, evaluation, remark, moments, pages=pages)
-        if outcome.map is not None and ply:
-            landmarks = outcome.map.living_landmarks()
-            save_ply(folder / "map.ply", outcome.map.arrays.xyz[landmarks])
-        if (stored := outcome.stored) is not None:
-            if outcome.settings.map is None and evaluation is not None:
-                stored = replace(stored, world=world_of(outcome, evaluation))
-            save_map(folder / "map.npz", stored)
-    except OSError as error:
-        files = sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime_ns)
-        raise ResultsError(
-            f"{folder}: not all results could be written ({error.strerror or error}); there are "
-            f"{', '.join(file.name for file in files)}, the last of them incomplete. Free some "
-            "space or name another folder with --out."
-        ) from error
+    written = Results(folder)
+    write_trajectories(written, outcome)
+    with written.file("trajectory_causal.tum") as file:
+        write_tum(file, causal_trajectory(outcome))
+    with written.file("keyframes.tum") as file:
+        write_tum(file, outcome.keyframes)
+    with written.file("frames.csv") as file:
+        write_frames(file, outcome.tracks)
+    config = outcome.settings.config.model_dump_json(indent=2) + "\n"
+    with written.file("config.json") as file:
+        file.write_text(config)
+    evaluation, remark = evaluate_run(outcome)
+    report = _write_report(written, outcome, config, evaluation, remark, moments, pages=pages)
+    if outcome.map is not None and ply:
+        landmarks = outcome.map.living_landmarks()
+        with written.file("map.ply") as file:
+            save_ply(file, outcome.map.arrays.xyz[landmarks])
+    if (stored := outcome.stored) is not None:
+        if outcome.settings.map is None and evaluation is not None:
+            stored = replace(stored, world=world_of(outcome, evaluation))
+        with written.file("map.npz") as file:
+            save_map(file, stored)
+    written.require_all()
     if map_file is not None and outcome.stored is not None:
         _copy_map(folder / "map.npz", map_file)
     return report
+
+
+class Results:
+    """The files of a run: each is tried, and what cannot be written whole is removed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._failed: dict[str, OSError] = {}
+
+    @contextlib.contextmanager
+    def file(self, name: str) -> Iterator[Path]:
+        """Where to write a file, or a folder of files."""
+        path = self.folder / name
+        try:
+            yield path
+        except OSError as error:
+            self._failed[name] = error
+            with contextlib.suppress(OSError):
+                shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+
+    def require_all(self) -> None:
+        """
+        Raises:
+            ResultsError: some could not be written.
+        """
+        if not self._failed:
+            return
+        error = next(iter(self._failed.values()))
+        remedy = "free some space or name another folder with --out"
+        if all((self.folder / name).exists() for name in ("autosave.npz", "run.json")):
+            remedy = f"free some space, then vslam run --resume {self.folder}"
+        raise ResultsError(
+            f"{self.folder}: {', '.join(self._failed)} could not be written "
+            f"({error.strerror or error}), all other results are there; {remedy}."
+        ) from error
 
 
 def _copy_map(file: Path, to: Path) -> None:
@@ -126,22 +162,26 @@ def _copy_map(file: Path, to: Path) -> None:
         ) from error
 
 
-def write_trajectories(folder: Path, outcome: RunOutcome) -> None:
+def write_trajectories(written: Results, outcome: RunOutcome) -> None:
     """Write the final trajectory in both formats and the ground truth of the same frames; in TUM's
     alone, which has times, where not all of them have one."""
-    write_kitti(folder / "trajectory_kitti.txt", outcome.trajectory.T_wc)
-    write_tum(folder / "trajectory.tum", outcome.trajectory)
+    with written.file("trajectory_kitti.txt") as file:
+        write_kitti(file, outcome.trajectory.T_wc)
+    with written.file("trajectory.tum") as file:
+        write_tum(file, outcome.trajectory)
     ground_truth = matched_ground_truth(outcome)
     if ground_truth is None:
         return
     if len(ground_truth) == len(outcome.trajectory):
-        write_kitti(folder / "ground_truth_kitti.txt", ground_truth.T_wc)
+        with written.file("ground_truth_kitti.txt") as file:
+            write_kitti(file, ground_truth.T_wc)
     else:
-        write_tum(folder / "ground_truth.tum", ground_truth)
+        with written.file("ground_truth.tum") as file:
+            write_tum(file, ground_truth)
 
 
 def _write_report(
-    folder: Path,
+    written: Results,
     outcome: RunOutcome,
     config: str,
     evaluation: Evaluation | None,
@@ -151,7 +191,7 @@ def _write_report(
     pages: bool,
 ) -> ReportJson:
     """``report.json``, and with ``pages`` what people read."""
-    verdict = evaluate_loops(outcome)
+    folder, verdict = written.folder, evaluate_loops(outcome)
     command = None
     if evaluation is not None:
         estimate, truth = folder / "trajectory_kitti.txt", folder / "ground_truth_kitti.txt"
@@ -161,18 +201,22 @@ def _write_report(
             estimate, truth = folder / "trajectory.tum", folder / "ground_truth.tum"
             command = evo_command(estimate, truth, evaluation.alignment, "tum")
     report = summarize(outcome, evaluation, verdict, command, remark)
-    (folder / "report.json").write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    with written.file("report.json") as file:
+        file.write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
     if pages:
         from vslam.report.explorer import explorer_data
         from vslam.report.figures import draw_figures
         from vslam.report.render import render_html, render_markdown
 
-        (folder / "report.md").write_text(render_markdown(report), encoding="utf-8")
+        with written.file("report.md") as file:
+            file.write_text(render_markdown(report), encoding="utf-8")
         figures = draw_figures(outcome, evaluation, matched_ground_truth(outcome), verdict)
-        (folder / "figures").mkdir(exist_ok=True)
-        for figure in figures:
-            (folder / "figures" / f"{figure.name}.png").write_bytes(figure.png)
+        with written.file("figures") as file:
+            file.mkdir(exist_ok=True)
+            for figure in figures:
+                (file / f"{figure.name}.png").write_bytes(figure.png)
         explorer = explorer_data(outcome, evaluation, matched_ground_truth(outcome), moments)
         page = render_html(report, config, figures, explorer)
-        (folder / "report.html").write_text(page, encoding="utf-8")
+        with written.file("report.html") as file:
+            file.write_text(page, encoding="utf-8")
     return report

@@ -224,11 +224,7 @@ def _copy(stored: StoredMap) -> StoredMap:
         {name: value.copy() if isinstance(value, (list, dict)) else value
          for name, value in vars(map_).items()}
     )  # fmt: skip
-    used = {"T_cw": map_.n_keyframes, "first_row": map_.n_keyframes + 1}
-    copy.arrays = map_.arrays._replace(
-        **{name: values[: used.get(name, len(values))].copy()
-           for name, values in map_.arrays._asdict().items()}
-    )  # fmt: skip
+    copy.arrays = map_.used_arrays()
     tables = {
         name: replace(table, first=table.first.copy(), values=table.values.copy())
         for name, table in stored.detector.tables.items()

@@ -1,0 +1,517 @@
+"""Every command on the pages runs on the corridor of the tests, shortened; what does not run here
+is named with the reason.
+
+Commands are the lines of shell blocks, and those with arguments in tables. The tutorials run in
+``test_site.py``, the pages of plug-ins in ``test_plugins.py``.
+"""
+
+from __future__ import annotations
+
+import glob
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import psutil
+import pytest
+from conftest import corridor_depth
+from source_files import write_bag, write_calibration, write_images, write_video
+from stub_runner import wait_for
+
+from vslam.trajectory import write_kitti
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = [p for p in sorted(DOCS.rglob("*.md")) if DOCS / "reference" not in p.parents]
+PAGES += [ROOT / name for name in ("README.md", "datasets.md", "CONTRIBUTING.md")]
+ELSEWHERE = {"docs/tutorial": "test_site.py", "docs/plugins.md": "test_plugins.py"}
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+IN_TABLE = re.compile(r"`(vslam [^` ]+ [^` ]+ [^`]+)`")
+TOOL = re.compile(r"(vslam|python3?|pip|pipx|uvx|make|dask|for) ")
+N = 6  # frames of each sequence
+
+TIME = "it measures times, for minutes"
+HOURS = "it takes hours"
+AGAIN = "each town takes seconds, and this form runs on another page or above"
+REAL = "it needs real KITTI"
+ORBSLAM = "it needs pyorbslam3, which vslam does not depend on"
+INSTALL = "`make test` builds and installs the wheel"
+
+
+@dataclass(frozen=True)
+class Rules:
+    """``shorter``: patterns of the page's text and what stands for them; ``not_run``: beginnings of
+    commands, with the reason."""
+
+    shorter: tuple[tuple[str, str], ...] = ()
+    not_run: tuple[tuple[str, str], ...] = ()
+
+
+ALWAYS = (
+    (r"--max-frames \d+", f"--max-frames {N}"),
+    (r"/tmp/", "tmp/"),
+    (r"--seqs 00-05", "--seqs 00"),
+    (r"--perturb none,brightness\b", "--perturb none"),
+    (r"--detectors none,bow,capsule", "--detectors none"),
+    (r"--runs 3", f"--runs 1 --max-frames {N}"),
+)
+RULES = {
+    "README.md": Rules(
+        not_run=(
+            ("git clone", "it needs the address of the repository"),
+            ("make ", "CI runs it, and this test in it"),
+            ("source .venv", "there is no other environment here"),
+            ("vslam report runs --serve", "it serves until it is stopped"),
+        )
+    ),
+    "CONTRIBUTING.md": Rules(
+        not_run=(("make ", "CI runs it"), (".ci/run", "CI runs it"), (".venv", "it is this test"))
+    ),
+    "datasets.md": Rules(
+        (
+            ("synth 05 --change", "synth block --max-frames 2 --change"),
+            (r"(vslam synth mine .*?)#", r"\1 --max-frames 2 #"),
+            ("--pairs 1000", "--pairs 1"),
+            ("--fisheye --out", "--max-frames 2 --fisheye --out"),
+        ),
+    ),
+    "docs/bench.md": Rules(
+        (
+            ("--runs 3", "--runs 1"),  # all frames: straight ahead alone no error is defined
+            (
+                "stereo.yaml --perturb none,brightness",
+                f"stereo.yaml --max-frames {N} --perturb none --detectors none",
+            ),
+            (r"\\\n +--trajectory ORB-SLAM3@00@brightness:1=\S+", ""),
+            (" --threads 4 ...", f" --seqs 00 --perturb none --detectors none --max-frames {N}"),
+        ),
+    ),
+    "docs/cameras.md": Rules(
+        not_run=(
+            ("vslam synth block --fisheye", AGAIN),
+            ("python tools/fisheye_twin.py", "it takes a minute to render a bend"),
+        )
+    ),
+    "docs/design.md": Rules(
+        not_run=(
+            ("python tools/orb_pattern.py", "it takes 20 s"),
+            ("python tools/bow_speed.py", TIME),
+            ("python tools/bench_optimisers.py", TIME),
+        )
+    ),
+    "docs/exports.md": Rules((("colmap RUN", "colmap RUN --out again"), ("RUN", "runs/latest"))),
+    "docs/howto/euroc.md": Rules(),
+    "docs/howto/install.md": Rules(
+        not_run=(("pip", INSTALL), ("uvx", INSTALL), ("python tools/wheel_test.py", INSTALL))
+    ),
+    "docs/howto/kitti.md": Rules(),
+    "docs/howto/tum.md": Rules(),
+    "docs/howto/untrusted.md": Rules((("--inputs 1000", "--inputs 2 --readers trajectory"),)),
+    "docs/lifelong.md": Rules(
+        not_run=(
+            ("python tools/laps.py", HOURS),
+            ("vslam run --resume", "test_autosave.py resumes runs"),
+            ("python tools/kill_test.py", "it runs for minutes; test_autosave.py kills runs"),
+        )
+    ),
+    "docs/local_descriptors.md": Rules(
+        not_run=(("python tools/", HOURS), ("vslam loops bench", REAL), ("vslam bench", HOURS))
+    ),
+    "docs/loops.md": Rules(
+        not_run=(
+            ("vslam loops bench", "it takes hours; test_loopbench.py runs it on a small town"),
+            ("vslam bench", HOURS),
+        )
+    ),
+    "docs/maps.md": Rules(
+        (
+            ("for town in 401 402 403", "for town in 401"),
+            ("for change in 1 0.9", "for change in 1"),
+            ("--start 220", "--start 3 --max-frames 3"),
+            ("--seq 00` writes", "--seq 00 --save-map town.npz` writes"),
+            ("--point 20,140", "--point 0,2"),
+        ),
+        (("vslam map merge", "its drives must meet; test_map_merge.py has some"),),
+    ),
+    "docs/motorway.md": Rules(
+        not_run=(
+            ("python tools/motorway.py errors", HOURS),
+            ("python tools/motorway.py offset", "it needs a drive of hundreds of metres"),
+        )
+    ),
+    "docs/online.md": Rules(
+        not_run=(("vslam loops bench", "it takes hours; test_online.py runs it"),)
+    ),
+    "docs/performance.md": Rules(
+        (("in 1 2 3 4 5 6 7 8 9 10", "in 1"),), (("python tools/bench_speed.py", ORBSLAM),)
+    ),
+    "docs/results.md": Rules(
+        not_run=(
+            ("ORBSLAM3=", ORBSLAM),
+            ("python tools/compare_orbslam3.py", ORBSLAM),
+            ("SYNTH=", ORBSLAM),
+            ("$SYNTH", ORBSLAM),
+            ("vslam bench --dataset synthetic", HOURS),
+        )
+    ),
+    "docs/rgbd.md": Rules(
+        (("demo --rgbd", f"demo --rgbd --max-frames {N}"),),
+        (("vslam synth block", AGAIN), ("vslam run --data block", AGAIN)),
+    ),
+    "docs/rivals.md": Rules(not_run=(("python tools/", HOURS),)),
+    "docs/scale.md": Rules(not_run=(("python tools/growth.py", HOURS),)),
+    "docs/sources.md": Rules(
+        not_run=(
+            ("vslam run --dataset synthetic --seq demo", "test_site.py runs it"),
+            ("vslam run --data 0", "there is no camera here; test_sources.py makes one"),
+        )
+    ),
+    "docs/stress.md": Rules(
+        (
+            ("--laws (fog,night,stereo_gain|all)", "--laws night --seeds 1 --steps 1"),
+            (
+                "--systems mine --system",
+                f"--max-frames {N} --laws night --seeds 1 --steps 1 --systems mine --system",
+            ),
+        ),
+        (
+            ("python3 -m venv orbslam", ORBSLAM),
+            ("vslam stress --seqs 00 --systems vslam,orbslam3", ORBSLAM),
+            (r'vslam stress --data "$KITTI_ROOT" --seqs 00 --max-frames 216 --seeds 1', ORBSLAM),
+        ),
+    ),
+    "docs/training.md": Rules(
+        (
+            (r'--data "kitti:[^"]*" ', ""),
+            ("--pairs 320 --epochs 8", "--pairs 4 --epochs 1 --pixels 65"),
+        ),
+        (("vslam synth ROUTE --pairs", AGAIN),),
+    ),
+}
+
+
+def name(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def is_elsewhere(path: Path) -> bool:
+    return any(name(path).startswith(page) for page in ELSEWHERE)
+
+
+def commands_of(text: str) -> Iterator[str]:
+    """Shell blocks command by command, loops and what is read up to ``END`` as a whole."""
+    rest = []
+    at = 0
+    for block in FENCE.finditer(text):
+        rest.append(text[at : block.start()])
+        at = block.end()
+        if block[1] == "sh":
+            yield from _logical_lines(block[2])
+        elif not block[1]:
+            yield from filter(TOOL.match, _logical_lines(block[2]))
+    rest.append(text[at:])
+    rows = [line for line in "".join(rest).splitlines() if line.startswith("|")]
+    for row in rows:
+        yield from IN_TABLE.findall(row)
+
+
+def _logical_lines(block: str) -> Iterator[str]:
+    waiting, until = "", ""
+    for line in block.replace("\\\n", " ").splitlines():
+        if not waiting and line.startswith("for ") and "done" not in line:
+            until = "done"
+        elif "<<'END'" in line:
+            until = "END"
+        waiting += line + "\n"
+        if not until or line.startswith(until):
+            if waiting.strip() and not waiting.startswith("#"):
+                yield waiting.strip()
+            waiting, until = "", ""
+
+
+def is_shell(command: str) -> bool:
+    """More than one ``vslam`` with its words."""
+    return not command.startswith("vslam ") or any(x in command for x in ("; ", "&&", " > "))
+
+
+@pytest.mark.parametrize("path", PAGES, ids=name)
+def test_every_page_with_commands_has_rules(path: Path):
+    """A page is run here, or elsewhere; and what is not run is on the page still."""
+    commands = list(commands_of(path.read_text()))
+    if is_elsewhere(path):
+        return
+    assert bool(commands) == (name(path) in RULES)
+    for start, reason in RULES.get(name(path), Rules()).not_run:
+        assert reason
+        assert any(command.startswith(start) for command in commands), start
+
+
+def test_the_reader_of_commands_sees_all_kinds():
+    text = (
+        "a\n```sh\nfor n in 1; do\n  vslam run\ndone\nvslam info \\\n  x  # y\n"
+        "python - <<'END'\nz\nEND\n# no\n```\n| `vslam map info FILE`, `vslam run` |\n"
+        "```python\nvslam\n```\n`vslam run x`\n"
+    )
+    assert list(commands_of(text)) == [
+        "for n in 1; do\n  vslam run\ndone", "vslam info    x  # y", "python - <<'END'\nz\nEND",
+        "vslam map info FILE",
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def home(corridor, kitti_tree: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the data sets that pages name; each sequence is the corridor."""
+    root, c = tmp_path_factory.mktemp("home"), corridor.camera
+    for sequence in ("00", "05", "06"):
+        for kind, file in (("sequences", "00"), ("poses", "00.txt")):
+            link = root / "kitti" / kind / file.replace("00", sequence)
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(kitti_tree / kind / file)
+    for sequence in ("V1_01_easy", "V1_01_start", "MH_03_medium", "V2_02_medium"):
+        _write_euroc(root / "euroc" / sequence, corridor)
+    depth = [
+        (5000 * corridor_depth(c, T_wc)).clip(0, 65535).astype(np.uint16)
+        for T_wc in corridor.T_wc[:N]
+    ]
+    for sequence in ("freiburg1_desk", "freiburg3_long_office_household", "freiburg1_xyz"):
+        _write_tum(root / "tum" / f"rgbd_dataset_{sequence}", corridor, depth)
+    return root
+
+
+def _write_euroc(folder: Path, corridor) -> None:
+    c = corridor.camera
+    for side, images in enumerate((corridor.left, corridor.right)):
+        camera = folder / "mav0" / f"cam{side}"
+        stamps = [10**18 + 10**8 * k for k in range(N)]
+        write_images(camera, {"data": images[:N]}, [f"{stamp}.png" for stamp in stamps])
+        lines = "".join(f"{stamp},{stamp}.png\n" for stamp in stamps)
+        (camera / "data.csv").write_text(f"#timestamp [ns],filename\n{lines}")
+        T = f"[1, 0, 0, {c.baseline * side}, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"
+        (camera / "sensor.yaml").write_text(
+            f"T_BS:\n  rows: 4\n  cols: 4\n  data: {T}\ncamera_model: pinhole\n"
+            f"resolution: [{c.width}, {c.height}]\nintrinsics: [{c.fx}, {c.fy}, {c.cx}, {c.cy}]"
+            "\ndistortion_model: radial-tangential\ndistortion_coefficients: [0, 0, 0, 0]\n"
+        )
+
+
+def _write_tum(folder: Path, corridor, depth: list[np.ndarray]) -> None:
+    names = [f"{100 + 0.1 * k:.1f}.png" for k in range(N)]
+    write_images(folder, {"rgb": corridor.left[:N], "depth": depth}, names)
+    for side in ("rgb", "depth"):
+        lines = "".join(f"{Path(name).stem} {side}/{name}\n" for name in names)
+        (folder / f"{side}.txt").write_text(lines)
+    write_calibration(folder / "calibration.yaml", corridor.camera, mono=True)
+
+
+@pytest.fixture(scope="module")
+def towns(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where rendered ones are kept, from page to page."""
+    return tmp_path_factory.mktemp("towns")
+
+
+@pytest.fixture
+def desk(
+    home: Path, towns: Path, corridor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """The folder that commands are typed in, with the files that they name."""
+    c = corridor.camera
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.setenv("KITTI_ROOT", str(home / "kitti"))
+    monkeypatch.setenv("VSLAM_CACHE", str(towns))
+    path = f"{tmp_path / 'bin'}:{Path(sys.executable).parent}:{os.environ['PATH']}"
+    monkeypatch.setenv("PATH", path)
+    for folder in ("tmp", "orbslam3", "poses", "bin"):
+        (tmp_path / folder).mkdir()
+    for link, target in {
+        "KITTI": "kitti", "KITTI_AS_PNG": "kitti", "V1_01_easy": "euroc/V1_01_easy",
+        "rgbd_dataset_freiburg1_desk": "tum/rgbd_dataset_freiburg1_desk",
+        "tum/mine": "tum/rgbd_dataset_freiburg1_xyz",
+    }.items():  # fmt: skip
+        (tmp_path / link).parent.mkdir(exist_ok=True)
+        (tmp_path / link).symlink_to(home / target)
+    for link in ("tools", "frontend"):
+        (tmp_path / link).symlink_to(ROOT / link)
+    poses = home / "kitti" / "poses" / "00.txt"
+    for copy in ("orbslam3.txt", "orbslam3/00.txt", "poses/07.txt"):
+        shutil.copy(poses, tmp_path / copy)
+    write_calibration(tmp_path / "stereo.yaml", c)
+    write_calibration(tmp_path / "mine.yaml", c)
+    for mono in ("camera.yaml", "left.yaml"):
+        write_calibration(tmp_path / mono, c, mono=True)
+    return tmp_path
+
+
+def _videos(desk: Path, corridor) -> None:
+    pairs = [np.hstack(x) for x in zip(corridor.left[:N], corridor.right[:N], strict=True)]
+    write_video(desk / "drive.mp4", pairs)
+
+
+def _depth_sources(desk: Path, corridor) -> None:
+    """Images in ``FOLDER``, a bag with depth."""
+    c = corridor.camera
+    names = [f"{10**18 + 10**8 * k}.png" for k in range(N)]
+    depth = [
+        (1000 * corridor_depth(c, T)).clip(0, 65535).astype(np.uint16) for T in corridor.T_wc[:N]
+    ]
+    write_images(desk / "FOLDER", {"rgb": corridor.left[:N], "depth": depth}, names)
+    topics = ("/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw")
+    sides = dict(zip(topics, (corridor.left[:N], depth), strict=True))
+    write_bag(desk / "drive.bag", "ros1", sides, [10**8 * (k + 1) for k in range(N)], camera=c)
+
+
+def _pair_sources(desk: Path, corridor) -> None:
+    """Images in ``FOLDER``, in two folders, with depth; a video; a bag of a pair."""
+    _videos(desk, corridor)
+    names = [f"{10**18 + 10**8 * k}.png" for k in range(N)]
+    sides = {"LEFT": corridor.left[:N], "RIGHT": corridor.right[:N], "RGB": corridor.left[:N]}
+    sides["DEPTH"] = [
+        (1000 * corridor_depth(corridor.camera, T)).clip(0, 65535).astype(np.uint16)
+        for T in corridor.T_wc[:N]
+    ]
+    write_images(desk, sides, names)
+    write_images(desk / "FOLDER", {"left": sides["LEFT"], "right": sides["RIGHT"]}, names)
+    of_bag = {"/cam0/image_raw": sides["LEFT"], "/cam1/image_raw": sides["RIGHT"]}
+    stamps = [10**8 * (k + 1) for k in range(N)]
+    write_bag(desk / "drive.bag", "ros1", of_bag, stamps, camera=corridor.camera)
+
+
+def _earlier_run(desk: Path, corridor) -> None:
+    _videos(desk, corridor)
+    run_words(["run", "--seq", "00"])
+    (desk / "runs" / "latest").resolve().rename(desk / "runs" / "20261121-100000-kitti-00-none")
+
+
+def _another_system(desk: Path, corridor) -> None:
+    """``run_mine``, which knows the truth of its frames."""
+    script = desk / "bin" / "run_mine"
+    truth = desk / "poses" / "07.txt"
+    script.write_text(
+        f'#!/bin/sh\nhead -n "$(wc -l < "$1/times.txt")" {truth} > "$2/trajectory.txt"\n'
+    )
+    script.chmod(0o755)
+
+
+def _photographs(desk: Path, corridor) -> None:
+    rng = np.random.default_rng(0)
+    for family in ("multiview", "stitch_pairs", "pano360", "bsds500"):
+        folder = desk / "PLACES" / family
+        for place in ("a", "b", "c", "d"):
+            image = cv2.resize(rng.integers(0, 256, (9, 12), dtype=np.uint8), (96, 72))
+            write_images(folder, {place: [image, image[::-1]]}, ["0.png", "1.png"])
+        (folder / "NOTES.txt").write_text("kind (a)\n")
+    (desk / "FILE").touch()
+    (desk / "training").mkdir()
+    (desk / "training" / "7-seventh").symlink_to(desk / "tmp" / "smoke")
+
+
+def _straight_route(desk: Path, corridor) -> None:
+    T_wc = np.tile(np.eye(4), (30, 1, 1))
+    T_wc[:, 2, 3] = np.arange(30)
+    write_kitti(desk / "poses" / "07.txt", T_wc)
+
+
+def _image(desk: Path, corridor) -> None:
+    cv2.imwrite("IMAGE.png", corridor.left[0])
+
+
+PREPARE: dict[str, Callable[[Path, object], None]] = {
+    "README.md": _videos,
+    "datasets.md": _straight_route,
+    "docs/bench.md": _earlier_run,
+    "docs/design.md": _image,
+    "docs/rgbd.md": _depth_sources,
+    "docs/sources.md": _pair_sources,
+    "docs/stress.md": _another_system,
+    "docs/training.md": _photographs,
+}
+
+
+def run_words(words: list[str]) -> None:
+    """``vslam`` in this process; runs are short and draw no pages."""
+    from vslam.cli import main as cli
+
+    if words[0] == "run":
+        words += [x for x in ("--no-record", "--no-report", "--quiet") if x not in words]
+        words += [] if "--max-frames" in words else ["--max-frames", str(N)]
+    before = sys.argv
+    sys.argv = ["vslam", *words]
+    try:
+        cli.main()
+        code = 0
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    finally:
+        sys.argv = before
+    assert code == 0, words
+
+
+def run_command(command: str) -> None:
+    if is_shell(command):
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", command], capture_output=True, text=True
+        )
+        assert done.returncode == 0, command + done.stdout + done.stderr
+        return
+    words = [os.path.expandvars(os.path.expanduser(w)) for w in shlex.split(command, comments=True)]
+    words = [w for word in words for w in (sorted(glob.glob(word)) if "*" in word else [word])]
+    run_words(words[1:])
+
+
+@pytest.fixture
+def dask(desk: Path) -> Iterator[Callable[[str], str]]:
+    """Takes the commands of the cluster's page: starts what it says, on loopback; gives the address
+    of the scheduler."""
+    pytest.importorskip("distributed", reason="no dask here: pip install 'vslam[cluster]'")
+    log, processes, address = desk / "dask.txt", [], ""
+
+    def start(command: str) -> str:
+        nonlocal address
+        here = " --host 127.0.0.1 --no-dashboard"
+        here += " --port 0" if "scheduler" in command else f" --local-directory {desk}"
+        words = shlex.split(command.replace("tcp://HOST:8786", address) + here, comments=False)
+        with log.open("ab") as output:
+            processes.append(psutil.Popen(words, stdout=output, stderr=subprocess.STDOUT))
+        said = r"Scheduler at:\s+(tcp://\S+)"
+        if not address:
+            wait_for(lambda: re.search(said, log.read_text()))
+            address = re.search(said, log.read_text())[1]  # type: ignore[index]
+        else:
+            wait_for(lambda: log.read_text().count("Registered to") == 2)
+        return address
+
+    yield start
+    for process in reversed(processes):
+        for child in process.children(recursive=True):
+            child.kill()
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.parametrize("page", RULES)
+def test_commands_of_the_page_run(page: str, desk: Path, corridor, request):
+    rules, text = RULES[page], (ROOT / page).read_text()
+    if page in PREPARE:
+        PREPARE[page](desk, corridor)
+    shorter = text
+    for pattern, instead in rules.shorter:
+        shorter, found = re.subn(pattern, instead, shorter)
+        assert found, pattern
+    for pattern, instead in ALWAYS:
+        shorter = re.sub(pattern, instead, shorter)
+    address = "tcp://HOST:8786"
+    for command, written in zip(commands_of(shorter), commands_of(text), strict=True):
+        if written.startswith(("export ", *(start for start, _ in rules.not_run))):
+            continue
+        if command.startswith("dask "):
+            address = request.getfixturevalue("dask")(command.partition("#")[0])
+            continue
+        run_command(command.replace("tcp://HOST:8786", address))

@@ -30,7 +30,7 @@ class BundleProblem:
         camera: ``(O,)`` int64, camera of each observation.
         uvr: ``(O, 3)`` float64, NaN u_right for monocular ones.
         inverse_sigma2: ``(O,)`` float64.
-        intrinsics: ``(5,)`` fx, fy, cx, cy, bf.
+        intrinsics: ``(6,)``, see ``Camera.intrinsics``.
     """
 
     T_cw: NDArray[np.float64]
@@ -145,10 +145,10 @@ def robust_cost(T_cw, points, observations, inlier):
     for p in range(len(points)):
         for o in range(first[p], first[p + 1]):
             _in_camera(T_cw[camera[o]], points[p], q)
-            r_u, r_v, r_right, stereo = residual(
+            r_u, r_v, r_disparity, stereo = residual(
                 q[0], q[1], q[2], uvr[o, 0], uvr[o, 1], uvr[o, 2], pinhole
             )
-            chi2, limit = chi_square(r_u, r_v, r_right, stereo, inverse_sigma2[o])
+            chi2, limit = chi_square(r_u, r_v, r_disparity, stereo, inverse_sigma2[o])
             inlier[o] = q[2] > 0.0 and chi2 <= limit
             if used[o]:
                 cost += 0.5 * chi2 if chi2 <= limit else np.sqrt(chi2 * limit) - 0.5 * limit
@@ -200,7 +200,7 @@ def linearise(T_cw, n_free, points, observations, equations):
     first, camera, uvr, inverse_sigma2, used, intrinsics = observations
     W, V, g, U, b = equations
     pinhole = unpacked(intrinsics)
-    fx, fy, _, _, bf = intrinsics  # not shared: that would fuse other products, and change bits
+    fx, fy, _, _, bf, disparity_weight = intrinsics
     U[:] = 0.0
     b[:] = 0.0
     q = np.empty(3)
@@ -226,13 +226,12 @@ def linearise(T_cw, n_free, points, observations, equations):
             c = -fx * q[0] * iz * iz
             e = fy * iz
             f = -fy * q[1] * iz * iz
-            h = c + bf * iz * iz if stereo else 0.0
-            m = a if stereo else 0.0
-            # Rows of d(u, v, u_right)/d(point): projection times rotation.
+            h = disparity_weight * bf * iz * iz if stereo else 0.0
+            # Rows of d(u, v, -disparity)/d(point): projection times rotation.
             for i in range(3):
                 P[0, i] = a * T[0, i] + c * T[2, i]
                 P[1, i] = e * T[1, i] + f * T[2, i]
-                P[2, i] = m * T[0, i] + h * T[2, i]
+                P[2, i] = h * T[2, i]
             w0, w1, w2 = weight * r0, weight * r1, weight * r2
             g0 += P[0, 0] * w0 + P[1, 0] * w1 + P[2, 0] * w2
             g1 += P[0, 1] * w0 + P[1, 1] * w1 + P[2, 1] * w2
@@ -250,8 +249,8 @@ def linearise(T_cw, n_free, points, observations, equations):
             C[0, 3], C[0, 4], C[0, 5] = c * y, a * z - c * x, -a * y
             C[1, 0], C[1, 1], C[1, 2] = 0.0, e, f
             C[1, 3], C[1, 4], C[1, 5] = -e * z + f * y, -f * x, e * x
-            C[2, 0], C[2, 1], C[2, 2] = m, 0.0, h
-            C[2, 3], C[2, 4], C[2, 5] = h * y, m * z - h * x, -m * y
+            C[2, 0], C[2, 1], C[2, 2] = 0.0, 0.0, h
+            C[2, 3], C[2, 4], C[2, 5] = h * y, -h * x, 0.0
             block, vector = U[k], b[k]
             for i in range(6):
                 c0, c1, c2 = weight * C[0, i], weight * C[1, i], weight * C[2, i]

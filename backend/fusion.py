@@ -129,7 +129,7 @@ def _fuse(
     max_distance,
 ):
     pinhole = unpacked(intrinsics)
-    fx, fy, cx, cy, _ = pinhole
+    fx, fy, cx, cy, _, _ = pinhole
     start, items, columns = grid
     T = a.T_cw[keyframe]
     first_row = a.first_row[keyframe]

@@ -89,7 +89,7 @@ def unmapped_rows(a, keyframe):
 @kernel
 def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, max_cosine):
     """New landmarks of two keyframes: ``xyz`` ``(N, 3)`` and the rows of both, ``(N,)`` int64."""
-    fx, fy, cx, cy, bf = intrinsics
+    fx, fy, cx, cy, bf, _ = intrinsics
     T1, T2 = a.T_cw[k1], a.T_cw[k2]
     centre_1, centre_2, gap = np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
@@ -271,7 +271,7 @@ def sorted_about_epipole(x, y, gate, intrinsics, across):
 @inner_kernel
 def seen_along(x, y, intrinsics, across):
     """The ray of a pixel along the two axes."""
-    fx, fy, cx, cy, _ = intrinsics
+    fx, fy, cx, cy, _, _ = intrinsics
     d_x, d_y = (x - cx) / fx, (y - cy) / fy
     u = d_x * across[0, 0] + d_y * across[0, 1] + across[0, 2]
     v = d_x * across[1, 0] + d_y * across[1, 1] + across[1, 2]

@@ -27,7 +27,7 @@ def predict_view(T, xyz, normal, distance_range, intrinsics, width, height, scal
         ``uvr`` ``(N, 3)``; search radius ``(N,)``, 0 if not visible; octave ``(N,)`` int64.
     """
     n = len(xyz)
-    fx, fy, cx, cy, bf = intrinsics
+    fx, fy, cx, cy, bf, _ = intrinsics
     uvr = np.zeros((n, 3))
     radius = np.zeros(n)
     octave = np.zeros(n, np.int64)

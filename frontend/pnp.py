@@ -283,7 +283,7 @@ def ransac_pose(points, uvr, inverse_sigma2, intrinsics, seed, min_inliers, max_
         points: ``(N, 3)`` float64 landmarks in the world.
         uvr: ``(N, 3)`` float64 observed u, v, u_right; NaN u_right: monocular.
         inverse_sigma2: ``(N,)`` float64, inverse variance of a pixel coordinate.
-        intrinsics: ``(5,)`` fx, fy, cx, cy, bf.
+        intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         seed: uint64; the same seed gives the same result.
         min_inliers, max_draws, confidence: draws end when this confident that no pose with more
             inliers, or none with ``min_inliers``, is left.
@@ -291,7 +291,7 @@ def ransac_pose(points, uvr, inverse_sigma2, intrinsics, seed, min_inliers, max_
     Returns:
         ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers of the best pose, few or many.
     """
-    fx, fy, cx, cy, _ = intrinsics
+    fx, fy, cx, cy, _, _ = intrinsics
     n = len(points)
     best_T, best_score = np.eye(4), 0.0
     best_inlier, inlier = np.zeros(n, np.bool_), np.zeros(n, np.bool_)

@@ -24,14 +24,14 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
         points: ``(N, 3)`` float64 landmarks in the world.
         uvr: ``(N, 3)`` float64 observations u, v, u_right; NaN u_right: monocular.
         inverse_sigma2: ``(N,)`` float64, inverse variance of a pixel coordinate.
-        intrinsics: ``(5,)`` fx, fy, cx, cy, bf.
+        intrinsics: ``(6,)``, see ``Camera.intrinsics``.
 
     Returns:
         ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers.
     """
     n = len(points)
     pinhole = unpacked(intrinsics)
-    fx, fy, _, _, bf = intrinsics  # not shared: that would fuse other products, and change bits
+    fx, fy, _, _, bf, disparity_weight = intrinsics
     T = T_cw.copy()
     inlier = np.ones(n, np.bool_)
     for turn in range(ROUNDS):
@@ -51,20 +51,20 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
                 z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
                 if z <= 1e-6:
                     continue
-                r_u, r_v, r_right, stereo = residual(
+                r_u, r_v, r_disparity, stereo = residual(
                     x, y, z, uvr[i, 0], uvr[i, 1], uvr[i, 2], pinhole
                 )
-                chi2, limit = chi_square(r_u, r_v, r_right, stereo, inverse_sigma2[i])
-                r[0], r[1], r[2] = r_u, r_v, r_right
+                chi2, limit = chi_square(r_u, r_v, r_disparity, stereo, inverse_sigma2[i])
+                r[0], r[1], r[2] = r_u, r_v, r_disparity
                 weight = inverse_sigma2[i]
                 iz = 1.0 / z
                 if robust and chi2 > limit:
                     weight *= np.sqrt(limit / chi2)
                 used += 1
-                # d(u, v)/d(v, w) for T <- exp([v, w]) T.
+                # d(u, v, -disparity)/d(v, w) for T <- exp([v, w]) T.
                 J[0, 0], J[0, 1], J[0, 2] = fx * iz, 0.0, -fx * x * iz * iz
                 J[1, 0], J[1, 1], J[1, 2] = 0.0, fy * iz, -fy * y * iz * iz
-                J[2, 0], J[2, 1], J[2, 2] = J[0, 0], 0.0, J[0, 2] + bf * iz * iz
+                J[2, 0], J[2, 1], J[2, 2] = 0.0, 0.0, disparity_weight * bf * iz * iz
                 for k in range(3 if stereo else 2):
                     J[k, 3] = -J[k, 1] * z + J[k, 2] * y
                     J[k, 4] = J[k, 0] * z - J[k, 2] * x

@@ -59,7 +59,7 @@ def align(
 
     Args:
         a, b: the same N landmarks from both cameras.
-        intrinsics: ``(5,)`` fx, fy, cx, cy, bf of both.
+        intrinsics: ``(6,)`` of both, see ``Camera.intrinsics``.
         seed: of the draws; the same seed gives the same result.
         min_inliers: fewer are no consensus.
         max_draws, confidence: draws end when this confident that none better is left.
@@ -202,19 +202,19 @@ def _add_residual(p, motion, uvr, inverse_sigma2, intrinsics, H, b):
     if p[2] <= 0.1:
         return
     pinhole = unpacked(intrinsics)
-    fx, fy, _, _, bf = intrinsics  # not shared: that would fuse other products, and change bits
+    fx, fy, _, _, bf, disparity_weight = intrinsics
     iz = 1.0 / p[2]
-    r_u, r_v, r_right, stereo = residual(p[0], p[1], p[2], uvr[0], uvr[1], uvr[2], pinhole)
-    chi2, limit = chi_square(r_u, r_v, r_right, stereo, inverse_sigma2)
+    r_u, r_v, r_disparity, stereo = residual(p[0], p[1], p[2], uvr[0], uvr[1], uvr[2], pinhole)
+    chi2, limit = chi_square(r_u, r_v, r_disparity, stereo, inverse_sigma2)
     weight = inverse_sigma2 * (np.sqrt(limit / chi2) if chi2 > limit else 1.0)
     J = np.zeros((3, 7))
     for k in range(7):
         J[0, k] = fx * iz * (motion[0, k] - p[0] * iz * motion[2, k])
         J[1, k] = fy * iz * (motion[1, k] - p[1] * iz * motion[2, k])
         if stereo:
-            J[2, k] = J[0, k] + bf * iz * iz * motion[2, k]
+            J[2, k] = disparity_weight * bf * iz * iz * motion[2, k]
     for k in range(7):
-        b[k] += weight * (J[0, k] * r_u + J[1, k] * r_v + J[2, k] * r_right)
+        b[k] += weight * (J[0, k] * r_u + J[1, k] * r_v + J[2, k] * r_disparity)
         for m in range(k + 1):
             H[k, m] += weight * (J[0, k] * J[0, m] + J[1, k] * J[1, m] + J[2, k] * J[2, m])
 
@@ -284,8 +284,7 @@ def _error(x, y, z, uvr, inverse_sigma2, intrinsics):
     """``chi_square_ratio``; 2 for a point that is not in front of the camera."""
     if z <= 0.1:
         return 2.0
-    fx, fy, cx, cy, bf = intrinsics  # not unpacked(): that would change bits
-    pinhole = (fx, fy, cx, cy, bf)
+    pinhole = unpacked(intrinsics)
     return chi_square_ratio(x, y, z, uvr[0], uvr[1], uvr[2], inverse_sigma2, pinhole)
 
 

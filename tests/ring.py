@@ -51,7 +51,7 @@ class Ring:
         return T
 
     def see(self, k: float, seed: int) -> Features:
-        """Features at frame k, 0.3 px of noise, six bits of each descriptor wrong."""
+        """Features at frame k, noise as of real images, six bits of each descriptor wrong."""
         rng = np.random.default_rng((seed, round(10 * k)))
         T_cw = inverse(self.pose(k))
         p = self.points @ T_cw[:3, :3].T + T_cw[:3, 3]
@@ -62,9 +62,9 @@ class Ring:
         inside = (u > 0) & (u < CAMERA.width - 1) & (v > 0) & (v < CAMERA.height - 1)
         seen = np.flatnonzero(ahead & inside)[:1200]
         n = len(seen)
-        xy = np.stack([u[seen], v[seen]], axis=1) + rng.normal(0, 0.3, (n, 2))
+        xy = np.stack([u[seen], v[seen]], axis=1) + rng.normal(0, 0.5, (n, 2))
         u_right = xy[:, 0] - CAMERA.bf * (1.0 + self.focal_error) / z[seen]
-        u_right += rng.normal(0, 0.3, n)
+        u_right += rng.normal(0, 0.17, n)
         bits = np.unpackbits(self.descriptors[seen], axis=1)
         for _ in range(6):
             bits[np.arange(n), rng.integers(0, 256, n)] ^= 1

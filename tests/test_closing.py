@@ -11,7 +11,7 @@ from ring import CAMERA, LAP, Oracle, Ring
 
 from vslam.backend.pose_graph import GAP, held_by
 from vslam.closing import LoopClosing
-from vslam.config import Config
+from vslam.config import Config, ConsistencyConfig, KeyframeConfig
 from vslam.features import Features, TrackingState
 from vslam.geometry import inverse
 from vslam.loopclosure.detector import NoDetector
@@ -19,8 +19,9 @@ from vslam.loops import LoopCandidate
 from vslam.slam import Slam
 
 ROUND = [float(k) for k in range(LAP + 40)]
-DRIFTING = Ring.create(focal_error=0.01)
+DRIFTING = Ring.create(focal_error=0.015)
 EXACT = Ring.create()
+DENSE = Config(keyframes=KeyframeConfig(max_interval_s=0.35))  # many keyframes, many queries
 
 
 class Deceived(Oracle):
@@ -42,7 +43,7 @@ class Sticker(Ring):
         if k != CARRIED_TO:
             return features
         before = super().see(CARRIED_FROM, seed)
-        chosen = np.linspace(0, len(before) - 1, 60).astype(int)
+        chosen = np.linspace(0, len(before) - 1, 70).astype(int)
         return Features(*(
             np.concatenate([getattr(before, name)[chosen], getattr(features, name)])
             for name in ("xy", "octave", "angle", "descriptors", "u_right")
@@ -83,7 +84,7 @@ def test_a_closed_loop_takes_the_drift_out(check_map):
     slam = closed()
     before, after = errors(without, DRIFTING, ROUND), errors(slam, DRIFTING, ROUND)
     assert before[-1] > 3.0
-    assert after[-1] < 0.8
+    assert after[-1] < 1.2  # the ring is 1.5 % too large: 0.75 m of its radius
     assert np.sqrt((after**2).mean()) < 0.5 * np.sqrt((before**2).mean())
     accepted = [edge for edge in slam.loops if edge.accepted]
     assert [edge.reason for edge in accepted] == ["closed"] * len(slam.corrections)
@@ -168,7 +169,7 @@ def test_two_seconds_of_darkness_lose_no_pose(check_map):
 @pytest.mark.parametrize(
     ("ring", "frames", "dark", "hypotheses"),
     [
-        (DRIFTING, ROUND, range(60, 64), [True]),
+        (DRIFTING, ROUND, range(60, 70), [True]),
         (EXACT, [*ROUND[:80], *ROUND[140:]], (), [True, False]),  # 90 m between two frames
     ],
 )
@@ -210,7 +211,7 @@ def test_past_an_unpredicted_restart_the_second_hypothesis_is_tried_too(monkeypa
 
     monkeypatch.setattr(LoopClosing, "_solve", first_contradicted)
     frames = [0.0, *ROUND[30:]]
-    slam, _ = run(EXACT, frames, Oracle(EXACT, frames))
+    slam, _ = run(EXACT, frames, Oracle(EXACT, frames), config=DENSE)
     assert slam.map.unpredicted_restarts == [1]
     assert tried == [True, False]
     assert len(slam.corrections) == 1
@@ -219,7 +220,8 @@ def test_past_an_unpredicted_restart_the_second_hypothesis_is_tried_too(monkeypa
 @cache
 def carried(*, heal=True, threads=1):
     """A camera carried 45 m on, whose next image agrees with wrong landmarks: a wrong keyframe."""
-    config = Config.model_validate({"consistency": {"min_against": 4 if heal else 1000}})
+    consistency = ConsistencyConfig(min_against=4 if heal else 1000)
+    config = DENSE.model_copy(update={"consistency": consistency})
     ring = Sticker(EXACT.points, EXACT.descriptors)
     return run(ring, CARRIED, Oracle(ring, CARRIED), threads=threads, config=config)
 
@@ -295,4 +297,4 @@ def test_a_sound_map_is_not_doubted_whatever_many_keyframes_resemble():
     assert len({edge.query for edge in against}) >= 4
     assert not slam.corrections
     assert not slam.map.restarts
-    assert errors(slam, EXACT, frames).max() < 0.5
+    assert errors(slam, EXACT, frames).max() < 1.0

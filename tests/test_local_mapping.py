@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from stereo_noise import white_noise
 
 from vslam.backend.fusion import fuse_into, fuse_neighbourhood
 from vslam.backend.local_mapping import (
@@ -61,7 +62,7 @@ class World:
         """A keyframe that sees every point (``among`` some) in its image, in random order."""
         in_camera = transform(T_cw, self.points)
         uvr = CAMERA.project(np.where(in_camera[:, 2:] > 0.5, in_camera, 1.0))
-        uvr += noise * self.rng.normal(size=uvr.shape)
+        uvr += noise * white_noise(self.rng, np.full(len(uvr), not mono))
         seen = in_camera[:, 2] > 0.5
         seen &= (uvr[:, :2] >= 0).all(axis=1) & (uvr[:, :2] < [CAMERA.width, CAMERA.height]).all(
             axis=1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stereo_noise import white_noise
 
 from vslam.camera import Camera
 from vslam.frontend.pnp import ransac_pose, solve_p3p
@@ -45,7 +46,7 @@ def scene(seed: int, *, n: int = 100, outliers: float = 0.7, mono: bool = False)
     T = se3_exp(np.r_[3 * rng.normal(size=3), rng.normal(size=3)])
     xy = rng.uniform([0, 0], [CAMERA.width, CAMERA.height], (n, 2))
     in_camera = CAMERA.backproject(xy, rng.uniform(5, 40, n))
-    uvr = CAMERA.project(in_camera) + 0.7 * rng.normal(size=(n, 3))
+    uvr = CAMERA.project(in_camera) + 0.7 * white_noise(rng, np.full(n, not mono))
     if mono:
         uvr[:, 2] = np.nan
     points = transform(inverse(T), in_camera)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
+from stereo_noise import WHITENING, white_noise
 
 from vslam.camera import Camera
 from vslam.frontend.pose import optimise_pose
@@ -24,9 +25,9 @@ def observations(kind: str, n: int = 120, noise: float = 0.0, seed: int = 0):
     in_camera = CAMERA.backproject(pixels, depth)
     uvr = CAMERA.project(in_camera)
     sigma = 1.2 ** rng.integers(0, 8, n)
-    uvr += noise * sigma[:, None] * rng.normal(size=(n, 3))
     if kind != "stereo":
         uvr[:: 1 if kind == "mono" else 2, 2] = np.nan
+    uvr += noise * sigma[:, None] * white_noise(rng, ~np.isnan(uvr[:, 2]))
     return transform(inverse(TRUTH), in_camera), uvr, sigma**-2.0
 
 
@@ -36,6 +37,8 @@ def pose_difference(A: np.ndarray, B: np.ndarray) -> float:
 
 def chi2(T: np.ndarray, points, uvr, inverse_sigma2) -> np.ndarray:
     error = np.nan_to_num(uvr - CAMERA.project(transform(T, points)))
+    stereo = ~np.isnan(uvr[:, 2])
+    error[stereo] = error[stereo] @ WHITENING.T
     return (error**2).sum(axis=1) * inverse_sigma2
 
 
@@ -90,7 +93,8 @@ def gtsam_pose(points, uvr, inverse_sigma2) -> np.ndarray:
             pixel = np.array([u, v])
             graph.add(gtsam.GenericProjectionFactorCal3_S2(pixel, noise, 0, i, mono))
         else:
-            noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
+            turned = WHITENING[:, [0, 2, 1]]  # GTSAM's order: u, u_right, v
+            noise = gtsam.noiseModel.Gaussian.Information(sigma**-2.0 * turned.T @ turned)
             graph.add(gtsam.GenericStereoFactor3D(gtsam.StereoPoint2(u, r, v), noise, 0, i, stereo))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-14)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stereo_noise import WHITENING, white_noise
 
 from vslam.camera import Camera
 from vslam.kernels import kernel
@@ -46,18 +47,22 @@ def test_residual_and_test_are_those_of_the_camera(mono):
         noise[:, 2] = 0.0
     weight = rng.uniform(0.2, 1.0, 200)
     ratio, r, chi2, limit = errors_of(points, uvr, weight, CAMERA.intrinsics)
-    np.testing.assert_allclose(r, noise, atol=1e-9)
-    np.testing.assert_allclose(chi2, weight * (noise**2).sum(axis=1), rtol=1e-9)
+    expected = noise.copy()
+    if not mono:
+        expected = noise @ WHITENING.T
+    np.testing.assert_allclose(r, expected, atol=1e-9)
+    np.testing.assert_allclose(chi2, weight * (expected**2).sum(axis=1), rtol=1e-9)
     assert set(limit) == {CHI2_MONO if mono else CHI2_STEREO}
     np.testing.assert_allclose(ratio, chi2 / limit, rtol=1e-9)
-    assert 0.2 < np.mean(ratio <= 1.0) < 0.9
+    assert 0.02 < np.mean(ratio <= 1.0) < 0.9
 
 
 def test_the_limits_hold_19_of_20_true_observations():
     rng = np.random.default_rng(1)
     points = np.tile([1.0, 0.5, 10.0], (20000, 1))
-    uvr = CAMERA.project(points) + rng.normal(size=(20000, 3))
     for columns in (3, 2):
+        noise = white_noise(rng, np.full(len(points), columns == 3))
+        uvr = CAMERA.project(points) + noise
         uvr[:, columns:] = np.nan
         ratio, *_ = errors_of(points, uvr, np.ones(20000), CAMERA.intrinsics)
         assert np.mean(ratio <= 1.0) == pytest.approx(0.95, abs=0.005)

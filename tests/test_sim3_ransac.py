@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stereo_noise import white_noise
 
 from vslam.camera import Camera
 from vslam.geometry import inverse, se3_exp, se3_log, symmetric_eigen, transform
@@ -27,7 +28,7 @@ def scene(seed: int, n: int, outliers: float, scale: float = 1.0, noise: float =
     in_b = transform(inverse(T), in_a)
     views = []
     for p in (in_a, in_b):
-        uvr = CAMERA.project(p) + noise * rng.normal(size=(n, 3))
+        uvr = CAMERA.project(p) + noise * white_noise(rng, np.ones(n, bool))
         depth_error = 1 + p[:, 2:] / CAMERA.bf * (0.1 if noise else 0.0) * rng.normal(size=(n, 1))
         views.append((p * depth_error, uvr))
     wrong = rng.permutation(n)[: round(outliers * n)]

@@ -16,6 +16,10 @@ Image = NDArray[np.uint8]  # (H, W) grey
 DepthImage = NDArray[np.float32]  # (H, W) metres along z, 0 where unknown
 Sensor = Literal["stereo", "mono", "rgbd"]
 
+# How much surer the disparity of an observation is than its column and row: the factor on its
+# reprojection error (docs/motorway.md, tools/noise_model.py).
+DISPARITY_WEIGHT = 3.0
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -72,8 +76,9 @@ class Camera:
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """``(5,)`` float64 ``[fx, fy, cx, cy, bf]``, the form that the kernels take."""
-        return np.array([self.fx, self.fy, self.cx, self.cy, self.bf])
+        """``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``, the form that the kernels
+        take."""
+        return np.array([self.fx, self.fy, self.cx, self.cy, self.bf, DISPARITY_WEIGHT])
 
     def project(self, p_c: NDArray[np.float64]) -> NDArray[np.float64]:
         """Project ``(N, 3)`` points of the left camera to ``(N, 3)`` rows ``u, v, u_right``."""

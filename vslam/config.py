@@ -81,7 +81,7 @@ class StereoConfig(_Section):
         description="Depth below which a point is close, baselines. [OS2 III-A, printed]",
     )
     offset_sigma: float = Field(
-        0.0,
+        0.2,
         ge=0,
         description="Sigma of the offset of all disparities before the camera's motion tells it, "
         "pixels; 0: not looked for (docs/motorway.md). [own]",

@@ -30,8 +30,15 @@ def stack_uvr(xy: NDArray[np.floating], u_right: NDArray[np.floating]) -> Matrix
 
 @inner_kernel
 def unpacked(intrinsics):
-    """``(5,)`` fx, fy, cx, cy, bf as a tuple: numbers stay in registers, an array is read anew."""
-    return intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3], intrinsics[4]
+    """``Camera.intrinsics`` as a tuple: numbers stay in registers, an array is read anew."""
+    return (
+        intrinsics[0],
+        intrinsics[1],
+        intrinsics[2],
+        intrinsics[3],
+        intrinsics[4],
+        intrinsics[5],
+    )
 
 
 @inner_kernel
@@ -43,31 +50,30 @@ def chi_square_ratio(x, y, z, u, v, u_right, inverse_sigma2, pinhole):
         u, v, u_right: float64 observation; inverse_sigma2: inverse variance of a pixel coordinate.
         pinhole: intrinsics as ``unpacked`` gives them.
     """
-    fx, fy, cx, cy, bf = pinhole
-    predicted = fx * x / z + cx
-    chi2 = (u - predicted) ** 2 + (v - fy * y / z - cy) ** 2
+    fx, fy, cx, cy, bf, disparity_weight = pinhole
+    chi2 = (u - fx * x / z - cx) ** 2 + (v - fy * y / z - cy) ** 2
     limit = CHI2_MONO
     if not np.isnan(u_right):
-        chi2 += (u_right - predicted + bf / z) ** 2
+        chi2 += (disparity_weight * (u_right - u + bf / z)) ** 2
         limit = CHI2_STEREO
     return chi2 * inverse_sigma2 / limit
 
 
 @inner_kernel
 def residual(x, y, z, u, v, u_right, pinhole):
-    """Reprojection error of a point in the camera in u, v and u_right, 0 for a missing one, and
-    whether the observation is stereo. Arguments as of ``chi_square_ratio``."""
-    fx, fy, cx, cy, bf = pinhole
+    """Reprojection error of a point in the camera in u, v and minus the disparity, which is
+    weighted and 0 where there is none, and whether the observation is stereo. Arguments as of
+    ``chi_square_ratio``."""
+    fx, fy, cx, cy, bf, disparity_weight = pinhole
     iz = 1.0 / z
-    predicted = fx * x * iz + cx
     stereo = not np.isnan(u_right)
-    r_right = u_right - (predicted - bf * iz) if stereo else 0.0
-    return u - predicted, v - (fy * y * iz + cy), r_right, stereo
+    r_disparity = disparity_weight * (u_right - u + bf * iz) if stereo else 0.0
+    return u - (fx * x * iz + cx), v - (fy * y * iz + cy), r_disparity, stereo
 
 
 @inner_kernel
-def chi_square(r_u, r_v, r_right, stereo, inverse_sigma2):
+def chi_square(r_u, r_v, r_disparity, stereo, inverse_sigma2):
     """Squared error of a ``residual`` in variances, and the limit of an inlier, which is where the
     Huber loss becomes linear, too."""
-    chi2 = (r_u * r_u + r_v * r_v + r_right * r_right) * inverse_sigma2
+    chi2 = (r_u * r_u + r_v * r_v + r_disparity * r_disparity) * inverse_sigma2
     return chi2, CHI2_STEREO if stereo else CHI2_MONO

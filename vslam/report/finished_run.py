@@ -84,7 +84,7 @@ def open_images(
         InputError: the images are not there, not those of the run, or of no data set.
     """
     report = run.report
-    if len(set(run.map.sessions)) > 1:
+    if set(run.map.sessions) != {run.map.session}:  # the report is of the last drive
         raise InputError(
             f"{run.folder}: the map is of several drives, whose images cannot be opened together; "
             "export g2o, euroc or ply --no-colours, which need none."

@@ -253,8 +253,11 @@ def test_full_disk_keeps_what_was_written(kitti_tree, tmp_path, monkeypatch, cap
     assert stop.value.code == 1
     message = capsys.readouterr().err
     assert "No space left on device" in message
-    assert "trajectory_kitti.txt" in message
-    assert len(read_kitti_poses(tmp_path / "runs" / "latest" / "trajectory_kitti.txt")) == 5
+    assert "map.npz" in message
+    latest = tmp_path / "runs" / "latest"
+    assert not (latest / "map.npz").exists()  # nor the half of it
+    assert len(read_kitti_poses(latest / "trajectory_kitti.txt")) == 5
+    assert json.loads((latest / "report.json").read_text())["frames"] == 5
 
 
 def test_map_round_trip(kitti_tree, tmp_path, check_map):

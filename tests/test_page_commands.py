@@ -145,6 +145,7 @@ RULES = {
         not_run=(
             ("python tools/motorway.py errors", HOURS),
             ("python tools/motorway.py offset", "it needs a drive of hundreds of metres"),
+            ("python tools/noise_model.py", "it needs two runs; test_noise_model.py has a map"),
         )
     ),
     "docs/online.md": Rules(
@@ -160,6 +161,7 @@ RULES = {
             ("SYNTH=", ORBSLAM),
             ("$SYNTH", ORBSLAM),
             ("vslam bench --dataset synthetic", HOURS),
+            ("python tools/focal_length.py --dataset synthetic", "it renders 600 frames"),
         )
     ),
     "docs/rgbd.md": Rules(

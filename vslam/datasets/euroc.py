@@ -107,7 +107,7 @@ def _read_list(camera: Path) -> tuple[NDArray[np.int64], list[str]]:
         if not line.strip() or line.startswith("#"):
             continue
         stamp, _, name = line.partition(",")
-        if not stamp.strip().isdecimal() or not name.strip() or "/" in name:
+        if not _is_time(stamp.strip()) or not name.strip() or "/" in name:
             raise InputError(
                 f"{path}: line {number} is not a time in nanoseconds and a file name; repair it."
             )
@@ -120,6 +120,11 @@ def _read_list(camera: Path) -> tuple[NDArray[np.int64], list[str]]:
     if not times:
         raise InputError(f"{path}: the list of images is empty; unpack the sequence again.")
     return np.array(times, np.int64), names
+
+
+def _is_time(stamp: str) -> bool:
+    """Whether a text is a number of nanoseconds that 64 bits hold."""
+    return stamp.isdecimal() and len(stamp) <= 19 and int(stamp) <= np.iinfo(np.int64).max
 
 
 def _pair(

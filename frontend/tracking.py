@@ -143,28 +143,30 @@ def extract_features(
         sides: what ``compare_sides`` says of both images, if that is known.
     """
     camera, config = context.camera, context.config
-    if second is None or camera.depth:
+    if second is None:
+        return _features_alone(left, config)
+    if camera.depth:
         found = extract(left, config.orb)
-        if second is None:
-            u_right = np.full(len(found.xy), np.nan, np.float32)
-        else:
-            scale, depth = context.scales[found.octave], np.asarray(second, np.float32)
-            u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
+        scale, depth = context.scales[found.octave], np.asarray(second, np.float32)
+        u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
     else:
         right_image = np.asarray(second, np.uint8)
         sides = sides or compare_sides(left, right_image, config.stereo)
         if sides.black == "left":
-            return _features_of_right(right_image, config)
+            return _features_alone(right_image, config, from_right=True)
         pair = balanced(left, right_image, config.stereo, sides)
         found, right = image_map(lambda image: extract(image, config.orb), pair)
         u_right = match_stereo(found, right, camera, config.stereo)
     return Features(found.xy, found.octave, found.angle, found.descriptors, u_right)
 
 
-def _features_of_right(right: NDArray[np.uint8], config: Config) -> Features:
-    found = extract(right, config.orb)
-    alone = np.full(len(found.xy), np.nan, np.float32)
-    return Features(found.xy, found.octave, found.angle, found.descriptors, alone, from_right=True)
+def _features_alone(
+    image: NDArray[np.uint8], config: Config, *, from_right: bool = False
+) -> Features:
+    """Those of an image whose columns in another one nobody knows."""
+    found = extract(image, config.orb)
+    u_right = np.full(len(found.xy), np.nan, np.float32)
+    return Features(found.xy, found.octave, found.angle, found.descriptors, u_right, from_right)
 
 
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:

@@ -51,12 +51,12 @@ def grey_of(message: Message) -> Image:
     """
     import cv2
 
-    from vslam.datasets.png import is_cut_off
+    from vslam.datasets.png import decode_with_opencv
 
     if not hasattr(message, "encoding"):
         try:
-            data = np.asarray(message.data, np.uint8)
-            image = None if is_cut_off(data.tobytes()) else cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+            data = np.asarray(message.data, np.uint8).tobytes()
+            image = decode_with_opencv(data, cv2.IMREAD_GRAYSCALE)
         except cv2.error:
             image = None
         if image is None:
@@ -110,13 +110,12 @@ def _compressed_depth(message: Message, scale: float | None) -> DepthImage:
     (``compressed_depth_image_transport``, ``ConfigHeader``)."""
     import cv2
 
-    from vslam.datasets.png import is_cut_off
+    from vslam.datasets.png import decode_with_opencv
 
     data = np.asarray(message.data, np.uint8)
     header = np.dtype([("kind", "<i4"), ("a", "<f4"), ("b", "<f4")])
     try:
-        file = data[header.itemsize :]
-        image = None if is_cut_off(file.tobytes()) else cv2.imdecode(file, cv2.IMREAD_UNCHANGED)
+        image = decode_with_opencv(data[header.itemsize :].tobytes(), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if _COMPRESSED_DEPTH not in message.format or image is None or image.dtype != np.uint16:

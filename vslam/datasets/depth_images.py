@@ -93,11 +93,10 @@ def with_depth(camera: Camera, calibration: Calibration) -> Camera:
 def _read_steps(path: Path, width: int, height: int) -> NDArray[np.uint16]:
     import cv2
 
-    from vslam.datasets.png import is_cut_off
+    from vslam.datasets.png import decode_with_opencv
 
     try:
-        data = np.fromfile(path, np.uint8)
-        image = None if is_cut_off(data.tobytes()) else cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        image = decode_with_opencv(path.read_bytes(), cv2.IMREAD_UNCHANGED)
     except (OSError, ValueError, cv2.error):
         image = None
     if image is None:

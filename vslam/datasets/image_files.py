@@ -157,14 +157,13 @@ def read_grey(path: Path) -> Image:
     """
     import cv2
 
-    from vslam.datasets.png import decode_png, is_cut_off
+    from vslam.datasets.png import decode_png, decode_with_opencv
 
     try:
         data = path.read_bytes()
         if (image := decode_png(data)) is not None:
             return image
-        pixels = np.frombuffer(data, np.uint8)
-        decoded = None if is_cut_off(data) else cv2.imdecode(pixels, cv2.IMREAD_GRAYSCALE)
+        decoded = decode_with_opencv(data, cv2.IMREAD_GRAYSCALE)
     except cv2.error as error:
         if "MAX_IMAGE" in str(error):
             raise UnreadableImageError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,6 +107,18 @@ def is_cut_off(data: bytes) -> bool:
         if kind == b"IEND":
             return False
     return False
+
+
+def decode_with_opencv(data: bytes, flags: int) -> NDArray[Any] | None:
+    """``cv2.imdecode`` of the bytes of a file of any format, without the memory that a PNG promises
+    in vain; None where it cannot be decoded.
+
+    Raises:
+        cv2.error: the image is too large, or the file is empty.
+    """
+    import cv2
+
+    return None if is_cut_off(data) else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
 
 
 @kernel

@@ -20,11 +20,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from merge_drives import parts
+from merge_drives import lit_frames, parts
 
 from vslam.datasets import open_sequence
-from vslam.datasets.perturbation import parse_perturbation, perturbed
-from vslam.datasets.stream import timed_frames
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.stress.external import calibration_text
 from vslam.trajectory import Trajectory, read_kitti_poses, write_kitti
@@ -57,10 +55,8 @@ def cut(options: argparse.Namespace) -> None:
     kept: list[int] = []
     times: list[float] = []
     for seed, frames in drives[::2] + drives[1::2]:
-        light = parse_perturbation(options.perturb, seed)
-        every = (frame for k, frame in enumerate(timed_frames(sequence)) if k in frames)
         start = times[-1] + CUT_S if times else 0.0
-        for number, frame in enumerate(perturbed(every, light)):
+        for number, frame in enumerate(lit_frames(sequence, frames, options.perturb, seed)):
             for side, image in enumerate(frame.read(map)):
                 cv2.imwrite(str(folder / f"image_{side}" / f"{len(kept):06d}.png"), image)
             kept.append(frames[number])

@@ -12,6 +12,7 @@ all keyframes, of each drive alone, merged, and of the long drive.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -20,7 +21,7 @@ from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import parse_perturbation, perturbed
 from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import timed_frames
+from vslam.datasets.stream import TimedFrame, timed_frames
 from vslam.evaluation.loops import LoopLimits
 from vslam.evaluation.trajectories import evaluate_trajectory, path_length
 from vslam.geometry import inverses
@@ -71,12 +72,17 @@ def memory(detector: str):
     return create_detector(detector, Config(), None, images), images
 
 
+def lit_frames(sequence: Sequence, frames: range, perturb: str, seed: int) -> Iterator[TimedFrame]:
+    """Some frames of a sequence, in a light of their own."""
+    some = (frame for k, frame in enumerate(timed_frames(sequence)) if k in frames)
+    return perturbed(some, parse_perturbation(perturb, seed))
+
+
 def drive(sequence: Sequence, frames: range, detector: str, perturb: str, seed: int) -> StoredMap:
     made, images = memory(detector)
     slam = Slam(sequence.camera, Config(), made, images=images)
-    light = parse_perturbation(perturb, seed)
-    every = (frame for k, frame in enumerate(timed_frames(sequence)) if k in frames)
-    for timestamp, prepared in prepared_frames(perturbed(every, light), slam.context, 2):
+    lit = lit_frames(sequence, frames, perturb, seed)
+    for timestamp, prepared in prepared_frames(lit, slam.context, 2):
         slam.step_features(prepared.features, timestamp, prepared.image)
     slam.finish()
     stored = slam.stored_map(f"{sequence.name} {frames.start}-{frames[-1]}").compact()

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scale_probe import in_cameras
 
 from vslam.backend.bundle_adjustment import BundleProblem
 from vslam.backend.global_bundle_adjustment import adjust_globally
@@ -46,8 +47,8 @@ def variance_components(
     )
     solution = adjust_globally(scaled, iterations=10)
     owner = np.repeat(np.arange(len(problem.points)), np.diff(problem.first))
-    T = solution.T_cw[problem.camera]
-    q = np.einsum("oij,oj->oi", T[:, :3, :3], solution.points[owner]) + T[:, :3, 3]
+    adjusted = replace(problem, T_cw=solution.T_cw, points=solution.points)
+    q = in_cameras(adjusted)
     fx, fy, cx, cy, bf, _ = problem.intrinsics
     x, y, z = q.T
     u, v, disparity = fx * x / z + cx, fy * y / z + cy, bf / z
@@ -65,6 +66,7 @@ def variance_components(
     with np.errstate(invalid="ignore"):
         good = (z > 0) & (np.abs(np.nan_to_num(error)) < GATE * sigma).all(axis=1)
     # Rows of d(u, v, disparity)/d(point) in units of sigma.
+    R = solution.T_cw[problem.camera, :3, :3]
     nil = np.zeros_like(z)
     P = np.stack(
         [
@@ -75,7 +77,7 @@ def variance_components(
         axis=1,
     )
     spread = octave[:, None] * [pixel, pixel, sigma[2]]
-    J = np.einsum("oij,ojk->oik", P, T[:, :3, :3]) / spread[:, :, None]
+    J = np.einsum("oij,ojk->oik", P, R) / spread[:, :, None]
     J[~stereo, 2] = 0.0
     J[~good] = 0.0
     V = np.zeros((len(problem.points), 3, 3))
@@ -84,7 +86,7 @@ def variance_components(
     counted = good & stereo
     redundancy = (1.0 - lever[counted]).sum(axis=0)
     found = np.sqrt((error[counted] ** 2).sum(axis=0) / redundancy)
-    return replace(problem, T_cw=solution.T_cw, points=solution.points), found, int(counted.sum())
+    return adjusted, found, int(counted.sum())
 
 
 def main() -> None:

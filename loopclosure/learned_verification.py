@@ -219,7 +219,7 @@ def nearest_features(
     # 3 ms. SciPy's tree takes less, but 27 MB and 0.2 s to import.
     x, y = xy.T.astype(np.float64)
     feature = np.array([np.argmin((x - u) ** 2 + (y - v) ** 2) for u, v in uv.tolist()])
-    distance = np.hypot(x[feature] - uv[:, 0], y[feature] - uv[:, 1])
+    distance = np.sqrt((x[feature] - uv[:, 0]) ** 2 + (y[feature] - uv[:, 1]) ** 2)
     near = np.flatnonzero(distance <= config.fuse_pixels * scales[octave[feature]])
     near = near[np.argsort(distance[near], kind="stable")]
     _, first = np.unique(feature[near], return_index=True)

@@ -8,10 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from vslam.evaluation.loops import _pairs_within, judge_loops, metres_per_unit, revisits
+from vslam.evaluation.loops import judge_loops, metres_per_unit, revisits
 from vslam.loops import LoopEdge
 
 Poses = NDArray[np.float64]
@@ -273,11 +272,3 @@ def test_unit_of_a_monocular_map_is_told_from_the_steps_around_a_frame():
     np.testing.assert_allclose(metres_per_unit(T_wc[:1], T_wc[:1]), 1.0)
     standing = np.tile(np.eye(4), (5, 1, 1))
     np.testing.assert_allclose(metres_per_unit(standing, standing), 1.0)
-
-
-@pytest.mark.parametrize(("n", "spread"), [(1, 1.0), (40, 1.0), (2000, 100.0)])
-def test_pairs_are_those_of_a_tree(n, spread):
-    position = np.random.default_rng(n).normal(0, spread, (n, 3)) * [1.0, 0.02, 1.0]
-    first, second = _pairs_within(position, 6.0)
-    found = sorted(zip(first.tolist(), second.tolist(), strict=True))
-    assert found == sorted(cKDTree(position).query_pairs(6.0))

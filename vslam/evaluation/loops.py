@@ -246,6 +246,8 @@ def _earlier_passage(
     T_wc: Poses, timestamps: NDArray[np.float64], path: NDArray[np.float64], limits: LoopLimits
 ) -> Indices:
     """``(S,)`` for each sample the nearest one of an earlier passage, -1 without one."""
+    from scipy.spatial import cKDTree
+
     position, axis = T_wc[:, :3, 3], T_wc[:, :3, 2]
     forward = np.diff(position, axis=0, append=position[-1:])  # to the next sample
     length = np.linalg.norm(forward, axis=1)
@@ -254,7 +256,8 @@ def _earlier_passage(
 
     # The nearest point of a step lies beside it, or at an end: no farther than this from its start.
     radius = float(np.hypot(limits.max_lateral_m, length.max()))
-    start, query = _pairs_within(position, radius)
+    pairs = cKDTree(position).query_pairs(radius, output_type="ndarray")
+    start, query = pairs[:, 0], pairs[:, 1]
     kept = _long_ago(path, timestamps, query, start, limits)
     start, query = start[kept], query[kept]
 
@@ -273,30 +276,6 @@ def _earlier_passage(
     order = np.lexsort((nearest, -distance, query))  # the nearest of each query is written last
     match[query[order]] = nearest[order]
     return match
-
-
-def _pairs_within(position: NDArray[np.float64], radius: float) -> tuple[Indices, Indices]:
-    """All i < j with ``(S, 3)`` positions at most ``radius`` apart, by a grid of such cells. (SciPy
-    has trees for this, and takes longer to import than a run takes to be evaluated.)"""
-    cell = np.floor(position / radius).astype(np.int64)
-    cell -= cell.min(axis=0) - 1
-    weight = np.array([1, *np.cumprod(cell.max(axis=0) + 2)[:2]])
-    key = cell @ weight
-    order = np.argsort(key, kind="stable")
-    sorted_keys = key[order]
-    found = []
-    for offset in np.ndindex(3, 3, 3):
-        beside = key + (np.array(offset) - 1) @ weight
-        first, last = (np.searchsorted(sorted_keys, beside, side) for side in ("left", "right"))
-        count = last - first
-        i = np.repeat(np.arange(len(position)), count)
-        place = np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count)
-        j = order[np.repeat(first, count) + place]
-        later = j > i
-        found.append(np.column_stack([i[later], j[later]]))
-    i, j = np.concatenate(found).T
-    near = ((position[i] - position[j]) ** 2).sum(axis=1) <= radius**2
-    return i[near], j[near]
 
 
 def _long_ago(

@@ -1,7 +1,7 @@
 """How good a trajectory is: ATE, RPE and KITTI's drift, in the definitions that papers use.
 
-ATE and RPE are those of evo (Grupp, 2017), whose command line repeats them; the tests hold them
-together. Importing it and SciPy takes 0.2 s of CPU time, more than evaluating a run does.
+ATE and RPE come from evo (Grupp, 2017), so that anyone can repeat them with its command line; this
+is the only module that imports it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError
-from vslam.geometry import inverses
-from vslam.trajectory import Trajectory, quaternions, read_table, read_trajectory, trajectory_format
+from vslam.trajectory import Trajectory, read_table, read_trajectory, trajectory_format
 
 MAX_TIME_DIFFERENCE_S = 0.01  # evo's default
 _LENGTHS_M = np.arange(100.0, 801.0, 100.0)
@@ -75,29 +74,37 @@ def evaluate_trajectory(
     Raises:
         InputError: unknown alignment, no frames in common, or too little motion to align.
     """
+    from evo import EvoException
+    from evo.core.metrics import APE, RPE, PoseRelation
+    from evo.core.trajectory import PoseTrajectory3D
+
     if alignment not in _EVO_FLAGS:
         raise InputError(
             f"--align {alignment}: unknown alignment; choose one of {', '.join(_EVO_FLAGS)}."
         )
     estimate, ground_truth = _associate(estimate, ground_truth)
-    T_wc_aligned, true = estimate.T_wc, ground_truth.T_wc
+    reference, aligned = (
+        PoseTrajectory3D(poses_se3=list(t.T_wc), timestamps=t.timestamps)
+        for t in (ground_truth, estimate)
+    )
     try:
         if alignment != "none":
-            T_wc_aligned = _aligned(T_wc_aligned, true, with_scale=alignment == "sim3")
-        if len(estimate) < 2:
-            raise np.linalg.LinAlgError("no motion")
-    except np.linalg.LinAlgError as error:
+            aligned.align(reference, correct_scale=alignment == "sim3")
+        ape = APE(PoseRelation.translation_part)
+        ape.process_data((reference, aligned))
+        rpe_m, rpe_deg = RPE(PoseRelation.translation_part), RPE(PoseRelation.rotation_angle_deg)
+        for rpe in (rpe_m, rpe_deg):
+            rpe.process_data((reference, aligned))
+    except EvoException as error:
         raise InputError(
             f"--align {alignment}: {len(estimate)} frames with too little motion to compare; "
             "alignment takes three that are not on one line, --align none takes two."
         ) from error
 
-    errors = np.linalg.norm(T_wc_aligned[:, :3, 3] - true[:, :3, 3], axis=1)
-    # Of the motion from one frame to the next (Sturm et al., section IV-B).
-    steps, true_steps = (inverses(T[:-1]) @ T[1:] for T in (T_wc_aligned, true))
-    step_errors = inverses(true_steps) @ steps
-    distances = path_length(true)
-    drift = kitti_drift(T_wc_aligned, true)
+    T_wc_aligned = np.array(aligned.poses_se3)
+    errors = np.asarray(ape.error)
+    distances = path_length(ground_truth.T_wc)
+    drift = kitti_drift(T_wc_aligned, ground_truth.T_wc)
     return Evaluation(
         frames=len(errors),
         alignment=alignment,
@@ -108,40 +115,11 @@ def evaluate_trajectory(
         errors_m=errors,
         T_wc_aligned=T_wc_aligned,
         distances_m=distances,
-        rpe_m=_rmse(np.linalg.norm(step_errors[:, :3, 3], axis=1)),
-        rpe_deg=_rmse(np.degrees(_angles(step_errors[:, :3, :3]))),
+        rpe_m=_rmse(np.asarray(rpe_m.error)),
+        rpe_deg=_rmse(np.asarray(rpe_deg.error)),
         t_rel_percent=None if drift is None else drift[0],
         r_rel_deg_per_100m=None if drift is None else drift[1],
     )
-
-
-def _aligned(
-    T_wc: NDArray[np.float64], T_wc_true: NDArray[np.float64], *, with_scale: bool
-) -> NDArray[np.float64]:
-    """``(N, 4, 4)`` poses moved to where their positions are nearest to the true ones (Umeyama,
-    TPAMI 1991, equations 38 to 43).
-
-    Raises:
-        LinAlgError: the positions lie on a line.
-    """
-    x, y = T_wc[:, :3, 3], T_wc_true[:, :3, 3]
-    mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
-    U, d, Vt = np.linalg.svd((y - mean_y).T @ (x - mean_x) / len(x))
-    if np.count_nonzero(d > np.finfo(d.dtype).eps) < 2:
-        raise np.linalg.LinAlgError("positions on a line")
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
-    R = (U * signs) @ Vt
-    scale = (d @ signs) / ((x - mean_x) ** 2).sum(axis=1).mean() if with_scale else 1.0
-    aligned = T_wc.copy()
-    aligned[:, :3, :3] = R @ T_wc[:, :3, :3]
-    aligned[:, :3, 3] = scale * (x - mean_x) @ R.T + mean_y
-    return aligned
-
-
-def _angles(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``(N,)`` radians that ``(N, 3, 3)`` rotations turn; exact for small ones, too."""
-    q = quaternions(R)
-    return 2.0 * np.arctan2(np.linalg.norm(q[:, :3], axis=1), q[:, 3])
 
 
 def path_length(T_wc: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -219,14 +197,13 @@ def evo_command(
 
 
 def _associate(estimate: Trajectory, ground_truth: Trajectory) -> tuple[Trajectory, Trajectory]:
+    from evo.core.sync import matching_time_indices
+
     times, true_times = estimate.timestamps, ground_truth.timestamps
     if len(times) == len(true_times) and np.allclose(
         times, true_times, rtol=0.0, atol=MAX_TIME_DIFFERENCE_S
     ):
         return estimate, ground_truth
-
-    from evo.core.sync import matching_time_indices
-
     if len(true_times) > len(times):  # evo looks up the poses of the shorter one in the longer
         mine, true = matching_time_indices(times, true_times, MAX_TIME_DIFFERENCE_S)
     else:

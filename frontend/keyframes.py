@@ -51,9 +51,7 @@ def needs_keyframe(
     wanted: float = config.min_tracked_close
     if evidence.gained_close < wanted:
         wanted = config.min_kept_close * evidence.gained_close
-    starved = (
-        evidence.tracked_close < wanted and evidence.untracked_close > config.min_new_close
-    )
+    starved = evidence.tracked_close < wanted and evidence.untracked_close > config.min_new_close
     moved_on = evidence.n_inliers < config.max_tracked_ratio * evidence.n_reference
     if evidence.seconds_since_keyframe >= max_interval_s:
         return True

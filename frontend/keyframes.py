@@ -41,7 +41,8 @@ def needs_keyframe(
 
     Too few close points are evidence only where a keyframe brings enough of them. On a motorway
     they are few by nature and leave the view before they are seen twice: even the frame after a
-    keyframe tracks too few. There a share of what that frame tracks is all that is asked for.
+    keyframe tracks too few. There a share of what that frame tracks is all that is asked for, as
+    long as as many far points hold the pose: in fog there are none.
 
     Args:
         depth: of an RGB-D camera. Nearly all it sees is close and mapped at once, so that the
@@ -49,7 +50,8 @@ def needs_keyframe(
     """
     max_interval_s = config.depth_max_interval_s if depth else config.max_interval_s
     wanted: float = config.min_tracked_close
-    if evidence.gained_close < wanted:
+    tracked_far = evidence.n_inliers - evidence.tracked_close
+    if evidence.gained_close < wanted <= tracked_far:
         wanted = config.min_kept_close * evidence.gained_close
     starved = evidence.tracked_close < wanted and evidence.untracked_close > config.min_new_close
     moved_on = evidence.n_inliers < config.max_tracked_ratio * evidence.n_reference

@@ -78,6 +78,9 @@ def test_where_keyframes_bring_few_close_points_losing_most_of_those_makes_one()
     assert not decide(tracked_close=16, **few)
     assert decide(tracked_close=15, **few)
     assert not decide(tracked_close=15, gained_close=80.0, untracked_close=70)
+    # Not in fog, where there are no far points to hold the pose, either.
+    assert decide(tracked_close=16, n_inliers=115, n_reference=100, **few)
+    assert not decide(tracked_close=16, n_inliers=116, n_reference=100, **few)
     # Where they bring enough, all of these are wanted.
     assert decide(tracked_close=99, gained_close=100.0)
 

@@ -23,10 +23,11 @@ from vslam.frontend.matching import (
     search_all,
     search_windows,
 )
-from vslam.frontend.orb import extract, scale_factors
+from vslam.frontend.orb import scale_factors
 from vslam.frontend.pose import optimise_pose
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import match_stereo
+from vslam.frontend.weak_images import extract_in_any_light
 from vslam.geometry import compose, inverse, transform
 from vslam.map import LocalMap
 from vslam.reprojection import stack_uvr
@@ -146,7 +147,7 @@ def extract_features(
     if second is None:
         return _features_alone(left, config)
     if camera.depth:
-        found = extract(left, config.orb)
+        (found,) = extract_in_any_light([left], config)
         scale, depth = context.scales[found.octave], np.asarray(second, np.float32)
         u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
     else:
@@ -155,7 +156,7 @@ def extract_features(
         if sides.black == "left":
             return _features_alone(right_image, config, from_right=True)
         pair = balanced(left, right_image, config.stereo, sides)
-        found, right = image_map(lambda image: extract(image, config.orb), pair)
+        found, right = extract_in_any_light(pair, config, image_map)
         u_right = match_stereo(found, right, camera, config.stereo)
     return Features(found.xy, found.octave, found.angle, found.descriptors, u_right)
 
@@ -164,7 +165,7 @@ def _features_alone(
     image: NDArray[np.uint8], config: Config, *, from_right: bool = False
 ) -> Features:
     """Those of an image whose columns in another one nobody knows."""
-    found = extract(image, config.orb)
+    (found,) = extract_in_any_light([image], config)
     u_right = np.full(len(found.xy), np.nan, np.float32)
     return Features(found.xy, found.octave, found.angle, found.descriptors, u_right, from_right)
 

@@ -49,6 +49,53 @@ class OrbConfig(_Section):
     )
 
 
+class WeakImageConfig(_Section):
+    """Images with much noise or little contrast (docs/stress.md)."""
+
+    noise_from: float = Field(
+        5.0,
+        ge=0,
+        description="Deviation of the noise from which images are blurred, grey levels; "
+        "undisturbed ones have at most 2.5. [own]",
+    )
+    noise_left: float = Field(
+        4.0, gt=0, description="Noise that they are blurred to, grey levels. [own]"
+    )
+    max_blur: float = Field(3.5, gt=0, description="Deviation of that blur, at most, pixels. [own]")
+    spikes_from: float = Field(
+        0.04,
+        ge=0,
+        le=1,
+        description="Pixels that stand out alone, share; above, a median filter takes them out. "
+        "[own]",
+    )
+    few_features: float = Field(
+        0.5, ge=0, le=1, description="Share of n_features; below, contrast is measured. [own]"
+    )
+    low_contrast: float = Field(
+        6.0,
+        ge=0,
+        description="Deviation in blocks of 16 pixels, median; below, contrast is raised, grey "
+        "levels; 0: never. [own]",
+    )
+    raised_contrast: float = Field(
+        12.0, gt=0, description="What it is raised to: KITTI's on a bright day. [own]"
+    )
+    contrast_window: int = Field(
+        33, ge=3, description="Side of the window that contrast is raised in, pixels. [own]"
+    )
+    flat_share: float = Field(
+        0.25,
+        gt=0,
+        le=1,
+        description="Contrast of flat parts, share of the median, below which they are not raised "
+        "further. [own]",
+    )
+    least_contrast: float = Field(
+        0.15, gt=0, description="The same in grey levels: what rounding leaves. [own]"
+    )
+
+
 class StereoConfig(_Section):
     """Stereo matching [OS2, III-A]."""
 
@@ -151,6 +198,12 @@ class TrackingConfig(_Section):
     )
     depth_local_window: float = Field(
         5.0, gt=0, description="local_window of an RGB-D camera; ORB-SLAM2 has 7.5. [OS1 V-D, own]"
+    )
+    predicted_window: float = Field(
+        7.0,
+        gt=0,
+        description="local_window where neither the previous frame nor the reference keyframe is "
+        "recognised. [own]",
     )
     local_keyframes: int = Field(
         80, ge=1, description="Keyframes of the local map, at most. [OS1 V-D, customary]"
@@ -732,6 +785,7 @@ class Config(_Section):
     """The whole configuration, written to ``config.json`` of each run and read by --config."""
 
     orb: OrbConfig = OrbConfig()
+    weak_images: WeakImageConfig = WeakImageConfig()
     stereo: StereoConfig = StereoConfig()
     depth: DepthConfig = DepthConfig()
     tracking: TrackingConfig = TrackingConfig()

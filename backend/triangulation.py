@@ -19,12 +19,17 @@ MIN_CLOSE = 100  # stereo points mapped even if none is close (ORB-SLAM2, III-E)
 
 
 def map_stereo_points(
-    map_: Map, keyframe: int, camera: Camera, config: Config
+    map_: Map, keyframe: int, camera: Camera, config: Config, *, far: bool = False
 ) -> NDArray[np.int32]:
     """Map the close stereo features of a keyframe that observe no landmark yet.
 
     If fewer than 100 features are close, the 100 nearest count (ORB-SLAM2, section III-E).
-    Returns the ids of the new landmarks.
+
+    Args:
+        far: far ones, too.
+
+    Returns:
+        The ids of the new landmarks.
     """
     a, rows = map_.arrays, map_.rows(keyframe)
     xy = a.xy[rows].astype(np.float64)
@@ -32,7 +37,7 @@ def map_stereo_points(
     nearest = np.argsort(depth, kind="stable")
     nearest = nearest[: np.count_nonzero(np.isfinite(depth))]
     close = depth[nearest] < config.stereo.close_depth_baselines * camera.baseline
-    nearest = nearest[close | (np.arange(len(nearest)) < MIN_CLOSE)]
+    nearest = nearest[far | close | (np.arange(len(nearest)) < MIN_CLOSE)]
     new = nearest[a.landmark[rows][nearest] == NONE]
     T_wc = inverse(a.T_cw[keyframe])
     xyz = camera.backproject(xy[new], depth[new]) @ T_wc[:3, :3].T + T_wc[:3, 3]

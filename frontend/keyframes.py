@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from vslam.config import KeyframeConfig
 
 
@@ -18,6 +20,8 @@ class KeyframeEvidence:
             (all of them in a young map).
         tracked_close: close stereo features of this frame that track a landmark.
         untracked_close: close stereo features that do not.
+        gained_close: ``tracked_close`` of the first frame after a keyframe, as the last keyframes
+            made one expect; by default all that is wanted, as where nothing is known yet.
         mapping_idle: the last keyframe's local mapping is finished and merged.
     """
 
@@ -27,6 +31,7 @@ class KeyframeEvidence:
     tracked_close: int
     untracked_close: int
     mapping_idle: bool
+    gained_close: float = np.inf
 
 
 def needs_keyframe(
@@ -34,15 +39,21 @@ def needs_keyframe(
 ) -> bool:
     """Decide. Enough new must be visible, and either mapping is free or it is urgent.
 
+    Too few close points are evidence only where a keyframe brings enough of them. On a motorway
+    they are few by nature and leave the view before they are seen twice: even the frame after a
+    keyframe tracks too few. There a share of what that frame tracks is all that is asked for, as
+    long as as many far points hold the pose: in fog there are none.
+
     Args:
         depth: of an RGB-D camera. Nearly all it sees is close and mapped at once, so that the
             counts ask for few keyframes; a hand turns it faster than a car turns.
     """
     max_interval_s = config.depth_max_interval_s if depth else config.max_interval_s
-    starved = (
-        evidence.tracked_close < config.min_tracked_close
-        and evidence.untracked_close > config.min_new_close
-    )
+    wanted: float = config.min_tracked_close
+    tracked_far = evidence.n_inliers - evidence.tracked_close
+    if evidence.gained_close < wanted <= tracked_far:
+        wanted = config.min_kept_close * evidence.gained_close
+    starved = evidence.tracked_close < wanted and evidence.untracked_close > config.min_new_close
     moved_on = evidence.n_inliers < config.max_tracked_ratio * evidence.n_reference
     if evidence.seconds_since_keyframe >= max_interval_s:
         return True
@@ -65,6 +76,33 @@ def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig)
     urgent = tracked < max(config.monocular_urgent_ratio * reference, config.monocular_min_tracked)
     late = evidence.seconds_since_keyframe >= config.max_interval_s
     return evidence.mapping_idle or urgent or late
+
+
+class CloseGain:
+    """What the last keyframes gained: how many close points the first frame after one tracks.
+
+    One such frame may track few by chance; that they are few by nature takes several to show. So
+    this is a mean that forgets, and it begins with plenty.
+
+    Attributes:
+        mean: of those frames.
+        awaited: whether the next frame is the first one after a keyframe.
+    """
+
+    def __init__(self, config: KeyframeConfig) -> None:
+        self.mean = config.first_gain * config.min_tracked_close
+        self.awaited = False
+        self._weight = config.gain_weight
+
+    def begin(self) -> None:
+        """A keyframe was made."""
+        self.awaited = True
+
+    def add(self, tracked_close: int) -> None:
+        """A frame was tracked."""
+        if self.awaited:
+            self.mean += self._weight * (tracked_close - self.mean)
+            self.awaited = False
 
 
 @dataclass(frozen=True)

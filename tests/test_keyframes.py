@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from vslam.config import KeyframeConfig
 from vslam.frontend.keyframes import (
+    CloseGain,
     KeyframeEvidence,
     PlaceEvidence,
     is_known_place,
@@ -21,6 +23,9 @@ CONFIG = KeyframeConfig(
     min_new_close=70,
     max_tracked_ratio=0.75,
     urgent_ratio=0.25,
+    min_kept_close=0.2,
+    first_gain=2.0,
+    gain_weight=0.2,
 )
 CONTENT = KeyframeEvidence(
     seconds_since_keyframe=0.3,
@@ -66,6 +71,30 @@ def test_few_close_points_with_new_ones_in_sight_make_a_keyframe_at_once(idle):
     assert decide(tracked_close=99, untracked_close=71, mapping_idle=idle)
     assert not decide(tracked_close=100, untracked_close=71, mapping_idle=idle)
     assert not decide(tracked_close=99, untracked_close=70, mapping_idle=idle)
+
+
+def test_where_keyframes_bring_few_close_points_losing_most_of_those_makes_one():
+    few = {"gained_close": 80.0, "untracked_close": 300}
+    assert not decide(tracked_close=16, **few)
+    assert decide(tracked_close=15, **few)
+    assert not decide(tracked_close=15, gained_close=80.0, untracked_close=70)
+    # Not in fog, where there are no far points to hold the pose, either.
+    assert decide(tracked_close=16, n_inliers=115, n_reference=100, **few)
+    assert not decide(tracked_close=16, n_inliers=116, n_reference=100, **few)
+    # Where they bring enough, all of these are wanted.
+    assert decide(tracked_close=99, gained_close=100.0)
+
+
+def test_that_close_points_are_few_by_nature_takes_several_keyframes_to_show():
+    gain = CloseGain(CONFIG)
+    means = []
+    for _ in range(6):
+        gain.begin()
+        gain.add(50)
+        gain.add(3)  # later frames do not count
+        means.append(gain.mean)
+    np.testing.assert_allclose(means, 50 + 150 * 0.8 ** np.arange(1, 7), rtol=1e-12)
+    assert [mean < 100 for mean in means] == [False] * 4 + [True] * 2
 
 
 def test_thresholds_come_from_the_configuration():

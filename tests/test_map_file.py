@@ -428,6 +428,7 @@ def alive_that_died(file: Path, to: Path) -> Path:
         entry(T_cw=[[1.0]]),
         entry(closing={}),
         entry(n_tracked="many"),
+        entry(gained_close="many"),
         pytest.param(without_checkpoint, id="none"),
         pytest.param(merged_in_a_circle, id="circle"),
         pytest.param(alive_that_died, id="alive"),

@@ -290,6 +290,26 @@ def test_starts_with_the_first_frame_that_shows_something(corridor):
     assert np.linalg.norm(T_wc[-1, :3, 3] - relative[:3, 3]) < 0.1
 
 
+@pytest.mark.parametrize("first", [0, 2])
+def test_a_start_at_speed_is_tracked_by_far_points(corridor, check_map, first):
+    """2.8 m a frame from the first one on: what is close leaves the view at once."""
+    frames = range(first, 28, 8)
+    slam, results = run(corridor, frames=frames)
+    assert states(results) == "O" * len(frames)
+    relative = inverse(corridor.T_wc[first]) @ corridor.T_wc[list(frames)]
+    assert np.abs(slam.trajectory().T_wc[:, :3, 3] - relative[:, :3, 3]).max() < 0.1
+    check_map(slam.map)
+
+
+def test_far_points_are_mapped_only_where_a_start_fails(corridor):
+    slam, _ = run(corridor, frames=range(0, 28, 4))
+    first = slam.map.arrays.first_keyframe[: slam.map.n_landmarks] == 0
+    assert np.linalg.norm(slam.map.arrays.xyz[: slam.map.n_landmarks][first], axis=1).max() < 30.0
+    fast, _ = run(corridor, frames=range(0, 28, 8))
+    first = fast.map.arrays.first_keyframe[: fast.map.n_landmarks] == 0
+    assert np.linalg.norm(fast.map.arrays.xyz[: fast.map.n_landmarks][first], axis=1).max() > 30.0
+
+
 def test_nothing_but_darkness(corridor):
     slam, results = run(corridor, frames=range(12), black=range(12))
     assert states(results) == "L" * 12

@@ -334,6 +334,22 @@ class KeyframeConfig(_Section):
         description="Untracked close points; insert with more, if too few are tracked. "
         "[OS2 III-E, printed]",
     )
+    min_kept_close: float = Field(
+        0.2,
+        ge=0,
+        le=1,
+        description="min_tracked_close where a keyframe brings fewer: share of what it brings "
+        "(docs/motorway.md). [own]",
+    )
+    first_gain: float = Field(
+        2.0,
+        ge=0,
+        description="Close points that a keyframe is taken to bring at first, of "
+        "min_tracked_close. [own]",
+    )
+    gain_weight: float = Field(
+        0.2, gt=0, le=1, description="Weight of the last keyframe in what one brings. [own]"
+    )
     max_tracked_ratio: float = Field(
         0.75,
         gt=0,

@@ -139,6 +139,29 @@ class MappingThread:
         else:
             self._closing.process(map_, keyframe, frame.features, frame.image)
 
+    def map_far_points(self, frame: Frame) -> bool:
+        """Map all stereo points of a keyframe with which a map or sub-map begins, where nothing
+        follows it yet. Merge first.
+
+        ORB-SLAM2 (III-B) begins with all of them. They bend the first poses by what the pair
+        measures wrong; but at speed close points leave the view within a frame.
+
+        Args:
+            frame: that became the keyframe; its landmarks become those that its features observe.
+
+        Returns:
+            Whether there were any that had not been mapped.
+        """
+        map_, keyframe = self._map, self.reference
+        begins = keyframe == 0 or keyframe in map_.restarts
+        if not begins or keyframe != map_.n_keyframes - 1 or map_.frames[keyframe] != frame.index:
+            return False
+        new = map_stereo_points(map_, keyframe, self._camera, self._config, far=True)
+        refresh_keyframe(map_, keyframe)
+        self._copy_view()
+        self._observe(frame, keyframe)
+        return len(new) > 0
+
     def begin(self, start: TwoViewStart) -> tuple[int, int]:
         """Add the first two keyframes of a monocular map or sub-map. Merge first.
 

@@ -20,6 +20,7 @@ from vslam.errors import InputError
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.frame_poses import FramePoses, FrameTable
 from vslam.frontend.keyframes import (
+    CloseGain,
     KeyframeEvidence,
     PlaceEvidence,
     is_known_place,
@@ -134,6 +135,7 @@ class Slam:
         self._velocity: Matrix | None = None  # twist per second, None if unknown
         self._lost_frames = 0
         self._n_tracked = 0  # landmarks, in the last frame tracked
+        self._close_gain = CloseGain(self.config.keyframes)
         self._initialiser = Initialiser(self.context)  # of monocular maps
         self._is_between = True  # frames: nothing of the next one is tracked yet
         if resume and start is not None and start.checkpoint is not None:
@@ -237,6 +239,8 @@ class Slam:
             last_timestamp=self._mapping.last_timestamp,
             lost_frames=self._lost_frames,
             n_tracked=self._n_tracked,
+            gained_close=self._close_gain.mean,
+            gain_awaited=self._close_gain.awaited,
             closing=self._closing.memory(),
         )
 
@@ -245,6 +249,8 @@ class Slam:
         self._closing.restore(checkpoint.closing)
         self._velocity = checkpoint.velocity
         self._lost_frames, self._n_tracked = checkpoint.lost_frames, checkpoint.n_tracked
+        gain = self._close_gain
+        gain.mean, gain.awaited = checkpoint.gained_close, checkpoint.gain_awaited
         index, timestamp = checkpoint.index, checkpoint.timestamp
         frame = Frame.untracked(checkpoint.features, self.camera, index, timestamp)
         tracked = checkpoint.landmark >= 0
@@ -451,11 +457,11 @@ class Slam:
     def _locate(self, frame: Frame, T_cw: Matrix, clock: _Clock) -> _Found:
         """The pose of a frame, expected at ``T_cw``: by tracking or, where that fails or is
         doubtful, in the whole map."""
-        inliers = self._track_previous_frame(frame, T_cw)
-        clock.lap("track_frame")
-        matches, inliers, visible = self._track_local_map(frame, inliers)
-        clock.lap("track_local_map")
+        matches, inliers, visible = self._track_around(frame, T_cw, clock)
         state = self._state_of(inliers, matches)
+        if state == TrackingState.LOST and self._see_far():
+            matches, inliers, visible = self._track_around(frame, T_cw, clock)
+            state = self._state_of(inliers, matches)
         if state == TrackingState.LOST:
             elsewhere = self._relocalise(frame)
         elif self._is_doubtful(frame, inliers):
@@ -496,6 +502,25 @@ class Slam:
             return inliers
         frame.landmark[:], frame.xyz[:] = -1, np.nan
         return 0
+
+    def _track_around(
+        self, frame: Frame, T_cw: Matrix, clock: _Clock
+    ) -> tuple[int, int, NDArray[np.int32]]:
+        """Track a frame by what was seen last and by the map around; see ``track_local_map``."""
+        inliers = self._track_previous_frame(frame, T_cw)
+        clock.lap("track_frame")
+        found = self._track_local_map(frame, inliers)
+        clock.lap("track_local_map")
+        return found
+
+    def _see_far(self) -> bool:
+        """Map the far points of a keyframe that the camera has left too fast; returns whether."""
+        if self._localize or self.frame is None or self.camera.monocular:
+            return False
+        if self._velocity is not None:
+            return False
+        self._merge()
+        return self._mapping.map_far_points(self.frame)
 
     def _track_local_map(self, frame: Frame, inliers: int) -> tuple[int, int, NDArray[np.int32]]:
         if inliers < self.config.tracking.min_inliers_frame:
@@ -680,13 +705,16 @@ class Slam:
     def _needs_keyframe(self, frame: Frame, inliers: int) -> bool:
         close = feature_depth(frame.features, self.camera) < self.context.close_depth
         tracked = frame.landmark >= 0
+        tracked_close = int(np.count_nonzero(close & tracked))
+        self._close_gain.add(tracked_close)
         evidence = KeyframeEvidence(
             seconds_since_keyframe=frame.timestamp - self._mapping.last_timestamp,
             n_inliers=inliers,
             n_reference=self._mapping.n_reference,
-            tracked_close=int(np.count_nonzero(close & tracked)),
+            tracked_close=tracked_close,
             untracked_close=int(np.count_nonzero(close & ~tracked)),
             mapping_idle=not self._mapping.busy,
+            gained_close=self._close_gain.mean,
         )
         if self.camera.monocular:
             return needs_monocular_keyframe(evidence, self.config.keyframes)
@@ -710,6 +738,7 @@ class Slam:
         """Make a keyframe of the frame placed last (``MappingThread.insert``)."""
         self._merge(frame)
         self._mapping.insert(frame, predicted=predicted)
+        self._close_gain.begin()
         self._poses.replace(frame.index, self._mapping.reference)
 
     def _merge(self, current: Frame | None = None, *, renumber: bool = True) -> None:

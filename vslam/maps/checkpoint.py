@@ -22,7 +22,7 @@ ARRAYS: dict[str, tuple[type, tuple[int | None, ...]]] = {
     "landmark": (np.int32, (None,)),
 }
 _NUMBERS = ("index", "timestamp", "reference", "last_frame", "last_timestamp", "lost_frames",
-            "n_tracked")  # fmt: skip
+            "n_tracked", "gained_close", "gain_awaited")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ class Checkpoint:
         last_frame, last_timestamp: when the last keyframe was made.
         lost_frames: since the last frame tracked.
         n_tracked: landmarks in it when it was tracked.
+        gained_close, gain_awaited: close points that a keyframe brings (``CloseGain``).
         closing: what loop closing remembers.
     """
 
@@ -54,6 +55,8 @@ class Checkpoint:
     last_timestamp: float
     lost_frames: int
     n_tracked: int
+    gained_close: float
+    gain_awaited: bool
     closing: ClosingMemory
 
 

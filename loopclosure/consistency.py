@@ -94,14 +94,22 @@ class LoopConsistency:
 
     def votes(self, edge: LoopEdge, map_: Map) -> int:
         """How many recent keyframes, that of the edge included, were verified with its drift."""
-        drift = implied_drift(edge, map_)
-        where = inverse(map_.keyframe_pose(edge.query))[:3, 3]
         agreeing = {
             other.query
             for _, other in self._verified
-            if other.query != edge.query and self._agree(drift, implied_drift(other, map_), where)
+            if other.query != edge.query and self.agree(edge, other, map_)
         }
         return 1 + len(agreeing)
+
+    def waiting(self) -> list[LoopEdge]:
+        """Verified edges that would count at the next keyframe, the newest first."""
+        oldest = self._turn + 1 - self.config.verified_memory
+        return [edge for turn, edge in reversed(self._verified) if turn >= oldest]
+
+    def agree(self, edge: LoopEdge, other: LoopEdge, map_: Map) -> bool:
+        """Whether two edges imply the same drift at the query of the first."""
+        where = inverse(map_.keyframe_pose(edge.query))[:3, 3]
+        return self._agree(implied_drift(edge, map_), implied_drift(other, map_), where)
 
     def memory(self) -> ClosingMemory:
         """What is remembered, for a file."""

@@ -88,11 +88,21 @@ def verify(
             edge, reason=f"no motion that {config.min_consensus} of the matches agree on"
         )
     edge = replace(edge, n_inliers=n_inliers, T_query_match=T_query_match, scale=scale)
+    return verify_near(map_, edge, camera, config)
 
-    place = place_of(map_, match, query, config)
-    T_mw = map_.keyframe_pose(match)
+
+def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationConfig) -> LoopEdge:
+    """``verify`` from where an edge puts the query, with no descriptors matched before.
+
+    Raises:
+        ValueError: the edge has no pose.
+    """
+    if edge.T_query_match is None:
+        raise ValueError(f"the edge from {edge.query} to {edge.match} has no pose")
+    place = place_of(map_, edge.match, edge.query, config)
+    T_mw = map_.keyframe_pose(edge.match)
     landmarks = collect_landmarks(map_.arrays, place, map_.n_landmarks)
-    guided = guided_match(map_, query, landmarks, T_query_match @ T_mw, camera, config)
+    guided = guided_match(map_, edge.query, landmarks, edge.T_query_match @ T_mw, camera, config)
     T_query_match = orthonormalised(guided.T_cw @ inverse(T_mw))
     edge = replace(
         edge,
@@ -103,7 +113,8 @@ def verify(
         landmarks=guided.landmarks[guided.seen],
     )
     if camera.monocular:
-        edge = replace(edge, scale=relative_scale(map_, edge, guided.T_cw, default=scale))
+        scale = relative_scale(map_, edge, guided.T_cw, default=edge.scale)
+        edge = replace(edge, scale=scale)
     reason = _rejection_reason(map_, edge, guided, T_query_match, camera, config)
     return replace(edge, accepted=not reason, reason=reason or "verified")
 

@@ -22,22 +22,26 @@ class Ring:
     """Points on both sides of the road, each with a descriptor of its own.
 
     The camera is told a focal length that is ``focal_error`` too long: it takes every turn for
-    wider or narrower than it is, and a lap ends off its start.
+    wider or narrower than it is, and a lap ends off its start. With ``zoom`` a point is found in
+    the octave that its distance asks for, else in octave 0.
     """
 
     points: np.ndarray
     descriptors: np.ndarray
     focal_error: float = 0.0
+    zoom: bool = False
 
     @classmethod
-    def create(cls, seed: int = 0, n: int = 12000, focal_error: float = 0.0) -> Ring:
+    def create(
+        cls, seed: int = 0, n: int = 12000, focal_error: float = 0.0, zoom: bool = False
+    ) -> Ring:
         rng = np.random.default_rng(seed)
         angle = rng.uniform(0, 2 * np.pi, n)
         inner = rng.random(n) < 0.5
         radius = np.where(inner, RADIUS - 6, RADIUS + 6) + rng.uniform(-1, 1, n)
         height = rng.uniform(-5.0, 1.4, n)
         points = np.stack([radius * np.cos(angle), height, radius * np.sin(angle)], axis=1)
-        return cls(points, rng.integers(0, 256, (n, 32), dtype=np.uint8), focal_error)
+        return cls(points, rng.integers(0, 256, (n, 32), dtype=np.uint8), focal_error, zoom)
 
     def pose(self, k: float) -> np.ndarray:
         """``T_wc`` at frame k, counter-clockwise seen from below."""
@@ -65,12 +69,13 @@ class Ring:
         xy = np.stack([u[seen], v[seen]], axis=1) + rng.normal(0, 0.5, (n, 2))
         u_right = xy[:, 0] - CAMERA.bf * (1.0 + self.focal_error) / z[seen]
         u_right += rng.normal(0, 0.17, n)
+        octave = np.log(30.0 / np.linalg.norm(p[seen], axis=1)) / np.log(1.2) * self.zoom
         bits = np.unpackbits(self.descriptors[seen], axis=1)
         for _ in range(6):
             bits[np.arange(n), rng.integers(0, 256, n)] ^= 1
         return Features(
             xy.astype(np.float32),
-            np.zeros(n, np.uint8),
+            np.clip(np.round(octave), 0, 7).astype(np.uint8),
             np.zeros(n, np.float32),
             np.packbits(bits, axis=1),
             u_right.astype(np.float32),

@@ -92,6 +92,30 @@ def test_a_closed_loop_takes_the_drift_out(check_map):
     check_map(slam.map)
 
 
+ZOOMING = Ring.create(focal_error=0.015, zoom=True)
+ENDS_EARLY = ROUND[: LAP + 14]
+
+
+def test_a_drive_that_ends_before_the_next_keyframe_asks_an_earlier_one():
+    slam, _ = run(ZOOMING, ENDS_EARLY, Oracle(ZOOMING, ENDS_EARLY), finish=False)
+    assert slam.loops[-1].reason == "verified by 1 of 2 keyframes"
+    assert errors(slam, ZOOMING, ENDS_EARLY)[-1] > 3.0
+    slam.finish()
+    waiting, closed = slam.loops[-2:]
+    assert (closed.query, closed.match, closed.reason) == (waiting.query, waiting.match, "closed")
+    assert errors(slam, ZOOMING, ENDS_EARLY)[-1] < 1.2
+    before = len(slam.loops)
+    slam.finish()
+    assert len(slam.loops) == before
+
+
+def test_a_loop_that_no_earlier_keyframe_far_enough_away_confirms_stays_open():
+    config = Config(consistency=ConsistencyConfig(min_moved=20.0))
+    slam, _ = run(ZOOMING, ENDS_EARLY, Oracle(ZOOMING, ENDS_EARLY), config=config)
+    assert slam.loops[-1].reason == "verified by 1 of 2 keyframes"
+    assert not slam.corrections
+
+
 def test_both_ends_of_a_loop_see_the_same_landmarks_afterwards():
     slam = closed()
     edge = slam.corrections[0].edge

@@ -47,7 +47,7 @@ from vslam.loopclosure.consistency import LoopConsistency
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_verification import LearnedTrials, shows_known, verify_learned
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
-from vslam.loopclosure.verification import verify
+from vslam.loopclosure.verification import verify, verify_near
 from vslam.loops import ClosingMemory, LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map
 
@@ -167,6 +167,42 @@ class LoopClosing:
         if edge.T_query_match is not None:
             return edge
         return replace(by_orb, reason=f"{by_orb.reason}; {edge.reason}")
+
+    def conclude(self, map_: Map) -> None:
+        """At the end of a drive, close a loop that waits for another keyframe to agree if one from
+        before does: looked at from there with the same drift, the place must pass the same tests
+        (ORB-SLAM3, section VI, asks covisible keyframes first and later ones then)."""
+        for waiting in self._consistency.waiting():
+            if not map_.arrays.keyframe_alive[[waiting.query, waiting.match]].all():
+                continue
+            edge = verify_near(map_, waiting, self._camera, self._config.verification)
+            if not edge.accepted or not self._agrees_before(map_, edge):
+                continue
+            edge = self._close(map_, edge)
+            self.edges.append(edge)
+            if edge.accepted:
+                self._consistency.reset()
+                return
+
+    def _agrees_before(self, map_: Map, edge: LoopEdge) -> bool:
+        """Whether a keyframe that shares landmarks with the query, and is not where the query is,
+        is verified with the drift of the edge."""
+        assert edge.T_query_match is not None
+        config = self._config
+        for keyframe in map_.covisible(edge.query)[0].tolist():
+            T_keyframe_query = map_.keyframe_pose(keyframe) @ inverse(
+                map_.keyframe_pose(edge.query)
+            )
+            if np.linalg.norm(T_keyframe_query[:3, 3]) < config.consistency.min_moved:
+                continue
+            T_keyframe_query[:3, 3] /= edge.scale
+            expected = replace(
+                edge, query=keyframe, T_query_match=T_keyframe_query @ edge.T_query_match
+            )
+            other = verify_near(map_, expected, self._camera, config.verification)
+            if other.accepted and self._consistency.agree(edge, other, map_):
+                return True
+        return False
 
     def finish(self, map_: Map) -> None:
         """Merge the global bundle adjustment that is under way, if there is one."""

@@ -611,6 +611,12 @@ class ConsistencyConfig(_Section):
     max_turn: float = Field(
         1.0, gt=0, description="Rotation between agreeing loops, degrees. [own]"
     )
+    min_moved: float = Field(
+        2.0,
+        ge=0,
+        description="At the end of a drive, distance of an earlier keyframe that may confirm a "
+        "loop, metres: one next to the query would only repeat it. [own]",
+    )
 
 
 class RelocalizationConfig(_Section):

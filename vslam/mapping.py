@@ -190,6 +190,7 @@ class MappingThread:
     def finish(self) -> None:
         """Complete all that is pending, global bundle adjustment included."""
         self.merge()
+        self._closing.conclude(self._map)
         self._closing.finish(self._map)
         if self.n_keyframes:
             self._copy_view()

@@ -97,17 +97,9 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
         for x in range(length):
             s = here[x + 1]
             # Of equal neighbours the first in row order wins.
-            is_corner[x] = (
-                (s > weakest)
-                & (s > here[x])
-                & (s >= here[x + 2])
-                & (s > above[x])
-                & (s > above[x + 1])
-                & (s > above[x + 2])
-                & (s >= below[x])
-                & (s >= below[x + 1])
-                & (s >= below[x + 2])
-            )
+            before = max(max(above[x], above[x + 1]), max(above[x + 2], here[x]))
+            after = max(max(below[x], below[x + 1]), max(below[x + 2], here[x + 2]))
+            is_corner[x] = (s > max(before, weakest)) & (s >= after)
         for w in range(len(words)):
             corners = words[w]
             while corners != 0:

@@ -251,3 +251,22 @@ def test_tracking_and_mapping_load_no_heavy_library():
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd="/")
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
+
+
+def test_a_run_loads_what_it_needs(kitti_tree, tmp_path):
+    """A third of the start are imports: without pages, recording or ground truth a run does
+    without these."""
+    (tmp_path / "sequences").symlink_to(kitti_tree / "sequences")
+    script = (
+        "import atexit, sys\n"
+        "from vslam.cli.main import main\n"
+        f"unneeded = {set(ONLY_IN) - {'deflate', 'typer'} | {'scipy.spatial', 'matplotlib'}}\n"
+        "atexit.register(lambda: print(*sorted(unneeded & set(sys.modules))))\n"
+        "main()\n"
+    )
+    words = ["run", "--data", tmp_path, "--no-record", "--no-report", "--quiet"]
+    done = subprocess.run(
+        [sys.executable, "-c", script, *map(str, words)],
+        capture_output=True, text=True, cwd=tmp_path,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, "\n"), done.stderr

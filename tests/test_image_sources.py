@@ -19,7 +19,7 @@ from vslam.loopclosure.siamese.data import (
     refuse_test_data,
     write_pairs,
 )
-from vslam.loopclosure.siamese.image_source import undistorted
+from vslam.loopclosure.siamese.image_source import read_loop_matrix, undistorted
 from vslam.loopclosure.siamese.kitti_source import relation_of_poses
 from vslam.loopclosure.siamese.pack import write_pack
 from vslam.loopclosure.siamese.source_registry import open_source
@@ -131,6 +131,11 @@ def test_fabmap_ground_truth_must_fit_and_hold_something(tmp_path):
     (folder / "truth.mat").write_bytes(b"not a matrix")
     with pytest.raises(InputError, match=r"not a readable \.mat file"):
         open_source(f"fabmap:{folder}")
+
+
+def test_a_loop_matrix_that_is_not_there(tmp_path):
+    with pytest.raises(InputError, match="no such file; name the loop matrix"):
+        read_loop_matrix(tmp_path / "none.mat")
 
 
 def test_undistortion_straightens_lines():

@@ -180,6 +180,8 @@ def test_each_feature_takes_the_nearest_pixel():
     octave = np.array([0, 0, 0], np.uint8)
     feature, index = nearest_features(uv, xy, octave, 1.2 ** np.arange(8.0), CONFIG.learned)
     assert sorted(zip(feature.tolist(), index.tolist(), strict=True)) == [(0, 1), (1, 2)]
+    one, _ = nearest_features(uv[:1], xy[[0, 0]], octave[:2], 1.2 ** np.arange(8.0), CONFIG.learned)
+    assert one.tolist() == [0]  # of two at one pixel the finer, which comes first
     none = nearest_features(uv[:0], xy, octave, np.ones(8), CONFIG.learned)
     assert [len(x) for x in none] == [0, 0]
 

@@ -9,6 +9,7 @@ from vslam.geometry import se3_exp
 from vslam.trajectory import (
     Trajectory,
     bridge_gaps,
+    quaternions,
     read_kitti_poses,
     read_trajectory,
     trajectory_format,
@@ -106,3 +107,19 @@ def test_gaps_are_bridged_at_constant_velocity():
     bridged = bridge_gaps(Trajectory(times, guessed), known)
     np.testing.assert_allclose(bridged.T_wc[:4], T_wc[:4], atol=1e-12)
     np.testing.assert_array_equal(bridged.T_wc[4], np.eye(4))  # nothing known after it
+
+
+def test_quaternions_are_those_of_scipy_to_the_last_bit():
+    rng = np.random.default_rng(0)
+    half_turns = Rotation.from_matrix([np.diag(d) for d in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])])
+    for rotations in (
+        Rotation.random(1000, rng=1),
+        Rotation.from_rotvec(rng.normal(0, 1e-3, (1000, 3))),
+        half_turns,
+        Rotation.identity(2),
+    ):
+        R = rotations.as_matrix()
+        for almost in (R, R + rng.normal(0, 1e-8, R.shape)):
+            expected = Rotation.from_matrix(almost).as_quat(canonical=True)
+            assert quaternions(almost).tobytes() == expected.tobytes()
+    assert quaternions(np.empty((0, 3, 3))).shape == (0, 4)

@@ -111,6 +111,8 @@ def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; name the loop matrix of these images.")
     try:
         content = loadmat(path)
     except (OSError, ValueError, TypeError, NotImplementedError, MatReadError) as error:

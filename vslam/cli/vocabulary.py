@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.errors import InputError
+from vslam.errors import InputError, UnreadableImageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -150,15 +150,15 @@ def _extract_all(paths: list[Path], config: OrbConfig) -> Iterator[NDArray[np.ui
     """Yield the ``(n, 32)`` descriptors of each image in turn, None if it cannot be read."""
     from concurrent.futures import ThreadPoolExecutor
 
-    import cv2
-    import numpy as np
-
+    from vslam.datasets.image_files import read_grey
     from vslam.frontend.orb import extract
     from vslam.machine import available_cores
 
     def one(path: Path) -> NDArray[np.uint8] | None:
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        return None if image is None else extract(np.asarray(image, np.uint8), config).descriptors
+        try:
+            return extract(read_grey(path), config).descriptors
+        except UnreadableImageError:
+            return None
 
     threads = min(available_cores(), 4)
     with ThreadPoolExecutor(threads) as pool:

@@ -46,7 +46,7 @@ def save_map(path: Path, stored: StoredMap, *, resumable: bool = False) -> None:
         OSError: it cannot be written.
     """
     whole = resumable and stored.checkpoint is not None
-    arrays = _as_arrays(stored if whole else stored.compact())
+    arrays = _as_arrays(stored if whole else stored.compact(copy=False))
     with replaced_file(path) as file:
         np.savez(file, allow_pickle=False, **arrays)
 

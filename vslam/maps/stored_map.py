@@ -66,20 +66,24 @@ class StoredMap:
     world: World | None = None
     checkpoint: Checkpoint | None = None
 
-    def compact(self) -> StoredMap:
+    def compact(self, *, copy: bool = True) -> StoredMap:
         """A copy with the living keyframes and landmarks alone, numbered without gaps.
 
         What was placed by a culled keyframe is placed by the living one that took its place.
         Landmarks come in the order of the first keyframe that lives.
-        """
-        return self.select(self.map.living_keyframes())
 
-    def select(self, keyframes: NDArray[np.int64]) -> StoredMap:
+        Args:
+            copy: False: of keypoints, three quarters of a map, a view where all are kept.
+        """
+        return self.select(self.map.living_keyframes(), copy=copy)
+
+    def select(self, keyframes: NDArray[np.int64], *, copy: bool = True) -> StoredMap:
         """``compact`` with some of the living keyframes only, and the landmarks that they see.
 
         Args:
             keyframes: ``(K,)`` ascending ids of living keyframes. Frames are dropped unless these
                 are all.
+            copy: as ``compact``.
         """
         map_ = self.map
         whole = len(keyframes) == np.count_nonzero(map_.arrays.keyframe_alive[: map_.n_keyframes])
@@ -94,7 +98,7 @@ class StoredMap:
         tables = {name: table.select(keyframes) for name, table in self.detector.tables.items()}
         return replace(
             self,
-            map=selected(map_, keyframes),
+            map=selected(map_, keyframes, copy=copy),
             loops=tuple(loops),
             detector=replace(self.detector, tables=tables),
             images=None if self.images is None else self.images.select(keyframes),
@@ -103,7 +107,7 @@ class StoredMap:
         )
 
 
-def selected(map_: Map, keyframes: NDArray[np.int64]) -> Map:
+def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> Map:
     """A copy with some of the living keyframes only, ``(K,)`` ascending ids, and the landmarks that
     they see, numbered without gaps.
 
@@ -135,6 +139,8 @@ def selected(map_: Map, keyframes: NDArray[np.int64]) -> Map:
         np.concatenate([[0], np.cumsum(count[kept])]),
         a.u_right[kept_rows],
     )
+    all_kept = len(kept_rows) == map_.n_rows
+    of_rows = slice(map_.n_rows) if all_kept and not copy else kept_rows
     found = Map(map_.scales)
     found.n_keyframes, found.n_landmarks, found.n_rows = n, len(landmarks), len(kept_rows)
     found.disparity_offset = map_.disparity_offset
@@ -152,11 +158,11 @@ def selected(map_: Map, keyframes: NDArray[np.int64]) -> Map:
         found=a.found[landmarks],
         landmark_alive=np.ones(len(landmarks), np.bool_),
         merged_into=np.full(len(landmarks), NONE, np.int32),
-        xy=a.xy[kept_rows],
-        u_right=a.u_right[kept_rows],
-        octave=a.octave[kept_rows],
-        angle=a.angle[kept_rows],
-        descriptor=a.descriptor[kept_rows],
+        xy=a.xy[of_rows],
+        u_right=a.u_right[of_rows],
+        octave=a.octave[of_rows],
+        angle=a.angle[of_rows],
+        descriptor=a.descriptor[of_rows],
         keyframe=np.repeat(np.arange(n, dtype=np.int32), np.diff(first_row)),
         **links,
     )

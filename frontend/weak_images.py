@@ -24,7 +24,7 @@ Grey = NDArray[np.uint8]
 ROW_STRIDE = 32  # of the rows that noise is measured in: 15 thousand pixels of a KITTI image
 # Of a normal number, the median of the size; of I[x-1] - 2 I[x] + I[x+1], the deviation.
 _SECOND_DIFFERENCE = 0.6745 * 6.0**0.5
-_SPIKE_DEVIATIONS, _LEAST_SPIKE = 4.0, 32.0  # of the noise, grey levels
+_SPIKE_DEVIATIONS, LEAST_SPIKE = 4.0, 32.0  # of the noise, grey levels
 _MEDIAN = 5  # side of the filter against spikes, pixels
 _GAUSSIAN = 2.0 * np.pi**0.5  # noise after a blur of s pixels is a (2 sqrt(pi) s)-th
 _BLOCK = 16  # side of the blocks that contrast is measured in, pixels
@@ -51,10 +51,10 @@ def extract_in_any_light(
 def without_noise(images: Sequence[Grey], config: WeakImageConfig) -> Sequence[Grey]:
     """The images, those of usual noise themselves: pixels that stand out alone are replaced by
     the median around, and normal noise is blurred to ``noise_left``."""
-    measured = [grain(image, ROW_STRIDE, _LEAST_SPIKE) for image in images]
+    measured = [grain(image, ROW_STRIDE, LEAST_SPIKE) for image in images]
     if max(spikes for _, spikes in measured) > config.spikes_from:
         images = [np.asarray(cv2.medianBlur(image, _MEDIAN), np.uint8) for image in images]
-        measured = [grain(image, ROW_STRIDE, _LEAST_SPIKE) for image in images]
+        measured = [grain(image, ROW_STRIDE, LEAST_SPIKE) for image in images]
     noise = max(sigma for sigma, _ in measured)
     if noise < config.noise_from:
         return images
@@ -101,14 +101,23 @@ def grain(image, stride, least):
 
 
 def is_faint(images: Sequence[Grey], counts: Sequence[int], config: Config) -> bool:
-    """Whether an image has few corners because of low contrast; one that shows nothing at all is
-    not asked."""
-    weak = config.weak_images
-    few = weak.few_features * config.orb.n_features
+    """Whether an image has few corners because of low contrast. One out of focus has few, too, but
+    raising it would raise its rounding; one that shows nothing at all is not asked."""
+    few = config.weak_images.few_features * config.orb.n_features
     return any(
-        count < few and int(np.ptp(image)) > _SHOWS_NOTHING and contrast(image) < weak.low_contrast
+        count < few and int(np.ptp(image)) > _SHOWS_NOTHING and _is_faint(image, config.weak_images)
         for image, count in zip(images, counts, strict=True)
     )
+
+
+def _is_faint(image: Grey, config: WeakImageConfig) -> bool:
+    deviation = contrast(image)
+    return deviation < config.low_contrast and detail(image) >= config.least_detail * deviation
+
+
+def detail(image: Grey) -> float:
+    """Mean size of second differences along the rows, grey levels."""
+    return float(np.abs(np.diff(image[::2].astype(np.int16), 2, axis=1)).mean())
 
 
 def contrast(image: Grey) -> float:

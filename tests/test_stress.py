@@ -478,3 +478,12 @@ def test_stress_refuses_before_it_starts(tmp_path, words, said):
     assert isinstance(done.exception, InputError)
     assert said in str(done.exception)
     assert not (tmp_path / "out").exists()
+
+
+def test_the_table_of_boundaries_is_that_of_the_csv(monkeypatch):
+    root = Path(__file__).parents[1]
+    monkeypatch.syspath_prepend(str(root / "tools"))
+    import boundary_table
+
+    made = boundary_table.table(root / "docs" / "stress" / "kitti00.csv", "bow", "orbslam3")
+    assert made in (root / "docs" / "stress.md").read_text(), "run: python tools/boundary_table.py"

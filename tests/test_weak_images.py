@@ -12,10 +12,12 @@ from vslam.frontend.orb import extract
 from vslam.frontend.stereo import match_stereo
 from vslam.frontend.tracking import TrackingContext, extract_features
 from vslam.frontend.weak_images import (
+    LEAST_SPIKE,
     ROW_STRIDE,
     contrast,
     extract_in_any_light,
     grain,
+    is_faint,
     with_contrast,
     without_noise,
 )
@@ -75,16 +77,26 @@ def test_a_textureless_image_of_good_light_is_not_touched():
     assert found.pyramid.level(0).tobytes() == stripes.tobytes()
 
 
+def test_an_image_out_of_focus_is_not_faint():
+    """It has as few corners and as little contrast as a faint one, but no detail."""
+    sharp, blurred = scene(spread=2.0)[0], scene(spread=2.0, grain_px=12.0)[0]
+    assert contrast(camera_image(sharp)) < CONFIG.weak_images.low_contrast
+    assert contrast(camera_image(blurred)) < CONFIG.weak_images.low_contrast
+    assert is_faint([camera_image(sharp)], [0], CONFIG)
+    (found,) = extract_in_any_light([camera_image(3.0 * blurred - 220.0)], CONFIG)
+    assert found.pyramid.level(0).tobytes() == camera_image(3.0 * blurred - 220.0).tobytes()
+
+
 @pytest.mark.parametrize("noise", [5.0, 10.0, 20.0, 40.0])
 def test_noise_is_measured_in_grey_levels(noise):
     image = camera_image(scene(spread=15.0, grain_px=4.0)[0], noise)
-    sigma, spikes = grain(image, ROW_STRIDE, 32.0)
+    sigma, spikes = grain(image, ROW_STRIDE, LEAST_SPIKE)
     assert sigma == pytest.approx(noise, rel=0.1)
     assert spikes < CONFIG.weak_images.spikes_from
 
 
 def test_texture_is_no_noise():
-    sigma, spikes = grain(camera_image(scene()[0]), ROW_STRIDE, 32.0)
+    sigma, spikes = grain(camera_image(scene()[0]), ROW_STRIDE, LEAST_SPIKE)
     assert sigma < 0.5 * 35.0
     assert spikes == 0.0
 
@@ -93,7 +105,7 @@ def test_texture_is_no_noise():
 def test_spikes_are_counted_and_taken_out(share):
     clean = camera_image(scene(grain_px=4.0)[0])
     image = spiked(clean, share, seed=3)
-    _, spikes = grain(image, ROW_STRIDE, 32.0)
+    _, spikes = grain(image, ROW_STRIDE, LEAST_SPIKE)
     # One with a spike of its own colour beside it, or like the scene, does not stand out.
     assert 0.4 * share < spikes < share
     (mended,) = without_noise([image], CONFIG.weak_images)
@@ -107,7 +119,7 @@ def test_images_of_one_moment_are_treated_alike():
         [camera_image(left), camera_image(right, noise=30.0)], CONFIG.weak_images
     )
     assert one.tobytes() != camera_image(left).tobytes()
-    assert grain(two, ROW_STRIDE, 32.0)[0] < CONFIG.weak_images.noise_from
+    assert grain(two, ROW_STRIDE, LEAST_SPIKE)[0] < CONFIG.weak_images.noise_from
 
 
 @pytest.mark.parametrize("stops", [4.0, 5.0, 6.0])
@@ -149,7 +161,7 @@ def test_nothing_is_made_of_nothing():
     assert all(len(one.xy) == 0 for one in extract_in_any_light([black, black], CONFIG))
     tiny = np.zeros((8, 8), np.uint8)
     assert contrast(tiny) == 0.0
-    assert grain(np.zeros((2, 2), np.uint8), ROW_STRIDE, 32.0) == (0.0, 0.0)
+    assert grain(np.zeros((2, 2), np.uint8), ROW_STRIDE, LEAST_SPIKE) == (0.0, 0.0)
 
 
 def drive(corridor, change, config: Config) -> tuple[str, float]:

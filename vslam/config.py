@@ -78,6 +78,12 @@ class WeakImageConfig(_Section):
         description="Deviation in blocks of 16 pixels, median; below, contrast is raised, grey "
         "levels; 0: never. [own]",
     )
+    least_detail: float = Field(
+        0.25,
+        ge=0,
+        description="Mean second difference over that deviation; below, the image is out of focus "
+        "and stays as it is; sharp ones have 0.4 and more. [own]",
+    )
     raised_contrast: float = Field(
         12.0, gt=0, description="What it is raised to: KITTI's on a bright day. [own]"
     )

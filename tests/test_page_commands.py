@@ -144,6 +144,7 @@ RULES = {
     "docs/motorway.md": Rules(
         not_run=(
             ("python tools/motorway.py errors", HOURS),
+            ("python tools/motorway_variants.py", HOURS),
             ("python tools/motorway.py offset", "it needs a drive of hundreds of metres"),
             ("python tools/noise_model.py", "it needs two runs; test_noise_model.py has a map"),
         )
@@ -183,11 +184,16 @@ RULES = {
                 "--systems mine --system",
                 f"--max-frames {N} --laws night --seeds 1 --steps 1 --systems mine --system",
             ),
+            ("(docs/stress/kitti00.csv bow)", r"tools/../\1"),  # tools is a link
         ),
         (
             ("python3 -m venv orbslam", ORBSLAM),
             ("vslam stress --seqs 00 --systems vslam,orbslam3", ORBSLAM),
-            (r'vslam stress --data "$KITTI_ROOT" --seqs 00 --max-frames 216 --seeds 1', ORBSLAM),
+            (
+                'vslam stress --data "$KITTI_ROOT" --seqs 00 --max-frames 216 --laws all --seeds 1 '
+                "--steps 4 --systems orbslam3",
+                ORBSLAM,
+            ),
         ),
     ),
     "docs/training.md": Rules(

@@ -15,16 +15,13 @@ from __future__ import annotations
 
 import argparse
 import csv
-import sys
-import tempfile
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-import compare_orbslam3
+from changed_drive import changed_drive, run_over
 
 ROUTE = "01"
 SHORT = 4  # times as short is the baseline that leaves far points only
@@ -78,86 +75,44 @@ def main() -> None:
         ]
         if not wanted:
             continue
-        with drive_of(variant) as data:
+        with drive_of(variant) as (data, name):
             for system in wanted:
-                rows[variant.title, system] = row_of(variant, system, data, options)
+                rows[variant.title, system] = row_of(variant, system, data, name, options)
                 write(options.csv, rows)
     print(table(rows))
 
 
 @contextmanager
-def drive_of(variant: Variant) -> Iterator[Path]:
-    """A KITTI tree, in a temporary folder, with the drive as its sequence 00."""
-    import cv2
-
+def drive_of(variant: Variant) -> Iterator[tuple[Path, str]]:
+    """A KITTI tree, in a temporary folder, with the drive, and the drive's name there."""
     from vslam.datasets import open_sequence
-    from vslam.datasets.kitti import read_kitti_poses
-    from vslam.datasets.perturbation import parse_perturbation
     from vslam.datasets.synthetic import (
         Variation,
         built_in_route,
         cache_folder,
         render_sequence,
     )
-    from vslam.trajectory import write_kitti
 
     route = built_in_route(ROUTE)
     if variant.short:
         camera = replace(route.camera, baseline=route.camera.baseline / SHORT)
         route = replace(route, name=f"{ROUTE}-short", camera=camera)
     source = render_sequence(route, Variation(), cache_folder())
-    sequence = open_sequence("kitti", source, route.name, every=variant.every)
-    law = parse_perturbation(variant.law, 0).bound_to(sequence)
-    with tempfile.TemporaryDirectory(prefix="vslam-motorway-") as scratch:
-        root = Path(scratch)
-        folder = root / "sequences" / "00"
-        sides = [folder / "image_0", folder / "image_1"]
-        for made in (*sides, root / "poses"):
-            made.mkdir(parents=True)
-        calibration = (source / "sequences" / route.name / "calib.txt").read_bytes()
-        (folder / "calib.txt").write_bytes(calibration)
-        times = "".join(f"{time:.6e}\n" for time in sequence.timestamps)
-        (folder / "times.txt").write_text(times)
-        truth = read_kitti_poses(source / "poses" / f"{route.name}.txt")[:: variant.every]
-        write_kitti(root / "poses" / "00.txt", truth)
-
-        def put(number: int) -> None:
-            t = float(sequence.timestamps[number] - sequence.timestamps[0])
-            images = law.apply(number, t, *sequence.read(number))
-            for side, image in zip(sides, images, strict=True):
-                path = side / f"{number:06d}.png"
-                cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-
-        with ThreadPoolExecutor(2) as pool:
-            list(pool.map(put, range(len(sequence))))
-        yield root
+    frames = range(0, len(open_sequence("kitti", source, route.name)), variant.every)
+    with changed_drive(source, route.name, frames, variant.law) as root:
+        yield root, route.name
 
 
 def row_of(
-    variant: Variant, system: str, data: Path, options: argparse.Namespace
+    variant: Variant, system: str, data: Path, name: str, options: argparse.Namespace
 ) -> dict[str, str]:
     """Run one system over a drive."""
-    run_options = argparse.Namespace(
-        data=data,
-        seq="00",
-        frames=len(list((data / "sequences" / "00" / "image_0").iterdir())),
-        threads=None,
-        detector="bow",
-        sensor="stereo",
-        no_report=True,
-        vslam=str(Path(sys.executable).with_name("vslam")),
-        orbslam3_python=options.orbslam3_python and options.orbslam3_python.absolute(),
-        orbslam3_script=options.orbslam3_script and options.orbslam3_script.absolute(),
-        vocabulary=options.vocabulary and options.vocabulary.absolute(),
-    )
-    start = compare_orbslam3.run_vslam if system == VSLAM else compare_orbslam3.run_orbslam3
-    with tempfile.TemporaryDirectory(prefix="vslam-motorway-run-") as scratch:
-        run = start(run_options, Path(scratch))
-        found = compare_orbslam3.figures(run, run_options)
+    detector = "bow" if system == VSLAM else None
+    run, found = run_over(data, name, options, detector, sensor="stereo", no_report=True)
     return {
         "variant": variant.title,
         "system": system,
-        "frames": str(run_options.frames),
+        "frames": str(run.report["frames"]),
         "lost": f"{found['lost']:.0f}",
         "keyframes": str(run.report.get("keyframes", "")),
         "cpu_ms": f"{found['process_cpu_ms']:.0f}",
@@ -197,8 +152,8 @@ def table(rows: dict[tuple[str, str], dict[str, str]]) -> str:
             continue
         cells = [f"{ours['keyframes']} of {ours['frames']}"]
         for name in list(measures)[1:]:
-            peer = f" / {theirs[name] or '-'}" if theirs else ""
-            cells.append(f"{ours[name] or '-'}{peer}")
+            beside = f" / {theirs[name] or '-'}" if theirs else ""
+            cells.append(f"{ours[name] or '-'}{beside}")
         lines.append(f"| {variant.title} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 

@@ -21,15 +21,12 @@ import argparse
 import csv
 import json
 import os
-import sys
-import tempfile
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import compare_orbslam3
+from changed_drive import changed_drive, run_over
 
 OURS = {"vslam": "bow", "vslam without loops": "none"}
 ORBSLAM3 = "ORB-SLAM3"
@@ -124,43 +121,17 @@ def _in_light(drive: Drive, light: str) -> Iterator[Path]:
     ``cut:N`` takes N frames out, a third of the way; ``black:N`` blackens N frames there. Anything
     else is a perturbation of ``vslam run``.
     """
-    import cv2
-    import numpy as np
-
     from vslam.datasets import open_sequence
-    from vslam.datasets.perturbation import parse_perturbation
 
     if light == "clean":
         yield drive.root
         return
-    sequence = open_sequence("kitti", drive.root, drive.name)
-    kind, _, count = light.partition(":")
-    gap = range(len(sequence) // 3, len(sequence) // 3 + int(count)) if kind in GAPS else range(0)
-    law = parse_perturbation("none" if gap else light, 0)
-    frames = [k for k in range(len(sequence)) if kind != "cut" or k not in gap]
-    with tempfile.TemporaryDirectory(prefix="vslam-light-") as scratch:
-        root = Path(scratch)
-        folder = root / "sequences" / drive.name
-        sides = [folder / "image_0", folder / "image_1"]
-        for made in (*sides, root / "poses"):
-            made.mkdir(parents=True)
-        source = drive.root / "sequences" / drive.name
-        (folder / "calib.txt").write_bytes((source / "calib.txt").read_bytes())
-        for file in (Path("sequences", drive.name, "times.txt"), Path(f"poses/{drive.name}.txt")):
-            lines = (drive.root / file).read_text().splitlines()
-            (root / file).write_text("".join(f"{lines[k]}\n" for k in frames))
-
-        def write(number: int) -> None:
-            k = frames[number]
-            t = float(sequence.timestamps[k] - sequence.timestamps[0])
-            images = law.apply(k, t, *sequence.read(k))
-            for side, image in zip(sides, images, strict=True):
-                image = np.zeros_like(image) if kind == "black" and k in gap else image
-                path = side / f"{number:06d}.png"
-                cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-
-        with ThreadPoolExecutor(2) as pool:
-            list(pool.map(write, range(len(frames))))
+    count = len(open_sequence("kitti", drive.root, drive.name))
+    kind, _, length = light.partition(":")
+    gap = range(count // 3, count // 3 + int(length)) if kind in GAPS else range(0)
+    frames = [k for k in range(count) if kind != "cut" or k not in gap]
+    law = "none" if gap else light
+    with changed_drive(drive.root, drive.name, frames, law, black=gap) as root:
         yield root
 
 
@@ -172,21 +143,7 @@ def _row(drive: Drive, light: str, system: str, data: Path, options: argparse.Na
     from vslam.evaluation.trajectories import path_length
 
     truth = read_kitti_poses(data / "poses" / f"{drive.name}.txt")
-    run_options = argparse.Namespace(
-        data=data,
-        seq=drive.name,
-        frames=len(truth),
-        threads=None,
-        detector=OURS.get(system),
-        sensor=options.sensor,
-        vslam=str(Path(sys.executable).with_name("vslam")),
-        orbslam3_python=options.orbslam3_python and options.orbslam3_python.absolute(),
-        orbslam3_script=options.orbslam3_script and options.orbslam3_script.absolute(),
-        vocabulary=options.vocabulary and options.vocabulary.absolute(),
-    )
-    start = compare_orbslam3.run_vslam if system in OURS else compare_orbslam3.run_orbslam3
-    with tempfile.TemporaryDirectory(prefix="vslam-table-") as scratch:
-        found = compare_orbslam3.figures(start(run_options, Path(scratch)), run_options)
+    _, found = run_over(data, drive.name, options, OURS.get(system), sensor=options.sensor)
     return {
         "drive": drive.title,
         "light": light,

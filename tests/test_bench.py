@@ -120,7 +120,10 @@ def test_a_run_counts_if_it_is_of_the_sensor_asked_for(stub, tmp_path, sensor, a
     assert execute.finished_cells([cell], out, CONFIG) == [cell] * finished
 
 
-@pytest.mark.parametrize("change", ['"schema_version": 4|"schema_version": 3', "{|", "0|"])
+@pytest.mark.parametrize(
+    "change",
+    ['"schema_version": 4|"schema_version": 3', '"se3"|"se4"', "{|", "0|"],
+)
 def test_a_report_of_another_schema_or_damaged_is_none(run_folder, tmp_path, change):
     old, new = change.split("|")
     text = (run_folder / "report.json").read_text()

@@ -252,6 +252,8 @@ def _write_map(folder: Path) -> None:
         last_timestamp=0.2,
         lost_frames=0,
         n_tracked=n,
+        gained_close=100.0,
+        gain_awaited=False,
         closing=ClosingMemory((ResembledPlace(frozenset((0,)), 1),), ((3, waits),), 3),
     )
     stored = StoredMap(map_, _camera(), checkpoint=checkpoint)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, StringConstraints
 
 
 class _Model(BaseModel):
@@ -126,7 +126,7 @@ class ReportJson(_Model):
     interrupted: str | None
     warnings: tuple[str, ...] = ()
 
-    alignment: str | None
+    alignment: Annotated[str, StringConstraints(pattern="^(se3|sim3|none)$")] | None
     ate_rmse_m: float | None
     causal_ate_rmse_m: float | None = None
     ate_mean_m: float | None = None

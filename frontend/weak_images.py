@@ -41,8 +41,7 @@ def extract_in_any_light(
     weak = config.weak_images
     images = without_noise(images, weak)
     found = list(image_map(lambda image: extract(image, config.orb), images))
-    counts = [len(one.xy) for one in found]
-    if min(counts) < weak.few_features * config.orb.n_features and is_faint(images, counts, config):
+    if is_faint(images, [len(one.xy) for one in found], config):
         raised = image_map(lambda image: extract(with_contrast(image, weak), config.orb), images)
         found = list(raised)
     return found

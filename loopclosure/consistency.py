@@ -109,7 +109,13 @@ class LoopConsistency:
     def agree(self, edge: LoopEdge, other: LoopEdge, map_: Map) -> bool:
         """Whether two edges imply the same drift at the query of the first."""
         where = inverse(map_.keyframe_pose(edge.query))[:3, 3]
-        return self._agree(implied_drift(edge, map_), implied_drift(other, map_), where)
+        a, b = implied_drift(edge, map_), implied_drift(other, map_)
+        twist = se3_log(inverse(_rigid(a)) @ _rigid(b))
+        apart = (a[:3, :3] - b[:3, :3]) @ where + a[:3, 3] - b[:3, 3]
+        return bool(
+            np.linalg.norm(apart) <= self.config.max_apart
+            and np.degrees(np.linalg.norm(twist[3:])) <= self.config.max_turn
+        )
 
     def memory(self) -> ClosingMemory:
         """What is remembered, for a file."""
@@ -124,17 +130,6 @@ class LoopConsistency:
         """Forget everything: closing a loop has moved the map."""
         self._groups.clear()
         self._verified.clear()
-
-    def _agree(
-        self, a: NDArray[np.float64], b: NDArray[np.float64], where: NDArray[np.float64]
-    ) -> bool:
-        """Whether two drifts move a camera at ``where`` ((3,), world) to the same pose."""
-        twist = se3_log(inverse(_rigid(a)) @ _rigid(b))
-        apart = (a[:3, :3] - b[:3, :3]) @ where + a[:3, 3] - b[:3, 3]
-        return bool(
-            np.linalg.norm(apart) <= self.config.max_apart
-            and np.degrees(np.linalg.norm(twist[3:])) <= self.config.max_turn
-        )
 
 
 def implied_drift(edge: LoopEdge, map_: Map) -> NDArray[np.float64]:

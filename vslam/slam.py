@@ -480,28 +480,30 @@ class Slam:
         map that was loaded has no frame to go on from, but a drive that is resumed has gone on."""
         if self.frame is None and (self._lost_frames or not self._resumed):
             return 0
-        config = self.config.tracking
         if self._velocity is not None and self.frame is not None:
             matches, inliers = track_motion(frame, self.frame, T_cw, self.context)
-            if inliers >= max(config.min_inliers_motion, config.min_inlier_ratio * matches):
+            if self._moves_as_predicted(inliers, matches):
                 return inliers
         inliers = track_descriptors(frame, self._mapping.reference_view, T_cw, self.context)
-        if inliers >= config.min_inliers_frame or self._velocity is None:
+        if inliers >= self.config.tracking.min_inliers_frame or self._velocity is None:
             return inliers
         return self._track_predicted(frame, T_cw)
 
     def _track_predicted(self, frame: Frame, T_cw: Matrix) -> int:
         """Match the local map around the prediction: after a jump of the light, what older frames
         saw is found where the previous one saw other things. Returns inliers or 0."""
-        config = self.config.tracking
         frame.T_cw = T_cw
         frame.landmark[:], frame.xyz[:] = -1, np.nan
-        window = config.predicted_window
+        window = self.config.tracking.predicted_window
         matches, inliers, _ = track_local_map(frame, self._mapping.local, self.context, window)
-        if inliers >= max(config.min_inliers_motion, config.min_inlier_ratio * matches):
+        if self._moves_as_predicted(inliers, matches):
             return inliers
         frame.landmark[:], frame.xyz[:] = -1, np.nan
         return 0
+
+    def _moves_as_predicted(self, inliers: int, matches: int) -> bool:
+        config = self.config.tracking
+        return inliers >= max(config.min_inliers_motion, config.min_inlier_ratio * matches)
 
     def _track_around(
         self, frame: Frame, T_cw: Matrix, clock: _Clock

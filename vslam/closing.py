@@ -189,10 +189,9 @@ class LoopClosing:
         is verified with the drift of the edge."""
         assert edge.T_query_match is not None
         config = self._config
+        T_w_query = inverse(map_.keyframe_pose(edge.query))
         for keyframe in map_.covisible(edge.query)[0].tolist():
-            T_keyframe_query = map_.keyframe_pose(keyframe) @ inverse(
-                map_.keyframe_pose(edge.query)
-            )
+            T_keyframe_query = map_.keyframe_pose(keyframe) @ T_w_query
             if np.linalg.norm(T_keyframe_query[:3, 3]) < config.consistency.min_moved:
                 continue
             T_keyframe_query[:3, 3] /= edge.scale

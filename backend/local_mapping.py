@@ -160,7 +160,7 @@ def assemble(
         first=first,
         camera=index[a.keyframe[rows]],
         uvr=stack_uvr(a.xy[rows], a.u_right[rows]),
-        inverse_sigma2=map_.scales[a.octave[rows]] ** -2.0,
+        inverse_sigma2=map_.scales[a.octave[rows]] ** -2.0 * a.certainty[rows],
         intrinsics=camera.intrinsics,
     )
     return problem, rows

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import OrbConfig
+from vslam.features import PATCH_PIXELS
+from vslam.frontend.alignment import cut_patch
 from vslam.frontend.corners import fast_scores, local_maxima, spread
 from vslam.frontend.smoothing import smoothed
 from vslam.kernels import kernel
@@ -52,12 +54,17 @@ class Pyramid:
 
 @dataclass(frozen=True)
 class Extraction:
-    """Features of one image, sorted by octave: see ``vslam.features.Features`` for the fields."""
+    """Features of one image, sorted by octave: see ``vslam.features.Features`` for the fields.
+
+    Pixels are counted from the middle of the first one at every level: pixel x of a level that is
+    ``w`` times narrower lies at ``(x + 0.5) w - 0.5`` of the image.
+    """
 
     xy: NDArray[np.float32]
     octave: NDArray[np.uint8]
     angle: NDArray[np.float32]
     descriptors: NDArray[np.uint8]
+    patches: NDArray[np.uint8]
     pyramid: Pyramid
 
 
@@ -67,11 +74,10 @@ def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
     A pure function of its arguments, safe to call from several threads.
     """
     pyramid = build_pyramid(image, config)
-    xy, octave, angle, descriptors = extract_levels(
+    xy, octave, angle, descriptors, patches = extract_levels(
         pyramid.pixels,
         pyramid.offsets,
         pyramid.shapes,
-        pyramid.scales,
         _quota(config.n_features, config.n_levels, config.scale_factor),
         config.fast_threshold,
         config.fast_threshold_min,
@@ -79,7 +85,7 @@ def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
         DISC,
         PATTERN,
     )
-    return Extraction(xy, octave, angle, descriptors, pyramid)
+    return Extraction(xy, octave, angle, descriptors, patches, pyramid)
 
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
@@ -135,16 +141,15 @@ def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
 
 
 @kernel
-def extract_levels(
-    pixels, offsets, shapes, scales, quota, threshold, threshold_min, cell, inside, pattern
-):
-    """Features of all levels: ``xy``, ``octave``, ``angle`` and ``descriptors`` of `Extraction`.
+def extract_levels(pixels, offsets, shapes, quota, threshold, threshold_min, cell, inside, pattern):
+    """Features of all levels: ``xy``, ``octave``, ``angle``, ``descriptors``, ``patches``.
 
     One kernel, so that Python, for which threads wait for each other, is called once an image.
     """
     capacity = quota.sum()
     xy, octave = np.empty((capacity, 2), np.float32), np.empty(capacity, np.uint8)
     angle, descriptors = np.empty(capacity, np.float32), np.empty((capacity, 32), np.uint8)
+    patches = np.empty((capacity, PATCH_PIXELS), np.uint8)
     n = 0
     for level in range(len(shapes)):
         height, width = shapes[level]
@@ -155,14 +160,17 @@ def extract_levels(
             continue  # the smallest levels have none
         turned = orientations(image, corners, inside)
         described = describe(smoothed(image), corners, turned, pattern)
-        scale = np.float32(scales[level])
+        # Sizes are whole numbers: not quite the scale apart.
+        wide, high = shapes[0, 1] / width, shapes[0, 0] / height
         for i in range(len(corners)):
-            xy[n, 0], xy[n, 1] = corners[i, 0] * scale, corners[i, 1] * scale
+            x, y = int(corners[i, 0]), int(corners[i, 1])
+            xy[n, 0], xy[n, 1] = (x + 0.5) * wide - 0.5, (y + 0.5) * high - 0.5
+            cut_patch(image, x, y, patches[n])
             octave[n], angle[n] = level, turned[i]
             for k in range(32):
                 descriptors[n, k] = described[i, k]
             n += 1
-    return xy[:n], octave[:n], angle[:n], descriptors[:n]
+    return xy[:n], octave[:n], angle[:n], descriptors[:n], patches[:n]
 
 
 @kernel

@@ -116,17 +116,24 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
         height, width = shapes[level]
         image_l = pixels_l[offsets[level] : offsets[level] + height * width].reshape(height, width)
         image_r = pixels_r[offsets[level] : offsets[level] + height * width].reshape(height, width)
-        x_l, y_l = int(np.rint(u / scales[level])), int(np.rint(v / scales[level]))
-        x_r = int(np.rint(xy_r[best, 0] / scales[level]))
+        wide, high = shapes[0, 1] / width, shapes[0, 0] / height
+        x_l, y_l = level_pixel(u, wide), level_pixel(v, high)
+        x_r = level_pixel(xy_r[best, 0], wide)
         shift, score = slide(image_l, image_r, x_l, y_l, x_r, half, reach)
         if np.isnan(shift):
             continue
         # The left feature keeps its sub-pixel offset within the level's pixel.
-        disparity = (x_l - x_r - shift) * scales[level]
+        disparity = (x_l - x_r - shift) * wide
         if disparity < max_disparity and disparity > -1.0:
             u_right[i] = u - max(disparity, MIN_DISPARITY)
             sad[i] = score
     return u_right, sad
+
+
+@inner_kernel
+def level_pixel(x, ratio):
+    """Pixel of a level at a coordinate of the image, which has ``ratio`` pixels for one of it."""
+    return int(np.rint((np.float64(x) + 0.5) / ratio - 0.5))
 
 
 @kernel

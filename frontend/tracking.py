@@ -6,7 +6,7 @@ is never touched, so that local mapping can write it meanwhile.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from vslam.camera import Camera, ImageMap
 from vslam.config import Config
 from vslam.features import FeatureGrid, Features
+from vslam.frontend.alignment import align_matches
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.matching import (
     Projections,
@@ -23,7 +24,7 @@ from vslam.frontend.matching import (
     search_all,
     search_windows,
 )
-from vslam.frontend.orb import scale_factors
+from vslam.frontend.orb import Extraction, scale_factors
 from vslam.frontend.pose import optimise_pose
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import match_stereo
@@ -49,6 +50,8 @@ class Frame:
         landmark: ``(N,)`` int32, landmark that each feature tracks, or -1.
         xyz: ``(N, 3)`` float64, its position; NaN without one.
         disparity_offset: pixels that the disparities of the features were corrected by.
+        shift: ``(N, 2)`` float32, pixels from each feature to where its match was aligned, NaN for
+            those that were not; None if none was.
     """
 
     index: int
@@ -60,6 +63,7 @@ class Frame:
     landmark: NDArray[np.int32]
     xyz: NDArray[np.float64]
     disparity_offset: float = 0.0
+    shift: NDArray[np.float32] | None = None
 
     @classmethod
     def untracked(
@@ -89,6 +93,23 @@ class Frame:
             change = offset - self.disparity_offset
             self.features = self.features.with_larger_disparities(change)
             self.disparity_offset = offset
+
+    @property
+    def aligned(self) -> NDArray[np.bool_]:
+        """``(N,)`` features whose match was aligned."""
+        if self.shift is None:
+            return np.zeros(len(self.features), np.bool_)
+        return (self.landmark >= 0) & np.isfinite(self.shift[:, 0])
+
+    def observed(self) -> Features:
+        """The features, those that were aligned where they were aligned to; disparities stay."""
+        aligned = self.aligned
+        if self.shift is None or not aligned.any():
+            return self.features
+        xy, u_right = self.features.xy.copy(), self.features.u_right.copy()
+        xy[aligned] += self.shift[aligned]
+        u_right[aligned] += self.shift[aligned, 0]
+        return replace(self.features, xy=xy, u_right=u_right)
 
     @property
     def n_stereo(self) -> int:
@@ -158,7 +179,7 @@ def extract_features(
         pair = balanced(left, right_image, config.stereo, sides)
         found, right = extract_in_any_light(pair, config, image_map)
         u_right = match_stereo(found, right, camera, config.stereo)
-    return Features(found.xy, found.octave, found.angle, found.descriptors, u_right)
+    return _features(found, u_right)
 
 
 def _features_alone(
@@ -167,7 +188,15 @@ def _features_alone(
     """Those of an image whose columns in another one nobody knows."""
     (found,) = extract_in_any_light([image], config)
     u_right = np.full(len(found.xy), np.nan, np.float32)
-    return Features(found.xy, found.octave, found.angle, found.descriptors, u_right, from_right)
+    return _features(found, u_right, from_right=from_right)
+
+
+def _features(
+    found: Extraction, u_right: NDArray[np.float32], *, from_right: bool = False
+) -> Features:
+    return Features(
+        found.xy, found.octave, found.angle, found.descriptors, u_right, from_right, found.patches
+    )
 
 
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
@@ -277,7 +306,8 @@ def track_descriptors(
 def track_local_map(
     frame: Frame, local: LocalMap, context: TrackingContext, window: float | None = None
 ) -> tuple[int, int, NDArray[np.int32]]:
-    """Match every local landmark that should be visible, then refine the pose with all matches.
+    """Match every local landmark that should be visible, align all matches to a fraction of a
+    pixel, then refine the pose with them.
 
     Args:
         window: search radius at octave 0, pixels; None: ``context.local_window``.
@@ -313,8 +343,26 @@ def track_local_map(
     frame.landmark[found[hit]] = local.ids[hit]
     frame.xyz[found[hit]] = local.xyz[hit]
     matches = int(np.count_nonzero(frame.landmark >= 0))
-    inliers = refine(frame, frame.T_cw, context)
+    inliers = refine(frame, frame.T_cw, context, _shift(frame, local, context))
     return matches, inliers, local.ids[visible | tracked]
+
+
+def _shift(frame: Frame, local: LocalMap, context: TrackingContext) -> NDArray[np.float32] | None:
+    """``Frame.shift`` of its matches with the local map."""
+    features = frame.features
+    if features.patches is None:
+        return None
+    matched = np.flatnonzero(frame.landmark >= 0)
+    shift = np.full((len(features), 2), np.nan, np.float32)
+    shift[matched] = align_matches(
+        features.patches[matched],
+        context.scales[features.octave[matched]],
+        frame.landmark[matched],
+        local,
+        np.linalg.norm(transform(frame.T_cw, frame.xyz[matched]), axis=1),
+        context.config.alignment,
+    )
+    return shift
 
 
 def _search(
@@ -329,8 +377,18 @@ def _search(
     return search_windows(projections, features, free, max_distance, ratio)[0]
 
 
-def refine(frame: Frame, T_cw: NDArray[np.float64], context: TrackingContext) -> int:
-    """Optimise the pose from all matches, drop the outliers, return the number of inliers."""
+def refine(
+    frame: Frame,
+    T_cw: NDArray[np.float64],
+    context: TrackingContext,
+    shift: NDArray[np.float32] | None = None,
+) -> int:
+    """Optimise the pose from all matches, drop the outliers, return the number of inliers.
+
+    Args:
+        shift: what ``frame.shift`` is to be; None: no match is aligned.
+    """
+    frame.shift = shift
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
     frame.T_cw, inlier = optimise_pose(
         T_cw,
@@ -350,4 +408,10 @@ def observations(
     """``(N, 3)`` u, v, u_right of ``(N,)`` features, and ``(N,)`` their inverse variances."""
     features = frame.features
     uvr = stack_uvr(features.xy[feature], features.u_right[feature])
-    return uvr, context.scales[features.octave[feature]] ** -2.0
+    weight = context.scales[features.octave[feature]] ** -2.0
+    if frame.shift is not None:
+        shift = frame.shift[feature]
+        aligned = np.isfinite(shift[:, 0])
+        uvr[aligned] += shift[aligned][:, [0, 1, 0]]
+        weight[aligned] *= context.config.alignment.sigma**-2.0
+    return uvr, weight

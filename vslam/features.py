@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from vslam.kernels import kernel
 
 MIN_DISPARITY = 0.01  # pixels; a point farther away counts as so far
+PATCH_RADIUS = 8  # of the pixels that are kept around a feature, in its octave
+PATCH_SIDE = 2 * PATCH_RADIUS + 1
+PATCH_PIXELS = PATCH_SIDE**2
 CELL = 16  # pixels of a FeatureGrid cell; search windows are 5 to 60 px wide
 
 
@@ -28,6 +31,8 @@ class Features:
         u_right: ``(N,)`` float32, column of the match in the right image, NaN without one.
         from_right: whether the image is the right one; ``xy`` is in it then, and all ``u_right``
             are NaN.
+        patches: ``(N, PATCH_PIXELS)`` uint8, the pixels around each feature in its octave, row by
+            row; None if they are not known.
     """
 
     xy: NDArray[np.float32]
@@ -36,6 +41,7 @@ class Features:
     descriptors: NDArray[np.uint8]
     u_right: NDArray[np.float32]
     from_right: bool = False
+    patches: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
         return len(self.xy)

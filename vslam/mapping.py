@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +25,32 @@ from vslam.camera import Camera
 from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.features import Features
+from vslam.frontend.alignment import keep_patches
 from vslam.frontend.tracking import Frame
 from vslam.geometry import Matrix
 from vslam.map import LocalMap, Map, local_map
 from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
 from vslam.maps.checkpoint import Checkpoint
 from vslam.monocular import TwoViewStart
+
+
+class _Patches(NamedTuple):
+    """Those of a frame, None if it has none, and ``Frame.shift`` of what they show."""
+
+    pixels: NDArray[np.uint8] | None
+    shift: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, frame: Frame) -> _Patches:
+        shift = np.full((len(frame.features), 2), np.nan, np.float32)
+        if frame.shift is not None:
+            shift[frame.aligned] = frame.shift[frame.aligned]
+        return cls(frame.features.patches, shift)
+
+    def keep(self, map_: Map, keyframe: int) -> None:
+        """Give them to the landmarks that the frame, now a keyframe, observes."""
+        if self.pixels is not None:
+            keep_patches(map_.arrays, keyframe, self.pixels, self.shift, map_.scales)
 
 
 class MappingThread:
@@ -118,7 +139,13 @@ class MappingThread:
         """
         self.write_counts()
         map_ = self._map
-        keyframe = map_.add_keyframe(frame.features, frame.T_cw, frame.timestamp, frame.index)
+        keyframe = map_.add_keyframe(
+            frame.observed(),
+            frame.T_cw,
+            frame.timestamp,
+            frame.index,
+            self._certainty(frame),
+        )
         tracked = np.flatnonzero(frame.landmark >= 0)
         link_many(map_.arrays, map_.rows(keyframe).start + tracked, frame.landmark[tracked])
         if keyframe > 0:
@@ -129,12 +156,14 @@ class MappingThread:
                 map_.begin_submap(keyframe, self.reference, predicted=predicted)
         map_stereo_points(map_, keyframe, self._camera, self._config)
         refresh_keyframe(map_, keyframe)
+        patches = _Patches.of(frame)
+        patches.keep(map_, keyframe)
         self._set_newest(keyframe, frame)
         # The map is the thread's from here on.
         self._observe(frame, keyframe)
         if keyframe > 0:
             self._pending = self._start(
-                partial(self._map_keyframe, keyframe, frame.features, frame.image)
+                partial(self._map_keyframe, keyframe, frame.features, patches, frame.image)
             )
         else:
             self._closing.process(map_, keyframe, frame.features, frame.image)
@@ -185,6 +214,7 @@ class MappingThread:
         if one > 0:
             map_.begin_submap(one, self.reference, predicted=start.predicted)
         map_.parents[two] = one
+        _Patches.of(start.second).keep(map_, two)
         for keyframe, frame in zip((one, two), frames, strict=True):
             self._closing.process(map_, keyframe, frame.features, frame.image)
         self._set_newest(two, start.second)
@@ -299,6 +329,15 @@ class MappingThread:
         frame.landmark = self._map.arrays.landmark[self._map.rows(keyframe)]
         self.update(frame)
 
+    def _certainty(self, frame: Frame) -> NDArray[np.float32] | float:
+        """Of the features of a frame. What a landmark is first seen as is where it is seen; a
+        match that was not aligned is half a pixel off."""
+        if frame.features.patches is None:
+            return 1.0
+        sure = self._config.alignment.sigma**-2.0
+        unaligned = (frame.landmark >= 0) & ~frame.aligned
+        return np.where(unaligned, 1.0, sure).astype(np.float32)
+
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
         self.n_keyframes = keyframe + 1
         self.last_frame, self.last_timestamp = frame.index, frame.timestamp
@@ -315,9 +354,14 @@ class MappingThread:
             seen.clear()
 
     def _map_keyframe(
-        self, keyframe: int, features: Features, image: NDArray[np.uint8] | None
+        self,
+        keyframe: int,
+        features: Features,
+        patches: _Patches,
+        image: NDArray[np.uint8] | None,
     ) -> None:
         map_and_calibrate(self._map, keyframe, self._camera, self._config)
+        patches.keep(self._map, keyframe)  # landmarks that were triangulated have none yet
         self._closing.process(self._map, keyframe, features, image)
 
     def _start(self, work: Callable[[], None]) -> Callable[[], None]:

@@ -565,11 +565,12 @@ class Slam:
         keyframe."""
         self._merge_before(frame)
         T_cw, landmark, xyz = frame.T_cw, frame.landmark.copy(), frame.xyz.copy()
+        shift = frame.shift
         reference = self._mapping.reference
         found = self._relocalise(frame)
         if found > self.config.relocalization.better * inliers:
             return found
-        frame.T_cw, frame.landmark, frame.xyz = T_cw, landmark, xyz
+        frame.T_cw, frame.landmark, frame.xyz, frame.shift = T_cw, landmark, xyz, shift
         if self._mapping.reference != reference:
             self._mapping.set_reference(reference)
         return 0
@@ -589,6 +590,7 @@ class Slam:
             if found is not None:
                 frame.T_cw = found.T_cw
                 frame.landmark[found.feature] = found.landmark
+                frame.shift = None
                 frame.xyz[found.feature] = self.map.arrays.xyz[found.landmark]
                 self._mapping.set_reference(candidate.match)
                 return len(found.feature)

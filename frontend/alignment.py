@@ -26,7 +26,7 @@ SIDE = 2 * HALF + 1
 WIDE = SIDE + 2  # with a pixel around it, for slopes
 MIN_VARIANCE = 1.0  # grey levels squared; a patch with less shows nothing
 MIN_CORNERNESS = 0.05  # determinant of the normal equations over that of a corner
-STILL = 0.03  # pixels; a step this small ends the iteration (SVO's code, Klein and Murray)
+STILL = 0.03  # pixels; a smaller step ends the iteration
 
 
 @inner_kernel
@@ -130,7 +130,7 @@ def draw(patch, centre, zoom, out):
     """Draw a patch at another size around ``centre``; returns whether it reaches that far."""
     step = np.float32(1.0 / zoom)
     reach = np.float32(HALF + 1) * step + max(abs(centre[0]), abs(centre[1]))
-    if not reach <= np.float32(PATCH_RADIUS):
+    if not (step > 0.0 and reach <= np.float32(PATCH_RADIUS)):
         return False
     for r in range(WIDE):
         y = np.float32(PATCH_RADIUS) + centre[1] + np.float32(r - HALF - 1) * step

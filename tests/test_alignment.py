@@ -1,0 +1,232 @@
+"""Sub-pixel alignment: exact on patches of a known scene, silent where nothing agrees."""
+
+import numpy as np
+import pytest
+
+from vslam.camera import Camera
+from vslam.config import Config
+from vslam.features import PATCH_PIXELS, PATCH_RADIUS, Features
+from vslam.frontend.alignment import align, align_matches, keep_patches
+from vslam.frontend.orb import extract
+from vslam.frontend.tracking import Frame, TrackingContext, observations
+from vslam.map import LocalMap, Map, local_map
+from vslam.mapping import MappingThread
+
+CONFIG = Config().alignment
+NO_SHIFT = np.zeros((1, 2), np.float32)
+
+
+def seen(scene, x=0.0, y=0.0, zoom=1.0, gain=1.0, offset=0.0):
+    """The patch ``(1, PATCH_PIXELS)`` of a scene whose origin lies at x, y from its middle."""
+    at = np.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
+    u, v = np.meshgrid((at - x) / zoom, (at - y) / zoom)
+    return np.rint(np.clip(gain * scene(u, v) + offset, 0, 255)).astype(np.uint8).reshape(1, -1)
+
+
+def random_scene(seed):
+    """Waves of all directions, 6 pixels long or longer: about what the blur of a lens leaves."""
+    rng = np.random.default_rng(seed)
+    waves = rng.uniform(0.3, 1.0, 12)
+    turn, phase = rng.uniform(0, 2 * np.pi, (2, 12))
+    height = rng.uniform(5.0, 15.0, 12)
+
+    def scene(u, v):
+        along = np.cos(turn) * u[..., None] + np.sin(turn) * v[..., None]
+        return 128.0 + (height * np.sin(waves * along + phase)).sum(axis=-1)
+
+    return scene
+
+
+def aligned(image, reference, zoom=1.0, centre=NO_SHIFT):
+    config = CONFIG
+    return align(
+        image,
+        reference,
+        centre,
+        np.array([zoom]),
+        config.iterations,
+        config.max_shift,
+        config.min_correlation,
+    )[0]
+
+
+@pytest.mark.parametrize("zoom", [0.85, 1.0, 1.2, 1.35])
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.5, 20.0), (1.3, -60.0)])
+@pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (0.3, -0.4), (-0.9, 0.75), (1.2, 0.1)])
+def test_shift_under_another_size_and_light_is_found_to_a_twentieth_of_a_pixel(
+    x, y, zoom, gain, offset
+):
+    errors = []
+    for seed in range(20):
+        scene = random_scene(seed)
+        found = aligned(seen(scene, x, y, zoom, gain, offset), seen(scene), zoom)
+        errors.append(np.abs(found - [x, y]).max())
+    errors = np.array(errors)
+    known = np.isfinite(errors)
+    assert known.sum() >= 16
+    assert np.median(errors[known]) < 0.03
+    assert np.quantile(errors[known], 0.9) < 0.05
+
+
+def test_what_a_landmark_is_may_lie_beside_the_middle_of_its_patch():
+    scene = random_scene(3)
+    reference = seen(scene, x=1.4, y=-0.6)
+    found = aligned(seen(scene, 0.25, 0.5), reference, centre=np.array([[1.4, -0.6]], np.float32))
+    assert np.abs(found - [0.25, 0.5]).max() < 0.05
+
+
+def test_another_scene_is_refused_in_98_of_100_cases():
+    found = [aligned(seen(random_scene(k)), seen(random_scene(1000 + k))) for k in range(600)]
+    assert np.isfinite(found).all(axis=1).sum() <= 12
+
+
+def test_an_edge_and_a_flat_patch_are_refused():
+    edge = seen(lambda u, v: 128.0 + 60.0 * np.tanh(u))
+    flat = np.full((1, PATCH_PIXELS), 90, np.uint8)
+    assert np.isnan(aligned(edge, edge)).all()
+    assert np.isnan(aligned(flat, flat)).all()
+    assert np.isnan(aligned(flat, seen(random_scene(0)))).all()
+
+
+def test_what_lies_farther_than_asked_for_is_refused():
+    scene = random_scene(5)
+    assert np.isnan(aligned(seen(scene, x=2.6), seen(scene))).all()
+
+
+@pytest.mark.parametrize("zoom", [0.0, -1.0, 0.3, np.nan, np.inf, 1e-300])
+def test_sizes_that_the_patch_does_not_reach_are_refused(zoom):
+    image = seen(random_scene(0))
+    assert np.isnan(aligned(image, image, zoom)).all()
+
+
+@pytest.mark.parametrize("centre", [(np.nan, 0.0), (0.0, np.inf), (9.0, 0.0), (0.0, -1e30)])
+def test_a_centre_that_is_no_place_in_the_patch_is_refused(centre):
+    image = seen(random_scene(0))
+    assert np.isnan(aligned(image, image, centre=np.array([centre], np.float32))).all()
+
+
+def test_patches_are_the_pixels_around_the_keypoints():
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (240, 320), dtype=np.uint8)
+    found = extract(image, Config().orb)
+    for level in (0, 3):
+        of_level = np.flatnonzero(found.octave == level)
+        assert len(of_level)
+        pixels = found.pyramid.level(level)
+        ratio = np.array(image.shape[::-1]) / pixels.shape[::-1]
+        for i in of_level[:20]:
+            x, y = np.rint((found.xy[i] + 0.5) / ratio - 0.5).astype(int)
+            around = pixels[
+                y - PATCH_RADIUS : y + PATCH_RADIUS + 1, x - PATCH_RADIUS : x + PATCH_RADIUS + 1
+            ]
+            assert np.array_equal(found.patches[i], around.ravel())
+
+
+CAMERA = Camera(400.0, 400.0, 320.0, 240.0, 0.5, 640, 480)
+CONTEXT = TrackingContext.create(CAMERA, Config())
+
+
+def features_at(u, v, octave, patches):
+    n = len(patches)
+    xy = np.tile(np.array([[u, v]], np.float32), (n, 1))
+    return Features(
+        xy,
+        np.full(n, octave, np.uint8),
+        np.zeros(n, np.float32),
+        np.zeros((n, 32), np.uint8),
+        xy[:, 0] - 20.0,
+        patches=patches,
+    )
+
+
+def one_landmark(shift=np.nan):
+    """A map of one keyframe with a landmark 10 m ahead, its view, and the patch it has."""
+    map_ = Map(CONTEXT.scales)
+    patch = seen(random_scene(1))
+    keyframe = map_.add_keyframe(features_at(320, 240, 2, patch), np.eye(4), 0.0, 0)
+    ids = map_.add_landmarks(np.array([[0.0, 0.0, 10.0]]), np.zeros((1, 4), np.uint64), keyframe)
+    map_.arrays.landmark[0], map_.arrays.head[ids[0]] = ids[0], 0
+    keep_patches(
+        map_.arrays, keyframe, patch, np.full((1, 2), shift, np.float32), map_.scales
+    )
+    return map_
+
+
+def test_a_landmark_keeps_the_patch_of_the_keyframe_with_its_size_and_place():
+    map_ = one_landmark(shift=0.72)
+    a = map_.arrays
+    assert np.array_equal(a.patch[0], seen(random_scene(1))[0])
+    assert a.patch_extent[0] == pytest.approx(10.0 * 1.44)
+    assert a.patch_shift[0] == pytest.approx([0.5, 0.5])
+    assert one_landmark().arrays.patch_shift[0].tolist() == [0.0, 0.0]
+
+
+def test_size_follows_from_distance_and_octave():
+    local = local_map(one_landmark(), 0, 1)
+    # At half the distance it appears twice as large, in an octave whose pixels are 1.2**4 wide
+    # instead of 1.2**2.
+    image = seen(random_scene(1), 0.4, -0.2, zoom=2.0 / 1.44)
+    shift = align_matches(
+        image, np.array([1.2**4]), local.ids, local, np.array([5.0]), Config().alignment
+    )
+    assert shift[0] == pytest.approx([0.4 * 1.2**4, -0.2 * 1.2**4], abs=0.05 * 1.2**4)
+
+
+def test_landmarks_without_a_patch_or_elsewhere_are_not_aligned():
+    map_ = one_landmark()
+    image, size = seen(random_scene(1)), np.array([1.44])
+    local, distance = local_map(map_, 0, 1), np.array([10.0])
+    config = Config().alignment
+    assert np.isfinite(align_matches(image, size, local.ids, local, distance, config)).all()
+    unknown = np.array([7], np.int32)
+    assert np.isnan(align_matches(image, size, unknown, local, distance, config)).all()
+    map_.arrays.patch_extent[0] = 0.0
+    bare = local_map(map_, 0, 1)
+    assert np.isnan(align_matches(image, size, bare.ids, bare, distance, config)).all()
+    nothing = LocalMap(*(column[:0] for column in local))
+    assert np.isnan(align_matches(image, size, unknown, nothing, distance, config)).all()
+
+
+def test_alignment_moves_both_columns_and_makes_an_observation_surer():
+    frame = Frame.untracked(features_at(100, 50, 0, np.zeros((3, PATCH_PIXELS), np.uint8)), CAMERA)
+    frame.landmark[:] = 0, 1, -1
+    frame.shift = np.array([[0.5, -0.25], [np.nan, np.nan], [1.0, 1.0]], np.float32)
+    uvr, weight = observations(frame, np.arange(2), CONTEXT)
+    assert uvr.tolist() == [[100.5, 49.75, 80.5], [100.0, 50.0, 80.0]]
+    assert weight.tolist() == [Config().alignment.sigma**-2.0, 1.0]
+    assert frame.aligned.tolist() == [True, False, False]
+    observed = frame.observed()
+    assert observed.xy.tolist() == [[100.5, 49.75], [100.0, 50.0], [100.0, 50.0]]
+    assert observed.u_right.tolist() == [80.5, 80.0, 80.0]
+    assert frame.features.xy[0].tolist() == [100.0, 50.0]
+
+
+def test_the_map_knows_how_sure_each_observation_is(ring_mapping):
+    frame, map_ = ring_mapping
+    sure = Config().alignment.sigma**-2.0
+    # Tracked and aligned; tracked only; the first to see its landmark.
+    assert map_.arrays.certainty[map_.rows(1)].tolist() == [sure, 1.0, sure]
+    assert map_.arrays.xy[map_.rows(1)][0].tolist() == [100.5, 49.75]
+    assert map_.arrays.patch_shift[frame.landmark[0]].tolist() == [0.5, -0.25]
+
+
+@pytest.fixture
+def ring_mapping():
+    """A second keyframe that tracks two landmarks of the first."""
+    from vslam.closing import LoopClosing
+    from vslam.loopclosure.detector import NoDetector
+
+    config = Config()
+    closing = LoopClosing(NoDetector(), CAMERA, config, threads=1)
+    mapping = MappingThread(CONTEXT.scales, CAMERA, config, closing, threads=1)
+    frames = []
+    for index in range(2):
+        patches = np.concatenate([seen(random_scene(k)) for k in range(3)])
+        frame = Frame.untracked(features_at(100, 50, 0, patches), CAMERA, index, 0.1 * index)
+        frames.append(frame)
+    mapping.insert(frames[0])
+    frames[1].landmark = frames[0].landmark.copy()
+    frames[1].landmark[2] = -1
+    frames[1].shift = np.array([[0.5, -0.25], [np.nan] * 2, [np.nan] * 2], np.float32)
+    mapping.insert(frames[1])
+    return frames[1], mapping._map

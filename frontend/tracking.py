@@ -413,5 +413,5 @@ def observations(
         shift = frame.shift[feature]
         aligned = np.isfinite(shift[:, 0])
         uvr[aligned] += shift[aligned][:, [0, 1, 0]]
-        weight[aligned] *= context.config.alignment.sigma**-2.0
+        weight[aligned] *= context.config.alignment.weight
     return uvr, weight

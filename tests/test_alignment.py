@@ -146,9 +146,7 @@ def one_landmark(shift=np.nan):
     keyframe = map_.add_keyframe(features_at(320, 240, 2, patch), np.eye(4), 0.0, 0)
     ids = map_.add_landmarks(np.array([[0.0, 0.0, 10.0]]), np.zeros((1, 4), np.uint64), keyframe)
     map_.arrays.landmark[0], map_.arrays.head[ids[0]] = ids[0], 0
-    keep_patches(
-        map_.arrays, keyframe, patch, np.full((1, 2), shift, np.float32), map_.scales
-    )
+    keep_patches(map_.arrays, keyframe, patch, np.full((1, 2), shift, np.float32), map_.scales)
     return map_
 
 
@@ -193,7 +191,7 @@ def test_alignment_moves_both_columns_and_makes_an_observation_surer():
     frame.shift = np.array([[0.5, -0.25], [np.nan, np.nan], [1.0, 1.0]], np.float32)
     uvr, weight = observations(frame, np.arange(2), CONTEXT)
     assert uvr.tolist() == [[100.5, 49.75, 80.5], [100.0, 50.0, 80.0]]
-    assert weight.tolist() == [Config().alignment.sigma**-2.0, 1.0]
+    assert weight.tolist() == [Config().alignment.weight, 1.0]
     assert frame.aligned.tolist() == [True, False, False]
     observed = frame.observed()
     assert observed.xy.tolist() == [[100.5, 49.75], [100.0, 50.0], [100.0, 50.0]]
@@ -203,9 +201,9 @@ def test_alignment_moves_both_columns_and_makes_an_observation_surer():
 
 def test_the_map_knows_how_sure_each_observation_is(ring_mapping):
     frame, map_ = ring_mapping
-    sure = Config().alignment.sigma**-2.0
+    sure = Config().alignment.weight
     # Tracked and aligned; tracked only; the first to see its landmark.
-    assert map_.arrays.certainty[map_.rows(1)].tolist() == [sure, 1.0, sure]
+    assert map_.arrays.certainty[map_.rows(1)].tolist() == [sure, 1, sure]
     assert map_.arrays.xy[map_.rows(1)][0].tolist() == [100.5, 49.75]
     assert map_.arrays.patch_shift[frame.landmark[0]].tolist() == [0.5, -0.25]
 

@@ -177,11 +177,12 @@ class AlignmentConfig(_Section):
     min_correlation: float = Field(
         0.8, gt=0, le=1, description="Cross-correlation of an aligned patch with the image. [own]"
     )
-    sigma: float = Field(
-        0.5,
-        gt=0,
-        le=1,
-        description="Deviation of an aligned match; of others 1, pixels of the octave. [own]",
+    weight: int = Field(
+        4,
+        ge=1,
+        le=255,
+        description="Inverse variance of an aligned match, in pixels of its octave; of others 1. "
+        "[own]",
     )
 
 

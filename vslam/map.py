@@ -5,6 +5,8 @@ the table of observations too: ``landmark[row]`` names the landmark that the key
 ``next_row`` chains the rows of each landmark. Nothing is derived twice: covisibility is counted
 from the rows when it is needed (after DPVO's PatchGraph, arrays instead of objects). Ids of
 keyframes are never reused, those of landmarks until dead ones are dropped; arrays grow by half.
+
+One file because each method keeps what the others rely on.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ class Arrays(NamedTuple):
     distance from which it was seen, times full-resolution pixels for one of it; 0: no patch.
     Rows: ``xy`` (R, 2) f4; ``u_right`` (R,) f4; ``octave`` (R,) u1; ``angle`` (R,) f4;
     ``descriptor`` (R, 4) u8; ``keyframe`` (R,) i4; ``landmark``, ``next_row`` (R,) i4;
-    ``certainty`` (R,) f4 inverse variance of ``xy``, in pixels of the octave.
+    ``certainty`` (R,) u1 inverse variance of ``xy``, in pixels of the octave.
     """
 
     T_cw: NDArray[np.float64]
@@ -66,7 +68,7 @@ class Arrays(NamedTuple):
     keyframe: NDArray[np.int32]
     landmark: NDArray[np.int32]
     next_row: NDArray[np.int32]
-    certainty: NDArray[np.float32]
+    certainty: NDArray[np.uint8]
 
 
 KEYFRAME_FIELDS = Arrays._fields[:3]
@@ -147,7 +149,7 @@ class Map:
             keyframe=np.zeros(r, np.int32),
             landmark=np.zeros(r, np.int32),
             next_row=np.zeros(r, np.int32),
-            certainty=np.zeros(r, np.float32),
+            certainty=np.zeros(r, np.uint8),
         )
 
     def _reserve(self, fields: tuple[str, ...], used: int, extra: int) -> None:
@@ -165,7 +167,7 @@ class Map:
         T_cw: NDArray[np.float64],
         timestamp: float,
         frame: int,
-        certainty: NDArray[np.float32] | float = 1.0,
+        certainty: NDArray[np.uint8] | int = 1,
     ) -> int:
         """Append a keyframe without observations; returns its id.
 

@@ -329,14 +329,13 @@ class MappingThread:
         frame.landmark = self._map.arrays.landmark[self._map.rows(keyframe)]
         self.update(frame)
 
-    def _certainty(self, frame: Frame) -> NDArray[np.float32] | float:
+    def _certainty(self, frame: Frame) -> NDArray[np.uint8] | int:
         """Of the features of a frame. What a landmark is first seen as is where it is seen; a
         match that was not aligned is half a pixel off."""
         if frame.features.patches is None:
-            return 1.0
-        sure = self._config.alignment.sigma**-2.0
+            return 1
         unaligned = (frame.landmark >= 0) & ~frame.aligned
-        return np.where(unaligned, 1.0, sure).astype(np.float32)
+        return np.where(unaligned, 1, self._config.alignment.weight).astype(np.uint8)
 
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
         self.n_keyframes = keyframe + 1

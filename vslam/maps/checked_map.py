@@ -51,7 +51,7 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "row_octave": (np.uint8, ("R",)),
     "row_angle": (np.float32, ("R",)),
     "row_descriptor": (np.uint64, ("R", 4)),
-    "row_certainty": (np.float32, ("R",)),
+    "row_certainty": (np.uint8, ("R",)),
     "loop_ends": (np.int64, ("E", 2)),
     "loop_T_query_match": (np.float64, ("E", 4, 4)),
     "loop_scale": (np.float64, ("E",)),

@@ -84,7 +84,6 @@ def _carry(a, landmarks, motion, moved):
         for i in range(3):
             p[i], n[i] = a.xyz[landmark, i], a.normal[landmark, i]
         T = motion[anchor]
-        a.patch_extent[landmark] *= np.sqrt(T[0, 0] ** 2 + T[1, 0] ** 2 + T[2, 0] ** 2)
         for i in range(3):
             a.xyz[landmark, i] = T[i, 0] * p[0] + T[i, 1] * p[1] + T[i, 2] * p[2] + T[i, 3]
             a.normal[landmark, i] = T[i, 0] * n[0] + T[i, 1] * n[1] + T[i, 2] * n[2]

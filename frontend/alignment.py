@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import AlignmentConfig
-from vslam.features import PATCH_PIXELS, PATCH_RADIUS, PATCH_SIDE
+from vslam.features import PATCH_RADIUS, PATCH_SIDE
 from vslam.kernels import inner_kernel, kernel
-from vslam.map import LocalMap
+from vslam.recent_patches import LandmarkPatches
 
 HALF = 4  # of the window that is compared, pixels
 SIDE = 2 * HALF + 1
@@ -43,8 +43,8 @@ def align_matches(
     patches: NDArray[np.uint8],
     size: NDArray[np.float64],
     landmark: NDArray[np.int32],
-    local: LocalMap,
-    distance: NDArray[np.float64],
+    known: LandmarkPatches,
+    depth: NDArray[np.float64],
     config: AlignmentConfig,
 ) -> NDArray[np.float32]:
     """How far from its keypoint each match truly lies.
@@ -53,24 +53,24 @@ def align_matches(
         patches: ``(N, PATCH_PIXELS)`` uint8 around the matched keypoints.
         size: ``(N,)`` full-resolution pixels for a pixel of their octaves.
         landmark: ``(N,)`` ids that they are matched with.
-        local: where landmarks have their patches.
-        distance: ``(N,)`` from the camera to them.
+        known: patches of landmarks.
+        depth: ``(N,)`` of them in the camera.
 
     Returns:
-        ``(N, 2)`` float32 full-resolution pixels; NaN where that is not known: the landmark is not
-        in the local map, has no patch, or none that the image agrees with.
+        ``(N, 2)`` float32 full-resolution pixels; NaN where that is not known: the landmark has
+        no patch, or none that the image agrees with.
     """
     shift = np.full((len(landmark), 2), np.nan, np.float32)
-    if not len(local.ids):
+    if not len(known.ids):
         return shift
-    at = np.minimum(np.searchsorted(local.ids, landmark), len(local.ids) - 1)
-    known = np.flatnonzero((local.ids[at] == landmark) & (local.patch_extent[at] > 0.0))
-    at = at[known]
-    shift[known] = align(
-        patches[known],
-        local.patch[at],
-        local.patch_shift[at],
-        local.patch_extent[at] / (distance[known] * size[known]),
+    at = np.minimum(np.searchsorted(known.ids, landmark), len(known.ids) - 1)
+    found = np.flatnonzero(known.ids[at] == landmark)
+    at = at[found]
+    shift[found] = align(
+        patches[found],
+        known.pixels[at],
+        known.shift[at],
+        known.extent[at] / (depth[found] * size[found]),
         config.iterations,
         config.max_shift,
         config.min_correlation,
@@ -208,33 +208,3 @@ def compare(image, x, y, template, slope_x, slope_y):
             b_x += value * slope_x[r, c]
             b_y += value * slope_y[r, c]
     return square - total * total / np.float32(SIDE * SIDE), product, b_x, b_y
-
-
-@kernel
-def keep_patches(a, keyframe, patches, shift, scales):
-    """Give the landmarks that a keyframe observes its patches of them.
-
-    Args:
-        a: the map's ``Arrays``.
-        patches: ``(N, PATCH_PIXELS)`` of its N rows.
-        shift: ``(N, 2)`` float32 from the middle of each patch to what the row observes,
-            full-resolution pixels; NaN: it is in the middle.
-    """
-    first = a.first_row[keyframe]
-    T = a.T_cw[keyframe]
-    for i in range(len(patches)):
-        row = first + i
-        landmark = a.landmark[row]
-        if landmark < 0:
-            continue
-        p, scale = a.xyz[landmark], scales[a.octave[row]]
-        square = 0.0
-        for k in range(3):
-            along = T[k, 0] * p[0] + T[k, 1] * p[1] + T[k, 2] * p[2] + T[k, 3]
-            square += along * along
-        a.patch_extent[landmark] = np.sqrt(square) * scale
-        for k in range(2):
-            moved = shift[i, k] / scale
-            a.patch_shift[landmark, k] = 0.0 if np.isnan(moved) else moved
-        for k in range(PATCH_PIXELS):
-            a.patch[landmark, k] = patches[i, k]

@@ -14,6 +14,7 @@ from vslam.frontend.orb import Extraction
 from vslam.kernels import hamming, inline, inner_kernel, kernel
 
 LANES = 16  # shifts of the SAD window tried at once
+REFINE_HALF = 4  # of the patch that is refined: a larger one reaches over nearer things
 MEDIAN_FACTOR = 1.5 * 1.4826  # 1.5 standard deviations, from the median of a half-normal
 
 
@@ -185,7 +186,7 @@ def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
     if curvature <= 0:
         return np.nan, np.float32(-1.0)
     start = 0.5 * (before - after) / curvature
-    refined = refine_shift(image_l, image_r, x_l, y_l, x_r + best - reach, start, half)
+    refined = refine_shift(image_l, image_r, x_l, y_l, x_r + best - reach, start, REFINE_HALF)
     return best - reach + refined, np.float32(here)
 
 

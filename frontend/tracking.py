@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, ImageMap
+from vslam.camera import DISPARITY_WEIGHT, Camera, ImageMap
 from vslam.config import Config
 from vslam.features import FeatureGrid, Features
 from vslam.frontend.alignment import align_matches
@@ -31,6 +31,7 @@ from vslam.frontend.stereo import match_stereo
 from vslam.frontend.weak_images import extract_in_any_light
 from vslam.geometry import compose, inverse, transform
 from vslam.map import LocalMap
+from vslam.recent_patches import NO_PATCHES, LandmarkPatches
 from vslam.reprojection import stack_uvr
 
 NEVER = np.iinfo(np.int64).max
@@ -304,13 +305,18 @@ def track_descriptors(
 
 
 def track_local_map(
-    frame: Frame, local: LocalMap, context: TrackingContext, window: float | None = None
+    frame: Frame,
+    local: LocalMap,
+    context: TrackingContext,
+    window: float | None = None,
+    patches: LandmarkPatches = NO_PATCHES,
 ) -> tuple[int, int, NDArray[np.int32]]:
-    """Match every local landmark that should be visible, align all matches to a fraction of a
+    """Match every local landmark that should be visible, align the matches to a fraction of a
     pixel, then refine the pose with them.
 
     Args:
         window: search radius at octave 0, pixels; None: ``context.local_window``.
+        patches: of the landmarks that can be aligned.
 
     Returns:
         Matches, inliers, and the ids of the landmarks that should be visible.
@@ -343,14 +349,16 @@ def track_local_map(
     frame.landmark[found[hit]] = local.ids[hit]
     frame.xyz[found[hit]] = local.xyz[hit]
     matches = int(np.count_nonzero(frame.landmark >= 0))
-    inliers = refine(frame, frame.T_cw, context, _shift(frame, local, context))
+    inliers = refine(frame, frame.T_cw, context, _shift(frame, patches, context))
     return matches, inliers, local.ids[visible | tracked]
 
 
-def _shift(frame: Frame, local: LocalMap, context: TrackingContext) -> NDArray[np.float32] | None:
-    """``Frame.shift`` of its matches with the local map."""
+def _shift(
+    frame: Frame, patches: LandmarkPatches, context: TrackingContext
+) -> NDArray[np.float32] | None:
+    """``Frame.shift`` of its matches."""
     features = frame.features
-    if features.patches is None:
+    if features.patches is None or not len(patches.ids):
         return None
     matched = np.flatnonzero(frame.landmark >= 0)
     shift = np.full((len(features), 2), np.nan, np.float32)
@@ -358,8 +366,8 @@ def _shift(frame: Frame, local: LocalMap, context: TrackingContext) -> NDArray[n
         features.patches[matched],
         context.scales[features.octave[matched]],
         frame.landmark[matched],
-        local,
-        np.linalg.norm(transform(frame.T_cw, frame.xyz[matched]), axis=1),
+        patches,
+        transform(frame.T_cw, frame.xyz[matched])[:, 2],
         context.config.alignment,
     )
     return shift
@@ -390,11 +398,20 @@ def refine(
     """
     frame.shift = shift
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
+    uvr, weight = observations(frame, matched, context)
+    certainty = np.ones(len(matched))
+    if shift is not None:
+        moved = shift[matched]
+        aligned = np.isfinite(moved[:, 0])
+        uvr[aligned] += moved[aligned][:, [0, 1, 0]]
+        certainty[aligned] = context.config.alignment.certainty
     frame.T_cw, inlier = optimise_pose(
         T_cw,
         frame.xyz[matched],
-        *observations(frame, matched, context),
+        uvr,
+        weight * certainty,
         context.camera.intrinsics,
+        DISPARITY_WEIGHT / np.sqrt(certainty),
     )
     outliers = matched[~inlier]
     frame.landmark[outliers] = -1
@@ -408,10 +425,4 @@ def observations(
     """``(N, 3)`` u, v, u_right of ``(N,)`` features, and ``(N,)`` their inverse variances."""
     features = frame.features
     uvr = stack_uvr(features.xy[feature], features.u_right[feature])
-    weight = context.scales[features.octave[feature]] ** -2.0
-    if frame.shift is not None:
-        shift = frame.shift[feature]
-        aligned = np.isfinite(shift[:, 0])
-        uvr[aligned] += shift[aligned][:, [0, 1, 0]]
-        weight[aligned] *= context.config.alignment.weight
-    return uvr, weight
+    return uvr, context.scales[features.octave[feature]] ** -2.0

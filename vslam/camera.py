@@ -18,7 +18,7 @@ Sensor = Literal["stereo", "mono", "rgbd"]
 
 # How much surer the disparity of an observation is than its column and row: the factor on its
 # reprojection error (docs/motorway.md, tools/noise_model.py).
-DISPARITY_WEIGHT = 2.0
+DISPARITY_WEIGHT = 3.0
 
 
 @dataclass(frozen=True)

@@ -177,13 +177,14 @@ class AlignmentConfig(_Section):
     min_correlation: float = Field(
         0.8, gt=0, le=1, description="Cross-correlation of an aligned patch with the image. [own]"
     )
-    weight: int = Field(
+    certainty: int = Field(
         4,
         ge=1,
         le=255,
-        description="Inverse variance of an aligned match, in pixels of its octave; of others 1. "
-        "[own]",
+        description="How many times smaller the variance of an aligned match is than that of a "
+        "keypoint. [own]",
     )
+    keyframes: int = Field(5, ge=1, description="The newest ones, whose patches are kept. [own]")
 
 
 class TrackingConfig(_Section):

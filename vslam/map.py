@@ -5,8 +5,6 @@ the table of observations too: ``landmark[row]`` names the landmark that the key
 ``next_row`` chains the rows of each landmark. Nothing is derived twice: covisibility is counted
 from the rows when it is needed (after DPVO's PatchGraph, arrays instead of objects). Ids of
 keyframes are never reused, those of landmarks until dead ones are dropped; arrays grow by half.
-
-One file because each method keeps what the others rely on.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import PATCH_PIXELS, Features
+from vslam.features import Features
 from vslam.geometry import compose, inverse, orthonormalised
 from vslam.loops import LoopEdge
 from vslam.map_kernels import collect_landmarks, count_shared, detach_keyframe, resolve, unlink
@@ -35,12 +33,10 @@ class Arrays(NamedTuple):
     ``landmark_descriptor`` (L, 4) u8; ``first_keyframe`` (L,) i4; ``visible``, ``found`` (L,) i4
     frames that should, and did, see it; ``landmark_alive`` (L,) bool; ``merged_into`` (L,) i4;
     ``head`` (L,) i4 first row of its chain; ``n_observations`` (L,) i4, stereo ones counting twice
-    (ORB-SLAM2); ``patch`` (L, PATCH_PIXELS) u1 that the newest keyframe saw of it, ``patch_shift``
-    (L, 2) f4 where in it the landmark is, from its middle, in its pixels; ``patch_extent`` (L,) f8
-    distance from which it was seen, times full-resolution pixels for one of it; 0: no patch.
+    (ORB-SLAM2).
     Rows: ``xy`` (R, 2) f4; ``u_right`` (R,) f4; ``octave`` (R,) u1; ``angle`` (R,) f4;
     ``descriptor`` (R, 4) u8; ``keyframe`` (R,) i4; ``landmark``, ``next_row`` (R,) i4;
-    ``certainty`` (R,) u1 inverse variance of ``xy``, in pixels of the octave.
+    ``certainty`` (R,) u1 how many times smaller the variance of ``xy`` is than that of a keypoint.
     """
 
     T_cw: NDArray[np.float64]
@@ -57,9 +53,6 @@ class Arrays(NamedTuple):
     merged_into: NDArray[np.int32]
     head: NDArray[np.int32]
     n_observations: NDArray[np.int32]
-    patch: NDArray[np.uint8]
-    patch_shift: NDArray[np.float32]
-    patch_extent: NDArray[np.float64]
     xy: NDArray[np.float32]
     u_right: NDArray[np.float32]
     octave: NDArray[np.uint8]
@@ -72,8 +65,8 @@ class Arrays(NamedTuple):
 
 
 KEYFRAME_FIELDS = Arrays._fields[:3]
-LANDMARK_FIELDS = Arrays._fields[3:17]
-ROW_FIELDS = Arrays._fields[17:]
+LANDMARK_FIELDS = Arrays._fields[3:14]
+ROW_FIELDS = Arrays._fields[14:]
 
 
 def _grown(array: NDArray, capacity: int) -> NDArray:
@@ -138,9 +131,6 @@ class Map:
             merged_into=np.zeros(n, np.int32),
             head=np.zeros(n, np.int32),
             n_observations=np.zeros(n, np.int32),
-            patch=np.zeros((n, PATCH_PIXELS), np.uint8),
-            patch_shift=np.zeros((n, 2), np.float32),
-            patch_extent=np.zeros(n),
             xy=np.zeros((r, 2), np.float32),
             u_right=np.zeros(r, np.float32),
             octave=np.zeros(r, np.uint8),
@@ -215,7 +205,6 @@ class Map:
         a.landmark_alive[new] = True
         a.merged_into[new], a.head[new] = NONE, NONE
         a.n_observations[new] = 0
-        a.patch_extent[new] = 0.0
         self.n_landmarks += n
         return np.arange(start, start + n, dtype=np.int32)
 
@@ -373,7 +362,7 @@ class LocalMap(NamedTuple):
     """A copy of the landmarks around a keyframe, so that tracking can go on while mapping writes.
 
     ``ids`` (N,) i4; ``xyz``, ``normal`` (N, 3) f8; ``distance_range`` (N, 2) f8; ``descriptor``
-    (N, 4) u8; ``patch`` (N, PATCH_PIXELS) u1; ``patch_shift`` (N, 2) f4; ``patch_extent`` (N,) f8.
+    (N, 4) u8.
     """
 
     ids: NDArray[np.int32]
@@ -381,9 +370,6 @@ class LocalMap(NamedTuple):
     normal: NDArray[np.float64]
     distance_range: NDArray[np.float64]
     descriptor: NDArray[np.uint64]
-    patch: NDArray[np.uint8]
-    patch_shift: NDArray[np.float32]
-    patch_extent: NDArray[np.float64]
 
 
 def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
@@ -399,12 +385,5 @@ def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
     a = map_.arrays
     ids = collect_landmarks(a, np.array(chosen, np.int64), map_.n_landmarks)
     return LocalMap(
-        ids,
-        a.xyz[ids],
-        a.normal[ids],
-        a.distance_range[ids],
-        a.landmark_descriptor[ids],
-        a.patch[ids],
-        a.patch_shift[ids],
-        a.patch_extent[ids],
+        ids, a.xyz[ids], a.normal[ids], a.distance_range[ids], a.landmark_descriptor[ids]
     )

@@ -9,10 +9,10 @@ last merge left.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,32 +25,13 @@ from vslam.camera import Camera
 from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.features import Features
-from vslam.frontend.alignment import keep_patches
 from vslam.frontend.tracking import Frame
 from vslam.geometry import Matrix
 from vslam.map import LocalMap, Map, local_map
 from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
 from vslam.maps.checkpoint import Checkpoint
 from vslam.monocular import TwoViewStart
-
-
-class _Patches(NamedTuple):
-    """Those of a frame, None if it has none, and ``Frame.shift`` of what they show."""
-
-    pixels: NDArray[np.uint8] | None
-    shift: NDArray[np.float32]
-
-    @classmethod
-    def of(cls, frame: Frame) -> _Patches:
-        shift = np.full((len(frame.features), 2), np.nan, np.float32)
-        if frame.shift is not None:
-            shift[frame.aligned] = frame.shift[frame.aligned]
-        return cls(frame.features.patches, shift)
-
-    def keep(self, map_: Map, keyframe: int) -> None:
-        """Give them to the landmarks that the frame, now a keyframe, observes."""
-        if self.pixels is not None:
-            keep_patches(map_.arrays, keyframe, self.pixels, self.shift, map_.scales)
+from vslam.recent_patches import KeyframePatches, LandmarkPatches, patches_of
 
 
 class MappingThread:
@@ -61,12 +42,15 @@ class MappingThread:
         n_keyframes: keyframes made, culled ones included.
         last_frame, last_timestamp: index and seconds of the frame that became the last keyframe.
         local: landmarks around the reference keyframe, as of the last merge.
+        patches: of those of them that the newest keyframes observe.
+        recent: the patches of these keyframes, oldest first.
         reference_view: landmarks of the reference keyframe alone.
         n_reference: of these, those that at least three keyframes see (all in a young map).
         disparity_offset: ``Map.disparity_offset``.
     """
 
     local: LocalMap
+    patches: LandmarkPatches
     reference_view: LocalMap
     n_reference: int
     disparity_offset: float
@@ -87,6 +71,7 @@ class MappingThread:
         self.disparity_offset = 0.0
         self.last_frame = -1
         self.last_timestamp = -np.inf
+        self.recent: deque[KeyframePatches] = deque(maxlen=config.alignment.keyframes)
         self._map = map_ or Map(scales)
         self._camera = camera
         self._config = config
@@ -110,6 +95,7 @@ class MappingThread:
     def return_to(self, checkpoint: Checkpoint) -> None:
         """Go on as from there, in the map as it was then."""
         self.last_frame, self.last_timestamp = checkpoint.last_frame, checkpoint.last_timestamp
+        self.recent.extend(checkpoint.patches)
         self.set_reference(checkpoint.reference)
 
     @property
@@ -156,14 +142,13 @@ class MappingThread:
                 map_.begin_submap(keyframe, self.reference, predicted=predicted)
         map_stereo_points(map_, keyframe, self._camera, self._config)
         refresh_keyframe(map_, keyframe)
-        patches = _Patches.of(frame)
-        patches.keep(map_, keyframe)
+        self._remember_patches(frame, keyframe)
         self._set_newest(keyframe, frame)
         # The map is the thread's from here on.
         self._observe(frame, keyframe)
         if keyframe > 0:
             self._pending = self._start(
-                partial(self._map_keyframe, keyframe, frame.features, patches, frame.image)
+                partial(self._map_keyframe, keyframe, frame.features, frame.image)
             )
         else:
             self._closing.process(map_, keyframe, frame.features, frame.image)
@@ -214,7 +199,7 @@ class MappingThread:
         if one > 0:
             map_.begin_submap(one, self.reference, predicted=start.predicted)
         map_.parents[two] = one
-        _Patches.of(start.second).keep(map_, two)
+        self._remember_patches(start.second, two)
         for keyframe, frame in zip((one, two), frames, strict=True):
             self._closing.process(map_, keyframe, frame.features, frame.image)
         self._set_newest(two, start.second)
@@ -335,7 +320,17 @@ class MappingThread:
         if frame.features.patches is None:
             return 1
         unaligned = (frame.landmark >= 0) & ~frame.aligned
-        return np.where(unaligned, 1, self._config.alignment.weight).astype(np.uint8)
+        return np.where(unaligned, 1, self._config.alignment.certainty).astype(np.uint8)
+
+    def _remember_patches(self, frame: Frame, keyframe: int) -> None:
+        if frame.features.patches is None:
+            return
+        shift = np.zeros((len(frame.features), 2), np.float32)
+        if frame.shift is not None:
+            aligned = frame.aligned
+            scale = self._map.scales[frame.features.octave[aligned]]
+            shift[aligned] = frame.shift[aligned] / scale[:, None]
+        self.recent.append(KeyframePatches(keyframe, frame.features.patches, shift))
 
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
         self.n_keyframes = keyframe + 1
@@ -353,14 +348,9 @@ class MappingThread:
             seen.clear()
 
     def _map_keyframe(
-        self,
-        keyframe: int,
-        features: Features,
-        patches: _Patches,
-        image: NDArray[np.uint8] | None,
+        self, keyframe: int, features: Features, image: NDArray[np.uint8] | None
     ) -> None:
         map_and_calibrate(self._map, keyframe, self._camera, self._config)
-        patches.keep(self._map, keyframe)  # landmarks that were triangulated have none yet
         self._closing.process(self._map, keyframe, features, image)
 
     def _start(self, work: Callable[[], None]) -> Callable[[], None]:
@@ -373,6 +363,7 @@ class MappingThread:
         map_, reference = self._map, self.reference
         self.disparity_offset = map_.disparity_offset
         self.local = local_map(map_, reference, self._config.tracking.local_keyframes)
+        self.patches = patches_of(map_, self.local.ids, self.recent)
         self.reference_view = local_map(map_, reference, 1)
         living = map_.living_keyframes()
         if self._camera.monocular and map_.restarts:

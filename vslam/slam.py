@@ -495,7 +495,9 @@ class Slam:
         frame.T_cw = T_cw
         frame.landmark[:], frame.xyz[:] = -1, np.nan
         window = self.config.tracking.predicted_window
-        matches, inliers, _ = track_local_map(frame, self._mapping.local, self.context, window)
+        matches, inliers, _ = track_local_map(
+            frame, self._mapping.local, self.context, window, self._mapping.patches
+        )
         if self._moves_as_predicted(inliers, matches):
             return inliers
         frame.landmark[:], frame.xyz[:] = -1, np.nan
@@ -527,7 +529,9 @@ class Slam:
     def _track_local_map(self, frame: Frame, inliers: int) -> tuple[int, int, NDArray[np.int32]]:
         if inliers < self.config.tracking.min_inliers_frame:
             return inliers, 0, np.empty(0, np.int32)
-        return track_local_map(frame, self._mapping.local, self.context)
+        return track_local_map(
+            frame, self._mapping.local, self.context, patches=self._mapping.patches
+        )
 
     def _relocalise(self, frame: Frame) -> int:
         """Look for a lost frame in the whole map; returns inliers, 0 if it was found nowhere."""

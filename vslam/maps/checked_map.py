@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera
-from vslam.features import PATCH_PIXELS
 from vslam.frame_poses import FrameTable
 from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe
 from vslam.map import NONE, Arrays, Map
@@ -41,9 +40,6 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "landmark_found": (np.int32, ("L",)),
     "landmark_alive": (np.bool_, ("L",)),
     "landmark_merged_into": (np.int32, ("L",)),
-    "landmark_patch": (np.uint8, ("L", PATCH_PIXELS)),
-    "landmark_patch_shift": (np.float32, ("L", 2)),
-    "landmark_patch_extent": (np.float64, ("L",)),
     "landmark_first_observation": (np.int64, ("L+1",)),
     "observation_row": (np.int64, ("O",)),
     "row_xy": (np.float32, ("R", 2)),
@@ -164,7 +160,6 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) ->
     _check_ids("row_octave", data["row_octave"], len(scales))
     _require(not np.isinf(data["row_u_right"]).any(), "row_u_right is infinite")
     _require(bool((data["row_certainty"] > 0).all()), "row_certainty")
-    _require(bool((data["landmark_patch_extent"] >= 0).all()), "landmark_patch_extent")
 
     first, rows = data["landmark_first_observation"], data["observation_row"]
     _check_first("landmark_first_observation", first, sizes["O"])
@@ -196,9 +191,6 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) ->
         found=data["landmark_found"],
         landmark_alive=alive,
         merged_into=data["landmark_merged_into"],
-        patch=data["landmark_patch"],
-        patch_shift=data["landmark_patch_shift"],
-        patch_extent=data["landmark_patch_extent"],
         xy=data["row_xy"],
         u_right=data["row_u_right"],
         octave=data["row_octave"],

@@ -1,0 +1,92 @@
+"""Patches of landmarks: the pixels around them in the newest keyframes that observe them.
+
+Only the newest keyframes keep theirs: those see nearly all that tracking follows, and a patch takes
+more memory than the rest of an observation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.features import PATCH_PIXELS
+from vslam.kernels import kernel
+from vslam.map import Map
+
+
+class KeyframePatches(NamedTuple):
+    """Of the N features of a keyframe: ``pixels`` (N, PATCH_PIXELS) u1 around the keypoints, and
+    ``shift`` (N, 2) f4 from there to what each observes, in pixels of its octave."""
+
+    keyframe: int
+    pixels: NDArray[np.uint8]
+    shift: NDArray[np.float32]
+
+
+class LandmarkPatches(NamedTuple):
+    """Of N landmarks: ``ids`` (N,) i4, sorted; ``pixels``, ``shift`` as of ``KeyframePatches``;
+    ``extent`` (N,) f8 depth at which each was seen, times full-resolution pixels for one of it."""
+
+    ids: NDArray[np.int32]
+    pixels: NDArray[np.uint8]
+    shift: NDArray[np.float32]
+    extent: NDArray[np.float64]
+
+
+NO_PATCHES = LandmarkPatches(
+    np.empty(0, np.int32),
+    np.empty((0, PATCH_PIXELS), np.uint8),
+    np.empty((0, 2), np.float32),
+    np.empty(0),
+)
+
+
+def patches_of(
+    map_: Map, ids: NDArray[np.int32], recent: Collection[KeyframePatches]
+) -> LandmarkPatches:
+    """The patches of landmarks, each by the newest keyframe that observes it.
+
+    Args:
+        ids: ``(L,)`` landmarks, sorted.
+        recent: oldest first.
+    """
+    if not recent or not len(ids):
+        return NO_PATCHES
+    row, extent = newest_rows(
+        map_.arrays, np.array([one.keyframe for one in recent]), ids, map_.scales
+    )
+    seen = np.flatnonzero(row >= 0)
+    row = row[seen]
+    pixels = np.empty((len(seen), PATCH_PIXELS), np.uint8)
+    shift = np.empty((len(seen), 2), np.float32)
+    for one in recent:
+        rows = map_.rows(one.keyframe)
+        mine = np.flatnonzero((row >= rows.start) & (row < rows.stop))
+        pixels[mine] = one.pixels[row[mine] - rows.start]
+        shift[mine] = one.shift[row[mine] - rows.start]
+    return LandmarkPatches(ids[seen], pixels, shift, extent[seen])
+
+
+@kernel
+def newest_rows(a, keyframes, ids, scales):
+    """By which row the last of some keyframes observes each landmark, -1 for none, and the depth
+    in it times the width of a pixel of the octave."""
+    row = np.full(len(ids), -1, np.int64)
+    extent = np.zeros(len(ids))
+    for keyframe in keyframes:
+        if not a.keyframe_alive[keyframe]:
+            continue
+        T = a.T_cw[keyframe]
+        for r in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
+            landmark = a.landmark[r]
+            at = np.searchsorted(ids, landmark)
+            if landmark < 0 or at == len(ids) or ids[at] != landmark:
+                continue
+            p = a.xyz[landmark]
+            depth = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+            if depth > 0.0:
+                row[at], extent[at] = r, depth * scales[a.octave[r]]
+    return row, extent

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import AlignmentConfig
-from vslam.features import PATCH_RADIUS, PATCH_SIDE
+from vslam.features import PATCH_RADIUS, PATCH_SIDE, LandmarkPatches
 from vslam.kernels import inner_kernel, kernel
-from vslam.recent_patches import LandmarkPatches
 
 HALF = 4  # of the window that is compared, pixels
 SIDE = 2 * HALF + 1
@@ -27,16 +26,6 @@ WIDE = SIDE + 2  # with a pixel around it, for slopes
 MIN_VARIANCE = 1.0  # grey levels squared; a patch with less shows nothing
 MIN_CORNERNESS = 0.05  # determinant of the normal equations over that of a corner
 STILL = 0.03  # pixels; a smaller step ends the iteration
-
-
-@inner_kernel
-def cut_patch(image, x, y, out):
-    """Copy the pixels around ``x, y`` of a level into ``out`` ``(PATCH_PIXELS,)``."""
-    k = 0
-    for row in range(y - PATCH_RADIUS, y + PATCH_RADIUS + 1):
-        for column in range(x - PATCH_RADIUS, x + PATCH_RADIUS + 1):
-            out[k] = image[row, column]
-            k += 1
 
 
 def align_matches(

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from vslam.config import OrbConfig
 from vslam.features import PATCH_PIXELS
-from vslam.frontend.alignment import cut_patch
 from vslam.frontend.corners import fast_scores, local_maxima, spread
+from vslam.frontend.patches import cut_patch
 from vslam.frontend.smoothing import smoothed
 from vslam.kernels import kernel
 

@@ -175,7 +175,7 @@ class AlignmentConfig(_Section):
         description="From the keypoint, in x and in y, pixels of its octave. [own]",
     )
     min_correlation: float = Field(
-        0.8, gt=0, le=1, description="Cross-correlation of an aligned patch with the image. [own]"
+        0.85, gt=0, le=1, description="Cross-correlation of an aligned patch with the image. [own]"
     )
     certainty: int = Field(
         4,

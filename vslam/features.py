@@ -62,6 +62,25 @@ class Features:
         )
 
 
+class KeyframePatches(NamedTuple):
+    """Of the N features of a keyframe: ``pixels`` (N, PATCH_PIXELS) u1 around the keypoints, and
+    ``shift`` (N, 2) f4 from there to what each observes, in pixels of its octave."""
+
+    keyframe: int
+    pixels: NDArray[np.uint8]
+    shift: NDArray[np.float32]
+
+
+class LandmarkPatches(NamedTuple):
+    """Of N landmarks: ``ids`` (N,) i4, sorted; ``pixels``, ``shift`` as of ``KeyframePatches``;
+    ``extent`` (N,) f8 depth at which each was seen, times full-resolution pixels for one of it."""
+
+    ids: NDArray[np.int32]
+    pixels: NDArray[np.uint8]
+    shift: NDArray[np.float32]
+    extent: NDArray[np.float64]
+
+
 def shifted_columns(
     u_right: NDArray[np.float32], u: NDArray[np.float32], change: float
 ) -> NDArray[np.float32]:

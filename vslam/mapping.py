@@ -24,14 +24,14 @@ from vslam.backend.two_views import map_two_views
 from vslam.camera import Camera
 from vslam.closing import LoopClosing
 from vslam.config import Config
-from vslam.features import Features
-from vslam.frontend.tracking import Frame
+from vslam.features import Features, KeyframePatches, LandmarkPatches
+from vslam.frontend.frame import Frame
+from vslam.frontend.patches import patches_of
 from vslam.geometry import Matrix
 from vslam.map import LocalMap, Map, local_map
 from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
 from vslam.maps.checkpoint import Checkpoint
 from vslam.monocular import TwoViewStart
-from vslam.recent_patches import KeyframePatches, LandmarkPatches, patches_of
 
 
 class MappingThread:

@@ -19,6 +19,7 @@ from vslam.config import Config
 from vslam.errors import InputError
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.frame_poses import FramePoses, FrameTable
+from vslam.frontend.frame import Frame
 from vslam.frontend.keyframes import (
     CloseGain,
     KeyframeEvidence,
@@ -29,7 +30,6 @@ from vslam.frontend.keyframes import (
 )
 from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracking import (
-    Frame,
     TrackingContext,
     extract_features,
     feature_depth,
@@ -242,6 +242,7 @@ class Slam:
             gained_close=self._close_gain.mean,
             gain_awaited=self._close_gain.awaited,
             closing=self._closing.memory(),
+            patches=tuple(self._mapping.recent),
         )
 
     def _return_to(self, checkpoint: Checkpoint) -> None:

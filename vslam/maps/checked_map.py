@@ -90,7 +90,9 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
     checkpoint = None
     if header["checkpoint"] is not None:
         arrays = {name: data[f"checkpoint_{name}"] for name in CHECKPOINT_ARRAYS}
-        checkpoint = checked_checkpoint(arrays, header["checkpoint"], sizes["K"], sizes["L"])
+        checkpoint = checked_checkpoint(
+            arrays, header["checkpoint"], data["keyframe_first_row"], sizes["L"]
+        )
     else:
         a = map_.arrays
         _require(bool(a.keyframe_alive.all() and a.landmark_alive.all()), "what died is in it")

@@ -1,4 +1,4 @@
-"""Patches of landmarks: the pixels around them in the newest keyframes that observe them.
+"""Patches: the pixels around keypoints, and of landmarks as the newest keyframes saw them.
 
 Only the newest keyframes keep theirs: those see nearly all that tracking follows, and a patch takes
 more memory than the rest of an observation.
@@ -7,34 +7,13 @@ more memory than the rest of an observation.
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import PATCH_PIXELS
-from vslam.kernels import kernel
+from vslam.features import PATCH_PIXELS, PATCH_RADIUS, KeyframePatches, LandmarkPatches
+from vslam.kernels import inner_kernel, kernel
 from vslam.map import Map
-
-
-class KeyframePatches(NamedTuple):
-    """Of the N features of a keyframe: ``pixels`` (N, PATCH_PIXELS) u1 around the keypoints, and
-    ``shift`` (N, 2) f4 from there to what each observes, in pixels of its octave."""
-
-    keyframe: int
-    pixels: NDArray[np.uint8]
-    shift: NDArray[np.float32]
-
-
-class LandmarkPatches(NamedTuple):
-    """Of N landmarks: ``ids`` (N,) i4, sorted; ``pixels``, ``shift`` as of ``KeyframePatches``;
-    ``extent`` (N,) f8 depth at which each was seen, times full-resolution pixels for one of it."""
-
-    ids: NDArray[np.int32]
-    pixels: NDArray[np.uint8]
-    shift: NDArray[np.float32]
-    extent: NDArray[np.float64]
-
 
 NO_PATCHES = LandmarkPatches(
     np.empty(0, np.int32),
@@ -42,6 +21,16 @@ NO_PATCHES = LandmarkPatches(
     np.empty((0, 2), np.float32),
     np.empty(0),
 )
+
+
+@inner_kernel
+def cut_patch(image, x, y, out):
+    """Copy the pixels around ``x, y`` of a level into ``out`` ``(PATCH_PIXELS,)``."""
+    k = 0
+    for row in range(y - PATCH_RADIUS, y + PATCH_RADIUS + 1):
+        for column in range(x - PATCH_RADIUS, x + PATCH_RADIUS + 1):
+            out[k] = image[row, column]
+            k += 1
 
 
 def patches_of(

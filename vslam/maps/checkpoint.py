@@ -24,6 +24,7 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "patch_pixels": (np.uint8, ("R", PATCH_PIXELS)),
     "patch_shift": (np.float32, ("R", 2)),
 }
+FEATURES = ("xy", "octave", "angle", "descriptors", "u_right")
 _NUMBERS = ("index", "timestamp", "reference", "last_frame", "last_timestamp", "lost_frames",
             "n_tracked", "gained_close", "gain_awaited")  # fmt: skip
 
@@ -67,15 +68,16 @@ class Checkpoint:
 
 def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
     """Those of ``ARRAYS``."""
-    features, patches = vars(checkpoint.features), checkpoint.patches
+    patches = checkpoint.patches
     none = KeyframePatches(-1, np.empty((0, PATCH_PIXELS), np.uint8), np.empty((0, 2), np.float32))
-    others = {
+    arrays: dict[str, NDArray] = {
+        **{name: getattr(checkpoint.features, name) for name in FEATURES},
         "landmark": checkpoint.landmark,
         "patch_keyframe": np.array([one.keyframe for one in patches], np.int64),
         "patch_pixels": np.concatenate([one.pixels for one in (none, *patches)]),
         "patch_shift": np.concatenate([one.shift for one in (none, *patches)]),
     }
-    return {name: others[name] if name in others else features[name] for name in ARRAYS}
+    return arrays
 
 
 def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
@@ -134,13 +136,7 @@ def checked_checkpoint(
     )
     if not sound:
         raise ValueError("the last frame is out of range")
-    features = Features(
-        xy=arrays["xy"],
-        octave=arrays["octave"],
-        angle=arrays["angle"],
-        descriptors=arrays["descriptors"],
-        u_right=arrays["u_right"],
-    )
+    features = Features(*(arrays[name] for name in FEATURES))
     return Checkpoint(
         **numbers,
         features=features,

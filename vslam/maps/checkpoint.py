@@ -136,7 +136,13 @@ def checked_checkpoint(
     )
     if not sound:
         raise ValueError("the last frame is out of range")
-    features = Features(*(arrays[name] for name in FEATURES))
+    features = Features(
+        xy=arrays["xy"],
+        octave=arrays["octave"],
+        angle=arrays["angle"],
+        descriptors=arrays["descriptors"],
+        u_right=arrays["u_right"],
+    )
     return Checkpoint(
         **numbers,
         features=features,

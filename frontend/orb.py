@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import OrbConfig
-from vslam.features import PATCH_PIXELS
+from vslam.features import Pyramid
 from vslam.frontend.corners import fast_scores, local_maxima, spread
-from vslam.frontend.patches import cut_patch
 from vslam.frontend.smoothing import smoothed
 from vslam.kernels import kernel
 
@@ -26,30 +25,6 @@ LANES = 32  # pixels read of each row of the disc: its 31 columns and one that c
 SPARE = 64  # bytes at the end of a pyramid
 MARGIN = 19  # reach of a rotated test point (13 sqrt 2) from a keypoint, rounded up
 PATTERN: NDArray[np.int8] = np.load(Path(__file__).with_name("orb_pattern.npy"))
-
-
-@dataclass(frozen=True)
-class Pyramid:
-    """Levels of one image, back to back in one buffer so that kernels can take all of them.
-
-    Attributes:
-        pixels: ``(P + SPARE,)`` uint8, the levels row by row; kernels may read, and ignore, as much
-            as a register holds beyond the end.
-        offsets: ``(L,)`` int64, where each level starts.
-        shapes: ``(L, 2)`` int64, height and width.
-        scales: ``(L,)`` float64, full-resolution pixels for each pixel of the level.
-    """
-
-    pixels: NDArray[np.uint8]
-    offsets: NDArray[np.int64]
-    shapes: NDArray[np.int64]
-    scales: NDArray[np.float64]
-
-    def level(self, index: int) -> NDArray[np.uint8]:
-        """View of one level, ``(h, w)``."""
-        height, width = self.shapes[index]
-        start = self.offsets[index]
-        return self.pixels[start : start + height * width].reshape(height, width)
 
 
 @dataclass(frozen=True)
@@ -64,7 +39,6 @@ class Extraction:
     octave: NDArray[np.uint8]
     angle: NDArray[np.float32]
     descriptors: NDArray[np.uint8]
-    patches: NDArray[np.uint8]
     pyramid: Pyramid
 
 
@@ -74,7 +48,7 @@ def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
     A pure function of its arguments, safe to call from several threads.
     """
     pyramid = build_pyramid(image, config)
-    xy, octave, angle, descriptors, patches = extract_levels(
+    xy, octave, angle, descriptors = extract_levels(
         pyramid.pixels,
         pyramid.offsets,
         pyramid.shapes,
@@ -85,7 +59,7 @@ def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
         DISC,
         PATTERN,
     )
-    return Extraction(xy, octave, angle, descriptors, patches, pyramid)
+    return Extraction(xy, octave, angle, descriptors, pyramid)
 
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
@@ -142,14 +116,13 @@ def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
 
 @kernel
 def extract_levels(pixels, offsets, shapes, quota, threshold, threshold_min, cell, inside, pattern):
-    """Features of all levels: ``xy``, ``octave``, ``angle``, ``descriptors``, ``patches``.
+    """Features of all levels: ``xy``, ``octave``, ``angle`` and ``descriptors``.
 
     One kernel, so that Python, for which threads wait for each other, is called once an image.
     """
     capacity = quota.sum()
     xy, octave = np.empty((capacity, 2), np.float32), np.empty(capacity, np.uint8)
     angle, descriptors = np.empty(capacity, np.float32), np.empty((capacity, 32), np.uint8)
-    patches = np.empty((capacity, PATCH_PIXELS), np.uint8)
     n = 0
     for level in range(len(shapes)):
         height, width = shapes[level]
@@ -163,14 +136,13 @@ def extract_levels(pixels, offsets, shapes, quota, threshold, threshold_min, cel
         # Sizes are whole numbers: not quite the scale apart.
         wide, high = shapes[0, 1] / width, shapes[0, 0] / height
         for i in range(len(corners)):
-            x, y = int(corners[i, 0]), int(corners[i, 1])
-            xy[n, 0], xy[n, 1] = (x + 0.5) * wide - 0.5, (y + 0.5) * high - 0.5
-            cut_patch(image, x, y, patches[n])
+            x, y = corners[i, 0] + 0.5, corners[i, 1] + 0.5
+            xy[n, 0], xy[n, 1] = x * wide - 0.5, y * high - 0.5
             octave[n], angle[n] = level, turned[i]
             for k in range(32):
                 descriptors[n, k] = described[i, k]
             n += 1
-    return xy[:n], octave[:n], angle[:n], descriptors[:n], patches[:n]
+    return xy[:n], octave[:n], angle[:n], descriptors[:n]
 
 
 @kernel

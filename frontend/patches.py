@@ -11,8 +11,16 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import PATCH_PIXELS, PATCH_RADIUS, KeyframePatches, LandmarkPatches
-from vslam.kernels import inner_kernel, kernel
+from vslam.features import (
+    PATCH_PIXELS,
+    PATCH_RADIUS,
+    PATCH_SIDE,
+    KeyframePatches,
+    LandmarkPatches,
+    Pyramid,
+    level_pixel,
+)
+from vslam.kernels import kernel
 from vslam.map import Map
 
 NO_PATCHES = LandmarkPatches(
@@ -23,14 +31,32 @@ NO_PATCHES = LandmarkPatches(
 )
 
 
-@inner_kernel
-def cut_patch(image, x, y, out):
-    """Copy the pixels around ``x, y`` of a level into ``out`` ``(PATCH_PIXELS,)``."""
-    k = 0
-    for row in range(y - PATCH_RADIUS, y + PATCH_RADIUS + 1):
-        for column in range(x - PATCH_RADIUS, x + PATCH_RADIUS + 1):
-            out[k] = image[row, column]
-            k += 1
+def patches_around(
+    pyramid: Pyramid, xy: NDArray[np.float32], octave: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """``(N, PATCH_PIXELS)`` the pixels around keypoints in their octaves, row by row.
+
+    Args:
+        xy: ``(N, 2)`` full-resolution pixels, at least ``PATCH_RADIUS`` pixels of the octave from
+            its border.
+        octave: ``(N,)``.
+    """
+    return _cut(pyramid.pixels, pyramid.offsets, pyramid.shapes, xy, octave)
+
+
+@kernel
+def _cut(pixels, offsets, shapes, xy, octave):
+    patches = np.empty((len(xy), PATCH_PIXELS), np.uint8)
+    for i in range(len(xy)):
+        level = octave[i]
+        height, width = shapes[level]
+        x = level_pixel(xy[i, 0], shapes[0, 1] / width) - PATCH_RADIUS
+        y = level_pixel(xy[i, 1], shapes[0, 0] / height) - PATCH_RADIUS
+        start = offsets[level] + y * width + x
+        for row in range(PATCH_SIDE):
+            for k in range(np.uintp(PATCH_SIDE)):
+                patches[i, row * PATCH_SIDE + k] = pixels[start + row * width + k]
+    return patches
 
 
 def patches_of(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.config import StereoConfig
-from vslam.features import MIN_DISPARITY
+from vslam.features import MIN_DISPARITY, level_pixel
 from vslam.frontend.orb import Extraction
 from vslam.kernels import hamming, inline, inner_kernel, kernel
 
@@ -129,12 +129,6 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
             u_right[i] = u - max(disparity, MIN_DISPARITY)
             sad[i] = score
     return u_right, sad
-
-
-@inner_kernel
-def level_pixel(x, ratio):
-    """Pixel of a level at a coordinate of the image, which has ``ratio`` pixels for one of it."""
-    return int(np.rint((np.float64(x) + 0.5) / ratio - 0.5))
 
 
 @kernel

@@ -26,7 +26,7 @@ from vslam.frontend.matching import (
     search_windows,
 )
 from vslam.frontend.orb import Extraction, scale_factors
-from vslam.frontend.patches import NO_PATCHES
+from vslam.frontend.patches import NO_PATCHES, patches_around
 from vslam.frontend.pose import optimise_pose
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import match_stereo
@@ -116,7 +116,7 @@ def _features(
     found: Extraction, u_right: NDArray[np.float32], *, from_right: bool = False
 ) -> Features:
     return Features(
-        found.xy, found.octave, found.angle, found.descriptors, u_right, from_right, found.patches
+        found.xy, found.octave, found.angle, found.descriptors, u_right, from_right, found.pyramid
     )
 
 
@@ -278,12 +278,12 @@ def _shift(
 ) -> NDArray[np.float32] | None:
     """``Frame.shift`` of its matches."""
     features = frame.features
-    if features.patches is None or not len(patches.ids):
+    if features.pyramid is None or not len(patches.ids):
         return None
     matched = np.flatnonzero(frame.landmark >= 0)
     shift = np.full((len(features), 2), np.nan, np.float32)
     shift[matched] = align_matches(
-        features.patches[matched],
+        patches_around(features.pyramid, features.xy[matched], features.octave[matched]),
         context.scales[features.octave[matched]],
         frame.landmark[matched],
         patches,

@@ -10,8 +10,8 @@ from vslam.config import Config
 from vslam.features import PATCH_PIXELS, PATCH_RADIUS, Features, KeyframePatches
 from vslam.frontend.alignment import align, align_matches
 from vslam.frontend.frame import Frame
-from vslam.frontend.orb import extract
-from vslam.frontend.patches import NO_PATCHES, patches_of
+from vslam.frontend.orb import build_pyramid, extract
+from vslam.frontend.patches import NO_PATCHES, patches_around, patches_of
 from vslam.frontend.tracking import TrackingContext, refine
 from vslam.geometry import transform
 from vslam.map import Map
@@ -115,6 +115,7 @@ def test_patches_are_the_pixels_around_the_keypoints():
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (240, 320), dtype=np.uint8)
     found = extract(image, Config().orb)
+    patches = patches_around(found.pyramid, found.xy, found.octave)
     for level in (0, 3):
         of_level = np.flatnonzero(found.octave == level)
         assert len(of_level)
@@ -125,15 +126,15 @@ def test_patches_are_the_pixels_around_the_keypoints():
             around = pixels[
                 y - PATCH_RADIUS : y + PATCH_RADIUS + 1, x - PATCH_RADIUS : x + PATCH_RADIUS + 1
             ]
-            assert np.array_equal(found.patches[i], around.ravel())
+            assert np.array_equal(patches[i], around.ravel())
 
 
+IMAGE = np.random.default_rng(0).integers(0, 256, (480, 640), dtype=np.uint8)
 CAMERA = Camera(400.0, 400.0, 320.0, 240.0, 0.5, 640, 480)
 CONTEXT = TrackingContext.create(CAMERA, Config())
 
 
-def features_at(u, v, octave, patches):
-    n = len(patches)
+def features_at(u, v, octave, n):
     xy = np.tile(np.array([[u, v]], np.float32), (n, 1))
     return Features(
         xy,
@@ -141,7 +142,7 @@ def features_at(u, v, octave, patches):
         np.zeros(n, np.float32),
         np.zeros((n, 32), np.uint8),
         xy[:, 0] - 20.0,
-        patches=patches,
+        pyramid=build_pyramid(IMAGE, Config().orb),
     )
 
 
@@ -149,7 +150,7 @@ def one_landmark(shift=0.0):
     """A map of one keyframe with a landmark 10 m ahead, and the patches of the keyframe."""
     map_ = Map(CONTEXT.scales)
     patch = seen(random_scene(1))
-    keyframe = map_.add_keyframe(features_at(320, 240, 2, patch), np.eye(4), 0.0, 0)
+    keyframe = map_.add_keyframe(features_at(320, 240, 2, 1), np.eye(4), 0.0, 0)
     ids = map_.add_landmarks(np.array([[3.0, 0.0, 10.0]]), np.zeros((1, 4), np.uint64), keyframe)
     link_many(map_.arrays, np.array([0]), ids)
     return map_, KeyframePatches(keyframe, patch, np.full((1, 2), shift, np.float32))
@@ -170,7 +171,7 @@ def test_a_landmark_has_the_patch_of_the_newest_keyframe_that_observes_it():
     for k in (1, 2):
         T_cw = np.eye(4)
         T_cw[2, 3] = -2.0 * k
-        map_.add_keyframe(features_at(320, 240, 0, both), T_cw, 0.1 * k, k)
+        map_.add_keyframe(features_at(320, 240, 0, 2), T_cw, 0.1 * k, k)
     link_many(map_.arrays, np.array([1]), np.array([0], np.int32))
     recent = [first, *(KeyframePatches(k, both, np.zeros((2, 2), np.float32)) for k in (1, 2))]
     known = patches_of(map_, np.array([0], np.int32), recent)
@@ -213,7 +214,7 @@ def test_landmarks_without_a_patch_are_not_aligned():
 
 
 def test_an_aligned_frame_observes_where_matches_were_aligned_to():
-    frame = Frame.untracked(features_at(100, 50, 0, np.zeros((3, PATCH_PIXELS), np.uint8)), CAMERA)
+    frame = Frame.untracked(features_at(100, 50, 0, 3), CAMERA)
     frame.landmark[:] = 0, 1, -1
     frame.shift = np.array([[0.5, -0.25], [np.nan, np.nan], [1.0, 1.0]], np.float32)
     assert frame.aligned.tolist() == [True, False, False]
@@ -228,7 +229,7 @@ def test_a_pose_follows_aligned_matches():
     have four times the weight."""
     rng = np.random.default_rng(0)
     n = 100
-    frame = Frame.untracked(features_at(100, 50, 0, np.zeros((n, PATCH_PIXELS), np.uint8)), CAMERA)
+    frame = Frame.untracked(features_at(100, 50, 0, n), CAMERA)
     frame.xyz = np.column_stack([rng.uniform(-8, 8, (n, 2)), rng.uniform(8, 30, n)])
     uvr = CAMERA.project(frame.xyz).astype(np.float32)
     frame.landmark = np.arange(n, dtype=np.int32)
@@ -248,6 +249,7 @@ def test_the_map_knows_how_sure_each_observation_is(two_keyframes):
     assert map_.arrays.certainty[map_.rows(1)].tolist() == [sure, 1, sure]
     assert map_.arrays.xy[map_.rows(1)][0].tolist() == [100.5, 49.75]
     known = patches_of(map_, np.sort(frame.landmark), recent)
+    assert np.array_equal(known.pixels[0], IMAGE[42:59, 92:109].ravel())
     assert known.shift[known.ids == frame.landmark[0]].tolist() == [[0.5, -0.25]]
     assert known.shift[known.ids != frame.landmark[0]].tolist() == [[0.0, 0.0]] * 2
 
@@ -263,8 +265,7 @@ def two_keyframes():
     mapping = MappingThread(CONTEXT.scales, CAMERA, config, closing, threads=1)
     frames = []
     for index in range(2):
-        patches = np.concatenate([seen(random_scene(k)) for k in range(3)])
-        frame = Frame.untracked(features_at(100, 50, 0, patches), CAMERA, index, 0.1 * index)
+        frame = Frame.untracked(features_at(100, 50, 0, 3), CAMERA, index, 0.1 * index)
         frames.append(frame)
     mapping.insert(frames[0])
     frames[1].landmark = frames[0].landmark.copy()

@@ -26,7 +26,7 @@ from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.features import Features, KeyframePatches, LandmarkPatches
 from vslam.frontend.frame import Frame
-from vslam.frontend.patches import patches_of
+from vslam.frontend.patches import patches_around, patches_of
 from vslam.geometry import Matrix
 from vslam.map import LocalMap, Map, local_map
 from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
@@ -317,20 +317,22 @@ class MappingThread:
     def _certainty(self, frame: Frame) -> NDArray[np.uint8] | int:
         """Of the features of a frame. What a landmark is first seen as is where it is seen; a
         match that was not aligned is half a pixel off."""
-        if frame.features.patches is None:
+        if frame.features.pyramid is None:
             return 1
         unaligned = (frame.landmark >= 0) & ~frame.aligned
         return np.where(unaligned, 1, self._config.alignment.certainty).astype(np.uint8)
 
     def _remember_patches(self, frame: Frame, keyframe: int) -> None:
-        if frame.features.patches is None:
+        features = frame.features
+        if features.pyramid is None:
             return
-        shift = np.zeros((len(frame.features), 2), np.float32)
+        shift = np.zeros((len(features), 2), np.float32)
         if frame.shift is not None:
             aligned = frame.aligned
-            scale = self._map.scales[frame.features.octave[aligned]]
+            scale = self._map.scales[features.octave[aligned]]
             shift[aligned] = frame.shift[aligned] / scale[:, None]
-        self.recent.append(KeyframePatches(keyframe, frame.features.patches, shift))
+        pixels = patches_around(features.pyramid, features.xy, features.octave)
+        self.recent.append(KeyframePatches(keyframe, pixels, shift))
 
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
         self.n_keyframes = keyframe + 1

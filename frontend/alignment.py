@@ -57,8 +57,9 @@ def align_matches(
     at = at[found]
     shift[found] = align(
         patches[found],
-        known.pixels[at],
-        known.shift[at],
+        known.pixels,
+        known.shift,
+        known.where[at],
         known.extent[at] / (depth[found] * size[found]),
         config.iterations,
         config.max_shift,
@@ -68,12 +69,14 @@ def align_matches(
 
 
 @kernel
-def align(seen, reference, centre, zoom, iterations, max_shift, min_correlation):
+def align(seen, reference, centre, which, zoom, iterations, max_shift, min_correlation):
     """Where in each of N patches lies what is at the ``centre`` of its reference.
 
     Args:
-        seen, reference: ``(N, PATCH_PIXELS)`` uint8.
-        centre: ``(N, 2)`` float32, from the middle of the reference, pixels.
+        seen: ``(N, PATCH_PIXELS)`` uint8.
+        reference: ``(P, PATCH_PIXELS)`` uint8; centre: ``(P, 2)`` float32, from the middle of the
+            reference, pixels.
+        which: ``(N,)`` of these.
         zoom: ``(N,)`` pixels of the seen patch for each one of the reference.
         iterations: at most.
         max_shift: from the middle of the seen patch, in x and in y, pixels.
@@ -88,7 +91,9 @@ def align(seen, reference, centre, zoom, iterations, max_shift, min_correlation)
     template = np.empty((SIDE, SIDE), np.float32)
     slope_x, slope_y = np.empty((SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.float32)
     for i in range(n):
-        drawn = draw(reference[i].reshape(PATCH_SIDE, PATCH_SIDE), centre[i], zoom[i], wide)
+        drawn = draw(
+            reference[which[i]].reshape(PATCH_SIDE, PATCH_SIDE), centre[which[i]], zoom[i], wide
+        )
         if not drawn:
             continue
         energy, xx, xy, yy = prepare(wide, template, slope_x, slope_y)

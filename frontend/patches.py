@@ -6,8 +6,6 @@ more memory than the rest of an observation.
 
 from __future__ import annotations
 
-from collections.abc import Collection
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,13 +20,6 @@ from vslam.features import (
 )
 from vslam.kernels import kernel
 from vslam.map import Map
-
-NO_PATCHES = LandmarkPatches(
-    np.empty(0, np.int32),
-    np.empty((0, PATCH_PIXELS), np.uint8),
-    np.empty((0, 2), np.float32),
-    np.empty(0),
-)
 
 
 def patches_around(
@@ -59,49 +50,94 @@ def _cut(pixels, offsets, shapes, xy, octave):
     return patches
 
 
-def patches_of(
-    map_: Map, ids: NDArray[np.int32], recent: Collection[KeyframePatches]
-) -> LandmarkPatches:
-    """The patches of landmarks, each by the newest keyframe that observes it.
+class RecentPatches:
+    """The patches of the newest keyframes."""
 
-    Args:
-        ids: ``(L,)`` landmarks, sorted.
-        recent: oldest first.
-    """
-    if not recent or not len(ids):
-        return NO_PATCHES
-    row, extent = newest_rows(
-        map_.arrays, np.array([one.keyframe for one in recent]), ids, map_.scales
-    )
-    seen = np.flatnonzero(row >= 0)
-    row = row[seen]
-    pixels = np.empty((len(seen), PATCH_PIXELS), np.uint8)
-    shift = np.empty((len(seen), 2), np.float32)
-    for one in recent:
-        rows = map_.rows(one.keyframe)
-        mine = np.flatnonzero((row >= rows.start) & (row < rows.stop))
-        pixels[mine] = one.pixels[row[mine] - rows.start]
-        shift[mine] = one.shift[row[mine] - rows.start]
-    return LandmarkPatches(ids[seen], pixels, shift, extent[seen])
+    def __init__(self, capacity: int) -> None:
+        """``capacity``: of keyframes."""
+        self._keyframes = np.full(capacity, -1, np.int64)  # of each slot
+        self._n_features = np.zeros(capacity, np.int64)
+        self._pixels = np.empty((capacity, 0, PATCH_PIXELS), np.uint8)
+        self._shift = np.empty((capacity, 0, 2), np.float32)
+        self._next = 0
+
+    def add(self, one: KeyframePatches) -> None:
+        """Remember those of another keyframe, and forget those of the oldest one."""
+        slot, n = self._next, len(one.pixels)
+        if n > self._shift.shape[1]:
+            self._pixels = _widened(self._pixels, n)
+            self._shift = _widened(self._shift, n)
+        self._pixels[slot, :n], self._shift[slot, :n] = one.pixels, one.shift
+        self._keyframes[slot], self._n_features[slot] = one.keyframe, n
+        self._next = (slot + 1) % len(self._keyframes)
+
+    def all(self) -> tuple[KeyframePatches, ...]:
+        """Of all keyframes, oldest first."""
+        slots = np.roll(np.arange(len(self._keyframes)), -self._next)
+        return tuple(
+            KeyframePatches(
+                int(self._keyframes[slot]),
+                self._pixels[slot, : self._n_features[slot]].copy(),
+                self._shift[slot, : self._n_features[slot]].copy(),
+            )
+            for slot in slots
+            if self._keyframes[slot] >= 0
+        )
+
+    def of(self, map_: Map, ids: NDArray[np.int32]) -> LandmarkPatches:
+        """Those of ``(L,)`` landmarks, sorted, as the newest keyframe saw each; they hold until
+        ``add`` is called."""
+        width = self._shift.shape[1]
+        where, extent = newest_patches(map_.arrays, self._keyframes, width, ids, map_.scales)
+        seen = np.flatnonzero(where >= 0)
+        return LandmarkPatches(
+            ids[seen],
+            where[seen],
+            extent[seen],
+            self._pixels.reshape(-1, PATCH_PIXELS),
+            self._shift.reshape(-1, 2),
+        )
+
+
+def _widened(array: NDArray, n: int) -> NDArray:
+    wide = np.zeros((len(array), n, array.shape[2]), array.dtype)
+    wide[:, : array.shape[1]] = array
+    return wide
 
 
 @kernel
-def newest_rows(a, keyframes, ids, scales):
-    """By which row the last of some keyframes observes each landmark, -1 for none, and the depth
-    in it times the width of a pixel of the octave."""
-    row = np.full(len(ids), -1, np.int64)
-    extent = np.zeros(len(ids))
+def newest_patches(a, keyframes, width, ids, scales):
+    """Where the patch of each landmark lies among those of ``keyframes``, which have ``width``
+    each, -1 for none; and the depth at which it was seen times the width of a pixel of it.
+
+    Of observations those of newer keyframes come first, or nearly: what lies behind one that is
+    older than all ``keyframes`` is not looked at.
+    """
+    where, extent = np.full(len(ids), -1, np.int64), np.zeros(len(ids))
+    newest, oldest = keyframes.max(), keyframes.max()
     for keyframe in keyframes:
-        if not a.keyframe_alive[keyframe]:
+        if keyframe >= 0:
+            oldest = min(oldest, keyframe)
+    slot = np.full(newest - oldest + 1, -1, np.int64)
+    for k in range(len(keyframes)):
+        if keyframes[k] >= 0:
+            slot[keyframes[k] - oldest] = k
+    if newest < 0:
+        return where, extent
+    for i in range(len(ids)):
+        row, best = a.head[ids[i]], -1
+        while row >= 0 and a.keyframe[row] >= oldest:
+            keyframe = a.keyframe[row]
+            newer = best < 0 or keyframe > a.keyframe[best]
+            if newer and keyframe <= newest and slot[keyframe - oldest] >= 0:
+                best = row
+            row = a.next_row[row]
+        if best < 0:
             continue
-        T = a.T_cw[keyframe]
-        for r in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
-            landmark = a.landmark[r]
-            at = np.searchsorted(ids, landmark)
-            if landmark < 0 or at == len(ids) or ids[at] != landmark:
-                continue
-            p = a.xyz[landmark]
-            depth = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
-            if depth > 0.0:
-                row[at], extent[at] = r, depth * scales[a.octave[r]]
-    return row, extent
+        keyframe = a.keyframe[best]
+        T, p = a.T_cw[keyframe], a.xyz[ids[i]]
+        depth = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        if depth > 0.0:
+            where[i] = slot[keyframe - oldest] * width + best - a.first_row[keyframe]
+            extent[i] = depth * scales[a.octave[best]]
+    return where, extent

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import DISPARITY_WEIGHT, Camera, ImageMap
 from vslam.config import Config
-from vslam.features import Features, LandmarkPatches
+from vslam.features import NO_PATCHES, Features, LandmarkPatches
 from vslam.frontend.alignment import align_matches
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.frame import Frame
@@ -26,7 +26,7 @@ from vslam.frontend.matching import (
     search_windows,
 )
 from vslam.frontend.orb import Extraction, scale_factors
-from vslam.frontend.patches import NO_PATCHES, patches_around
+from vslam.frontend.patches import patches_around
 from vslam.frontend.pose import optimise_pose
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import match_stereo

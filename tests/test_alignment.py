@@ -7,15 +7,21 @@ import pytest
 
 from vslam.camera import Camera
 from vslam.config import Config
-from vslam.features import PATCH_PIXELS, PATCH_RADIUS, Features, KeyframePatches
+from vslam.features import (
+    NO_PATCHES,
+    PATCH_PIXELS,
+    PATCH_RADIUS,
+    Features,
+    KeyframePatches,
+)
 from vslam.frontend.alignment import align, align_matches
 from vslam.frontend.frame import Frame
 from vslam.frontend.orb import build_pyramid, extract
-from vslam.frontend.patches import NO_PATCHES, patches_around, patches_of
+from vslam.frontend.patches import RecentPatches, patches_around
 from vslam.frontend.tracking import TrackingContext, refine
 from vslam.geometry import transform
 from vslam.map import Map
-from vslam.map_kernels import link_many
+from vslam.map_kernels import link_many, unlink
 from vslam.mapping import MappingThread
 
 CONFIG = Config().alignment
@@ -49,6 +55,7 @@ def aligned(image, reference, zoom=1.0, centre=NO_SHIFT):
         image,
         reference,
         centre,
+        np.array([0]),
         np.array([zoom]),
         config.iterations,
         config.max_shift,
@@ -156,12 +163,21 @@ def one_landmark(shift=0.0):
     return map_, KeyframePatches(keyframe, patch, np.full((1, 2), shift, np.float32))
 
 
+def patches_of(map_, ids, keyframes, capacity=3):
+    """``RecentPatches.of``, and the pixels and shifts of each."""
+    recent = RecentPatches(capacity)
+    for one in keyframes:
+        recent.add(one)
+    known = recent.of(map_, np.array(ids, np.int32))
+    return known, known.pixels[known.where], known.shift[known.where]
+
+
 def test_a_landmark_has_the_patch_of_a_keyframe_with_its_size_and_place():
     map_, recent = one_landmark(shift=0.5)
-    known = patches_of(map_, np.array([0], np.int32), [recent])
-    assert np.array_equal(known.pixels, seen(random_scene(1)))
+    known, pixels, shift = patches_of(map_, [0], [recent])
+    assert np.array_equal(pixels, seen(random_scene(1)))
     assert known.extent.tolist() == [10.0 * CONTEXT.scales[2]]
-    assert known.shift.tolist() == [[0.5, 0.5]]
+    assert shift.tolist() == [[0.5, 0.5]]
 
 
 def test_a_landmark_has_the_patch_of_the_newest_keyframe_that_observes_it():
@@ -174,25 +190,42 @@ def test_a_landmark_has_the_patch_of_the_newest_keyframe_that_observes_it():
         map_.add_keyframe(features_at(320, 240, 0, 2), T_cw, 0.1 * k, k)
     link_many(map_.arrays, np.array([1]), np.array([0], np.int32))
     recent = [first, *(KeyframePatches(k, both, np.zeros((2, 2), np.float32)) for k in (1, 2))]
-    known = patches_of(map_, np.array([0], np.int32), recent)
-    assert np.array_equal(known.pixels, second)
+    known, pixels, _ = patches_of(map_, [0], recent)
+    assert np.array_equal(pixels, second)
     assert known.extent.tolist() == [8.0]
-    map_.arrays.keyframe_alive[1] = False
-    assert np.array_equal(patches_of(map_, np.array([0], np.int32), recent).pixels, first.pixels)
+    # A keyframe that is forgotten, and one that has no longer anything to do with the landmark.
+    assert np.array_equal(patches_of(map_, [0], recent, capacity=2)[1], second)
+    assert len(patches_of(map_, [0], recent, capacity=1)[1]) == 0
+    unlink(map_.arrays, 1)
+    assert np.array_equal(patches_of(map_, [0], recent)[1], first.pixels)
+
+
+def test_recent_patches_are_those_of_the_newest_keyframes():
+    recent = RecentPatches(2)
+    ones = [
+        KeyframePatches(k, np.full((n, PATCH_PIXELS), k, np.uint8), np.full((n, 2), k, np.float32))
+        for k, n in ((3, 2), (4, 5), (7, 1))
+    ]
+    for count, one in enumerate(ones, 1):
+        recent.add(one)
+        kept = ones[max(0, count - 2) : count]
+        assert [k.keyframe for k in recent.all()] == [k.keyframe for k in kept]
+        for is_, wanted in zip(recent.all(), kept, strict=True):
+            assert np.array_equal(is_.pixels, wanted.pixels)
+            assert np.array_equal(is_.shift, wanted.shift)
 
 
 def test_landmarks_that_no_recent_keyframe_observes_have_none():
     map_, recent = one_landmark()
-    ids = np.array([0], np.int32)
-    assert len(patches_of(map_, ids, []).ids) == 0
-    assert len(patches_of(map_, ids[:0], [recent]).ids) == 0
+    assert len(patches_of(map_, [0], [])[1]) == 0
+    assert len(patches_of(map_, [], [recent])[1]) == 0
     map_.arrays.xyz[0, 2] = -1.0  # behind the camera
-    assert len(patches_of(map_, ids, [recent]).ids) == 0
+    assert len(patches_of(map_, [0], [recent])[1]) == 0
 
 
 def test_size_follows_from_depth_and_octave():
     map_, recent = one_landmark()
-    known = patches_of(map_, np.array([0], np.int32), [recent])
+    known, _, _ = patches_of(map_, [0], [recent])
     # At half the depth it appears twice as large, in an octave whose pixels are 1.2**4 wide
     # instead of 1.2**2.
     image = seen(random_scene(1), 0.4, -0.2, zoom=2.0 / 1.44)
@@ -204,7 +237,7 @@ def test_size_follows_from_depth_and_octave():
 
 def test_landmarks_without_a_patch_are_not_aligned():
     map_, recent = one_landmark()
-    known = patches_of(map_, np.array([0], np.int32), [recent])
+    known, _, _ = patches_of(map_, [0], [recent])
     image, size, depth = seen(random_scene(1)), np.array([1.44]), np.array([10.0])
     config = Config().alignment
     assert np.isfinite(align_matches(image, size, known.ids, known, depth, config)).all()
@@ -248,10 +281,10 @@ def test_the_map_knows_how_sure_each_observation_is(two_keyframes):
     # Tracked and aligned; tracked only; the first to see its landmark.
     assert map_.arrays.certainty[map_.rows(1)].tolist() == [sure, 1, sure]
     assert map_.arrays.xy[map_.rows(1)][0].tolist() == [100.5, 49.75]
-    known = patches_of(map_, np.sort(frame.landmark), recent)
-    assert np.array_equal(known.pixels[0], IMAGE[42:59, 92:109].ravel())
-    assert known.shift[known.ids == frame.landmark[0]].tolist() == [[0.5, -0.25]]
-    assert known.shift[known.ids != frame.landmark[0]].tolist() == [[0.0, 0.0]] * 2
+    known, pixels, shift = patches_of(map_, np.sort(frame.landmark), recent.all())
+    assert np.array_equal(pixels[0], IMAGE[42:59, 92:109].ravel())
+    assert shift[known.ids == frame.landmark[0]].tolist() == [[0.5, -0.25]]
+    assert shift[known.ids != frame.landmark[0]].tolist() == [[0.0, 0.0]] * 2
 
 
 @pytest.fixture

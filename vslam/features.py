@@ -101,13 +101,24 @@ class KeyframePatches(NamedTuple):
 
 
 class LandmarkPatches(NamedTuple):
-    """Of N landmarks: ``ids`` (N,) i4, sorted; ``pixels``, ``shift`` as of ``KeyframePatches``;
-    ``extent`` (N,) f8 depth at which each was seen, times full-resolution pixels for one of it."""
+    """Of N landmarks: ``ids`` (N,) i4, sorted; ``where`` (N,) i8 row of each in ``pixels`` (P,
+    PATCH_PIXELS) u1 and ``shift`` (P, 2) f4, which are as of ``KeyframePatches``; ``extent`` (N,)
+    f8 depth at which it was seen, times full-resolution pixels for one of its patch."""
 
     ids: NDArray[np.int32]
+    where: NDArray[np.int64]
+    extent: NDArray[np.float64]
     pixels: NDArray[np.uint8]
     shift: NDArray[np.float32]
-    extent: NDArray[np.float64]
+
+
+NO_PATCHES = LandmarkPatches(
+    np.empty(0, np.int32),
+    np.empty(0, np.int64),
+    np.empty(0),
+    np.empty((0, PATCH_PIXELS), np.uint8),
+    np.empty((0, 2), np.float32),
+)
 
 
 def shifted_columns(

@@ -9,7 +9,6 @@ last merge left.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -26,7 +25,7 @@ from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.features import Features, KeyframePatches, LandmarkPatches
 from vslam.frontend.frame import Frame
-from vslam.frontend.patches import patches_around, patches_of
+from vslam.frontend.patches import RecentPatches, patches_around
 from vslam.geometry import Matrix
 from vslam.map import LocalMap, Map, local_map
 from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
@@ -43,7 +42,7 @@ class MappingThread:
         last_frame, last_timestamp: index and seconds of the frame that became the last keyframe.
         local: landmarks around the reference keyframe, as of the last merge.
         patches: of those of them that the newest keyframes observe.
-        recent: the patches of these keyframes, oldest first.
+        recent: the patches of these keyframes.
         reference_view: landmarks of the reference keyframe alone.
         n_reference: of these, those that at least three keyframes see (all in a young map).
         disparity_offset: ``Map.disparity_offset``.
@@ -71,7 +70,7 @@ class MappingThread:
         self.disparity_offset = 0.0
         self.last_frame = -1
         self.last_timestamp = -np.inf
-        self.recent: deque[KeyframePatches] = deque(maxlen=config.alignment.keyframes)
+        self.recent = RecentPatches(config.alignment.keyframes)
         self._map = map_ or Map(scales)
         self._camera = camera
         self._config = config
@@ -95,7 +94,8 @@ class MappingThread:
     def return_to(self, checkpoint: Checkpoint) -> None:
         """Go on as from there, in the map as it was then."""
         self.last_frame, self.last_timestamp = checkpoint.last_frame, checkpoint.last_timestamp
-        self.recent.extend(checkpoint.patches)
+        for one in checkpoint.patches:
+            self.recent.add(one)
         self.set_reference(checkpoint.reference)
 
     @property
@@ -332,7 +332,7 @@ class MappingThread:
             scale = self._map.scales[features.octave[aligned]]
             shift[aligned] = frame.shift[aligned] / scale[:, None]
         pixels = patches_around(features.pyramid, features.xy, features.octave)
-        self.recent.append(KeyframePatches(keyframe, pixels, shift))
+        self.recent.add(KeyframePatches(keyframe, pixels, shift))
 
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
         self.n_keyframes = keyframe + 1
@@ -365,7 +365,7 @@ class MappingThread:
         map_, reference = self._map, self.reference
         self.disparity_offset = map_.disparity_offset
         self.local = local_map(map_, reference, self._config.tracking.local_keyframes)
-        self.patches = patches_of(map_, self.local.ids, self.recent)
+        self.patches = self.recent.of(map_, self.local.ids)
         self.reference_view = local_map(map_, reference, 1)
         living = map_.living_keyframes()
         if self._camera.monocular and map_.restarts:

@@ -242,7 +242,7 @@ class Slam:
             gained_close=self._close_gain.mean,
             gain_awaited=self._close_gain.awaited,
             closing=self._closing.memory(),
-            patches=tuple(self._mapping.recent),
+            patches=self._mapping.recent.all(),
         )
 
     def _return_to(self, checkpoint: Checkpoint) -> None:

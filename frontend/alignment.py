@@ -2,13 +2,10 @@
 
 A corner is found at whole pixels of one of a few scales, half a pixel off as a rule, and where the
 camera comes closer, matches lie systematically too near to where it drives (docs/motorway.md). The
-patch of the keyframe that saw a landmark last, drawn at the size that the distance foretells, is
-moved until it agrees with the image: "feature alignment" of SVO (Forster et al., ICRA 2014, III-B),
-by the inverse compositional form of Lucas-Kanade (Baker and Matthews, IJCV 2004, section 3.2). Mean
-and contrast of a patch do not matter: both are unknowns beside the shift.
-
-All needed of an image are patches around its keypoints, cut when they are extracted: a frame is
-aligned after its images are gone.
+patch of a keyframe that saw the landmark, drawn as the frame should see it, is moved until it
+agrees with the image: "feature alignment" of SVO (Forster et al., ICRA 2014, III-B), by the inverse
+compositional form of Lucas-Kanade (Baker and Matthews, IJCV 2004, section 3.2). Mean and contrast
+of a patch do not matter: both are unknowns beside the shift.
 """
 
 from __future__ import annotations
@@ -18,6 +15,8 @@ from numpy.typing import NDArray
 
 from vslam.config import AlignmentConfig
 from vslam.features import PATCH_RADIUS, PATCH_SIDE, LandmarkPatches
+from vslam.frontend.frame import Frame
+from vslam.frontend.patches import patches_around
 from vslam.kernels import inner_kernel, kernel
 
 HALF = 4  # of the window that is compared, pixels
@@ -28,48 +27,92 @@ MIN_CORNERNESS = 0.05  # determinant of the normal equations over that of a corn
 STILL = 0.03  # pixels; a smaller step ends the iteration
 
 
-def align_matches(
-    patches: NDArray[np.uint8],
-    size: NDArray[np.float64],
-    landmark: NDArray[np.int32],
+def align_frame(
+    frame: Frame,
     known: LandmarkPatches,
-    depth: NDArray[np.float64],
+    scales: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
     config: AlignmentConfig,
-) -> NDArray[np.float32]:
-    """How far from its keypoint each match truly lies.
+) -> NDArray[np.float32] | None:
+    """``Frame.shift`` of the matches of a frame.
 
     Args:
-        patches: ``(N, PATCH_PIXELS)`` uint8 around the matched keypoints.
-        size: ``(N,)`` full-resolution pixels for a pixel of their octaves.
-        landmark: ``(N,)`` ids that they are matched with.
-        known: patches of landmarks.
-        depth: ``(N,)`` of them in the camera.
-
-    Returns:
-        ``(N, 2)`` float32 full-resolution pixels; NaN where that is not known: the landmark has
-        no patch, or none that the image agrees with.
+        scales: full-resolution pixels for a pixel of each octave.
     """
-    shift = np.full((len(landmark), 2), np.nan, np.float32)
-    if not len(known.ids):
-        return shift
+    features = frame.features
+    if features.pyramid is None or not len(known.ids):
+        return None
+    matched = np.flatnonzero(frame.landmark >= 0)
+    landmark = frame.landmark[matched]
     at = np.minimum(np.searchsorted(known.ids, landmark), len(known.ids) - 1)
-    found = np.flatnonzero(known.ids[at] == landmark)
-    at = at[found]
-    shift[found] = align(
-        patches[found],
+    same = known.ids[at] == landmark
+    at, matched = at[same], matched[same]
+    octave = features.octave[matched]
+    size = scales[octave]
+    warp = warps(
+        frame.T_cw, frame.xyz[matched], known.T_cw, known.view[at], known.size[at], size, intrinsics
+    )
+    found = align(
+        patches_around(features.pyramid, features.xy[matched], octave),
         known.pixels,
         known.shift,
         known.where[at],
-        known.extent[at] / (depth[found] * size[found]),
+        warp,
         config.iterations,
         config.max_shift,
         config.min_correlation,
     )
-    return shift * size[:, None].astype(np.float32)
+    shift = np.full((len(features), 2), np.nan, np.float32)
+    shift[matched] = found * size[:, None]
+    return shift
 
 
 @kernel
-def align(seen, reference, centre, which, zoom, iterations, max_shift, min_correlation):
+def warps(T_cw, xyz, T_seen, view, size_seen, size, intrinsics):
+    """What a step in the patch of a frame is in the patch of a keyframe.
+
+    Around a landmark the world is taken for a plane that faces the keyframe (SVO, III-B).
+
+    Args:
+        T_cw: ``(4, 4)`` of the frame.
+        xyz: ``(N, 3)`` the landmarks.
+        T_seen: ``(K, 4, 4)`` of keyframes; view: ``(N,)`` which of them saw each.
+        size_seen, size: ``(N,)`` full-resolution pixels for one of the patch of the keyframe, of
+            the frame.
+
+    Returns:
+        ``(N, 2, 2)`` float32; NaN for a landmark that does not lie in front of both, or would be
+        seen from behind.
+    """
+    fx, fy = intrinsics[0], intrinsics[1]
+    steps = np.full((len(xyz), 2, 2), np.nan, np.float32)
+    p, column = np.empty(3), np.empty(3)
+    A = np.empty((2, 2))
+    for i in range(len(xyz)):
+        T, X = T_seen[view[i]], xyz[i]
+        depth = T[2, 0] * X[0] + T[2, 1] * X[1] + T[2, 2] * X[2] + T[2, 3]
+        for r in range(3):
+            p[r] = T_cw[r, 0] * X[0] + T_cw[r, 1] * X[1] + T_cw[r, 2] * X[2] + T_cw[r, 3]
+        if not (depth > 0.0 and p[2] > 0.0):
+            continue
+        for k in range(2):
+            # A step of one pixel along u or v in the keyframe, on the plane, seen from the frame.
+            for r in range(3):
+                column[r] = 0.0
+                for m in range(3):
+                    column[r] += T_cw[r, m] * T[k, m]
+                column[r] *= depth * size_seen[i] / (fx if k == 0 else fy)
+            A[0, k] = fx * (column[0] - column[2] * p[0] / p[2]) / (p[2] * size[i])
+            A[1, k] = fy * (column[1] - column[2] * p[1] / p[2]) / (p[2] * size[i])
+        determinant = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+        if determinant > 1e-6:
+            steps[i, 0, 0], steps[i, 0, 1] = A[1, 1] / determinant, -A[0, 1] / determinant
+            steps[i, 1, 0], steps[i, 1, 1] = -A[1, 0] / determinant, A[0, 0] / determinant
+    return steps
+
+
+@kernel
+def align(seen, reference, centre, which, warp, iterations, max_shift, min_correlation):
     """Where in each of N patches lies what is at the ``centre`` of its reference.
 
     Args:
@@ -77,7 +120,7 @@ def align(seen, reference, centre, which, zoom, iterations, max_shift, min_corre
         reference: ``(P, PATCH_PIXELS)`` uint8; centre: ``(P, 2)`` float32, from the middle of the
             reference, pixels.
         which: ``(N,)`` of these.
-        zoom: ``(N,)`` pixels of the seen patch for each one of the reference.
+        warp: ``(N, 2, 2)`` float32, see ``warps``.
         iterations: at most.
         max_shift: from the middle of the seen patch, in x and in y, pixels.
         min_correlation: least normalised cross-correlation.
@@ -85,14 +128,14 @@ def align(seen, reference, centre, which, zoom, iterations, max_shift, min_corre
     Returns:
         ``(N, 2)`` float32 shift from the middle of the seen patch, NaN where there is none.
     """
-    n = len(zoom)
+    n = len(seen)
     shift = np.full((n, 2), np.nan, np.float32)
     wide = np.empty((WIDE, WIDE), np.float32)
     template = np.empty((SIDE, SIDE), np.float32)
     slope_x, slope_y = np.empty((SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.float32)
     for i in range(n):
         drawn = draw(
-            reference[which[i]].reshape(PATCH_SIDE, PATCH_SIDE), centre[which[i]], zoom[i], wide
+            reference[which[i]].reshape(PATCH_SIDE, PATCH_SIDE), centre[which[i]], warp[i], wide
         )
         if not drawn:
             continue
@@ -120,20 +163,26 @@ def align(seen, reference, centre, which, zoom, iterations, max_shift, min_corre
 
 
 @inner_kernel
-def draw(patch, centre, zoom, out):
-    """Draw a patch at another size around ``centre``; returns whether it reaches that far."""
-    step = np.float32(1.0 / zoom)
-    reach = np.float32(HALF + 1) * step + max(abs(centre[0]), abs(centre[1]))
-    if not (step > 0.0 and reach <= np.float32(PATCH_RADIUS)):
+def draw(patch, centre, warp, out):
+    """Draw a patch around ``centre`` with the steps of ``warp``; returns whether it reaches that
+    far."""
+    xx, xy, yx, yy = warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1]
+    far = np.float32(HALF + 1)
+    # Where the first pixel lies, and how far from the centre the farthest one.
+    left = np.float32(PATCH_RADIUS) + centre[0] - far * (xx + xy)
+    top = np.float32(PATCH_RADIUS) + centre[1] - far * (yx + yy)
+    reach_x = far * (abs(xx) + abs(xy)) + abs(centre[0])
+    reach_y = far * (abs(yx) + abs(yy)) + abs(centre[1])
+    if not max(reach_x, reach_y) <= np.float32(PATCH_RADIUS):
         return False
     for r in range(WIDE):
-        y = np.float32(PATCH_RADIUS) + centre[1] + np.float32(r - HALF - 1) * step
-        row = min(int(y), PATCH_SIDE - 2)
-        part_y = y - np.float32(row)
         for c in range(WIDE):
-            x = np.float32(PATCH_RADIUS) + centre[0] + np.float32(c - HALF - 1) * step
-            column = min(int(x), PATCH_SIDE - 2)
-            part_x = x - np.float32(column)
+            x = left + np.float32(c) * xx + np.float32(r) * xy
+            y = top + np.float32(c) * yx + np.float32(r) * yy
+            # Rounding may lead a hair beyond the border.
+            column = min(max(int(x), 0), PATCH_SIDE - 2)
+            row = min(max(int(y), 0), PATCH_SIDE - 2)
+            part_x, part_y = x - np.float32(column), y - np.float32(row)
             a, b = np.float32(patch[row, column]), np.float32(patch[row, column + 1])
             c_, d = np.float32(patch[row + 1, column]), np.float32(patch[row + 1, column + 1])
             above, below = a + part_x * (b - a), c_ + part_x * (d - c_)

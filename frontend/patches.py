@@ -87,15 +87,19 @@ class RecentPatches:
     def of(self, map_: Map, ids: NDArray[np.int32]) -> LandmarkPatches:
         """Those of ``(L,)`` landmarks, sorted, as the newest keyframe saw each; they hold until
         ``add`` is called."""
-        width = self._shift.shape[1]
-        where, extent = newest_patches(map_.arrays, self._keyframes, width, ids, map_.scales)
-        seen = np.flatnonzero(where >= 0)
+        width, arrays = self._shift.shape[1], map_.arrays
+        row, view = newest_rows(arrays, self._keyframes, ids)
+        seen = np.flatnonzero(row >= 0)
+        row, view = row[seen], view[seen]
+        keyframes = np.maximum(self._keyframes, 0)
         return LandmarkPatches(
             ids[seen],
-            where[seen],
-            extent[seen],
+            view * width + row - arrays.first_row[keyframes[view]],
+            view,
+            map_.scales[arrays.octave[row]],
             self._pixels.reshape(-1, PATCH_PIXELS),
             self._shift.reshape(-1, 2),
+            arrays.T_cw[keyframes],
         )
 
 
@@ -106,38 +110,30 @@ def _widened(array: NDArray, n: int) -> NDArray:
 
 
 @kernel
-def newest_patches(a, keyframes, width, ids, scales):
-    """Where the patch of each landmark lies among those of ``keyframes``, which have ``width``
-    each, -1 for none; and the depth at which it was seen times the width of a pixel of it.
+def newest_rows(a, keyframes, ids):
+    """Row by which the newest of ``keyframes`` observes each landmark, and which of them that is;
+    -1 for none.
 
     Of observations those of newer keyframes come first, or nearly: what lies behind one that is
     older than all ``keyframes`` is not looked at.
     """
-    where, extent = np.full(len(ids), -1, np.int64), np.zeros(len(ids))
-    newest, oldest = keyframes.max(), keyframes.max()
+    found, view = np.full(len(ids), -1, np.int64), np.full(len(ids), -1, np.int64)
+    newest = keyframes.max()
+    if newest < 0:
+        return found, view
+    oldest = newest
     for keyframe in keyframes:
         if keyframe >= 0:
             oldest = min(oldest, keyframe)
-    slot = np.full(newest - oldest + 1, -1, np.int64)
+    place = np.full(newest - oldest + 1, -1, np.int64)
     for k in range(len(keyframes)):
         if keyframes[k] >= 0:
-            slot[keyframes[k] - oldest] = k
-    if newest < 0:
-        return where, extent
+            place[keyframes[k] - oldest] = k
     for i in range(len(ids)):
-        row, best = a.head[ids[i]], -1
+        row, of = a.head[ids[i]], -1
         while row >= 0 and a.keyframe[row] >= oldest:
             keyframe = a.keyframe[row]
-            newer = best < 0 or keyframe > a.keyframe[best]
-            if newer and keyframe <= newest and slot[keyframe - oldest] >= 0:
-                best = row
+            if of < keyframe <= newest and place[keyframe - oldest] >= 0:
+                found[i], view[i], of = row, place[keyframe - oldest], keyframe
             row = a.next_row[row]
-        if best < 0:
-            continue
-        keyframe = a.keyframe[best]
-        T, p = a.T_cw[keyframe], a.xyz[ids[i]]
-        depth = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
-        if depth > 0.0:
-            where[i] = slot[keyframe - oldest] * width + best - a.first_row[keyframe]
-            extent[i] = depth * scales[a.octave[best]]
-    return where, extent
+    return found, view

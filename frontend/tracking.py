@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vslam.camera import DISPARITY_WEIGHT, Camera, ImageMap
 from vslam.config import Config
 from vslam.features import NO_PATCHES, Features, LandmarkPatches
-from vslam.frontend.alignment import align_matches
+from vslam.frontend.alignment import align_frame
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.frame import Frame
 from vslam.frontend.matching import (
@@ -26,7 +26,6 @@ from vslam.frontend.matching import (
     search_windows,
 )
 from vslam.frontend.orb import Extraction, scale_factors
-from vslam.frontend.patches import patches_around
 from vslam.frontend.pose import optimise_pose
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import match_stereo
@@ -269,28 +268,9 @@ def track_local_map(
     frame.landmark[found[hit]] = local.ids[hit]
     frame.xyz[found[hit]] = local.xyz[hit]
     matches = int(np.count_nonzero(frame.landmark >= 0))
-    inliers = refine(frame, frame.T_cw, context, _shift(frame, patches, context))
+    shift = align_frame(frame, patches, context.scales, camera.intrinsics, context.config.alignment)
+    inliers = refine(frame, frame.T_cw, context, shift)
     return matches, inliers, local.ids[visible | tracked]
-
-
-def _shift(
-    frame: Frame, patches: LandmarkPatches, context: TrackingContext
-) -> NDArray[np.float32] | None:
-    """``Frame.shift`` of its matches."""
-    features = frame.features
-    if features.pyramid is None or not len(patches.ids):
-        return None
-    matched = np.flatnonzero(frame.landmark >= 0)
-    shift = np.full((len(features), 2), np.nan, np.float32)
-    shift[matched] = align_matches(
-        patches_around(features.pyramid, features.xy[matched], features.octave[matched]),
-        context.scales[features.octave[matched]],
-        frame.landmark[matched],
-        patches,
-        transform(frame.T_cw, frame.xyz[matched])[:, 2],
-        context.config.alignment,
-    )
-    return shift
 
 
 def _search(

@@ -102,22 +102,27 @@ class KeyframePatches(NamedTuple):
 
 class LandmarkPatches(NamedTuple):
     """Of N landmarks: ``ids`` (N,) i4, sorted; ``where`` (N,) i8 row of each in ``pixels`` (P,
-    PATCH_PIXELS) u1 and ``shift`` (P, 2) f4, which are as of ``KeyframePatches``; ``extent`` (N,)
-    f8 depth at which it was seen, times full-resolution pixels for one of its patch."""
+    PATCH_PIXELS) u1 and ``shift`` (P, 2) f4, which are as of ``KeyframePatches``; ``view`` (N,) i8
+    the camera that saw it, of ``T_cw`` (K, 4, 4) f8; ``size`` (N,) f8 full-resolution pixels for
+    one of its patch."""
 
     ids: NDArray[np.int32]
     where: NDArray[np.int64]
-    extent: NDArray[np.float64]
+    view: NDArray[np.int64]
+    size: NDArray[np.float64]
     pixels: NDArray[np.uint8]
     shift: NDArray[np.float32]
+    T_cw: NDArray[np.float64]
 
 
 NO_PATCHES = LandmarkPatches(
     np.empty(0, np.int32),
     np.empty(0, np.int64),
+    np.empty(0, np.int64),
     np.empty(0),
     np.empty((0, PATCH_PIXELS), np.uint8),
     np.empty((0, 2), np.float32),
+    np.empty((0, 4, 4)),
 )
 
 

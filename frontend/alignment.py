@@ -130,14 +130,11 @@ def align(seen, reference, centre, which, warp, iterations, max_shift, min_corre
     """
     n = len(seen)
     shift = np.full((n, 2), np.nan, np.float32)
-    wide = np.empty((WIDE, WIDE), np.float32)
+    wide = np.empty(WIDE * WIDE, np.float32)
     template = np.empty((SIDE, SIDE), np.float32)
     slope_x, slope_y = np.empty((SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.float32)
     for i in range(n):
-        drawn = draw(
-            reference[which[i]].reshape(PATCH_SIDE, PATCH_SIDE), centre[which[i]], warp[i], wide
-        )
-        if not drawn:
+        if not draw(reference[which[i]], centre[which[i]], warp[i], wide):
             continue
         energy, xx, xy, yy = prepare(wide, template, slope_x, slope_y)
         determinant = xx * yy - xy * xy
@@ -165,28 +162,35 @@ def align(seen, reference, centre, which, warp, iterations, max_shift, min_corre
 @inner_kernel
 def draw(patch, centre, warp, out):
     """Draw a patch around ``centre`` with the steps of ``warp``; returns whether it reaches that
-    far."""
+    far.
+
+    Args:
+        patch: ``(PATCH_PIXELS,)`` uint8.
+        out: ``(WIDE * WIDE,)`` float32.
+    """
     xx, xy, yx, yy = warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1]
     far = np.float32(HALF + 1)
-    # Where the first pixel lies, and how far from the centre the farthest one.
-    left = np.float32(PATCH_RADIUS) + centre[0] - far * (xx + xy)
-    top = np.float32(PATCH_RADIUS) + centre[1] - far * (yx + yy)
     reach_x = far * (abs(xx) + abs(xy)) + abs(centre[0])
     reach_y = far * (abs(yx) + abs(yy)) + abs(centre[1])
-    if not max(reach_x, reach_y) <= np.float32(PATCH_RADIUS):
+    if not max(reach_x, reach_y) <= np.float32(PATCH_RADIUS - 0.01):
         return False
+    # Whole numbers of 1 / 65536 pixel: a shift parts a coordinate, where a float takes far longer.
+    one, part = np.float32(65536.0), np.float32(1.0 / 65536.0)
+    x_first = np.int32((np.float32(PATCH_RADIUS) + centre[0] - far * (xx + xy)) * one)
+    y_first = np.int32((np.float32(PATCH_RADIUS) + centre[1] - far * (yx + yy)) * one)
+    x_by_c, x_by_r = np.int32(xx * one), np.int32(xy * one)
+    y_by_c, y_by_r = np.int32(yx * one), np.int32(yy * one)
+    right, down = np.uintp(1), np.uintp(PATCH_SIDE)
     for r in range(WIDE):
+        x, y = np.int32(x_first + r * x_by_r), np.int32(y_first + r * y_by_r)
         for c in range(WIDE):
-            x = left + np.float32(c) * xx + np.float32(r) * xy
-            y = top + np.float32(c) * yx + np.float32(r) * yy
-            # Rounding may lead a hair beyond the border.
-            column = min(max(int(x), 0), PATCH_SIDE - 2)
-            row = min(max(int(y), 0), PATCH_SIDE - 2)
-            part_x, part_y = x - np.float32(column), y - np.float32(row)
-            a, b = np.float32(patch[row, column]), np.float32(patch[row, column + 1])
-            c_, d = np.float32(patch[row + 1, column]), np.float32(patch[row + 1, column + 1])
-            above, below = a + part_x * (b - a), c_ + part_x * (d - c_)
-            out[r, c] = above + part_y * (below - above)
+            k = np.uintp((y >> 16) * PATCH_SIDE + (x >> 16))
+            part_x, part_y = part * np.float32(x & 65535), part * np.float32(y & 65535)
+            above, below = np.float32(patch[k]), np.float32(patch[k + down])
+            above += part_x * (np.float32(patch[k + right]) - above)
+            below += part_x * (np.float32(patch[k + down + right]) - below)
+            out[r * WIDE + c] = above + part_y * (below - above)
+            x, y = np.int32(x + x_by_c), np.int32(y + y_by_c)
     return True
 
 
@@ -195,36 +199,33 @@ def prepare(wide, template, slope_x, slope_y):
     """Template without its mean, and its slopes without what another mean or contrast would
     explain; returns the template's energy and the three sums of products of the slopes."""
     half, nil, count = np.float32(0.5), np.float32(0.0), np.float32(SIDE * SIDE)
-    mean, mean_x, mean_y = nil, nil, nil
+    # Sums of products of 1, the template t and the slopes x, y; near 0, so that few digits go.
+    middle = wide[WIDE * WIDE // 2]
+    t, x, y, tt, tx, ty, xx, xy, yy = nil, nil, nil, nil, nil, nil, nil, nil, nil
     for r in range(SIDE):
         for c in range(SIDE):
-            template[r, c] = wide[r + 1, c + 1]
-            slope_x[r, c] = half * (wide[r + 1, c + 2] - wide[r + 1, c])
-            slope_y[r, c] = half * (wide[r + 2, c + 1] - wide[r, c + 1])
-            mean += template[r, c]
-            mean_x += slope_x[r, c]
-            mean_y += slope_y[r, c]
-    mean, mean_x, mean_y = mean / count, mean_x / count, mean_y / count
-    energy, on_x, on_y = nil, nil, nil
-    for r in range(SIDE):
-        for c in range(SIDE):
-            template[r, c] -= mean
-            slope_x[r, c] -= mean_x
-            slope_y[r, c] -= mean_y
-            energy += template[r, c] * template[r, c]
-            on_x += template[r, c] * slope_x[r, c]
-            on_y += template[r, c] * slope_y[r, c]
+            k = np.uintp((r + 1) * WIDE + c + 1)
+            value = wide[k] - middle
+            step_x = half * (wide[k + np.uintp(1)] - wide[k - np.uintp(1)])
+            step_y = half * (wide[k + np.uintp(WIDE)] - wide[k - np.uintp(WIDE)])
+            template[r, c], slope_x[r, c], slope_y[r, c] = value, step_x, step_y
+            t, x, y = t + value, x + step_x, y + step_y
+            tt, tx, ty = tt + value * value, tx + value * step_x, ty + value * step_y
+            xx, xy, yy = xx + step_x * step_x, xy + step_x * step_y, yy + step_y * step_y
+    t, x, y = t / count, x / count, y / count
+    energy = tt - count * t * t
     if energy < np.float32(MIN_VARIANCE) * count:
         return energy, nil, nil, nil
-    on_x, on_y = on_x / energy, on_y / energy
-    xx, xy, yy = nil, nil, nil
+    on_x, on_y = (tx - count * t * x) / energy, (ty - count * t * y) / energy
     for r in range(SIDE):
-        for c in range(SIDE):
-            slope_x[r, c] -= on_x * template[r, c]
-            slope_y[r, c] -= on_y * template[r, c]
-            xx += slope_x[r, c] * slope_x[r, c]
-            xy += slope_x[r, c] * slope_y[r, c]
-            yy += slope_y[r, c] * slope_y[r, c]
+        for c in range(np.uintp(SIDE)):
+            value = template[r, c] - t
+            template[r, c] = value
+            slope_x[r, c] -= x + on_x * value
+            slope_y[r, c] -= y + on_y * value
+    xx -= count * x * x + on_x * on_x * energy
+    xy -= count * x * y + on_x * on_y * energy
+    yy -= count * y * y + on_y * on_y * energy
     return energy, xx, xy, yy
 
 

@@ -28,7 +28,7 @@ from vslam.loopclosure.siamese.export import (
     to_onnx,
     write_onnx,
 )
-from vslam.loopclosure.siamese.inference import OnnxNetwork, open_network
+from vslam.loopclosure.siamese.inference import LateNetwork, OnnxNetwork, open_network
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
 from vslam.loopclosure.siamese.preprocessing import to_tensor
 from vslam.loopclosure.siamese.scoring import NetworkScorer
@@ -160,6 +160,37 @@ def test_without_onnxruntime_a_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(InputError, match="pip install onnxruntime"):
         open_network("capsule")
+
+
+def test_a_late_network_is_loaded_by_the_first_image_and_missed_before(monkeypatch):
+    script = (
+        "import sys\n"
+        "import numpy as np\n"
+        "from vslam.config import Config\n"
+        "from vslam.features import Features\n"
+        "from vslam.loopclosure.registry import create_detector, create_images\n"
+        "images = create_images('capsule', Config())\n"
+        "detector = create_detector('capsule', Config(), None, images, late=True)\n"
+        "image = np.zeros((188, 620), np.uint8)\n"
+        "detector.add(0, image, Features.none())\n"
+        "images.add(0, image)\n"
+        "detector.restore(detector.memory())\n"
+        "sys.stdout.write(str('onnxruntime' in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd="/")
+    assert (done.returncode, done.stdout) == (0, "False"), done.stderr
+    late, loaded = LateNetwork("capsule"), open_network("capsule")
+    assert late.fingerprint == loaded.fingerprint
+    assert (late.size, late.dimensions) == (loaded.size, loaded.dimensions)
+    image = cv2.resize(SCENES[0], loaded.size[::-1])
+    descriptor = loaded.embed(image)
+    assert np.array_equal(late.embed(image), descriptor)
+    assert late.compare(descriptor, descriptor[None]) == loaded.compare(
+        descriptor, descriptor[None]
+    )
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(InputError, match="pip install onnxruntime"):
+        LateNetwork("capsule")
 
 
 class CountingNetwork:

@@ -12,7 +12,7 @@ from vslam.features import Features
 from vslam.loopclosure.detector import require_same
 from vslam.loopclosure.local_matching import DescriptorMaps, likeness
 from vslam.loopclosure.siamese.images import to_size
-from vslam.loopclosure.siamese.inference import OnnxNetwork, open_network
+from vslam.loopclosure.siamese.inference import LateNetwork, OnnxNetwork, open_network
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loops import DetectorMemory, LoopCandidate, PerKeyframe
 from vslam.map import Map
@@ -24,12 +24,13 @@ class SiameseDetector:
     Where images are kept, the network sees a keyframe only once the camera is near enough to it
     that it may be there again (:func:`beyond_reach`): on a drive that never returns, none.
 
-    Descriptors are kept in one matrix that grows by half: a query is one product with it.
+    Descriptors are kept in one matrix that grows by half: a query is one product with it. It has
+    no columns before the network was asked.
     """
 
     def __init__(
         self,
-        network: OnnxNetwork,
+        network: OnnxNetwork | LateNetwork,
         config: SiameseConfig,
         learned: LearnedMatchingConfig | None = None,
         images: KeyframeImages | None = None,
@@ -47,7 +48,7 @@ class SiameseDetector:
         self._learned = learned or LearnedMatchingConfig()
         self._images = images
         self._config = config
-        self._descriptors = np.zeros((64, network.dimensions), np.float32)
+        self._descriptors = np.zeros((64, 0), np.float32)
         self._known = np.zeros(64, np.bool_)  # keyframes added with an image
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
@@ -57,8 +58,7 @@ class SiameseDetector:
             self._descriptors = np.pad(self._descriptors, ((0, more), (0, 0)))
             self._known = np.pad(self._known, (0, more))
         if image is not None and self._images is None:
-            self._descriptors[keyframe] = self._embed(image)
-            self._known[keyframe] = True
+            self._remember(keyframe, image)
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
         """Best first: alive, neither recent nor covisible, similarity at or above the threshold."""
@@ -115,10 +115,11 @@ class SiameseDetector:
         require_same(self.memory(), memory)
         table = memory.tables["descriptors"]
         known, values = np.diff(table.first), table.values
-        right = values.dtype == np.float32 and values.shape[1:] == self._descriptors.shape[1:]
+        columns = (self._network.dimensions if len(values) else 0,)
+        right = values.dtype == np.float32 and (values.shape[1:] == columns or not len(values))
         if not right or not np.isfinite(values).all() or (known > 1).any():
             raise ValueError("the descriptors of the keyframes are not those of the network")
-        self._descriptors = np.zeros((len(known), values.shape[1]), np.float32)
+        self._descriptors = np.zeros((len(known), *columns), np.float32)
         self._descriptors[known > 0] = values
         self._known = known > 0
 
@@ -140,8 +141,14 @@ class SiameseDetector:
         assert self._images is not None
         for keyframe in [*needed, *others[: self._config.embedded_at_once].tolist()]:
             if not self._known[keyframe]:
-                self._descriptors[keyframe] = self._embed(self._images.image(keyframe))
-                self._known[keyframe] = True
+                self._remember(keyframe, self._images.image(keyframe))
+
+    def _remember(self, keyframe: int, image: NDArray[np.uint8]) -> None:
+        descriptor = self._embed(image)
+        if not self._descriptors.shape[1]:
+            self._descriptors = np.zeros((len(self._known), len(descriptor)), np.float32)
+        self._descriptors[keyframe] = descriptor
+        self._known[keyframe] = True
 
     def _embed(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         return self._network.embed(to_size(image, self._network.size, self._config.fit))
@@ -224,6 +231,8 @@ def open_detector(
     weights: Path | None = None,
     learned: LearnedMatchingConfig | None = None,
     images: KeyframeImages | None = None,
+    *,
+    late: bool = False,
 ) -> SiameseDetector:
     """A detector with its weights.
 
@@ -231,8 +240,11 @@ def open_detector(
         name: one of ``NETWORKS``.
         weights: ONNX file; None for the ones that vslam ships.
         config, learned, images: as :class:`SiameseDetector` takes them.
+        late: load the weights that vslam ships when the first image comes.
 
     Raises:
         InputError: unknown name, no weights, or weights of another network.
     """
-    return SiameseDetector(open_network(name, weights), config, learned, images)
+    late = late and weights is None
+    network = LateNetwork(name) if late else open_network(name, weights)
+    return SiameseDetector(network, config, learned, images)

@@ -39,5 +39,5 @@ def test_the_command_runs_the_detectors_in_turn(tool, kitti_tree, monkeypatch, c
     assert none.startswith("| ring | `none` | ")
     assert bow.startswith("| ring | `bow` | ")
     assert bow.count("%") == 2
-    memory = float(bow.split("|")[5].split()[0])
-    assert 50 < memory < 2000
+    # Not less than the process that starts it holds, which is pytest here.
+    assert float(bow.split("|")[5].split()[0]) > 50

@@ -29,8 +29,10 @@ class BundleProblem:
         first: ``(P + 1,)`` int64, observations of point p are ``first[p]:first[p + 1]``.
         camera: ``(O,)`` int64, camera of each observation.
         uvr: ``(O, 3)`` float64, NaN u_right for monocular ones.
-        inverse_sigma2: ``(O,)`` float64.
+        inverse_sigma2: ``(O,)`` float64, of u and v.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
+        disparity_weight: ``(O,)`` float64, how many times surer a disparity is than its u and v;
+            None: as sure as the camera's intrinsics say.
     """
 
     T_cw: NDArray[np.float64]
@@ -41,6 +43,13 @@ class BundleProblem:
     uvr: NDArray[np.float64]
     inverse_sigma2: NDArray[np.float64]
     intrinsics: NDArray[np.float64]
+    disparity_weight: NDArray[np.float64] | None = None
+
+    def disparity_weights(self) -> NDArray[np.float64]:
+        """``(O,)``, whether they are given or not."""
+        if self.disparity_weight is not None:
+            return self.disparity_weight
+        return np.full(len(self.camera), self.intrinsics[5])
 
 
 class Observations(NamedTuple):
@@ -51,6 +60,7 @@ class Observations(NamedTuple):
     camera: NDArray[np.int64]
     uvr: NDArray[np.float64]
     inverse_sigma2: NDArray[np.float64]
+    disparity_weight: NDArray[np.float64]
     used: NDArray[np.bool_]
     intrinsics: NDArray[np.float64]
 
@@ -113,6 +123,7 @@ def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Ob
         problem.camera,
         problem.uvr,
         problem.inverse_sigma2,
+        problem.disparity_weights(),
         np.ones(len(problem.camera), np.bool_) if use is None else use,
         problem.intrinsics,
     )
@@ -138,13 +149,14 @@ def _in_camera(T, p, q):
 @inner_kernel
 def robust_cost(T_cw, points, observations, inlier):
     """Half the sum of Huber losses; sets ``inlier`` by the chi-square test."""
-    first, camera, uvr, inverse_sigma2, used, intrinsics = observations
-    pinhole = unpacked(intrinsics)
+    first, camera, uvr, inverse_sigma2, disparity_weight, used, intrinsics = observations
+    fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     cost = 0.0
     q = np.empty(3)
     for p in range(len(points)):
         for o in range(first[p], first[p + 1]):
             _in_camera(T_cw[camera[o]], points[p], q)
+            pinhole = (fx, fy, cx, cy, bf, disparity_weight[o])
             r_u, r_v, r_disparity, stereo = residual(
                 q[0], q[1], q[2], uvr[o, 0], uvr[o, 1], uvr[o, 2], pinhole
             )
@@ -197,10 +209,9 @@ def _adjust(T_start, n_free, points_start, observations, equations, iterations, 
 @inner_kernel
 def linearise(T_cw, n_free, points, observations, equations):
     """Normal equations at the current estimate, in blocks."""
-    first, camera, uvr, inverse_sigma2, used, intrinsics = observations
+    first, camera, uvr, inverse_sigma2, disparity_weight, used, intrinsics = observations
     W, V, g, U, b = equations
-    pinhole = unpacked(intrinsics)
-    fx, fy, _, _, bf, disparity_weight = intrinsics
+    fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     U[:] = 0.0
     b[:] = 0.0
     q = np.empty(3)
@@ -214,6 +225,7 @@ def linearise(T_cw, n_free, points, observations, equations):
             k = camera[o]
             T = T_cw[k]
             _in_camera(T, points[p], q)
+            pinhole = (fx, fy, cx, cy, bf, disparity_weight[o])
             r0, r1, r2, stereo = residual(
                 q[0], q[1], q[2], uvr[o, 0], uvr[o, 1], uvr[o, 2], pinhole
             )
@@ -226,7 +238,7 @@ def linearise(T_cw, n_free, points, observations, equations):
             c = -fx * q[0] * iz * iz
             e = fy * iz
             f = -fy * q[1] * iz * iz
-            h = disparity_weight * bf * iz * iz if stereo else 0.0
+            h = disparity_weight[o] * bf * iz * iz if stereo else 0.0
             # Rows of d(u, v, -disparity)/d(point): projection times rotation.
             for i in range(3):
                 P[0, i] = a * T[0, i] + c * T[2, i]

@@ -192,6 +192,7 @@ def _fuse(
         other = a.landmark[best]
         if other < 0:
             link(a, best, landmark)
+            a.certainty[best] = 1  # of a keypoint, matched by its descriptor alone
         elif a.n_observations[other] > a.n_observations[landmark]:
             merge_landmarks(a, landmark, other)
         else:

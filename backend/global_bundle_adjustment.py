@@ -59,6 +59,7 @@ def adjust_globally(
         camera=rank[problem.camera[order]],
         uvr=problem.uvr[order],
         inverse_sigma2=problem.inverse_sigma2[order],
+        disparity_weight=problem.disparity_weights()[order],
         used=used[order],
         intrinsics=problem.intrinsics,
     )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.backend.fusion import fuse_neighbourhood
 from vslam.backend.triangulation import triangulate_with_neighbours
-from vslam.camera import Camera
+from vslam.camera import DISPARITY_WEIGHT, Camera
 from vslam.config import Config
 from vslam.kernels import kernel
 from vslam.map import Map
@@ -160,8 +160,9 @@ def assemble(
         first=first,
         camera=index[a.keyframe[rows]],
         uvr=stack_uvr(a.xy[rows], a.u_right[rows]),
-        inverse_sigma2=map_.scales[a.octave[rows]] ** -2.0,
+        inverse_sigma2=map_.scales[a.octave[rows]] ** -2.0 * a.certainty[rows],
         intrinsics=camera.intrinsics,
+        disparity_weight=DISPARITY_WEIGHT / np.sqrt(a.certainty[rows], dtype=np.float64),
     )
     return problem, rows
 

@@ -74,6 +74,7 @@ def triangulate_with_neighbours(
         ids = map_.add_landmarks(xyz, a.descriptor[rows_1], keyframe)
         link_many(map_.arrays, rows_1, ids)
         link_many(map_.arrays, rows_2, ids)
+        map_.arrays.certainty[rows_2] = 1  # of a keypoint, matched by its descriptor alone
         created.append(ids)
     return np.concatenate(created)
 

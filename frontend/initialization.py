@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.config import InitializationConfig
+from vslam.frontend.frame import Frame
 from vslam.frontend.matching import Projections, Searchable, consistent_orientation, search_windows
-from vslam.frontend.tracking import Frame, TrackingContext
+from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix
 from vslam.reprojection import CHI2_MONO, stack_uvr
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import OrbConfig
+from vslam.features import Pyramid
 from vslam.frontend.corners import fast_scores, local_maxima, spread
 from vslam.frontend.smoothing import smoothed
 from vslam.kernels import kernel
@@ -27,32 +28,12 @@ PATTERN: NDArray[np.int8] = np.load(Path(__file__).with_name("orb_pattern.npy"))
 
 
 @dataclass(frozen=True)
-class Pyramid:
-    """Levels of one image, back to back in one buffer so that kernels can take all of them.
-
-    Attributes:
-        pixels: ``(P + SPARE,)`` uint8, the levels row by row; kernels may read, and ignore, as much
-            as a register holds beyond the end.
-        offsets: ``(L,)`` int64, where each level starts.
-        shapes: ``(L, 2)`` int64, height and width.
-        scales: ``(L,)`` float64, full-resolution pixels for each pixel of the level.
-    """
-
-    pixels: NDArray[np.uint8]
-    offsets: NDArray[np.int64]
-    shapes: NDArray[np.int64]
-    scales: NDArray[np.float64]
-
-    def level(self, index: int) -> NDArray[np.uint8]:
-        """View of one level, ``(h, w)``."""
-        height, width = self.shapes[index]
-        start = self.offsets[index]
-        return self.pixels[start : start + height * width].reshape(height, width)
-
-
-@dataclass(frozen=True)
 class Extraction:
-    """Features of one image, sorted by octave: see ``vslam.features.Features`` for the fields."""
+    """Features of one image, sorted by octave: see ``vslam.features.Features`` for the fields.
+
+    Pixels are counted from the middle of the first one at every level: pixel x of a level that is
+    ``w`` times narrower lies at ``(x + 0.5) w - 0.5`` of the image.
+    """
 
     xy: NDArray[np.float32]
     octave: NDArray[np.uint8]
@@ -71,7 +52,6 @@ def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
         pyramid.pixels,
         pyramid.offsets,
         pyramid.shapes,
-        pyramid.scales,
         _quota(config.n_features, config.n_levels, config.scale_factor),
         config.fast_threshold,
         config.fast_threshold_min,
@@ -135,10 +115,8 @@ def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
 
 
 @kernel
-def extract_levels(
-    pixels, offsets, shapes, scales, quota, threshold, threshold_min, cell, inside, pattern
-):
-    """Features of all levels: ``xy``, ``octave``, ``angle`` and ``descriptors`` of `Extraction`.
+def extract_levels(pixels, offsets, shapes, quota, threshold, threshold_min, cell, inside, pattern):
+    """Features of all levels: ``xy``, ``octave``, ``angle`` and ``descriptors``.
 
     One kernel, so that Python, for which threads wait for each other, is called once an image.
     """
@@ -155,9 +133,11 @@ def extract_levels(
             continue  # the smallest levels have none
         turned = orientations(image, corners, inside)
         described = describe(smoothed(image), corners, turned, pattern)
-        scale = np.float32(scales[level])
+        # Sizes are whole numbers: not quite the scale apart.
+        wide, high = shapes[0, 1] / width, shapes[0, 0] / height
         for i in range(len(corners)):
-            xy[n, 0], xy[n, 1] = corners[i, 0] * scale, corners[i, 1] * scale
+            x, y = corners[i, 0] + 0.5, corners[i, 1] + 0.5
+            xy[n, 0], xy[n, 1] = x * wide - 0.5, y * high - 0.5
             octave[n], angle[n] = level, turned[i]
             for k in range(32):
                 descriptors[n, k] = described[i, k]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.geometry import compose, orthonormalised, se3_exp, solve_positive
 from vslam.kernels import inner_kernel, kernel
@@ -12,8 +13,14 @@ ROUNDS = 4
 ITERATIONS = 10
 
 
-@kernel
-def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
+def optimise_pose(
+    T_cw: NDArray[np.float64],
+    points: NDArray[np.float64],
+    uvr: NDArray[np.float64],
+    inverse_sigma2: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    disparity_weight: NDArray[np.float64] | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Pose that minimises the robust reprojection error of fixed landmarks.
 
     Four rounds of Gauss-Newton; after each one the chi-square test sorts inliers from outliers,
@@ -25,13 +32,21 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
         uvr: ``(N, 3)`` float64 observations u, v, u_right; NaN u_right: monocular.
         inverse_sigma2: ``(N,)`` float64, inverse variance of a pixel coordinate.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
+        disparity_weight: ``(N,)`` float64, how many times surer a disparity is than its u and v;
+            None: as sure as the camera's intrinsics say.
 
     Returns:
         ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers.
     """
+    if disparity_weight is None:
+        disparity_weight = np.full(len(points), intrinsics[5])
+    return _optimise(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics)
+
+
+@kernel
+def _optimise(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics):
     n = len(points)
-    pinhole = unpacked(intrinsics)
-    fx, fy, _, _, bf, disparity_weight = intrinsics
+    fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     T = T_cw.copy()
     inlier = np.ones(n, np.bool_)
     for turn in range(ROUNDS):
@@ -51,6 +66,7 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
                 z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
                 if z <= 1e-6:
                     continue
+                pinhole = (fx, fy, cx, cy, bf, disparity_weight[i])
                 r_u, r_v, r_disparity, stereo = residual(
                     x, y, z, uvr[i, 0], uvr[i, 1], uvr[i, 2], pinhole
                 )
@@ -64,7 +80,7 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
                 # d(u, v, -disparity)/d(v, w) for T <- exp([v, w]) T.
                 J[0, 0], J[0, 1], J[0, 2] = fx * iz, 0.0, -fx * x * iz * iz
                 J[1, 0], J[1, 1], J[1, 2] = 0.0, fy * iz, -fy * y * iz * iz
-                J[2, 0], J[2, 1], J[2, 2] = 0.0, 0.0, disparity_weight * bf * iz * iz
+                J[2, 0], J[2, 1], J[2, 2] = 0.0, 0.0, disparity_weight[i] * bf * iz * iz
                 for k in range(3 if stereo else 2):
                     J[k, 3] = -J[k, 1] * z + J[k, 2] * y
                     J[k, 4] = J[k, 0] * z - J[k, 2] * x
@@ -85,18 +101,20 @@ def optimise_pose(T_cw, points, uvr, inverse_sigma2, intrinsics):
                 moved |= not abs(step[k]) < 1e-7
             if not moved:
                 break
-        classify(T, points, uvr, inverse_sigma2, pinhole, inlier)
+        classify(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier)
     return T, inlier
 
 
 @inner_kernel
-def classify(T, points, uvr, inverse_sigma2, pinhole, inlier):
+def classify(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier):
     """Set ``inlier`` to those that pass the chi-square test at pose ``T``."""
+    fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     for i in range(len(points)):
         p = points[i]
         x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
         y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
         z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        pinhole = (fx, fy, cx, cy, bf, disparity_weight[i])
         inlier[i] = z > 0.0 and (
             chi_square_ratio(x, y, z, uvr[i, 0], uvr[i, 1], uvr[i, 2], inverse_sigma2[i], pinhole)
             <= 1.0

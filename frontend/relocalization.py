@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from vslam.frontend.frame import Frame
 from vslam.frontend.matching import count_elsewhere, search_all
 from vslam.frontend.pnp import ransac_pose
-from vslam.frontend.tracking import Frame, TrackingContext, observations, refine, track_local_map
+from vslam.frontend.tracking import TrackingContext, observations, refine, track_local_map
 from vslam.map import LocalMap
 
 

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.config import StereoConfig
-from vslam.features import MIN_DISPARITY
+from vslam.features import MIN_DISPARITY, level_pixel
 from vslam.frontend.orb import Extraction
 from vslam.kernels import hamming, inline, inner_kernel, kernel
 
 LANES = 16  # shifts of the SAD window tried at once
+REFINE_HALF = 4  # of the patch that is refined: a larger one reaches over nearer things
 MEDIAN_FACTOR = 1.5 * 1.4826  # 1.5 standard deviations, from the median of a half-normal
 
 
@@ -116,13 +117,14 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
         height, width = shapes[level]
         image_l = pixels_l[offsets[level] : offsets[level] + height * width].reshape(height, width)
         image_r = pixels_r[offsets[level] : offsets[level] + height * width].reshape(height, width)
-        x_l, y_l = int(np.rint(u / scales[level])), int(np.rint(v / scales[level]))
-        x_r = int(np.rint(xy_r[best, 0] / scales[level]))
+        wide, high = shapes[0, 1] / width, shapes[0, 0] / height
+        x_l, y_l = level_pixel(u, wide), level_pixel(v, high)
+        x_r = level_pixel(xy_r[best, 0], wide)
         shift, score = slide(image_l, image_r, x_l, y_l, x_r, half, reach)
         if np.isnan(shift):
             continue
         # The left feature keeps its sub-pixel offset within the level's pixel.
-        disparity = (x_l - x_r - shift) * scales[level]
+        disparity = (x_l - x_r - shift) * wide
         if disparity < max_disparity and disparity > -1.0:
             u_right[i] = u - max(disparity, MIN_DISPARITY)
             sad[i] = score
@@ -178,7 +180,7 @@ def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
     if curvature <= 0:
         return np.nan, np.float32(-1.0)
     start = 0.5 * (before - after) / curvature
-    refined = refine_shift(image_l, image_r, x_l, y_l, x_r + best - reach, start, half)
+    refined = refine_shift(image_l, image_r, x_l, y_l, x_r + best - reach, start, REFINE_HALF)
     return best - reach + refined, np.float32(here)
 
 

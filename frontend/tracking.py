@@ -11,10 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, ImageMap
+from vslam.camera import DISPARITY_WEIGHT, Camera, ImageMap
 from vslam.config import Config
-from vslam.features import FeatureGrid, Features
+from vslam.features import NO_PATCHES, Features, LandmarkPatches
+from vslam.frontend.alignment import align_frame
 from vslam.frontend.depth import columns_of_depth
+from vslam.frontend.frame import Frame
 from vslam.frontend.matching import (
     Projections,
     Searchable,
@@ -23,7 +25,7 @@ from vslam.frontend.matching import (
     search_all,
     search_windows,
 )
-from vslam.frontend.orb import scale_factors
+from vslam.frontend.orb import Extraction, scale_factors
 from vslam.frontend.pose import optimise_pose
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import match_stereo
@@ -33,67 +35,6 @@ from vslam.map import LocalMap
 from vslam.reprojection import stack_uvr
 
 NEVER = np.iinfo(np.int64).max
-
-
-@dataclass
-class Frame:
-    """A frame being tracked.
-
-    Attributes:
-        index: number of the frame in the run, from 0.
-        timestamp: seconds.
-        image: ``(H, W)`` uint8 left image, for loop detectors that look at it, or None.
-        features, grid: of the left image, or of the right one (``Features.from_right``).
-        T_cw: ``(4, 4)`` pose estimate, of the left camera once the frame is tracked; while it is,
-            of the camera that its features are of.
-        landmark: ``(N,)`` int32, landmark that each feature tracks, or -1.
-        xyz: ``(N, 3)`` float64, its position; NaN without one.
-        disparity_offset: pixels that the disparities of the features were corrected by.
-    """
-
-    index: int
-    timestamp: float
-    image: NDArray[np.uint8] | None
-    features: Features
-    grid: FeatureGrid
-    T_cw: NDArray[np.float64]
-    landmark: NDArray[np.int32]
-    xyz: NDArray[np.float64]
-    disparity_offset: float = 0.0
-
-    @classmethod
-    def untracked(
-        cls,
-        features: Features,
-        camera: Camera,
-        index: int = 0,
-        timestamp: float = 0.0,
-        image: NDArray[np.uint8] | None = None,
-    ) -> Frame:
-        """A frame of which nothing is known but its features."""
-        n = len(features)
-        return cls(
-            index=index,
-            timestamp=timestamp,
-            image=image,
-            features=features,
-            grid=FeatureGrid.of_positions(features.xy, camera.width, camera.height),
-            T_cw=np.eye(4),
-            landmark=np.full(n, -1, np.int32),
-            xyz=np.full((n, 3), np.nan),
-        )
-
-    def correct_disparities(self, offset: float) -> None:
-        """Correct the features by the whole offset of the pair (``Map.disparity_offset``)."""
-        if offset != self.disparity_offset:
-            change = offset - self.disparity_offset
-            self.features = self.features.with_larger_disparities(change)
-            self.disparity_offset = offset
-
-    @property
-    def n_stereo(self) -> int:
-        """Features with a stereo match."""
-        return int(np.count_nonzero(np.isfinite(self.features.u_right)))
 
 
 @dataclass(frozen=True)
@@ -158,7 +99,7 @@ def extract_features(
         pair = balanced(left, right_image, config.stereo, sides)
         found, right = extract_in_any_light(pair, config, image_map)
         u_right = match_stereo(found, right, camera, config.stereo)
-    return Features(found.xy, found.octave, found.angle, found.descriptors, u_right)
+    return _features(found, u_right)
 
 
 def _features_alone(
@@ -167,7 +108,15 @@ def _features_alone(
     """Those of an image whose columns in another one nobody knows."""
     (found,) = extract_in_any_light([image], config)
     u_right = np.full(len(found.xy), np.nan, np.float32)
-    return Features(found.xy, found.octave, found.angle, found.descriptors, u_right, from_right)
+    return _features(found, u_right, from_right=from_right)
+
+
+def _features(
+    found: Extraction, u_right: NDArray[np.float32], *, from_right: bool = False
+) -> Features:
+    return Features(
+        found.xy, found.octave, found.angle, found.descriptors, u_right, from_right, found.pyramid
+    )
 
 
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
@@ -275,12 +224,18 @@ def track_descriptors(
 
 
 def track_local_map(
-    frame: Frame, local: LocalMap, context: TrackingContext, window: float | None = None
+    frame: Frame,
+    local: LocalMap,
+    context: TrackingContext,
+    window: float | None = None,
+    patches: LandmarkPatches = NO_PATCHES,
 ) -> tuple[int, int, NDArray[np.int32]]:
-    """Match every local landmark that should be visible, then refine the pose with all matches.
+    """Match every local landmark that should be visible, align the matches to a fraction of a
+    pixel, then refine the pose with them.
 
     Args:
         window: search radius at octave 0, pixels; None: ``context.local_window``.
+        patches: of the landmarks that can be aligned.
 
     Returns:
         Matches, inliers, and the ids of the landmarks that should be visible.
@@ -313,7 +268,8 @@ def track_local_map(
     frame.landmark[found[hit]] = local.ids[hit]
     frame.xyz[found[hit]] = local.xyz[hit]
     matches = int(np.count_nonzero(frame.landmark >= 0))
-    inliers = refine(frame, frame.T_cw, context)
+    shift = align_frame(frame, patches, context.scales, camera.intrinsics, context.config.alignment)
+    inliers = refine(frame, frame.T_cw, context, shift)
     return matches, inliers, local.ids[visible | tracked]
 
 
@@ -329,14 +285,33 @@ def _search(
     return search_windows(projections, features, free, max_distance, ratio)[0]
 
 
-def refine(frame: Frame, T_cw: NDArray[np.float64], context: TrackingContext) -> int:
-    """Optimise the pose from all matches, drop the outliers, return the number of inliers."""
+def refine(
+    frame: Frame,
+    T_cw: NDArray[np.float64],
+    context: TrackingContext,
+    shift: NDArray[np.float32] | None = None,
+) -> int:
+    """Optimise the pose from all matches, drop the outliers, return the number of inliers.
+
+    Args:
+        shift: what ``frame.shift`` is to be; None: no match is aligned.
+    """
+    frame.shift = shift
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
+    uvr, weight = observations(frame, matched, context)
+    certainty = np.ones(len(matched))
+    if shift is not None:
+        moved = shift[matched]
+        aligned = np.isfinite(moved[:, 0])
+        uvr[aligned] += moved[aligned][:, [0, 1, 0]]
+        certainty[aligned] = context.config.alignment.certainty
     frame.T_cw, inlier = optimise_pose(
         T_cw,
         frame.xyz[matched],
-        *observations(frame, matched, context),
+        uvr,
+        weight * certainty,
         context.camera.intrinsics,
+        DISPARITY_WEIGHT / np.sqrt(certainty),
     )
     outliers = matched[~inlier]
     frame.landmark[outliers] = -1

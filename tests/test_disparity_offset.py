@@ -10,7 +10,7 @@ from vslam.backend.bundle_adjustment import BundleProblem
 from vslam.backend.disparity_offset import remaining_offset
 from vslam.camera import Camera
 from vslam.features import MIN_DISPARITY, Features, shifted_columns
-from vslam.frontend.tracking import Frame
+from vslam.frontend.frame import Frame
 
 CAMERA = Camera(700.0, 700.0, 600.0, 180.0, 0.54, 1200, 370)
 N_CAMERAS = 8

@@ -85,6 +85,8 @@ def test_both_cameras_at_once_are_prepared_to_the_same_bytes(kitti_tree, monocul
             one = prepare_frame(frame, context)
             other = prepare_frame(frame, context, at_once)
             assert one.image.tobytes() == other.image.tobytes()
+            pixels = [vars(prepared.features).pop("pyramid").pixels for prepared in (one, other)]
+            assert np.array_equal(*pixels)
             for name, value in vars(one.features).items():
                 assert np.array_equal(value, getattr(other.features, name), equal_nan=True), name
 

@@ -9,8 +9,9 @@ from test_verification import forward, in_strip, link_pass
 
 from vslam.config import Config, RelocalizationConfig
 from vslam.features import Features
+from vslam.frontend.frame import Frame
 from vslam.frontend.relocalization import relocalise
-from vslam.frontend.tracking import Frame, TrackingContext
+from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp, se3_log
 from vslam.map import local_map
 

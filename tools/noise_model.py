@@ -8,7 +8,8 @@ disparity, in pixels of the feature's octave, that explain its residuals: varian
 squared residuals of a kind are divided by its redundancy, which is the number of its observations
 less what landmarks could follow, so that a kind is not called sure because it is trusted. The
 weights are then those found, and it begins again until they stay. Poses take a share of the
-redundancy that is left out: six numbers for hundreds of observations.
+redundancy that is left out: six numbers for hundreds of observations. u and v are those of aligned
+matches and of what was first seen; of others the variance is taken to be four times theirs.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from scale_probe import in_cameras
 from vslam.backend.bundle_adjustment import BundleProblem
 from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.global_mapping import take_snapshot
+from vslam.camera import DISPARITY_WEIGHT
 from vslam.maps.storage import load_map
 
 ROUNDS = 8
@@ -40,10 +42,13 @@ def variance_components(
     The program trusts u and v alike, monocular ones, too: so does the adjustment.
     """
     pixel = float(np.sqrt(np.mean(sigma[:2] ** 2)))
-    intrinsics = problem.intrinsics.copy()
-    intrinsics[5] = pixel / sigma[2]
+    certainty = (DISPARITY_WEIGHT / problem.disparity_weights()) ** 2
+    octave = (problem.inverse_sigma2 / certainty) ** -0.5
+    pixels = pixel * np.sqrt(certainty.max() / certainty)
     scaled = replace(
-        problem, intrinsics=intrinsics, inverse_sigma2=problem.inverse_sigma2 / pixel**2
+        problem,
+        inverse_sigma2=(octave * pixels) ** -2.0,
+        disparity_weight=pixels / sigma[2],
     )
     solution = adjust_globally(scaled, iterations=10)
     owner = np.repeat(np.arange(len(problem.points)), np.diff(problem.first))
@@ -52,7 +57,6 @@ def variance_components(
     fx, fy, cx, cy, bf, _ = problem.intrinsics
     x, y, z = q.T
     u, v, disparity = fx * x / z + cx, fy * y / z + cy, bf / z
-    octave = problem.inverse_sigma2**-0.5
     error = np.stack(
         [
             problem.uvr[:, 0] - u,
@@ -64,7 +68,8 @@ def variance_components(
     error /= octave[:, None]
     stereo = np.isfinite(error[:, 2])
     with np.errstate(invalid="ignore"):
-        good = (z > 0) & (np.abs(np.nan_to_num(error)) < GATE * sigma).all(axis=1)
+        gate = GATE * np.stack([pixels, pixels, np.full_like(pixels, sigma[2])], axis=1)
+        good = (z > 0) & (np.abs(np.nan_to_num(error)) < gate).all(axis=1)
     # Rows of d(u, v, disparity)/d(point) in units of sigma.
     R = solution.T_cw[problem.camera, :3, :3]
     nil = np.zeros_like(z)
@@ -76,14 +81,14 @@ def variance_components(
         ],
         axis=1,
     )
-    spread = octave[:, None] * [pixel, pixel, sigma[2]]
+    spread = octave[:, None] * gate / GATE
     J = np.einsum("oij,ojk->oik", P, R) / spread[:, :, None]
     J[~stereo, 2] = 0.0
     J[~good] = 0.0
     V = np.zeros((len(problem.points), 3, 3))
     np.add.at(V, owner, np.einsum("oki,okj->oij", J, J))
     lever = np.einsum("oki,oij,okj->ok", J, np.linalg.pinv(V, hermitian=True)[owner], J)
-    counted = good & stereo
+    counted = good & stereo & (certainty == certainty.max())
     redundancy = (1.0 - lever[counted]).sum(axis=0)
     found = np.sqrt((error[counted] ** 2).sum(axis=0) / redundancy)
     return adjusted, found, int(counted.sum())

@@ -164,6 +164,29 @@ class DepthConfig(_Section):
     )
 
 
+class AlignmentConfig(_Section):
+    """Matches to a fraction of a pixel (Forster et al., ICRA 2014, III-B)."""
+
+    iterations: int = Field(7, ge=1, description="Steps of Gauss-Newton, at most. [own]")
+    max_shift: float = Field(
+        2.0,
+        gt=0,
+        le=2.0,
+        description="From the keypoint, in x and in y, pixels of its octave. [own]",
+    )
+    min_correlation: float = Field(
+        0.85, gt=0, le=1, description="Cross-correlation of an aligned patch with the image. [own]"
+    )
+    certainty: int = Field(
+        4,
+        ge=1,
+        le=255,
+        description="How many times smaller the variance of an aligned match is than that of a "
+        "keypoint. [own]",
+    )
+    keyframes: int = Field(5, ge=1, description="The newest ones, whose patches are kept. [own]")
+
+
 class TrackingConfig(_Section):
     """Frame-to-map tracking."""
 
@@ -806,6 +829,7 @@ class Config(_Section):
     weak_images: WeakImageConfig = WeakImageConfig()
     stereo: StereoConfig = StereoConfig()
     depth: DepthConfig = DepthConfig()
+    alignment: AlignmentConfig = AlignmentConfig()
     tracking: TrackingConfig = TrackingConfig()
     initialization: InitializationConfig = InitializationConfig()
     keyframes: KeyframeConfig = KeyframeConfig()

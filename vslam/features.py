@@ -9,10 +9,43 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.kernels import kernel
+from vslam.kernels import inner_kernel, kernel
 
 MIN_DISPARITY = 0.01  # pixels; a point farther away counts as so far
+PATCH_RADIUS = 8  # of the pixels that are kept around a feature, in its octave
+PATCH_SIDE = 2 * PATCH_RADIUS + 1
+PATCH_PIXELS = PATCH_SIDE**2
 CELL = 16  # pixels of a FeatureGrid cell; search windows are 5 to 60 px wide
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """Levels of one image, back to back in one buffer so that kernels can take all of them.
+
+    Attributes:
+        pixels: ``(P + SPARE,)`` uint8, the levels row by row; kernels may read, and ignore, as much
+            as a register holds beyond the end.
+        offsets: ``(L,)`` int64, where each level starts.
+        shapes: ``(L, 2)`` int64, height and width.
+        scales: ``(L,)`` float64, full-resolution pixels for each pixel of the level.
+    """
+
+    pixels: NDArray[np.uint8]
+    offsets: NDArray[np.int64]
+    shapes: NDArray[np.int64]
+    scales: NDArray[np.float64]
+
+    def level(self, index: int) -> NDArray[np.uint8]:
+        """View of one level, ``(h, w)``."""
+        height, width = self.shapes[index]
+        start = self.offsets[index]
+        return self.pixels[start : start + height * width].reshape(height, width)
+
+
+@inner_kernel
+def level_pixel(x, ratio):
+    """Pixel of a level at a coordinate of the image, which has ``ratio`` pixels for one of it."""
+    return int(np.rint((np.float64(x) + 0.5) / ratio - 0.5))
 
 
 @dataclass(frozen=True)
@@ -28,6 +61,7 @@ class Features:
         u_right: ``(N,)`` float32, column of the match in the right image, NaN without one.
         from_right: whether the image is the right one; ``xy`` is in it then, and all ``u_right``
             are NaN.
+        pyramid: of the image; None if it is not known any more.
     """
 
     xy: NDArray[np.float32]
@@ -36,6 +70,7 @@ class Features:
     descriptors: NDArray[np.uint8]
     u_right: NDArray[np.float32]
     from_right: bool = False
+    pyramid: Pyramid | None = None
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -54,6 +89,41 @@ class Features:
             np.empty((0, 32), np.uint8),
             np.empty(0, np.float32),
         )
+
+
+class KeyframePatches(NamedTuple):
+    """Of the N features of a keyframe: ``pixels`` (N, PATCH_PIXELS) u1 around the keypoints, and
+    ``shift`` (N, 2) f4 from there to what each observes, in pixels of its octave."""
+
+    keyframe: int
+    pixels: NDArray[np.uint8]
+    shift: NDArray[np.float32]
+
+
+class LandmarkPatches(NamedTuple):
+    """Of N landmarks: ``ids`` (N,) i4, sorted; ``where`` (N,) i8 row of each in ``pixels`` (P,
+    PATCH_PIXELS) u1 and ``shift`` (P, 2) f4, which are as of ``KeyframePatches``; ``view`` (N,) i8
+    the camera that saw it, of ``T_cw`` (K, 4, 4) f8; ``size`` (N,) f8 full-resolution pixels for
+    one of its patch."""
+
+    ids: NDArray[np.int32]
+    where: NDArray[np.int64]
+    view: NDArray[np.int64]
+    size: NDArray[np.float64]
+    pixels: NDArray[np.uint8]
+    shift: NDArray[np.float32]
+    T_cw: NDArray[np.float64]
+
+
+NO_PATCHES = LandmarkPatches(
+    np.empty(0, np.int32),
+    np.empty(0, np.int64),
+    np.empty(0, np.int64),
+    np.empty(0),
+    np.empty((0, PATCH_PIXELS), np.uint8),
+    np.empty((0, 2), np.float32),
+    np.empty((0, 4, 4)),
+)
 
 
 def shifted_columns(

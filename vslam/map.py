@@ -35,7 +35,8 @@ class Arrays(NamedTuple):
     ``head`` (L,) i4 first row of its chain; ``n_observations`` (L,) i4, stereo ones counting twice
     (ORB-SLAM2).
     Rows: ``xy`` (R, 2) f4; ``u_right`` (R,) f4; ``octave`` (R,) u1; ``angle`` (R,) f4;
-    ``descriptor`` (R, 4) u8; ``keyframe`` (R,) i4; ``landmark``, ``next_row`` (R,) i4.
+    ``descriptor`` (R, 4) u8; ``keyframe`` (R,) i4; ``landmark``, ``next_row`` (R,) i4;
+    ``certainty`` (R,) u1 how many times smaller the variance of ``xy`` is than that of a keypoint.
     """
 
     T_cw: NDArray[np.float64]
@@ -60,6 +61,7 @@ class Arrays(NamedTuple):
     keyframe: NDArray[np.int32]
     landmark: NDArray[np.int32]
     next_row: NDArray[np.int32]
+    certainty: NDArray[np.uint8]
 
 
 KEYFRAME_FIELDS = Arrays._fields[:3]
@@ -137,6 +139,7 @@ class Map:
             keyframe=np.zeros(r, np.int32),
             landmark=np.zeros(r, np.int32),
             next_row=np.zeros(r, np.int32),
+            certainty=np.zeros(r, np.uint8),
         )
 
     def _reserve(self, fields: tuple[str, ...], used: int, extra: int) -> None:
@@ -149,9 +152,18 @@ class Map:
             self.arrays = self.arrays._replace(**{name: grown})
 
     def add_keyframe(
-        self, features: Features, T_cw: NDArray[np.float64], timestamp: float, frame: int
+        self,
+        features: Features,
+        T_cw: NDArray[np.float64],
+        timestamp: float,
+        frame: int,
+        certainty: NDArray[np.uint8] | int = 1,
     ) -> int:
-        """Append a keyframe without observations; returns its id."""
+        """Append a keyframe without observations; returns its id.
+
+        Args:
+            certainty: ``(N,)`` of the features.
+        """
         k, n = self.n_keyframes, len(features)
         self._reserve(KEYFRAME_FIELDS, k, 1)
         self._reserve(ROW_FIELDS, self.n_rows, n)
@@ -161,6 +173,7 @@ class Map:
         a.octave[rows], a.angle[rows] = features.octave, features.angle
         a.descriptor[rows] = features.descriptors.view(np.uint64)
         a.keyframe[rows] = k
+        a.certainty[rows] = certainty
         a.landmark[rows] = NONE
         a.next_row[rows] = NONE
         a.T_cw[k] = T_cw

@@ -23,8 +23,9 @@ from vslam.backend.two_views import map_two_views
 from vslam.camera import Camera
 from vslam.closing import LoopClosing
 from vslam.config import Config
-from vslam.features import Features
-from vslam.frontend.tracking import Frame
+from vslam.features import Features, KeyframePatches, LandmarkPatches
+from vslam.frontend.frame import Frame
+from vslam.frontend.patches import RecentPatches, patches_around
 from vslam.geometry import Matrix
 from vslam.map import LocalMap, Map, local_map
 from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
@@ -40,12 +41,15 @@ class MappingThread:
         n_keyframes: keyframes made, culled ones included.
         last_frame, last_timestamp: index and seconds of the frame that became the last keyframe.
         local: landmarks around the reference keyframe, as of the last merge.
+        patches: of those of them that the newest keyframes observe.
+        recent: the patches of these keyframes.
         reference_view: landmarks of the reference keyframe alone.
         n_reference: of these, those that at least three keyframes see (all in a young map).
         disparity_offset: ``Map.disparity_offset``.
     """
 
     local: LocalMap
+    patches: LandmarkPatches
     reference_view: LocalMap
     n_reference: int
     disparity_offset: float
@@ -66,6 +70,7 @@ class MappingThread:
         self.disparity_offset = 0.0
         self.last_frame = -1
         self.last_timestamp = -np.inf
+        self.recent = RecentPatches(config.alignment.keyframes)
         self._map = map_ or Map(scales)
         self._camera = camera
         self._config = config
@@ -89,6 +94,8 @@ class MappingThread:
     def return_to(self, checkpoint: Checkpoint) -> None:
         """Go on as from there, in the map as it was then."""
         self.last_frame, self.last_timestamp = checkpoint.last_frame, checkpoint.last_timestamp
+        for one in checkpoint.patches:
+            self.recent.add(one)
         self.set_reference(checkpoint.reference)
 
     @property
@@ -118,7 +125,13 @@ class MappingThread:
         """
         self.write_counts()
         map_ = self._map
-        keyframe = map_.add_keyframe(frame.features, frame.T_cw, frame.timestamp, frame.index)
+        keyframe = map_.add_keyframe(
+            frame.observed(),
+            frame.T_cw,
+            frame.timestamp,
+            frame.index,
+            self._certainty(frame),
+        )
         tracked = np.flatnonzero(frame.landmark >= 0)
         link_many(map_.arrays, map_.rows(keyframe).start + tracked, frame.landmark[tracked])
         if keyframe > 0:
@@ -129,6 +142,7 @@ class MappingThread:
                 map_.begin_submap(keyframe, self.reference, predicted=predicted)
         map_stereo_points(map_, keyframe, self._camera, self._config)
         refresh_keyframe(map_, keyframe)
+        self._remember_patches(frame, keyframe)
         self._set_newest(keyframe, frame)
         # The map is the thread's from here on.
         self._observe(frame, keyframe)
@@ -185,6 +199,7 @@ class MappingThread:
         if one > 0:
             map_.begin_submap(one, self.reference, predicted=start.predicted)
         map_.parents[two] = one
+        self._remember_patches(start.second, two)
         for keyframe, frame in zip((one, two), frames, strict=True):
             self._closing.process(map_, keyframe, frame.features, frame.image)
         self._set_newest(two, start.second)
@@ -299,6 +314,26 @@ class MappingThread:
         frame.landmark = self._map.arrays.landmark[self._map.rows(keyframe)]
         self.update(frame)
 
+    def _certainty(self, frame: Frame) -> NDArray[np.uint8] | int:
+        """Of the features of a frame. What a landmark is first seen as is where it is seen; a
+        match that was not aligned is half a pixel off."""
+        if frame.features.pyramid is None:
+            return 1
+        unaligned = (frame.landmark >= 0) & ~frame.aligned
+        return np.where(unaligned, 1, self._config.alignment.certainty).astype(np.uint8)
+
+    def _remember_patches(self, frame: Frame, keyframe: int) -> None:
+        features = frame.features
+        if features.pyramid is None:
+            return
+        shift = np.zeros((len(features), 2), np.float32)
+        if frame.shift is not None:
+            aligned = frame.aligned
+            scale = self._map.scales[features.octave[aligned]]
+            shift[aligned] = frame.shift[aligned] / scale[:, None]
+        pixels = patches_around(features.pyramid, features.xy, features.octave)
+        self.recent.add(KeyframePatches(keyframe, pixels, shift))
+
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
         self.n_keyframes = keyframe + 1
         self.last_frame, self.last_timestamp = frame.index, frame.timestamp
@@ -330,6 +365,7 @@ class MappingThread:
         map_, reference = self._map, self.reference
         self.disparity_offset = map_.disparity_offset
         self.local = local_map(map_, reference, self._config.tracking.local_keyframes)
+        self.patches = self.recent.of(map_, self.local.ids)
         self.reference_view = local_map(map_, reference, 1)
         living = map_.living_keyframes()
         if self._camera.monocular and map_.restarts:

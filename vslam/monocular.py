@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.two_views import adjust_two_views
+from vslam.frontend.frame import Frame
 from vslam.frontend.initialization import match_views, reconstruct
-from vslam.frontend.tracking import Frame, TrackingContext
+from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix, se3_log
 
 

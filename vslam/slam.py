@@ -19,6 +19,7 @@ from vslam.config import Config
 from vslam.errors import InputError
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.frame_poses import FramePoses, FrameTable
+from vslam.frontend.frame import Frame
 from vslam.frontend.keyframes import (
     CloseGain,
     KeyframeEvidence,
@@ -29,7 +30,6 @@ from vslam.frontend.keyframes import (
 )
 from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracking import (
-    Frame,
     TrackingContext,
     extract_features,
     feature_depth,
@@ -242,6 +242,7 @@ class Slam:
             gained_close=self._close_gain.mean,
             gain_awaited=self._close_gain.awaited,
             closing=self._closing.memory(),
+            patches=self._mapping.recent.all(),
         )
 
     def _return_to(self, checkpoint: Checkpoint) -> None:
@@ -495,7 +496,9 @@ class Slam:
         frame.T_cw = T_cw
         frame.landmark[:], frame.xyz[:] = -1, np.nan
         window = self.config.tracking.predicted_window
-        matches, inliers, _ = track_local_map(frame, self._mapping.local, self.context, window)
+        matches, inliers, _ = track_local_map(
+            frame, self._mapping.local, self.context, window, self._mapping.patches
+        )
         if self._moves_as_predicted(inliers, matches):
             return inliers
         frame.landmark[:], frame.xyz[:] = -1, np.nan
@@ -527,7 +530,9 @@ class Slam:
     def _track_local_map(self, frame: Frame, inliers: int) -> tuple[int, int, NDArray[np.int32]]:
         if inliers < self.config.tracking.min_inliers_frame:
             return inliers, 0, np.empty(0, np.int32)
-        return track_local_map(frame, self._mapping.local, self.context)
+        return track_local_map(
+            frame, self._mapping.local, self.context, patches=self._mapping.patches
+        )
 
     def _relocalise(self, frame: Frame) -> int:
         """Look for a lost frame in the whole map; returns inliers, 0 if it was found nowhere."""
@@ -565,11 +570,12 @@ class Slam:
         keyframe."""
         self._merge_before(frame)
         T_cw, landmark, xyz = frame.T_cw, frame.landmark.copy(), frame.xyz.copy()
+        shift = frame.shift
         reference = self._mapping.reference
         found = self._relocalise(frame)
         if found > self.config.relocalization.better * inliers:
             return found
-        frame.T_cw, frame.landmark, frame.xyz = T_cw, landmark, xyz
+        frame.T_cw, frame.landmark, frame.xyz, frame.shift = T_cw, landmark, xyz, shift
         if self._mapping.reference != reference:
             self._mapping.set_reference(reference)
         return 0
@@ -589,6 +595,7 @@ class Slam:
             if found is not None:
                 frame.T_cw = found.T_cw
                 frame.landmark[found.feature] = found.landmark
+                frame.shift = None
                 frame.xyz[found.feature] = self.map.arrays.xyz[found.landmark]
                 self._mapping.set_reference(candidate.match)
                 return len(found.feature)

@@ -47,6 +47,7 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "row_octave": (np.uint8, ("R",)),
     "row_angle": (np.float32, ("R",)),
     "row_descriptor": (np.uint64, ("R", 4)),
+    "row_certainty": (np.uint8, ("R",)),
     "loop_ends": (np.int64, ("E", 2)),
     "loop_T_query_match": (np.float64, ("E", 4, 4)),
     "loop_scale": (np.float64, ("E",)),
@@ -89,7 +90,9 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
     checkpoint = None
     if header["checkpoint"] is not None:
         arrays = {name: data[f"checkpoint_{name}"] for name in CHECKPOINT_ARRAYS}
-        checkpoint = checked_checkpoint(arrays, header["checkpoint"], sizes["K"], sizes["L"])
+        checkpoint = checked_checkpoint(
+            arrays, header["checkpoint"], data["keyframe_first_row"], sizes["L"]
+        )
     else:
         a = map_.arrays
         _require(bool(a.keyframe_alive.all() and a.landmark_alive.all()), "what died is in it")
@@ -158,6 +161,7 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) ->
         _check_ids(name, data[name], n, least=1)
     _check_ids("row_octave", data["row_octave"], len(scales))
     _require(not np.isinf(data["row_u_right"]).any(), "row_u_right is infinite")
+    _require(bool((data["row_certainty"] > 0).all()), "row_certainty")
 
     first, rows = data["landmark_first_observation"], data["observation_row"]
     _check_first("landmark_first_observation", first, sizes["O"])
@@ -194,6 +198,7 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) ->
         octave=data["row_octave"],
         angle=data["row_angle"],
         descriptor=data["row_descriptor"],
+        certainty=data["row_certainty"],
         keyframe=keyframe,
         **observations(rows, first, data["row_u_right"]),
     )

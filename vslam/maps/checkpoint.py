@@ -8,19 +8,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import Features
+from vslam.features import PATCH_PIXELS, Features, KeyframePatches
 from vslam.geometry import Matrix
 from vslam.loops import ClosingMemory, ResembledPlace, loop_entry, loop_of
 
-# N features of the last frame tracked; a velocity is there or not.
-ARRAYS: dict[str, tuple[type, tuple[int | None, ...]]] = {
-    "xy": (np.float32, (None, 2)),
-    "octave": (np.uint8, (None,)),
-    "angle": (np.float32, (None,)),
-    "descriptors": (np.uint8, (None, 32)),
-    "u_right": (np.float32, (None,)),
-    "landmark": (np.int32, (None,)),
+# N features of the last frame tracked; M keyframes with patches, R rows in all.
+ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
+    "xy": (np.float32, ("N", 2)),
+    "octave": (np.uint8, ("N",)),
+    "angle": (np.float32, ("N",)),
+    "descriptors": (np.uint8, ("N", 32)),
+    "u_right": (np.float32, ("N",)),
+    "landmark": (np.int32, ("N",)),
+    "patch_keyframe": (np.int64, ("M",)),
+    "patch_pixels": (np.uint8, ("R", PATCH_PIXELS)),
+    "patch_shift": (np.float32, ("R", 2)),
 }
+FEATURES = ("xy", "octave", "angle", "descriptors", "u_right")
 _NUMBERS = ("index", "timestamp", "reference", "last_frame", "last_timestamp", "lost_frames",
             "n_tracked", "gained_close", "gain_awaited")  # fmt: skip
 
@@ -42,6 +46,7 @@ class Checkpoint:
         n_tracked: landmarks in it when it was tracked.
         gained_close, gain_awaited: close points that a keyframe brings (``CloseGain``).
         closing: what loop closing remembers.
+        patches: of the newest keyframes, oldest first.
     """
 
     index: int
@@ -58,12 +63,21 @@ class Checkpoint:
     gained_close: float
     gain_awaited: bool
     closing: ClosingMemory
+    patches: tuple[KeyframePatches, ...]
 
 
 def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
     """Those of ``ARRAYS``."""
-    features = vars(checkpoint.features)
-    return {name: features.get(name, checkpoint.landmark) for name in ARRAYS}
+    patches = checkpoint.patches
+    none = KeyframePatches(-1, np.empty((0, PATCH_PIXELS), np.uint8), np.empty((0, 2), np.float32))
+    arrays: dict[str, NDArray] = {
+        **{name: getattr(checkpoint.features, name) for name in FEATURES},
+        "landmark": checkpoint.landmark,
+        "patch_keyframe": np.array([one.keyframe for one in patches], np.int64),
+        "patch_pixels": np.concatenate([one.pixels for one in (none, *patches)]),
+        "patch_shift": np.concatenate([one.shift for one in (none, *patches)]),
+    }
+    return arrays
 
 
 def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
@@ -81,17 +95,28 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
 
 
 def checked_checkpoint(
-    arrays: dict[str, NDArray], entry: dict[str, Any], n_keyframes: int, n_landmarks: int
+    arrays: dict[str, NDArray],
+    entry: dict[str, Any],
+    first_row: NDArray[np.int64],
+    n_landmarks: int,
 ) -> Checkpoint:
     """The checkpoint of a file, which may hold anything.
+
+    Args:
+        first_row: ``(K + 1,)`` of the map's keyframes.
 
     Raises:
         KeyError, TypeError, ValueError: in a few words what is wrong with it.
     """
-    n = len(arrays["landmark"])
+    n_keyframes = len(first_row) - 1
+    sizes = {
+        "N": len(arrays["landmark"]),
+        "M": len(arrays["patch_keyframe"]),
+        "R": len(arrays["patch_shift"]),
+    }
     for name, (dtype, shape) in ARRAYS.items():
         array = arrays[name]
-        wanted = tuple(n if size is None else size for size in shape)
+        wanted = tuple(sizes[size] if isinstance(size, str) else size for size in shape)
         if array.dtype != dtype or array.shape != wanted or not array.flags.c_contiguous:
             raise ValueError(f"checkpoint_{name} is {array.dtype} {array.shape}")
     landmark = arrays["landmark"]
@@ -125,7 +150,21 @@ def checked_checkpoint(
         T_cw=T_cw,
         velocity=velocity,
         closing=closing,
+        patches=_patches_of(arrays, first_row),
     )
+
+
+def _patches_of(
+    arrays: dict[str, NDArray], first_row: NDArray[np.int64]
+) -> tuple[KeyframePatches, ...]:
+    keyframes, shift = arrays["patch_keyframe"], arrays["patch_shift"]
+    if not ((keyframes >= 0) & (keyframes < len(first_row) - 1)).all():
+        raise ValueError("a keyframe with patches is out of range")
+    last = np.cumsum(first_row[keyframes + 1] - first_row[keyframes])
+    if len(shift) != (last[-1] if len(last) else 0) or not np.isfinite(shift).all():
+        raise ValueError("the patches are not those of their keyframes")
+    parts = (np.split(arrays[name], last[:-1]) for name in ("patch_pixels", "patch_shift"))
+    return tuple(map(KeyframePatches, keyframes.tolist(), *parts)) if len(last) else ()
 
 
 def _closing_of(entry: dict[str, Any], n_keyframes: int) -> ClosingMemory:

@@ -163,6 +163,7 @@ def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> M
         octave=a.octave[of_rows],
         angle=a.angle[of_rows],
         descriptor=a.descriptor[of_rows],
+        certainty=a.certainty[of_rows],
         keyframe=np.repeat(np.arange(n, dtype=np.int32), np.diff(first_row)),
         **links,
     )

@@ -52,9 +52,10 @@ from vslam.datasets.png import unfilter
 from vslam.features import Features
 from vslam.frontend import pnp
 from vslam.frontend.depth import columns_of_depth
+from vslam.frontend.frame import Frame
 from vslam.frontend.orb import scale_factors
 from vslam.frontend.relocalization import relocalise
-from vslam.frontend.tracking import Frame, TrackingContext
+from vslam.frontend.tracking import TrackingContext
 from vslam.loopclosure import bow, local_matching, sim3_ransac
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.detector import NoDetector

@@ -1,0 +1,254 @@
+"""Sub-pixel alignment of matches: a landmark's patch is laid over the image around its keypoint.
+
+A corner is found at whole pixels of one of a few scales, half a pixel off as a rule, and where the
+camera comes closer, matches lie systematically too near to where it drives (docs/motorway.md). The
+patch of a keyframe that saw the landmark, drawn as the frame should see it, is moved until it
+agrees with the image: "feature alignment" of SVO (Forster et al., ICRA 2014, III-B), by the inverse
+compositional form of Lucas-Kanade (Baker and Matthews, IJCV 2004, section 3.2). Mean and contrast
+of a patch do not matter: both are unknowns beside the shift.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.config import AlignmentConfig
+from vslam.features import PATCH_RADIUS, PATCH_SIDE, LandmarkPatches
+from vslam.frontend.frame import Frame
+from vslam.frontend.patches import patches_around
+from vslam.kernels import inner_kernel, kernel
+
+HALF = 4  # of the window that is compared, pixels
+SIDE = 2 * HALF + 1
+WIDE = SIDE + 2  # with a pixel around it, for slopes
+MIN_VARIANCE = 1.0  # grey levels squared; a patch with less shows nothing
+MIN_CORNERNESS = 0.05  # determinant of the normal equations over that of a corner
+STILL = 0.03  # pixels; a smaller step ends the iteration
+
+
+def align_frame(
+    frame: Frame,
+    known: LandmarkPatches,
+    scales: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    config: AlignmentConfig,
+) -> NDArray[np.float32] | None:
+    """``Frame.shift`` of the matches of a frame.
+
+    Args:
+        scales: full-resolution pixels for a pixel of each octave.
+    """
+    features = frame.features
+    if features.pyramid is None or not len(known.ids):
+        return None
+    matched = np.flatnonzero(frame.landmark >= 0)
+    landmark = frame.landmark[matched]
+    at = np.minimum(np.searchsorted(known.ids, landmark), len(known.ids) - 1)
+    same = known.ids[at] == landmark
+    at, matched = at[same], matched[same]
+    octave = features.octave[matched]
+    size = scales[octave]
+    warp = warps(
+        frame.T_cw, frame.xyz[matched], known.T_cw, known.view[at], known.size[at], size, intrinsics
+    )
+    found = align(
+        patches_around(features.pyramid, features.xy[matched], octave),
+        known.pixels,
+        known.shift,
+        known.where[at],
+        warp,
+        config.iterations,
+        config.max_shift,
+        config.min_correlation,
+    )
+    shift = np.full((len(features), 2), np.nan, np.float32)
+    shift[matched] = found * size[:, None]
+    return shift
+
+
+@kernel
+def warps(T_cw, xyz, T_seen, view, size_seen, size, intrinsics):
+    """What a step in the patch of a frame is in the patch of a keyframe.
+
+    Around a landmark the world is taken for a plane that faces the keyframe (SVO, III-B).
+
+    Args:
+        T_cw: ``(4, 4)`` of the frame.
+        xyz: ``(N, 3)`` the landmarks.
+        T_seen: ``(K, 4, 4)`` of keyframes; view: ``(N,)`` which of them saw each.
+        size_seen, size: ``(N,)`` full-resolution pixels for one of the patch of the keyframe, of
+            the frame.
+
+    Returns:
+        ``(N, 2, 2)`` float32; NaN for a landmark that does not lie in front of both, or would be
+        seen from behind.
+    """
+    fx, fy = intrinsics[0], intrinsics[1]
+    steps = np.full((len(xyz), 2, 2), np.nan, np.float32)
+    p, column = np.empty(3), np.empty(3)
+    A = np.empty((2, 2))
+    for i in range(len(xyz)):
+        T, X = T_seen[view[i]], xyz[i]
+        depth = T[2, 0] * X[0] + T[2, 1] * X[1] + T[2, 2] * X[2] + T[2, 3]
+        for r in range(3):
+            p[r] = T_cw[r, 0] * X[0] + T_cw[r, 1] * X[1] + T_cw[r, 2] * X[2] + T_cw[r, 3]
+        if not (depth > 0.0 and p[2] > 0.0):
+            continue
+        for k in range(2):
+            # A step of one pixel along u or v in the keyframe, on the plane, seen from the frame.
+            for r in range(3):
+                column[r] = 0.0
+                for m in range(3):
+                    column[r] += T_cw[r, m] * T[k, m]
+                column[r] *= depth * size_seen[i] / (fx if k == 0 else fy)
+            A[0, k] = fx * (column[0] - column[2] * p[0] / p[2]) / (p[2] * size[i])
+            A[1, k] = fy * (column[1] - column[2] * p[1] / p[2]) / (p[2] * size[i])
+        determinant = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+        if determinant > 1e-6:
+            steps[i, 0, 0], steps[i, 0, 1] = A[1, 1] / determinant, -A[0, 1] / determinant
+            steps[i, 1, 0], steps[i, 1, 1] = -A[1, 0] / determinant, A[0, 0] / determinant
+    return steps
+
+
+@kernel
+def align(seen, reference, centre, which, warp, iterations, max_shift, min_correlation):
+    """Where in each of N patches lies what is at the ``centre`` of its reference.
+
+    Args:
+        seen: ``(N, PATCH_PIXELS)`` uint8.
+        reference: ``(P, PATCH_PIXELS)`` uint8; centre: ``(P, 2)`` float32, from the middle of the
+            reference, pixels.
+        which: ``(N,)`` of these.
+        warp: ``(N, 2, 2)`` float32, see ``warps``.
+        iterations: at most.
+        max_shift: from the middle of the seen patch, in x and in y, pixels.
+        min_correlation: least normalised cross-correlation.
+
+    Returns:
+        ``(N, 2)`` float32 shift from the middle of the seen patch, NaN where there is none.
+    """
+    n = len(seen)
+    shift = np.full((n, 2), np.nan, np.float32)
+    wide = np.empty(WIDE * WIDE, np.float32)
+    template = np.empty((SIDE, SIDE), np.float32)
+    slope_x, slope_y = np.empty((SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.float32)
+    for i in range(n):
+        if not draw(reference[which[i]], centre[which[i]], warp[i], wide):
+            continue
+        energy, xx, xy, yy = prepare(wide, template, slope_x, slope_y)
+        determinant = xx * yy - xy * xy
+        if not determinant > np.float32(MIN_CORNERNESS) * xx * yy:
+            continue
+        image = seen[i].reshape(PATCH_SIDE, PATCH_SIDE)
+        x, y = np.float32(0.0), np.float32(0.0)
+        for _ in range(iterations):
+            square, product, b_x, b_y = compare(image, x, y, template, slope_x, slope_y)
+            if not product > 0.0:
+                break
+            gain = product / energy
+            step_x = (yy * b_x - xy * b_y) / (determinant * gain)
+            step_y = (xx * b_y - xy * b_x) / (determinant * gain)
+            x, y = x - step_x, y - step_y
+            if not max(abs(x), abs(y)) <= max_shift:
+                break
+            if step_x * step_x + step_y * step_y < np.float32(STILL * STILL):
+                if product >= min_correlation * np.sqrt(square * energy):
+                    shift[i, 0], shift[i, 1] = x, y
+                break
+    return shift
+
+
+@inner_kernel
+def draw(patch, centre, warp, out):
+    """Draw a patch around ``centre`` with the steps of ``warp``; returns whether it reaches that
+    far.
+
+    Args:
+        patch: ``(PATCH_PIXELS,)`` uint8.
+        out: ``(WIDE * WIDE,)`` float32.
+    """
+    xx, xy, yx, yy = warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1]
+    far = np.float32(HALF + 1)
+    reach_x = far * (abs(xx) + abs(xy)) + abs(centre[0])
+    reach_y = far * (abs(yx) + abs(yy)) + abs(centre[1])
+    if not max(reach_x, reach_y) <= np.float32(PATCH_RADIUS - 0.01):
+        return False
+    # Whole numbers of 1 / 65536 pixel: a shift parts a coordinate, where a float takes far longer.
+    one, part = np.float32(65536.0), np.float32(1.0 / 65536.0)
+    x_first = np.int32((np.float32(PATCH_RADIUS) + centre[0] - far * (xx + xy)) * one)
+    y_first = np.int32((np.float32(PATCH_RADIUS) + centre[1] - far * (yx + yy)) * one)
+    x_by_c, x_by_r = np.int32(xx * one), np.int32(xy * one)
+    y_by_c, y_by_r = np.int32(yx * one), np.int32(yy * one)
+    right, down = np.uintp(1), np.uintp(PATCH_SIDE)
+    for r in range(WIDE):
+        x, y = np.int32(x_first + r * x_by_r), np.int32(y_first + r * y_by_r)
+        for c in range(WIDE):
+            k = np.uintp((y >> 16) * PATCH_SIDE + (x >> 16))
+            part_x, part_y = part * np.float32(x & 65535), part * np.float32(y & 65535)
+            above, below = np.float32(patch[k]), np.float32(patch[k + down])
+            above += part_x * (np.float32(patch[k + right]) - above)
+            below += part_x * (np.float32(patch[k + down + right]) - below)
+            out[r * WIDE + c] = above + part_y * (below - above)
+            x, y = np.int32(x + x_by_c), np.int32(y + y_by_c)
+    return True
+
+
+@inner_kernel
+def prepare(wide, template, slope_x, slope_y):
+    """Template without its mean, and its slopes without what another mean or contrast would
+    explain; returns the template's energy and the three sums of products of the slopes."""
+    half, nil, count = np.float32(0.5), np.float32(0.0), np.float32(SIDE * SIDE)
+    # Sums of products of 1, the template t and the slopes x, y; near 0, so that few digits go.
+    middle = wide[WIDE * WIDE // 2]
+    t, x, y, tt, tx, ty, xx, xy, yy = nil, nil, nil, nil, nil, nil, nil, nil, nil
+    for r in range(SIDE):
+        for c in range(SIDE):
+            k = np.uintp((r + 1) * WIDE + c + 1)
+            value = wide[k] - middle
+            step_x = half * (wide[k + np.uintp(1)] - wide[k - np.uintp(1)])
+            step_y = half * (wide[k + np.uintp(WIDE)] - wide[k - np.uintp(WIDE)])
+            template[r, c], slope_x[r, c], slope_y[r, c] = value, step_x, step_y
+            t, x, y = t + value, x + step_x, y + step_y
+            tt, tx, ty = tt + value * value, tx + value * step_x, ty + value * step_y
+            xx, xy, yy = xx + step_x * step_x, xy + step_x * step_y, yy + step_y * step_y
+    t, x, y = t / count, x / count, y / count
+    energy = tt - count * t * t
+    if energy < np.float32(MIN_VARIANCE) * count:
+        return energy, nil, nil, nil
+    on_x, on_y = (tx - count * t * x) / energy, (ty - count * t * y) / energy
+    for r in range(SIDE):
+        for c in range(np.uintp(SIDE)):
+            value = template[r, c] - t
+            template[r, c] = value
+            slope_x[r, c] -= x + on_x * value
+            slope_y[r, c] -= y + on_y * value
+    xx -= count * x * x + on_x * on_x * energy
+    xy -= count * x * y + on_x * on_y * energy
+    yy -= count * y * y + on_y * on_y * energy
+    return energy, xx, xy, yy
+
+
+@inner_kernel
+def compare(image, x, y, template, slope_x, slope_y):
+    """The image around its middle, shifted by ``x, y``: its energy without the mean, and its
+    products with the template and the slopes."""
+    one, nil = np.float32(1.0), np.float32(0.0)
+    left, top = int(np.floor(x)), int(np.floor(y))
+    part_x, part_y = x - np.float32(left), y - np.float32(top)
+    a, b = (one - part_y) * (one - part_x), (one - part_y) * part_x
+    c_, d = part_y * (one - part_x), part_y * part_x
+    total, square, product, b_x, b_y = nil, nil, nil, nil, nil
+    for r in range(SIDE):
+        above = image[PATCH_RADIUS - HALF + r + top]
+        below = image[PATCH_RADIUS - HALF + r + top + 1]
+        for c in range(SIDE):
+            k = PATCH_RADIUS - HALF + c + left
+            value = a * above[k] + b * above[k + 1] + c_ * below[k] + d * below[k + 1]
+            # Template and slopes have no mean: the value's own counts for nothing.
+            total += value
+            square += value * value
+            product += value * template[r, c]
+            b_x += value * slope_x[r, c]
+            b_y += value * slope_y[r, c]
+    return square - total * total / np.float32(SIDE * SIDE), product, b_x, b_y

@@ -1,0 +1,139 @@
+"""Patches: the pixels around keypoints, and of landmarks as the newest keyframes saw them.
+
+Only the newest keyframes keep theirs: those see nearly all that tracking follows, and a patch takes
+more memory than the rest of an observation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.features import (
+    PATCH_PIXELS,
+    PATCH_RADIUS,
+    PATCH_SIDE,
+    KeyframePatches,
+    LandmarkPatches,
+    Pyramid,
+    level_pixel,
+)
+from vslam.kernels import kernel
+from vslam.map import Map
+
+
+def patches_around(
+    pyramid: Pyramid, xy: NDArray[np.float32], octave: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """``(N, PATCH_PIXELS)`` the pixels around keypoints in their octaves, row by row.
+
+    Args:
+        xy: ``(N, 2)`` full-resolution pixels, at least ``PATCH_RADIUS`` pixels of the octave from
+            its border.
+        octave: ``(N,)``.
+    """
+    return _cut(pyramid.pixels, pyramid.offsets, pyramid.shapes, xy, octave)
+
+
+@kernel
+def _cut(pixels, offsets, shapes, xy, octave):
+    patches = np.empty((len(xy), PATCH_PIXELS), np.uint8)
+    for i in range(len(xy)):
+        level = octave[i]
+        height, width = shapes[level]
+        x = level_pixel(xy[i, 0], shapes[0, 1] / width) - PATCH_RADIUS
+        y = level_pixel(xy[i, 1], shapes[0, 0] / height) - PATCH_RADIUS
+        start = offsets[level] + y * width + x
+        for row in range(PATCH_SIDE):
+            for k in range(np.uintp(PATCH_SIDE)):
+                patches[i, row * PATCH_SIDE + k] = pixels[start + row * width + k]
+    return patches
+
+
+class RecentPatches:
+    """The patches of the newest keyframes."""
+
+    def __init__(self, capacity: int) -> None:
+        """``capacity``: of keyframes."""
+        self._keyframes = np.full(capacity, -1, np.int64)  # of each slot
+        self._n_features = np.zeros(capacity, np.int64)
+        self._pixels = np.empty((capacity, 0, PATCH_PIXELS), np.uint8)
+        self._shift = np.empty((capacity, 0, 2), np.float32)
+        self._next = 0
+
+    def add(self, one: KeyframePatches) -> None:
+        """Remember those of another keyframe, and forget those of the oldest one."""
+        slot, n = self._next, len(one.pixels)
+        if n > self._shift.shape[1]:
+            self._pixels = _widened(self._pixels, n)
+            self._shift = _widened(self._shift, n)
+        self._pixels[slot, :n], self._shift[slot, :n] = one.pixels, one.shift
+        self._keyframes[slot], self._n_features[slot] = one.keyframe, n
+        self._next = (slot + 1) % len(self._keyframes)
+
+    def all(self) -> tuple[KeyframePatches, ...]:
+        """Of all keyframes, oldest first."""
+        slots = np.roll(np.arange(len(self._keyframes)), -self._next)
+        return tuple(
+            KeyframePatches(
+                int(self._keyframes[slot]),
+                self._pixels[slot, : self._n_features[slot]].copy(),
+                self._shift[slot, : self._n_features[slot]].copy(),
+            )
+            for slot in slots
+            if self._keyframes[slot] >= 0
+        )
+
+    def of(self, map_: Map, ids: NDArray[np.int32]) -> LandmarkPatches:
+        """Those of ``(L,)`` landmarks, sorted, as the newest keyframe saw each; they hold until
+        ``add`` is called."""
+        width, arrays = self._shift.shape[1], map_.arrays
+        row, view = newest_rows(arrays, self._keyframes, ids)
+        seen = np.flatnonzero(row >= 0)
+        row, view = row[seen], view[seen]
+        keyframes = np.maximum(self._keyframes, 0)
+        return LandmarkPatches(
+            ids[seen],
+            view * width + row - arrays.first_row[keyframes[view]],
+            view,
+            map_.scales[arrays.octave[row]],
+            self._pixels.reshape(-1, PATCH_PIXELS),
+            self._shift.reshape(-1, 2),
+            arrays.T_cw[keyframes],
+        )
+
+
+def _widened(array: NDArray, n: int) -> NDArray:
+    wide = np.zeros((len(array), n, array.shape[2]), array.dtype)
+    wide[:, : array.shape[1]] = array
+    return wide
+
+
+@kernel
+def newest_rows(a, keyframes, ids):
+    """Row by which the newest of ``keyframes`` observes each landmark, and which of them that is;
+    -1 for none.
+
+    Of observations those of newer keyframes come first, or nearly: what lies behind one that is
+    older than all ``keyframes`` is not looked at.
+    """
+    found, view = np.full(len(ids), -1, np.int64), np.full(len(ids), -1, np.int64)
+    newest = keyframes.max()
+    if newest < 0:
+        return found, view
+    oldest = newest
+    for keyframe in keyframes:
+        if keyframe >= 0:
+            oldest = min(oldest, keyframe)
+    place = np.full(newest - oldest + 1, -1, np.int64)
+    for k in range(len(keyframes)):
+        if keyframes[k] >= 0:
+            place[keyframes[k] - oldest] = k
+    for i in range(len(ids)):
+        row, of = a.head[ids[i]], -1
+        while row >= 0 and a.keyframe[row] >= oldest:
+            keyframe = a.keyframe[row]
+            if of < keyframe <= newest and place[keyframe - oldest] >= 0:
+                found[i], view[i], of = row, place[keyframe - oldest], keyframe
+            row = a.next_row[row]
+    return found, view

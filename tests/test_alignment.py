@@ -1,0 +1,376 @@
+"""Sub-pixel alignment: exact on patches of a known scene, silent where nothing agrees."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vslam.camera import Camera
+from vslam.config import Config
+from vslam.features import (
+    NO_PATCHES,
+    PATCH_PIXELS,
+    PATCH_RADIUS,
+    Features,
+    KeyframePatches,
+)
+from vslam.frontend.alignment import align, align_frame, warps
+from vslam.frontend.frame import Frame
+from vslam.frontend.orb import build_pyramid, extract
+from vslam.frontend.patches import RecentPatches, patches_around
+from vslam.frontend.tracking import TrackingContext, refine
+from vslam.geometry import inverse, se3_exp, transform
+from vslam.map import Map
+from vslam.map_kernels import link_many, unlink
+from vslam.mapping import MappingThread
+
+CONFIG = Config().alignment
+NO_SHIFT = np.zeros((1, 2), np.float32)
+
+
+def seen(scene, x=0.0, y=0.0, zoom=1.0, gain=1.0, offset=0.0):
+    """The patch ``(1, PATCH_PIXELS)`` of a scene whose origin lies at x, y from its middle."""
+    at = np.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
+    u, v = np.meshgrid((at - x) / zoom, (at - y) / zoom)
+    return np.rint(np.clip(gain * scene(u, v) + offset, 0, 255)).astype(np.uint8).reshape(1, -1)
+
+
+def random_scene(seed):
+    """Waves of all directions, 6 pixels long or longer: about what the blur of a lens leaves."""
+    rng = np.random.default_rng(seed)
+    waves = rng.uniform(0.3, 1.0, 12)
+    turn, phase = rng.uniform(0, 2 * np.pi, (2, 12))
+    height = rng.uniform(5.0, 15.0, 12)
+
+    def scene(u, v):
+        along = np.cos(turn) * u[..., None] + np.sin(turn) * v[..., None]
+        return 128.0 + (height * np.sin(waves * along + phase)).sum(axis=-1)
+
+    return scene
+
+
+def aligned(image, reference, zoom=1.0, centre=NO_SHIFT):
+    config = CONFIG
+    return align(
+        image,
+        reference,
+        centre,
+        np.array([0]),
+        np.eye(2, dtype=np.float32)[None] / np.float32(zoom),
+        config.iterations,
+        config.max_shift,
+        config.min_correlation,
+    )[0]
+
+
+@pytest.mark.parametrize("zoom", [0.85, 1.0, 1.2, 1.35])
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.5, 20.0), (1.3, -60.0)])
+@pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (0.3, -0.4), (-0.9, 0.75), (1.2, 0.1)])
+def test_shift_under_another_size_and_light_is_found_to_a_twentieth_of_a_pixel(
+    x, y, zoom, gain, offset
+):
+    errors = []
+    for seed in range(20):
+        scene = random_scene(seed)
+        found = aligned(seen(scene, x, y, zoom, gain, offset), seen(scene), zoom)
+        errors.append(np.abs(found - [x, y]).max())
+    errors = np.array(errors)
+    known = np.isfinite(errors)
+    assert known.sum() >= 16
+    assert np.median(errors[known]) < 0.03
+    assert np.quantile(errors[known], 0.9) < 0.05
+
+
+def test_what_a_landmark_is_may_lie_beside_the_middle_of_its_patch():
+    scene = random_scene(3)
+    reference = seen(scene, x=1.4, y=-0.6)
+    found = aligned(seen(scene, 0.25, 0.5), reference, centre=np.array([[1.4, -0.6]], np.float32))
+    assert np.abs(found - [0.25, 0.5]).max() < 0.05
+
+
+def test_another_scene_is_refused_in_99_of_100_cases():
+    found = [aligned(seen(random_scene(k)), seen(random_scene(1000 + k))) for k in range(600)]
+    assert np.isfinite(found).all(axis=1).sum() <= 6
+
+
+def test_an_edge_and_a_flat_patch_are_refused():
+    edge = seen(lambda u, v: 128.0 + 60.0 * np.tanh(u))
+    flat = np.full((1, PATCH_PIXELS), 90, np.uint8)
+    assert np.isnan(aligned(edge, edge)).all()
+    assert np.isnan(aligned(flat, flat)).all()
+    assert np.isnan(aligned(flat, seen(random_scene(0)))).all()
+
+
+def test_what_lies_farther_than_asked_for_is_refused():
+    scene = random_scene(5)
+    assert np.isnan(aligned(seen(scene, x=2.6), seen(scene))).all()
+
+
+@pytest.mark.parametrize("zoom", [0.3, 1e-30, np.nan])
+def test_sizes_that_the_patch_does_not_reach_are_refused(zoom):
+    image = seen(random_scene(0))
+    assert np.isnan(aligned(image, image, zoom)).all()
+
+
+@pytest.mark.parametrize("centre", [(np.nan, 0.0), (0.0, np.inf), (9.0, 0.0), (0.0, -1e30)])
+def test_a_centre_that_is_no_place_in_the_patch_is_refused(centre):
+    image = seen(random_scene(0))
+    assert np.isnan(aligned(image, image, centre=np.array([centre], np.float32))).all()
+
+
+def test_patches_are_the_pixels_around_the_keypoints():
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (240, 320), dtype=np.uint8)
+    found = extract(image, Config().orb)
+    patches = patches_around(found.pyramid, found.xy, found.octave)
+    for level in (0, 3):
+        of_level = np.flatnonzero(found.octave == level)
+        assert len(of_level)
+        pixels = found.pyramid.level(level)
+        ratio = np.array(image.shape[::-1]) / pixels.shape[::-1]
+        for i in of_level[:20]:
+            x, y = np.rint((found.xy[i] + 0.5) / ratio - 0.5).astype(int)
+            around = pixels[
+                y - PATCH_RADIUS : y + PATCH_RADIUS + 1, x - PATCH_RADIUS : x + PATCH_RADIUS + 1
+            ]
+            assert np.array_equal(patches[i], around.ravel())
+
+
+IMAGE = np.random.default_rng(0).integers(0, 256, (480, 640), dtype=np.uint8)
+CAMERA = Camera(400.0, 400.0, 320.0, 240.0, 0.5, 640, 480)
+CONTEXT = TrackingContext.create(CAMERA, Config())
+
+
+def features_at(u, v, octave, n):
+    xy = np.tile(np.array([[u, v]], np.float32), (n, 1))
+    return Features(
+        xy,
+        np.full(n, octave, np.uint8),
+        np.zeros(n, np.float32),
+        np.zeros((n, 32), np.uint8),
+        xy[:, 0] - 20.0,
+        pyramid=build_pyramid(IMAGE, Config().orb),
+    )
+
+
+def one_landmark(shift=0.0):
+    """A map of one keyframe with a landmark 10 m ahead, and the patches of the keyframe."""
+    map_ = Map(CONTEXT.scales)
+    patch = seen(random_scene(1))
+    keyframe = map_.add_keyframe(features_at(320, 240, 2, 1), np.eye(4), 0.0, 0)
+    ids = map_.add_landmarks(np.array([[3.0, 0.0, 10.0]]), np.zeros((1, 4), np.uint64), keyframe)
+    link_many(map_.arrays, np.array([0]), ids)
+    return map_, KeyframePatches(keyframe, patch, np.full((1, 2), shift, np.float32))
+
+
+def patches_of(map_, ids, keyframes, capacity=3):
+    """``RecentPatches.of``, and the pixels and shifts of each."""
+    recent = RecentPatches(capacity)
+    for one in keyframes:
+        recent.add(one)
+    known = recent.of(map_, np.array(ids, np.int32))
+    return known, known.pixels[known.where], known.shift[known.where]
+
+
+def test_a_landmark_has_the_patch_of_a_keyframe_with_its_size_and_place():
+    map_, recent = one_landmark(shift=0.5)
+    known, pixels, shift = patches_of(map_, [0], [recent])
+    assert np.array_equal(pixels, seen(random_scene(1)))
+    assert known.size.tolist() == [CONTEXT.scales[2]]
+    assert known.T_cw[known.view].tolist() == [np.eye(4).tolist()]
+    assert shift.tolist() == [[0.5, 0.5]]
+
+
+def test_a_landmark_has_the_patch_of_the_newest_keyframe_that_observes_it():
+    map_, first = one_landmark()
+    second, other = (seen(random_scene(k)) for k in (2, 3))
+    both = np.concatenate([second, other])
+    for k in (1, 2):
+        T_cw = np.eye(4)
+        T_cw[2, 3] = -2.0 * k
+        map_.add_keyframe(features_at(320, 240, 0, 2), T_cw, 0.1 * k, k)
+    link_many(map_.arrays, np.array([1]), np.array([0], np.int32))
+    recent = [first, *(KeyframePatches(k, both, np.zeros((2, 2), np.float32)) for k in (1, 2))]
+    known, pixels, _ = patches_of(map_, [0], recent)
+    assert np.array_equal(pixels, second)
+    assert known.T_cw[known.view, 2, 3].tolist() == [-2.0]
+    # A keyframe that is forgotten, and one that has no longer anything to do with the landmark.
+    assert np.array_equal(patches_of(map_, [0], recent, capacity=2)[1], second)
+    assert len(patches_of(map_, [0], recent, capacity=1)[1]) == 0
+    unlink(map_.arrays, 1)
+    assert np.array_equal(patches_of(map_, [0], recent)[1], first.pixels)
+
+
+def test_recent_patches_are_those_of_the_newest_keyframes():
+    recent = RecentPatches(2)
+    ones = [
+        KeyframePatches(k, np.full((n, PATCH_PIXELS), k, np.uint8), np.full((n, 2), k, np.float32))
+        for k, n in ((3, 2), (4, 5), (7, 1))
+    ]
+    for count, one in enumerate(ones, 1):
+        recent.add(one)
+        kept = ones[max(0, count - 2) : count]
+        assert [k.keyframe for k in recent.all()] == [k.keyframe for k in kept]
+        for is_, wanted in zip(recent.all(), kept, strict=True):
+            assert np.array_equal(is_.pixels, wanted.pixels)
+            assert np.array_equal(is_.shift, wanted.shift)
+
+
+def test_landmarks_that_no_recent_keyframe_observes_have_none():
+    map_, recent = one_landmark()
+    assert len(patches_of(map_, [0], [])[1]) == 0
+    assert len(patches_of(map_, [], [recent])[1]) == 0
+
+
+def wide_scene(texture):
+    """An image that a camera sees of the plane 10 m ahead of the world's origin."""
+
+    def image(T_cw):
+        u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
+        rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u)])
+        T = inverse(T_cw)
+        directions = np.tensordot(T[:3, :3], rays, axes=1)
+        x, y = T[:2, 3, None, None] + directions[:2] * (10.0 - T[2, 3]) / directions[2]
+        return np.rint(texture(40.0 * x, 40.0 * y)).clip(0, 255).astype(np.uint8)
+
+    return image
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [0.2, -0.1, -1.5, 0.0, 0.0, 0.0],  # ahead
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.4],  # rolled
+        [-0.6, 0.0, -1.0, 0.05, 0.15, -0.3],
+    ],
+)
+def test_matches_are_aligned_however_the_camera_has_moved(motion):
+    """To a tenth of a pixel, where keypoints lie up to a pixel beside what they are matched
+    with."""
+    image = wide_scene(random_scene(4))
+    T_cw = se3_exp(np.array(motion))
+    rng = np.random.default_rng(0)
+    n = 40
+    points = np.column_stack([rng.uniform(-4, 4, n), rng.uniform(-3, 3, n), np.full(n, 10.0)])
+
+    def frame_at(T, off):
+        uvr = CAMERA.project(transform(T, points)).astype(np.float32)
+        features = replace(
+            features_at(0, 0, 0, n),
+            xy=np.rint(uvr[:, :2] + off).astype(np.float32),
+            pyramid=build_pyramid(image(T), Config().orb),
+        )
+        frame = Frame.untracked(features, CAMERA)
+        frame.T_cw, frame.landmark, frame.xyz = T, np.arange(n, dtype=np.int32), points
+        return frame, uvr[:, :2]
+
+    first, seen_at = frame_at(np.eye(4), 0.0)
+    map_ = Map(CONTEXT.scales)
+    map_.add_keyframe(first.features, first.T_cw, 0.0, 0)
+    ids = map_.add_landmarks(points, np.zeros((n, 4), np.uint64), 0)
+    link_many(map_.arrays, np.arange(n), ids)
+    recent = RecentPatches(2)
+    pixels = patches_around(first.features.pyramid, first.features.xy, first.features.octave)
+    recent.add(KeyframePatches(0, pixels, seen_at - first.features.xy))
+
+    frame, truth = frame_at(T_cw, rng.uniform(-0.5, 0.5, (n, 2)))
+    inside = ((truth > 20) & (truth < [620, 460])).all(axis=1)
+    frame.landmark[~inside] = -1
+    shift = align_frame(
+        frame, recent.of(map_, ids), CONTEXT.scales, CAMERA.intrinsics, Config().alignment
+    )
+    error = np.linalg.norm(frame.features.xy + shift - truth, axis=1)[inside]
+    assert np.isnan(shift[~inside]).all()
+    assert np.isfinite(error).mean() > 0.8
+    assert np.nanmedian(error) < 0.05
+    assert np.nanquantile(error, 0.9) < 0.15
+
+
+def test_what_lies_behind_a_camera_or_is_seen_from_behind_has_no_warp():
+    X = np.array([[0.0, 0.0, 10.0]])
+    beyond, turned = np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0])
+    beyond[2, 3], turned[2, 3] = -12.0, 20.0
+    one, ones = np.array([0]), np.ones(1)
+
+    def warp(T_cw, T_seen):
+        return warps(T_cw, X, T_seen[None], one, ones, ones, CAMERA.intrinsics)
+
+    assert warp(np.eye(4), np.eye(4)).tolist() == [np.eye(2).tolist()]
+    assert np.isnan(warp(beyond, np.eye(4))).all()
+    assert np.isnan(warp(np.eye(4), beyond)).all()
+    assert np.isnan(warp(turned, np.eye(4))).all()
+
+
+def test_matches_without_a_patch_are_not_aligned():
+    map_, recent = one_landmark()
+    known, _, _ = patches_of(map_, [0], [recent])
+    frame = Frame.untracked(features_at(100, 50, 0, 1), CAMERA)
+    frame.landmark[:], frame.xyz[:] = 7, 1.0
+    arguments = CONTEXT.scales, CAMERA.intrinsics, Config().alignment
+    assert np.isnan(align_frame(frame, known, *arguments)).all()
+    assert align_frame(frame, NO_PATCHES, *arguments) is None
+    frame.features = replace(frame.features, pyramid=None)
+    assert align_frame(frame, known, *arguments) is None
+
+
+def test_an_aligned_frame_observes_where_matches_were_aligned_to():
+    frame = Frame.untracked(features_at(100, 50, 0, 3), CAMERA)
+    frame.landmark[:] = 0, 1, -1
+    frame.shift = np.array([[0.5, -0.25], [np.nan, np.nan], [1.0, 1.0]], np.float32)
+    assert frame.aligned.tolist() == [True, False, False]
+    observed = frame.observed()
+    assert observed.xy.tolist() == [[100.5, 49.75], [100.0, 50.0], [100.0, 50.0]]
+    assert observed.u_right.tolist() == [80.5, 80.0, 80.0]
+    assert frame.features.xy[0].tolist() == [100.0, 50.0]
+
+
+def test_a_pose_follows_aligned_matches():
+    """Of matches that say one thing half a pixel beside what another half says, the aligned ones
+    have four times the weight."""
+    rng = np.random.default_rng(0)
+    n = 100
+    frame = Frame.untracked(features_at(100, 50, 0, n), CAMERA)
+    frame.xyz = np.column_stack([rng.uniform(-8, 8, (n, 2)), rng.uniform(8, 30, n)])
+    uvr = CAMERA.project(frame.xyz).astype(np.float32)
+    frame.landmark = np.arange(n, dtype=np.int32)
+    frame.features = replace(frame.features, xy=uvr[:, :2], u_right=uvr[:, 2])
+    shift = np.full((n, 2), np.nan, np.float32)
+    shift[::2] = 0.5, 0.0
+    assert refine(frame, np.eye(4), CONTEXT, shift) == n
+    moved = CAMERA.project(transform(frame.T_cw, frame.xyz))[:, 0] - uvr[:, 0]
+    certainty = Config().alignment.certainty
+    assert moved.mean() == pytest.approx(0.5 * certainty / (certainty + 1), abs=0.02)
+
+
+def test_the_map_knows_how_sure_each_observation_is(two_keyframes):
+    frame, map_, recent = two_keyframes
+    sure = Config().alignment.certainty
+    # Tracked and aligned; tracked only; the first to see its landmark.
+    assert map_.arrays.certainty[map_.rows(1)].tolist() == [sure, 1, sure]
+    assert map_.arrays.xy[map_.rows(1)][0].tolist() == [100.5, 49.75]
+    known, pixels, shift = patches_of(map_, np.sort(frame.landmark), recent.all())
+    assert np.array_equal(pixels[0], IMAGE[42:59, 92:109].ravel())
+    assert shift[known.ids == frame.landmark[0]].tolist() == [[0.5, -0.25]]
+    assert shift[known.ids != frame.landmark[0]].tolist() == [[0.0, 0.0]] * 2
+
+
+@pytest.fixture
+def two_keyframes():
+    """A second keyframe that tracks two landmarks of the first."""
+    from vslam.closing import LoopClosing
+    from vslam.loopclosure.detector import NoDetector
+
+    config = Config()
+    closing = LoopClosing(NoDetector(), CAMERA, config, threads=1)
+    mapping = MappingThread(CONTEXT.scales, CAMERA, config, closing, threads=1)
+    frames = []
+    for index in range(2):
+        frame = Frame.untracked(features_at(100, 50, 0, 3), CAMERA, index, 0.1 * index)
+        frames.append(frame)
+    mapping.insert(frames[0])
+    frames[1].landmark = frames[0].landmark.copy()
+    frames[1].landmark[2] = -1
+    frames[1].shift = np.array([[0.5, -0.25], [np.nan] * 2, [np.nan] * 2], np.float32)
+    mapping.insert(frames[1])
+    return frames[1], mapping._map, mapping.recent

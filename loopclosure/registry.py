@@ -47,12 +47,15 @@ def create_detector(
     config: Config,
     weights: Path | None = None,
     images: KeyframeImages | None = None,
+    *,
+    late: bool = False,
 ) -> LoopDetector:
     """A detector that remembers nothing yet. What it needs is imported here, not before.
 
     Args:
         weights: of a learned detector; None for those that vslam ships.
         images: of the keyframes, from :func:`create_images`; given to ``LoopClosing``, too.
+        late: load a network that vslam ships when the first image is shown to it.
 
     Raises:
         InputError: its vocabulary or weights cannot be read, or its package is broken.
@@ -70,13 +73,13 @@ def create_detector(
 
         detectors = [
             create_detector("bow", config),
-            create_detector(_network_of(name), config, weights, images),
+            create_detector(_network_of(name), config, weights, images, late=late),
         ]
         return CombinedDetector(name, detectors, config.siamese.min_shared)
     if name in NETWORKS:
         from vslam.loopclosure.siamese.detector import open_detector
 
-        return open_detector(name, config.siamese, weights, config.learned, images)
+        return open_detector(name, config.siamese, weights, config.learned, images, late=late)
     others = plugins.find_plugins(plugins.DETECTORS)
     if name in others:
         return open_plugin(others[name], config, weights)

@@ -20,7 +20,7 @@ from vslam.cli.main import app
 from vslam.config import Config, SiameseConfig
 from vslam.errors import InputError
 from vslam.features import Features
-from vslam.loopclosure.siamese.detector import SiameseDetector, open_detector
+from vslam.loopclosure.siamese.detector import SiameseDetector, beyond_reach, open_detector
 from vslam.loopclosure.siamese.export import (
     SIMILARITY_TOLERANCE,
     TOLERANCE,
@@ -28,7 +28,8 @@ from vslam.loopclosure.siamese.export import (
     to_onnx,
     write_onnx,
 )
-from vslam.loopclosure.siamese.inference import OnnxNetwork, open_network
+from vslam.loopclosure.siamese.inference import LateNetwork, OnnxNetwork, open_network
+from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
 from vslam.loopclosure.siamese.preprocessing import to_tensor
 from vslam.loopclosure.siamese.scoring import NetworkScorer
 from vslam.loopclosure.siamese.siamese import build_network, for_inference, load_network
@@ -159,6 +160,100 @@ def test_without_onnxruntime_a_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(InputError, match="pip install onnxruntime"):
         open_network("capsule")
+
+
+def test_a_late_network_is_loaded_by_the_first_image_and_missed_before(monkeypatch):
+    script = (
+        "import sys\n"
+        "import numpy as np\n"
+        "from vslam.config import Config\n"
+        "from vslam.features import Features\n"
+        "from vslam.loopclosure.registry import create_detector, create_images\n"
+        "images = create_images('capsule', Config())\n"
+        "detector = create_detector('capsule', Config(), None, images, late=True)\n"
+        "image = np.zeros((188, 620), np.uint8)\n"
+        "detector.add(0, image, Features.none())\n"
+        "images.add(0, image)\n"
+        "detector.restore(detector.memory())\n"
+        "sys.stdout.write(str('onnxruntime' in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd="/")
+    assert (done.returncode, done.stdout) == (0, "False"), done.stderr
+    late, loaded = LateNetwork("capsule"), open_network("capsule")
+    assert late.fingerprint == loaded.fingerprint
+    assert (late.size, late.dimensions) == (loaded.size, loaded.dimensions)
+    image = cv2.resize(SCENES[0], loaded.size[::-1])
+    descriptor = loaded.embed(image)
+    assert np.array_equal(late.embed(image), descriptor)
+    assert late.compare(descriptor, descriptor[None]) == loaded.compare(
+        descriptor, descriptor[None]
+    )
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(InputError, match="pip install onnxruntime"):
+        LateNetwork("capsule")
+
+
+class CountingNetwork:
+    """``exported()``; ``seen``: how many images it was given."""
+
+    def __init__(self) -> None:
+        self.seen = 0
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(exported(), name)
+
+    def embed(self, image: np.ndarray) -> np.ndarray:
+        self.seen += 1
+        return exported().embed(image)
+
+
+def driven(x: list[float], *, stereo: bool = True) -> Map:
+    """A map whose keyframes lie at so many metres along x."""
+    map_ = a_map(len(x))
+    map_.arrays.u_right[: map_.n_rows] = 1.0 if stereo else np.nan
+    map_.arrays.T_cw[: len(x), 0, 3] = [-one for one in x]
+    return map_
+
+
+def test_reach_grows_with_the_way_and_knows_nothing_of_lost_cameras_and_units():
+    config = SiameseConfig(reach=20.0, reach_share=0.1)
+    x = [0.0, 100.0, 200.0, 100.0, 30.0]  # there and back
+    beyond = beyond_reach(driven(x), 4, config)
+    np.testing.assert_allclose(
+        beyond, [30 - 20 - 37, 70 - 20 - 27, 170 - 20 - 17, 70 - 20 - 7, -20]
+    )
+    assert not beyond_reach(driven(x, stereo=False), 4, config).any()
+    lost = driven(x)
+    lost.restarts = [3]
+    lost.parents[:] = [0, 0, 1, 2, 3]
+    assert (beyond_reach(lost, 4, config)[:3] == 0).all()
+    assert beyond_reach(lost, 4, config)[3] == pytest.approx(70 - 20 - 7)
+
+
+def test_the_network_sees_nothing_until_the_camera_may_be_back():
+    network = CountingNetwork()
+    images = KeyframeImages(LocalDescriptors())
+    config = SiameseConfig(recent_keyframes=3, offered=0.0, embedded_at_once=2)
+    one = SiameseDetector(network, config, images=images)
+    x = [50.0 * k for k in range(10)] + [0.0]
+    map_ = driven(x)
+    for keyframe in range(11):
+        image = SCENES[keyframe % 10]
+        one.add(keyframe, image, Features.none())
+        images.add(keyframe, image)
+    assert one.query(9, map_) == []
+    assert network.seen == 0
+    # Back at the start, where 20 m and a tenth of 900 m may hide it: the two nearest are seen.
+    assert {found.match for found in one.query(10, map_)} == {0, 1}
+    assert network.seen == 3
+    assert {found.match for found in one.query(10, map_)} <= {0, 1, 2}
+    assert network.seen == 4
+    # A lost frame may be anywhere: more are seen at each, the newest first.
+    assert len(one.locate(SCENES[5], Features.none(), map_)) == 2
+    assert network.seen == 7
+    restored = SiameseDetector(network, config, images=images)
+    restored.restore(one.memory())
+    assert restored.query(10, map_) == one.query(10, map_)
 
 
 def test_a_run_closes_with_a_learned_detector(kitti_tree, tmp_path):

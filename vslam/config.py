@@ -496,6 +496,18 @@ class SiameseConfig(_Section):
         ge=1,
         description="Shared landmarks that make two candidates one place. [OS1 III-D, printed]",
     )
+    reach: float = Field(
+        20.0,
+        ge=0,
+        description="Where local descriptors verify, only keyframes so near are compared, metres, "
+        "and by a share of the drive since; not in monocular maps. [own]",
+    )
+    reach_share: float = Field(
+        0.1, ge=0, description="Share of the drive that `reach` grows by. [own]"
+    )
+    embedded_at_once: int = Field(
+        8, ge=1, description="Keyframes that a query has the network see, the nearest. [own]"
+    )
     fit: Literal["squash", "crop"] = Field(
         "squash", description="Input: whole image squashed, or its middle cropped. [own]"
     )

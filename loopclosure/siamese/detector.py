@@ -12,7 +12,7 @@ from vslam.features import Features
 from vslam.loopclosure.detector import require_same
 from vslam.loopclosure.local_matching import DescriptorMaps, likeness
 from vslam.loopclosure.siamese.images import to_size
-from vslam.loopclosure.siamese.inference import OnnxNetwork, open_network
+from vslam.loopclosure.siamese.inference import LateNetwork, OnnxNetwork, open_network
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loops import DetectorMemory, LoopCandidate, PerKeyframe
 from vslam.map import Map
@@ -21,12 +21,16 @@ from vslam.map import Map
 class SiameseDetector:
     """Implements :class:`vslam.loopclosure.detector.LoopDetector`.
 
-    Descriptors are kept in one matrix that grows by half: a query is one product with it.
+    Where images are kept, the network sees a keyframe only once the camera is near enough to it
+    that it may be there again (:func:`beyond_reach`): on a drive that never returns, none.
+
+    Descriptors are kept in one matrix that grows by half: a query is one product with it. It has
+    no columns before the network was asked.
     """
 
     def __init__(
         self,
-        network: OnnxNetwork,
+        network: OnnxNetwork | LateNetwork,
         config: SiameseConfig,
         learned: LearnedMatchingConfig | None = None,
         images: KeyframeImages | None = None,
@@ -44,27 +48,34 @@ class SiameseDetector:
         self._learned = learned or LearnedMatchingConfig()
         self._images = images
         self._config = config
-        self._descriptors = np.zeros((64, network.dimensions), np.float32)
+        self._descriptors = np.zeros((64, 0), np.float32)
         self._known = np.zeros(64, np.bool_)  # keyframes added with an image
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Embed and remember a keyframe. Without its image it can be neither query nor match."""
+        """Remember a keyframe. Without its image it can be neither query nor match."""
         while keyframe >= len(self._known):
             more = max(64, len(self._known) // 2)
             self._descriptors = np.pad(self._descriptors, ((0, more), (0, 0)))
             self._known = np.pad(self._known, (0, more))
-        if image is not None:
-            self._descriptors[keyframe] = self._embed(image)
-            self._known[keyframe] = True
+        if image is not None and self._images is None:
+            self._remember(keyframe, image)
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
         """Best first: alive, neither recent nor covisible, similarity at or above the threshold."""
-        if keyframe >= len(self._known) or not self._known[keyframe]:
+        if keyframe >= len(self._known) or not (self._known[keyframe] or self._pending(keyframe)):
             return []
         eligible = self._alive(map_)
         eligible[max(0, keyframe - self._config.recent_keyframes) :] = False
         covisible, _ = map_.covisible(keyframe)
         eligible[covisible[covisible < len(eligible)]] = False
+        if self._images is not None:
+            away = beyond_reach(map_, keyframe, self._config)[: len(eligible)]
+            eligible &= away <= 0
+            if not eligible.any():
+                return []
+            unseen = self._unseen(eligible)
+            self._see([keyframe], unseen[np.argsort(away[unseen], kind="stable")])
+            eligible &= self._known[: len(eligible)]
         threshold = self._config.threshold if self._images is None else self._config.offered
         p = self._similarities(self._descriptors[keyframe], eligible)
         p[p < threshold] = -1.0
@@ -82,7 +93,11 @@ class SiameseDetector:
         """
         if image is None:
             return []
-        p = self._similarities(self._embed(image), self._alive(map_))
+        alive = self._alive(map_)
+        if self._images is not None:
+            self._see([], self._unseen(alive)[::-1])
+            alive &= self._known[: len(alive)]
+        p = self._similarities(self._embed(image), alive)
         order = p
         if self._images is not None:
             order = self._reranked(p, self._images.glance_at(image))
@@ -100,16 +115,40 @@ class SiameseDetector:
         require_same(self.memory(), memory)
         table = memory.tables["descriptors"]
         known, values = np.diff(table.first), table.values
-        right = values.dtype == np.float32 and values.shape[1:] == self._descriptors.shape[1:]
+        columns = (self._network.dimensions if len(values) else 0,)
+        right = values.dtype == np.float32 and (values.shape[1:] == columns or not len(values))
         if not right or not np.isfinite(values).all() or (known > 1).any():
             raise ValueError("the descriptors of the keyframes are not those of the network")
-        self._descriptors = np.zeros((len(known), values.shape[1]), np.float32)
+        self._descriptors = np.zeros((len(known), *columns), np.float32)
         self._descriptors[known > 0] = values
         self._known = known > 0
 
     def _alive(self, map_: Map) -> NDArray[np.bool_]:
+        """``(n,)`` living keyframes with a descriptor, or with an image for one."""
         n = min(map_.n_keyframes, len(self._known))
-        return self._known[:n] & map_.arrays.keyframe_alive[:n]
+        able = self._known[:n].copy()
+        able[[k for k in np.flatnonzero(~able).tolist() if self._pending(k)]] = True
+        return able & map_.arrays.keyframe_alive[:n]
+
+    def _pending(self, keyframe: int) -> bool:
+        return self._images is not None and keyframe in self._images
+
+    def _unseen(self, keyframes: NDArray[np.bool_]) -> NDArray[np.int64]:
+        return np.flatnonzero(keyframes & ~self._known[: len(keyframes)])
+
+    def _see(self, needed: list[int], others: NDArray[np.int64]) -> None:
+        """Embed keyframes that are not yet, of others the first few."""
+        assert self._images is not None
+        for keyframe in [*needed, *others[: self._config.embedded_at_once].tolist()]:
+            if not self._known[keyframe]:
+                self._remember(keyframe, self._images.image(keyframe))
+
+    def _remember(self, keyframe: int, image: NDArray[np.uint8]) -> None:
+        descriptor = self._embed(image)
+        if not self._descriptors.shape[1]:
+            self._descriptors = np.zeros((len(self._known), len(descriptor)), np.float32)
+        self._descriptors[keyframe] = descriptor
+        self._known[keyframe] = True
 
     def _embed(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         return self._network.embed(to_size(image, self._network.size, self._config.fit))
@@ -161,12 +200,39 @@ class SiameseDetector:
         return found
 
 
+def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.float64]:
+    """``(n_keyframes,)`` how far each keyframe lies beyond what odometry's error may hide, metres;
+    0 or less for those where the camera may be.
+
+    The error of a position grows with the way driven. Where the camera was lost between two
+    keyframes nothing is known of it, nor of the unit of a monocular map.
+    """
+    n, a = map_.n_keyframes, map_.arrays
+    if not np.isfinite(a.u_right[map_.rows(keyframe)]).any():
+        return np.zeros(n)
+    T = a.T_cw[:n]
+    position = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
+    living = map_.living_keyframes()
+    steps = np.linalg.norm(np.diff(position[living], axis=0), axis=1)
+    driven = np.zeros(n)
+    driven[living[1:]] = np.cumsum(steps)
+    way = np.abs(driven[keyframe] - driven)
+    apart = np.linalg.norm(position - position[keyframe], axis=1)
+    beyond = apart - config.reach - config.reach_share * way
+    if map_.restarts:
+        submap = map_.submaps()
+        beyond[submap != submap[keyframe]] = 0.0
+    return np.asarray(beyond, np.float64)
+
+
 def open_detector(
     name: str,
     config: SiameseConfig,
     weights: Path | None = None,
     learned: LearnedMatchingConfig | None = None,
     images: KeyframeImages | None = None,
+    *,
+    late: bool = False,
 ) -> SiameseDetector:
     """A detector with its weights.
 
@@ -174,8 +240,11 @@ def open_detector(
         name: one of ``NETWORKS``.
         weights: ONNX file; None for the ones that vslam ships.
         config, learned, images: as :class:`SiameseDetector` takes them.
+        late: load the weights that vslam ships when the first image comes.
 
     Raises:
         InputError: unknown name, no weights, or weights of another network.
     """
-    return SiameseDetector(open_network(name, weights), config, learned, images)
+    late = late and weights is None
+    network = LateNetwork(name) if late else open_network(name, weights)
+    return SiameseDetector(network, config, learned, images)

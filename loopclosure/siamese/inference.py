@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
+from functools import cached_property
 from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from vslam.loopclosure.siamese.weights import find_weights
 # Keys of the metadata.
 FORMAT, NAME, ABOUT, COMPARISON = "vslam", "name", "about", "comparison"
 VERSION = "1"  # of the format
+_NO_RUNTIME = "learned loop detectors need ONNX Runtime: pip install onnxruntime."
 
 
 class OnnxNetwork:
@@ -49,7 +52,7 @@ class OnnxNetwork:
         self._views = tuple(compared[0].shape)
         self._compared = [one.name for one in compared]
         self.name: str = metadata[NAME]
-        self.fingerprint = sha256(path.read_bytes()).hexdigest()[:16]
+        self.fingerprint = fingerprint_of(path)
         self.about: dict[str, Any] = json.loads(metadata[ABOUT])
         height, width = self._embedding.get_inputs()[0].shape
         self.size: Size = (height, width)
@@ -71,6 +74,54 @@ class OnnxNetwork:
         given = {"query": query.reshape(self._views), "gallery": views, "lengths": lengths}
         (similarity,) = self._comparison.run(None, {name: given[name] for name in self._compared})
         return np.asarray(similarity, np.float32)
+
+
+class LateNetwork:
+    """A network that is loaded when the first image comes: most of a drive never needs it.
+
+    Attributes:
+        name, fingerprint: as of :class:`OnnxNetwork`.
+    """
+
+    def __init__(self, name: str) -> None:
+        """The network of that name that vslam ships.
+
+        Raises:
+            InputError: unknown name, no weights shipped, or ONNX Runtime is not installed.
+        """
+        if find_spec("onnxruntime") is None:
+            raise InputError(_NO_RUNTIME)
+        self.name = name
+        self.fingerprint = fingerprint_of(find_weights(name, None))
+
+    @cached_property
+    def _loaded(self) -> OnnxNetwork:
+        return open_network(self.name)
+
+    @property
+    def size(self) -> Size:
+        """See :class:`OnnxNetwork`."""
+        return self._loaded.size
+
+    @property
+    def dimensions(self) -> int:
+        """See :class:`OnnxNetwork`."""
+        return self._loaded.dimensions
+
+    def embed(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """See :class:`OnnxNetwork`."""
+        return self._loaded.embed(image)
+
+    def compare(
+        self, query: NDArray[np.float32], gallery: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """See :class:`OnnxNetwork`."""
+        return self._loaded.compare(query, gallery)
+
+
+def fingerprint_of(path: Path) -> str:
+    """What tells the weights of a file from all others."""
+    return sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def open_network(name: str, weights: Path | None = None) -> OnnxNetwork:
@@ -105,9 +156,7 @@ def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
     try:
         import onnxruntime
     except ImportError as error:
-        raise InputError(
-            "learned loop detectors need ONNX Runtime: pip install onnxruntime."
-        ) from error
+        raise InputError(_NO_RUNTIME) from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4  # what it says of damaged files is in the exception, too

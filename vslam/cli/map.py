@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -135,6 +136,9 @@ def merge(
         raise InputError(f"{maps[0]}: one map alone; name two or more to make them one.")
     _require_free(out)
     thresholds = Config() if config is None else load_config(config)
+    # No camera waits: the network may see all keyframes at once.
+    seen = thresholds.siamese.model_copy(update={"embedded_at_once": sys.maxsize})
+    thresholds = thresholds.model_copy(update={"siamese": seen})
     files = [map_file_of(path) for path in maps]
     for number, file in enumerate(files):
         if file.resolve() in [other.resolve() for other in files[:number]]:

@@ -273,7 +273,8 @@ def begin(camera: Camera, settings: RunSettings, saved: Path | None = None) -> S
     """
     config, threads = settings.config, settings.threads
     images = create_images(settings.detector, config)
-    detector = create_detector(settings.detector, config, settings.weights, images)
+    late = not settings.realtime  # then nothing is loaded while the camera drives
+    detector = create_detector(settings.detector, config, settings.weights, images, late=late)
     if saved is not None:
         return Slam.load(saved, config, detector, threads=threads, images=images, resume=True)
     if settings.map is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ class SiameseDetector:
     """Implements :class:`vslam.loopclosure.detector.LoopDetector`.
 
     Where images are kept, the network sees a keyframe only once the camera is near enough to it
-    that it may be there again (:func:`beyond_reach`): on a drive that never returns, none.
+    that it may be there again (:func:`beyond_reach`), or lost: on a drive that never returns, none.
 
     Descriptors are kept in one matrix that grows by half: a query is one product with it. It has
     no columns before the network was asked.
@@ -74,7 +75,8 @@ class SiameseDetector:
             if not eligible.any():
                 return []
             unseen = self._unseen(eligible)
-            self._see([keyframe], unseen[np.argsort(away[unseen], kind="stable")])
+            nearest = unseen[np.argsort(away[unseen], kind="stable")]
+            self._see([keyframe, *nearest[: self._config.embedded_at_once].tolist()])
             eligible &= self._known[: len(eligible)]
         threshold = self._config.threshold if self._images is None else self._config.offered
         p = self._similarities(self._descriptors[keyframe], eligible)
@@ -95,8 +97,7 @@ class SiameseDetector:
             return []
         alive = self._alive(map_)
         if self._images is not None:
-            self._see([], self._unseen(alive)[::-1])
-            alive &= self._known[: len(alive)]
+            self._see(self._unseen(alive))  # the camera may be anywhere
         p = self._similarities(self._embed(image), alive)
         order = p
         if self._images is not None:
@@ -136,10 +137,10 @@ class SiameseDetector:
     def _unseen(self, keyframes: NDArray[np.bool_]) -> NDArray[np.int64]:
         return np.flatnonzero(keyframes & ~self._known[: len(keyframes)])
 
-    def _see(self, needed: list[int], others: NDArray[np.int64]) -> None:
-        """Embed keyframes that are not yet, of others the first few."""
+    def _see(self, keyframes: Iterable[int]) -> None:
+        """Embed keyframes that are not yet."""
         assert self._images is not None
-        for keyframe in [*needed, *others[: self._config.embedded_at_once].tolist()]:
+        for keyframe in keyframes:
             if not self._known[keyframe]:
                 self._remember(keyframe, self._images.image(keyframe))
 

@@ -184,11 +184,12 @@ RULES = {
                 "--systems mine --system",
                 f"--max-frames {N} --laws night --seeds 1 --steps 1 --systems mine --system",
             ),
-            ("(docs/stress/kitti00.csv bow)", r"tools/../\1"),  # tools is a link
+            (r"(docs/stress/\w+.csv bow)", r"tools/../\1"),  # tools is a link
         ),
         (
             ("python3 -m venv orbslam", ORBSLAM),
             ("vslam stress --seqs 00 --systems vslam,orbslam3", ORBSLAM),
+            ("vslam stress --dataset synthetic --seqs demo --laws all", HOURS),
             (
                 'vslam stress --data "$KITTI_ROOT" --seqs 00 --max-frames 216 --laws all --seeds 1 '
                 "--steps 4 --systems orbslam3",

@@ -18,7 +18,9 @@ def table(path: Path, ours: str, theirs: str) -> str:
     """Markdown, a line for each law that one of both was run under."""
     with path.open(newline="") as file:
         rows = {(row["law"], row["system"]): row for row in csv.DictReader(file)}
-    names = [NAMES.get(system, system) for system in (ours, theirs)]
+    # Two detectors are told by their names, two systems by theirs.
+    known = NAMES if theirs in NAMES else {}
+    names = [known.get(system, f"`{system}`") for system in (ours, theirs)]
     columns = [f"{name} {what}" for name in names for what in ("holds to", "fails at")]
     lines = [f"| law | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
     for law, kind in LAWS.items():

@@ -6,7 +6,7 @@ is never touched, so that local mapping can write it meanwhile.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,15 +91,15 @@ def extract_features(
         (found,) = extract_in_any_light([left], config)
         scale, depth = context.scales[found.octave], np.asarray(second, np.float32)
         u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
-    else:
-        right_image = np.asarray(second, np.uint8)
-        sides = sides or compare_sides(left, right_image, config.stereo)
-        if sides.black == "left":
-            return _features_alone(right_image, config, from_right=True)
-        pair = balanced(left, right_image, config.stereo, sides)
-        found, right = extract_in_any_light(pair, config, image_map)
-        u_right = match_stereo(found, right, camera, config.stereo)
-    return _features(found, u_right)
+        # A rolling shutter, as depth cameras have, moves points by more than alignment mends.
+        return replace(_features(found, u_right), pyramid=None)
+    right_image = np.asarray(second, np.uint8)
+    sides = sides or compare_sides(left, right_image, config.stereo)
+    if sides.black == "left":
+        return _features_alone(right_image, config, from_right=True)
+    pair = balanced(left, right_image, config.stereo, sides)
+    found, right = extract_in_any_light(pair, config, image_map)
+    return _features(found, match_stereo(found, right, camera, config.stereo))
 
 
 def _features_alone(

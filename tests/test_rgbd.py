@@ -125,6 +125,7 @@ def test_features_without_depth_are_monocular(corridor):
     assert 100 < np.count_nonzero(known) < len(known) - 100
     found = camera.bf / (features.xy[known, 0] - features.u_right[known])
     np.testing.assert_allclose(found, depth[rows, columns][known], rtol=1e-3)
+    assert features.pyramid is None  # matches are not aligned
 
 
 def test_a_corner_at_an_edge_of_depth_has_none():

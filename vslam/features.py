@@ -61,7 +61,7 @@ class Features:
         u_right: ``(N,)`` float32, column of the match in the right image, NaN without one.
         from_right: whether the image is the right one; ``xy`` is in it then, and all ``u_right``
             are NaN.
-        pyramid: of the image; None if it is not known any more.
+        pyramid: of the image; None where matches are not to be aligned, or no longer.
     """
 
     xy: NDArray[np.float32]

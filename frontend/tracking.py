@@ -25,6 +25,7 @@ from vslam.frontend.matching import (
 )
 from vslam.frontend.orb import scale_factors
 from vslam.frontend.pose import optimise_pose
+from vslam.frontend.side_delay import row_offsets
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import match_stereo
 from vslam.frontend.weak_images import extract_in_any_light
@@ -144,6 +145,7 @@ def extract_features(
         sides: what ``compare_sides`` says of both images, if that is known.
     """
     camera, config = context.camera, context.config
+    rows = None
     if second is None:
         return _features_alone(left, config)
     if camera.depth:
@@ -158,7 +160,10 @@ def extract_features(
         pair = balanced(left, right_image, config.stereo, sides)
         found, right = extract_in_any_light(pair, config, image_map)
         u_right = match_stereo(found, right, camera, config.stereo)
-    return Features(found.xy, found.octave, found.angle, found.descriptors, u_right)
+        rows = row_offsets(found, right, u_right, config.stereo)
+    return Features(
+        found.xy, found.octave, found.angle, found.descriptors, u_right, row_offset=rows
+    )
 
 
 def _features_alone(

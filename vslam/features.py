@@ -28,6 +28,8 @@ class Features:
         u_right: ``(N,)`` float32, column of the match in the right image, NaN without one.
         from_right: whether the image is the right one; ``xy`` is in it then, and all ``u_right``
             are NaN.
+        row_offset: ``(N,)`` float32, pixels by which a stereo match is lower in the right image
+            than here, of some matches; NaN else. None where nobody measured it.
     """
 
     xy: NDArray[np.float32]
@@ -36,12 +38,14 @@ class Features:
     descriptors: NDArray[np.uint8]
     u_right: NDArray[np.float32]
     from_right: bool = False
+    row_offset: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.xy)
 
-    def with_larger_disparities(self, change: float) -> Features:
-        """The same with ``change`` pixels added to the disparity of each stereo match."""
+    def with_larger_disparities(self, change: float | NDArray[np.float64]) -> Features:
+        """The same with ``change`` pixels, one number or ``(N,)``, added to the disparity of each
+        stereo match."""
         return replace(self, u_right=shifted_columns(self.u_right, self.xy[:, 0], change))
 
     @classmethod
@@ -57,11 +61,11 @@ class Features:
 
 
 def shifted_columns(
-    u_right: NDArray[np.float32], u: NDArray[np.float32], change: float
+    u_right: NDArray[np.float32], u: NDArray[np.float32], change: float | NDArray[np.float64]
 ) -> NDArray[np.float32]:
     """``(N,)`` columns in the right image, ``change`` pixels further to the left, but never so far
     to the right that the point would lie behind the camera. NaN stays NaN."""
-    return np.minimum(u_right - np.float32(change), u - np.float32(MIN_DISPARITY))
+    return np.minimum(u_right - np.asarray(change, np.float32), u - np.float32(MIN_DISPARITY))
 
 
 class FeatureGrid(NamedTuple):

@@ -28,6 +28,7 @@ from vslam.frontend.keyframes import (
     needs_monocular_keyframe,
 )
 from vslam.frontend.relocalization import relocalise
+from vslam.frontend.side_delay import SideDelay
 from vslam.frontend.tracking import (
     Frame,
     TrackingContext,
@@ -69,6 +70,7 @@ class Slam:
     Attributes:
         frame: the last frame tracked, for drawing; None before the first.
         context: camera, thresholds and pyramid scales, as ``extract_features`` takes them.
+        side_delay: by how much the right side of the pair seems late.
         world: where the map that was loaded lies in that of a ground truth, None if unknown.
         on_merge: called where local mapping was merged, also in the middle of a step: the frame
             of that step may be placed, and the map can be read.
@@ -111,6 +113,7 @@ class Slam:
         self.config = config or Config()
         self.context = TrackingContext.create(camera, self.config)
         self.frame: Frame | None = None
+        self.side_delay = SideDelay(camera, self.config.stereo)
         self._detector = detector or NoDetector()
         self._localize = localize
         self._drives: tuple[str, ...] = ()
@@ -242,11 +245,13 @@ class Slam:
             gained_close=self._close_gain.mean,
             gain_awaited=self._close_gain.awaited,
             closing=self._closing.memory(),
+            side_delay=self.side_delay.memory(),
         )
 
     def _return_to(self, checkpoint: Checkpoint) -> None:
         self._mapping.return_to(checkpoint)
         self._closing.restore(checkpoint.closing)
+        self.side_delay.restore(checkpoint.side_delay)
         self._velocity = checkpoint.velocity
         self._lost_frames, self._n_tracked = checkpoint.lost_frames, checkpoint.n_tracked
         gain = self._close_gain
@@ -332,6 +337,7 @@ class Slam:
         if self._mapping.is_due(frame.index):
             self._merge()
         frame.correct_disparities(self._mapping.disparity_offset)
+        frame.features = self.side_delay.corrected(frame.features, self._velocity)
         clock.lap("wait_for_mapping")
         self._is_between = False
         result = (
@@ -354,6 +360,8 @@ class Slam:
             return _result(frame, found, restarted, clock)
 
         self._update_motion(frame, found.relocalised)
+        if self._velocity is not None:
+            self.side_delay.add(frame.features, self._velocity, self.context.scales)
         is_keyframe = self._extend_map(frame, found.inliers, found.visible)
         clock.lap("keyframe")
         return _result(frame, found, is_keyframe, clock)

@@ -42,6 +42,7 @@ class Checkpoint:
         n_tracked: landmarks in it when it was tracked.
         gained_close, gain_awaited: close points that a keyframe brings (``CloseGain``).
         closing: what loop closing remembers.
+        side_delay: what was learned of the delay between the sides (``SideDelay``).
     """
 
     index: int
@@ -58,6 +59,7 @@ class Checkpoint:
     gained_close: float
     gain_awaited: bool
     closing: ClosingMemory
+    side_delay: tuple[float, ...] = ()
 
 
 def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
@@ -72,6 +74,7 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
     return {name: getattr(checkpoint, name) for name in _NUMBERS} | {
         "T_cw": checkpoint.T_cw.tolist(),
         "velocity": None if checkpoint.velocity is None else checkpoint.velocity.tolist(),
+        "side_delay": list(checkpoint.side_delay),
         "closing": {
             **asdict(closing),
             "places": [[sorted(one.keyframes), one.length, one.age] for one in closing.places],
@@ -125,6 +128,7 @@ def checked_checkpoint(
         T_cw=T_cw,
         velocity=velocity,
         closing=closing,
+        side_delay=tuple(map(float, entry["side_delay"])),
     )
 
 

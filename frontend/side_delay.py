@@ -23,7 +23,9 @@ EVERY = 8  # of that many features one is measured: they are a hundred an image
 ROUNDS = 3  # of Gauss-Newton
 LARGEST = 3.0  # pixels of the feature's level: beyond, it is another thing
 HUBER_PX = 0.3
-_UNKNOWNS = 7  # the delay, and a polynomial of second order in the position
+FRAMES_OF_A_GROUP, FEWEST_GROUPS, MOST_GROUPS = 5, 5, 16
+_DEGREE = 3  # of the polynomial
+_NUISANCES = (_DEGREE + 1) * (_DEGREE + 2) // 2
 
 
 def row_offsets(
@@ -119,72 +121,71 @@ def _between(image, x, y, a, b):
 
 
 class SideDelay:
-    """What all frames so far tell of the delay.
+    """What all frames so far tell of the delay, by least squares.
+
+    The speed of the image at a frame is that between the frames before and after it: the sums of a
+    frame wait for the next one. They can, since a speed is linear in the twist.
 
     Attributes:
         seconds: by which the right side is late.
-        sigma: of that; infinite as long as nothing tells.
+        sigma: of that, from how much groups of frames contradict each other (Liang and Zeger,
+            Biometrika 1986); infinite as long as nothing tells.
     """
 
     def __init__(self, camera: Camera, config: StereoConfig) -> None:
         self.seconds, self.sigma = 0.0, np.inf
         self._camera, self._config = camera, config
-        self._normal = np.zeros((_UNKNOWNS, _UNKNOWNS))
-        self._right = np.zeros(_UNKNOWNS)
-        self._squares, self._weight, self._frames = 0.0, 0.0, 0
+        self._solution = np.zeros(1 + _NUISANCES)
+        self._twist = np.zeros(6)
+        self._waiting = np.zeros((7 + _NUISANCES, 7 + _NUISANCES))
+        self._group = np.zeros((2 + _NUISANCES, 2 + _NUISANCES))
+        self._groups: list[NDArray[np.float64]] = []
+        self._n_group, self._length = 0, FRAMES_OF_A_GROUP
 
     @property
     def known(self) -> float:
         """``seconds`` where they are beyond doubt, else 0."""
-        config = self._config
-        least = max(config.least_delay, config.delay_sigmas * self.sigma)
-        sure = self._frames >= config.delay_frames and abs(self.seconds) > least
-        return self.seconds if sure else 0.0
+        least = max(self._config.least_delay, self._config.delay_sigmas * self.sigma)
+        return self.seconds if abs(self.seconds) > least else 0.0
 
-    def add(self, features: Features, twist: Matrix, scales: NDArray[np.float64]) -> None:
-        """Learn from a tracked frame, whose camera moved by ``twist`` per second: it maps points
-        of the camera before to those of the camera then."""
-        offsets = features.row_offset
-        if offsets is None or self._camera.sensor != "stereo":
+    def add(
+        self, features: Features, twist: Matrix | None, scales: NDArray[np.float64]
+    ) -> None:
+        """Learn from a tracked frame.
+
+        Args:
+            features: with ``row_offset``; without, there is nothing to learn.
+            twist: ``(6,)`` per second, maps points of the camera before to those of this one; None
+                if unknown.
+            scales: ``(levels,)`` of the pyramid.
+        """
+        if features.row_offset is None or twist is None:
+            self._waiting[:] = 0.0
             return
-        chosen = np.flatnonzero(np.isfinite(offsets) & np.isfinite(features.u_right))
-        if len(chosen) < _UNKNOWNS:
-            return
-        ray = _rays(features.xy[chosen], self._camera)
-        disparity = features.xy[chosen, 0].astype(np.float64) - features.u_right[chosen]
-        speed = self._camera.fy * _speed(ray, disparity, twist, self._camera, axis=1)
-        x, y = ray[:, 0], ray[:, 1]
-        A = np.stack([speed, np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-        found = offsets[chosen].astype(np.float64)
-        residual = found - A @ self._solution()
-        scale = scales[features.octave[chosen]]
-        weight = scale**-2.0 * np.minimum(1.0, HUBER_PX / np.maximum(np.abs(residual), 1e-9))
-        weighted = A * weight[:, None]
-        self._normal += weighted.T @ A
-        self._right += weighted.T @ found
-        self._squares += float(weight @ residual**2)
-        self._weight += float(weight.sum())
-        self._frames += 1
-        self._conclude()
+        self._take_in(0.5 * (self._twist + twist))
+        self._twist = twist
+        self._waiting = self._moments(features, twist, scales)
 
     def corrected(self, features: Features, twist: Matrix | None) -> Features:
-        """Features with columns in the right image as they were when the left one was taken."""
+        """Features with their columns in the right image as these were when the left one was taken;
+        ``twist`` as in ``add``."""
         delay = self.known
         if delay == 0.0 or twist is None:
             return features
-        ray = _rays(features.xy, self._camera)
+        x, y = _rays(features.xy, self._camera)
         seen = features.xy[:, 0].astype(np.float64) - features.u_right
         disparity = seen
-        for _ in range(3):  # depth depends on the disparity, and the speed on depth
-            disparity = np.maximum(disparity, MIN_DISPARITY)
-            speed = self._camera.fx * _speed(ray, disparity, twist, self._camera, axis=0)
-            disparity = seen + delay * speed
+        for _ in range(3):  # the speed depends on the disparity
+            nearness = np.maximum(disparity, MIN_DISPARITY) / self._camera.bf
+            speed = _column_speeds(x, y, nearness, self._camera.baseline) @ twist
+            disparity = seen + delay * self._camera.fx * speed
         return features.with_larger_disparities(disparity - seen)
 
     def memory(self) -> tuple[float, ...]:
         """All that was learned."""
-        sums = (self._squares, self._weight, float(self._frames))
-        return (*sums, *self._right.tolist(), *self._normal.ravel().tolist())
+        arrays = (*self._state(), *self._groups)
+        counts = (float(self._n_group), float(self._length))
+        return (*counts, *np.concatenate([each.ravel() for each in arrays]).tolist())
 
     def restore(self, memory: tuple[float, ...]) -> None:
         """Go on from there; from nothing if that is empty.
@@ -194,39 +195,87 @@ class SideDelay:
         """
         if not memory:
             return
-        (self._squares, self._weight, frames), rest = memory[:3], np.array(memory[3:])
-        self._frames = int(frames)
-        self._right = rest[:_UNKNOWNS]
-        self._normal = rest[_UNKNOWNS:].reshape(_UNKNOWNS, _UNKNOWNS)
+        self._n_group, self._length = int(memory[0]), int(memory[1])
+        ends = np.cumsum([each.size for each in self._state()])
+        *state, groups = np.split(np.array(memory[2:]), ends)
+        for array, values in zip(self._state(), state, strict=True):
+            array[...] = values.reshape(array.shape)
+        self._groups = list(groups.reshape(-1, *self._group.shape))
         self._conclude()
 
-    def _conclude(self) -> None:
-        if not self._frames:
+    def _state(self) -> tuple[NDArray[np.float64], ...]:
+        return self._solution, self._twist, self._waiting, self._group
+
+    def _moments(
+        self, features: Features, twist: Matrix, scales: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Weighted second moments of the derivatives of the speed by the twist, the polynomial and
+        the row offsets of a frame. What contradicts the rest weighs little (Huber)."""
+        assert features.row_offset is not None
+        chosen = np.flatnonzero(np.isfinite(features.row_offset) & np.isfinite(features.u_right))
+        xy = features.xy[chosen]
+        x, y = _rays(xy, self._camera)
+        nearness = (xy[:, 0].astype(np.float64) - features.u_right[chosen]) / self._camera.bf
+        speeds = self._camera.fy * _row_speeds(x, y, nearness)
+        powers = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+        found = features.row_offset[chosen].astype(np.float64)
+        A = np.column_stack([speeds, *powers, found])
+        residual = found - (speeds @ twist) * self._solution[0] - A[:, 6:-1] @ self._solution[1:]
+        robust = np.minimum(1.0, HUBER_PX / np.maximum(np.abs(residual), 1e-9))
+        weight = robust * scales[features.octave[chosen]] ** -2.0
+        moments: NDArray[np.float64] = (A * weight[:, None]).T @ A
+        return moments
+
+    def _take_in(self, twist: Matrix) -> None:
+        """Add the frame that waits, now that its motion is known from both sides."""
+        if not self._waiting.any():
             return
-        self.seconds = float(self._solution()[0])
-        variance = self._squares / self._weight
-        self.sigma = float(np.sqrt(variance * np.linalg.pinv(self._normal, hermitian=True)[0, 0]))
+        project = np.zeros((len(self._group), len(self._waiting)))
+        project[0, :6] = twist
+        project[1:, 6:] = np.eye(1 + _NUISANCES)
+        self._group += project @ self._waiting @ project.T
+        self._n_group += 1
+        if self._n_group == self._length:
+            self._groups.append(self._group)
+            self._group, self._n_group = np.zeros_like(self._group), 0
+            if len(self._groups) == MOST_GROUPS:  # each two become one
+                self._groups = [a + b for a, b in zip(self._groups[::2], self._groups[1::2], strict=True)]
+                self._length *= 2
+            self._conclude()
 
-    def _solution(self) -> NDArray[np.float64]:
-        return np.linalg.lstsq(self._normal, self._right, rcond=1e-12)[0]
+    def _conclude(self) -> None:
+        if len(self._groups) < FEWEST_GROUPS:
+            return
+        groups = np.stack(self._groups)
+        total = groups.sum(axis=0)
+        inverse = np.linalg.pinv(total[:-1, :-1], rcond=1e-12, hermitian=True)
+        self._solution = inverse @ total[:-1, -1]
+        self.seconds = float(self._solution[0])
+        pulls = (groups[:, :-1, -1] - groups[:, :-1, :-1] @ self._solution) @ inverse[0]
+        n = len(pulls)
+        self.sigma = float(np.sqrt(n / (n - 1) * pulls @ pulls))
 
 
-def _rays(xy: NDArray[np.float32], camera: Camera) -> NDArray[np.float64]:
-    """``(N, 3)`` points in the left camera at depth 1."""
+def _rays(
+    xy: NDArray[np.float32], camera: Camera
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """``(N,)`` each, x and y at depth 1 in the left camera."""
     xy = xy.astype(np.float64)
-    x, y = (xy[:, 0] - camera.cx) / camera.fx, (xy[:, 1] - camera.cy) / camera.fy
-    return np.stack([x, y, np.ones_like(x)], axis=1)
+    return (xy[:, 0] - camera.cx) / camera.fx, (xy[:, 1] - camera.cy) / camera.fy
 
 
-def _speed(
-    ray: NDArray[np.float64],
-    disparity: NDArray[np.float64],
-    twist: Matrix,
-    camera: Camera,
-    axis: int,
+def _row_speeds(
+    x: NDArray[np.float64], y: NDArray[np.float64], nearness: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """``(N,)`` speed in the right image of points at a disparity, in focal lengths a second."""
-    inverse_depth = disparity / camera.bf
-    moved = twist[:3] * inverse_depth[:, None] + np.cross(twist[3:], ray)
-    where = ray[:, axis] - (camera.baseline * inverse_depth if axis == 0 else 0.0)
-    return moved[:, axis] - where * moved[:, 2]
+    """``(N, 6)`` derivatives of the row by a twist, in focal lengths; alike in both images.
+    ``nearness`` is 1 / depth."""
+    zero = np.zeros_like(x)
+    return np.column_stack([zero, nearness, -y * nearness, -1.0 - y * y, x * y, x])
+
+
+def _column_speeds(
+    x: NDArray[np.float64], y: NDArray[np.float64], nearness: NDArray[np.float64], baseline: float
+) -> NDArray[np.float64]:
+    """The same of the column in the right image."""
+    zero, right = np.zeros_like(x), x - baseline * nearness
+    return np.column_stack([nearness, zero, -right * nearness, -right * y, 1.0 + right * x, -y])

@@ -143,16 +143,13 @@ class StereoConfig(_Section):
         12, ge=3, description="Keyframes after which that offset is measured anew. [own]"
     )
     least_delay: float = Field(
-        0.4e-3,
+        1.2e-3,
         gt=0,
         description="Delay between the sides from which it is corrected, seconds "
         "(docs/stress.md). [own]",
     )
     delay_sigmas: float = Field(
         5.0, gt=0, description="The same in standard deviations of what was measured. [own]"
-    )
-    delay_frames: int = Field(
-        10, ge=1, description="Frames tracked before a delay is believed. [own]"
     )
 
 

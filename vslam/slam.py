@@ -360,8 +360,7 @@ class Slam:
             return _result(frame, found, restarted, clock)
 
         self._update_motion(frame, found.relocalised)
-        if self._velocity is not None:
-            self.side_delay.add(frame.features, self._velocity, self.context.scales)
+        self.side_delay.add(frame.features, self._velocity, self.context.scales)
         is_keyframe = self._extend_map(frame, found.inliers, found.visible)
         clock.lap("keyframe")
         return _result(frame, found, is_keyframe, clock)

@@ -9,20 +9,24 @@ calibrated badly, shows the same at every speed: a polynomial of the position ta
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.config import StereoConfig
-from vslam.features import MIN_DISPARITY, Features
+from vslam.features import Features
 from vslam.frontend.orb import Extraction
 from vslam.geometry import Matrix
+from vslam.image_motion import columns_without_delay, rays, row_speeds
 from vslam.kernels import inner_kernel, kernel
 
 EVERY = 8  # of that many features one is measured: they are a hundred an image
 ROUNDS = 3  # of Gauss-Newton
 LARGEST = 3.0  # pixels of the feature's level: beyond, it is another thing
 HUBER_PX = 0.3
+NEWS = 0.25  # of the least delay: a change by which all is corrected once more
 FRAMES_OF_A_GROUP, FEWEST_GROUPS, MOST_GROUPS = 5, 5, 16
 _DEGREE = 3  # of the polynomial
 _NUISANCES = (_DEGREE + 1) * (_DEGREE + 2) // 2
@@ -130,10 +134,11 @@ class SideDelay:
         seconds: by which the right side is late.
         sigma: of that, from how much groups of frames contradict each other (Liang and Zeger,
             Biometrika 1986); infinite as long as nothing tells.
+        applied: by which features are corrected: 0 for a sound rig.
     """
 
     def __init__(self, camera: Camera, config: StereoConfig) -> None:
-        self.seconds, self.sigma = 0.0, np.inf
+        self.seconds, self.sigma, self.applied = 0.0, np.inf, 0.0
         self._camera, self._config = camera, config
         self._solution = np.zeros(1 + _NUISANCES)
         self._twist = np.zeros(6)
@@ -142,15 +147,19 @@ class SideDelay:
         self._groups: list[NDArray[np.float64]] = []
         self._n_group, self._length = 0, FRAMES_OF_A_GROUP
 
-    @property
-    def known(self) -> float:
-        """``seconds`` where they are beyond doubt, else 0."""
+    def adopt(self) -> float:
+        """Correct features from now on by what is known, if it is beyond doubt and news; returns
+        by how much more than before."""
         least = max(self._config.least_delay, self._config.delay_sigmas * self.sigma)
-        return self.seconds if abs(self.seconds) > least else 0.0
+        if self.applied == 0.0 and abs(self.seconds) <= least:
+            return 0.0
+        change = self.seconds - self.applied
+        if abs(change) <= NEWS * self._config.least_delay:
+            return 0.0
+        self.applied = self.seconds
+        return change
 
-    def add(
-        self, features: Features, twist: Matrix | None, scales: NDArray[np.float64]
-    ) -> None:
+    def add(self, features: Features, twist: Matrix | None, scales: NDArray[np.float64]) -> None:
         """Learn from a tracked frame.
 
         Args:
@@ -169,22 +178,17 @@ class SideDelay:
     def corrected(self, features: Features, twist: Matrix | None) -> Features:
         """Features with their columns in the right image as these were when the left one was taken;
         ``twist`` as in ``add``."""
-        delay = self.known
-        if delay == 0.0 or twist is None:
+        if self.applied == 0.0 or twist is None:
             return features
-        x, y = _rays(features.xy, self._camera)
-        seen = features.xy[:, 0].astype(np.float64) - features.u_right
-        disparity = seen
-        for _ in range(3):  # the speed depends on the disparity
-            nearness = np.maximum(disparity, MIN_DISPARITY) / self._camera.bf
-            speed = _column_speeds(x, y, nearness, self._camera.baseline) @ twist
-            disparity = seen + delay * self._camera.fx * speed
-        return features.with_larger_disparities(disparity - seen)
+        u_right = columns_without_delay(
+            features.xy, features.u_right, twist, self.applied, self._camera
+        )
+        return replace(features, u_right=u_right)
 
     def memory(self) -> tuple[float, ...]:
         """All that was learned."""
         arrays = (*self._state(), *self._groups)
-        counts = (float(self._n_group), float(self._length))
+        counts = (float(self._n_group), float(self._length), self.applied)
         return (*counts, *np.concatenate([each.ravel() for each in arrays]).tolist())
 
     def restore(self, memory: tuple[float, ...]) -> None:
@@ -196,8 +200,9 @@ class SideDelay:
         if not memory:
             return
         self._n_group, self._length = int(memory[0]), int(memory[1])
+        self.applied = memory[2]
         ends = np.cumsum([each.size for each in self._state()])
-        *state, groups = np.split(np.array(memory[2:]), ends)
+        *state, groups = np.split(np.array(memory[3:]), ends)
         for array, values in zip(self._state(), state, strict=True):
             array[...] = values.reshape(array.shape)
         self._groups = list(groups.reshape(-1, *self._group.shape))
@@ -214,9 +219,9 @@ class SideDelay:
         assert features.row_offset is not None
         chosen = np.flatnonzero(np.isfinite(features.row_offset) & np.isfinite(features.u_right))
         xy = features.xy[chosen]
-        x, y = _rays(xy, self._camera)
-        nearness = (xy[:, 0].astype(np.float64) - features.u_right[chosen]) / self._camera.bf
-        speeds = self._camera.fy * _row_speeds(x, y, nearness)
+        x, y = rays(xy, self._camera)
+        inverse_depth = (xy[:, 0].astype(np.float64) - features.u_right[chosen]) / self._camera.bf
+        speeds = self._camera.fy * row_speeds(x, y, inverse_depth)
         powers = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
         found = features.row_offset[chosen].astype(np.float64)
         A = np.column_stack([speeds, *powers, found])
@@ -239,7 +244,9 @@ class SideDelay:
             self._groups.append(self._group)
             self._group, self._n_group = np.zeros_like(self._group), 0
             if len(self._groups) == MOST_GROUPS:  # each two become one
-                self._groups = [a + b for a, b in zip(self._groups[::2], self._groups[1::2], strict=True)]
+                self._groups = [
+                    a + b for a, b in zip(self._groups[::2], self._groups[1::2], strict=True)
+                ]
                 self._length *= 2
             self._conclude()
 
@@ -254,28 +261,3 @@ class SideDelay:
         pulls = (groups[:, :-1, -1] - groups[:, :-1, :-1] @ self._solution) @ inverse[0]
         n = len(pulls)
         self.sigma = float(np.sqrt(n / (n - 1) * pulls @ pulls))
-
-
-def _rays(
-    xy: NDArray[np.float32], camera: Camera
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``(N,)`` each, x and y at depth 1 in the left camera."""
-    xy = xy.astype(np.float64)
-    return (xy[:, 0] - camera.cx) / camera.fx, (xy[:, 1] - camera.cy) / camera.fy
-
-
-def _row_speeds(
-    x: NDArray[np.float64], y: NDArray[np.float64], nearness: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """``(N, 6)`` derivatives of the row by a twist, in focal lengths; alike in both images.
-    ``nearness`` is 1 / depth."""
-    zero = np.zeros_like(x)
-    return np.column_stack([zero, nearness, -y * nearness, -1.0 - y * y, x * y, x])
-
-
-def _column_speeds(
-    x: NDArray[np.float64], y: NDArray[np.float64], nearness: NDArray[np.float64], baseline: float
-) -> NDArray[np.float64]:
-    """The same of the column in the right image."""
-    zero, right = np.zeros_like(x), x - baseline * nearness
-    return np.column_stack([nearness, zero, -right * nearness, -right * y, 1.0 + right * x, -y])

@@ -6,7 +6,7 @@ is never touched, so that local mapping can write it meanwhile.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,8 @@ from vslam.frontend.side_delay import row_offsets
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import match_stereo
 from vslam.frontend.weak_images import extract_in_any_light
-from vslam.geometry import compose, inverse, transform
+from vslam.geometry import Matrix, compose, inverse, transform
+from vslam.image_motion import columns_without_delay
 from vslam.map import LocalMap
 from vslam.reprojection import stack_uvr
 
@@ -90,6 +91,13 @@ class Frame:
             change = offset - self.disparity_offset
             self.features = self.features.with_larger_disparities(change)
             self.disparity_offset = offset
+
+    def correct_delay(self, delay: float, twist: Matrix, camera: Camera) -> None:
+        """Take so much more of a delay of the right side out of the features' columns there."""
+        xy, u_right = self.features.xy, self.features.u_right
+        self.features = replace(
+            self.features, u_right=columns_without_delay(xy, u_right, twist, delay, camera)
+        )
 
     @property
     def n_stereo(self) -> int:

@@ -43,9 +43,8 @@ class Features:
     def __len__(self) -> int:
         return len(self.xy)
 
-    def with_larger_disparities(self, change: float | NDArray[np.float64]) -> Features:
-        """The same with ``change`` pixels, one number or ``(N,)``, added to the disparity of each
-        stereo match."""
+    def with_larger_disparities(self, change: float) -> Features:
+        """The same with ``change`` pixels added to the disparity of each stereo match."""
         return replace(self, u_right=shifted_columns(self.u_right, self.xy[:, 0], change))
 
     @classmethod

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.backend.late_side import correct_delay
 from vslam.camera import Camera, DepthImage, Image, same_camera
 from vslam.closing import LoopClosing
 from vslam.config import Config
@@ -746,9 +747,29 @@ class Slam:
     def _insert_keyframe(self, frame: Frame, *, predicted: bool = True) -> None:
         """Make a keyframe of the frame placed last (``MappingThread.insert``)."""
         self._merge(frame)
+        self._correct_delay(frame)
         self._mapping.insert(frame, predicted=predicted)
         self._close_gain.begin()
         self._poses.replace(frame.index, self._mapping.reference)
+
+    def _correct_delay(self, frame: Frame) -> None:
+        """Where the right side turns out to be late, or later than it was thought to be: correct
+        the map, and the frames that tracking goes on from. Merge first."""
+        if self.is_adjusting or not self._mapping.n_keyframes:
+            return
+        change = self.side_delay.adopt()
+        if change == 0.0:
+            return
+        map_, camera = self.map, self.camera
+        own = [k for k in map_.living_keyframes() if map_.sessions[k] == map_.session]
+        twists = {int(k): self._poses.twist(map_.frames[k]) for k in own}
+        correct_delay(map_, twists, change, camera, self.config)
+        for each in {id(one): one for one in (self.frame, frame) if one is not None}.values():
+            each.correct_delay(change, self._poses.twist(each.index), camera)
+        self._mapping.set_reference(self._mapping.reference)
+        self._follow_map(self.frame)
+        if frame is not self.frame:
+            self._follow_map(frame)
 
     def _merge(self, current: Frame | None = None, *, renumber: bool = True) -> None:
         """Show tracking what local mapping has done: poses, landmarks, merged identities.

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.features import FeatureGrid, Features
+from vslam.geometry import Matrix
+from vslam.image_motion import columns_without_delay
 
 
 @dataclass
@@ -68,6 +70,13 @@ class Frame:
             change = offset - self.disparity_offset
             self.features = self.features.with_larger_disparities(change)
             self.disparity_offset = offset
+
+    def correct_delay(self, delay: float, twist: Matrix, camera: Camera) -> None:
+        """Take so much more of a delay of the right side out of the features' columns there."""
+        xy, u_right = self.features.xy, self.features.u_right
+        self.features = replace(
+            self.features, u_right=columns_without_delay(xy, u_right, twist, delay, camera)
+        )
 
     @property
     def aligned(self) -> NDArray[np.bool_]:

@@ -27,6 +27,7 @@ from vslam.frontend.matching import (
 )
 from vslam.frontend.orb import Extraction, scale_factors
 from vslam.frontend.pose import optimise_pose
+from vslam.frontend.side_delay import row_offsets
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import match_stereo
 from vslam.frontend.weak_images import extract_in_any_light
@@ -85,6 +86,7 @@ def extract_features(
         sides: what ``compare_sides`` says of both images, if that is known.
     """
     camera, config = context.camera, context.config
+    rows = None
     if second is None:
         return _features_alone(left, config)
     if camera.depth:
@@ -99,7 +101,9 @@ def extract_features(
         return _features_alone(right_image, config, from_right=True)
     pair = balanced(left, right_image, config.stereo, sides)
     found, right = extract_in_any_light(pair, config, image_map)
-    return _features(found, match_stereo(found, right, camera, config.stereo))
+    u_right = match_stereo(found, right, camera, config.stereo)
+    rows = row_offsets(found, right, u_right, config.stereo)
+    return replace(_features(found, u_right), row_offset=rows)
 
 
 def _features_alone(

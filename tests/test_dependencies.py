@@ -31,6 +31,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     (
         "vslam.loops",
         "vslam.reprojection",
+        "vslam.image_motion",
         "vslam.trajectory",
         "vslam.map_kernels",
         "vslam.calibration",
@@ -225,7 +226,7 @@ def test_heavy_libraries_stay_where_they_belong(library):
 
 
 def test_few_modules_lie_directly_in_the_package():
-    assert len(list((ROOT / "vslam").glob("*.py"))) <= 24
+    assert len(list((ROOT / "vslam").glob("*.py"))) <= 25
 
 
 def test_long_files_give_their_reason():

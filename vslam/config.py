@@ -142,6 +142,15 @@ class StereoConfig(_Section):
     offset_keyframes: int = Field(
         12, ge=3, description="Keyframes after which that offset is measured anew. [own]"
     )
+    least_delay: float = Field(
+        1.2e-3,
+        gt=0,
+        description="Delay between the sides from which it is corrected, seconds "
+        "(docs/stress.md). [own]",
+    )
+    delay_sigmas: float = Field(
+        5.0, gt=0, description="The same in standard deviations of what was measured. [own]"
+    )
 
 
 class DepthConfig(_Section):

@@ -62,6 +62,8 @@ class Features:
         from_right: whether the image is the right one; ``xy`` is in it then, and all ``u_right``
             are NaN.
         pyramid: of the image; None where matches are not to be aligned, or no longer.
+        row_offset: ``(N,)`` float32, pixels by which a stereo match is lower in the right image
+            than here, of some matches; NaN else. None where nobody measured it.
     """
 
     xy: NDArray[np.float32]
@@ -71,6 +73,7 @@ class Features:
     u_right: NDArray[np.float32]
     from_right: bool = False
     pyramid: Pyramid | None = None
+    row_offset: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -127,11 +130,11 @@ NO_PATCHES = LandmarkPatches(
 
 
 def shifted_columns(
-    u_right: NDArray[np.float32], u: NDArray[np.float32], change: float
+    u_right: NDArray[np.float32], u: NDArray[np.float32], change: float | NDArray[np.float64]
 ) -> NDArray[np.float32]:
     """``(N,)`` columns in the right image, ``change`` pixels further to the left, but never so far
     to the right that the point would lie behind the camera. NaN stays NaN."""
-    return np.minimum(u_right - np.float32(change), u - np.float32(MIN_DISPARITY))
+    return np.minimum(u_right - np.asarray(change, np.float32), u - np.float32(MIN_DISPARITY))
 
 
 class FeatureGrid(NamedTuple):

@@ -47,6 +47,7 @@ class Checkpoint:
         gained_close, gain_awaited: close points that a keyframe brings (``CloseGain``).
         closing: what loop closing remembers.
         patches: of the newest keyframes, oldest first.
+        side_delay: what was learned of the delay between the sides (``SideDelay``).
     """
 
     index: int
@@ -64,6 +65,7 @@ class Checkpoint:
     gain_awaited: bool
     closing: ClosingMemory
     patches: tuple[KeyframePatches, ...]
+    side_delay: tuple[float, ...] = ()
 
 
 def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
@@ -86,6 +88,7 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
     return {name: getattr(checkpoint, name) for name in _NUMBERS} | {
         "T_cw": checkpoint.T_cw.tolist(),
         "velocity": None if checkpoint.velocity is None else checkpoint.velocity.tolist(),
+        "side_delay": list(checkpoint.side_delay),
         "closing": {
             **asdict(closing),
             "places": [[sorted(one.keyframes), one.length, one.age] for one in closing.places],
@@ -131,6 +134,7 @@ def checked_checkpoint(
         and all(np.isfinite(x).all() for x in (T_cw, 0.0 if velocity is None else velocity))
         and np.isfinite(arrays["xy"]).all()
         and all(isinstance(number, int | float) for number in numbers.values())
+        and np.isfinite(np.array(entry["side_delay"], np.float64)).all()
         and 0 <= numbers["reference"] < n_keyframes
         and ((landmark >= -1) & (landmark < n_landmarks)).all()
     )
@@ -151,6 +155,7 @@ def checked_checkpoint(
         velocity=velocity,
         closing=closing,
         patches=_patches_of(arrays, first_row),
+        side_delay=tuple(map(float, entry["side_delay"])),
     )
 
 

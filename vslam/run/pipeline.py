@@ -220,7 +220,10 @@ def _outcome(
         keyframes=slam.keyframe_trajectory(),
         tracks=account.tracks,
         skipped=account.skipped,
-        warnings=[*rig_warnings(account.sides), *residual_warnings(residuals, sequence.camera)],
+        warnings=[
+            *rig_warnings(account.sides),
+            *residual_warnings(residuals, sequence.camera, slam.side_delay.applied),
+        ],
         wall_s=seconds[0],
         cpu_s=seconds[1],
         startup_s=account.startup_s,

@@ -100,8 +100,21 @@ def _twists(map_: Map) -> NDArray[np.float64]:
     return twists
 
 
-def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
-    """What residuals say of the rig, nothing of a sound one."""
+def residual_warnings(
+    found: RigResiduals | None, camera: Camera, corrected_s: float = 0.0
+) -> list[str]:
+    """What residuals say of the rig, nothing of a sound one.
+
+    Args:
+        corrected_s: the delay of the right side that stereo matches were corrected by.
+    """
+    if corrected_s:
+        side = "right" if corrected_s > 0 else "left"
+        return [
+            f"The sides are not synchronised: the {side} one is {1e3 * abs(corrected_s):.1f} ms "
+            "late, by the rows of stereo matches. These were corrected by that, as well as it can "
+            "be measured. Trigger both by one signal."
+        ]
     if found is None:
         return []
     said = []

@@ -1,0 +1,266 @@
+"""By how much the right side of a stereo pair is late, measured in the rows of its matches.
+
+In a rectified pair a point is in the same row of both images. If the right one is taken later, its
+row is moved on by the image's speed times the delay. Columns are moved as well, and bend the map:
+there, bundle adjustment takes much of the delay for depth and motion. Rows say nothing of depth, so
+that nothing can hide in them, and no map is asked. A rig whose rows do not correspond, as one
+calibrated badly, shows the same at every speed: a polynomial of the position takes that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Camera
+from vslam.config import StereoConfig
+from vslam.features import Features, level_pixel
+from vslam.frontend.orb import Extraction
+from vslam.geometry import Matrix
+from vslam.image_motion import columns_without_delay, rays, row_speeds
+from vslam.kernels import inner_kernel, kernel
+
+EVERY = 8  # of that many features one is measured: they are a hundred an image
+ROUNDS = 3  # of Gauss-Newton
+LARGEST = 3.0  # pixels of the feature's level: beyond, it is another thing
+HUBER_PX = 0.3
+NEWS = 0.25  # of the least delay: a change by which all is corrected once more
+FRAMES_OF_A_GROUP, FEWEST_GROUPS, MOST_GROUPS = 5, 5, 16
+_DEGREE = 3  # of the polynomial
+_NUISANCES = (_DEGREE + 1) * (_DEGREE + 2) // 2
+
+
+def row_offsets(
+    left: Extraction, right: Extraction, u_right: NDArray[np.float32], config: StereoConfig
+) -> NDArray[np.float32]:
+    """By how many pixels stereo matches are lower in the right image than in the left one:
+    ``(N,)`` float32, of some of them; NaN of all other features."""
+    pyramid = left.pyramid
+    return _row_offsets(
+        left.xy,
+        left.octave,
+        u_right,
+        pyramid.pixels,
+        right.pyramid.pixels,
+        pyramid.offsets,
+        pyramid.shapes,
+        config.sad_window,
+    )
+
+
+@kernel
+def _row_offsets(xy, octave, u_right, pixels_l, pixels_r, offsets, shapes, half):
+    found = np.full(len(xy), np.nan, np.float32)
+    for i in range(0, len(xy), EVERY):
+        if np.isnan(u_right[i]):
+            continue
+        level = octave[i]
+        height, width = shapes[level]
+        image_l = pixels_l[offsets[level] : offsets[level] + height * width].reshape(height, width)
+        image_r = pixels_r[offsets[level] : offsets[level] + height * width].reshape(height, width)
+        wide, high = shapes[0, 1] / width, shapes[0, 0] / height
+        x, y = level_pixel(xy[i, 0], wide), level_pixel(xy[i, 1], high)
+        moved = (u_right[i] - xy[i, 0]) / wide
+        found[i] = _row_shift(image_l, image_r, x, y, moved, half) * high
+    return found
+
+
+@inner_kernel
+def _row_shift(image_l, image_r, x, y, dx, half):
+    """Rows by which the patch around ``(x, y)`` is lower in the right image, NaN where it does not
+    tell; ``dx`` columns to the right of it is where to begin.
+
+    The inverse compositional form of Lucas and Kanade's method (Baker and Matthews, IJCV 2004): the
+    gradients are those of the left patch.
+    """
+    height, width = image_l.shape
+    edge = half + 1
+    if x < edge or y < edge or x + edge >= width or y + edge >= height:
+        return np.nan
+    xx, xy, yy = 0.0, 0.0, 0.0
+    for j in range(-half, half + 1):
+        for k in range(-half, half + 1):
+            gx = 0.5 * (float(image_l[y + j, x + k + 1]) - float(image_l[y + j, x + k - 1]))
+            gy = 0.5 * (float(image_l[y + j + 1, x + k]) - float(image_l[y + j - 1, x + k]))
+            xx += gx * gx
+            xy += gx * gy
+            yy += gy * gy
+    determinant = xx * yy - xy * xy
+    if determinant < 0.05 * xx * yy or determinant < 1.0:
+        return np.nan
+    dy = 0.0
+    for _ in range(ROUNDS):
+        x0, y0 = int(np.floor(x + dx)), int(np.floor(y + dy))
+        if x0 < half or y0 < half or x0 + half + 1 >= width or y0 + half + 1 >= height:
+            return np.nan
+        a, b = x + dx - x0, y + dy - y0
+        mean = 0.0
+        for j in range(-half, half + 1):
+            for k in range(-half, half + 1):
+                mean += _between(image_r, x0 + k, y0 + j, a, b) - float(image_l[y + j, x + k])
+        mean /= (2 * half + 1) ** 2
+        rx, ry = 0.0, 0.0
+        for j in range(-half, half + 1):
+            for k in range(-half, half + 1):
+                gx = 0.5 * (float(image_l[y + j, x + k + 1]) - float(image_l[y + j, x + k - 1]))
+                gy = 0.5 * (float(image_l[y + j + 1, x + k]) - float(image_l[y + j - 1, x + k]))
+                here = _between(image_r, x0 + k, y0 + j, a, b) - float(image_l[y + j, x + k])
+                rx += gx * (here - mean)
+                ry += gy * (here - mean)
+        dx -= (yy * rx - xy * ry) / determinant
+        dy -= (xx * ry - xy * rx) / determinant
+        if abs(dy) > LARGEST:
+            return np.nan
+    return dy
+
+
+@inner_kernel
+def _between(image, x, y, a, b):
+    """Bilinear, at ``(x + a, y + b)``."""
+    upper = (1.0 - a) * float(image[y, x]) + a * float(image[y, x + 1])
+    lower = (1.0 - a) * float(image[y + 1, x]) + a * float(image[y + 1, x + 1])
+    return (1.0 - b) * upper + b * lower
+
+
+class SideDelay:
+    """What all frames so far tell of the delay, by least squares.
+
+    The speed of the image at a frame is that between the frames before and after it: the sums of a
+    frame wait for the next one. They can, since a speed is linear in the twist.
+
+    Attributes:
+        seconds: by which the right side is late.
+        sigma: of that, from how much groups of frames contradict each other (Liang and Zeger,
+            Biometrika 1986); infinite as long as nothing tells.
+        applied: by which features are corrected: 0 for a sound rig.
+    """
+
+    def __init__(self, camera: Camera, config: StereoConfig) -> None:
+        self.seconds, self.sigma, self.applied = 0.0, np.inf, 0.0
+        self._camera, self._config = camera, config
+        self._solution = np.zeros(1 + _NUISANCES)
+        self._twist = np.zeros(6)
+        self._waiting = np.zeros((7 + _NUISANCES, 7 + _NUISANCES))
+        self._group = np.zeros((2 + _NUISANCES, 2 + _NUISANCES))
+        self._groups: list[NDArray[np.float64]] = []
+        self._n_group, self._length = 0, FRAMES_OF_A_GROUP
+
+    def adopt(self) -> float:
+        """Correct features from now on by what is known, if it is beyond doubt and news; returns
+        by how much more than before."""
+        least = max(self._config.least_delay, self._config.delay_sigmas * self.sigma)
+        if self.applied == 0.0 and abs(self.seconds) <= least:
+            return 0.0
+        change = self.seconds - self.applied
+        if abs(change) <= NEWS * self._config.least_delay:
+            return 0.0
+        self.applied = self.seconds
+        return change
+
+    def add(self, features: Features, twist: Matrix | None, scales: NDArray[np.float64]) -> None:
+        """Learn from a tracked frame.
+
+        Args:
+            features: with ``row_offset``; without, there is nothing to learn.
+            twist: ``(6,)`` per second, maps points of the camera before to those of this one; None
+                if unknown.
+            scales: ``(levels,)`` of the pyramid.
+        """
+        if features.row_offset is None or twist is None:
+            self._waiting[:] = 0.0
+            return
+        self._take_in(0.5 * (self._twist + twist))
+        self._twist = twist
+        self._waiting = self._moments(features, twist, scales)
+
+    def corrected(self, features: Features, twist: Matrix | None) -> Features:
+        """Features with their columns in the right image as these were when the left one was taken;
+        ``twist`` as in ``add``."""
+        if self.applied == 0.0 or twist is None:
+            return features
+        u_right = columns_without_delay(
+            features.xy, features.u_right, twist, self.applied, self._camera
+        )
+        return replace(features, u_right=u_right)
+
+    def memory(self) -> tuple[float, ...]:
+        """All that was learned."""
+        arrays = (*self._state(), *self._groups)
+        counts = (float(self._n_group), float(self._length), self.applied)
+        return (*counts, *np.concatenate([each.ravel() for each in arrays]).tolist())
+
+    def restore(self, memory: tuple[float, ...]) -> None:
+        """Go on from there; from nothing if that is empty.
+
+        Raises:
+            ValueError: it is none.
+        """
+        if not memory:
+            return
+        fixed = 3 + sum(each.size for each in self._state())
+        if len(memory) < fixed or (len(memory) - fixed) % self._group.size:
+            raise ValueError("what it knows of the delay between the sides is damaged")
+        self._n_group, self._length = int(memory[0]), int(memory[1])
+        self.applied = memory[2]
+        ends = np.cumsum([each.size for each in self._state()])
+        *state, groups = np.split(np.array(memory[3:]), ends)
+        for array, values in zip(self._state(), state, strict=True):
+            array[...] = values.reshape(array.shape)
+        self._groups = list(groups.reshape(-1, *self._group.shape))
+        self._conclude()
+
+    def _state(self) -> tuple[NDArray[np.float64], ...]:
+        return self._solution, self._twist, self._waiting, self._group
+
+    def _moments(
+        self, features: Features, twist: Matrix, scales: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Weighted second moments of the derivatives of the speed by the twist, the polynomial and
+        the row offsets of a frame. What contradicts the rest weighs little (Huber)."""
+        assert features.row_offset is not None
+        chosen = np.flatnonzero(np.isfinite(features.row_offset) & np.isfinite(features.u_right))
+        xy = features.xy[chosen]
+        x, y = rays(xy, self._camera)
+        inverse_depth = (xy[:, 0].astype(np.float64) - features.u_right[chosen]) / self._camera.bf
+        speeds = self._camera.fy * row_speeds(x, y, inverse_depth)
+        powers = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+        found = features.row_offset[chosen].astype(np.float64)
+        A = np.column_stack([speeds, *powers, found])
+        residual = found - (speeds @ twist) * self._solution[0] - A[:, 6:-1] @ self._solution[1:]
+        robust = np.minimum(1.0, HUBER_PX / np.maximum(np.abs(residual), 1e-9))
+        weight = robust * scales[features.octave[chosen]] ** -2.0
+        moments: NDArray[np.float64] = (A * weight[:, None]).T @ A
+        return moments
+
+    def _take_in(self, twist: Matrix) -> None:
+        """Add the frame that waits, now that its motion is known from both sides."""
+        if not self._waiting.any():
+            return
+        project = np.zeros((len(self._group), len(self._waiting)))
+        project[0, :6] = twist
+        project[1:, 6:] = np.eye(1 + _NUISANCES)
+        self._group += project @ self._waiting @ project.T
+        self._n_group += 1
+        if self._n_group == self._length:
+            self._groups.append(self._group)
+            self._group, self._n_group = np.zeros_like(self._group), 0
+            if len(self._groups) == MOST_GROUPS:  # each two become one
+                self._groups = [
+                    a + b for a, b in zip(self._groups[::2], self._groups[1::2], strict=True)
+                ]
+                self._length *= 2
+            self._conclude()
+
+    def _conclude(self) -> None:
+        if len(self._groups) < FEWEST_GROUPS:
+            return
+        groups = np.stack(self._groups)
+        total = groups.sum(axis=0)
+        inverse = np.linalg.pinv(total[:-1, :-1], rcond=1e-12, hermitian=True)
+        self._solution = inverse @ total[:-1, -1]
+        self.seconds = float(self._solution[0])
+        pulls = (groups[:, :-1, -1] - groups[:, :-1, :-1] @ self._solution) @ inverse[0]
+        n = len(pulls)
+        self.sigma = float(np.sqrt(n / (n - 1) * pulls @ pulls))

@@ -1,0 +1,71 @@
+"""How fast points of a rectified pair move in its images, and columns of a right image that was
+taken later than the left one.
+
+With depth z, a twist [v, w] moves the point (x, y, 1) z of the left camera so that its image moves
+as in Longuet-Higgins and Prazdny (Proc. R. Soc. B, 1980), eq. 2.9 to 2.11; the signs are those of
+points that move past a camera. In the right camera x is less by the baseline over z.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Camera
+from vslam.features import MIN_DISPARITY, shifted_columns
+from vslam.geometry import Matrix
+
+_ROUNDS = 3  # the speed depends on the disparity, and the disparity on the speed
+
+
+def rays(
+    xy: NDArray[np.float32], camera: Camera
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """``(N,)`` each: x and y at depth 1 in the left camera, of ``(N, 2)`` pixels."""
+    xy = xy.astype(np.float64)
+    return (xy[:, 0] - camera.cx) / camera.fx, (xy[:, 1] - camera.cy) / camera.fy
+
+
+def row_speeds(
+    x: NDArray[np.float64], y: NDArray[np.float64], inverse_depth: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """``(N, 6)`` derivatives of the row by the twist, in focal lengths; alike in both images."""
+    zero = np.zeros_like(x)
+    return np.column_stack([zero, inverse_depth, -y * inverse_depth, -1.0 - y * y, x * y, x])
+
+
+def column_speeds(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    inverse_depth: NDArray[np.float64],
+    baseline: float,
+) -> NDArray[np.float64]:
+    """The same of the column in the right image."""
+    zero, right = np.zeros_like(x), x - baseline * inverse_depth
+    return np.column_stack(
+        [inverse_depth, zero, -right * inverse_depth, -right * y, 1.0 + right * x, -y]
+    )
+
+
+def columns_without_delay(
+    xy: NDArray[np.float32],
+    u_right: NDArray[np.float32],
+    twist: Matrix,
+    delay: float,
+    camera: Camera,
+) -> NDArray[np.float32]:
+    """``(N,)`` columns in the right image as if it had been taken ``delay`` seconds earlier.
+
+    Args:
+        xy: ``(N, 2)`` in the left image.
+        u_right: ``(N,)``; NaN stays NaN.
+        twist: ``(6,)`` of the points against the camera, per second.
+    """
+    x, y = rays(xy, camera)
+    seen = xy[:, 0].astype(np.float64) - u_right
+    disparity = seen
+    for _ in range(_ROUNDS):
+        inverse_depth = np.maximum(disparity, MIN_DISPARITY) / camera.bf
+        speed = camera.fx * column_speeds(x, y, inverse_depth, camera.baseline) @ twist
+        disparity = seen + delay * speed
+    return shifted_columns(u_right, xy[:, 0], disparity - seen)

@@ -23,7 +23,8 @@ from vslam.image_motion import columns_without_delay, rays, row_speeds
 from vslam.kernels import inner_kernel, kernel
 
 EVERY = 8  # of that many features one is measured: they are a hundred an image
-ROUNDS = 3  # of Gauss-Newton
+ROUNDS = 3  # of Gauss-Newton, at most
+STILL = 0.05  # pixels; a smaller step ends them
 LARGEST = 3.0  # pixels of the feature's level: beyond, it is another thing
 HUBER_PX = 0.3
 NEWS = 0.25  # of the least delay: a change by which all is corrected once more
@@ -79,7 +80,7 @@ def _row_shift(image_l, image_r, x, y, dx, half):
     edge = half + 1
     if x < edge or y < edge or x + edge >= width or y + edge >= height:
         return np.nan
-    xx, xy, yy = 0.0, 0.0, 0.0
+    xx, xy, yy, sum_x, sum_y = 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(-half, half + 1):
         for k in range(-half, half + 1):
             gx = 0.5 * (float(image_l[y + j, x + k + 1]) - float(image_l[y + j, x + k - 1]))
@@ -87,6 +88,7 @@ def _row_shift(image_l, image_r, x, y, dx, half):
             xx += gx * gx
             xy += gx * gy
             yy += gy * gy
+            sum_x, sum_y = sum_x + gx, sum_y + gy
     determinant = xx * yy - xy * xy
     if determinant < 0.05 * xx * yy or determinant < 1.0:
         return np.nan
@@ -96,23 +98,22 @@ def _row_shift(image_l, image_r, x, y, dx, half):
         if x0 < half or y0 < half or x0 + half + 1 >= width or y0 + half + 1 >= height:
             return np.nan
         a, b = x + dx - x0, y + dy - y0
-        mean = 0.0
-        for j in range(-half, half + 1):
-            for k in range(-half, half + 1):
-                mean += _between(image_r, x0 + k, y0 + j, a, b) - float(image_l[y + j, x + k])
-        mean /= (2 * half + 1) ** 2
-        rx, ry = 0.0, 0.0
+        rx, ry, total = 0.0, 0.0, 0.0
         for j in range(-half, half + 1):
             for k in range(-half, half + 1):
                 gx = 0.5 * (float(image_l[y + j, x + k + 1]) - float(image_l[y + j, x + k - 1]))
                 gy = 0.5 * (float(image_l[y + j + 1, x + k]) - float(image_l[y + j - 1, x + k]))
                 here = _between(image_r, x0 + k, y0 + j, a, b) - float(image_l[y + j, x + k])
-                rx += gx * (here - mean)
-                ry += gy * (here - mean)
-        dx -= (yy * rx - xy * ry) / determinant
-        dy -= (xx * ry - xy * rx) / determinant
+                rx, ry, total = rx + gx * here, ry + gy * here, total + here
+        # One side may be brighter.
+        mean = total / (2 * half + 1) ** 2
+        rx, ry = rx - mean * sum_x, ry - mean * sum_y
+        step_x, step_y = (yy * rx - xy * ry) / determinant, (xx * ry - xy * rx) / determinant
+        dx, dy = dx - step_x, dy - step_y
         if abs(dy) > LARGEST:
             return np.nan
+        if abs(step_x) + abs(step_y) < STILL:
+            break
     return dy
 
 

@@ -22,8 +22,8 @@ def rays(
     xy: NDArray[np.float32], camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """``(N,)`` each: x and y at depth 1 in the left camera, of ``(N, 2)`` pixels."""
-    xy = xy.astype(np.float64)
-    return (xy[:, 0] - camera.cx) / camera.fx, (xy[:, 1] - camera.cy) / camera.fy
+    u, v = xy.astype(np.float64).T
+    return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
 
 
 def row_speeds(

@@ -16,7 +16,7 @@ from vslam.report.schema import ReportJson
 from vslam.run.outcome import alignment_of
 from vslam.trajectory import Trajectory, read_trajectory
 
-_MONOCULAR = ", mono"  # ends the name of a monocular system
+MONOCULAR = ", mono"  # ends the name of a monocular system
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
     parts = [f"frames from {report.start}"] if report.start else []
     parts += [f"every {report.every}"] if report.every > 1 else []
     parts += [f"{report.max_frames} frames"] if report.max_frames else []
-    detector = report.detector + (_MONOCULAR if report.sensor == "mono" else "")
+    detector = report.detector + (MONOCULAR if report.sensor == "mono" else "")
     sequence, town = report.sequence, None
     laws: list[str] = []
     if report.dataset == "synthetic":
@@ -217,7 +217,7 @@ def _alignment_of_external(system: str, drive: Drive, found: Found) -> str:
     there = {run.alignment for run in found.runs if run.drive.place == drive.place}
     if len(there) == 1:
         return there.pop()
-    return alignment_of("mono" if system.endswith(_MONOCULAR) else "stereo")
+    return alignment_of("mono" if system.endswith(MONOCULAR) else "stereo")
 
 
 def _truth(found: Found, drive: Drive) -> Trajectory | None:

@@ -342,6 +342,15 @@ def test_changes_of_a_rendered_town_are_perturbations(run_folder: Path, tmp_path
     assert list(strengths(drives, "change").values()) == [0.0, 0.5]
 
 
+def test_a_drive_with_a_name_of_its_own_keeps_it(run_folder: Path, tmp_path: Path):
+    for name in ("night", "night+moving:2"):
+        copy_run(run_folder, tmp_path / name, dataset="synthetic", sequence=name, perturb="none")
+    runs = collect([tmp_path], []).runs
+    assert [(run.drive.sequence, run.drive.perturb, run.town) for run in runs] == [
+        ("night", "none", 1), ("night", "moving:2", 1),
+    ]  # fmt: skip
+
+
 def test_towns_of_other_seeds_are_put_together_as_seeds_are(run_folder: Path, tmp_path: Path):
     for town, ate in (("05+change:0.5", 1.0), ("05+change:0.5+seed:1", 2.0), ("05+seed:2", 4.0)):
         copy_run(

@@ -137,9 +137,9 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
         from vslam.datasets.synthetic import parse_drive  # and with it the renderer
 
         # What changes a rendered town is a perturbation, too: 05+change:0.5 is the route 05.
-        laws = [part for part in sequence.split("+")[1:] if not part.startswith("seed:")]
-        sequence, variation = parse_drive(sequence)
-        town = variation.seed
+        town = parse_drive(sequence)[1].seed
+        sequence, *parts_of_town = sequence.split("+")
+        laws = [part for part in parts_of_town if not part.startswith("seed:")]
     if report.perturb != "none":
         laws.append(report.perturb)
     return RunEntry(

@@ -15,6 +15,7 @@ import pytest
 from browser import chromium, dumped
 
 from vslam.cli import main as cli
+from vslam.cli.tables import show_tables, table_lines
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.overview import write_overview
@@ -261,13 +262,13 @@ def test_a_row_for_each_sequence_and_condition_and_who_wins_over_all(two_conditi
     (table,) = versus(summarize(Found(two_conditions, [])))
     assert table.title == "both against bow"
     assert len(table.rows) == 12
-    row = dict(zip(table.head[:7], table.rows[3], strict=False))
-    assert row == {
-        "sequence": "01", "perturbation": "brightness:1", "runs": "2", "lost, bow": "0.5",
-        "lost, both": "0.5", "ATE (m), bow": "2.100", "ATE (m), both": "1.500",
-    }  # fmt: skip
-    assert table.rows[3][7:] == ("-0.600", "0.0200", "0.0200", "tie", "0/1/0", "1/0/0")
-    assert table.rows[2][7] == "tie"  # without brightness
+    assert list(zip(table.head, table.rows[3], strict=True)) == [
+        ("sequence", "01"), ("perturbation", "brightness:1"), ("lost, bow", "0.5"),
+        ("lost, both", "0.5"), ("ATE (m), bow", "2.100"), ("ATE (m), both", "1.500"),
+        ("diff.", "-0.600"), ("RPE (mm), bow", "20.0"), ("RPE (mm), both", "20.0"),
+        ("diff.", "tie"), ("loops, bow", "0/1/0"), ("loops, both", "1/0/0"),
+    ]  # fmt: skip
+    assert table.rows[2][6] == "tie"  # without brightness
     lost, found, ate, rpe = table.points
     assert lost == "Lost frames: bow 6 in 18 runs, both 6 in 18 runs."
     assert found.endswith("bow 6 / 12 / 0, both 18 / 0 / 0.")
@@ -276,6 +277,23 @@ def test_a_row_for_each_sequence_and_condition_and_who_wins_over_all(two_conditi
     assert "median -0.375 m (-0.500 to -0.250)" in ate
     assert "p = 0.0312" in ate
     assert rpe.startswith("RPE over all conditions: a tie. Of 6 sequences, no difference on 6 (00")
+
+
+def test_the_table_of_a_short_name_fits_a_terminal_of_80_columns(two_conditions, capsys):
+    found = versus(summarize(Found(two_conditions, [])))
+    lines = list(table_lines(found[0]))
+    assert max(map(len, lines)) <= 80
+    assert lines[2].split() == [
+        "sequence", "perturbation", "bow", "both", "bow", "both", "diff.", "bow", "both", "diff.",
+        "bow", "both",
+    ]  # fmt: skip
+    for head in lines[:3]:  # numbers and their headings end in one column
+        ends = {match.end() for match in re.finditer(r"\S+", lines[4])}
+        assert {match.end() for match in re.finditer(r"\S+", head[22:])} <= {e - 22 for e in ends}
+    show_tables(found)
+    printed = capsys.readouterr().out
+    assert "\n".join(lines) in printed
+    assert "- RPE over all conditions: a tie." in printed
 
 
 def test_one_condition_is_not_called_all(two_conditions):
@@ -318,9 +336,9 @@ def test_what_a_run_does_not_have_is_not_made_up():
     ]
     (table,) = versus(summarize(Found(runs, [])))
     assert table.rows[0][2:] == (
-        "1", "0", "n/a", "n/a", "1.000", "n/a", "0.0200", "n/a", "n/a", "1/0/0", "n/a",
+        "0", "n/a", "n/a", "1.000", "n/a", "20.0", "n/a", "n/a", "1/0/0", "n/a",
     )  # fmt: skip
-    assert table.rows[1][2:5] == ("1, 0", "n/a", "n/a")
+    assert table.rows[1][2:5] == ("n/a", "n/a", "1.000")
     assert table.points[0] == "Lost frames: bow 0 in 1 run, both n/a in 1 run."
     assert len(table.points) == 2  # nothing to compare
 

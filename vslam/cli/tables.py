@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 import sys
-from collections.abc import Iterable
+import textwrap
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
+
+import typer
 
 if TYPE_CHECKING:
     from vslam.report.page import Table
@@ -13,25 +18,34 @@ if TYPE_CHECKING:
 def show_tables(tables: Iterable[Table]) -> None:
     """Print tables on stdout, each with its title above, its note and its points below.
 
-    A comma in a heading breaks its line. A terminal folds what is too wide for it; a file or a
-    pipe gets whole lines.
+    Sentences are folded at the width of a terminal, lines of a table never: a number that is torn
+    apart cannot be read.
     """
-    from rich import box, table
-    from rich.console import Console
-    from rich.markup import escape
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 1000
+    for table in tables:
+        typer.echo(f"\n{table.title}\n")
+        for line in table_lines(table):
+            typer.echo(line)
+        typer.echo()
+        for sentence in filter(None, (table.note, *(f"- {point}" for point in table.points))):
+            indent = "  " if sentence.startswith("- ") else ""
+            typer.echo(textwrap.fill(sentence, width, subsequent_indent=indent))
 
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 1000)
-    for found in tables:
-        console.print(f"\n[b]{escape(found.title)}[/b]\n")
-        grid = table.Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-        for name in found.head:
-            text = name in found.texts
-            grid.add_column(
-                escape(name.replace(", ", "\n")), justify="left" if text else "right",
-                vertical="bottom", overflow="fold", header_style="",
-            )  # fmt: skip
-        for row in found.rows:
-            grid.add_row(*map(escape, row))
-        console.print(grid)
-        for line in filter(None, (found.note, *(f"- {point}" for point in found.points))):
-            console.print(escape(line))
+
+def table_lines(table: Table) -> Iterator[str]:
+    """The lines of a table in columns; headings are broken at their commas and brackets."""
+    broken = [re.split(r", | (?=\()", name) for name in table.head]
+    height = max(map(len, broken))
+    head = list(zip(*([""] * (height - len(lines)) + lines for lines in broken), strict=True))
+    widths = [max(map(len, column)) for column in zip(*head, *table.rows, strict=True)]
+
+    def line(cells: tuple[str, ...]) -> str:
+        columns = zip(table.head, cells, widths, strict=True)
+        return " ".join(
+            cell.ljust(width) if name in table.texts else cell.rjust(width)
+            for name, cell, width in columns
+        ).rstrip()
+
+    yield from map(line, head)
+    yield "-" * (sum(widths) + len(widths) - 1)
+    yield from map(line, table.rows)

@@ -11,6 +11,7 @@ import statistics
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from itertools import combinations
+from typing import NamedTuple
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.weights import NETWORKS
@@ -18,7 +19,6 @@ from vslam.machine import versions
 from vslam.overview.collect import MONOCULAR, Found
 from vslam.overview.schema import (
     ALL,
-    DECIMALS,
     MEASURES,
     Comparison,
     Drive,
@@ -31,7 +31,22 @@ from vslam.overview.schema import (
 
 ALPHA = 0.05
 _KNOWN = ("none", "bow", *NETWORKS, "both")
-_COMPARED = {"ate_rmse_m": "ATE", "rpe_m": "RPE"}
+
+
+class Shown(NamedTuple):
+    """How a compared error is written: ``scale`` times the metres of the measure."""
+
+    title: str
+    unit: str
+    scale: float
+    decimals: int
+
+    def text(self, metres: float, sign: str = "") -> str:
+        """The figure without its unit; ``sign`` is ``+`` for differences."""
+        return f"{self.scale * metres:{sign}.{self.decimals}f}"
+
+
+COMPARED = {"ate_rmse_m": Shown("ATE", "m", 1.0, 3), "rpe_m": Shown("RPE", "mm", 1e3, 1)}
 
 
 def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
@@ -51,7 +66,7 @@ def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
     laws = list(dict.fromkeys(row.drive.perturb for row in rows))
     compared: list[Comparison] = []
     for first, second in combinations(names, 2):
-        for measure in _COMPARED:
+        for measure in COMPARED:
             under = [compare(rows, first, second, law, measure) for law in laws]
             compared += (known := [one for one in under if one is not None])
             if len(known) > 1 and (all_ := compare(rows, first, second, ALL, measure)) is not None:
@@ -179,7 +194,8 @@ def compare(
 
 def is_tie(difference: float, measure: str) -> bool:
     """Whether two systems differ by at most half of the last digit that is printed."""
-    return abs(difference) <= 0.5 * 10.0 ** -DECIMALS[measure]
+    shown = COMPARED[measure]
+    return shown.scale * abs(difference) <= 0.5 * 10.0**-shown.decimals
 
 
 def strengths(drives: Iterable[Drive], law: str) -> dict[Drive, float]:
@@ -216,7 +232,8 @@ def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
     def named(some: list[Pair]) -> str:
         return ", ".join(pair.drive.place for pair in some)
 
-    first, second, what = found.first, found.second, _COMPARED[found.measure]
+    first, second, shown = found.first, found.second, COMPARED[found.measure]
+    what = shown.title
     light = {"none": ", images as they are", ALL: " over all conditions"}.get(
         found.perturb, f", {found.perturb}"
     )
@@ -235,10 +252,11 @@ def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
     text += "; ".join(counts) + ". "
     if not untied:
         return text.rstrip()
-    digits = DECIMALS[found.measure]
     differences = sorted(pair.difference for pair in found.pairs)
-    text += f"{second} minus {first}: median {found.median_difference:+.{digits}f} m"
-    text += f" ({differences[0]:+.{digits}f} to {differences[-1]:+.{digits}f}). " if n > 1 else ". "
+    least, greatest = (shown.text(differences[k], "+") for k in (0, -1))
+    median = shown.text(found.median_difference, "+")
+    text += f"{second} minus {first}: median {median} {shown.unit}"
+    text += f" ({least} to {greatest}). " if n > 1 else ". "
     if found.p_value is None:
         return text + (
             f"Too few sequences differ ({untied}) for Wilcoxon's test, which takes {least_pairs()} "

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from vslam.overview.schema import DECIMALS, Drive, OverviewJson, Row, Spread
-from vslam.overview.summary import is_tie
+from vslam.overview.schema import Drive, OverviewJson, Row, Spread
+from vslam.overview.summary import COMPARED, is_tie
 from vslam.report.page import Table
 
 _TEXTS = ("sequence", "perturbation")
-_ERRORS = {"ate_rmse_m": "ATE (m)", "rpe_m": "RPE (m)"}
 _LOOPS = ("loops_found", "loops_missed", "loops_wrong")
 _NOTE = "Medians over runs. Lost: frames. Loops: found / missed / wrong."
 
@@ -54,13 +53,14 @@ def _pairs(names: list[str], rows: dict[str, dict[Key, Row]]) -> Iterator[tuple[
 
 def _table(report: OverviewJson, rows: dict[str, dict[Key, Row]], names: tuple[str, ...]) -> Table:
     pair = len(names) == 2
-    head = [*_TEXTS, "runs", *(f"lost, {name}" for name in names)]
-    for title in _ERRORS.values():
-        head += [*(f"{title}, {name}" for name in names), *(["difference"] if pair else [])]
+    head = [*_TEXTS, *(f"lost, {name}" for name in names)]
+    for shown in COMPARED.values():
+        title = f"{shown.title} ({shown.unit})"
+        head += [*(f"{title}, {name}" for name in names), *(["diff."] if pair else [])]
     head += [f"loops, {name}" for name in names]
     order = {(row.drive, row.alignment): None for row in report.rows if row.system in names}
     lines = [_line(key, [rows[name].get(key) for name in names]) for key in order]
-    note = f"{_NOTE} Difference: {names[1]} minus {names[0]}." if pair else _NOTE
+    note = f"{_NOTE} Differences: {names[1]} minus {names[0]}." if pair else _NOTE
     points = tuple(_points(report, rows, names))
     title = f"{names[1]} against {names[0]}" if pair else names[0]
     return Table(title, tuple(head), lines, _TEXTS, note, points=points)
@@ -69,12 +69,11 @@ def _table(report: OverviewJson, rows: dict[str, dict[Key, Row]], names: tuple[s
 def _line(key: Key, rows: list[Row | None]) -> tuple[str, ...]:
     drive, _ = key
     spreads = [row.measures if row else {} for row in rows]
-    counts = [str(row.runs) if row else "0" for row in rows]
-    cells = [drive.place, drive.perturb, ", ".join(dict.fromkeys(counts))]
+    cells = [drive.place, drive.perturb]
     cells += [median_text(each.get("lost_frames"), 0) for each in spreads]
-    for measure in _ERRORS:
+    for measure, shown in COMPARED.items():
         found = [each.get(measure) for each in spreads]
-        cells += [median_text(spread, DECIMALS[measure]) for spread in found]
+        cells += ["n/a" if spread is None else shown.text(spread.median) for spread in found]
         if len(rows) == 2:
             cells.append(_difference(found[0], found[1], measure))
     for each in spreads:
@@ -87,7 +86,7 @@ def _difference(first: Spread | None, second: Spread | None, measure: str) -> st
     if first is None or second is None:
         return "n/a"
     difference = second.median - first.median
-    return "tie" if is_tie(difference, measure) else f"{difference:+.{DECIMALS[measure]}f}"
+    return "tie" if is_tie(difference, measure) else COMPARED[measure].text(difference, "+")
 
 
 def _points(
@@ -117,7 +116,7 @@ def _points(
     yield f"Lost frames: {', '.join(lost)}."
     loops = (f"{name} {' / '.join(total(name, loop) for loop in _LOOPS)}" for name in names)
     yield f"Loops found / missed / wrong in these runs: {', '.join(loops)}."
-    for measure in _ERRORS:
+    for measure in COMPARED:
         found = [
             one
             for one in report.comparisons

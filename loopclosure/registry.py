@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 DETECTORS = ("none", "bow", "both", *NETWORKS)
 DEFAULT_DETECTOR = "both"
+# Detectors whose candidates learned descriptors verify, too, unless the configuration says more.
+LEARNED_VERIFICATION = ("both", *NETWORKS)
 
 
 def require_detector(name: str, weights: Path | None = None, option: str = "--detector") -> None:
@@ -107,14 +109,16 @@ def create_detector(
 
 
 def create_images(name: str, config: Config) -> KeyframeImages | None:
-    """What keeps the images that learned descriptors verify a detector's candidates with; None for
-    a detector that does without a network, one of another package too, or where the configuration
-    switches it off.
+    """What keeps the images that learned descriptors rate and verify candidates with; None where
+    ORB alone verifies them (``verification.descriptors``).
 
     Raises:
         InputError: the network cannot be read.
     """
-    if name not in ("both", *NETWORKS) or config.learned.max_candidates == 0:
+    descriptors = config.verification.descriptors
+    if descriptors == "usual":
+        descriptors = "both" if name in LEARNED_VERIFICATION else "orb"
+    if name == "none" or descriptors == "orb":
         return None
     from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
 

@@ -54,7 +54,7 @@ CARRIED_FROM, CARRIED_TO = 60.0, 90.0
 CARRIED = [*ROUND[:60], *ROUND[90:]]
 
 
-def run(ring, frames, detector=None, *, threads=1, dark=(), finish=True, config=None):
+def run(ring, frames, detector="none", *, threads=1, dark=(), finish=True, config=None):
     """Drive along ``frames`` of the ring, ten a second; ``dark`` ones show nothing."""
     slam = Slam(CAMERA, config, detector, threads=threads)
     results = []

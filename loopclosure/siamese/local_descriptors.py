@@ -21,7 +21,7 @@ WIDTH = 640  # pixels of the image that the network reads; docs/loops.md has oth
 GLANCE_WIDTH = 320  # of a first look
 _QUALITY = 90  # of the JPEG files of keyframes in memory
 _JPEG = b"\xff\xd8"
-_KEPT = 6  # descriptor maps, the latest used
+_KEPT = 4  # descriptor maps, the latest used
 
 
 class LocalDescriptors:

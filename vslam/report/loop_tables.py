@@ -77,8 +77,9 @@ def _closed(report: ReportJson) -> Table:
     ]
     head = (*_EVIDENCE, "pose", "moved", "time")
     note = (
-        "By: descriptors that the geometry comes from. Moved: the farthest way of a keyframe. "
-        "Pose: against the ground truth's."
+        "Proposed by: the detectors that found the place. Verified by: the descriptors whose "
+        "matches give the relative pose, ORB's or those that the network learned. Pose: compared "
+        "with the ground truth. Moved: the farthest that the correction moved a keyframe."
     )
     if len(closed) > _MAX_CLOSED:
         note += f" {len(closed) - _MAX_CLOSED} more are in report.json."
@@ -110,15 +111,15 @@ def _nearly(report: ReportJson) -> Table:
     return Table("Rejected with the most inliers", head, rows, ("pose", "reason"), folded=True)
 
 
-_EVIDENCE = ("frame", "earlier", "score", "by", "matches", "inliers")
+_EVIDENCE = ("frame", "earlier", "proposed by", "score", "verified by", "matches", "inliers")
 
 
 def _evidence(loop: LoopEntry) -> Row:
     query = "lost" if loop.query_frame is None else str(loop.query_frame)
     match = "before this run" if loop.match_frame is None else str(loop.match_frame)
     return (
-        query, match, f"{loop.score:.3f}", loop.matched_by, str(loop.matches),
-        str(loop.inliers),
+        query, match, loop.proposed_by.replace("+", " + "), f"{loop.score:.3f}", loop.matched_by,
+        str(loop.matches), str(loop.inliers),
     )  # fmt: skip
 
 

@@ -29,7 +29,8 @@ class LoopEntry(_Model):
     earlier drive. ``right`` says whether the relative pose found is the ground truth's, None where
     that cannot be said. ``moved_m`` is the farthest way that the correction moved a keyframe,
     ``correction_s`` its time; None if rejected. ``matched_by`` names the descriptors that the
-    relative pose comes from, ``orb`` or ``learned``.
+    relative pose comes from, ``orb`` or ``learned``, ``proposed_by`` the detector that found the
+    candidate, or several joined by ``+``.
     """
 
     query_frame: int | None
@@ -38,6 +39,7 @@ class LoopEntry(_Model):
     matches: int
     inliers: int
     matched_by: Literal["orb", "learned"] = "orb"
+    proposed_by: str = ""
     accepted: bool
     right: bool | None
     reason: str

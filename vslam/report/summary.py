@@ -178,6 +178,7 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
                 matches=edge.n_matches,
                 inliers=edge.n_inliers,
                 matched_by=edge.matched_by,
+                proposed_by=edge.proposed_by,
                 accepted=edge.accepted,
                 right=is_right,
                 reason=edge.reason,

@@ -500,7 +500,8 @@ def _path(T_wc: NDArray[np.float64], color: tuple[int, int, int]) -> Any:
 def _in_words(edge: LoopEdge, map_: Map) -> str:
     query = f"frame {map_.frames[edge.query]}" if edge.query >= 0 else "a lost frame"
     evidence = f"{edge.n_inliers} inliers of {edge.n_matches} matches"
-    return f"{query} to frame {map_.frames[edge.match]}: {edge.reason}, {evidence}"
+    by = f"proposed by {edge.proposed_by}, matched by {edge.matched_by} descriptors"
+    return f"{query} to frame {map_.frames[edge.match]}: {edge.reason}, {evidence}, {by}"
 
 
 def _half(xy: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -41,11 +41,6 @@ class MomentRecorder(NullRecorder):
         self.moments: list[Moment] = []
         self._every = 1
         self._n_keyframes = 0
-        self._n_frames = 0
-
-    def frame(self, result: TrackResult, T_wc: NDArray[np.float64]) -> None:
-        """See `vslam.run.recorder.Recorder.frame`."""
-        self._n_frames += 1
 
     def keyframe(
         self,
@@ -60,7 +55,7 @@ class MomentRecorder(NullRecorder):
                 self.moments = self.moments[::2]
                 self._every *= 2
             if self._n_keyframes % self._every == 0:
-                self.moments.append(_moment(self._n_frames - 1, image, features, tracked))
+                self.moments.append(_moment(result.index, image, features, tracked))
         self._n_keyframes += 1
 
 

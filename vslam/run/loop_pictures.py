@@ -31,8 +31,8 @@ _MOST_MATCHES = 60  # more lines hide the images
 _PANEL_WIDTH, _GUTTER = 640, 8  # pixels of a picture
 _PICTURE_QUALITY = 80
 _SUBPIXEL = 4  # OpenCV draws positions in 16ths of a pixel
-_WHITE, _INK, _GREEN = (255, 255, 255), (33, 23, 17), (129, 185, 16)  # BGR
-_LINE_OPACITY = 0.55
+_WHITE, _INK, _GREEN = (255, 255, 255), (33, 23, 17), (153, 211, 52)  # BGR
+_LINE_OPACITY = 0.35
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def draw_picture(picture: LoopPicture) -> bytes:
         cv2.line(lines, a, b, _GREEN, 1, cv2.LINE_AA, _SUBPIXEL)
     canvas = cv2.addWeighted(lines, _LINE_OPACITY, canvas, 1.0 - _LINE_OPACITY, 0.0)
     for point in (point for pair in pairs for point in pair):
-        cv2.circle(canvas, point, 4 << _SUBPIXEL, _INK, -1, cv2.LINE_AA, _SUBPIXEL)
+        cv2.circle(canvas, point, 7 << (_SUBPIXEL - 1), _INK, -1, cv2.LINE_AA, _SUBPIXEL)
         cv2.circle(canvas, point, 5 << (_SUBPIXEL - 1), _GREEN, -1, cv2.LINE_AA, _SUBPIXEL)
     _label(canvas, f"frame {picture.match_frame}", 0)
     _label(canvas, f"frame {picture.query_frame}", _PANEL_WIDTH + _GUTTER)
@@ -180,11 +180,12 @@ def _small(xy: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _panel(jpeg: bytes) -> tuple[NDArray[np.uint8], float]:
     """A small image in the width of half a picture, and how many times larger it is there."""
-    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert image is not None
     scale = _PANEL_WIDTH / image.shape[1]
     size = _PANEL_WIDTH, max(1, round(scale * image.shape[0]))
-    return cv2.resize(image, size, interpolation=cv2.INTER_CUBIC).astype(np.uint8), scale
+    grey = cv2.resize(image, size, interpolation=cv2.INTER_CUBIC)
+    return cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR).astype(np.uint8, copy=False), scale
 
 
 def _label(canvas: NDArray[np.uint8], text: str, left: int) -> None:

@@ -44,12 +44,9 @@ def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Se
         report: of the run.
         pictures: of its closed loops, as far as both images are kept.
     """
-    of_frames = {(picture.query_frame, picture.match_frame): picture for picture in pictures}
-    shown = [
-        (loop, of_frames[loop.query_frame, loop.match_frame])
-        for loop in report.loops
-        if loop.accepted and (loop.query_frame, loop.match_frame) in of_frames
-    ]
+    closed = {(loop.query_frame, loop.match_frame): loop for loop in report.loops if loop.accepted}
+    of_loop = [(closed.get((one.query_frame, one.match_frame)), one) for one in pictures]
+    shown = [(loop, picture) for loop, picture in of_loop if loop is not None]
     if not shown:
         return []
     from vslam.run.loop_pictures import draw_picture

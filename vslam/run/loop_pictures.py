@@ -188,7 +188,7 @@ def _panel(jpeg: bytes) -> tuple[NDArray[np.uint8], float]:
     return cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR).astype(np.uint8, copy=False), scale
 
 
-def _label(canvas: NDArray[np.uint8], text: str, left: int) -> None:
+def _label(canvas: NDArray, text: str, left: int) -> None:
     """Write a text into the upper left corner of a panel."""
     font, size, margin = cv2.FONT_HERSHEY_SIMPLEX, 0.5, 7
     (width, height), _ = cv2.getTextSize(text, font, size, 1)
@@ -202,7 +202,7 @@ def _fixed(point: NDArray[np.float64]) -> tuple[int, int]:
     return x, y
 
 
-def _jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
+def _jpeg(image: NDArray, quality: int) -> bytes:
     # Colours at full resolution, or thin lines would lose theirs.
     options = [cv2.IMWRITE_JPEG_QUALITY, quality]
     options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]

@@ -242,9 +242,9 @@ def pipeline(monkeypatch) -> SimpleNamespace:
     monkeypatch.setattr(run_pipeline, "run_sequence", run_sequence)
     monkeypatch.setattr(run_pipeline, "begin", lambda camera, settings, saved=None: None)
     monkeypatch.setattr(recorder, "NullRecorder", lambda: "null")
-    monkeypatch.setattr(recorder, "RerunRecorder", str)
+    monkeypatch.setattr(recorder, "RerunRecorder", lambda target, pictures: str(target))
     monkeypatch.setattr(run_pipeline, "NullRecorder", lambda: "null")
-    monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[0])
+    monkeypatch.setattr(recorder, "SeveralRecorders", list)
     monkeypatch.setattr(figures, "draw_figures", draw_figures)
     monkeypatch.setattr(warmup, "is_cold", lambda: False)
     monkeypatch.setattr(warmup, "compile_kernels", lambda processes, load: None)
@@ -264,7 +264,7 @@ def test_run_writes_its_folder_and_a_summary(call, root, pipeline):
     assert folder.name.endswith("-kitti-00-blur0.5-bow")
     assert pipeline.settings.threads == 3
     assert pipeline.settings.perturb == "blur:0.5"
-    assert pipeline.recorder == str(Path("runs") / folder.name / "recording.rrd")
+    assert str(Path("runs") / folder.name / "recording.rrd") in pipeline.recorder
     assert pipeline.evaluation.ate_rmse_m < 1e-9
     assert len(read_kitti_poses(folder / "ground_truth_kitti.txt")) == 10
 
@@ -343,6 +343,13 @@ def test_a_monocular_run_says_that_its_scale_is_arbitrary(call, root, pipeline):
 
 def test_quiet_run_says_nothing(call, root, pipeline):
     assert call("run", "--data", root, "--max-frames", 10, "--no-record", "--quiet") == (0, "", "")
+    # What the page shows is kept; a file would be a string here.
+    assert not any(isinstance(one, str) for one in pipeline.recorder)
+
+
+def test_a_run_without_recording_and_report_keeps_no_images(call, root, pipeline):
+    words = ("--max-frames", 10, "--no-record", "--no-report")
+    assert call("run", "--data", root, *words)[0] == 0
     assert pipeline.recorder == "null"
 
 

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import vslam.run.loop_pictures
+import vslam.run.moments
 from vslam.camera import Camera
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.loops import LoopEdge
 from vslam.map import Map
 from vslam.map_kernels import link, link_many, merge_landmarks
-from vslam.run.loop_pictures import LoopPicture, LoopPictures, draw_picture, loop_matches, spread
+from vslam.run.loop_pictures import LoopPicture, draw_picture, loop_matches, spread
+from vslam.run.moments import LoopPictureRecorder
 
 CAMERA = Camera(100.0, 100.0, 100.0, 50.0, 0.5, 200, 100)
 MATCH, NEIGHBOUR, QUERY = 0, 1, 2
@@ -94,9 +95,9 @@ def result(frame: int) -> TrackResult:
     return TrackResult(frame, 0.1 * frame, np.eye(4), TrackingState.OK, 9, 9, 9, 9, True)
 
 
-def told(frames: list[int]) -> LoopPictures:
+def told(frames: list[int]) -> LoopPictureRecorder:
     """A recorder that has seen these keyframes, whose images are as bright as their number."""
-    pictures = LoopPictures()
+    pictures = LoopPictureRecorder()
     pictures.begin(CAMERA, None)
     for frame in frames:
         image = np.full((CAMERA.height, CAMERA.width), frame, np.uint8)
@@ -137,7 +138,7 @@ def test_there_is_no_picture_without_both_images(closed_map: Map) -> None:
 def test_a_long_run_keeps_new_images_and_some_of_the_old(
     closed_map: Map, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(vslam.run.loop_pictures, "_MOST_KEYFRAMES", 8)
+    monkeypatch.setattr(vslam.run.moments, "_MOST_LOOP_IMAGES", 8)
     pictures = told(list(range(41)))
     assert len(pictures._jpegs) <= 8
     assert {0, 40} <= set(pictures._jpegs)

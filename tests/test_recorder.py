@@ -19,7 +19,7 @@ from vslam.errors import InputError
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.loops import LoopEdge
 from vslam.map import Map
-from vslam.run.loop_pictures import LoopPictures
+from vslam.run.moments import LoopPictureRecorder
 from vslam.run.recorder import (
     NullRecorder,
     Recorder,
@@ -125,8 +125,8 @@ def rows(path: Path, entity: str) -> list[dict[str, Any]]:
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("run") / "recording.rrd"
-    pictures = LoopPictures()
-    record(SeveralRecorders((pictures, RerunRecorder(path, pictures))))
+    pictures = LoopPictureRecorder()
+    record(SeveralRecorders((pictures, RerunRecorder(path, pictures.pictures))))
     return path
 
 

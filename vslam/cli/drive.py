@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from vslam.datasets.sequence import Sequence
     from vslam.datasets.stream import Stream
     from vslam.run.autosave import Unfinished
-    from vslam.run.loop_pictures import LoopPictures
+    from vslam.run.moments import LoopPictureRecorder
     from vslam.run.options import RunOptions
     from vslam.run.outcome import RunSettings
     from vslam.run.recorder import Recorder, Viewer
@@ -58,8 +58,7 @@ def drive(
     from vslam.datasets.stream import count_expected
     from vslam.report.folder import write_results
     from vslam.run.autosave import FolderAutosave, remove_autosave
-    from vslam.run.loop_pictures import LoopPictures
-    from vslam.run.moments import MomentRecorder
+    from vslam.run.moments import LoopPictureRecorder, MomentRecorder
     from vslam.run.options import settings_of
     from vslam.run.pipeline import begin, run_sequence, with_comparison
 
@@ -70,7 +69,7 @@ def drive(
         slam = begin(source.camera, settings, None if unfinished is None else unfinished.map)
         viewer = _viewer(output, told)
         folder = resume or _new_folder(options, settings, out, lock)
-        moments, pictures = MomentRecorder(), LoopPictures()
+        moments, pictures = MomentRecorder(), LoopPictureRecorder()
         recorder = _recorder(folder, output, unfinished, viewer, moments, pictures)
         # When only localising there is nothing to save but the poses.
         period = 0.0 if options.localize else options.autosave
@@ -185,7 +184,7 @@ def _recorder(
     unfinished: Unfinished | None,
     viewer: Viewer | None,
     moments: Recorder,
-    pictures: LoopPictures,
+    pictures: LoopPictureRecorder,
 ) -> Recorder:
     """All that is to be told of the run: a file, a viewer, and what the report shows."""
     from vslam.run.recorder import NullRecorder, RerunRecorder, SeveralRecorders
@@ -195,11 +194,11 @@ def _recorder(
         name = "recording.rrd"
         if unfinished is not None:
             name = f"recording-from-{len(unfinished.progress.tracks)}.rrd"
-        recorders.append(RerunRecorder(folder / name, pictures))
+        recorders.append(RerunRecorder(folder / name, pictures.pictures))
     if viewer is not None:
-        recorders.append(RerunRecorder(viewer, pictures))
+        recorders.append(RerunRecorder(viewer, pictures.pictures))
     if output.pages:
         recorders.append(moments)
     if not recorders:
         return NullRecorder()
-    return SeveralRecorders((pictures, *recorders))  # the pictures first: others show them
+    return SeveralRecorders((pictures, *recorders))  # pictures first, since the others show them

@@ -15,11 +15,11 @@ import shutil
 import socket
 import sys
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol
+from typing import Any, Concatenate, ParamSpec, Protocol
 
 import cv2
 import numpy as np
@@ -31,10 +31,8 @@ from vslam.features import Features, TrackingState, TrackResult
 from vslam.geometry import inverses
 from vslam.loops import LoopEdge
 from vslam.map import Map
+from vslam.run.loop_pictures import LoopPicture, draw_picture
 from vslam.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from vslam.run.loop_pictures import LoopPictures
 
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")
@@ -287,13 +285,13 @@ class RerunRecorder:
     with a warning: its file may be cut off within a message. So is a viewer that has been closed.
     """
 
-    def __init__(self, target: Path | Viewer, pictures: LoopPictures | None = None) -> None:
+    def __init__(self, target: Path | Viewer, pictures: Sequence[LoopPicture] = ()) -> None:
         """Open a file, replacing an old recording, or send to a viewer; where that fails, warn and
         record nothing.
 
         Args:
-            pictures: of the closed loops, which are then recorded too. This recorder must be told
-                of keyframes and loops before the :class:`RerunRecorder` is.
+            pictures: of the loops that were closed. Those that another recorder has added, told of
+                loops before this one, are recorded.
         """
         import rerun as rr
 
@@ -458,9 +456,7 @@ class RerunRecorder:
         """The loops closed just now: if there are several, the last one stays in sight."""
         import rerun as rr
 
-        from vslam.run.loop_pictures import draw_picture
-
-        new = [] if self._pictures is None else self._pictures.pictures[self._n_pictures :]
+        new = self._pictures[self._n_pictures :]
         self._n_pictures += len(new)
         for picture in new:
             image = rr.EncodedImage(contents=draw_picture(picture), media_type="image/jpeg")

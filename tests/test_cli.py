@@ -23,6 +23,7 @@ from vslam.loops import LoopEdge
 from vslam.report import figures
 from vslam.run import pipeline as run_pipeline
 from vslam.run import recorder, warmup
+from vslam.run.moments import MomentRecorder
 from vslam.run.outcome import RunOutcome
 from vslam.trajectory import Trajectory, read_kitti_poses, write_kitti, write_tum
 
@@ -242,9 +243,9 @@ def pipeline(monkeypatch) -> SimpleNamespace:
     monkeypatch.setattr(run_pipeline, "run_sequence", run_sequence)
     monkeypatch.setattr(run_pipeline, "begin", lambda camera, settings, saved=None: None)
     monkeypatch.setattr(recorder, "NullRecorder", lambda: "null")
-    monkeypatch.setattr(recorder, "RerunRecorder", str)
+    monkeypatch.setattr(recorder, "RerunRecorder", lambda target, pictures: str(target))
     monkeypatch.setattr(run_pipeline, "NullRecorder", lambda: "null")
-    monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[0])
+    monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[1])
     monkeypatch.setattr(figures, "draw_figures", draw_figures)
     monkeypatch.setattr(warmup, "is_cold", lambda: False)
     monkeypatch.setattr(warmup, "compile_kernels", lambda processes, load: None)
@@ -343,6 +344,12 @@ def test_a_monocular_run_says_that_its_scale_is_arbitrary(call, root, pipeline):
 
 def test_quiet_run_says_nothing(call, root, pipeline):
     assert call("run", "--data", root, "--max-frames", 10, "--no-record", "--quiet") == (0, "", "")
+    assert isinstance(pipeline.recorder, MomentRecorder)  # for the page; a file would be a string
+
+
+def test_a_run_without_recording_and_report_keeps_no_images(call, root, pipeline):
+    words = ("--max-frames", 10, "--no-record", "--no-report")
+    assert call("run", "--data", root, *words)[0] == 0
     assert pipeline.recorder == "null"
 
 

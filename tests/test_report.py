@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+from base64 import b64decode
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -22,6 +24,7 @@ from vslam.report.render import headlines
 from vslam.report.schema import ReportJson
 from vslam.report.summary import summarize
 from vslam.report.trajectory_figures import loop_closing, top_view
+from vslam.run.loop_pictures import LoopPicture
 from vslam.run.outcome import RunOutcome, RunSettings, matched_ground_truth
 from vslam.trajectory import Trajectory, read_trajectory
 
@@ -408,6 +411,54 @@ def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) 
     assert [cell.strip() for cell in reasons[1].rsplit("|", 4)[1:4]] == ["1", "84", "1 of 1"]
     assert text.count("needed") <= 14
     assert "1 of 1 revisits found, 0 missed, 1 wrong, 300 candidates rejected" in text
+
+
+def test_closed_loops_are_shown_in_pictures(tmp_path: Path) -> None:
+    outcome = two_laps()
+    loops = [
+        replace(loop, matched_by="learned" if loop.query == 80 else "orb") for loop in outcome.loops
+    ]
+    outcome = replace(outcome, loops=loops)
+    grey = cv2.imencode(".jpg", np.full((50, 100), 90, np.uint8))[1].tobytes()
+    xy = np.array([[20.0, 20.0]])
+    rejected = (368, 116)
+    pictures = [
+        LoopPicture(query, match, grey, grey, xy, xy)
+        for query, match in ((264, 12), (320, 68), (360, 200), rejected)
+    ]
+    write_results(tmp_path, outcome, pictures=pictures)
+    # The wrong one first, then the one by learned descriptors; that of frame 400 has no picture.
+    names = ["loop-360-200.jpg", "loop-320-68.jpg", "loop-264-12.jpg"]
+    captions = [
+        "Frame 360 (right) was wrongly taken for the place of frame 200 (left): 84 matches agree; "
+        "verified by ORB descriptors.",
+        "Frame 320 (right) shows the place of frame 68 (left): 84 matches agree; "
+        "verified by learned descriptors.",
+        "Frame 264 (right) shows the place of frame 12 (left): 84 matches agree; "
+        "verified by ORB descriptors.",
+    ]
+    html, markdown = ((tmp_path / f"report.{kind}").read_text() for kind in ("html", "md"))
+    assert re.findall(r"<figcaption>(Frame .*)</figcaption>", html) == captions
+    assert re.findall(r"^Frame .*", markdown, re.MULTILINE) == captions
+    assert re.findall(r"\(figures/(.*)\)", markdown) == names
+    assert "3 of the 4 closed loops are shown." in html
+    files = [(tmp_path / "figures" / name).read_bytes() for name in names]
+    embedded = re.findall(r'<img src="data:image/jpeg;base64,([^"]*)"', html)
+    assert [b64decode(picture) for picture in embedded] == files
+    assert len(list((tmp_path / "figures").glob("*.jpg"))) == len(names)
+
+
+def test_a_report_shows_a_few_loops(tmp_path: Path) -> None:
+    outcome = two_laps()
+    grey = cv2.imencode(".jpg", np.full((50, 100), 90, np.uint8))[1].tobytes()
+    loops = [LoopEdge(query, 3, 0.7, True, "closed", 120, 84) for query in range(66, 86)]
+    pictures = [
+        LoopPicture(4 * loop.query, 12, grey, grey, np.zeros((0, 2)), np.zeros((0, 2)))
+        for loop in loops
+    ]
+    write_results(tmp_path, replace(outcome, loops=loops, corrections=[]), pictures=pictures)
+    assert len(list((tmp_path / "figures").glob("loop-*.jpg"))) == 6
+    assert "6 of the 20 closed loops are shown." in (tmp_path / "report.html").read_text()
 
 
 def test_missed_revisit_is_named(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from vslam.datasets.sequence import Sequence
     from vslam.datasets.stream import Stream
     from vslam.run.autosave import Unfinished
+    from vslam.run.moments import LoopPictureRecorder
     from vslam.run.options import RunOptions
     from vslam.run.outcome import RunSettings
     from vslam.run.recorder import Recorder, Viewer
@@ -57,7 +58,7 @@ def drive(
     from vslam.datasets.stream import count_expected
     from vslam.report.folder import write_results
     from vslam.run.autosave import FolderAutosave, remove_autosave
-    from vslam.run.moments import MomentRecorder
+    from vslam.run.moments import LoopPictureRecorder, MomentRecorder
     from vslam.run.options import settings_of
     from vslam.run.pipeline import begin, run_sequence, with_comparison
 
@@ -68,8 +69,8 @@ def drive(
         slam = begin(source.camera, settings, None if unfinished is None else unfinished.map)
         viewer = _viewer(output, told)
         folder = resume or _new_folder(options, settings, out, lock)
-        moments = MomentRecorder()
-        recorder = _recorder(folder, output, unfinished, viewer, moments)
+        moments, pictures = MomentRecorder(), LoopPictureRecorder()
+        recorder = _recorder(folder, output, unfinished, viewer, moments, pictures)
         # When only localising there is nothing to save but the poses.
         period = 0.0 if options.localize else options.autosave
         autosave = FolderAutosave(folder, period, f"{settings.dataset} {source.name}")
@@ -82,7 +83,7 @@ def drive(
             with told.progress_bar(count_expected(source)) as on_frame:
                 outcome = with_comparison(outcome, perturbation, on_frame=on_frame)
         report = write_results(
-            folder, outcome, moments.moments,
+            folder, outcome, moments.moments, pictures.pictures,
             pages=output.pages, ply=output.ply, map_file=options.save_map,
         )  # fmt: skip
         if not outcome.interrupted:
@@ -183,16 +184,21 @@ def _recorder(
     unfinished: Unfinished | None,
     viewer: Viewer | None,
     moments: Recorder,
+    pictures: LoopPictureRecorder,
 ) -> Recorder:
-    """All that is to be told of the run: a file, ``moments`` for the report, and a viewer."""
+    """All that is to be told of the run: a file, a viewer, and what the report shows."""
     from vslam.run.recorder import NullRecorder, RerunRecorder, SeveralRecorders
 
-    name = "recording.rrd"
-    if unfinished is not None:
-        name = f"recording-from-{len(unfinished.progress.tracks)}.rrd"
-    recorder: Recorder = RerunRecorder(folder / name) if output.record else NullRecorder()
-    if output.pages:
-        recorder = SeveralRecorders((recorder, moments))
+    recorders: list[Recorder] = []
+    if output.record:
+        name = "recording.rrd"
+        if unfinished is not None:
+            name = f"recording-from-{len(unfinished.progress.tracks)}.rrd"
+        recorders.append(RerunRecorder(folder / name, pictures.pictures))
     if viewer is not None:
-        recorder = SeveralRecorders((recorder, RerunRecorder(viewer)))
-    return recorder
+        recorders.append(RerunRecorder(viewer, pictures.pictures))
+    if output.pages:
+        recorders.append(moments)
+    if not recorders:
+        return NullRecorder()
+    return SeveralRecorders((pictures, *recorders))  # pictures first, since the others show them

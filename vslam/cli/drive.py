@@ -41,7 +41,6 @@ def drive(
     *,
     out: Path = Path(),
     resume: Path | None = None,
-    compare_loops: bool = False,
 ) -> None:
     """Open the images, run SLAM and write the results.
 
@@ -51,7 +50,7 @@ def drive(
     """
     told = console(shown=not output.quiet)
     kind, source, perturbation = _open(options, told)
-    _refuse_camera(source, resume, compare_loops=compare_loops)
+    _refuse_camera(source, resume)
 
     # Bad input has been refused by now; what follows takes a second to import.
     from vslam.cli.summary import print_summary
@@ -60,7 +59,7 @@ def drive(
     from vslam.run.autosave import FolderAutosave, remove_autosave
     from vslam.run.moments import LoopPictureRecorder, MomentRecorder
     from vslam.run.options import settings_of
-    from vslam.run.pipeline import begin, run_sequence, with_comparison
+    from vslam.run.pipeline import begin, run_sequence
 
     settings = settings_of(options, kind, source, perturbation.name)
     with ExitStack() as lock:
@@ -79,9 +78,6 @@ def drive(
                 source, perturbation, settings, recorder,
                 on_frame=on_frame, autosave=autosave, resume=unfinished, slam=slam,
             )  # fmt: skip
-        if compare_loops and not outcome.interrupted:
-            with told.progress_bar(count_expected(source)) as on_frame:
-                outcome = with_comparison(outcome, perturbation, on_frame=on_frame)
         report = write_results(
             folder, outcome, moments.moments, pictures.pictures,
             pages=output.pages, ply=output.ply, map_file=options.save_map,
@@ -116,12 +112,10 @@ def _open(options: RunOptions, told: Console) -> tuple[str, Sequence | Stream, P
     return kind, source, perturbation
 
 
-def _refuse_camera(source: Sequence | Stream, resume: Path | None, *, compare_loops: bool) -> None:
+def _refuse_camera(source: Sequence | Stream, resume: Path | None) -> None:
     """What a camera has shown is gone."""
     from vslam.datasets.stream import is_live
 
-    if is_live(source) and compare_loops:
-        raise InputError("--compare-loops: a camera cannot be seen twice; leave it out.")
     if is_live(source) and resume is not None:
         raise InputError(
             f"--resume {resume}: what a camera has shown is gone; go on in its map with "

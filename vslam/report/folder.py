@@ -42,8 +42,7 @@ def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, dete
         InputError: the folder cannot be created.
     """
     parts = [dataset, sequence, perturb.replace(":", "").replace(",", "+"), detector]
-    safe = [re.sub(r"[^A-Za-z0-9.+-]+", "_", part)[:_LONGEST_PART] for part in parts]
-    name = "-".join([f"{datetime.now():%Y%m%d-%H%M%S}", *safe])
+    name = "-".join([f"{datetime.now():%Y%m%d-%H%M%S}", *map(_safe, parts)])
     try:
         out.mkdir(parents=True, exist_ok=True)
         for number in count(1):
@@ -62,6 +61,11 @@ def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, dete
     return folder
 
 
+def _safe(part: str) -> str:
+    """A name as a part of a file name."""
+    return re.sub(r"[^A-Za-z0-9.+-]+", "_", part)[:_LONGEST_PART]
+
+
 def write_results(
     folder: Path,
     outcome: RunOutcome,
@@ -75,7 +79,8 @@ def write_results(
     """Evaluate a run, in any state of completion, and write all that is known of it.
 
     Files: ``trajectory_kitti.txt``, ``trajectory.tum``, ``trajectory_causal.tum`` (poses as they
-    were given at the time), ``ground_truth_kitti.txt``, ``config.json`` (read by ``--config``),
+    were given at the time), ``trajectory_<detector>.tum`` (of each one compared),
+    ``ground_truth_kitti.txt``, ``config.json`` (read by ``--config``),
     ``keyframes.tum``, ``frames.csv``, ``report.json``,
     ``report.md``, ``report.html`` (one file, no network request), ``figures/*.png``, ``map.npz``,
     ``map.ply``; what matters most comes first.
@@ -96,6 +101,9 @@ def write_results(
     write_trajectories(written, outcome)
     with written.file("trajectory_causal.tum") as file:
         write_tum(file, causal_trajectory(outcome))
+    for other in outcome.compared:
+        with written.file(f"trajectory_{_safe(other.settings.detector)}.tum") as file:
+            write_tum(file, other.trajectory)
     with written.file("keyframes.tum") as file:
         write_tum(file, outcome.keyframes)
     with written.file("frames.csv") as file:

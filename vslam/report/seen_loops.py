@@ -75,5 +75,6 @@ def _caption(loop: LoopEntry) -> str:
     shows = "was wrongly taken for" if wrong else "shows"
     return (
         f"Frame {loop.query_frame} (right) {shows} the place of frame {loop.match_frame} (left): "
-        f"{loop.inliers} matches agree; verified by {_DESCRIPTORS[loop.matched_by]}."
+        f"{loop.inliers} matches agree; proposed by {loop.proposed_by.replace('+', ' and ')}, "
+        f"verified by {_DESCRIPTORS[loop.matched_by]}."
     )

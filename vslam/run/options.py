@@ -43,6 +43,7 @@ class RunOptions(BaseModel):
     thresholds: Config = Config()
     map_file: Path | None = None
     localize: bool = False
+    compare: tuple[str, ...] = ()
     save_map: Path | None = None
     realtime: bool = False
     autosave: float = 60.0
@@ -74,6 +75,7 @@ def settings_of(
         calib=options.calib,
         map=options.map_file,
         localize=options.localize,
+        compare=options.compare,
     )
 
 

@@ -74,7 +74,7 @@ def run(cell: Cell, runs: Path) -> dict[str, Any]:
             command += ["--perturb", cell.perturb]
         if orb_alone:
             config = runs / "orb-alone.json"
-            config.write_text(json.dumps({"learned": {"max_candidates": 0}}))
+            config.write_text(json.dumps({"verification": {"descriptors": "orb"}}))
             command += ["--config", str(config)]
         subprocess.run([sys.executable, "-m", "vslam", *command], check=True)
         reports = sorted(folder.glob("*/report.json"))

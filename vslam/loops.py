@@ -148,10 +148,10 @@ class PerKeyframe:
 
     def select(self, keyframes: NDArray[np.int64]) -> PerKeyframe:
         """Those of ``(M,)`` keyframes, numbered anew; of keyframes not known here, nothing."""
-        known = np.minimum(keyframes, max(len(self) - 1, 0))
-        count = np.where(keyframes < len(self), np.diff(self.first, append=0)[known], 0)
-        first = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
-        return PerKeyframe(first, self.values[ranges(self.first[known], count)])
+        nothing = self.values[:0]
+        parts = [self.of(k) if k < len(self) else nothing for k in keyframes.tolist()]
+        first = np.cumsum([0, *map(len, parts)]).astype(np.int64)
+        return PerKeyframe(first, np.concatenate([nothing, *parts]))
 
     def followed_by(self, other: PerKeyframe) -> PerKeyframe:
         """Those of another map's keyframes appended."""

@@ -24,7 +24,7 @@ from vslam.features import TrackingState, TrackResult
 from vslam.frontend.sides import Sides
 from vslam.loopclosure.registry import detector_with_images, problem_of
 from vslam.loops import LoopCorrection, LoopEdge
-from vslam.machine import peak_memory_mb, process_age
+from vslam.machine import give_back_memory, peak_memory_mb, process_age
 from vslam.map import Map
 from vslam.maps.storage import made_with
 from vslam.run.autosave import NO_AUTOSAVE, Autosave, Unfinished
@@ -109,6 +109,7 @@ def run_sequence(
         for other in others:
             other.finish()
     seconds = main.seconds()
+    give_back_memory()  # results need room: a map is copied before it is written
     _tell_loops(recorder, slam, n_told)
     recorder.finish(slam.trajectory(), slam.map)
     ended = broken[0] if broken else None

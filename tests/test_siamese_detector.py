@@ -262,8 +262,8 @@ def test_the_network_sees_nothing_until_the_camera_may_be_back():
     assert restored.query(10, map_) == one.query(10, map_)
 
 
-def test_a_run_closes_with_a_learned_detector(kitti_tree, tmp_path):
-    """Random weights: places are found by similarity alone, and geometry has the last word."""
+def test_a_run_takes_the_weights_of_a_file(kitti_tree, tmp_path):
+    """With random weights places are found by similarity alone: geometry must refuse them."""
     path = tmp_path / "capsule.onnx"
     export_onnx(small_network(), path)
     settings = tmp_path / "config.json"

@@ -46,13 +46,19 @@ def problem_of(detector: LoopDetector) -> str | None:
 
 
 def detector_with_images(
-    name: str, config: Config, weights: Path | None = None, *, late: bool = True
+    name: str,
+    config: Config,
+    weights: Path | None = None,
+    *,
+    local_weights: Path | None = None,
+    late: bool = True,
 ) -> tuple[LoopDetector, KeyframeImages | None]:
     """A detector that remembers nothing yet, and where it keeps the images of keyframes for
     learned verification: both halves that :class:`vslam.slam.Slam` takes.
 
     Args:
         weights, late: as of :func:`create_detector`.
+        local_weights: of the local descriptors; None for those that vslam ships.
 
     Returns:
         The detector, and None in place of images where ORB alone verifies its candidates.
@@ -60,7 +66,7 @@ def detector_with_images(
     Raises:
         InputError, ValueError: as :func:`create_detector`.
     """
-    images = create_images(name, config)
+    images = create_images(name, config, local_weights)
     return create_detector(name, config, weights, images, late=late), images
 
 
@@ -108,7 +114,7 @@ def create_detector(
     raise ValueError(f"no loop detector {name!r}")
 
 
-def create_images(name: str, config: Config) -> KeyframeImages | None:
+def create_images(name: str, config: Config, weights: Path | None = None) -> KeyframeImages | None:
     """What keeps the images that learned descriptors rate and verify candidates with; None where
     ORB alone verifies them (``verification.descriptors``).
 
@@ -120,9 +126,13 @@ def create_images(name: str, config: Config) -> KeyframeImages | None:
         descriptors = "both" if name in LEARNED_VERIFICATION else "orb"
     if name == "none" or descriptors == "orb":
         return None
-    from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
+    from vslam.loopclosure.siamese.local_descriptors import (
+        SHIPPED_LOCAL,
+        KeyframeImages,
+        LocalDescriptors,
+    )
 
-    return KeyframeImages(LocalDescriptors())
+    return KeyframeImages(LocalDescriptors(weights or SHIPPED_LOCAL))
 
 
 def _network_of(name: str) -> str:

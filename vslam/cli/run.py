@@ -98,6 +98,12 @@ def run(
         Path | None,
         typer.Option(help="ONNX file of a learned detector ([b]vslam train[/b])."),
     ] = None,
+    local_weights: Annotated[
+        Path | None,
+        typer.Option(
+            help="ONNX file of the local descriptors that verify loops (docs/local_descriptors.md)."
+        ),
+    ] = None,
     sensor: Sensor = None,
     out: Annotated[Path, typer.Option(help="Where the folders of the runs go.")] = Path("runs"),
     config: Thresholds = None,
@@ -170,6 +176,8 @@ def run(
         if given is not None and given.name == "COMMANDLINE":
             raise InputError(f"{source}: --data says what to run on, too; leave one of them out.")
         data = source
+    if local_weights is not None and not local_weights.is_file():
+        raise InputError(f"--local-weights {local_weights}: no such file; name an .onnx file.")
     if localize and map_file is None:
         raise InputError("--localize: name the map to localise in with --map.")
     if localize and save_map is not None:
@@ -214,6 +222,7 @@ def run(
         threads=threads or min(available_cores(), 4),
         detector=detector,
         weights=weights,
+        local_weights=local_weights,
         sensor=sensor,
         thresholds=Config() if config is None else load_config(config),
         map_file=map_file,

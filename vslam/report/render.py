@@ -214,6 +214,8 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
     options = [(name, str(getattr(report, name))) for name in (*names, "every")]
     limit = "all" if report.max_frames is None else str(report.max_frames)
     weights = [("weights", str(report.weights))] if report.weights else []
+    if report.local_weights:
+        weights += [("local-weights", str(report.local_weights))]
     realtime = [("realtime", "yes")] if report.realtime else []
     compare = [("compare", ", ".join(report.compare))] if report.compare else []
     calib = [("calib", str(path)) for path in report.calib]

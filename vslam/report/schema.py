@@ -189,6 +189,7 @@ class ReportJson(_Model):
     every: int
     max_frames: int | None
     weights: Path | None = None
+    local_weights: Path | None = None
     realtime: bool = False
     calib: tuple[Path, ...] = ()
     map: Path | None = None

@@ -39,6 +39,7 @@ class RunSettings:
     max_frames: int | None
     config: Config
     weights: Path | None = None
+    local_weights: Path | None = None
     realtime: bool = False
     calib: tuple[Path, ...] = ()
     map: Path | None = None

@@ -307,7 +307,10 @@ def begin(camera: Camera, settings: RunSettings, saved: Path | None = None) -> S
     """
     config, threads = settings.config, settings.threads
     late = not settings.realtime  # then nothing is loaded while the camera drives
-    detector, images = detector_with_images(settings.detector, config, settings.weights, late=late)
+    detector, images = detector_with_images(
+        settings.detector, config, settings.weights,
+        local_weights=settings.local_weights, late=late,
+    )  # fmt: skip
     if saved is not None:
         return Slam.load(saved, config, detector, threads=threads, images=images, resume=True)
     if settings.map is None:

@@ -1,5 +1,5 @@
-"""Write docs/loops/night_runs.csv: short loops whose second pass is in another light or on the other
-lane, with every detector's candidates verified by ORB, by learned descriptors, or by both.
+"""Write docs/loops/night_runs.csv: short loops that are hard to close, with every detector's
+candidates verified by ORB, by learned descriptors, or by both.
 
     vslam synth block --seed 501 --change 1    # and so on, with other seeds and drives
     python tools/night_runs.py --runs FOLDER --seeds 501-516

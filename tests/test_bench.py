@@ -123,7 +123,7 @@ def test_a_run_counts_if_it_is_of_the_sensor_asked_for(stub, tmp_path, sensor, a
 
 @pytest.mark.parametrize(
     "change",
-    ['"schema_version": 4|"schema_version": 3', '"se3"|"se4"', "{|", "0|"],
+    ['"schema_version": 5|"schema_version": 4', '"se3"|"se4"', "{|", "0|"],
 )
 def test_a_report_of_another_schema_or_damaged_is_none(run_folder, tmp_path, change):
     old, new = change.split("|")

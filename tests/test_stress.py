@@ -43,7 +43,7 @@ def report_of(cell: Cell, **figures: object) -> ReportJson:
         "startup_s": 1.0, "peak_memory_mb": 300.0, "stage_ms": {}, "keyframes": 10,
         "landmarks": 1000, "submaps": 1, "loops_closed": 1, "loops_rejected": 0, "loops_found": 1,
         "loops_missed": 0, "loops_wrong": 0, "revisit_stretches": 1, "revisits": [], "loops": [],
-        "without_loops": None, "dataset": cell.dataset, "sequence": cell.sequence,
+        "dataset": cell.dataset, "sequence": cell.sequence,
         "perturb": cell.perturb, "detector": cell.detector, "sensor": "stereo", "seed": cell.seed,
         "threads": 1, "start": 0, "every": 1, "max_frames": cell.max_frames,
         "machine": Machine(cpu="x", cores=2, python="3", platform="x"), "versions": {},

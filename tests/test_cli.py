@@ -286,7 +286,7 @@ def test_run_writes_its_folder_and_a_summary(call, root, pipeline):
     assert "report.html" in out
     assert "10/10" in err
     folder = Path("runs/latest").resolve()
-    assert folder.name.endswith("-kitti-00-blur0.5-bow")
+    assert folder.name.endswith("-kitti-00-blur0.5-both")
     assert pipeline.settings.threads == 3
     assert pipeline.settings.perturb == "blur:0.5"
     assert pipeline.recorder == str(Path("runs") / folder.name / "recording.rrd")

@@ -34,9 +34,12 @@ pytest.importorskip("rerun.chunk", reason="this rerun cannot read recordings in 
 CAMERA = Camera(718.9, 718.9, 607.2, 185.2, 0.537, 1241, 376)
 FRAMES, FRAMES_PER_KEYFRAME, LANDMARKS_PER_KEYFRAME = 100, 3, 150
 
-REJECTED = LoopEdge(3, 0, 0.2, False, "too few inliers", 14, 7)
+REJECTED = LoopEdge(3, 0, 0.2, False, "too few inliers", 14, 7, proposed_by="bow")
 LOST = LoopEdge(-1, 2, 0.3, False, "too few matches", 8)
-CLOSED = LoopEdge(12, 1, 0.6, True, "closed", 90, 60, features=np.zeros(1, np.int32))
+CLOSED = LoopEdge(
+    12, 1, 0.6, True, "closed", 90, 60, features=np.zeros(1, np.int32), matched_by="learned",
+    proposed_by="bow+capsule",
+)  # fmt: skip
 LOOPS = {12: [REJECTED], 42: [REJECTED, CLOSED, LOST], 45: [CLOSED], 70: [LOST]}
 SHIFTED_AT = 60
 
@@ -198,9 +201,15 @@ def test_accepted_loops_stay_and_move_with_the_map(recording: Path) -> None:
 
 def test_loops_are_told_with_their_reasons(recording: Path) -> None:
     told = [row["TextLog:text"][0] for row in rows(recording, "state/loops")]
-    assert told[0] == "frame 9 to frame 0: too few inliers, 7 inliers of 14 matches"
+    assert told[0] == (
+        "frame 9 to frame 0: too few inliers, 7 inliers of 14 matches, "
+        "proposed by bow, matched by orb descriptors"
+    )
     assert any(text.startswith("a lost frame to frame 6: too few matches") for text in told)
-    assert told[-2] == "frame 36 to frame 3: closed, 60 inliers of 90 matches"
+    assert told[-2] == (
+        "frame 36 to frame 3: closed, 60 inliers of 90 matches, "
+        "proposed by bow+capsule, matched by learned descriptors"
+    )
 
 
 def test_a_closed_loop_shows_its_images_until_the_next_one(recording: Path) -> None:

@@ -159,7 +159,9 @@ def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
         T_wq, T_wm = (truth[keyframe_frames[k]] for k in (query, match))
         T_query_match = np.linalg.inv(T_wq) @ T_wm
         T_query_match[0, 3] += shift
-        return LoopEdge(query, match, 0.7, accepted, reason, 120, 84, T_query_match)
+        return LoopEdge(
+            query, match, 0.7, accepted, reason, 120, 84, T_query_match, proposed_by="bow"
+        )
 
     rejected = [
         LoopEdge(70 + k % 20, k % 9, 0.3, False, f"{k % 14} inliers, 20 needed | <b>", 40, k % 14)
@@ -451,7 +453,8 @@ def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) 
 def test_closed_loops_are_shown_in_pictures(tmp_path: Path) -> None:
     outcome = two_laps()
     loops = [
-        replace(loop, matched_by="learned" if loop.query == 80 else "orb") for loop in outcome.loops
+        replace(loop, matched_by="learned", proposed_by="bow+capsule") if loop.query == 80 else loop
+        for loop in outcome.loops
     ]
     outcome = replace(outcome, loops=loops)
     grey = cv2.imencode(".jpg", np.full((50, 100), 90, np.uint8))[1].tobytes()
@@ -466,11 +469,11 @@ def test_closed_loops_are_shown_in_pictures(tmp_path: Path) -> None:
     names = ["loop-360-200.jpg", "loop-320-68.jpg", "loop-264-12.jpg"]
     captions = [
         "Frame 360 (right) was wrongly taken for the place of frame 200 (left): 84 matches agree; "
-        "verified by ORB descriptors.",
+        "proposed by bow, verified by ORB descriptors.",
         "Frame 320 (right) shows the place of frame 68 (left): 84 matches agree; "
-        "verified by learned descriptors.",
+        "proposed by bow and capsule, verified by learned descriptors.",
         "Frame 264 (right) shows the place of frame 12 (left): 84 matches agree; "
-        "verified by ORB descriptors.",
+        "proposed by bow, verified by ORB descriptors.",
     ]
     html, markdown = ((tmp_path / f"report.{kind}").read_text() for kind in ("html", "md"))
     assert re.findall(r"<figcaption>(Frame .*)</figcaption>", html) == captions

@@ -467,7 +467,7 @@ rows = [f"1 0 0 {0.1 * (i % 3) + far * (i % 2)} 0 1 0 0 0 0 1 {i}" for i in k]
         ("--systems orbslam3", "--vocabulary"),
         ("--systems dso", "--systems dso: unknown"),
         ("--system x", "write NAME=COMMAND"),
-        ("--system bow={folder}{out}", "--system bow: a detector of this test has that name"),
+        ("--system both={folder}{out}", "--system both: a detector of this test has that name"),
         ("--preset kitti-c --baseline capsule", "--baseline capsule: not tested"),
     ],
 )

@@ -18,8 +18,21 @@ if TYPE_CHECKING:
 
 DETECTORS = ("none", "bow", "both", *NETWORKS)
 DEFAULT_DETECTOR = "both"
+_ABOUT = {
+    "none": "no loop closing",
+    "bow": "the bag of words",
+    "both": "the Siamese capsule network beside the bag of words",
+    "capsule": "the Siamese capsule network",
+    "capsule-pruned": "the Siamese capsule network, pruned",
+    "capsule-paper": "the Siamese capsule network as the paper describes it",
+}
 # Detectors whose candidates learned descriptors verify, too, unless the configuration says more.
 LEARNED_VERIFICATION = ("both", *NETWORKS)
+
+
+def about(name: str) -> str:
+    """What a detector is, in a few words; its name for all others."""
+    return _ABOUT.get(name, name)
 
 
 def require_detector(name: str, weights: Path | None = None, option: str = "--detector") -> None:

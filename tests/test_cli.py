@@ -309,7 +309,8 @@ def test_summary_counts_loops(call, root, with_detector):
     assert code == 0, err
     assert "loops          1 closed, 0 missed, 0 wrong, 2 candidates rejected\n" in out
     assert "99 landmarks in 2 sub-maps" in out
-    assert "detector" not in out
+    assert "detector       bow: the bag of words\n" in out
+    assert "detectors together" not in out
     (root / "poses" / "00.txt").unlink()
     _, out, _ = call("run", "--data", root, "--max-frames", 10, "--detector", "bow")
     assert "1 closed, 2 candidates rejected" in out

@@ -42,6 +42,7 @@ def error_rows(errors: Evaluation | ReportJson) -> Rows:
 
 def print_summary(report: ReportJson, folder: Path) -> None:
     """Print what matters of a run that is over; ``folder`` holds its results."""
+    from vslam.loopclosure.registry import about
     from vslam.report.render import advice
 
     evaluated = report.alignment is not None
@@ -59,6 +60,7 @@ def print_summary(report: ReportJson, folder: Path) -> None:
             *_latency(report),
             *([("evaluation", report.evaluation_remark)] if report.evaluation_remark else []),
             *(error_rows(report) if evaluated else []),
+            ("detector", f"{report.detector}: {about(report.detector)}"),
             ("loops", _loops(report)),
             ("speed", _speed(report)),
             ("map", f"{report.keyframes} keyframes, {report.landmarks} landmarks{submaps}"),

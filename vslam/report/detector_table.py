@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from vslam.loopclosure.registry import about
 from vslam.report.page import Row, Table
 from vslam.report.schema import ReportJson
 
@@ -48,7 +49,8 @@ def detector_table(report: ReportJson) -> Table:
         )
         for one in detectors
     ]
-    return Table("Detectors", head, rows, ("detector", *ended), _NOTE)
+    names = "; ".join(f"{one.detector}: {about(one.detector)}" for one in detectors)
+    return Table("Detectors", head, rows, ("detector", *ended), f"{names}. {_NOTE}")
 
 
 def left_out(report: ReportJson) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
+from vslam.loopclosure.registry import about
 from vslam.report.detector_table import detector_table
 from vslam.report.loop_tables import loop_tables
 from vslam.report.page import Table, markdown_table, render_page
@@ -139,6 +140,10 @@ def render_markdown(report: ReportJson, seen: Collection[SeenLoop] = ()) -> str:
         lines += ["", f"**Warning: {warning}**"]
     lines += ["", advice(report)] if advice(report) else []
     lines += _table(detector_table(report))
+    if seen:
+        lines += ["", "## Loops seen", "", seen_note(report, seen)]
+        for loop in seen:
+            lines += ["", f"![{loop.name}](figures/{loop.name})", "", loop.caption]
     if report.skipped_messages:
         lines += ["", "## Skipped frames", "", *(f"- {text}" for text in report.skipped_messages)]
     if report.evo_command:
@@ -146,10 +151,6 @@ def render_markdown(report: ReportJson, seen: Collection[SeenLoop] = ()) -> str:
     if report.stage_ms:
         lines += ["", "## Time per stage (ms)", ""]
         lines += markdown_table(("stage", "mean", "median", "p95", "p99"), stage_rows(report))
-    if seen:
-        lines += ["", "## Loops seen", "", seen_note(report, seen)]
-        for loop in seen:
-            lines += ["", f"![{loop.name}](figures/{loop.name})", "", loop.caption]
     for table in loop_tables(report):
         lines += _table(table)
     lines += ["", "## Run", "", *markdown_table(("", ""), option_rows(report))]
@@ -190,6 +191,7 @@ def render_html(
         seen=seen,
         seen_note=seen_note(report, seen),
         detector_table=detector_table(report),
+        about_detector=about(report.detector),
         loop_tables=loop_tables(report),
         options=option_rows(report),
         machine=machine_rows(report),

@@ -28,14 +28,14 @@ from vslam.report.schema import ReportJson
 OUT = Path(__file__).parent.parent / "docs" / "loops" / "night_runs.csv"
 DRIVES = ("block+change:1", "lane+change:0.9", "block+aliased")
 DETECTORS = ("both", "bow", "capsule")  # the first one is the run's, the others are compared
-VERIFIED_BY = ("both", "orb", "learned")
+VERIFIED_BY = ("usual", "both", "orb", "learned")  # of verification.descriptors
 COLUMNS = (
     "drive", "candidates", "verified_by", "seeds", "towns", "found", "missed", "wrong", "lost",
     "ate_median_m", "ate_max_m", "loops_by",
 )  # fmt: skip
 
 
-def run(drive: str, seed: int, verified_by: str, runs: Path) -> ReportJson:
+def run(drive: str, seed: int, verified_by: str, detectors: list[str], runs: Path) -> ReportJson:
     """The report of one comparison, which is made if it is not there."""
     folder = runs / f"{drive}-{seed}-{verified_by}".replace(":", "")
     if not (reports := sorted(folder.glob("*/report.json"))):
@@ -43,8 +43,8 @@ def run(drive: str, seed: int, verified_by: str, runs: Path) -> ReportJson:
         config.write_text(json.dumps({"verification": {"descriptors": verified_by}}))
         command = [
             sys.executable, "-m", "vslam", "run", "--dataset", "synthetic",
-            "--seq", f"{drive}+seed:{seed}", "--detector", DETECTORS[0],
-            "--compare", ",".join(DETECTORS[1:]), "--config", str(config),
+            "--seq", f"{drive}+seed:{seed}", "--detector", detectors[0],
+            "--compare", ",".join(detectors[1:]), "--config", str(config),
             "--quiet", "--no-report", "--no-record", "--out", str(folder),
         ]  # fmt: skip
         subprocess.run(command, check=True)
@@ -101,19 +101,21 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, required=True)
     parser.add_argument("--seeds", type=seeds_of, default=seeds_of("501-516"))
     parser.add_argument("--drives", default=",".join(DRIVES), help="default: %(default)s")
+    parser.add_argument("--detectors", default=",".join(DETECTORS), help="default: %(default)s")
     parser.add_argument("--verified-by", default=",".join(VERIFIED_BY), help="default: %(default)s")
     parser.add_argument("--out", type=Path, default=OUT)
     given = parser.parse_args()
     given.runs.mkdir(parents=True, exist_ok=True)
     drives, verified = given.drives.split(","), given.verified_by.split(",")
+    detectors = given.detectors.split(",")
     done: dict[tuple[str, str], dict[int, ReportJson]] = {}
     for seed in given.seeds:
         for drive in drives:
             if rendered(drive, seed):
                 for by in verified:
-                    report = run(drive, seed, by, given.runs)
+                    report = run(drive, seed, by, detectors, given.runs)
                     done.setdefault((drive, by), {})[seed] = report
-    rows = [row(d, name, by, reports) for (d, by), reports in done.items() for name in DETECTORS]
+    rows = [row(d, name, by, reports) for (d, by), reports in done.items() for name in detectors]
     rows.sort(key=lambda one: (drives.index(one["drive"]), one["candidates"], one["verified_by"]))
     with given.out.open("w", newline="") as file:
         table = csv.DictWriter(file, COLUMNS, lineterminator="\n")

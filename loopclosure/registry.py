@@ -11,7 +11,7 @@ from vslam.config import Config
 from vslam.errors import InputError
 from vslam.loopclosure.detector import LoopDetector, NoDetector
 from vslam.loopclosure.plugin_detector import PlugInDetector, open_plugin
-from vslam.loopclosure.siamese.weights import NETWORKS, find_weights
+from vslam.loopclosure.siamese.weights import NETWORKS, TO_THE_LETTER, find_weights
 
 if TYPE_CHECKING:
     from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
@@ -87,14 +87,16 @@ def create_detector(
 
 
 def create_images(name: str, config: Config) -> KeyframeImages | None:
-    """What keeps the images that learned descriptors verify a detector's candidates with; None for
-    a detector that does without a network, one of another package too, or where the configuration
-    switches it off.
+    """What keeps the images that learned descriptors verify a detector's candidates with.
+
+    None for detectors that verify by ORB alone: those without a network, those of other packages,
+    and ``capsule-paper``. None, too, where the configuration switches learned verification off.
 
     Raises:
         InputError: the network cannot be read.
     """
-    if name not in ("both", *NETWORKS) or config.learned.max_candidates == 0:
+    learned = name in ("both", *NETWORKS) and name != TO_THE_LETTER
+    if not learned or config.learned.max_candidates == 0:
         return None
     from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
 

@@ -87,7 +87,7 @@ def run(
     detector: Annotated[
         DetectorName | None,
         typer.Option(
-            help="Loop detector; [b]none[/b] for odometry only; those after capsule-pruned need "
+            help="Loop detector; [b]none[/b] for odometry only; those after capsule-paper need "
             "[b]--weights[/b].",
             show_default="bow, or that of --map",
         ),

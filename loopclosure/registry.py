@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 
 DETECTORS = ("none", "bow", "both", *NETWORKS)
+DEFAULT_DETECTOR = "both"
 
 
 def require_detector(name: str, weights: Path | None = None, option: str = "--detector") -> None:
@@ -40,6 +41,25 @@ def require_detector(name: str, weights: Path | None = None, option: str = "--de
 def problem_of(detector: LoopDetector) -> str | None:
     """What failed in a detector of another package, in one sentence; None if nothing did."""
     return detector.problem if isinstance(detector, PlugInDetector) else None
+
+
+def detector_with_images(
+    name: str, config: Config, weights: Path | None = None, *, late: bool = True
+) -> tuple[LoopDetector, KeyframeImages | None]:
+    """A detector that remembers nothing yet, and where it keeps the images of keyframes for
+    learned verification: both halves that :class:`vslam.slam.Slam` takes.
+
+    Args:
+        weights, late: as of :func:`create_detector`.
+
+    Returns:
+        The detector, and None in place of images where ORB alone verifies its candidates.
+
+    Raises:
+        InputError, ValueError: as :func:`create_detector`.
+    """
+    images = create_images(name, config)
+    return create_detector(name, config, weights, images, late=late), images
 
 
 def create_detector(

@@ -131,7 +131,7 @@ def test_a_live_camera_sets_the_pace_and_dropped_frames_are_let_go():
 
 def test_frames_that_were_dropped_are_not_lost(corridor, check_map):
     """Of seven frames four are dropped: tracking goes on, and their poses lie on the way."""
-    slam = Slam(corridor.camera, Config(orb=OrbConfig(n_features=800)), threads=1)
+    slam = Slam(corridor.camera, Config(orb=OrbConfig(n_features=800)), "none", threads=1)
     states = []
     for k in range(len(corridor.left)):
         if k % 7 in (2, 3, 5, 6):

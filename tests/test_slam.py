@@ -13,6 +13,7 @@ from vslam.config import Config, KeyframeConfig, MappingConfig, OrbConfig, Track
 from vslam.datasets.kitti import open_kitti
 from vslam.features import TrackResult
 from vslam.geometry import inverse, se3_log
+from vslam.loopclosure.detector import NoDetector
 from vslam.map import Map
 from vslam.map_kernels import detach_keyframe
 from vslam.slam import Slam
@@ -34,7 +35,7 @@ def run(
     skipped: Iterable[int] = (),
 ) -> tuple[Slam, list[TrackResult]]:
     """Track some frames, black or missing ones among them."""
-    slam = Slam(sequence.camera, config, threads=threads)
+    slam = Slam(sequence.camera, config, "none", threads=threads)
     results = []
     nothing = np.zeros_like(sequence.left[0])
     for k in range(len(sequence)) if frames is None else frames:
@@ -177,7 +178,7 @@ def test_dropping_dead_landmarks_changes_no_byte(corridor, config, dark, monkeyp
 
 
 def test_the_map_cannot_be_read_while_a_keyframe_is_mapped(corridor):
-    slam = Slam(corridor.camera, EAGER, threads=1)
+    slam = Slam(corridor.camera, EAGER, "none", threads=1)
     for k in range(2):
         slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
     assert slam.is_mapping
@@ -232,7 +233,7 @@ def test_a_black_frame_soon_after_a_keyframe_does_not_move_the_frame_before(corr
     """The merge falls on the frame behind the black one, on the black one, or before."""
     _, plain = run(corridor)
     keyframe = next(r.index for r in plain if r.is_keyframe and r.index > 10)
-    slam = Slam(corridor.camera, CONFIG, threads=1)
+    slam = Slam(corridor.camera, CONFIG, "none", threads=1)
     nothing = np.zeros_like(corridor.left[0])
     black = keyframe + 1 + after
     for k in range(black):
@@ -254,7 +255,7 @@ def test_lost_for_long_mapping_restarts_at_the_predicted_pose(corridor, check_ma
     # From frame 10 on the camera is elsewhere: the images of the corridor run backwards, upside
     # down, so that nothing can be recognised.
     frames = list(range(20))
-    slam = Slam(corridor.camera, config, threads=1)
+    slam = Slam(corridor.camera, config, "none", threads=1)
     results = []
     for k in frames:
         left, right = corridor.left[k], corridor.right[k]
@@ -359,7 +360,7 @@ def test_dropped_frames_do_not_disturb_the_prediction(corridor):
 def test_the_prediction_scales_with_the_time_passed(corridor):
     ends = {}
     for gap in (0.1, 0.2, 0.4):
-        slam = Slam(corridor.camera, CONFIG, threads=1)
+        slam = Slam(corridor.camera, CONFIG, "none", threads=1)
         for k in range(6):
             slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
         ends[gap] = slam.skip(corridor.timestamps[5] + gap).T_wc[2, 3]
@@ -370,7 +371,7 @@ def test_the_prediction_scales_with_the_time_passed(corridor):
 
 
 def test_a_stationary_camera_stays_and_does_not_grow_the_map(corridor):
-    slam = Slam(corridor.camera, CONFIG, threads=1)
+    slam = Slam(corridor.camera, CONFIG, "none", threads=1)
     for k in range(25):
         slam.step(corridor.left[0], corridor.right[0], 0.1 * k)
         if k == 12:
@@ -382,7 +383,7 @@ def test_a_stationary_camera_stays_and_does_not_grow_the_map(corridor):
 
 
 def test_a_stationary_camera_keeps_few_of_many_keyframes(corridor, check_map):
-    slam = Slam(corridor.camera, EAGER, threads=1)
+    slam = Slam(corridor.camera, EAGER, "none", threads=1)
     for k in range(15):
         slam.step(corridor.left[0], corridor.right[0], 0.1 * k)
     slam.finish()
@@ -393,7 +394,7 @@ def test_a_stationary_camera_keeps_few_of_many_keyframes(corridor, check_map):
 
 
 def test_refuses_images_of_another_size_and_time_that_stands_still(corridor):
-    slam = Slam(corridor.camera, CONFIG, threads=1)
+    slam = Slam(corridor.camera, CONFIG, "none", threads=1)
     with pytest.raises(ValueError, match="camera"):
         slam.step(corridor.left[0][:-1], corridor.right[0], 0.0)
     slam.step(corridor.left[0], corridor.right[0], 1.0)
@@ -440,3 +441,38 @@ def test_a_step_after_finish_goes_on(corridor):
             slam.finish()
     slam.finish()
     assert rmse(position_errors(slam, corridor)) < 0.06
+
+
+class Onlooker(NoDetector):
+    """Keeps the image of every keyframe that it is shown."""
+
+    def __init__(self) -> None:
+        self.images: list[np.ndarray] = []
+
+    def add(self, keyframe, image, features):
+        self.images.append(image)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_caller_may_write_the_next_images_into_the_same_arrays(corridor, threads):
+    """As every camera loop does: a detector in the mapping thread must still see the keyframe."""
+    onlooker = Onlooker()
+    slam = Slam(corridor.camera, EAGER, onlooker, threads=threads)
+    left, right = np.empty_like(corridor.left[0]), np.empty_like(corridor.right[0])
+    for k in range(12):
+        left[:], right[:] = corridor.left[k], corridor.right[k]
+        slam.step(left, right, corridor.timestamps[k])
+        left[:] = right[:] = 0
+    slam.finish()
+    assert len(onlooker.images) == len(slam.map.frames) > 3
+    for frame, image in zip(slam.map.frames, onlooker.images, strict=True):
+        np.testing.assert_array_equal(image, corridor.left[frame])
+
+
+def test_the_capsule_network_beside_the_bag_of_words_is_the_default(corridor):
+    assert Slam(corridor.camera).detector.name == "both"
+    assert Slam(corridor.camera.left_camera()).detector.name == "both"
+    assert Slam(corridor.camera, detector="bow").detector.name == "bow"
+    assert Slam(corridor.camera, detector="none").detector.name == "none"
+    with pytest.raises(ValueError, match="no loop detector 'bwo'"):
+        Slam(corridor.camera, detector="bwo")

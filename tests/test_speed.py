@@ -76,7 +76,7 @@ def test_a_frame_tracked(corridor):
     seldom = KeyframeConfig(max_interval_s=1e9, max_tracked_ratio=1e-6, min_tracked_close=0)
 
     def drive() -> None:
-        slam = Slam(corridor.camera, Config(keyframes=seldom), threads=1)
+        slam = Slam(corridor.camera, Config(keyframes=seldom), "none", threads=1)
         for k in range(len(features)):
             slam.step_features(features[k], corridor.timestamps[k], corridor.left[k], {})
 
@@ -90,7 +90,7 @@ def test_a_keyframe_mapped():
 
 def test_a_frame_tracked_and_mapped(corridor):
     def drive() -> None:
-        slam = Slam(corridor.camera, Config(), threads=1)
+        slam = Slam(corridor.camera, Config(), "none", threads=1)
         for k in range(len(corridor.left)):
             slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
         slam.finish()

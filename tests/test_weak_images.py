@@ -166,7 +166,7 @@ def test_nothing_is_made_of_nothing():
 
 def drive(corridor, change, config: Config) -> tuple[str, float]:
     """States, one letter a frame, and the largest error in metres."""
-    slam = Slam(corridor.camera, config, threads=1)
+    slam = Slam(corridor.camera, config, "none", threads=1)
     states = ""
     for k, (left, right) in enumerate(zip(corridor.left, corridor.right, strict=True)):
         sides = (change(image, 2 * k + side) for side, image in enumerate((left, right)))

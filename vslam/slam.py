@@ -40,9 +40,9 @@ from vslam.frontend.tracking import (
     track_motion,
 )
 from vslam.geometry import Matrix, inverse, inverses, orthonormalised, se3_exp, se3_log
-from vslam.loopclosure.detector import LoopDetector, NoDetector
+from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_verification import recognise
-from vslam.loopclosure.registry import create_detector, create_images
+from vslam.loopclosure.registry import DEFAULT_DETECTOR, detector_with_images
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map, local_map
@@ -81,7 +81,7 @@ class Slam:
         self,
         camera: Camera,
         config: Config | None = None,
-        detector: LoopDetector | None = None,
+        detector: LoopDetector | str = DEFAULT_DETECTOR,
         *,
         threads: int = 2,
         images: KeyframeImages | None = None,
@@ -93,10 +93,11 @@ class Slam:
         Args:
             camera: the rectified pair that the images come from, or ``camera.left_camera()``.
             config: thresholds; the defaults are those of the papers.
-            detector: finds loops and relocalises (``vslam.loopclosure.registry``); without one
-                there is odometry only.
-            images: keeps what learned descriptors verify loops with, where ORB's fail; None for
-                ORB alone.
+            detector: finds loops and relocalises: a name (``vslam.loopclosure.registry``; ``both``
+                is the capsule network beside the bag of words, ``none`` is odometry only) or an
+                object.
+            images: for a detector that is an object: where the images of keyframes are kept for
+                learned descriptors, which verify loops where ORB's fail; None for ORB alone.
             threads: with 1, mapping runs where it is merged instead of beside tracking. The
                 result is the same.
             start: a map to begin in, of the same camera, detector and pyramid; it becomes this
@@ -115,7 +116,9 @@ class Slam:
         self.context = TrackingContext.create(camera, self.config)
         self.frame: Frame | None = None
         self.side_delay = SideDelay(camera, self.config.stereo)
-        self._detector = detector or NoDetector()
+        if isinstance(detector, str):
+            detector, images = detector_with_images(detector, self.config)
+        self._detector = detector
         self._localize = localize
         self._drives: tuple[str, ...] = ()
         self.world: World | None = None
@@ -152,7 +155,7 @@ class Slam:
         cls,
         path: Path,
         config: Config | None = None,
-        detector: LoopDetector | None = None,
+        detector: LoopDetector | str | None = None,
         *,
         threads: int = 2,
         images: KeyframeImages | None = None,
@@ -162,7 +165,8 @@ class Slam:
         """Go on in a map that ``save`` or a run wrote.
 
         Args:
-            detector: like the one that the map was made with; None for just that, as it is shipped.
+            detector: like the one that the map was made with, a name or an object; None for just
+                that one, as it is shipped.
             config, threads, images, localize, resume: as for a new map.
 
         Raises:
@@ -171,13 +175,10 @@ class Slam:
         config = config or Config()
         stored = load_checkpoint(path) if resume else load_map(path)
         try:
-            if detector is None:
-                images = create_images(stored.detector.name, config)
-                detector = create_detector(stored.detector.name, config, None, images)
             return cls(
                 stored.camera,
                 config,
-                detector,
+                stored.detector.name if detector is None else detector,
                 threads=threads,
                 images=images,
                 start=stored,
@@ -305,6 +306,9 @@ class Slam:
         """Track one rectified stereo pair, an image with its depth, or a monocular image, and map
         it if it is new.
 
+        The images are the caller's: what is kept of them is copied, so that a camera may write the
+        next ones into the same arrays.
+
         Args:
             left: ``(H, W)`` uint8.
             second: the right image, uint8; with ``camera.depth`` the depth of the left image's
@@ -319,7 +323,7 @@ class Slam:
         start = time.perf_counter()
         features = extract_features(left, second, self.context)
         stage_ms = {"extract": 1e3 * (time.perf_counter() - start)}
-        image = np.asarray(second, np.uint8) if features.from_right else left
+        image = np.array(second if features.from_right else left, np.uint8)
         return self.step_features(features, timestamp, image, stage_ms)
 
     def step_features(
@@ -332,7 +336,8 @@ class Slam:
         """``step`` for a pair whose features were extracted elsewhere (``extract_features``).
 
         Args:
-            image: what the features are of, for loop detectors that look at it.
+            image: ``(H, W)`` uint8 that the features were extracted from, for loop detectors that
+                look at it. It is kept as it is: do not write to it afterwards.
         """
         clock = _Clock(dict(stage_ms or {}))
         frame = self._next_frame(features, timestamp, image)

@@ -128,7 +128,7 @@ def merge(
     """
     from vslam.cli.console import console
     from vslam.config import Config, load_config
-    from vslam.loopclosure.registry import create_detector, create_images
+    from vslam.loopclosure.registry import detector_with_images
     from vslam.maps.storage import load_map, map_file_of, save_map
     from vslam.merging import Memory, merge_maps
 
@@ -151,8 +151,7 @@ def merge(
         raise InputError(f"{files[0]}: made with the detector none, which finds nothing again.")
 
     def create() -> Memory:
-        images = create_images(name, thresholds)
-        return create_detector(name, thresholds, weights, images), images
+        return detector_with_images(name, thresholds, weights)
 
     keyframes = sum(one.map.n_keyframes for one in stored[1:])
     try:

@@ -87,13 +87,14 @@ def run(
     detector: Annotated[
         DetectorName | None,
         typer.Option(
-            help="Loop detector; [b]none[/b] for odometry only; those after capsule-paper need "
-            "[b]--weights[/b].",
-            show_default="bow, or that of --map",
+            help="Loop detector: [b]both[/b] is the capsule network beside the bag of words, "
+            "[b]none[/b] odometry only; those after capsule-paper need [b]--weights[/b].",
+            show_default="both, or that of --map",
         ),
     ] = None,
     weights: Annotated[
-        Path | None, typer.Option(help="Safetensors file of a learned detector (vslam train).")
+        Path | None,
+        typer.Option(help="ONNX file of a learned detector ([b]vslam train[/b])."),
     ] = None,
     sensor: Sensor = None,
     out: Annotated[Path, typer.Option(help="Where the folders of the runs go.")] = Path("runs"),
@@ -149,7 +150,7 @@ def run(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
 ) -> None:
     """Run SLAM on a sequence and write trajectory, map, recording and report to a folder."""
-    from vslam.loopclosure.registry import require_detector
+    from vslam.loopclosure.registry import DEFAULT_DETECTOR, require_detector
 
     output = Output(record=record, view=view, pages=pages, ply=ply, quiet=quiet)
     if resume is not None:
@@ -175,7 +176,7 @@ def run(
         if compare_loops:
             raise InputError("--compare-loops: not for a run that goes on in a map; leave it out.")
         map_file, detector = _map_to_go_on_in(map_file, detector)
-    detector = detector or "bow"
+    detector = detector or DEFAULT_DETECTOR
     require_detector(detector, weights)
     if compare_loops and detector == "none":
         raise InputError("--compare-loops: nothing to compare with --detector none; name another.")

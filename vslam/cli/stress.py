@@ -50,7 +50,7 @@ def stress(
     laws: Annotated[
         str, typer.Option(help="Laws without strengths, with commas, or [b]all[/b].")
     ] = "all",
-    detectors: Annotated[str, typer.Option(help="Loop detectors of vslam, with commas.")] = "bow",
+    detectors: Annotated[str, typer.Option(help="Loop detectors of vslam, with commas.")] = "both",
     systems: Annotated[
         str, typer.Option(help="[b]vslam[/b], [b]orbslam3[/b], names of --system, with commas.")
     ] = "vslam",

@@ -10,6 +10,7 @@ from vslam.config import Config
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import Stream, is_live
 from vslam.errors import InputError
+from vslam.loopclosure.registry import DEFAULT_DETECTOR
 from vslam.run.outcome import RunSettings
 
 OPTIONS = "run.json"
@@ -36,7 +37,7 @@ class RunOptions(BaseModel):
     max_frames: int | None = None
     seed: int = 0
     threads: int = 1
-    detector: str = "bow"
+    detector: str = DEFAULT_DETECTOR
     weights: Path | None = None
     sensor: str | None = None
     thresholds: Config = Config()

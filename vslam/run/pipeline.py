@@ -22,7 +22,7 @@ from vslam.datasets.stream import Stream, TimedFrame, is_live, timed_frames
 from vslam.errors import BrokenSourceError, InputError
 from vslam.features import TrackingState, TrackResult
 from vslam.frontend.sides import Sides
-from vslam.loopclosure.registry import create_detector, create_images, problem_of
+from vslam.loopclosure.registry import detector_with_images, problem_of
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.machine import peak_memory_mb, process_age
 from vslam.map import Map
@@ -275,9 +275,8 @@ def begin(camera: Camera, settings: RunSettings, saved: Path | None = None) -> S
             be read.
     """
     config, threads = settings.config, settings.threads
-    images = create_images(settings.detector, config)
     late = not settings.realtime  # then nothing is loaded while the camera drives
-    detector = create_detector(settings.detector, config, settings.weights, images, late=late)
+    detector, images = detector_with_images(settings.detector, config, settings.weights, late=late)
     if saved is not None:
         return Slam.load(saved, config, detector, threads=threads, images=images, resume=True)
     if settings.map is None:

@@ -175,7 +175,7 @@ def run_slam(config: Config, frames: int) -> None:
     noise = rng.uniform(0, 255, (HEIGHT, WIDTH + DISPARITY + STEP * FRAMES)).astype(np.float32)
     wall = cv2.GaussianBlur(noise, (0, 0), 2.0)
     wall = np.clip(128 + 5.0 * (wall - 128), 0, 255).astype(np.uint8)
-    slam = Slam(CAMERA, config, threads=1)
+    slam = Slam(CAMERA, config, "none", threads=1)
     for k in range(frames):
         x = STEP * k
         left, right = wall[:, x : x + WIDTH], wall[:, x + DISPARITY : x + DISPARITY + WIDTH]

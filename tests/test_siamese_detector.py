@@ -22,7 +22,7 @@ from vslam.closing import LoopClosing
 from vslam.config import Config, SiameseConfig
 from vslam.errors import InputError
 from vslam.features import Features
-from vslam.loopclosure.registry import create_detector, create_images
+from vslam.loopclosure.registry import detector_with_images
 from vslam.loopclosure.siamese.detector import SiameseDetector, beyond_reach, open_detector
 from vslam.loopclosure.siamese.export import (
     SIMILARITY_TOLERANCE,
@@ -380,12 +380,10 @@ def test_no_run_loads_torch():
 
 def test_the_paper_s_detector_compares_with_all_keyframes_and_verifies_by_orb():
     config = Config()
-    images = create_images("capsule-paper", config)
+    detector, images = detector_with_images("capsule-paper", config)
     assert images is None  # so that no local descriptors rerank or verify
-    closing = LoopClosing(
-        create_detector("capsule-paper", config, images=images, late=True),
-        Camera(400.0, 400.0, 310.0, 94.0, 0.5, 620, 188), config, threads=1, images=images,
-    )  # fmt: skip
+    camera = Camera(400.0, 400.0, 310.0, 94.0, 0.5, 620, 188)
+    closing = LoopClosing(detector, camera, config, threads=1, images=images)
     # Odometry puts the last keyframe 700 m from the first one, whose place it shows, darker.
     map_ = driven([50.0 * k for k in range(15)])
     for keyframe, place in enumerate([*range(14), 0]):

@@ -6,7 +6,7 @@ KITTI_ROOT holds sequences/00 and poses/00.txt, DIR the sets of photographs (dat
 
 The script renders eight towns, trains from random weights with the settings paper.json beside this
 file (the preset ``paper`` in float32, with fewer images mined and validated), removes 20 % of the
-primary capsules, trains what is left for one epoch and exports it. Finished parts are skipped and
+primary capsules, trains what is left for two epochs and exports it. Finished parts are skipped and
 an interrupted training resumes from its checkpoint, so the same command continues everything.
 
 bfloat16 is no option on a CPU: of thirteen steps replayed with torch 2.13 one had a gradient of
@@ -69,7 +69,7 @@ def _commands(out: Path, kitti: Path, photos: Path) -> list[list[str]]:
     whole, pruned = out / "paper" / "capsule", out / "paper-pruned" / "capsule-paper"
     for weights, more in (
         (whole, []),
-        (pruned, ["--weights", f"{whole}.safetensors", "--epochs", "1"]),
+        (pruned, ["--weights", f"{whole}.safetensors", "--epochs", "2"]),
     ):
         if not weights.with_suffix(".md").exists():
             command = ["train", weights.name, "--settings", str(_SETTINGS), "--threads", "1", *more]

@@ -517,8 +517,8 @@ class SiameseConfig(_Section):
     monocular_reach_share: float = Field(
         0.3,
         ge=0,
-        description="The same share in monocular maps, whose unit drifts: twice what KITTI 00 needs, "
-        "whose unit drifts by a factor of 2.3. [own]",
+        description="The same share in monocular maps, whose unit drifts: twice what KITTI 00 "
+        "needs, where it drifts by a factor of 2.3. [own]",
     )
     embedded_at_once: int = Field(
         8, ge=1, description="Keyframes that a query has the network see, the nearest. [own]"

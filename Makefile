@@ -13,8 +13,8 @@ help:  ## show this list
 
 install: $(INSTALLED)  ## make .venv and install vslam with its tools into it
 
-demo: $(INSTALLED)  ## render a town, run on it under changing light, write report and recording
-	$(BIN)/vslam run --dataset synthetic --seq demo --perturb brightness
+demo: $(INSTALLED)  ## drive a street by day and again by night: the default detector against bow
+	$(BIN)/vslam run --dataset synthetic --seq night --compare bow
 
 test: $(INSTALLED)  ## run the tests, then the built wheel in a clean environment
 	$(BIN)/python -m pytest

@@ -138,7 +138,10 @@ class BowDetector:
             config.group_score_ratio,
             config.max_groups,
         )
-        return [LoopCandidate(query, k, float(likeness.score[k])) for k in chosen.tolist()]
+        return [
+            LoopCandidate(query, k, float(likeness.score[k]), proposed_by=self.name)
+            for k in chosen.tolist()
+        ]
 
 
 @inner_kernel

@@ -68,11 +68,19 @@ class CombinedDetector:
                 continue
             known = place.get(candidate.match)
             if known is not None:
-                if merged[known].alike is None:
-                    merged[known] = replace(merged[known], alike=candidate.alike)
+                merged[known] = _joined(merged[known], candidate)
                 continue
             around, _ = map_.covisible(candidate.match, self._min_shared)
             for keyframe in (candidate.match, *around.tolist()):
                 place.setdefault(keyframe, len(merged))
             merged.append(candidate)
         return merged
+
+
+def _joined(first: LoopCandidate, second: LoopCandidate) -> LoopCandidate:
+    """The candidate of one detector, at whose place that of another lies."""
+    names = first.proposed_by.split("+")
+    if second.proposed_by not in names:
+        names.append(second.proposed_by)
+    alike = second.alike if first.alike is None else first.alike
+    return replace(first, alike=alike, proposed_by="+".join(names))

@@ -61,7 +61,7 @@ class LoopConsistency:
                 consistent.append(candidate)
             else:
                 reason = f"resembled {length} of {self.config.min_keyframes} keyframes in a row"
-                rejected.append(LoopEdge(keyframe, candidate.match, candidate.score, False, reason))
+                rejected.append(LoopEdge.of(candidate, reason))
         waiting = [
             replace(g, age=g.age + 1)
             for i, g in enumerate(self._groups)

@@ -15,9 +15,15 @@ from vslam.map import Map
 class LoopDetector(Protocol):
     """Remembers keyframes by their looks and finds those that look alike.
 
-    Calls come in the order of the keyframes, from one thread at a time. Everything after a
-    detector (consistency, verification, correction) is shared, so that a comparison of runs
-    isolates the detector.
+    Calls come in the order of the keyframes, from one thread at a time.
+
+    What follows a detector is the same code for all: rating and verification of candidates,
+    consistency, correction. Which descriptors verify is a threshold, ``verification.descriptors``.
+    Its default differs between detectors: ORB alone for ``bow``, ``capsule-paper`` and plug-ins;
+    ORB and, where that fails, the network's local descriptors for ``both`` and the networks, which
+    then also reorder their 20 most similar keyframes by these descriptors (those of the capsule
+    network's extractor, whichever network made the candidates). A comparison that is to isolate the
+    detectors sets it to ``orb`` or ``both`` for all of them.
     """
 
     name: str

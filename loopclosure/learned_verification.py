@@ -6,7 +6,7 @@ refinement, and the same evidence against look-alikes.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from vslam.config import Config, LearnedMatchingConfig, VerificationConfig
 from vslam.features import Features
 from vslam.geometry import Matrix, inverse, orthonormalised, transform
 from vslam.loopclosure.learned_localisation import Sight, localise, project, view_of
-from vslam.loopclosure.local_matching import DescriptorMaps, locate_near
+from vslam.loopclosure.local_matching import DescriptorMaps, likeness, locate_near
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verification import (
     guided_match,
@@ -57,7 +57,7 @@ class LearnedTrials:
         self.resting_until, self.in_vain = 0, 0.0
 
     def choose(self, keyframe: int, candidates: Collection[LoopCandidate]) -> set[int]:
-        """Keyframes that are matches to try; none of a detector without a network."""
+        """Keyframes that are matches to try, of the candidates that are rated."""
         config = self._config
         least = config.min_alike
         if keyframe < self.resting_until:
@@ -73,6 +73,33 @@ class LearnedTrials:
         else:
             self.resting_until = candidate.query + 1 + self._config.rest
             self.in_vain = candidate.alike or 0.0
+
+
+def rated(
+    candidates: Sequence[LoopCandidate],
+    glance: Callable[[], DescriptorMaps],
+    images: KeyframeImages,
+    config: LearnedMatchingConfig,
+    beyond: NDArray[np.float64] | None = None,
+) -> list[LoopCandidate]:
+    """Say of candidates how much local descriptors find alike, where the detector has not said it.
+
+    Args:
+        candidates: best first; of those without a rating, the first ``config.rated`` get one.
+        glance: at the image that they are candidates of; called if there is something to rate.
+        beyond: of :func:`vslam.loopclosure.reach.beyond_reach`, if the camera cannot be anywhere.
+    """
+    unrated = [one.match for one in candidates if one.alike is None and one.match in images]
+    if beyond is not None:
+        unrated = [match for match in unrated if beyond[match] <= 0.0]
+    if not unrated:
+        return list(candidates)
+    query = glance()
+    alike = {
+        match: likeness(query, images.glance(match), config.coarse_alike)
+        for match in unrated[: config.rated]
+    }
+    return [replace(one, alike=alike.get(one.match, one.alike)) for one in candidates]
 
 
 def shows_known(
@@ -105,7 +132,7 @@ def verify_learned(
     The edge's features and landmarks are the inliers at which the query has a keypoint.
     """
     query, match = candidate.query, candidate.match
-    edge = LoopEdge(query, match, candidate.score, False, "", matched_by="learned")
+    edge = LoopEdge.of(candidate, matched_by="learned")
     keyframes = [k for k in place_of(map_, match, query, gates).tolist() if k in images]
     if query not in images or not keyframes:
         return replace(edge, reason="no image is kept")

@@ -22,20 +22,20 @@ class DescriptorMaps(NamedTuple):
     """Local descriptors of an image, all of length 1.
 
     Attributes:
-        coarse: ``(h, w, C)`` float32; cell (i, j) lies at pixel (16 j, 16 i) of the image that the
-            network read.
+        coarse: ``(h, w, C)`` float32, or float16 of a glance that is kept; cell (i, j) lies at
+            pixel (16 j, 16 i) of the image that the network read.
         fine: ``(H, W, D)`` float32, likewise at (4 j, 4 i).
         scale: pixels of that image for one of the camera's.
     """
 
-    coarse: NDArray[np.float32]
+    coarse: NDArray[np.float32] | NDArray[np.float16]
     fine: NDArray[np.float32]
     scale: float
 
     def coarse_alone(self) -> DescriptorMaps:
-        """Without the fine ones, of which no view keeps the memory."""
+        """Without the fine ones, in half the memory: those of all keyframes are kept."""
         none = np.empty((0, *self.fine.shape[1:]), np.float32)
-        return self._replace(coarse=self.coarse.copy(), fine=none)
+        return self._replace(coarse=self.coarse.astype(np.float16), fine=none)
 
 
 class CoarseMatches(NamedTuple):
@@ -68,7 +68,7 @@ class Located(NamedTuple):
 
 def match_coarse(a: DescriptorMaps, b: DescriptorMaps, least: float) -> CoarseMatches:
     """Mutual nearest neighbours with a cosine of at least ``least``."""
-    cells = [np.ascontiguousarray(one.coarse.reshape(-1, one.coarse.shape[2])) for one in (a, b)]
+    cells = [one.coarse.reshape(-1, one.coarse.shape[2]).astype(np.float32) for one in (a, b)]
     best_a, best_b, alike = _nearest(cells[0], np.ascontiguousarray(cells[1].T))
     mutual = (best_b[best_a] == np.arange(len(best_a))) & (alike >= least)
     chosen = np.flatnonzero(mutual)

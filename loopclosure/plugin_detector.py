@@ -96,7 +96,7 @@ class PlugInDetector:
         if wrong:
             self.problem = f"{self._plugin}: {method.__name__} {wrong}; repair the package"
             return []
-        return list(found)
+        return [replace(one, proposed_by=self.name) for one in found]
 
 
 def open_plugin(plugin: PlugIn, config: Config, weights: Path | None) -> PlugInDetector:

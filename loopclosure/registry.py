@@ -18,6 +18,21 @@ if TYPE_CHECKING:
 
 DETECTORS = ("none", "bow", "both", *NETWORKS)
 DEFAULT_DETECTOR = "both"
+_ABOUT = {
+    "none": "no loop closing",
+    "bow": "the bag of words",
+    "both": "the Siamese capsule network beside the bag of words",
+    "capsule": "the Siamese capsule network",
+    "capsule-pruned": "the Siamese capsule network, pruned",
+    "capsule-paper": "the Siamese capsule network as the paper describes it",
+}
+# Detectors whose candidates learned descriptors verify, too, unless the configuration says more.
+LEARNED_VERIFICATION = ("both", *(name for name in NETWORKS if name != TO_THE_LETTER))
+
+
+def about(name: str) -> str:
+    """What a detector is, in a few words; its name for all others."""
+    return _ABOUT.get(name, name)
 
 
 def require_detector(name: str, weights: Path | None = None, option: str = "--detector") -> None:
@@ -44,13 +59,19 @@ def problem_of(detector: LoopDetector) -> str | None:
 
 
 def detector_with_images(
-    name: str, config: Config, weights: Path | None = None, *, late: bool = True
+    name: str,
+    config: Config,
+    weights: Path | None = None,
+    *,
+    local_weights: Path | None = None,
+    late: bool = True,
 ) -> tuple[LoopDetector, KeyframeImages | None]:
     """A detector that remembers nothing yet, and where it keeps the images of keyframes for
     learned verification: both halves that :class:`vslam.slam.Slam` takes.
 
     Args:
         weights, late: as of :func:`create_detector`.
+        local_weights: of the local descriptors; None for those that vslam ships.
 
     Returns:
         The detector, and None in place of images where ORB alone verifies its candidates.
@@ -58,7 +79,7 @@ def detector_with_images(
     Raises:
         InputError, ValueError: as :func:`create_detector`.
     """
-    images = create_images(name, config)
+    images = create_images(name, config, local_weights)
     return create_detector(name, config, weights, images, late=late), images
 
 
@@ -106,21 +127,25 @@ def create_detector(
     raise ValueError(f"no loop detector {name!r}")
 
 
-def create_images(name: str, config: Config) -> KeyframeImages | None:
-    """What keeps the images that learned descriptors verify a detector's candidates with.
-
-    None for detectors that verify by ORB alone: those without a network, those of other packages,
-    and ``capsule-paper``. None, too, where the configuration switches learned verification off.
+def create_images(name: str, config: Config, weights: Path | None = None) -> KeyframeImages | None:
+    """What keeps the images that learned descriptors rate and verify candidates with; None where
+    ORB alone verifies them (``verification.descriptors``).
 
     Raises:
         InputError: the network cannot be read.
     """
-    learned = name in ("both", *NETWORKS) and name != TO_THE_LETTER
-    if not learned or config.learned.max_candidates == 0:
+    descriptors = config.verification.descriptors
+    if descriptors == "usual":
+        descriptors = "both" if name in LEARNED_VERIFICATION else "orb"
+    if name == "none" or descriptors == "orb":
         return None
-    from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
+    from vslam.loopclosure.siamese.local_descriptors import (
+        SHIPPED_LOCAL,
+        KeyframeImages,
+        LocalDescriptors,
+    )
 
-    return KeyframeImages(LocalDescriptors())
+    return KeyframeImages(LocalDescriptors(weights or SHIPPED_LOCAL))
 
 
 def _network_of(name: str) -> str:

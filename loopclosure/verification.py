@@ -76,7 +76,7 @@ def verify(
         inliers: features of the query, and living landmarks of the place, neither of them twice.
     """
     query, match = candidate.query, candidate.match
-    edge = LoopEdge(query, match, candidate.score, accepted=False, reason="")
+    edge = LoopEdge.of(candidate)
     rows_q, rows_m = match_keyframes(map_, query, match, config)
     edge = replace(edge, n_matches=len(rows_q))
     if len(rows_q) < config.min_matches:

@@ -26,6 +26,7 @@ from vslam.features import TrackingState, TrackResult
 from vslam.frontend.sides import Sides
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.maps.storage import load_checkpoint, load_map
+from vslam.report.folder import write_results
 from vslam.run import autosave as saving
 from vslam.run.autosave import (
     LOCK,
@@ -70,11 +71,14 @@ def drive(
     config: Config = Config(),  # noqa: B008
     law: str = "none",
     change: Callable[[Sequence], Sequence] = lambda sequence: sequence,
+    compare: tuple[str, ...] = (),
     **options: object,
 ) -> RunOutcome:
     """Run over the corridor; with a folder, saving whenever that is possible."""
     sequence = change(open_sequence("kitti", root, "00"))
-    settings = RunSettings("kitti", "00", "none", "bow", "stereo", 0, 2, 0, 1, None, config)
+    settings = RunSettings(
+        "kitti", "00", "none", "bow", "stereo", 0, 2, 0, 1, None, config, compare=compare
+    )
     autosave = {} if folder is None else {"autosave": FolderAutosave(folder, 1e-6, "kitti 00")}
     return run_sequence(
         sequence,
@@ -216,6 +220,22 @@ def test_a_map_is_saved_where_every_frame_becomes_a_keyframe(kitti_tree, tmp_pat
     assert outcome.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
 
 
+def test_a_resumed_run_goes_on_without_the_detectors_compared(kitti_tree, tmp_path):
+    def interrupt(result: TrackResult) -> None:
+        if result.index == 12:
+            signal.raise_signal(signal.SIGINT)
+
+    drive(kitti_tree, tmp_path, compare=("none",), on_frame=interrupt)
+    whole = drive(kitti_tree, tmp_path, find_unfinished(tmp_path), compare=("none",))
+    assert whole.compared == ()
+    assert len(whole.trajectory) == FRAMES
+    report = write_results(tmp_path, whole)
+    assert (report.compare, report.detectors) == (("none",), [])
+    for name in ("report.md", "report.html"):
+        text = (tmp_path / name).read_text()
+        assert "comparison with none was left out, since the run was resumed" in text
+
+
 def test_half_written_files_of_killed_runs_go_with_the_rest(tmp_path):
     for name in (MAP, PROGRESS, f".{MAP}.123.part", f".{PROGRESS}.7.part", "map.npz"):
         (tmp_path / name).write_bytes(b"")
@@ -337,7 +357,8 @@ def test_where_no_lock_can_be_made_a_run_goes_on(tmp_path):
 
 def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     brief = ("--no-record", "--no-report", "--quiet")
-    done = vslam("run", "--data", kitti_tree, "--max-frames", 12, *brief, cwd=tmp_path)
+    words = ("--data", kitti_tree, "--max-frames", 12, "--detector", "bow")
+    done = vslam("run", *words, *brief, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     folder = (tmp_path / "runs" / "latest").resolve()
     assert not (folder / MAP).exists()  # the run is whole

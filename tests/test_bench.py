@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import io
 import json
+import re
 import subprocess
 import sys
 from contextlib import closing
@@ -122,7 +123,7 @@ def test_a_run_counts_if_it_is_of_the_sensor_asked_for(stub, tmp_path, sensor, a
 
 @pytest.mark.parametrize(
     "change",
-    ['"schema_version": 4|"schema_version": 3', '"se3"|"se4"', "{|", "0|"],
+    ['"schema_version": 5|"schema_version": 4', '"se3"|"se4"', "{|", "0|"],
 )
 def test_a_report_of_another_schema_or_damaged_is_none(run_folder, tmp_path, change):
     old, new = change.split("|")
@@ -254,16 +255,24 @@ def test_table_counts_cells(stub: Path, tmp_path: Path):
         assert part in text
 
 
-def test_table_stays_on_a_terminal(monkeypatch, capsys, tmp_path: Path):
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    progress = table.GridProgress(CELLS, [], {"00": 100, "05": 100}, tmp_path, 1)
-    with table.shown_live(progress, shown=True) as say:
-        say("a line for logs")
-        progress.add(execute.Failed(CELLS[0], "no luck"))
-    text = capsys.readouterr().err
-    assert "a line for logs" not in text
-    assert "1 failed" in text
-    assert "brightness:1" in text
+@pytest.mark.parametrize("color", [False, True])
+def test_the_table_stays_only_if_cells_are_missing_or_failed(
+    monkeypatch, capsys, stub: Path, tmp_path: Path, color: bool
+):
+    """``color`` makes rich take stderr for a terminal."""
+    if color:
+        monkeypatch.setenv("FORCE_COLOR", "1")
+    for cells, stays in ((CELLS[:2], True), (CELLS[:1], False)):
+        progress = table.GridProgress(cells, [], {"00": 100}, tmp_path, 1)
+        with table.shown_live(progress, shown=True) as say:
+            say("a line for logs")
+            for outcome in execute.run_here(CELLS[:1], options_for(tmp_path), 1, tmp_path):
+                progress.add(outcome)
+        text = capsys.readouterr().err
+        assert ("a line for logs" in text) is not color
+        last = text.rpartition("1 of 2 cells" if stays else "1 of 1 cells")[2]
+        assert (f"1 of {len(cells)} cells finished" in text) is (stays or color)
+        assert ("\x1b[2K" in last) is (color and not stays)  # erased again
 
 
 @pytest.fixture
@@ -307,12 +316,43 @@ def test_bench_runs_the_grid_and_writes_the_report(bench, stub: Path):
     assert "0 to do" in err
 
 
+def test_bench_shows_the_detectors_beside_the_first_one(bench):
+    code, out, err = bench("--detectors", "bow,none,both")
+    assert code == 0, err
+    first, second = out.index("none against bow"), out.index("both against bow")
+    assert first < second < out.index("9 of 9 cells finished")
+    lines = [line.split() for line in out[second:].splitlines()]
+    assert [line[:2] for line in lines if line[:1] == ["00"]] == [
+        ["00", "none"], ["00", "brightness:1"],
+    ]  # fmt: skip
+    assert re.search(r"\n- Lost frames: bow \d+ in 3 runs, both \d+ in 3 runs\.\n", out)
+    assert "ATE over all conditions: no winner. Of 1 sequence, " in out
+    assert "## both against bow" in Path("bench/report.md").read_text()
+    assert bench("--detectors", "both", "--quiet")[1] == ""
+
+
+def test_bench_shows_what_is_left_when_all_runs_of_the_baseline_fail(bench, stub: Path):
+    for name in ("none-bow-0", "brightness:1-bow-0", "brightness:1-bow-1"):
+        (stub / f"fail-00-{name}").touch()
+    code, out, err = bench()
+    assert code == 1
+    assert err.count("failed: ") > 2
+    assert "\nboth\n" in out
+    assert "against" not in out
+
+
+def test_help_begins_with_the_table_of_the_mission():
+    text = CliRunner().invoke(app, ["bench", "--help"], env={"COLUMNS": "100"}).output
+    examples = [line.split("(")[0].split() for line in text.splitlines() if "  vslam" in line]
+    assert examples[:2] == [["vslam", "bench"], ["vslam", "bench", "--dataset", "synthetic"]]
+
+
 def test_bench_counts_failures_and_ends_with_1(bench, stub: Path):
     (stub / "fail-00-brightness:1-bow-1").touch()
     code, out, err = bench()
     assert code == 1
     assert "failed: kitti-00-brightness1-bow-seed1: images of the moon" in err
-    assert "5 of 6 cells finished, 1 failed; the same command goes on" in out
+    assert "5 of 6 cells finished, 1 failed; the same command continues" in out
     (stub / "fail-00-brightness:1-bow-1").unlink()
     assert bench()[0] == 0
     assert len(started(stub)) == 7
@@ -388,6 +428,17 @@ def test_a_real_grid_killed_and_resumed(kitti_tree: Path, tmp_path: Path):
     assert (report.frames, report.perturb, report.lost_frames) == (6, "brightness:1", 0)
     assert not (out / ".parts").exists()
     assert "brightness:1" in (out / "report.md").read_text()
+
+
+def test_a_cell_runs_with_the_networks_that_are_shipped(kitti_tree: Path, tmp_path: Path):
+    options = execute.RunOptions(kitti_tree, CONFIG, threads=2, scratch=tmp_path / "scratch")
+    cell = Cell("kitti", "00", "none", "both", 0)
+    outcome = execute.run_cell(cell, options)
+    assert isinstance(outcome, execute.Finished), outcome
+    execute.publish(outcome, tmp_path)
+    report = grid.read_report(tmp_path / cell.name)
+    assert report is not None
+    assert (report.detector, report.frames, report.lost_frames) == ("both", 28, 0)
 
 
 def test_a_run_ends_by_itself_though_its_standard_input_is_open():

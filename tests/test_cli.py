@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import get_args
@@ -23,8 +25,15 @@ from vslam.loops import LoopEdge
 from vslam.report import figures
 from vslam.run import pipeline as run_pipeline
 from vslam.run import recorder, warmup
+from vslam.run.moments import MomentRecorder
 from vslam.run.outcome import RunOutcome
-from vslam.trajectory import Trajectory, read_kitti_poses, write_kitti, write_tum
+from vslam.trajectory import (
+    Trajectory,
+    read_kitti_poses,
+    read_trajectory,
+    write_kitti,
+    write_tum,
+)
 
 FRAMES = 12
 
@@ -128,7 +137,10 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
         ("", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
         ("--config nothing.json", ["nothing.json", "configuration"]),
-        ("--compare-loops --detector none", ["--compare-loops", "--detector none"]),
+        ("--compare none --detector none", ["--compare none", "name another"]),
+        ("--compare both,bow --detector bow", ["--compare bow", "name another"]),
+        ("--compare bow,words --detector none", ["--compare words", "unknown; choose one of"]),
+        ("--compare vgg16 --detector none", ["--compare vgg16", "ships no weights", "--detector"]),
         ("--data nowhere", ["nowhere", "no such file or folder", "--data"]),
         ("--data .", ["the folder is empty", "--data"]),
         ("nowhere", ["nowhere", "no such file or folder", "--data"]),
@@ -203,6 +215,13 @@ def test_misspelt_option(call):
     assert "No such option" in err
 
 
+def shaken(trajectory: Trajectory) -> Trajectory:
+    """Every other pose 0.2 m off, which is an ATE of 0.1 m."""
+    T_wc = trajectory.T_wc.copy()
+    T_wc[::2, 1, 3] += 0.2
+    return replace(trajectory, T_wc=T_wc)
+
+
 def fake_result(index: int, T_wc: np.ndarray) -> TrackResult:
     state = TrackingState.LOST if index == 3 else TrackingState.OK
     return TrackResult(index, 0.1 * index, T_wc, state, 9, 9, 9, 9, False)
@@ -211,28 +230,35 @@ def fake_result(index: int, T_wc: np.ndarray) -> TrackResult:
 @pytest.fixture
 def pipeline(monkeypatch) -> SimpleNamespace:
     """In place of SLAM: returns the ground truth, shifted; notes what it was called with."""
-    calls = SimpleNamespace(interrupted=None, interrupted_without=None, loops=[], runs=[])
+    calls = SimpleNamespace(interrupted=None, loops=[])
 
     def run_sequence(
         sequence, perturbation, settings, recorder, on_frame, autosave=None, resume=None, slam=None
     ):
-        looped = settings.detector != "none" or not calls.runs
-        calls.runs.append((settings.detector, recorder))
-        calls.settings, calls.recorder = settings, recorder
         T_wc = circle(len(sequence))  # the ground truth, if it has one
         T_wc[:, 1, 3] += 2.0
-        if not looped:
-            T_wc[::2, 1, 3] += 0.2
         tracks = [fake_result(k, T_wc[k]) for k in range(len(sequence))]
         for track in tracks:
             on_frame(track)
         trajectory = Trajectory(sequence.timestamps, T_wc)
+        compared = [
+            run_sequence(
+                sequence,
+                perturbation,
+                replace(settings, detector=name, compare=()),
+                recorder,
+                lambda track: None,
+            )
+            for name in settings.compare
+        ]
+        calls.settings, calls.recorder = settings, recorder
         return RunOutcome(
             settings, sequence, trajectory, trajectory, tracks, [], wall_s=2.0, cpu_s=2.0,
             startup_s=0.1, peak_memory_mb=1.0, n_keyframes=4, n_landmarks=99,
             loops=calls.loops if settings.detector != "none" else [],
             keyframe_frames=np.arange(0, len(sequence), 3),
-            n_submaps=2, interrupted=calls.interrupted if looped else calls.interrupted_without,
+            n_submaps=2, interrupted=calls.interrupted, step_s=1.5,
+            compared=tuple(replace(one, trajectory=shaken(one.trajectory)) for one in compared),
         )  # fmt: skip
 
     def draw_figures(outcome, evaluation, ground_truth, verdict):
@@ -242,9 +268,8 @@ def pipeline(monkeypatch) -> SimpleNamespace:
     monkeypatch.setattr(run_pipeline, "run_sequence", run_sequence)
     monkeypatch.setattr(run_pipeline, "begin", lambda camera, settings, saved=None: None)
     monkeypatch.setattr(recorder, "NullRecorder", lambda: "null")
-    monkeypatch.setattr(recorder, "RerunRecorder", str)
-    monkeypatch.setattr(run_pipeline, "NullRecorder", lambda: "null")
-    monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[0])
+    monkeypatch.setattr(recorder, "RerunRecorder", lambda target, pictures: str(target))
+    monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[1])
     monkeypatch.setattr(figures, "draw_figures", draw_figures)
     monkeypatch.setattr(warmup, "is_cold", lambda: False)
     monkeypatch.setattr(warmup, "compile_kernels", lambda processes, load: None)
@@ -261,7 +286,7 @@ def test_run_writes_its_folder_and_a_summary(call, root, pipeline):
     assert "report.html" in out
     assert "10/10" in err
     folder = Path("runs/latest").resolve()
-    assert folder.name.endswith("-kitti-00-blur0.5-bow")
+    assert folder.name.endswith("-kitti-00-blur0.5-both")
     assert pipeline.settings.threads == 3
     assert pipeline.settings.perturb == "blur:0.5"
     assert pipeline.recorder == str(Path("runs") / folder.name / "recording.rrd")
@@ -284,7 +309,8 @@ def test_summary_counts_loops(call, root, with_detector):
     assert code == 0, err
     assert "loops          1 closed, 0 missed, 0 wrong, 2 candidates rejected\n" in out
     assert "99 landmarks in 2 sub-maps" in out
-    assert "without" not in out
+    assert "detector       bow: the bag of words\n" in out
+    assert "detectors together" not in out
     (root / "poses" / "00.txt").unlink()
     _, out, _ = call("run", "--data", root, "--max-frames", 10, "--detector", "bow")
     assert "1 closed, 2 candidates rejected" in out
@@ -295,37 +321,51 @@ def test_summary_without_a_detector(call, root, pipeline):
     assert "not looked for, 0 missed" in out
 
 
-def test_compare_loops_runs_twice_and_prints_both(call, root, with_detector):
-    words = ("run", "--data", root, "--max-frames", 10, "--detector", "bow", "--compare-loops")
-    code, out, err = call(*words)
+def test_compare_prints_a_row_for_each_detector(call, root, with_detector):
+    words = ("run", "--data", root, "--max-frames", 10, "--detector", "bow")
+    code, out, err = call(*words, "--compare", "both, none,none")
     assert code == 0, err
-    assert [run[0] for run in with_detector.runs] == ["bow", "none"]
-    assert with_detector.runs[0][1].endswith("recording.rrd")
-    assert with_detector.runs[1][1] == "null"
-    table = {line.split("  ")[0]: line.split()[-4:] for line in out.splitlines()[-6:]}
-    assert table["ATE rmse"][:2] == ["0.000", "m"]
-    assert float(table["ATE rmse"][2]) == pytest.approx(0.1, rel=0.02)
-    assert table["loops closed"][-2:] == ["1", "0"]
-    assert table["lost frames"][-2:] == ["1", "1"]
-    assert table["t_rel"][-2:] == ["n/a", "n/a"]
-    assert with_detector.outcome.without_loops.settings.detector == "none"
-    assert with_detector.evaluation.ate_rmse_m < 1e-9
+    assert with_detector.settings.compare == ("both", "none")
+    assert "5.0 fps, all 3 detectors together" in out
+    head, *rows = [re.split(r"  +", line.strip()) for line in out.splitlines()[-4:]]
+    assert head == [
+        "detector", "lost", "ATE", "causal ATE", "RPE", "loops found", "missed", "wrong", "time",
+    ]  # fmt: skip
+    assert [row[0] for row in rows] == ["bow", "both", "none"]
+    assert rows[0][1:3] == ["1", "0.000 m"]
+    assert [float(row[2].split()[0]) for row in rows[1:]] == pytest.approx([0.1, 0.1], rel=0.02)
+    assert {row[-1] for row in rows} == {"1.5 s"}
     folder = Path("runs/latest").resolve()
     assert folder.name.endswith("-bow")
+    assert json.loads((folder / "run.json").read_text())["compare"] == ["both", "none"]
+    assert len(read_trajectory(folder / "trajectory_both.tum")) == 10
+    assert (folder / "trajectory_none.tum").is_file()
 
 
-def test_compare_loops_interrupted(call, root, with_detector):
-    words = ("run", "--data", root, "--max-frames", 10, "--detector", "bow", "--compare-loops")
-    with_detector.interrupted_without = "Ctrl-C"
+def test_compare_without_ground_truth_counts_the_loops_closed(call, root, with_detector):
+    (root / "poses" / "00.txt").unlink()
+    words = ("run", "--data", root, "--max-frames", 10, "--detector", "bow", "--compare", "none")
+    head, *rows = [re.split(r"  +", line.strip()) for line in call(*words)[1].splitlines()[-3:]]
+    assert head == ["detector", "lost", "loops closed", "time"]
+    assert rows == [["bow", "1", "1", "1.5 s"], ["none", "1", "0", "1.5 s"]]
+    with_detector.interrupted = "Ctrl-C"
     code, out, _ = call(*words)
     assert code == 1
-    assert "Ctrl-C, in the run without loops" in out
-    assert "10 done" in out
-    assert with_detector.outcome.without_loops is None
-    with_detector.interrupted = "Ctrl-C"
-    with_detector.runs.clear()
-    assert call(*words)[0] == 1
-    assert len(with_detector.runs) == 1
+    assert out.splitlines()[-1].endswith("1.5 s  Ctrl-C")
+
+
+@pytest.mark.parametrize(
+    ("detector", "other"),
+    [("bow", "both"), ("none", "both"), ("both", "bow"), ("capsule", "bow")],
+)
+def test_the_last_line_says_how_to_compare(call, root, pipeline, detector, other):
+    words = ("run", "--data", root, "--max-frames", 10, "--detector", detector)
+    last = call(*words)[1].splitlines()[-1]
+    assert last.split()[:4] == ["compare", "add", "--compare", other]
+    assert call(*words, "--quiet")[1] == ""
+    assert "add --compare" not in call(*words, "--compare", other)[1]
+    (root / "poses" / "00.txt").unlink()
+    assert "add --compare" not in call(*words)[1]
 
 
 def test_a_monocular_run_says_that_its_scale_is_arbitrary(call, root, pipeline):
@@ -343,6 +383,12 @@ def test_a_monocular_run_says_that_its_scale_is_arbitrary(call, root, pipeline):
 
 def test_quiet_run_says_nothing(call, root, pipeline):
     assert call("run", "--data", root, "--max-frames", 10, "--no-record", "--quiet") == (0, "", "")
+    assert isinstance(pipeline.recorder, MomentRecorder)  # for the page; a file would be a string
+
+
+def test_a_run_without_recording_and_report_keeps_no_images(call, root, pipeline):
+    words = ("--max-frames", 10, "--no-record", "--no-report")
+    assert call("run", "--data", root, *words)[0] == 0
     assert pipeline.recorder == "null"
 
 

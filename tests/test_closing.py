@@ -54,7 +54,7 @@ CARRIED_FROM, CARRIED_TO = 60.0, 90.0
 CARRIED = [*ROUND[:60], *ROUND[90:]]
 
 
-def run(ring, frames, detector=None, *, threads=1, dark=(), finish=True, config=None):
+def run(ring, frames, detector="none", *, threads=1, dark=(), finish=True, config=None):
     """Drive along ``frames`` of the ring, ten a second; ``dark`` ones show nothing."""
     slam = Slam(CAMERA, config, detector, threads=threads)
     results = []
@@ -138,6 +138,43 @@ def test_a_correction_says_where_the_keyframes_were():
 def test_same_bytes_with_one_thread_and_two():
     again = run(DRIFTING, ROUND, Oracle(DRIFTING, ROUND), threads=2)[0]
     assert again.trajectory().T_wc.tobytes() == closed().trajectory().T_wc.tobytes()
+
+
+def test_two_slams_may_share_the_features_of_their_frames():
+    """As those of compared detectors do: neither writes to them, one closes the loop. All that is
+    corrected in features is: disparities, and a right side that seems late."""
+    ring, late = Ring.create(focal_error=0.015), 0.004
+
+    def start(detector, threads):
+        slam = Slam(CAMERA, None, detector, threads=threads)
+        slam.side_delay.applied = late
+        return slam
+
+    def drive(slams, shown):
+        for i, features in enumerate(shown):
+            image = np.array([[i & 255, i >> 8]], np.uint8)
+            for slam in slams:
+                slam.step_features(features, 0.1 * i, image)
+        for slam in slams:
+            slam.finish()
+
+    def see():
+        return [ring.see(k, 1) for k in ROUND]
+
+    together = start(Oracle(ring, ROUND), 2), start(NoDetector(), 2)
+    shown = see()
+    drive(together, shown)
+    assert [len(slam.corrections) > 0 for slam in together] == [True, False]
+    assert all(slam.map.disparity_offset != 0.0 for slam in together)
+    for features, as_seen in zip(shown, see(), strict=True):
+        for name in ("xy", "octave", "angle", "descriptors", "u_right"):
+            assert getattr(features, name).tobytes() == getattr(as_seen, name).tobytes()
+    for slam, detector in zip(together, (Oracle(ring, ROUND), NoDetector()), strict=True):
+        alone = start(detector, 1)
+        drive([alone], see())
+        assert slam.trajectory().T_wc.tobytes() == alone.trajectory().T_wc.tobytes()
+        n = alone.map.n_landmarks
+        assert slam.map.arrays.xyz[:n].tobytes() == alone.map.arrays.xyz[:n].tobytes()
 
 
 def test_a_detector_that_is_wrong_changes_nothing():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_siamese_detector import a_map
 
-from vslam.config import Config, LearnedMatchingConfig
+from vslam.config import Config, VerificationConfig
 from vslam.errors import InputError
 from vslam.features import Features
 from vslam.loopclosure.combined import CombinedDetector
@@ -19,7 +19,7 @@ class Told:
 
     def __init__(self, name: str, matches: list[int], *, alike: float | None) -> None:
         self.name, self.added = name, []
-        self._found = [LoopCandidate(9, m, 1.0 / (1 + m), alike) for m in matches]
+        self._found = [LoopCandidate(9, m, 1.0 / (1 + m), alike, name) for m in matches]
 
     def add(self, keyframe, image, features):
         self.added.append(keyframe)
@@ -37,6 +37,7 @@ def test_candidates_come_in_turn_and_one_for_each_place():
     map_ = a_map(10, covisible=((1, 2), (1, 6)))  # 1, 2 and 6 are one place
     found = both.query(9, map_)
     assert [(c.match, c.alike) for c in found] == [(1, 0.5), (4, None), (5, 0.5)]
+    assert [c.proposed_by for c in found] == ["bow+net", "bow", "net"]
     assert [c.match for c in both.locate(None, Features.none(), map_)] == [1]
     both.add(9, None, Features.none())
     assert words.added == network.added == [9]
@@ -53,8 +54,15 @@ def test_both_remembers_by_words_and_by_looks():
 def test_only_detectors_with_a_network_keep_images():
     assert create_images("bow", Config()) is None
     assert create_images("none", Config()) is None
-    assert create_images("capsule", Config(learned=LearnedMatchingConfig(max_candidates=0))) is None
     assert create_images("both", Config()) is not None
+
+
+@pytest.mark.parametrize("name", ["bow", "capsule", "both"])
+def test_one_option_says_what_verifies_the_candidates_of_every_detector(name):
+    for descriptors, kept in (("orb", False), ("learned", True), ("both", True)):
+        config = Config(verification=VerificationConfig(descriptors=descriptors))
+        assert (create_images(name, config) is not None) == kept
+    assert create_images("none", config) is None
 
 
 def test_weights_of_both_are_those_of_its_network(tmp_path):

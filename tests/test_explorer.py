@@ -78,6 +78,17 @@ def test_a_moment_is_the_small_image_with_its_keypoints():
     assert moment.tracked[:20].all()
 
 
+def test_a_moment_knows_its_frame_where_others_were_dropped():
+    some = MomentRecorder()
+    tracks = make_outcome(12).tracks
+    features = Features.none()
+    for frame in (0, 4, 8):  # a recorder is told of no dropped frame
+        some.frame(tracks[frame], np.eye(4))
+        image = np.zeros((200, 720), np.uint8)
+        some.keyframe(tracks[frame], image, features, np.zeros(0, np.bool_))
+    assert [moment.frame for moment in some.moments] == [0, 4, 8]
+
+
 def test_the_data_are_those_of_the_run():
     outcome = make_outcome(FRAMES, lost=slice(20, 22))
     evaluation, _ = evaluate_run(outcome)

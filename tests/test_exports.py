@@ -501,7 +501,7 @@ def test_refusals(corridor_run, kitti_tree, tmp_path):
     assert "missing or damaged" in refusal("export", "g2o", run, *out)
     report = json.loads((corridor_run / "report.json").read_text())
     (run / "report.json").write_text(json.dumps({**report, "schema_version": 3, "eyes": 2}))
-    assert "report schema 3, this version reads 4" in refusal("export", "g2o", run, *out)
+    assert "report schema 3, this version reads 5" in refusal("export", "g2o", run, *out)
     np.savez(tmp_path / "new.npz", schema=1, keyframe_first_row=np.zeros(1))
     assert "a map of schema 1" in refusal("map", "info", tmp_path / "new.npz")
     assert not (tmp_path / "out").exists()

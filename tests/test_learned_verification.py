@@ -14,10 +14,12 @@ from vslam.loopclosure.learned_verification import (
     LearnedTrials,
     joined,
     nearest_features,
+    rated,
     recognise,
     shows_known,
     verify_learned,
 )
+from vslam.loopclosure.local_matching import DescriptorMaps
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
 from vslam.loops import LoopCandidate
 from vslam.map import Map
@@ -206,6 +208,32 @@ def test_only_what_looks_alike_is_tried_and_less_after_a_try_in_vain():
     # However little alike the last one was, the least that is tried stays.
     trials.record(candidates(0.1)[0], located=False)
     assert trials.choose(52, candidates(0.3)) == set()
+
+
+def test_candidates_that_no_detector_rated_are_rated_where_the_camera_may_be(network):
+    images = KeyframeImages(network)
+    rng = np.random.default_rng(3)
+    view = cv2.GaussianBlur(rng.integers(0, 256, (192, 640), np.uint8), (0, 0), 2.0)
+    other = cv2.GaussianBlur(rng.integers(0, 256, (192, 640), np.uint8), (0, 0), 9.0)
+    for keyframe, image in enumerate((view, other, view, view)):
+        images.add(keyframe, image)
+    candidates = [
+        LoopCandidate(9, 0, 0.5), LoopCandidate(9, 1, 0.4), LoopCandidate(9, 2, 0.3, 0.2),
+        LoopCandidate(9, 3, 0.2), LoopCandidate(9, 8, 0.1),
+    ]  # fmt: skip
+    beyond = np.array([0.0, -1.0, 0.0, 5.0, 0, 0, 0, 0, 0])
+    found = rated(candidates, lambda: images.glance_at(view), images, CONFIG.learned, beyond)
+    assert found[0].alike > 0.9 > found[1].alike
+    # Rated by its detector, beyond reach, without an image: as they were.
+    assert found[2:] == candidates[2:]
+    first = CONFIG.learned.model_copy(update={"rated": 1})
+    found = rated(candidates, lambda: images.glance_at(view), images, first, beyond)
+    assert [one.alike is not None for one in found] == [True, False, True, False, False]
+
+    def never() -> DescriptorMaps:
+        raise AssertionError("there is nothing to rate")
+
+    assert rated(candidates[2:3], never, images, CONFIG.learned) == candidates[2:3]
 
 
 def test_no_network_sees_what_an_image_shows_already(network):

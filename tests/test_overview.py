@@ -15,12 +15,13 @@ import pytest
 from browser import chromium, dumped
 
 from vslam.cli import main as cli
+from vslam.cli.tables import show_tables, table_lines
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.overview import write_overview
-from vslam.overview.collect import collect, read_aligned
+from vslam.overview.collect import Found, collect, read_aligned
 from vslam.overview.render import tables
-from vslam.overview.schema import MEASURES, Drive, OverviewJson, RunEntry, Spread
+from vslam.overview.schema import ALL, MEASURES, Drive, OverviewJson, RunEntry, Spread
 from vslam.overview.summary import (
     compare,
     least_pairs,
@@ -29,6 +30,7 @@ from vslam.overview.summary import (
     summarize,
     systems,
 )
+from vslam.overview.versus import versus
 from vslam.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 
 LAWS = ("none", "brightness:0.5", "brightness:1")
@@ -79,14 +81,21 @@ def written(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Overv
     return write_overview([runs], [f"ORB-SLAM3@00={estimate}"], out), out
 
 
-def entry(system: str, sequence: str, ate: float | None, seed: int = 0) -> RunEntry:
+def entry(
+    system: str,
+    sequence: str,
+    ate: float | None,
+    seed: int = 0,
+    perturb: str = "brightness:1",
+    **measures: float,
+) -> RunEntry:
     return RunEntry(
-        drive=Drive(dataset="kitti", sequence=sequence, excerpt="", perturb="brightness:1"),
+        drive=Drive(dataset="kitti", sequence=sequence, excerpt="", perturb=perturb),
         system=system,
         seed=seed,
         frames=100,
-        measures={name: None for name, *_ in MEASURES} | {"ate_rmse_m": ate},
-        source=f"{system}-{sequence}-{seed}",
+        measures={name: None for name, *_ in MEASURES} | {"ate_rmse_m": ate} | measures,
+        source=f"{system}-{sequence}-{perturb}-{seed}",
         machine=None,
     )
 
@@ -95,7 +104,7 @@ def test_json_is_versioned_and_round_trips(written):
     report, out = written
     text = (out / "report.json").read_text()
     found = json.loads(text)
-    assert (found["kind"], found["schema_version"]) == ("overview", 2)
+    assert (found["kind"], found["schema_version"]) == ("overview", 3)
     assert OverviewJson.model_validate_json(text).model_dump_json(indent=2) + "\n" == text
     assert OverviewJson.model_validate_json(text) == report
 
@@ -231,6 +240,109 @@ def test_noise_is_not_called_a_win():
     assert "chance alone may do this" in found.words
 
 
+def loops(found: int, missed: int, lost: int = 0, rpe: float = 0.02) -> dict[str, float]:
+    counts = {"loops_found": found, "loops_missed": missed, "loops_wrong": 0}
+    return {**counts, "lost_frames": lost, "rpe_m": rpe}
+
+
+@pytest.fixture
+def two_conditions() -> list[RunEntry]:
+    """Six sequences; ``both`` closes the loop of each under brightness, ``bow`` of none."""
+    runs = []
+    for name in (f"{k:02d}" for k in range(6)):
+        for system in ("bow", "both"):
+            runs.append(entry(system, name, 1.0, perturb="none", **loops(1, 0)))
+            finds = system == "both"
+            ate = 1.5 if finds else 2.0 + 0.1 * int(name)
+            runs += [entry(system, name, ate, k, **loops(finds, not finds, lost=k)) for k in (0, 1)]
+    return runs
+
+
+def test_a_row_for_each_sequence_and_condition_and_who_wins_over_all(two_conditions):
+    (table,) = versus(summarize(Found(two_conditions, [])))
+    assert table.title == "both against bow"
+    assert len(table.rows) == 12
+    assert list(zip(table.head, table.rows[3], strict=True)) == [
+        ("sequence", "01"), ("perturbation", "brightness:1"), ("lost, bow", "0.5"),
+        ("lost, both", "0.5"), ("ATE (m), bow", "2.100"), ("ATE (m), both", "1.500"),
+        ("diff.", "-0.600"), ("RPE (mm), bow", "20.0"), ("RPE (mm), both", "20.0"),
+        ("diff.", "tie"), ("loops, bow", "0/1/0"), ("loops, both", "1/0/0"),
+    ]  # fmt: skip
+    assert table.rows[2][6] == "tie"  # without brightness
+    lost, found, ate, rpe = table.points
+    assert lost == "Lost frames: bow 6 in 18 runs, both 6 in 18 runs."
+    assert found.endswith("bow 6 / 12 / 0, both 18 / 0 / 0.")
+    # Half of what brightness costs: the other condition is a tie.
+    assert ate.startswith("ATE over all conditions: both wins. Of 6 sequences, both has the small")
+    assert "median -0.375 m (-0.500 to -0.250)" in ate
+    assert "p = 0.0312" in ate
+    assert rpe.startswith("RPE over all conditions: a tie. Of 6 sequences, no difference on 6 (00")
+
+
+def test_the_table_of_a_short_name_fits_a_terminal_of_80_columns(two_conditions, capsys):
+    found = versus(summarize(Found(two_conditions, [])))
+    lines = list(table_lines(found[0]))
+    assert max(map(len, lines)) <= 80
+    assert lines[2].split() == [
+        "sequence", "perturbation", "bow", "both", "bow", "both", "diff.", "bow", "both", "diff.",
+        "bow", "both",
+    ]  # fmt: skip
+    for head in lines[:3]:  # numbers and their headings end in one column
+        ends = {match.end() for match in re.finditer(r"\S+", lines[4])}
+        assert {match.end() for match in re.finditer(r"\S+", head[22:])} <= {e - 22 for e in ends}
+    show_tables(found)
+    printed = capsys.readouterr().out
+    assert "\n".join(lines) in printed
+    assert "- RPE over all conditions: a tie." in printed
+
+
+def test_one_condition_is_not_called_all(two_conditions):
+    runs = [run for run in two_conditions if run.drive.perturb == "none"]
+    report = summarize(Found(runs, []))
+    assert {c.perturb for c in report.comparisons} == {"none"}
+    assert versus(report)[0].points[2].startswith("ATE, images as they are: a tie. Of 6 sequences")
+
+
+def test_the_winner_is_who_has_the_smaller_errors(two_conditions):
+    report = summarize(Found(two_conditions, []), "both")
+    assert report.systems == ["both", "bow"]
+    winners = {(c.perturb, c.measure): c.winner for c in report.comparisons}
+    assert winners == {
+        (perturb, measure): "both" if perturb != "none" and measure == "ate_rmse_m" else None
+        for perturb in ("none", "brightness:1", ALL)
+        for measure in ("ate_rmse_m", "rpe_m")
+    }
+    assert versus(report)[0].title == "bow against both"
+
+
+def test_every_system_stands_beside_its_baseline():
+    runs = [entry(name, "00", 1.0) for name in ("none", "bow", "both")]
+    mono = {"alignment": "sim3"}
+    runs += [entry(name, "00", 1.0).model_copy(update=mono) for name in ("bow, mono", "both, mono")]
+    runs.append(entry("alone", "01", 1.0))
+    report = summarize(Found(runs, []), "bow")
+    assert [table.title for table in versus(report)] == [
+        "none against bow", "both against bow", "both, mono against bow, mono", "alone",
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="--baseline vgg16: no run of it; choose from none, bow"):
+        summarize(Found(runs, []), "vgg16")
+
+
+def test_what_a_run_does_not_have_is_not_made_up():
+    runs = [
+        entry("bow", "00", None, **loops(1, 0)),
+        entry("both", "00", 1.0),
+        entry("bow", "01", 1.0),
+    ]
+    (table,) = versus(summarize(Found(runs, [])))
+    assert table.rows[0][2:] == (
+        "0", "n/a", "n/a", "1.000", "n/a", "20.0", "n/a", "n/a", "1/0/0", "n/a",
+    )  # fmt: skip
+    assert table.rows[1][2:5] == ("n/a", "n/a", "1.000")
+    assert table.points[0] == "Lost frames: bow 0 in 1 run, both n/a in 1 run."
+    assert len(table.points) == 2  # nothing to compare
+
+
 def test_runs_of_different_thresholds_are_noted(run_folder: Path, tmp_path: Path):
     for name in ("a", "b"):
         folder = copy_run(run_folder, tmp_path / name)
@@ -246,6 +358,15 @@ def test_changes_of_a_rendered_town_are_perturbations(run_folder: Path, tmp_path
     assert {drive.sequence for drive in drives} == {"05"}
     assert [drive.perturb for drive in drives] == ["none", "change:0.5", "change:1,blur:1"]
     assert list(strengths(drives, "change").values()) == [0.0, 0.5]
+
+
+def test_a_drive_with_a_name_of_its_own_keeps_it(run_folder: Path, tmp_path: Path):
+    for name in ("night", "night+moving:2"):
+        copy_run(run_folder, tmp_path / name, dataset="synthetic", sequence=name, perturb="none")
+    runs = collect([tmp_path], []).runs
+    assert [(run.drive.sequence, run.drive.perturb, run.town) for run in runs] == [
+        ("night", "none", 1), ("night", "moving:2", 1),
+    ]  # fmt: skip
 
 
 def test_towns_of_other_seeds_are_put_together_as_seeds_are(run_folder: Path, tmp_path: Path):
@@ -367,7 +488,7 @@ def test_csv_has_a_line_for_each_row(written):
 def test_markdown_tables_are_aligned(written):
     blocks = (written[1] / "report.md").read_text().split("\n\n")
     tables = [block for block in blocks if block.startswith("|")]
-    assert len(tables) == 5
+    assert len(tables) == 7
     for table in tables:
         assert len({len(line) for line in table.splitlines()}) == 1
 
@@ -474,6 +595,8 @@ def test_command_line(runs: Path, tmp_path: Path, monkeypatch, capsys):
     assert not stop.value.code
     output = capsys.readouterr()
     assert f"{tmp_path / 'made' / 'report.html'}: 3 runs" in output.out
+    for part in ("bow against none", "ORB-SLAM3 against none", "Lost frames: none "):
+        assert part in output.out
     assert "note: " in output.err
     # A report of many runs is not a run.
     assert len(collect([tmp_path / "made", *runs], []).runs) == 2

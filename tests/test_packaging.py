@@ -121,8 +121,8 @@ def test_the_readme_of_a_registry_has_no_link_that_leads_nowhere(wheels, tmp_pat
         assert not link.search(text)
     assert "](https://example.org/v/blob/main/docs/cameras.md)" in text
     assert "![" not in readme_for("", tmp_path)
-    assert "![A rendered frame" in text
-    assert "](https://example.org/v/raw/main/docs/images/demo.jpg)" in text
+    assert "![The same street" in text
+    assert "](https://example.org/v/raw/main/docs/images/night.jpg)" in text
     assert ("![" in shown) == bool(source)
 
 

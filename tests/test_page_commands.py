@@ -85,13 +85,20 @@ RULES = {
     ),
     "docs/bench.md": Rules(
         (
-            ("--runs 3", "--runs 1"),  # all frames: straight ahead alone no error is defined
+            # All frames: straight ahead alone no error is defined.
+            ("vslam bench --out bench/kitti", "vslam bench --seqs 00 --runs 1 --out bench/kitti"),
+            ("synthetic --out", f"synthetic --seqs block --max-frames {N} --perturb none --out"),
+            (
+                "--seqs 00,05-07 --perturb brightness:1.5",
+                f"--seqs 00 --max-frames {N} --perturb none",
+            ),
+            ("--runs 3", "--runs 1"),
             (
                 "stereo.yaml --perturb none,brightness",
-                f"stereo.yaml --max-frames {N} --perturb none --detectors none",
+                f"stereo.yaml --max-frames {N} --perturb none",
             ),
             (r"\\\n +--trajectory ORB-SLAM3@00@brightness:1=\S+", ""),
-            (" --threads 4 ...", f" --seqs 00 --perturb none --detectors none --max-frames {N}"),
+            (" --threads 4 ...", f" --seqs 00 --perturb none --max-frames {N}"),
         ),
     ),
     "docs/cameras.md": Rules(

@@ -30,10 +30,8 @@ from vslam.frontend.tracking import TrackingContext
 from vslam.loops import LoopEdge
 from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap
-from vslam.report.schema import LoopFigures
-from vslam.report.summary import summarize
 from vslam.run.outcome import RunOutcome, RunSettings
-from vslam.run.pipeline import _tell_loops, run_sequence, with_comparison
+from vslam.run.pipeline import _tell_loops, run_sequence
 from vslam.run.preparation import prepare_frame
 from vslam.run.recorder import NullRecorder
 from vslam.trajectory import Trajectory, read_kitti_poses
@@ -43,13 +41,15 @@ needs_kitti = pytest.mark.skipif(not KITTI.is_dir(), reason="KITTI is not at ../
 
 
 def run(root: Path, sequence: str = "00", *, threads: int = 2, perturb: str = "none",
-        seed: int = 0, max_frames: int | None = None) -> RunOutcome:  # fmt: skip
+        seed: int = 0, max_frames: int | None = None, detector: str = "none",
+        compare: tuple[str, ...] = (), **options: object) -> RunOutcome:  # fmt: skip
     frames = open_sequence("kitti", root, sequence, max_frames=max_frames)
     perturbation = parse_perturbation(perturb, seed)
     settings = RunSettings(
-        "kitti", sequence, perturb, "none", "stereo", seed, threads, 0, 1, max_frames, Config()
-    )
-    return run_sequence(frames, perturbation, settings, NullRecorder())
+        "kitti", sequence, perturb, detector, "stereo", seed, threads, 0, 1, max_frames, Config(),
+        compare=compare,
+    )  # fmt: skip
+    return run_sequence(frames, perturbation, settings, NullRecorder(), **options)
 
 
 def vslam(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -123,25 +123,47 @@ def test_recorder_is_told_of_each_loop_once():
     assert told == edges
 
 
-def test_comparison_runs_the_same_images_again(kitti_tree):
-    outcome = run(kitti_tree, perturb="brightness:1", seed=3)
-    law = parse_perturbation("brightness:1", 3)
-    seen = []
-    compared = with_comparison(outcome, law, on_frame=lambda result: seen.append(result.index))
-    assert seen == list(range(28))
-    assert compared.trajectory is outcome.trajectory
-    without = compared.without_loops
-    assert without is not None
-    assert without.map is None
-    assert without.trajectory.T_wc.tobytes() == outcome.trajectory.T_wc.tobytes()
-    truth = ground_truth(outcome)
-    evaluation = evaluate_trajectory(outcome.trajectory, truth)
-    report = summarize(compared, evaluation, None, None)
-    figures = report.without_loops
-    assert figures is not None
-    assert figures.ate_rmse_m is not None
-    for name in LoopFigures.model_fields:  # there is no loop in the corridor
-        assert getattr(figures, name) == getattr(report, name)
+@pytest.mark.parametrize("threads", [1, 2])
+def test_compared_detectors_have_the_bytes_of_their_own_runs(kitti_tree, threads):
+    conditions = {"perturb": "brightness:1,desync:5", "seed": 3, "threads": threads}
+    read = []
+    together = run(
+        kitti_tree, detector="both", compare=("bow", "none"),
+        on_frame=lambda result: read.append(result.index), **conditions,
+    )  # fmt: skip
+    assert read == list(range(28))
+    assert [one.settings.detector for one in together.compared] == ["bow", "none"]
+    for one in (together, *together.compared):
+        alone = run(kitti_tree, detector=one.settings.detector, **conditions)
+        assert one.trajectory.T_wc.tobytes() == alone.trajectory.T_wc.tobytes()
+        assert one.keyframes.T_wc.tobytes() == alone.keyframes.T_wc.tobytes()
+        for track, own in zip(one.tracks, alone.tracks, strict=True):
+            assert track.T_wc.tobytes() == own.T_wc.tobytes()
+            assert (track.state, track.n_inliers) == (own.state, own.n_inliers)
+        assert 0.0 < one.step_s < together.wall_s
+    assert together.map is not None
+    assert [(one.map, one.stored) for one in together.compared] == [(None, None)] * 2
+
+
+def test_ctrl_c_ends_compared_detectors_at_the_same_frame(kitti_tree):
+    def interrupt(result):
+        if result.index == 9:
+            signal.raise_signal(signal.SIGINT)
+
+    outcome = run(kitti_tree, compare=("bow",), on_frame=interrupt)
+    for one in (outcome, *outcome.compared):
+        assert (one.interrupted, len(one.trajectory)) == ("Ctrl-C", 10)
+
+
+def test_unreadable_frames_are_told_once_and_counted_by_each_detector(kitti_tree, tmp_path, caplog):
+    root = tmp_path / "kitti"
+    shutil.copytree(kitti_tree, root)
+    image = root / "sequences" / "00" / "image_1" / "000004.png"
+    image.write_bytes(image.read_bytes()[:2000])
+    outcome = run(root, compare=("bow",), max_frames=6)
+    assert [len(one.skipped) for one in (outcome, *outcome.compared)] == [1, 1]
+    assert len(caplog.records) == 1
+    assert "frame 4 skipped" in caplog.text
 
 
 def test_truncated_image_is_skipped_and_counted(kitti_tree, tmp_path):

@@ -278,6 +278,24 @@ def test_a_detector_that_fails_ends_the_run_with_what_it_has(broken, kitti_tree,
     assert (folder / "trajectory.tum").is_file()
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_compared_detector_that_fails_ends_alone(broken, kitti_tree, tmp_path, threads):
+    broken(FAILING, "[vslam.detectors]\nmine = broken:Detector\n")
+    sequence = open_sequence("kitti", kitti_tree, "00")
+    settings = RunSettings(
+        "kitti", "00", "none", "none", "stereo", 0, threads, 0, 1, None, Config(), compare=("mine",)
+    )
+    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    assert outcome.interrupted is None
+    assert len(outcome.trajectory) == len(sequence)
+    assert 3 <= len(outcome.compared[0].trajectory) <= len(sequence)
+    report = write_results(tmp_path, outcome)
+    assert [one.interrupted is None for one in report.detectors] == [True, False]
+    for name in ("report.md", "report.html"):
+        assert "broken 2.0 failed" in (tmp_path / name).read_text()
+    assert (tmp_path / "trajectory_mine.tum").is_file()
+
+
 @pytest.mark.parametrize(
     ("answer", "says"),
     [

@@ -175,6 +175,20 @@ def test_an_unreadable_image_in_real_time(kitti_tree, threads, tmp_path):
     assert [str(image) in message for message in outcome.skipped] == [True]
 
 
+def test_a_compared_detector_drops_the_frames_that_the_main_one_drops(kitti_tree):
+    """As a live camera has it, whose frames come once."""
+    sequence = open_sequence("kitti", kitti_tree, "00", max_frames=8)
+    settings = RunSettings(
+        "kitti", "00", "none", "bow", "stereo", 0, 2, 0, 1, 8, Config(),
+        realtime=True, compare=("none",),
+    )  # fmt: skip
+    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    (other,) = outcome.compared
+    assert len(outcome.tracks) == len(other.tracks) == 8
+    for own, compared in zip(outcome.tracks, other.tracks, strict=True):
+        assert (own.timestamp, own.n_features) == (compared.timestamp, compared.n_features)
+
+
 def test_command_line_in_real_time(kitti_tree, tmp_path):
     command = [sys.executable, "-m", "vslam", "run", "--data", str(kitti_tree), "--realtime"]
     done = subprocess.run(
@@ -192,7 +206,10 @@ def test_command_line_in_real_time(kitti_tree, tmp_path):
     assert 0.0 < latency["median"] <= latency["p95"] <= latency["p99"]
     assert "| Latency" in (folder / "report.md").read_text()
     refused = subprocess.run(
-        [*command, "--compare-loops"], cwd=tmp_path, capture_output=True, text=True
+        [*command, "--detector", "none", "--compare", "bow"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
     )
     assert refused.returncode == 2
     assert "leave out --realtime" in refused.stderr

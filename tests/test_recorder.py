@@ -19,6 +19,7 @@ from vslam.errors import InputError
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.loops import LoopEdge
 from vslam.map import Map
+from vslam.run.moments import LoopPictureRecorder
 from vslam.run.recorder import (
     NullRecorder,
     Recorder,
@@ -33,9 +34,12 @@ pytest.importorskip("rerun.chunk", reason="this rerun cannot read recordings in 
 CAMERA = Camera(718.9, 718.9, 607.2, 185.2, 0.537, 1241, 376)
 FRAMES, FRAMES_PER_KEYFRAME, LANDMARKS_PER_KEYFRAME = 100, 3, 150
 
-REJECTED = LoopEdge(3, 0, 0.2, False, "too few inliers", 14, 7)
+REJECTED = LoopEdge(3, 0, 0.2, False, "too few inliers", 14, 7, proposed_by="bow")
 LOST = LoopEdge(-1, 2, 0.3, False, "too few matches", 8)
-CLOSED = LoopEdge(12, 1, 0.6, True, "closed", 90, 60)
+CLOSED = LoopEdge(
+    12, 1, 0.6, True, "closed", 90, 60, features=np.zeros(1, np.int32), matched_by="learned",
+    proposed_by="bow+capsule",
+)  # fmt: skip
 LOOPS = {12: [REJECTED], 42: [REJECTED, CLOSED, LOST], 45: [CLOSED], 70: [LOST]}
 SHIFTED_AT = 60
 
@@ -124,7 +128,8 @@ def rows(path: Path, entity: str) -> list[dict[str, Any]]:
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("run") / "recording.rrd"
-    record(RerunRecorder(path))
+    pictures = LoopPictureRecorder()
+    record(SeveralRecorders((pictures, RerunRecorder(path, pictures.pictures))))
     return path
 
 
@@ -141,6 +146,7 @@ def test_entities_and_their_frames(recording: Path) -> None:
         "world/loops/accepted": 2 + 1,  # decided twice, at the end
         "world/loops/rejected": 6,  # shown and hidden
         "state/loops": 6,
+        "loops/images": 2,  # of those accepted
         "world/ground_truth": 1,
         "world/trajectory": 1,
         "points/inliers": 1 + FRAMES,
@@ -195,9 +201,33 @@ def test_accepted_loops_stay_and_move_with_the_map(recording: Path) -> None:
 
 def test_loops_are_told_with_their_reasons(recording: Path) -> None:
     told = [row["TextLog:text"][0] for row in rows(recording, "state/loops")]
-    assert told[0] == "frame 9 to frame 0: too few inliers, 7 inliers of 14 matches"
+    assert told[0] == (
+        "frame 9 to frame 0: too few inliers, 7 inliers of 14 matches, "
+        "proposed by bow, matched by orb descriptors"
+    )
     assert any(text.startswith("a lost frame to frame 6: too few matches") for text in told)
-    assert told[-2] == "frame 36 to frame 3: closed, 60 inliers of 90 matches"
+    assert told[-2] == (
+        "frame 36 to frame 3: closed, 60 inliers of 90 matches, "
+        "proposed by bow+capsule, matched by learned descriptors"
+    )
+
+
+def test_a_closed_loop_shows_its_images_until_the_next_one(recording: Path) -> None:
+    import cv2
+
+    shown = rows(recording, "loops/images")
+    assert [row["frame"] for row in shown] == [42, 45]
+    picture = cv2.imdecode(np.array(shown[0]["EncodedImage:blob"][0], np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape == (194, 640 + 8 + 640, 3)
+    # The images of the two keyframes, frames 3 and 36 of the run.
+    keyframes = {
+        row["frame"]: row for row in rows(recording, "world/camera/image") if "frame" in row
+    }
+    for frame, half in ((3, picture[:, :640]), (36, picture[:, 648:])):
+        blob = np.array(keyframes[frame]["EncodedImage:blob"][0], np.uint8)
+        image = cv2.resize(cv2.imdecode(blob, cv2.IMREAD_GRAYSCALE), (640, 194)).astype(float)
+        difference = np.abs(image - half[..., 0])[30:]  # below the number of the frame
+        assert difference.mean() < 6
 
 
 def test_image_is_half_size_jpeg(recording: Path) -> None:

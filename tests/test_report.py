@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+from base64 import b64decode
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -19,9 +21,10 @@ from vslam.features import TrackingState, TrackResult
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.report.folder import write_results
 from vslam.report.render import headlines
-from vslam.report.schema import ReportJson
+from vslam.report.schema import DetectorFigures, ReportJson
 from vslam.report.summary import summarize
 from vslam.report.trajectory_figures import loop_closing, top_view
+from vslam.run.loop_pictures import LoopPicture
 from vslam.run.outcome import RunOutcome, RunSettings, matched_ground_truth
 from vslam.trajectory import Trajectory, read_trajectory
 
@@ -156,7 +159,9 @@ def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
         T_wq, T_wm = (truth[keyframe_frames[k]] for k in (query, match))
         T_query_match = np.linalg.inv(T_wq) @ T_wm
         T_query_match[0, 3] += shift
-        return LoopEdge(query, match, 0.7, accepted, reason, 120, 84, T_query_match)
+        return LoopEdge(
+            query, match, 0.7, accepted, reason, 120, 84, T_query_match, proposed_by="bow"
+        )
 
     rejected = [
         LoopEdge(70 + k % 20, k % 9, 0.3, False, f"{k % 14} inliers, 20 needed | <b>", 40, k % 14)
@@ -190,7 +195,8 @@ def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
         corrections=corrections,
         keyframe_frames=keyframe_frames,
         n_submaps=2,
-        without_loops=replace(plain, sequence=_Sequence(timestamps, truth)),
+        step_s=9.25,
+        compared=(replace(plain, sequence=_Sequence(timestamps, truth), step_s=8.5),),
     )
 
 
@@ -260,8 +266,8 @@ def test_json_holds_the_numbers_of_the_run(written: tuple[RunOutcome, Path]) -> 
     assert report["keyframes"] == 40
     assert report["landmarks"] == 9600
     assert report["seed"] == 3
-    assert report["schema_version"] == 4
-    assert (report["loops"], report["revisits"], report["without_loops"]) == ([], [], None)
+    assert report["schema_version"] == 5
+    assert (report["loops"], report["revisits"], report["detectors"]) == ([], [], [])
     assert (report["loops_closed"], report["loops_missed"], report["revisit_stretches"]) == (
         0,
         0,
@@ -373,20 +379,54 @@ def test_json_judges_every_loop(looped: tuple[RunOutcome, Path]) -> None:
 
 def test_comparison_is_in_every_text(looped: tuple[RunOutcome, Path]) -> None:
     outcome, folder = looped
-    without, truth = outcome.without_loops, matched_ground_truth(outcome)
-    assert without is not None
+    (other,), truth = outcome.compared, matched_ground_truth(outcome)
     assert truth is not None
-    expected = evaluate_trajectory(without.trajectory, truth)
+    expected = evaluate_trajectory(other.trajectory, truth)
     report = ReportJson.model_validate_json((folder / "report.json").read_bytes())
-    assert report.without_loops is not None
-    assert report.without_loops.ate_rmse_m == expected.ate_rmse_m
-    assert report.without_loops.loops_closed == 0
-    assert report.ate_rmse_m is not None
+    own, compared = report.detectors
+    assert (own.detector, compared.detector) == ("bow", "none")
+    for name in set(DetectorFigures.model_fields) & set(ReportJson.model_fields):
+        assert getattr(own, name) == getattr(report, name), name
+    for name in ("ate_rmse_m", "rpe_m", "rpe_deg", "t_rel_percent", "r_rel_deg_per_100m"):
+        assert getattr(compared, name) == getattr(expected, name), name
+    assert compared.causal_ate_rmse_m == expected.ate_rmse_m  # the stub has no other poses
+    counts = ("loops_closed", "loops_found", "loops_missed", "loops_wrong")
+    assert [getattr(own, name) for name in counts] == [4, 1, 0, 1]
+    assert [getattr(compared, name) for name in counts] == [0, 0, 1, 0]
+    assert (own.seconds, compared.seconds) == (9.25, 8.5)
     for name in ("report.md", "report.html"):
         text = (folder / name).read_text()
-        assert "With and without loop closing" in text
-        assert f"{report.ate_rmse_m:.3f} m" in text
-        assert f"{expected.ate_rmse_m:.3f} m" in text
+        for row, found in (("bow", own), ("none", compared)):
+            cells = [
+                row, str(found.lost_frames), f"{found.ate_rmse_m:.3f} m",
+                f"{found.causal_ate_rmse_m:.3f} m", f"{found.rpe_m:.4f} m",
+                f"{found.t_rel_percent:.3f} %", str(found.loops_found), str(found.loops_missed),
+                str(found.loops_wrong), f"{found.seconds:.1f} s",
+            ]  # fmt: skip
+            between = r"\s*(\||</td><td[^>]*>)\s*"
+            assert re.search(between.join(map(re.escape, cells)), text), (name, row)
+        assert text.index("Detectors") < text.index("Loops closed")
+    estimate = read_trajectory(folder / "trajectory_none.tum")
+    np.testing.assert_allclose(estimate.T_wc, other.trajectory.T_wc, atol=1e-8)
+
+
+def test_compared_trajectories_are_in_the_top_view(looped: tuple[RunOutcome, Path]) -> None:
+    outcome, folder = looped
+    T_elsewhere = np.eye(4)
+    T_elsewhere[0, 3] = 40.0
+    moved = Trajectory(outcome.trajectory.timestamps, T_elsewhere @ outcome.trajectory.T_wc)
+    outcome = replace(outcome, compared=(replace(outcome, trajectory=moved, compared=()),))
+    truth = matched_ground_truth(outcome)
+    assert truth is not None
+    evaluation = evaluate_trajectory(outcome.trajectory, truth)
+    axes = top_view(outcome, evaluation, truth, None).axes[0]
+    own, compared = (line for line in axes.lines if line.get_label() == "bow")
+    assert "truth" in {line.get_label() for line in axes.lines}
+    np.testing.assert_allclose(own.get_xydata(), compared.get_xydata(), atol=1e-6)
+    alone = top_view(outcome, None, None, None).axes[0].lines
+    own, compared = (line for line in alone if line.get_label() == "bow")
+    np.testing.assert_allclose(own.get_xdata() + 40.0, compared.get_xdata(), atol=1e-6)
+    assert "Dashed: the detectors compared" in (folder / "report.html").read_text()
 
 
 def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) -> None:
@@ -410,6 +450,55 @@ def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) 
     assert "1 of 1 revisits found, 0 missed, 1 wrong, 300 candidates rejected" in text
 
 
+def test_closed_loops_are_shown_in_pictures(tmp_path: Path) -> None:
+    outcome = two_laps()
+    loops = [
+        replace(loop, matched_by="learned", proposed_by="bow+capsule") if loop.query == 80 else loop
+        for loop in outcome.loops
+    ]
+    outcome = replace(outcome, loops=loops)
+    grey = cv2.imencode(".jpg", np.full((50, 100), 90, np.uint8))[1].tobytes()
+    xy = np.array([[20.0, 20.0]])
+    rejected = (368, 116)
+    pictures = [
+        LoopPicture(query, match, grey, grey, xy, xy)
+        for query, match in ((264, 12), (320, 68), (360, 200), rejected)
+    ]
+    write_results(tmp_path, outcome, pictures=pictures)
+    # The wrong one first, then the one by learned descriptors; that of frame 400 has no picture.
+    names = ["loop-360-200.jpg", "loop-320-68.jpg", "loop-264-12.jpg"]
+    captions = [
+        "Frame 360 (right) was wrongly taken for the place of frame 200 (left): 84 matches agree; "
+        "proposed by bow, verified by ORB descriptors.",
+        "Frame 320 (right) shows the place of frame 68 (left): 84 matches agree; "
+        "proposed by bow and capsule, verified by learned descriptors.",
+        "Frame 264 (right) shows the place of frame 12 (left): 84 matches agree; "
+        "proposed by bow, verified by ORB descriptors.",
+    ]
+    html, markdown = ((tmp_path / f"report.{kind}").read_text() for kind in ("html", "md"))
+    assert re.findall(r"<figcaption>(Frame .*)</figcaption>", html) == captions
+    assert re.findall(r"^Frame .*", markdown, re.MULTILINE) == captions
+    assert re.findall(r"\(figures/(.*)\)", markdown) == names
+    assert "3 of the 4 closed loops are shown." in html
+    files = [(tmp_path / "figures" / name).read_bytes() for name in names]
+    embedded = re.findall(r'<img src="data:image/jpeg;base64,([^"]*)"', html)
+    assert [b64decode(picture) for picture in embedded] == files
+    assert len(list((tmp_path / "figures").glob("*.jpg"))) == len(names)
+
+
+def test_a_report_shows_a_few_loops(tmp_path: Path) -> None:
+    outcome = two_laps()
+    grey = cv2.imencode(".jpg", np.full((50, 100), 90, np.uint8))[1].tobytes()
+    loops = [LoopEdge(query, 3, 0.7, True, "closed", 120, 84) for query in range(66, 86)]
+    pictures = [
+        LoopPicture(4 * loop.query, 12, grey, grey, np.zeros((0, 2)), np.zeros((0, 2)))
+        for loop in loops
+    ]
+    write_results(tmp_path, replace(outcome, loops=loops, corrections=[]), pictures=pictures)
+    assert len(list((tmp_path / "figures").glob("loop-*.jpg"))) == 6
+    assert "6 of the 20 closed loops are shown." in (tmp_path / "report.html").read_text()
+
+
 def test_missed_revisit_is_named(tmp_path: Path) -> None:
     outcome = two_laps()
     report = report_of(replace(outcome, loops=outcome.loops[1:3], corrections=[]), tmp_path)
@@ -423,7 +512,7 @@ def test_loops_without_ground_truth() -> None:
     outcome = two_laps()
     sequence = _Sequence(outcome.sequence.timestamps, None)
     lost = LoopEdge(-1, 3, 0.4, False, "too few matches")
-    outcome = replace(outcome, sequence=sequence, loops=[*outcome.loops, lost], without_loops=None)
+    outcome = replace(outcome, sequence=sequence, loops=[*outcome.loops, lost], compared=())
     report = summarize(outcome, None, evaluate_loops(outcome), None)
     assert (report.loops_found, report.loops_missed, report.loops_wrong) == (None, None, None)
     assert report.revisit_stretches is None

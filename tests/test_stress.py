@@ -43,7 +43,7 @@ def report_of(cell: Cell, **figures: object) -> ReportJson:
         "startup_s": 1.0, "peak_memory_mb": 300.0, "stage_ms": {}, "keyframes": 10,
         "landmarks": 1000, "submaps": 1, "loops_closed": 1, "loops_rejected": 0, "loops_found": 1,
         "loops_missed": 0, "loops_wrong": 0, "revisit_stretches": 1, "revisits": [], "loops": [],
-        "without_loops": None, "dataset": cell.dataset, "sequence": cell.sequence,
+        "dataset": cell.dataset, "sequence": cell.sequence,
         "perturb": cell.perturb, "detector": cell.detector, "sensor": "stereo", "seed": cell.seed,
         "threads": 1, "start": 0, "every": 1, "max_frames": cell.max_frames,
         "machine": Machine(cpu="x", cores=2, python="3", platform="x"), "versions": {},
@@ -467,7 +467,7 @@ rows = [f"1 0 0 {0.1 * (i % 3) + far * (i % 2)} 0 1 0 0 0 0 1 {i}" for i in k]
         ("--systems orbslam3", "--vocabulary"),
         ("--systems dso", "--systems dso: unknown"),
         ("--system x", "write NAME=COMMAND"),
-        ("--system bow={folder}{out}", "--system bow: a detector of this test has that name"),
+        ("--system both={folder}{out}", "--system both: a detector of this test has that name"),
         ("--preset kitti-c --baseline capsule", "--baseline capsule: not tested"),
     ],
 )

@@ -13,8 +13,10 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from typer.testing import CliRunner
 
 from vslam.camera import Camera
+from vslam.cli.main import app
 from vslam.datasets import open_sequence
 from vslam.datasets.kitti import open_kitti
 from vslam.datasets.synthetic import houses, parse_drive, store, textures, vehicles, views
@@ -593,8 +595,22 @@ def test_a_name_says_how_the_town_varies():
         "05",
         Variation(3, aliased=True, change=0.5, moving=6),
     )
+    assert parse_drive("night") == ("lane", Variation(1, change=1.0))
+    assert parse_drive("night+seed:7+moving:2") == ("lane", Variation(7, change=1.0, moving=2))
     for name in ("05+fog", "05+change:2", "05+change", "05+moving:x", "05+seed:", "05+"):
         with pytest.raises(InputError, match=r"--seq 05\+.* is not understood"):
             parse_drive(name)
-    with pytest.raises(InputError, match="route 77: unknown"):
+    with pytest.raises(InputError, match=r"route 77: unknown; choose one of demo, .*, lane, night"):
         open_sequence("synthetic", None, "77+change:0.5")
+
+
+def test_a_drive_with_a_name_of_its_own_is_that_route_in_that_town(tmp_path, monkeypatch):
+    monkeypatch.setenv("VSLAM_CACHE", str(tmp_path))
+    words = ["synth", "night", "--max-frames", "1", "--quiet"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    folder = tmp_path / "synthetic" / "v2-seed1-change1"
+    assert done.output.startswith(f"{folder}: ")
+    assert [path.name for path in (folder / "sequences").iterdir()] == ["lane"]
+    found = open_sequence("synthetic", None, "night", max_frames=1)
+    assert (found.name, found.dataset, len(found)) == ("night", "synthetic", 1)

@@ -45,7 +45,13 @@ from vslam.features import Features
 from vslam.geometry import Matrix, compose, inverse, inverses, orthonormalised
 from vslam.loopclosure.consistency import LoopConsistency
 from vslam.loopclosure.detector import LoopDetector
-from vslam.loopclosure.learned_verification import LearnedTrials, shows_known, verify_learned
+from vslam.loopclosure.learned_verification import (
+    LearnedTrials,
+    rated,
+    shows_known,
+    verify_learned,
+)
+from vslam.loopclosure.reach import beyond_reach
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verification import verify, verify_near
 from vslam.loops import ClosingMemory, LoopCandidate, LoopCorrection, LoopEdge
@@ -107,6 +113,7 @@ class LoopClosing:
 
     def consider(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> None:
         """Verify what a keyframe looks like, best first; close the first real loop."""
+        candidates = self._rated(map_, keyframe, candidates)
         consistent, rejected = self._consistency.update(keyframe, candidates, map_)
         chosen = self._trials.choose(keyframe, candidates)
         self.edges += [edge for edge in rejected if edge.match not in chosen]
@@ -114,7 +121,9 @@ class LoopClosing:
         verified = [one for one in candidates if one in consistent or one.match in chosen]
         for number, candidate in enumerate(verified):
             edge = refused.get(candidate.match)
-            if edge is None:
+            if edge is None and self._config.verification.descriptors == "learned":
+                edge = LoopEdge.of(candidate, "not alike enough for learned descriptors")
+            elif edge is None:
                 edge = verify(map_, candidate, self._camera, self._config.verification)
             if not edge.accepted and candidate.match in chosen:
                 edge = self._verify_learned(map_, candidate, edge)
@@ -155,6 +164,16 @@ class LoopClosing:
 
     def _is_due(self, keyframe: int) -> bool:
         return self._global is not None and keyframe + self._followed >= self._global.due
+
+    def _rated(
+        self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
+    ) -> list[LoopCandidate]:
+        """Candidates with their likeness, of those where the camera may be."""
+        images, config = self.images, self._config
+        if images is None or keyframe not in images or not candidates:
+            return candidates
+        beyond = beyond_reach(map_, keyframe, config.siamese)
+        return rated(candidates, lambda: images.glance(keyframe), images, config.learned, beyond)
 
     def _verify_learned(self, map_: Map, candidate: LoopCandidate, by_orb: LoopEdge) -> LoopEdge:
         """What learned descriptors say of a candidate that ORB's did not verify."""
@@ -356,8 +375,7 @@ class LoopClosing:
 
 
 def _superseded(candidate: LoopCandidate) -> LoopEdge:
-    reason = "another loop was closed at this keyframe"
-    return LoopEdge(candidate.query, candidate.match, candidate.score, False, reason)
+    return LoopEdge.of(candidate, "another loop was closed at this keyframe")
 
 
 @dataclass(frozen=True)

@@ -509,10 +509,16 @@ class SiameseConfig(_Section):
         20.0,
         ge=0,
         description="Where local descriptors verify, only keyframes so near are compared, metres, "
-        "and by a share of the drive since; not in monocular maps. [own]",
+        "and by a share of the drive since. [own]",
     )
     reach_share: float = Field(
         0.1, ge=0, description="Share of the drive that `reach` grows by. [own]"
+    )
+    monocular_reach_share: float = Field(
+        0.3,
+        ge=0,
+        description="The same share in monocular maps, whose unit drifts: twice what KITTI 00 "
+        "needs, where it drifts by a factor of 2.3. [own]",
     )
     embedded_at_once: int = Field(
         8, ge=1, description="Keyframes that a query has the network see, the nearest. [own]"
@@ -524,6 +530,13 @@ class SiameseConfig(_Section):
 
 class VerificationConfig(_Section):
     """When a loop candidate is a revisit [OS1, VII-B; OS2, III-C]."""
+
+    descriptors: Literal["usual", "orb", "learned", "both"] = Field(
+        "usual",
+        description="What verifies candidates, whichever detector proposed them: ORB, the "
+        "network's local descriptors, or these where ORB fails (`both`); `usual` is `orb` for "
+        "`bow`, `capsule-paper` and plug-ins, `both` for the other networks and `both`. [own]",
+    )
 
     match_distance: int = Field(
         50, ge=0, le=256, description="Descriptor distance, bits. [OS1 VII-B, customary]"
@@ -583,7 +596,13 @@ class LearnedMatchingConfig(_Section):
     """Places matched by the network's local descriptors, where ORB fails."""
 
     max_candidates: int = Field(
-        2, ge=0, description="Candidates tried of a keyframe or lost frame; 0: ORB alone. [own]"
+        2, ge=1, description="Candidates tried of a keyframe or lost frame. [own]"
+    )
+    rated: int = Field(
+        5,
+        ge=0,
+        description="Candidates of a detector without local descriptors whose likeness they say, "
+        "at most. [own]",
     )
     views: int = Field(
         2, ge=1, description="Keyframes of the place that are matched, at most. [own]"

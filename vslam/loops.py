@@ -19,13 +19,15 @@ class LoopCandidate:
         match: keyframe of the same place, alive in the map.
         score: the detector's own measure, greater is more alike.
         alike: how much of the two images local descriptors of a network find alike, so that they
-            may verify what ORB's do not; None for the candidate of a detector without.
+            may verify what ORB's do not; None where they were not asked.
+        proposed_by: name of the detector that found it; several are joined by ``+``.
     """
 
     query: int
     match: int
     score: float
     alike: float | None = None
+    proposed_by: str = ""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class LoopEdge:
     """What became of a candidate, accepted or not: rejected ones are kept for the report.
 
     Attributes:
-        query, match, score: as in the candidate.
+        query, match, score, proposed_by: as in the candidate.
         accepted: whether the loop was closed.
         reason: "closed", or in a few words what spoke against it.
         n_matches: landmarks of the place matched to features of the query.
@@ -59,6 +61,25 @@ class LoopEdge:
     landmarks: NDArray[np.int32] | None = None
     scale: float = 1.0
     matched_by: Literal["orb", "learned"] = "orb"
+    proposed_by: str = ""
+
+    @classmethod
+    def of(
+        cls,
+        candidate: LoopCandidate,
+        reason: str = "",
+        matched_by: Literal["orb", "learned"] = "orb",
+    ) -> LoopEdge:
+        """The edge of a candidate that is not accepted yet, or for this reason."""
+        return cls(
+            candidate.query,
+            candidate.match,
+            candidate.score,
+            accepted=False,
+            reason=reason,
+            matched_by=matched_by,
+            proposed_by=candidate.proposed_by,
+        )
 
 
 def loop_entry(loop: LoopEdge) -> dict[str, Any]:
@@ -127,10 +148,10 @@ class PerKeyframe:
 
     def select(self, keyframes: NDArray[np.int64]) -> PerKeyframe:
         """Those of ``(M,)`` keyframes, numbered anew; of keyframes not known here, nothing."""
-        known = np.minimum(keyframes, max(len(self) - 1, 0))
-        count = np.where(keyframes < len(self), np.diff(self.first, append=0)[known], 0)
-        first = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
-        return PerKeyframe(first, self.values[ranges(self.first[known], count)])
+        nothing = self.values[:0]
+        parts = [self.of(k) if k < len(self) else nothing for k in keyframes.tolist()]
+        first = np.cumsum([0, *map(len, parts)]).astype(np.int64)
+        return PerKeyframe(first, np.concatenate([nothing, *parts]))
 
     def followed_by(self, other: PerKeyframe) -> PerKeyframe:
         """Those of another map's keyframes appended."""

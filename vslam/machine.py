@@ -97,6 +97,14 @@ def keep_memory() -> None:
         of_c.mallopt(M_ARENA_MAX, 1)
 
 
+def give_back_memory() -> None:
+    """Give the system what ``keep_memory`` has kept and nobody uses. Nothing without glibc."""
+    import ctypes
+
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
 def cpu_name() -> str:
     """The processor's name as its maker writes it."""
     # platform.processor() is empty or just "x86_64" on Linux.

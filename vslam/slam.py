@@ -41,7 +41,7 @@ from vslam.frontend.tracking import (
 )
 from vslam.geometry import Matrix, inverse, inverses, orthonormalised, se3_exp, se3_log
 from vslam.loopclosure.detector import LoopDetector
-from vslam.loopclosure.learned_verification import recognise
+from vslam.loopclosure.learned_verification import rated, recognise
 from vslam.loopclosure.registry import DEFAULT_DETECTOR, detector_with_images
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
@@ -596,12 +596,16 @@ class Slam:
     def _relocalise_learned(self, frame: Frame, candidates: list[LoopCandidate]) -> int:
         """By local descriptors of the network: where the light has changed ORB's find nothing."""
         images, config = self._closing.images, self.config.learned
-        candidates = [one for one in candidates if one.alike is not None]
-        candidates = candidates[: config.max_candidates]
-        if images is None or frame.image is None or not candidates:
+        image = frame.image
+        if images is None or image is None:
             return 0
-        maps = images.network.describe(frame.image)
-        for candidate in candidates:
+        candidates = rated(candidates, lambda: images.glance_at(image), images, config)
+        alike = [one for one in candidates if one.alike is not None]
+        alike.sort(key=lambda one: -(one.alike or 0.0))
+        if not alike:
+            return 0
+        maps = images.network.describe(image)
+        for candidate in alike[: config.max_candidates]:
             found = recognise(
                 self.map, maps, frame.features, candidate.match, images, self.camera, self.config
             )

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from vslam.config import LearnedMatchingConfig, SiameseConfig
 from vslam.features import Features
+from vslam.loopclosure.bow_index import grown
 from vslam.loopclosure.detector import require_same
 from vslam.loopclosure.local_matching import DescriptorMaps, likeness
+from vslam.loopclosure.reach import beyond_reach
 from vslam.loopclosure.siamese.images import to_size
 from vslam.loopclosure.siamese.inference import LateNetwork, OnnxNetwork, open_network
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
@@ -25,8 +27,8 @@ class SiameseDetector:
     Where images are kept, the network sees a keyframe only once the camera is near enough to it
     that it may be there again (:func:`beyond_reach`), or lost: on a drive that never returns, none.
 
-    Descriptors are kept in one matrix that grows by half: a query is one product with it. It has
-    no columns before the network was asked.
+    Descriptors of the keyframes that the network has seen are rows of one matrix that grows by
+    half. It has no columns before the network was asked.
     """
 
     def __init__(
@@ -50,20 +52,20 @@ class SiameseDetector:
         self._images = images
         self._config = config
         self._descriptors = np.zeros((64, 0), np.float32)
-        self._known = np.zeros(64, np.bool_)  # keyframes added with an image
+        self._n_seen = 0  # rows in use
+        self._row = np.full(64, -1, np.int64)  # of each keyframe, -1 for those not seen
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
         """Remember a keyframe. Without its image it can be neither query nor match."""
-        while keyframe >= len(self._known):
-            more = max(64, len(self._known) // 2)
-            self._descriptors = np.pad(self._descriptors, ((0, more), (0, 0)))
-            self._known = np.pad(self._known, (0, more))
+        if keyframe >= len(self._row):
+            more = max(keyframe + 1 - len(self._row), len(self._row) // 2)
+            self._row = np.pad(self._row, (0, more), constant_values=-1)
         if image is not None and self._images is None:
             self._remember(keyframe, image)
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
         """Best first: alive, neither recent nor covisible, similarity at or above the threshold."""
-        if keyframe >= len(self._known) or not (self._known[keyframe] or self._pending(keyframe)):
+        if keyframe >= len(self._row) or not (self._known[keyframe] or self._pending(keyframe)):
             return []
         eligible = self._alive(map_)
         eligible[max(0, keyframe - self._config.recent_keyframes) :] = False
@@ -79,7 +81,7 @@ class SiameseDetector:
             self._see([keyframe, *nearest[: self._config.embedded_at_once].tolist()])
             eligible &= self._known[: len(eligible)]
         threshold = self._config.threshold if self._images is None else self._config.offered
-        p = self._similarities(self._descriptors[keyframe], eligible)
+        p = self._similarities(self._descriptors[self._row[keyframe]], eligible)
         p[p < threshold] = -1.0
         order = p
         if self._images is not None and keyframe in self._images and (p >= 0).any():
@@ -106,9 +108,8 @@ class SiameseDetector:
 
     def memory(self) -> DetectorMemory:
         """See :class:`LoopDetector`: the descriptors of the keyframes with an image."""
-        known = np.flatnonzero(self._known)
         first = np.concatenate([[0], np.cumsum(self._known)]).astype(np.int64)
-        table = PerKeyframe(first, self._descriptors[known])
+        table = PerKeyframe(first, self._descriptors[self._row[self._known]])
         return DetectorMemory(self.name, self._network.fingerprint, {"descriptors": table})
 
     def restore(self, memory: DetectorMemory) -> None:
@@ -120,13 +121,18 @@ class SiameseDetector:
         right = values.dtype == np.float32 and (values.shape[1:] == columns or not len(values))
         if not right or not np.isfinite(values).all() or (known > 1).any():
             raise ValueError("the descriptors of the keyframes are not those of the network")
-        self._descriptors = np.zeros((len(known), *columns), np.float32)
-        self._descriptors[known > 0] = values
-        self._known = known > 0
+        self._descriptors = values.reshape(len(values), *columns)
+        self._n_seen = len(values)
+        self._row = np.where(known > 0, table.first[:-1], -1)
+
+    @property
+    def _known(self) -> NDArray[np.bool_]:
+        """``(K,)`` keyframes that the network has seen."""
+        return self._row >= 0
 
     def _alive(self, map_: Map) -> NDArray[np.bool_]:
         """``(n,)`` living keyframes with a descriptor, or with an image for one."""
-        n = min(map_.n_keyframes, len(self._known))
+        n = min(map_.n_keyframes, len(self._row))
         able = self._known[:n].copy()
         able[[k for k in np.flatnonzero(~able).tolist() if self._pending(k)]] = True
         return able & map_.arrays.keyframe_alive[:n]
@@ -147,9 +153,11 @@ class SiameseDetector:
     def _remember(self, keyframe: int, image: NDArray[np.uint8]) -> None:
         descriptor = self._embed(image)
         if not self._descriptors.shape[1]:
-            self._descriptors = np.zeros((len(self._known), len(descriptor)), np.float32)
-        self._descriptors[keyframe] = descriptor
-        self._known[keyframe] = True
+            self._descriptors = np.zeros((len(self._descriptors), len(descriptor)), np.float32)
+        self._descriptors = grown(self._descriptors, self._n_seen + 1)
+        self._descriptors[self._n_seen] = descriptor
+        self._row[keyframe] = self._n_seen
+        self._n_seen += 1
 
     def _embed(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         return self._network.embed(to_size(image, self._network.size, self._config.fit))
@@ -158,10 +166,16 @@ class SiameseDetector:
         self, descriptor: NDArray[np.float32], eligible: NDArray[np.bool_]
     ) -> NDArray[np.float32]:
         """``(N,)``, -1 for keyframes that are not eligible."""
-        if not eligible.any():
-            return np.full(len(eligible), -1.0, np.float32)
-        p = self._network.compare(descriptor, self._descriptors[: len(eligible)])
-        p[~eligible] = -1.0
+        p = np.full(len(eligible), -1.0, np.float32)
+        rows = self._row[: len(eligible)][eligible]
+        if len(rows):
+            # In the order of the keyframes, in whichever order they were seen: the last bits of a
+            # product of matrices may depend on where a row stands. Without gaps, nothing is copied.
+            in_a_row = (np.diff(rows) == 1).all()
+            gallery = (
+                self._descriptors[rows[0] : rows[-1] + 1] if in_a_row else self._descriptors[rows]
+            )
+            p[eligible] = self._network.compare(descriptor, gallery)
         return p
 
     def _reranked(self, p: NDArray[np.float32], query: DescriptorMaps) -> NDArray[np.float32]:
@@ -194,36 +208,11 @@ class SiameseDetector:
             if order[best] < 0.0:
                 break
             alike = None if self._images is None else float(order[best])
-            found.append(LoopCandidate(query, best, float(p[best]), alike))
+            found.append(LoopCandidate(query, best, float(p[best]), alike, self.name))
             around, _ = map_.covisible(best, self._config.min_shared)
             order[around[around < len(order)]] = -1.0
             order[best] = -1.0
         return found
-
-
-def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.float64]:
-    """``(n_keyframes,)`` how far each keyframe lies beyond what odometry's error may hide, metres;
-    0 or less for those where the camera may be.
-
-    The error of a position grows with the way driven. Where the camera was lost between two
-    keyframes nothing is known of it, nor of the unit of a monocular map.
-    """
-    n, a = map_.n_keyframes, map_.arrays
-    if not np.isfinite(a.u_right[map_.rows(keyframe)]).any():
-        return np.zeros(n)
-    T = a.T_cw[:n]
-    position = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
-    living = map_.living_keyframes()
-    steps = np.linalg.norm(np.diff(position[living], axis=0), axis=1)
-    driven = np.zeros(n)
-    driven[living[1:]] = np.cumsum(steps)
-    way = np.abs(driven[keyframe] - driven)
-    apart = np.linalg.norm(position - position[keyframe], axis=1)
-    beyond = apart - config.reach - config.reach_share * way
-    if map_.restarts:
-        submap = map_.submaps()
-        beyond[submap != submap[keyframe]] = 0.0
-    return np.asarray(beyond, np.float64)
 
 
 def open_detector(

@@ -17,23 +17,28 @@ from vslam.loopclosure.siamese.inference import FORMAT, NAME, VERSION, open_sess
 from vslam.loopclosure.siamese.weights import SHIPPED
 from vslam.loops import PerKeyframe
 
+SHIPPED_LOCAL = SHIPPED / "local.onnx"
 WIDTH = 640  # pixels of the image that the network reads; docs/loops.md has other widths
 GLANCE_WIDTH = 320  # of a first look
 _QUALITY = 90  # of the JPEG files of keyframes in memory
 _JPEG = b"\xff\xd8"
-_KEPT = 6  # descriptor maps, the latest used
+_KEPT = 4  # descriptor maps, the latest used
 
 
 class LocalDescriptors:
     """The network of local descriptors; it is loaded when the first image comes."""
 
-    def __init__(self, path: Path = SHIPPED / "local.onnx") -> None:
+    def __init__(self, path: Path = SHIPPED_LOCAL) -> None:
         """
+        Args:
+            path: ONNX file that ``tools/training/train_local.py`` wrote.
+
         Raises:
             InputError: no such file.
         """
         if not path.exists():
-            raise InputError(f"{path}: the local descriptors are not there; install vslam again.")
+            fix = "install vslam again" if path == SHIPPED_LOCAL else "name another file"
+            raise InputError(f"{path}: the local descriptors are not there; {fix}.")
         self._path = path
 
     @cached_property

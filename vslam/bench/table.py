@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from rich.console import Console
@@ -90,11 +90,17 @@ class GridProgress:
 @contextmanager
 def shown_live(progress: GridProgress, *, shown: bool) -> Iterator[Callable[[str], None]]:
     """Show the table on stderr and keep it up to date; where that is no terminal, print the lines
-    given to what this yields, and the table at the end."""
+    given to what this yields. At the end the table stays only if cells are missing or failed: a
+    finished grid is followed by its results."""
     console = Console(stderr=True, quiet=not shown, highlight=False, soft_wrap=True)
-    if console.is_terminal:
-        with Live(get_renderable=progress.table, console=console, refresh_per_second=1):
-            yield lambda line: None
-    else:
-        yield lambda line: console.print(line, markup=False)
-        console.print(progress.table())
+    live = (
+        Live(get_renderable=progress.table, console=console, refresh_per_second=1, transient=True)
+        if console.is_terminal
+        else nullcontext()
+    )
+    try:
+        with live:
+            yield lambda line: None if console.is_terminal else console.print(line, markup=False)
+    finally:
+        if progress.missing or progress.failed:
+            console.print(progress.table())

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from vslam.datasets.sequence import Sequence
     from vslam.datasets.stream import Stream
     from vslam.run.autosave import Unfinished
+    from vslam.run.moments import LoopPictureRecorder
     from vslam.run.options import RunOptions
     from vslam.run.outcome import RunSettings
     from vslam.run.recorder import Recorder, Viewer
@@ -40,7 +41,6 @@ def drive(
     *,
     out: Path = Path(),
     resume: Path | None = None,
-    compare_loops: bool = False,
 ) -> None:
     """Open the images, run SLAM and write the results.
 
@@ -50,16 +50,16 @@ def drive(
     """
     told = console(shown=not output.quiet)
     kind, source, perturbation = _open(options, told)
-    _refuse_camera(source, resume, compare_loops=compare_loops)
+    _refuse_camera(source, resume)
 
     # Bad input has been refused by now; what follows takes a second to import.
     from vslam.cli.summary import print_summary
     from vslam.datasets.stream import count_expected
     from vslam.report.folder import write_results
     from vslam.run.autosave import FolderAutosave, remove_autosave
-    from vslam.run.moments import MomentRecorder
+    from vslam.run.moments import LoopPictureRecorder, MomentRecorder
     from vslam.run.options import settings_of
-    from vslam.run.pipeline import begin, run_sequence, with_comparison
+    from vslam.run.pipeline import begin, run_sequence
 
     settings = settings_of(options, kind, source, perturbation.name)
     with ExitStack() as lock:
@@ -68,8 +68,8 @@ def drive(
         slam = begin(source.camera, settings, None if unfinished is None else unfinished.map)
         viewer = _viewer(output, told)
         folder = resume or _new_folder(options, settings, out, lock)
-        moments = MomentRecorder()
-        recorder = _recorder(folder, output, unfinished, viewer, moments)
+        moments, pictures = MomentRecorder(), LoopPictureRecorder()
+        recorder = _recorder(folder, output, unfinished, viewer, moments, pictures)
         # When only localising there is nothing to save but the poses.
         period = 0.0 if options.localize else options.autosave
         autosave = FolderAutosave(folder, period, f"{settings.dataset} {source.name}")
@@ -78,11 +78,8 @@ def drive(
                 source, perturbation, settings, recorder,
                 on_frame=on_frame, autosave=autosave, resume=unfinished, slam=slam,
             )  # fmt: skip
-        if compare_loops and not outcome.interrupted:
-            with told.progress_bar(count_expected(source)) as on_frame:
-                outcome = with_comparison(outcome, perturbation, on_frame=on_frame)
         report = write_results(
-            folder, outcome, moments.moments,
+            folder, outcome, moments.moments, pictures.pictures,
             pages=output.pages, ply=output.ply, map_file=options.save_map,
         )  # fmt: skip
         if not outcome.interrupted:
@@ -115,12 +112,10 @@ def _open(options: RunOptions, told: Console) -> tuple[str, Sequence | Stream, P
     return kind, source, perturbation
 
 
-def _refuse_camera(source: Sequence | Stream, resume: Path | None, *, compare_loops: bool) -> None:
+def _refuse_camera(source: Sequence | Stream, resume: Path | None) -> None:
     """What a camera has shown is gone."""
     from vslam.datasets.stream import is_live
 
-    if is_live(source) and compare_loops:
-        raise InputError("--compare-loops: a camera cannot be seen twice; leave it out.")
     if is_live(source) and resume is not None:
         raise InputError(
             f"--resume {resume}: what a camera has shown is gone; go on in its map with "
@@ -183,16 +178,21 @@ def _recorder(
     unfinished: Unfinished | None,
     viewer: Viewer | None,
     moments: Recorder,
+    pictures: LoopPictureRecorder,
 ) -> Recorder:
-    """All that is to be told of the run: a file, ``moments`` for the report, and a viewer."""
+    """All that is to be told of the run: a file, a viewer, and what the report shows."""
     from vslam.run.recorder import NullRecorder, RerunRecorder, SeveralRecorders
 
-    name = "recording.rrd"
-    if unfinished is not None:
-        name = f"recording-from-{len(unfinished.progress.tracks)}.rrd"
-    recorder: Recorder = RerunRecorder(folder / name) if output.record else NullRecorder()
-    if output.pages:
-        recorder = SeveralRecorders((recorder, moments))
+    recorders: list[Recorder] = []
+    if output.record:
+        name = "recording.rrd"
+        if unfinished is not None:
+            name = f"recording-from-{len(unfinished.progress.tracks)}.rrd"
+        recorders.append(RerunRecorder(folder / name, pictures.pictures))
     if viewer is not None:
-        recorder = SeveralRecorders((recorder, RerunRecorder(viewer)))
-    return recorder
+        recorders.append(RerunRecorder(viewer, pictures.pictures))
+    if output.pages:
+        recorders.append(moments)
+    if not recorders:
+        return NullRecorder()
+    return SeveralRecorders((pictures, *recorders))  # pictures first, since the others show them

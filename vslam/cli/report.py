@@ -12,7 +12,7 @@ _EXAMPLES = """
 
   vslam report bench
 
-  vslam report runs/20261121-1* other/bench --out comparison
+  vslam report runs/20261121-1* other/bench --baseline bow --out comparison
 
   vslam report runs --serve
 
@@ -35,6 +35,14 @@ def report(
             "the runs of that sequence are, or with scale if its name ends in ', mono'.",
         ),
     ] = None,
+    baseline: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Detector or system that the others are set against.",
+            show_default="the simplest",
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("report"),
     serve: Annotated[
         bool,
@@ -50,11 +58,11 @@ def report(
     ] = 0,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing.")] = False,
 ) -> None:
-    """Write one report of finished runs: medians, detectors compared, trajectories, curves."""
+    """Write one report of finished runs: detectors side by side, trajectories, curves."""
     if serve:
         serve_runs(runs, port)
         return
-    write_overview_of(runs, trajectory or [], out, quiet=quiet)
+    write_overview_of(runs, trajectory or [], out, baseline=baseline, quiet=quiet)
 
 
 def serve_runs(folders: list[Path], port: int) -> None:
@@ -69,12 +77,23 @@ def serve_runs(folders: list[Path], port: int) -> None:
             typer.echo("ended")
 
 
-def write_overview_of(runs: list[Path], trajectories: list[str], out: Path, *, quiet: bool) -> None:
-    """Write the report of finished runs, and say so unless ``quiet``."""
+def write_overview_of(
+    runs: list[Path],
+    trajectories: list[str],
+    out: Path,
+    *,
+    baseline: str | None = None,
+    quiet: bool,
+) -> None:
+    """Write the report of finished runs; unless ``quiet``, show its first tables and say where it
+    is."""
+    from vslam.cli.tables import show_tables
     from vslam.overview import write_overview
+    from vslam.overview.versus import versus
 
-    written = write_overview(runs, trajectories, out)
+    written = write_overview(runs, trajectories, out, baseline)
     if not quiet:
+        show_tables(versus(written))
         for note in written.notes:
             typer.echo(f"note: {note}", err=True)
-        typer.echo(f"{out / 'report.html'}: {len(written.runs)} runs")
+        typer.echo(f"\n{out / 'report.html'}: {len(written.runs)} runs")

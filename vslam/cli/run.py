@@ -41,6 +41,8 @@ _EXAMPLES = """
 
   vslam run --dataset synthetic --seq demo
 
+  vslam run --data ~/kitti --seq 00 --perturb brightness --compare bow
+
   vslam run --dataset euroc --data ~/euroc/V1_01_easy
 
   vslam run --seq 00 --max-frames 200 --no-record --quiet
@@ -96,13 +98,23 @@ def run(
         Path | None,
         typer.Option(help="ONNX file of a learned detector ([b]vslam train[/b])."),
     ] = None,
+    local_weights: Annotated[
+        Path | None,
+        typer.Option(
+            help="ONNX file of the local descriptors that verify loops (docs/local_descriptors.md)."
+        ),
+    ] = None,
     sensor: Sensor = None,
     out: Annotated[Path, typer.Option(help="Where the folders of the runs go.")] = Path("runs"),
     config: Thresholds = None,
-    compare_loops: Annotated[
-        bool,
-        typer.Option("--compare-loops", help="Run again without loop closing; print both."),
-    ] = False,
+    compare: Annotated[
+        str,
+        typer.Option(
+            metavar="DETECTORS",
+            help="Loop detectors to run beside it on the same frames, joined by commas, each with "
+            "a map of its own: a table of all. [b]none[/b] is odometry only.",
+        ),
+    ] = "",
     map_file: Annotated[
         Path | None,
         typer.Option(
@@ -164,6 +176,8 @@ def run(
         if given is not None and given.name == "COMMANDLINE":
             raise InputError(f"{source}: --data says what to run on, too; leave one of them out.")
         data = source
+    if local_weights is not None and not local_weights.is_file():
+        raise InputError(f"--local-weights {local_weights}: no such file; name an .onnx file.")
     if localize and map_file is None:
         raise InputError("--localize: name the map to localise in with --map.")
     if localize and save_map is not None:
@@ -173,15 +187,17 @@ def run(
 
         require_place(save_map, "--save-map")
     if map_file is not None:
-        if compare_loops:
-            raise InputError("--compare-loops: not for a run that goes on in a map; leave it out.")
+        if compare:
+            raise InputError("--compare: not for a run that goes on in a map; leave it out.")
         map_file, detector = _map_to_go_on_in(map_file, detector)
     detector = detector or DEFAULT_DETECTOR
     require_detector(detector, weights)
-    if compare_loops and detector == "none":
-        raise InputError("--compare-loops: nothing to compare with --detector none; name another.")
-    if compare_loops and realtime:
-        raise InputError("--compare-loops: two runs drop different frames; leave out --realtime.")
+    beside = _compared(compare, detector)
+    if beside and realtime:
+        raise InputError(
+            "--compare: in real time each detector would cost the others frames; leave out "
+            "--realtime."
+        )
 
     from vslam.config import Config, load_config
     from vslam.machine import available_cores
@@ -206,15 +222,17 @@ def run(
         threads=threads or min(available_cores(), 4),
         detector=detector,
         weights=weights,
+        local_weights=local_weights,
         sensor=sensor,
         thresholds=Config() if config is None else load_config(config),
         map_file=map_file,
         localize=localize,
+        compare=beside,
         save_map=save_map,
         realtime=realtime,
         autosave=autosave,
     )
-    drive(options, output, out=out, compare_loops=compare_loops)
+    drive(options, output, out=out)
 
 
 _BESIDE_RESUME = {"resume", "record", "view", "pages", "ply", "quiet"}
@@ -230,6 +248,26 @@ def _refuse_beside_resume(context: typer.Context) -> None:
                 f"{option.opts[0]}: a run that is resumed goes on with its own options; leave it "
                 "out."
             )
+
+
+def _compared(names: str, detector: str) -> tuple[str, ...]:
+    """The detectors of ``--compare``, each once."""
+    from vslam.loopclosure.registry import require_detector
+    from vslam.loopclosure.siamese.weights import NETWORKS, SHIPPED
+
+    found = tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
+    for name in found:
+        if name in NETWORKS and not (SHIPPED / f"{name}.onnx").exists():
+            raise InputError(
+                f"--compare {name}: vslam ships no weights for it; name it with --detector and "
+                "--weights, and compare it with another."
+            )
+        require_detector(name, option="--compare")
+    if detector in found:
+        raise InputError(
+            f"--compare {detector}: this is the detector that the run itself has; name another."
+        )
+    return found
 
 
 def _map_to_go_on_in(file: Path, detector: DetectorName | None) -> tuple[Path, DetectorName]:

@@ -42,6 +42,7 @@ def error_rows(errors: Evaluation | ReportJson) -> Rows:
 
 def print_summary(report: ReportJson, folder: Path) -> None:
     """Print what matters of a run that is over; ``folder`` holds its results."""
+    from vslam.loopclosure.registry import about
     from vslam.report.render import advice
 
     evaluated = report.alignment is not None
@@ -59,16 +60,18 @@ def print_summary(report: ReportJson, folder: Path) -> None:
             *_latency(report),
             *([("evaluation", report.evaluation_remark)] if report.evaluation_remark else []),
             *(error_rows(report) if evaluated else []),
+            ("detector", f"{report.detector}: {about(report.detector)}"),
             ("loops", _loops(report)),
-            ("speed", f"{report.fps:.1f} fps"),
+            ("speed", _speed(report)),
             ("map", f"{report.keyframes} keyframes, {report.landmarks} landmarks{submaps}"),
             *(("warning", warning) for warning in report.warnings),
             *([("advice", advice(report))] if advice(report) else []),
             ("folder", str(folder)),
             *((name, str(folder / file)) for name, file in _LOOK_AT if (folder / file).exists()),
+            *_how_to_compare(report),
         ]
     )
-    _print_comparison(report)
+    _print_detectors(report)
 
 
 def in_map_rows(report: ReportJson) -> Rows:
@@ -110,15 +113,38 @@ def _loops(report: ReportJson) -> str:
     return ", ".join([*counts, f"{report.loops_rejected} candidates rejected"])
 
 
-def _print_comparison(report: ReportJson) -> None:
-    from vslam.report.loop_tables import comparison_table
+def _speed(report: ReportJson) -> str:
+    together = f", all {len(report.detectors)} detectors together" if report.detectors else ""
+    return f"{report.fps:.1f} fps{together}"
 
-    compared = comparison_table(report).rows
-    if not compared:
+
+def _how_to_compare(report: ReportJson) -> Rows:
+    """What to type for a comparison where the ground truth could judge one, or why there is none
+    though it was asked for."""
+    from vslam.report.detector_table import left_out
+
+    if reason := left_out(report):
+        return [("compare", reason)]
+    refused = report.realtime or report.map is not None  # as of the command line
+    if report.detectors or report.alignment is None or refused:
+        return []
+    if report.detector in ("bow", "none"):
+        return [("compare", "add --compare both to set the capsule network beside it")]
+    return [("compare", "add --compare bow to set the bag of words beside it")]
+
+
+def _print_detectors(report: ReportJson) -> None:
+    from vslam.report.detector_table import detector_table
+
+    table = detector_table(report)
+    if not table.rows:
         return
-    table = [("", "with loops", "without"), *compared]
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    lines = [table.head, *table.rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     typer.echo()
-    for name, *values in table:
-        cells = (f"{value:>{width}}" for value, width in zip(values, widths[1:], strict=True))
-        typer.echo("  ".join([f"{name:<{widths[0]}}", *cells]))
+    for line in lines:
+        cells = [
+            f"{cell:<{width}}" if title in table.texts else f"{cell:>{width}}"
+            for title, cell, width in zip(table.head, line, widths, strict=True)
+        ]
+        typer.echo("  ".join(cells).rstrip())

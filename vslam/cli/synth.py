@@ -115,15 +115,27 @@ def synth(
 ) -> None:
     """Render a town in KITTI format, with exact ground truth."""
     from vslam.cli.console import console
-    from vslam.datasets.synthetic import ROUTES, built_in_route, route_of_poses, store
-    from vslam.datasets.synthetic.site import Variation
+    from vslam.datasets.synthetic import (
+        DRIVES,
+        ROUTES,
+        Variation,
+        built_in_route,
+        parse_drive,
+        route_of_poses,
+        store,
+    )
     from vslam.machine import available_cores
     from vslam.trajectory import read_kitti_poses
 
     cache = out or store.cache_folder()
+    town = Variation()
+    if trajectory is None and route in DRIVES:
+        route, town = parse_drive(route)
     if list_:
         for name, about in ROUTES.items():
             typer.echo(f"{name:<6}{about}")
+        for name, drive_of in DRIVES.items():
+            typer.echo(f"{name:<6}the drive {drive_of}")
         for found in store.list_stored(cache):
             state = "complete" if found.complete else "in part"
             folder = found.root / "sequences" / found.name
@@ -147,7 +159,9 @@ def synth(
             raise InputError(
                 f"{option}: leave out --depth, --pairs, --verify and every other form."
             )
-    variation = Variation(seed, aliased, change, dynamic)
+    variation = Variation(
+        seed or town.seed, aliased or town.aliased, change or town.change, dynamic or town.moving
+    )
     threads = threads or min(available_cores(), 4)
     with console(shown=not quiet).render_bar() as on_frame:
         if pairs:

@@ -13,7 +13,10 @@ __all__ = ["write_overview"]
 
 
 def write_overview(
-    runs: Collection[Path], trajectories: Collection[str], out: Path
+    runs: Collection[Path],
+    trajectories: Collection[str],
+    out: Path,
+    baseline: str | None = None,
 ) -> OverviewJson:
     """Gather finished runs and write ``report.{html,md,json}`` and ``table.csv`` into ``out``.
 
@@ -21,9 +24,11 @@ def write_overview(
         runs: folders of runs, or folders that hold such at any depth.
         trajectories: ``NAME[@SEQUENCE[@PERTURB]]=FILE``, of other systems.
         out: made if it is not there.
+        baseline: system that the others are set against; None for the simplest.
 
     Raises:
-        InputError: no finished run, or a trajectory that cannot be read or placed.
+        InputError: no finished run, a trajectory that cannot be read or placed, or no run of the
+            baseline.
         ResultsError: a file cannot be written.
     """
     from vslam.errors import ResultsError
@@ -33,7 +38,7 @@ def write_overview(
     from vslam.overview.summary import summarize
 
     found = collect(runs, trajectories)
-    report = summarize(found)
+    report = summarize(found, baseline)
     figures = draw_overview(report, found)
     report = report.model_copy(update={"notes": found.notes})  # with those of the drawing
     try:

@@ -16,7 +16,7 @@ from vslam.report.schema import ReportJson
 from vslam.run.outcome import alignment_of
 from vslam.trajectory import Trajectory, read_trajectory
 
-_MONOCULAR = ", mono"  # ends the name of a monocular system
+MONOCULAR = ", mono"  # ends the name of a monocular system
 
 
 @dataclass(frozen=True)
@@ -130,16 +130,16 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
     parts = [f"frames from {report.start}"] if report.start else []
     parts += [f"every {report.every}"] if report.every > 1 else []
     parts += [f"{report.max_frames} frames"] if report.max_frames else []
-    detector = report.detector + (_MONOCULAR if report.sensor == "mono" else "")
+    detector = report.detector + (MONOCULAR if report.sensor == "mono" else "")
     sequence, town = report.sequence, None
     laws: list[str] = []
     if report.dataset == "synthetic":
         from vslam.datasets.synthetic import parse_drive  # and with it the renderer
 
         # What changes a rendered town is a perturbation, too: 05+change:0.5 is the route 05.
-        laws = [part for part in sequence.split("+")[1:] if not part.startswith("seed:")]
-        sequence, variation = parse_drive(sequence)
-        town = variation.seed
+        town = parse_drive(sequence)[1].seed
+        sequence, *parts_of_town = sequence.split("+")
+        laws = [part for part in parts_of_town if not part.startswith("seed:")]
     if report.perturb != "none":
         laws.append(report.perturb)
     return RunEntry(
@@ -217,7 +217,7 @@ def _alignment_of_external(system: str, drive: Drive, found: Found) -> str:
     there = {run.alignment for run in found.runs if run.drive.place == drive.place}
     if len(there) == 1:
         return there.pop()
-    return alignment_of("mono" if system.endswith(_MONOCULAR) else "stereo")
+    return alignment_of("mono" if system.endswith(MONOCULAR) else "stereo")
 
 
 def _truth(found: Found, drive: Drive) -> Trajectory | None:

@@ -7,8 +7,9 @@ import io
 from collections.abc import Collection
 from typing import TYPE_CHECKING
 
-from vslam.overview.schema import MEASURES, Measure, OverviewJson, RunEntry, Spread
-from vslam.overview.summary import ALPHA, systems
+from vslam.overview.schema import DECIMALS, MEASURES, Measure, OverviewJson, RunEntry, Spread
+from vslam.overview.summary import ALPHA
+from vslam.overview.versus import median_text, versus
 from vslam.report.page import Table, markdown_table, render_page
 
 if TYPE_CHECKING:
@@ -27,13 +28,14 @@ _ABOUT_OTHERS = (
 ALIGNMENTS = {"se3": "SE3", "sim3": "Sim3"}
 _TESTED = (
     "Pairs are sequences, each with the median of its runs: runs of one sequence are not "
-    f"independent. Two-sided, level {ALPHA:g}, not corrected for the number of tests."
+    "independent. Over all conditions, a sequence counts once, with the mean of its medians. "
+    f"Two-sided, level {ALPHA:g}, not corrected for the number of tests."
 )
 
 
 def tables(report: OverviewJson) -> list[Table]:
     """Every table of the report."""
-    found = [_compared(report), *_results(report), _runs(report)]
+    found = [*versus(report), _compared(report), *_results(report), _runs(report)]
     return [table for table in found if table.rows]
 
 
@@ -41,7 +43,7 @@ def title(report: OverviewJson) -> str:
     """What the report is of, in one line."""
     places = len({(row.drive.dataset, row.drive.place) for row in report.rows})
     return (
-        f"{', '.join(systems(report.runs))}: {len(report.runs)} runs on {places} "
+        f"{', '.join(report.systems)}: {len(report.runs)} runs on {places} "
         f"sequence{'s' if places > 1 else ''}"
     )
 
@@ -49,11 +51,10 @@ def title(report: OverviewJson) -> str:
 def render_markdown(report: OverviewJson) -> str:
     """Markdown whose tables are aligned, to be read in a terminal."""
     lines = [f"# {title(report)}", ""]
-    if report.comparisons:
-        lines += ["## Who wins where", "", *(f"- {c.words}" for c in report.comparisons), ""]
     for table in tables(report):
         lines += [f"## {table.title}", "", *markdown_table(table.head, table.rows), ""]
         lines += [table.note, ""] if table.note else []
+        lines += [*(f"- {point}" for point in table.points), ""] if table.points else []
     if report.notes:
         lines += ["## Notes", "", *(f"- {note}" for note in report.notes), ""]
     lines += ["## Made", "", *markdown_table(("", ""), _made(report)), ""]
@@ -66,7 +67,6 @@ def render_html(report: OverviewJson, figures: Collection[ReportFigure]) -> str:
         "overview.html.jinja",
         report=report,
         title=title(report),
-        words=[c.words for c in report.comparisons],
         tables=tables(report),
         made=_made(report),
         figures=figures,
@@ -120,20 +120,24 @@ def _results(report: OverviewJson) -> list[Table]:
 
 
 def _compared(report: OverviewJson) -> Table:
-    head = ("systems", "perturbation", "better", "worse", "same", "median (m)", "p")
+    texts = ("systems", "perturbation", "error", "winner")
+    head = ("systems", "perturbation", "error", "better", "worse", "same", "median (m)", "p")
+    titles = {name: title for name, title, *_ in MEASURES}
     rows: list[tuple[str, ...]] = [
         (
             f"{c.second} - {c.first}",
             c.perturb,
+            titles[c.measure],
             str(c.second_better),
             str(c.first_better),
             str(c.ties),
-            f"{c.median_difference:+.3f}",
+            f"{c.median_difference:+.{DECIMALS[c.measure]}f}",
             "too few" if c.p_value is None else f"{c.p_value:.3g}",
+            c.winner or "-",
         )
         for c in report.comparisons
     ]
-    return Table("Difference in ATE", head, rows, ("systems", "perturbation"), _TESTED)
+    return Table("Differences", (*head, "winner"), rows, texts, _TESTED)
 
 
 def _runs(report: OverviewJson) -> Table:
@@ -166,9 +170,8 @@ def _made(report: OverviewJson) -> list[tuple[str, str]]:
 def _cell(spread: Spread | None, decimals: int) -> str:
     if spread is None:
         return "n/a"
-    half = 1 if decimals == 0 and spread.median % 1 else decimals  # of an even number of counts
     least, greatest = f"{spread.least:.{decimals}f}", f"{spread.greatest:.{decimals}f}"
-    median = f"{spread.median:.{half}f}"
+    median = median_text(spread, decimals)
     return median if least == greatest else f"{median} ({least}-{greatest})"
 
 

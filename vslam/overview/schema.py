@@ -21,6 +21,8 @@ MEASURES: tuple[Measure, ...] = (
     ("loops_wrong", "wrong", "", 0),
     ("fps", "fps", "", 1),
 )
+DECIMALS = {name: decimals for name, _, _, decimals in MEASURES}
+ALL = "all"  # in the place of a perturbation: over all of them
 
 
 class _Model(BaseModel):
@@ -98,8 +100,11 @@ class Pair(_Model):
 class Comparison(_Model):
     """Two systems under one perturbation, paired by sequence.
 
-    ``p_value`` is two-sided, of Wilcoxon's signed-rank test on the differences that are not ties;
-    None where there are too few for it to say anything.
+    ``perturb`` is ``all`` for a comparison over all perturbations: a sequence then counts once,
+    with its mean over the perturbations under which both systems have run on it. ``p_value`` is
+    two-sided, of Wilcoxon's signed-rank test on the differences that are not ties; None where there
+    are too few for it to say anything. ``winner`` is the system that has the smaller errors by that
+    test, None where the test does not tell.
     """
 
     measure: str
@@ -112,16 +117,19 @@ class Comparison(_Model):
     ties: int
     median_difference: float
     p_value: float | None
+    winner: str | None
     words: str
 
 
 class OverviewJson(_Model):
-    """``kind`` tells this file from the ``report.json`` of one run."""
+    """``kind`` tells this file from the ``report.json`` of one run. ``systems`` are in the order in
+    which they are compared, the baseline first."""
 
     kind: Literal["overview"] = "overview"
-    schema_version: int = 2
+    schema_version: int = 3
 
     notes: list[str]
+    systems: list[str]
     rows: list[Row]
     comparisons: list[Comparison]
     runs: list[RunEntry]

@@ -1,8 +1,8 @@
 """From runs to rows, and from rows to who wins where.
 
 A system's figure on a drive is the median over its runs. Two systems are compared under one
-perturbation, and what is paired are *sequences*: runs of one sequence are not independent, and
-counting each of them would make the test believe in more than it has seen.
+perturbation and over all of them, and what is paired are *sequences*: runs of one sequence are not
+independent, and counting each of them would make the test believe in more than it has seen.
 """
 
 from __future__ import annotations
@@ -11,11 +11,14 @@ import statistics
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from itertools import combinations
+from typing import NamedTuple
 
+from vslam.errors import InputError
 from vslam.loopclosure.siamese.weights import NETWORKS
 from vslam.machine import versions
-from vslam.overview.collect import Found
+from vslam.overview.collect import MONOCULAR, Found
 from vslam.overview.schema import (
+    ALL,
     MEASURES,
     Comparison,
     Drive,
@@ -28,22 +31,50 @@ from vslam.overview.schema import (
 
 ALPHA = 0.05
 _KNOWN = ("none", "bow", *NETWORKS, "both")
-# Differences below this are ties: the last digit that is printed.
-_TIES = {"ate_rmse_m": 0.0005}
 
 
-def summarize(found: Found) -> OverviewJson:
-    """All that the report says."""
+class Shown(NamedTuple):
+    """How a compared error is written: ``scale`` times the metres of the measure."""
+
+    title: str
+    unit: str
+    scale: float
+    decimals: int
+
+    def text(self, metres: float, sign: str = "") -> str:
+        """The figure without its unit; ``sign`` is ``+`` for differences."""
+        return f"{self.scale * metres:{sign}.{self.decimals}f}"
+
+
+COMPARED = {"ate_rmse_m": Shown("ATE", "m", 1.0, 3), "rpe_m": Shown("RPE", "mm", 1e3, 1)}
+
+
+def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
+    """All that the report says.
+
+    Args:
+        found: the runs.
+        baseline: system that the others are set against; None for the simplest.
+
+    Raises:
+        InputError: no run of the baseline.
+    """
+    names = systems(found.runs, baseline)
+    if baseline not in (None, names[0].removesuffix(MONOCULAR)):
+        raise InputError(f"--baseline {baseline}: no run of it; choose from {', '.join(names)}.")
     rows = make_rows(found.runs)
-    compared = [
-        comparison
-        for first, second in combinations(systems(found.runs), 2)
-        for perturb in dict.fromkeys(row.drive.perturb for row in rows)
-        if (comparison := compare(rows, first, second, perturb, "ate_rmse_m")) is not None
-    ]
+    laws = list(dict.fromkeys(row.drive.perturb for row in rows))
+    compared: list[Comparison] = []
+    for first, second in combinations(names, 2):
+        for measure in COMPARED:
+            under = [compare(rows, first, second, law, measure) for law in laws]
+            compared += (known := [one for one in under if one is not None])
+            if len(known) > 1 and (all_ := compare(rows, first, second, ALL, measure)) is not None:
+                compared.append(all_)
     order = {(row.drive, row.system): k for k, row in enumerate(rows)}
     return OverviewJson(
         notes=[*found.notes, *_unlike_towns(found.runs)],
+        systems=names,
         rows=rows,
         comparisons=compared,
         runs=sorted(found.runs, key=lambda run: order[run.drive, run.system]),
@@ -66,10 +97,16 @@ def _unlike_towns(runs: Iterable[RunEntry]) -> Iterator[str]:
             yield f"{drive.place}, {drive.perturb}: runs in towns of different seeds ({had})"
 
 
-def systems(runs: Iterable[RunEntry | Row]) -> list[str]:
-    """Loop detectors from the simplest to the most elaborate, then other systems as they came."""
+def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list[str]:
+    """The baseline if one is named, monocular or not, then loop detectors from the simplest to the
+    most elaborate, then other systems as they came."""
     names = dict.fromkeys(run.system for run in runs)
-    return sorted(names, key=lambda name: _KNOWN.index(name) if name in _KNOWN else len(_KNOWN))
+
+    def key(name: str) -> tuple[bool, int]:
+        place = _KNOWN.index(name) if name in _KNOWN else len(_KNOWN)
+        return name.removesuffix(MONOCULAR) != baseline, place
+
+    return sorted(names, key=key)
 
 
 def make_rows(runs: list[RunEntry]) -> list[Row]:
@@ -102,27 +139,43 @@ def make_rows(runs: list[RunEntry]) -> list[Row]:
 def compare(
     rows: list[Row], first: str, second: str, perturb: str, measure: str
 ) -> Comparison | None:
-    """The second system against the first, by the medians of a measure of which less is better;
-    None where they share no drive. Errors after different alignments are not compared."""
+    """The second system against the first, by a measure of which less is better.
+
+    Args:
+        rows: medians of both, and of others.
+        first, second: systems. Errors after different alignments are not compared.
+        perturb: a perturbation, or `ALL`: a sequence then counts with its mean over the
+            perturbations under which both systems have run on it.
+        measure: ``ate_rmse_m`` or ``rpe_m``.
+
+    Returns:
+        None where the two share no drive.
+    """
     medians: dict[str, dict[tuple[Drive, str], float]] = {first: {}, second: {}}
     for row in rows:
         spread = row.measures[measure]
-        if row.system in medians and row.drive.perturb == perturb and spread is not None:
+        if row.system in medians and perturb in (row.drive.perturb, ALL) and spread is not None:
             medians[row.system][row.drive, row.alignment] = spread.median
-    pairs = [
-        Pair(
-            drive=key[0], first=a, second=medians[second][key], difference=medians[second][key] - a
-        )
-        for key, a in medians[first].items()
-        if key in medians[second]
-    ]
-    if not pairs:
+    values: dict[tuple[Drive, str], list[tuple[float, float]]] = {}
+    for (drive, alignment), value in medians[first].items():
+        if (drive, alignment) in medians[second]:
+            sequence = drive.model_copy(update={"perturb": perturb}), alignment
+            values.setdefault(sequence, []).append((value, medians[second][drive, alignment]))
+    if not values:
         return None
-    threshold = _TIES.get(measure, 0.0)
-    better = [pair for pair in pairs if pair.difference < -threshold]
-    worse = [pair for pair in pairs if pair.difference > threshold]
-    p_value = _wilcoxon([pair.difference for pair in (*better, *worse)])
-    return Comparison(
+    pairs = []
+    for (drive, _), both in values.items():
+        a, b = (statistics.fmean(column) for column in zip(*both, strict=True))
+        pairs.append(Pair(drive=drive, first=a, second=b, difference=b - a))
+    better = [
+        pair for pair in pairs if pair.difference < 0 and not is_tie(pair.difference, measure)
+    ]
+    worse = [pair for pair in pairs if pair.difference > 0 and not is_tie(pair.difference, measure)]
+    p_value, second_is_less = _wilcoxon([pair.difference for pair in (*better, *worse)])
+    winner = None
+    if p_value is not None and p_value < ALPHA:
+        winner = second if second_is_less else first
+    found = Comparison(
         measure=measure,
         perturb=perturb,
         first=first,
@@ -133,8 +186,16 @@ def compare(
         ties=len(pairs) - len(better) - len(worse),
         median_difference=statistics.median(pair.difference for pair in pairs),
         p_value=p_value,
-        words=_words(first, second, perturb, pairs, better, worse, p_value),
+        winner=winner,
+        words="",
     )
+    return found.model_copy(update={"words": _words(found, better, worse)})
+
+
+def is_tie(difference: float, measure: str) -> bool:
+    """Whether two systems differ by at most half of the last digit that is printed."""
+    shown = COMPARED[measure]
+    return shown.scale * abs(difference) <= 0.5 * 10.0**-shown.decimals
 
 
 def strengths(drives: Iterable[Drive], law: str) -> dict[Drive, float]:
@@ -156,47 +217,53 @@ def least_pairs() -> int:
     return n
 
 
-def _wilcoxon(differences: list[float]) -> float | None:
+def _wilcoxon(differences: list[float]) -> tuple[float | None, bool]:
+    """The two-sided p, None where there are too few differences, and whether they tend to be
+    negative."""
     if len(differences) < least_pairs():
-        return None
+        return None, False
     from scipy.stats import wilcoxon
 
-    return float(wilcoxon(differences).pvalue)
+    less = float(wilcoxon(differences, alternative="less").pvalue)
+    return float(wilcoxon(differences).pvalue), less < 0.5
 
 
-def _words(
-    first: str,
-    second: str,
-    perturb: str,
-    pairs: list[Pair],
-    better: list[Pair],
-    worse: list[Pair],
-    p_value: float | None,
-) -> str:
+def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
     def named(some: list[Pair]) -> str:
         return ", ".join(pair.drive.place for pair in some)
 
-    n = len(pairs)
-    light = "images as they are" if perturb == "none" else perturb
-    ties = [pair for pair in pairs if pair not in better and pair not in worse]
-    parts = [
-        f"{who} has the smaller ATE on {len(some)} ({named(some)})"
+    first, second, shown = found.first, found.second, COMPARED[found.measure]
+    what = shown.title
+    light = {"none": ", images as they are", ALL: " over all conditions"}.get(
+        found.perturb, f", {found.perturb}"
+    )
+    n, untied = len(found.pairs), len(better) + len(worse)
+    ties = [pair for pair in found.pairs if pair not in better and pair not in worse]
+    counts = [
+        f"{who} has the smaller {what} on {len(some)} ({named(some)})"
         for who, some in ((second, better), (first, worse))
         if some
     ]
-    parts += [f"no difference on {len(ties)} ({named(ties)})"] if ties else []
-    differences = sorted(pair.difference for pair in pairs)
-    text = f"{light}: of {n} sequence{'s' if n > 1 else ''}, {'; '.join(parts)}. "
-    text += f"{second} minus {first}: median {statistics.median(differences):+.3f} m"
-    text += f" ({differences[0]:+.3f} to {differences[-1]:+.3f}). " if n > 1 else ". "
-    untied = len(better) + len(worse)
-    if p_value is None:
+    counts += [f"no difference on {len(ties)} ({named(ties)})"] if ties else []
+    verdict = "no winner" if untied else "a tie"
+    if found.winner:
+        verdict = f"{found.winner} wins"
+    text = f"{what}{light}: {verdict}. Of {n} sequence{'s' if n > 1 else ''}, "
+    text += "; ".join(counts) + ". "
+    if not untied:
+        return text.rstrip()
+    differences = sorted(pair.difference for pair in found.pairs)
+    least, greatest = (shown.text(differences[k], "+") for k in (0, -1))
+    median = shown.text(found.median_difference, "+")
+    text += f"{second} minus {first}: median {median} {shown.unit}"
+    text += f" ({least} to {greatest}). " if n > 1 else ". "
+    if found.p_value is None:
         return text + (
             f"Too few sequences differ ({untied}) for Wilcoxon's test, which takes {least_pairs()} "
             f"to reach p < {ALPHA:g}: no claim about others."
         )
-    verdict = "unlikely by chance" if p_value < ALPHA else "chance alone may do this"
-    return text + f"Wilcoxon's signed-rank test on {untied}: p = {p_value:.3g}, {verdict}."
+    chance = "unlikely by chance" if found.winner else "chance alone may do this"
+    return text + f"Wilcoxon's signed-rank test on {untied}: p = {found.p_value:.3g}, {chance}."
 
 
 def _spread(values: Iterable[float | None]) -> Spread | None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 BLUE, GREEN, AMBER, RED, GREY = "#3b82f6", "#10b981", "#f59e0b", "#ef4444", "#94a3b8"
 VIOLET = "#8b5cf6"
+COMPARED = ("#ec4899", "#f97316", "#06b6d4")  # of other detectors, in turn
 STATE_COLORS = {
     TrackingState.WEAK: AMBER, TrackingState.LOST: RED, TrackingState.DROPPED: VIOLET,
 }  # fmt: skip

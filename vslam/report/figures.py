@@ -75,6 +75,8 @@ def _draw(
         caption = "Seen from above, at equal scale; z points ahead of the first camera."
         if evaluation is not None and evaluation.alignment != "none":
             caption += f" Estimate after {evaluation.alignment.upper()} alignment."
+        if outcome.compared:
+            caption += " Dashed: the detectors compared, each after an alignment of its own."
         yield "top_view", caption, top_view(outcome, evaluation, ground_truth, verdict)
     if outcome.corrections:
         caption = (

@@ -26,6 +26,7 @@ from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_trut
 from vslam.trajectory import write_kitti, write_tum
 
 if TYPE_CHECKING:
+    from vslam.run.loop_pictures import LoopPicture
     from vslam.run.moments import Moment
 
 _LONGEST_PART = 60  # characters: file systems take 255 for a name, and a URL may have more
@@ -41,8 +42,7 @@ def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, dete
         InputError: the folder cannot be created.
     """
     parts = [dataset, sequence, perturb.replace(":", "").replace(",", "+"), detector]
-    safe = [re.sub(r"[^A-Za-z0-9.+-]+", "_", part)[:_LONGEST_PART] for part in parts]
-    name = "-".join([f"{datetime.now():%Y%m%d-%H%M%S}", *safe])
+    name = "-".join([f"{datetime.now():%Y%m%d-%H%M%S}", *map(_safe, parts)])
     try:
         out.mkdir(parents=True, exist_ok=True)
         for number in count(1):
@@ -61,10 +61,16 @@ def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, dete
     return folder
 
 
+def _safe(part: str) -> str:
+    """A name as a part of a file name."""
+    return re.sub(r"[^A-Za-z0-9.+-]+", "_", part)[:_LONGEST_PART]
+
+
 def write_results(
     folder: Path,
     outcome: RunOutcome,
     moments: Collection[Moment] = (),
+    pictures: Collection[LoopPicture] = (),
     *,
     pages: bool = True,
     ply: bool = False,
@@ -73,7 +79,8 @@ def write_results(
     """Evaluate a run, in any state of completion, and write all that is known of it.
 
     Files: ``trajectory_kitti.txt``, ``trajectory.tum``, ``trajectory_causal.tum`` (poses as they
-    were given at the time), ``ground_truth_kitti.txt``, ``config.json`` (read by ``--config``),
+    were given at the time), ``trajectory_<detector>.tum`` (of each one compared),
+    ``ground_truth_kitti.txt``, ``config.json`` (read by ``--config``),
     ``keyframes.tum``, ``frames.csv``, ``report.json``,
     ``report.md``, ``report.html`` (one file, no network request), ``figures/*.png``, ``map.npz``,
     ``map.ply``; what matters most comes first.
@@ -84,6 +91,7 @@ def write_results(
         pages: write what people read, too: Markdown, HTML and figures.
         ply: write the landmarks as ``map.ply``, too.
         moments: images of keyframes for the HTML page.
+        pictures: of closed loops; some are written as ``figures/loop-<frame>-<frame>.jpg``.
         map_file: where to write the map, too.
 
     Raises:
@@ -93,6 +101,9 @@ def write_results(
     write_trajectories(written, outcome)
     with written.file("trajectory_causal.tum") as file:
         write_tum(file, causal_trajectory(outcome))
+    for other in outcome.compared:
+        with written.file(f"trajectory_{_safe(other.settings.detector)}.tum") as file:
+            write_tum(file, other.trajectory)
     with written.file("keyframes.tum") as file:
         write_tum(file, outcome.keyframes)
     with written.file("frames.csv") as file:
@@ -101,7 +112,9 @@ def write_results(
     with written.file("config.json") as file:
         file.write_text(config)
     evaluation, remark = evaluate_run(outcome)
-    report = _write_report(written, outcome, config, evaluation, remark, moments, pages=pages)
+    report = _write_report(
+        written, outcome, config, evaluation, remark, moments, pictures, pages=pages
+    )
     if outcome.map is not None and ply:
         landmarks = outcome.map.living_landmarks()
         with written.file("map.ply") as file:
@@ -187,6 +200,7 @@ def _write_report(
     evaluation: Evaluation | None,
     remark: str | None,
     moments: Collection[Moment],
+    pictures: Collection[LoopPicture],
     *,
     pages: bool,
 ) -> ReportJson:
@@ -207,16 +221,20 @@ def _write_report(
         from vslam.report.explorer import explorer_data
         from vslam.report.figures import draw_figures
         from vslam.report.render import render_html, render_markdown
+        from vslam.report.seen_loops import seen_loops
 
+        seen = seen_loops(report, pictures)
         with written.file("report.md") as file:
-            file.write_text(render_markdown(report), encoding="utf-8")
+            file.write_text(render_markdown(report, seen), encoding="utf-8")
         figures = draw_figures(outcome, evaluation, matched_ground_truth(outcome), verdict)
         with written.file("figures") as file:
             file.mkdir(exist_ok=True)
             for figure in figures:
                 (file / f"{figure.name}.png").write_bytes(figure.png)
+            for loop in seen:
+                (file / loop.name).write_bytes(loop.jpeg)
         explorer = explorer_data(outcome, evaluation, matched_ground_truth(outcome), moments)
-        page = render_html(report, config, figures, explorer)
+        page = render_html(report, config, figures, explorer, seen)
         with written.file("report.html") as file:
             file.write_text(page, encoding="utf-8")
     return report

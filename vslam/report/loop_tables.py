@@ -6,18 +6,17 @@ import re
 from collections import defaultdict
 
 from vslam.report.page import Row, Table
-from vslam.report.schema import LoopEntry, LoopFigures, ReportJson
+from vslam.report.schema import LoopEntry, ReportJson
 
 _MAX_CLOSED = 60
 _MAX_REJECTED = 12
 
 
 def loop_tables(report: ReportJson) -> list[Table]:
-    """With and without loops, revisits, closed loops, why others were rejected, which came near."""
+    """Revisits, closed loops, why others were rejected, which came near."""
     return [
         table
         for table in (
-            comparison_table(report),
             _revisits(report),
             _closed(report),
             _reasons(report),
@@ -25,33 +24,6 @@ def loop_tables(report: ReportJson) -> list[Table]:
         )
         if table.rows
     ]
-
-
-def comparison_table(report: ReportJson) -> Table:
-    """The figures that loop closing can change, with it and without it; no rows where no second
-    run was made (``--compare-loops``)."""
-    rows: list[Row] = []
-    if report.without_loops:
-        with_ = LoopFigures(**{name: getattr(report, name) for name in LoopFigures.model_fields})
-        rows = [
-            (title, _figure(getattr(with_, name), form), _figure(without, form))
-            for title, name, form in _COMPARED
-            for without in [getattr(report.without_loops, name)]
-        ]
-    return Table("With and without loop closing", ("", report.detector, "without"), rows, ("",))
-
-
-_COMPARED = (
-    ("ATE rmse", "ate_rmse_m", "{:.3f} m"),
-    ("RPE per frame", "rpe_m", "{:.4f} m"),
-    ("t_rel", "t_rel_percent", "{:.3f} %"),
-    ("lost frames", "lost_frames", "{}"),
-    ("loops closed", "loops_closed", "{}"),
-)
-
-
-def _figure(value: float | None, form: str) -> str:
-    return "n/a" if value is None else form.format(value)
 
 
 def _revisits(report: ReportJson) -> Table:
@@ -77,8 +49,9 @@ def _closed(report: ReportJson) -> Table:
     ]
     head = (*_EVIDENCE, "pose", "moved", "time")
     note = (
-        "By: descriptors that the geometry comes from. Moved: the farthest way of a keyframe. "
-        "Pose: against the ground truth's."
+        "Proposed by: the detectors that found the place. Verified by: the descriptors whose "
+        "matches give the relative pose, ORB's or those that the network learned. Pose: compared "
+        "with the ground truth. Moved: the farthest that the correction moved a keyframe."
     )
     if len(closed) > _MAX_CLOSED:
         note += f" {len(closed) - _MAX_CLOSED} more are in report.json."
@@ -110,15 +83,15 @@ def _nearly(report: ReportJson) -> Table:
     return Table("Rejected with the most inliers", head, rows, ("pose", "reason"), folded=True)
 
 
-_EVIDENCE = ("frame", "earlier", "score", "by", "matches", "inliers")
+_EVIDENCE = ("frame", "earlier", "proposed by", "score", "verified by", "matches", "inliers")
 
 
 def _evidence(loop: LoopEntry) -> Row:
     query = "lost" if loop.query_frame is None else str(loop.query_frame)
     match = "before this run" if loop.match_frame is None else str(loop.match_frame)
     return (
-        query, match, f"{loop.score:.3f}", loop.matched_by, str(loop.matches),
-        str(loop.inliers),
+        query, match, loop.proposed_by.replace("+", " + "), f"{loop.score:.3f}", loop.matched_by,
+        str(loop.matches), str(loop.inliers),
     )  # fmt: skip
 
 

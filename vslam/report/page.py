@@ -10,7 +10,8 @@ Row = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Table:
-    """``texts``: the columns that hold words, aligned to the left; ``note`` goes below."""
+    """``texts``: the columns that hold words, aligned to the left; ``note`` goes below, and
+    ``points``, sentences of a list, below that."""
 
     title: str
     head: Row
@@ -18,6 +19,7 @@ class Table:
     texts: Row = ()
     note: str = ""
     folded: bool = False
+    points: tuple[str, ...] = ()
 
 
 def render_page(template: str, **values: object) -> str:

@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
+from vslam.loopclosure.registry import about
+from vslam.report.detector_table import detector_table
 from vslam.report.loop_tables import loop_tables
-from vslam.report.page import markdown_table, render_page
+from vslam.report.page import Table, markdown_table, render_page
 from vslam.report.schema import ReportJson
+from vslam.report.seen_loops import SeenLoop, seen_note
 
 if TYPE_CHECKING:
     from vslam.report.figures import ReportFigure
@@ -57,18 +60,23 @@ def headlines(report: ReportJson) -> list[Headline]:
         Headline(
             "Speed",
             f"{report.fps:.1f} fps",
-            f"{report.threads} thread{'s' * (report.threads != 1)}",
+            f"{report.threads} thread{'s' * (report.threads != 1)}{_together(report)}",
         ),
         *_latency(report),
         Headline(
             "CPU",
             f"{report.cpu_ms_per_frame:.1f} ms",
-            f"a frame, of all threads; start-up {report.startup_s:.1f} s",
+            f"a frame, of all threads{_together(report)}; start-up {report.startup_s:.1f} s",
         ),
-        Headline("Memory", f"{report.peak_memory_mb:.0f} MB", "at its peak"),
+        Headline("Memory", f"{report.peak_memory_mb:.0f} MB", f"at its peak{_together(report)}"),
         Headline("Map", f"{report.landmarks:,}", _map_note(report)),
         _loops(report),
     ]
+
+
+def _together(report: ReportJson) -> str:
+    """What is said of speed and memory where several detectors were run."""
+    return f", all {len(report.detectors)} detectors together" if report.detectors else ""
 
 
 def advice(report: ReportJson) -> str:
@@ -121,8 +129,9 @@ def _loops(report: ReportJson) -> Headline:
     return Headline("Loops", f"{report.loops_closed} closed", ", ".join(notes), tone)
 
 
-def render_markdown(report: ReportJson) -> str:
-    """Markdown whose tables are aligned, to be read in a terminal."""
+def render_markdown(report: ReportJson, seen: Collection[SeenLoop] = ()) -> str:
+    """Markdown whose tables are aligned, to be read in a terminal; the pictures of the loops
+    ``seen`` are files in the folder ``figures``."""
     lines = [f"# vslam: {report.dataset} {report.sequence}", ""]
     if report.interrupted:
         lines += [f"**Interrupted: {report.interrupted}.** Numbers are of the frames done.", ""]
@@ -130,6 +139,11 @@ def render_markdown(report: ReportJson) -> str:
     for warning in report.warnings:
         lines += ["", f"**Warning: {warning}**"]
     lines += ["", advice(report)] if advice(report) else []
+    lines += _table(detector_table(report))
+    if seen:
+        lines += ["", "## Loops seen", "", seen_note(report, seen)]
+        for loop in seen:
+            lines += ["", f"![{loop.name}](figures/{loop.name})", "", loop.caption]
     if report.skipped_messages:
         lines += ["", "## Skipped frames", "", *(f"- {text}" for text in report.skipped_messages)]
     if report.evo_command:
@@ -138,12 +152,18 @@ def render_markdown(report: ReportJson) -> str:
         lines += ["", "## Time per stage (ms)", ""]
         lines += markdown_table(("stage", "mean", "median", "p95", "p99"), stage_rows(report))
     for table in loop_tables(report):
-        lines += ["", f"## {table.title}", "", *markdown_table(table.head, table.rows)]
-        lines += ["", table.note] if table.note else []
+        lines += _table(table)
     lines += ["", "## Run", "", *markdown_table(("", ""), option_rows(report))]
     lines += ["", "## Machine", "", *markdown_table(("", ""), machine_rows(report))]
     lines += ["", "## Recording", "", "    rerun recording.rrd", ""]
     return "\n".join(lines)
+
+
+def _table(table: Table) -> list[str]:
+    """Lines of a table with its title and its note; of the note alone where there are no rows."""
+    lines = ["", f"## {table.title}", ""] if table.rows or table.note else []
+    lines += [*markdown_table(table.head, table.rows), ""] if table.rows else []
+    return [*lines, table.note] if table.note else lines[:-1]
 
 
 def render_html(
@@ -151,6 +171,7 @@ def render_html(
     config: str,
     figures: Collection[ReportFigure],
     explorer: dict[str, Any] | None = None,
+    seen: Collection[SeenLoop] = (),
 ) -> str:
     """One self-contained page: style, figures and numbers are inside, nothing is loaded.
 
@@ -159,6 +180,7 @@ def render_html(
         config: text of ``config.json``, shown as it is.
         figures: drawn by :func:`vslam.report.figures.draw_figures`.
         explorer: made by :func:`vslam.report.explorer.explorer_data`.
+        seen: drawn by :func:`vslam.report.seen_loops.seen_loops`.
     """
     return render_page(
         "report.html.jinja",
@@ -166,6 +188,10 @@ def render_html(
         headlines=headlines(report),
         advice=advice(report),
         stages=stage_rows(report),
+        seen=seen,
+        seen_note=seen_note(report, seen),
+        detector_table=detector_table(report),
+        about_detector=about(report.detector),
         loop_tables=loop_tables(report),
         options=option_rows(report),
         machine=machine_rows(report),
@@ -190,9 +216,12 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
     options = [(name, str(getattr(report, name))) for name in (*names, "every")]
     limit = "all" if report.max_frames is None else str(report.max_frames)
     weights = [("weights", str(report.weights))] if report.weights else []
+    if report.local_weights:
+        weights += [("local-weights", str(report.local_weights))]
     realtime = [("realtime", "yes")] if report.realtime else []
+    compare = [("compare", ", ".join(report.compare))] if report.compare else []
     calib = [("calib", str(path)) for path in report.calib]
-    return [*options, ("max-frames", limit), *weights, *realtime, *calib]
+    return [*options, ("max-frames", limit), *weights, *realtime, *calib, *compare]
 
 
 def machine_rows(report: ReportJson) -> list[tuple[str, str]]:

@@ -29,7 +29,8 @@ class LoopEntry(_Model):
     earlier drive. ``right`` says whether the relative pose found is the ground truth's, None where
     that cannot be said. ``moved_m`` is the farthest way that the correction moved a keyframe,
     ``correction_s`` its time; None if rejected. ``matched_by`` names the descriptors that the
-    relative pose comes from, ``orb`` or ``learned``.
+    relative pose comes from, ``orb`` or ``learned``, ``proposed_by`` the detector that found the
+    candidate, or several joined by ``+``.
     """
 
     query_frame: int | None
@@ -38,6 +39,7 @@ class LoopEntry(_Model):
     matches: int
     inliers: int
     matched_by: Literal["orb", "learned"] = "orb"
+    proposed_by: str = ""
     accepted: bool
     right: bool | None
     reason: str
@@ -59,14 +61,29 @@ class RevisitEntry(_Model):
     loop_frame: int | None
 
 
-class LoopFigures(_Model):
-    """The figures of a run that loop closing can change; None where they cannot be given."""
+class DetectorFigures(_Model):
+    """One of the detectors that were compared on the same frames; None where a figure cannot be
+    given, as in ``ReportJson``.
 
-    ate_rmse_m: float | None
-    rpe_m: float | None
-    t_rel_percent: float | None
+    ``seconds`` is the wall time of the detector's own steps: tracking, waiting for its mapping, and
+    completing the map at the end. Reading images and extracting features, which all detectors
+    share, is not in it. ``interrupted`` says why its run ended early.
+    """
+
+    detector: str
     lost_frames: int
+    ate_rmse_m: float | None
+    causal_ate_rmse_m: float | None
+    rpe_m: float | None
+    rpe_deg: float | None
+    t_rel_percent: float | None
+    r_rel_deg_per_100m: float | None
     loops_closed: int
+    loops_found: int | None
+    loops_missed: int | None
+    loops_wrong: int | None
+    seconds: float
+    interrupted: str | None
 
 
 class MapFigures(_Model):
@@ -106,7 +123,9 @@ class ReportJson(_Model):
     ``causal_ate_rmse_m`` is of the poses as they were given at the time
     (``trajectory_causal.tum``), after an alignment of their own.
     ``warnings`` are sentences on faults of the rig that the run has shown.
-    ``without_loops`` is of the same run with the detector ``none`` (``--compare-loops``).
+    ``detectors`` has a row for each detector, the run's own first, where others were run beside it
+    (``--compare``): speed, CPU time and memory are then of all together. It is empty in a run that
+    was resumed, since the maps of the others are not saved.
     ``frames`` counts the frames done; of them ``skipped_frames`` had an unreadable image and
     ``dropped_frames`` were overtaken by a newer one in a real-time run, whose ``latency_ms`` is
     from the time of an image to its pose (None in any other run).
@@ -115,7 +134,7 @@ class ReportJson(_Model):
     are None without ground truth. See :mod:`vslam.evaluation.loops`.
     """
 
-    schema_version: int = 4
+    schema_version: int = 5
 
     lost_frames: int
     weak_frames: int
@@ -156,7 +175,7 @@ class ReportJson(_Model):
     revisit_stretches: int | None
     revisits: list[RevisitEntry]
     loops: list[LoopEntry]
-    without_loops: LoopFigures | None
+    detectors: list[DetectorFigures] = []
     in_map: MapFigures | None = None
 
     dataset: str
@@ -170,10 +189,12 @@ class ReportJson(_Model):
     every: int
     max_frames: int | None
     weights: Path | None = None
+    local_weights: Path | None = None
     realtime: bool = False
     calib: tuple[Path, ...] = ()
     map: Path | None = None
     localize: bool = False
+    compare: tuple[str, ...] = ()
 
     machine: Machine
     versions: dict[str, str]

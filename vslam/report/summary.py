@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError
-from vslam.evaluation.loops import LoopEvaluation
+from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
 from vslam.evaluation.trajectories import Evaluation, evaluate_trajectory
 from vslam.evaluation.worlds import error_in_map
 from vslam.features import TrackingState, TrackResult
@@ -19,8 +19,8 @@ from vslam.geometry import inverses
 from vslam.loops import LoopCorrection
 from vslam.machine import available_cores, cpu_name, versions
 from vslam.report.schema import (
+    DetectorFigures,
     LoopEntry,
-    LoopFigures,
     Machine,
     MapFigures,
     ReportJson,
@@ -88,7 +88,7 @@ def summarize(
         revisit_stretches=len(verdict.revisits) if verdict else None,
         revisits=_revisits(verdict) if verdict else [],
         loops=loops,
-        without_loops=_figures_without_loops(outcome),
+        detectors=_detectors(outcome, evaluation, verdict),
         in_map=_figures_in_map(outcome),
         machine=this_machine(),
         versions=versions(),
@@ -124,17 +124,37 @@ def causal_ate(outcome: RunOutcome) -> float | None:
         return None
 
 
-def _figures_without_loops(outcome: RunOutcome) -> LoopFigures | None:
-    without = outcome.without_loops
-    if without is None:
-        return None
-    evaluation, _ = evaluate_run(without)
-    return LoopFigures(
+def _detectors(
+    outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
+) -> list[DetectorFigures]:
+    """A row for each detector if there was a comparison, the run's own first."""
+    if not outcome.compared:
+        return []
+    others = [
+        _detector_figures(other, evaluate_run(other)[0], evaluate_loops(other))
+        for other in outcome.compared
+    ]
+    return [_detector_figures(outcome, evaluation, verdict), *others]
+
+
+def _detector_figures(
+    outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
+) -> DetectorFigures:
+    return DetectorFigures(
+        detector=outcome.settings.detector,
+        lost_frames=sum(track.state == TrackingState.LOST for track in outcome.tracks),
         ate_rmse_m=evaluation.ate_rmse_m if evaluation else None,
+        causal_ate_rmse_m=causal_ate(outcome),
         rpe_m=evaluation.rpe_m if evaluation else None,
+        rpe_deg=evaluation.rpe_deg if evaluation else None,
         t_rel_percent=evaluation.t_rel_percent if evaluation else None,
-        lost_frames=sum(track.state is TrackingState.LOST for track in without.tracks),
-        loops_closed=sum(edge.accepted for edge in without.loops),
+        r_rel_deg_per_100m=evaluation.r_rel_deg_per_100m if evaluation else None,
+        loops_closed=sum(edge.accepted for edge in outcome.loops),
+        loops_found=verdict.n_found if verdict else None,
+        loops_missed=verdict.n_missed if verdict else None,
+        loops_wrong=verdict.n_wrong if verdict else None,
+        seconds=outcome.step_s,
+        interrupted=outcome.interrupted,
     )
 
 
@@ -178,6 +198,7 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
                 matches=edge.n_matches,
                 inliers=edge.n_inliers,
                 matched_by=edge.matched_by,
+                proposed_by=edge.proposed_by,
                 accepted=edge.accepted,
                 right=is_right,
                 reason=edge.reason,

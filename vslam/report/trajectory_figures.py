@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from itertools import cycle
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,6 +15,7 @@ from vslam.geometry import inverses
 from vslam.report.drawing import (
     AMBER,
     BLUE,
+    COMPARED,
     GREEN,
     GREY,
     INK,
@@ -24,6 +26,7 @@ from vslam.report.drawing import (
     add_legend,
     new_figure,
 )
+from vslam.report.summary import evaluate_run
 from vslam.run.outcome import RunOutcome
 from vslam.trajectory import Trajectory
 
@@ -36,14 +39,28 @@ def top_view(
     ground_truth: Trajectory | None,
     verdict: LoopEvaluation | None,
 ) -> Figure:
-    """Estimate and truth, doubtful frames, closed loops, and revisits that were missed."""
+    """Estimate and truth, doubtful frames, closed loops, and revisits that were missed; dashed, the
+    estimates of the detectors compared, each after an alignment of its own."""
     figure, axes = new_figure("Top view", "x (m)", "z (m)", SQUARE)
     path = _aligned(outcome, evaluation, outcome.trajectory.T_wc[:, :3, 3])
     x, z = path[:, 0], path[:, 2]
     if evaluation is not None and ground_truth is not None:
         truth = ground_truth.T_wc[:, :3, 3]
         axes.plot(truth[:, 0], truth[:, 2], color=GREY, linewidth=3.4, alpha=0.65, label="truth")
-    axes.plot(x, z, color=BLUE, label="estimate")
+    name = outcome.settings.detector if outcome.compared else "estimate"
+    axes.plot(x, z, color=BLUE, label=name)
+    for k, (other, color) in enumerate(zip(outcome.compared, cycle(COMPARED), strict=False)):
+        its_own = None if evaluation is None else evaluate_run(other)[0]
+        points = _aligned(other, its_own, other.trajectory.T_wc[:, :3, 3])
+        # Where paths coincide the dashes of all of them are seen, one after the other.
+        dashes = (2.0 * k, (2.0, 2.0 * len(outcome.compared)))
+        axes.plot(
+            points[:, 0],
+            points[:, 2],
+            color=color,
+            linestyle=dashes,
+            label=other.settings.detector,
+        )
     axes.plot(x[:1], z[:1], "o", color=INK, markersize=5, zorder=4, label="start")
     for state, color in STATE_COLORS.items():
         times = [track.timestamp for track in outcome.tracks if track.state == state]

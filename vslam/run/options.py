@@ -39,10 +39,12 @@ class RunOptions(BaseModel):
     threads: int = 1
     detector: str = DEFAULT_DETECTOR
     weights: Path | None = None
+    local_weights: Path | None = None
     sensor: str | None = None
     thresholds: Config = Config()
     map_file: Path | None = None
     localize: bool = False
+    compare: tuple[str, ...] = ()
     save_map: Path | None = None
     realtime: bool = False
     autosave: float = 60.0
@@ -70,10 +72,12 @@ def settings_of(
         max_frames=options.max_frames,
         config=options.thresholds,
         weights=options.weights,
+        local_weights=options.local_weights,
         realtime=options.realtime or is_live(source),
         calib=options.calib,
         map=options.map_file,
         localize=options.localize,
+        compare=options.compare,
     )
 
 
@@ -86,7 +90,7 @@ def write_options(folder: Path, options: RunOptions) -> None:
     data = Path(options.data)
     absolute: dict[str, object] = {
         name: path.resolve()
-        for name in ("right", "depth", "weights", "map_file", "save_map")
+        for name in ("right", "depth", "weights", "local_weights", "map_file", "save_map")
         if (path := getattr(options, name)) is not None
     }
     absolute["data"] = str(data.resolve()) if data.exists() else options.data

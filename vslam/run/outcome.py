@@ -39,10 +39,12 @@ class RunSettings:
     max_frames: int | None
     config: Config
     weights: Path | None = None
+    local_weights: Path | None = None
     realtime: bool = False
     calib: tuple[Path, ...] = ()
     map: Path | None = None
     localize: bool = False
+    compare: tuple[str, ...] = ()
 
     @property
     def alignment(self) -> str:
@@ -61,7 +63,10 @@ class RunOutcome:
         warnings: faults of the rig that the run has shown, in sentences.
         skipped: messages of the frames whose images could not be read.
         latency_ms: of each frame tracked in a real-time run, from its time to its pose.
-        wall_s, cpu_s: seconds from the first frame read to the last one tracked and mapped.
+        wall_s, cpu_s: seconds from the first frame read to the last one tracked and mapped, by
+            all detectors where several are compared.
+        step_s: wall seconds of this detector's own steps: tracking, waiting for its mapping, and
+            completing the map at the end. Reading images and extracting features is not in it.
         startup_s: seconds from the start of the process to the first frame.
         peak_memory_mb: of the process.
         n_landmarks, n_keyframes: in the final map.
@@ -76,7 +81,8 @@ class RunOutcome:
             included: loops speak of keyframes, people of frames. -1 for those of earlier drives.
         n_submaps: how often mapping began, the first time included; 0 before the first keyframe.
         interrupted: why the run ended early ("Ctrl-C", a file cut off), or None.
-        without_loops: the same run without a loop detector, if one was made to compare.
+        compared: the runs of the detectors of ``settings.compare`` on the same frames, without
+            their maps; none in a run that was resumed.
     """
 
     settings: RunSettings
@@ -102,7 +108,8 @@ class RunOutcome:
     keyframe_frames: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     n_submaps: int = 1
     interrupted: str | None = None
-    without_loops: RunOutcome | None = None
+    step_s: float = 0.0
+    compared: tuple[RunOutcome, ...] = ()
 
 
 def causal_trajectory(outcome: RunOutcome) -> Trajectory:

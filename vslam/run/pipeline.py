@@ -24,7 +24,7 @@ from vslam.features import TrackingState, TrackResult
 from vslam.frontend.sides import Sides
 from vslam.loopclosure.registry import detector_with_images, problem_of
 from vslam.loops import LoopCorrection, LoopEdge
-from vslam.machine import peak_memory_mb, process_age
+from vslam.machine import give_back_memory, peak_memory_mb, process_age
 from vslam.map import Map
 from vslam.maps.storage import made_with
 from vslam.run.autosave import NO_AUTOSAVE, Autosave, Unfinished
@@ -32,7 +32,7 @@ from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
 from vslam.run.preparation import PreparedFrame, in_their_time
 from vslam.run.progress import Progress, TrackLog, in_frames
 from vslam.run.realtime import Played
-from vslam.run.recorder import NullRecorder, Recorder
+from vslam.run.recorder import Recorder
 from vslam.run.rig import measure_rig, residual_warnings, rig_warnings
 from vslam.slam import Slam
 
@@ -57,6 +57,11 @@ def run_sequence(
     the run after the current frame, a source that breaks off after its last good one, a detector of
     another package where it fails; all done so far is kept.
 
+    The detectors of ``settings.compare`` run beside the main one. Images are read and features
+    extracted once; each detector has a map of its own, of which only trajectory, frames and loops
+    are kept. One that fails ends alone. A run that is resumed goes on without them, since their
+    maps were not saved.
+
     Args:
         autosave: saves what is done while the run goes on.
         resume: what such a run left; this one goes on at the next frame, and its outcome covers
@@ -69,58 +74,106 @@ def run_sequence(
     cv2.setNumThreads(1)  # the pool uses the cores
     slam = slam or begin(sequence.camera, settings, None if resume is None else resume.map)
     perturbation = perturbation.bound_to(sequence)
+    others = [] if resume is not None else _compared(sequence.camera, settings)
     recorder.begin(sequence.camera, ground_truth_of(sequence))
-    account = _Account(slam, Progress() if resume is None else resume.progress)
-    slam.on_merge = lambda: autosave.offer_amid(slam, account.so_far)
+    main = _Run(slam, settings, Progress() if resume is None else resume.progress)
+    slam.on_merge = lambda: autosave.offer_amid(slam, main.so_far)
     n_told = 0  # loops that the recorder knows of
     broken: list[str] = []
     with _stop_on_interrupt() as interrupted:
         frames = perturbed(_until_broken(timed_frames(sequence), broken), perturbation)
-        frames = _following(frames, account.before.tracks.timestamps)
+        frames = _following(frames, main.before.tracks.timestamps)
         for played in in_their_time(frames, slam.context, settings, live=is_live(sequence)):
-            result = _track(slam, played, account, realtime=settings.realtime)
+            result = main.step(played)
+            if (frame := played.made) is not None and frame.problem and not frame.dropped:
+                _log.warning("frame %d skipped: %s", result.index, frame.problem)
             autosave.frame(result)
             if result.state != TrackingState.DROPPED:
                 n_told = _show(recorder, slam, result, played, n_told)
             on_frame(result)
-            autosave.offer(slam, account.so_far)
-            if problem := problem_of(slam.detector):
-                broken.append(problem)
+            autosave.offer(slam, main.so_far)
+            for other in others:
+                if other.problem is None:
+                    other.step(played)
+            if main.problem:
+                broken.append(main.problem)
                 break
             if interrupted.is_set():
                 if not is_live(sequence):  # a camera has no other end
                     broken.append("Ctrl-C")
                 break
-        slam.finish()
-    if not broken and (problem := problem_of(slam.detector)):
-        broken.append(problem)
-    autosave.close(slam, account.so_far, whole=not broken)
-    seconds = account.seconds()
+        main.finish()
+        if not broken and main.problem:
+            broken.append(main.problem)
+        autosave.close(slam, main.so_far, whole=not broken)
+        for other in others:
+            other.finish()
+    seconds = main.seconds()
+    give_back_memory()  # results need room: a map is copied before it is written
     _tell_loops(recorder, slam, n_told)
     recorder.finish(slam.trajectory(), slam.map)
-    return _outcome(sequence, settings, slam, account, seconds, broken[0] if broken else None)
+    ended = broken[0] if broken else None
+    beside = [_outcome(sequence, other, seconds, other.problem or ended) for other in others]
+    compared = tuple(replace(one, map=None, stored=None) for one in beside)  # maps are large
+    return replace(_outcome(sequence, main, seconds, ended), compared=compared)
 
 
-class _Account:
-    """What becomes of the frames of a run, those before it was resumed included."""
+def _compared(camera: Camera, settings: RunSettings) -> list[_Run]:
+    """The runs of ``settings.compare`` before their first frame; weights that were given are the
+    main detector's."""
+    each = [replace(settings, detector=name, weights=None, compare=()) for name in settings.compare]
+    return [_Run(begin(camera, one), one, Progress()) for one in each]
 
-    def __init__(self, slam: Slam, before: Progress) -> None:
-        self.before = before
+
+class _Run:
+    """One detector's SLAM, and what becomes of its frames, those before it was resumed included.
+
+    Attributes:
+        step_s: wall time of its own steps (``RunOutcome.step_s``).
+    """
+
+    def __init__(self, slam: Slam, settings: RunSettings, before: Progress) -> None:
+        self.slam, self.settings, self.before = slam, settings, before
         self.tracks = before.tracks.results()
         self.sides = before.tracks.sides()
         self.skipped = list(before.skipped)
         self.latency_ms = list(before.latency_ms)
         self.startup_s = process_age()
-        self._slam = slam
+        self.step_s = 0.0
         self._log = TrackLog(before.tracks)
         self._wall, self._cpu = time.perf_counter(), time.process_time()
 
-    def add(self, result: TrackResult, sides: Sides | None = None) -> None:
-        """The next frame; without ``sides`` it was dropped."""
+    @property
+    def problem(self) -> str | None:
+        """What failed in the detector, if it is of another package."""
+        return problem_of(self.slam.detector)
+
+    def step(self, played: Played[PreparedFrame]) -> TrackResult:
+        """Track a frame that was prepared, or pass over one that was dropped or cannot be read."""
+        start = time.perf_counter()
+        timestamp, frame = played.timestamp, played.made
+        if frame is None or frame.dropped:
+            result, sides = self.slam.skip(timestamp, dropped=True), None
+        elif frame.features is None or frame.image is None:
+            result, sides = self.slam.skip(timestamp), frame.sides
+            self.skipped.append(f"frame {len(self.tracks)}: {frame.problem}")
+        else:
+            result = self.slam.step_features(frame.features, timestamp, frame.image, frame.stage_ms)
+            sides = frame.sides
+            if self.settings.realtime:
+                self.latency_ms.append(1e3 * (time.perf_counter() - played.came))
+        self.step_s += time.perf_counter() - start
         self.tracks.append(result)
         self._log.append(result, sides or Sides())
         if sides is not None:
             self.sides.append(sides)
+        return result
+
+    def finish(self) -> None:
+        """Complete what is being mapped."""
+        start = time.perf_counter()
+        self.slam.finish()
+        self.step_s += time.perf_counter() - start
 
     def seconds(self) -> tuple[float, float]:
         """Wall and CPU time of all frames."""
@@ -129,7 +182,7 @@ class _Account:
 
     def so_far(self) -> Progress:
         """A copy of what is known, for an autosave."""
-        slam, before = self._slam, self.before
+        slam, before = self.slam, self.before
         frames = _frames_of_this_run(slam.map)
         loops, corrections = in_frames(slam.loops, slam.corrections, frames)
         wall_s, cpu_s = self.seconds()
@@ -142,28 +195,6 @@ class _Account:
             loops=before.loops + loops,
             corrections=before.corrections + corrections,
         )
-
-
-def _track(
-    slam: Slam, played: Played[PreparedFrame], account: _Account, *, realtime: bool
-) -> TrackResult:
-    """Track a frame that was prepared, or pass over one that was dropped or cannot be read."""
-    timestamp, frame = played.timestamp, played.made
-    if frame is None or frame.dropped:
-        result = slam.skip(timestamp, dropped=True)
-        account.add(result)
-        return result
-    if frame.features is None or frame.image is None:
-        index = len(account.tracks)
-        account.skipped.append(f"frame {index}: {frame.problem}")
-        _log.warning("frame %d skipped: %s", index, frame.problem)
-        result = slam.skip(timestamp)
-    else:
-        result = slam.step_features(frame.features, timestamp, frame.image, frame.stage_ms)
-        if realtime:
-            account.latency_ms.append(1e3 * (time.perf_counter() - played.came))
-    account.add(result, frame.sides)
-    return result
 
 
 def _show(
@@ -203,14 +234,13 @@ def _following(frames: Iterator[TimedFrame], before: NDArray[np.float64]) -> Ite
 
 def _outcome(
     sequence: Sequence | Stream,
-    settings: RunSettings,
-    slam: Slam,
-    account: _Account,
+    run: _Run,
     seconds: tuple[float, float],
     interrupted: str | None,
 ) -> RunOutcome:
     """All that is known at the end; ``seconds`` of wall and CPU time of all frames."""
-    loops, corrections, keyframe_frames = _with_earlier(account.before, slam)
+    slam, settings = run.slam, run.settings
+    loops, corrections, keyframe_frames = _with_earlier(run.before, slam)
     residuals = measure_rig(slam.map, sequence.camera)
     drive = f"{settings.dataset} {sequence.name}"
     return RunOutcome(
@@ -218,17 +248,18 @@ def _outcome(
         sequence=sequence,
         trajectory=slam.trajectory(),
         keyframes=slam.keyframe_trajectory(),
-        tracks=account.tracks,
-        skipped=account.skipped,
+        tracks=run.tracks,
+        skipped=run.skipped,
         warnings=[
-            *rig_warnings(account.sides),
+            *rig_warnings(run.sides),
             *residual_warnings(residuals, sequence.camera, slam.side_delay.applied),
         ],
         wall_s=seconds[0],
         cpu_s=seconds[1],
-        startup_s=account.startup_s,
+        step_s=run.step_s,
+        startup_s=run.startup_s,
         peak_memory_mb=peak_memory_mb(),
-        latency_ms=account.latency_ms,
+        latency_ms=run.latency_ms,
         n_keyframes=len(slam.map.living_keyframes()),
         n_landmarks=len(slam.map.living_landmarks()),
         map=slam.map,
@@ -276,7 +307,10 @@ def begin(camera: Camera, settings: RunSettings, saved: Path | None = None) -> S
     """
     config, threads = settings.config, settings.threads
     late = not settings.realtime  # then nothing is loaded while the camera drives
-    detector, images = detector_with_images(settings.detector, config, settings.weights, late=late)
+    detector, images = detector_with_images(
+        settings.detector, config, settings.weights,
+        local_weights=settings.local_weights, late=late,
+    )  # fmt: skip
     if saved is not None:
         return Slam.load(saved, config, detector, threads=threads, images=images, resume=True)
     if settings.map is None:
@@ -304,27 +338,6 @@ def require_camera(map_file: Path, camera: Camera) -> None:
 def _frames_of_this_run(map_: Map) -> NDArray[np.int64]:
     of_this = np.array(map_.sessions, np.int64) == map_.session
     return np.where(of_this, np.array(map_.frames, np.int64), -1)
-
-
-def with_comparison(
-    outcome: RunOutcome,
-    perturbation: Perturbation,
-    *,
-    on_frame: Callable[[TrackResult], None] = lambda result: None,
-) -> RunOutcome:
-    """Run the sequence again with the detector ``none``, unrecorded, and keep both outcomes.
-
-    Everything else is the same: images, perturbation, thresholds. Where Ctrl-C ends the second run
-    there is nothing to compare, and the first one's outcome says so.
-    """
-    settings = replace(outcome.settings, detector="none", weights=None, map=None)
-    without = run_sequence(
-        outcome.sequence, perturbation, settings, NullRecorder(), on_frame=on_frame
-    )
-    if without.interrupted:
-        return replace(outcome, interrupted=f"{without.interrupted}, in the run without loops")
-    without = replace(without, map=None, stored=None)  # a map takes 100s of MB
-    return replace(outcome, without_loops=without)
 
 
 def _until_broken(frames: Iterator[TimedFrame], broken: list[str]) -> Iterator[TimedFrame]:

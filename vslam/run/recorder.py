@@ -15,7 +15,7 @@ import shutil
 import socket
 import sys
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -31,6 +31,7 @@ from vslam.features import Features, TrackingState, TrackResult
 from vslam.geometry import inverses
 from vslam.loops import LoopEdge
 from vslam.map import Map
+from vslam.run.loop_pictures import LoopPicture, draw_picture
 from vslam.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
@@ -38,7 +39,8 @@ _P = ParamSpec("_P")
 
 # Budget: 50 MB for 1,000 frames. At 350 keyframes of 1241x376 with 2,000 features, images take
 # about 11 MB, keypoints 6 MB, 14 maps 5 MB and all that is logged each frame 0.3 MB. A map after
-# each loop, at most one in ten keyframes, can add 35 x 0.36 = 13 MB; loops themselves are lines.
+# each loop, at most one in ten keyframes, can add 35 x 0.36 = 13 MB, and the pictures of those
+# loops 35 x 0.1 = 4 MB.
 _IMAGE_SCALE = 0.5
 _JPEG_QUALITY = 75
 _MAX_POINTS_PER_MAP = 30_000  # the last map is complete
@@ -270,7 +272,8 @@ class RerunRecorder:
     Entities: ``world/camera`` (every frame), ``world/camera/image`` with ``tracked`` and
     ``untracked`` keypoints (keyframes, half size), ``world/landmarks`` and ``world/keyframes``
     (every 25 keyframes, after a loop and at the end), ``world/loops/accepted`` (green, from the
-    loop on) and ``rejected`` (faint red, for 20 frames), ``world/ground_truth`` and
+    loop on) and ``rejected`` (faint red, for 20 frames), ``loops/images`` (the two images of each
+    closed loop with their matches, until the next loop), ``world/ground_truth`` and
     ``world/trajectory`` (static), ``points/*`` and ``stage_ms/*`` (every frame), ``state`` (on
     change) and ``state/loops`` (each with its reason). The world is the one of the estimate: first
     frame of the run, x right, y down, z forward.
@@ -282,9 +285,14 @@ class RerunRecorder:
     with a warning: its file may be cut off within a message. So is a viewer that has been closed.
     """
 
-    def __init__(self, target: Path | Viewer) -> None:
+    def __init__(self, target: Path | Viewer, pictures: Sequence[LoopPicture] = ()) -> None:
         """Open a file, replacing an old recording, or send to a viewer; where that fails, warn and
-        record nothing."""
+        record nothing.
+
+        Args:
+            pictures: of the loops that were closed. Those that another recorder has added, told of
+                loops before this one, are recorded.
+        """
         import rerun as rr
 
         self._path = target if isinstance(target, Path) else None
@@ -298,6 +306,8 @@ class RerunRecorder:
         self._keyframes = 0
         self._mapped_keyframes = -self._pace.keyframes
         self._accepted: list[LoopEdge] = []
+        self._pictures = pictures
+        self._n_pictures = 0  # recorded so far
         self._hide_rejected_at: int | None = None  # frame
         try:
             self._recording.set_log_time_enabled(False)  # would be the viewer's default timeline
@@ -405,6 +415,7 @@ class RerunRecorder:
         for edge in edges:
             color = _GREEN if edge.accepted else _GREY
             self._recording.log("state/loops", rr.TextLog(_in_words(edge, map_), color=color))
+        self._log_pictures()
 
     @_guarded
     def finish(self, trajectory: Trajectory, map_: Map) -> None:
@@ -440,6 +451,16 @@ class RerunRecorder:
         centres = inverses(poses.reshape(-1, 4, 4))[:, :3, 3].reshape(-1, 2, 3).astype(np.float32)
         lines = rr.LineStrips3D(list(centres), colors=[color], radii=[-1.5])
         self._recording.log(f"world/loops/{name}", lines)
+
+    def _log_pictures(self) -> None:
+        """The loops closed just now: if there are several, the last one stays in sight."""
+        import rerun as rr
+
+        new = self._pictures[self._n_pictures :]
+        self._n_pictures += len(new)
+        for picture in new:
+            image = rr.EncodedImage(contents=draw_picture(picture), media_type="image/jpeg")
+            self._recording.log("loops/images", image)
 
     def _send_frames(self) -> None:
         import rerun as rr
@@ -500,7 +521,8 @@ def _path(T_wc: NDArray[np.float64], color: tuple[int, int, int]) -> Any:
 def _in_words(edge: LoopEdge, map_: Map) -> str:
     query = f"frame {map_.frames[edge.query]}" if edge.query >= 0 else "a lost frame"
     evidence = f"{edge.n_inliers} inliers of {edge.n_matches} matches"
-    return f"{query} to frame {map_.frames[edge.match]}: {edge.reason}, {evidence}"
+    by = f"proposed by {edge.proposed_by}, matched by {edge.matched_by} descriptors"
+    return f"{query} to frame {map_.frames[edge.match]}: {edge.reason}, {evidence}, {by}"
 
 
 def _half(xy: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -521,7 +543,10 @@ def _blueprint() -> Any:
         name="Map",
     )
     column = rrb.Vertical(
-        rrb.Spatial2DView(origin="world/camera/image", name="Keyframe"),
+        rrb.Tabs(
+            rrb.Spatial2DView(origin="world/camera/image", name="Keyframe"),
+            rrb.Spatial2DView(origin="loops/images", name="Loop"),
+        ),
         rrb.TimeSeriesView(origin="points", name="Tracked points"),
         rrb.TimeSeriesView(origin="stage_ms", name="Time per stage (ms)"),
         rrb.TextLogView(origin="state", name="State"),

@@ -5,12 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 
 from vslam.datasets.kitti import KittiSequence, open_kitti
-from vslam.datasets.synthetic.routes import ROUTES, Route, built_in_route, route_of_poses
+from vslam.datasets.synthetic.routes import (
+    DRIVES,
+    ROUTES,
+    Route,
+    built_in_route,
+    route_of_poses,
+)
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import OnFrame, cache_folder, render_sequence
 from vslam.errors import InputError
 
 __all__ = [
+    "DRIVES",
     "ROUTES",
     "Route",
     "SyntheticSequence",
@@ -35,10 +42,13 @@ class SyntheticSequence(KittiSequence):
 def parse_drive(name: str) -> tuple[str, Variation]:
     """``05+change:0.5+moving:6+aliased+seed:1`` -> the route's name and the town's variation.
 
+    A name of `DRIVES` stands for its route and town, to which further parts may be added.
+
     Raises:
         InputError: a part that is none of these.
     """
-    route, *parts = name.split("+")
+    first, plus, further = name.partition("+")
+    route, *parts = (DRIVES.get(first, first) + plus + further).split("+")
     town = Variation()
     try:
         for part in parts:

@@ -1,0 +1,76 @@
+"""The point of the whole system, end to end: a loop that closes by night with the shipped network,
+and does not with the bag of words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vslam.config import Config
+from vslam.datasets.kitti import open_kitti
+from vslam.datasets.perturbation import parse_perturbation
+from vslam.datasets.synthetic.routes import built_in_route
+from vslam.datasets.synthetic.site import Variation
+from vslam.datasets.synthetic.store import render_sequence
+from vslam.evaluation.loops import evaluate_loops
+from vslam.loopclosure.registry import DEFAULT_DETECTOR
+from vslam.run.outcome import RunSettings
+from vslam.run.pipeline import run_sequence
+from vslam.run.recorder import NullRecorder
+from vslam.slam import Slam
+
+
+@pytest.fixture(scope="module")
+def round_the_block(tmp_path_factory):
+    """Once round a block at half the resolution, from noon to midnight: every second frame."""
+    route = built_in_route("block")
+    camera = route.camera
+    camera = replace(
+        camera,
+        fx=camera.fx / 2,
+        fy=camera.fy / 2,
+        cx=(camera.cx - 0.5) / 2,
+        cy=(camera.cy - 0.5) / 2,
+        width=camera.width // 2,
+        height=camera.height // 2,
+    )
+    smaller = replace(route, camera=camera, T_wc=route.T_wc[::2])
+    cache = tmp_path_factory.mktemp("night")
+    return open_kitti(render_sequence(smaller, Variation(seed=3, change=1.0), cache), "block")
+
+
+@pytest.fixture(scope="module")
+def compared(round_the_block):
+    """The drive with the default detector and, beside it, with ``bow``."""
+    settings = RunSettings(
+        "synthetic", "block", "none", DEFAULT_DETECTOR, "stereo", seed=0, threads=2, start=0,
+        every=1, max_frames=None, config=Config(), compare=("bow",),
+    )  # fmt: skip
+    return run_sequence(round_the_block, parse_perturbation("none", 0), settings, NullRecorder())
+
+
+def test_the_default_closes_a_loop_by_night_that_the_bag_of_words_misses(compared):
+    (bow,) = compared.compared
+    by_default, by_words = evaluate_loops(compared), evaluate_loops(bow)
+    assert (by_default.n_found, by_default.n_missed, by_default.n_wrong) == (1, 0, 0)
+    assert (by_words.n_found, by_words.n_missed, by_words.n_wrong) == (0, 1, 0)
+    for outcome in (compared, bow):
+        assert all(track.state != "LOST" for track in outcome.tracks)
+
+
+def test_the_loop_says_that_the_network_found_and_verified_it(compared):
+    closed = [edge for edge in compared.loops if edge.accepted]
+    assert [(edge.proposed_by, edge.matched_by) for edge in closed] == [("capsule", "learned")]
+
+
+def test_the_library_closes_it_without_being_told_how(round_the_block, compared):
+    """``Slam(camera)`` gives the trajectory of the command, to the byte."""
+    slam = Slam(round_the_block.camera)
+    for k, timestamp in enumerate(round_the_block.timestamps):
+        left, right = round_the_block.read(k)
+        slam.step(left, right, timestamp)
+    slam.finish()
+    assert len(slam.corrections) == 1
+    np.testing.assert_array_equal(slam.trajectory().T_wc, compared.trajectory.T_wc)

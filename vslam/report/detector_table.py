@@ -1,0 +1,67 @@
+"""The table of detectors that were run on the same frames (``--compare``)."""
+
+from __future__ import annotations
+
+from vslam.loopclosure.registry import about
+from vslam.report.page import Row, Table
+from vslam.report.schema import ReportJson
+
+_FIGURES = (
+    ("lost", "lost_frames", "{}"),
+    ("ATE", "ate_rmse_m", "{:.3f} m"),
+    ("causal ATE", "causal_ate_rmse_m", "{:.3f} m"),
+    ("RPE", "rpe_m", "{:.4f} m"),
+    ("t_rel", "t_rel_percent", "{:.3f} %"),
+    ("loops closed", "loops_closed", "{}"),
+    ("loops found", "loops_found", "{}"),
+    ("missed", "loops_missed", "{}"),
+    ("wrong", "loops_wrong", "{}"),
+    ("time", "seconds", "{:.1f} s"),
+)
+_NOTE = (
+    "All detectors saw the same frames. The time is that of tracking and mapping: images are read "
+    "and features extracted once for all."
+)
+
+
+def detector_table(report: ReportJson) -> Table:
+    """A row for each detector, the run's own first; no rows where there was no comparison.
+
+    Figures that none of them has are left out. The loops closed are counted only where there is no
+    ground truth to say which revisits were found.
+    """
+    detectors = report.detectors
+    if not detectors:
+        return Table("Detectors", ("detector",), [], note=left_out(report))
+    known = {
+        name for _, name, _ in _FIGURES if any(getattr(one, name) is not None for one in detectors)
+    }
+    if "loops_found" in known:
+        known.remove("loops_closed")
+    figures = [figure for figure in _FIGURES if figure[1] in known]
+    ended = ("ended early",) if any(one.interrupted for one in detectors) else ()
+    head = ("detector", *(title for title, _, _ in figures), *ended)
+    rows: list[Row] = [
+        (
+            one.detector,
+            *(_cell(getattr(one, name), form) for _, name, form in figures),
+            *(one.interrupted or "no" for _ in ended),
+        )
+        for one in detectors
+    ]
+    names = "; ".join(f"{one.detector}: {about(one.detector)}" for one in detectors)
+    return Table("Detectors", head, rows, ("detector", *ended), f"{names}. {_NOTE}")
+
+
+def left_out(report: ReportJson) -> str:
+    """Why there is no comparison though one was asked for; empty otherwise."""
+    if report.detectors or not report.compare:
+        return ""
+    return (
+        f"The comparison with {', '.join(report.compare)} was left out, since the run was resumed: "
+        "only the map of its own detector had been saved."
+    )
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "n/a" if value is None else form.format(value)

@@ -1,0 +1,80 @@
+"""The closed loops that a report shows in pictures."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from vslam.report.schema import LoopEntry, ReportJson
+
+if TYPE_CHECKING:
+    from vslam.run.loop_pictures import LoopPicture
+
+_MOST = 6  # loops in pictures: about 0.5 MB of the page
+_DESCRIPTORS = {"orb": "ORB descriptors", "learned": "learned descriptors"}
+
+
+@dataclass(frozen=True)
+class SeenLoop:
+    """A closed loop in a picture.
+
+    Attributes:
+        name: of its file in the folder of figures.
+        caption: what the picture shows.
+        jpeg: both images side by side, with the matches.
+    """
+
+    name: str
+    caption: str
+    jpeg: bytes
+
+    @property
+    def address(self) -> str:
+        """The picture as a ``data:`` address, for a page that loads nothing."""
+        return f"data:image/jpeg;base64,{b64encode(self.jpeg).decode()}"
+
+
+def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[SeenLoop]:
+    """Draw the closed loops that a reader should see: wrong ones first, then those that learned
+    descriptors verified, else in their order.
+
+    Args:
+        report: of the run.
+        pictures: of its closed loops, as far as both images are kept.
+    """
+    closed = {(loop.query_frame, loop.match_frame): loop for loop in report.loops if loop.accepted}
+    of_loop = [(closed.get((one.query_frame, one.match_frame)), one) for one in pictures]
+    shown = [(loop, picture) for loop, picture in of_loop if loop is not None]
+    if not shown:
+        return []
+    from vslam.run.loop_pictures import draw_picture
+
+    shown.sort(key=lambda one: (one[0].right is not False, one[0].matched_by != "learned"))
+    return [
+        SeenLoop(
+            f"loop-{picture.query_frame}-{picture.match_frame}.jpg",
+            _caption(loop),
+            draw_picture(picture),
+        )
+        for loop, picture in shown[:_MOST]
+    ]
+
+
+def seen_note(report: ReportJson, seen: Collection[SeenLoop]) -> str:
+    """What the pictures show, and of how many loops there is none."""
+    note = "Lines join what both images show; at most 60 matches are drawn."
+    if len(seen) < report.loops_closed:
+        note += f" {len(seen)} of the {report.loops_closed} closed loops are shown."
+    return note
+
+
+def _caption(loop: LoopEntry) -> str:
+    wrong = loop.right is False
+    shows = "was wrongly taken for" if wrong else "shows"
+    return (
+        f"Frame {loop.query_frame} (right) {shows} the place of frame {loop.match_frame} (left): "
+        f"{loop.inliers} matches agree; proposed by {loop.proposed_by.replace('+', ' and ')}, "
+        f"verified by {_DESCRIPTORS[loop.matched_by]}."
+    )

@@ -5,9 +5,10 @@ python tools/training/train_paper.py --kitti $KITTI_ROOT --photos DIR --out DIR 
 KITTI_ROOT holds sequences/00 and poses/00.txt, DIR the sets of photographs (datasets.md).
 
 The script renders eight towns, trains from random weights with the settings paper.json beside this
-file (the preset ``paper`` in float32, with fewer images mined and validated), removes 20 % of the
-primary capsules, trains what is left for two epochs and exports it. Finished parts are skipped and
-an interrupted training resumes from its checkpoint, so the same command continues everything.
+file (the preset ``paper`` in float32, with less patience and fewer images mined and validated),
+removes 20 % of the primary capsules, trains what is left for two epochs and exports it. Finished
+parts are skipped and an interrupted training resumes from its checkpoint, so the same command
+continues everything.
 
 bfloat16 is no option on a CPU: of thirteen steps replayed with torch 2.13 one had a gradient of
 norm 5e32 where float32 gives 0.16, and the loss became NaN in the second epoch.

@@ -70,6 +70,12 @@ def precision_at_recall(curve: PrecisionRecall, recall: float = 0.7) -> float:
     return float(curve.precision[curve.recall >= recall].max())
 
 
+def accepted_at(curve: PrecisionRecall, threshold: float) -> tuple[float, float]:
+    """Precision and recall of the pairs that a threshold accepts; 1 and 0 if it accepts none."""
+    k = int(np.searchsorted(curve.thresholds, threshold))
+    return float(curve.precision[k]), float(curve.recall[k])
+
+
 def max_f1(curve: PrecisionRecall) -> tuple[float, float]:
     """The highest harmonic mean of precision and recall, and its threshold."""
     p, r = curve.precision[:-1], curve.recall[:-1]

@@ -11,7 +11,7 @@ from vslam.config import Config
 from vslam.errors import InputError
 from vslam.loopclosure.detector import LoopDetector, NoDetector
 from vslam.loopclosure.plugin_detector import PlugInDetector, open_plugin
-from vslam.loopclosure.siamese.weights import NETWORKS, find_weights
+from vslam.loopclosure.siamese.weights import NETWORKS, TO_THE_LETTER, find_weights
 
 if TYPE_CHECKING:
     from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
@@ -27,7 +27,7 @@ _ABOUT = {
     "capsule-paper": "the Siamese capsule network as the paper describes it",
 }
 # Detectors whose candidates learned descriptors verify, too, unless the configuration says more.
-LEARNED_VERIFICATION = ("both", *NETWORKS)
+LEARNED_VERIFICATION = ("both", *(name for name in NETWORKS if name != TO_THE_LETTER))
 
 
 def about(name: str) -> str:

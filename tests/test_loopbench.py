@@ -194,10 +194,12 @@ def test_figures_of_detectors_that_know_and_that_err(vocabulary):
     assert sage.figures["average_precision"] == 1.0
     assert sage.figures["recall_at_100_precision"] == 1.0
     assert sage.accuracy == {"0.5": 1.0, "0.9": 1.0}
+    assert sage.accepted == (1.0, 1.0)
     assert (sage.queries, sage.first_right) == (6, 1.0)
     names = ("orb", "learned", "both")
     assert sage.verified == {name: Verified(right=1.0, wrong=0) for name in names}
     assert liar.accuracy == {"0.5": 0.0, "0.9": 0.0}
+    assert liar.accepted == (0.0, 0.0)
     # The liar's best images show other walls, whose matches obey no one geometry.
     assert liar.first_right == 0.0
     assert liar.verified == {name: Verified(right=0.0, wrong=0) for name in names}

@@ -8,6 +8,7 @@ from sklearn.metrics import average_precision_score, balanced_accuracy_score, pr
 
 from vslam.errors import InputError
 from vslam.loopclosure.precision_recall import (
+    accepted_at,
     average_precision,
     balanced_accuracy,
     max_f1,
@@ -48,6 +49,8 @@ def test_figures_by_hand():
     best, threshold = max_f1(curve)
     assert best == pytest.approx(2 * 5 / (8 + 5))
     assert threshold == 0.1
+    assert accepted_at(curve, 1.1 * SCORE.max()) == (1.0, 0.0)
+    assert accepted_at(curve, threshold) == pytest.approx((5 / 8, 1.0))
     wanted = 0.2 * (1 + 1 + 3 / 4 + 4 / 6 + 5 / 8)
     assert average_precision(curve) == pytest.approx(wanted)
     assert summary(SAME, SCORE)["average_precision"] == pytest.approx(wanted)

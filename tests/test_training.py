@@ -242,6 +242,9 @@ def test_pruning_and_fine_tuning(tmp_path):
     wanted = settings.model_copy(update={"network": "capsule-pruned"})
     start, fitted, report = starting_network(wanted, collection, full.weights, "cpu")
     assert fitted.shape.kept == round(0.8 * SMALL.places)
+    assert start.name == "capsule-pruned"
+    of_paper = wanted.model_copy(update={"network": "capsule-paper"})
+    assert starting_network(of_paper, collection, full.weights, "cpu")[0].name == "capsule-paper"
     half = wanted.model_copy(update={"prune_share": 0.5})
     fewer = starting_network(half, collection, full.weights, "cpu")[1]
     assert fewer.shape.kept == SMALL.places - round(0.5 * SMALL.places)

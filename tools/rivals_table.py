@@ -42,7 +42,7 @@ from vslam.loopbench.report import draw
 from vslam.loopbench.schema import LoopsJson, Score
 from vslam.loopbench.sets import open_set
 from vslam.loopclosure.siamese.inference import OnnxNetwork, open_network
-from vslam.loopclosure.siamese.weights import NETWORKS, find_weights
+from vslam.loopclosure.siamese.weights import NETWORKS, TO_THE_LETTER, find_weights
 from vslam.loopclosure.vocabulary import load
 from vslam.machine import versions
 from vslam.report.drawing import (
@@ -263,7 +263,10 @@ def tables(
         title = WAYS[way]
         mine = [row[1:] for row in rows if row[0] == way]
         if way in ("images", "minutes"):
-            without = dict.fromkeys(NETWORKS, "not trained") | ABSENT
+            rivals = [
+                name for name in NETWORKS if name != TO_THE_LETTER
+            ]  # has a training of its own
+            without = dict.fromkeys(rivals, "not trained") | ABSENT
             known = {row[0] for row in mine}
             mine += [
                 (name, why, *["-"] * (len(head) - 3))

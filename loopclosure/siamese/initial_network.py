@@ -30,6 +30,7 @@ from vslam.loopclosure.siamese.siamese import (
     for_inference,
     load_network,
 )
+from vslam.loopclosure.siamese.weights import PRUNED
 
 _RANKED_IMAGES = 1000
 
@@ -52,9 +53,11 @@ def starting_network(
     Raises:
         InputError: weights that are missing, damaged or of another network.
     """
-    if settings.network == "capsule-pruned":
+    if settings.network in PRUNED:
         if weights is None:
-            raise InputError("vslam train capsule-pruned: name the network to prune, --weights.")
+            raise InputError(
+                f"vslam train {settings.network}: name the network to prune, --weights."
+            )
         return _prune(settings, collection, weights, torch.device(device))
     if settings.network == "pcanet" and weights is not None:
         raise InputError("vslam train pcanet: learns from images alone; leave out --weights.")
@@ -143,7 +146,8 @@ def _prune(
     if settings.prune_iterations is not None:
         routed = with_iterations(whole, settings.prune_iterations)
         report["iterations"] = settings.prune_iterations
-    smaller = pruned(routed, lowest(mean_couplings(routed, batches), settings.prune_share))
+    drop = lowest(mean_couplings(routed, batches), settings.prune_share)
+    smaller = pruned(routed, drop, settings.network)
     if whole.size != full.size:
         report["resized_to"] = whole.size
     for name, network in (("before", whole), ("removed", smaller)):

@@ -61,8 +61,11 @@ def masked(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
     return copied
 
 
-def pruned(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
+def pruned(network: SiameseNetwork, drop: Tensor, name: str = "capsule-pruned") -> SiameseNetwork:
     """A copy without the capsules of ``drop`` ``(T, K)``, as many of each type.
+
+    Args:
+        name: of the copy, one of ``PRUNED``.
 
     Raises:
         InputError: a network without capsules.
@@ -71,7 +74,7 @@ def pruned(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
     layer = branch.capsules
     kept = (~drop).nonzero()[:, 1].view(len(drop), -1)
     shape = branch.shape.model_copy(update={"kept": kept.shape[1]})
-    smaller = SiameseNetwork("capsule-pruned", CapsuleBranch(shape), copy.deepcopy(network.head))
+    smaller = SiameseNetwork(name, CapsuleBranch(shape), copy.deepcopy(network.head))
     state = network.state_dict()
     prefix = "branch.capsules."
     rows = kept[:, :, None].expand(-1, -1, layer.gains.shape[2])

@@ -54,10 +54,10 @@ class TrainSettings(BaseModel):
     validation_images: int = Field(800, ge=2, description="At most.")
     augmentation: Augmentation = Augmentation()
     prune_share: float = Field(
-        0.2, gt=0, lt=1, description="Of the capsules, taken out of capsule-pruned. [paper]"
+        0.2, gt=0, lt=1, description="Of the capsules, removed when pruning. [paper]"
     )
     prune_iterations: int | None = Field(
-        None, ge=1, description="Of the routing of capsule-pruned; null: as many as before."
+        None, ge=1, description="Of the routing after pruning; null: as many as before."
     )
 
 

@@ -19,7 +19,7 @@ from vslam.loopclosure.siamese.capsules import TINY
 from vslam.loopclosure.siamese.convolutional import CONVOLUTIONAL, ConvolutionalBranch
 from vslam.loopclosure.siamese.extractors import fold_batch_norms
 from vslam.loopclosure.siamese.pcanet import PcaNetBranch
-from vslam.loopclosure.siamese.weights import NETWORKS
+from vslam.loopclosure.siamese.weights import NETWORKS, PRUNED
 
 Head = Literal["distance", "concatenation"]
 """What compares two descriptors: :class:`DistanceHead` or :class:`ConcatenationHead`."""
@@ -194,7 +194,7 @@ def build_network(
     """
     shape = shape or CapsuleShape()
     branch: CapsuleBranch | ConvolutionalBranch | PcaNetBranch
-    if name in ("capsule", "capsule-pruned"):
+    if name in ("capsule", *PRUNED):
         branch = CapsuleBranch(shape)
     elif name == "pcanet":
         branch = PcaNetBranch(shape.input)

@@ -8,9 +8,14 @@ from typing import Any
 from vslam.errors import InputError
 
 NETWORKS = (
-    "capsule", "capsule-pruned", "alexnet", "vgg16", "darknet19", "googlenet", "mobilenet",
-    "squeezenet", "pcanet",
+    "capsule", "capsule-pruned", "capsule-paper", "alexnet", "vgg16", "darknet19", "googlenet",
+    "mobilenet", "squeezenet", "pcanet",
 )  # fmt: skip
+PRUNED = ("capsule-pruned", "capsule-paper")
+"""Made from trained weights of ``capsule`` by removing primary capsules."""
+TO_THE_LETTER = "capsule-paper"
+"""The paper's own method: no keyframe image is kept, so neither odometry nor learned local
+descriptors have a part in what it finds."""
 SHIPPED = Path(__file__).parent / "weights"
 
 

@@ -23,8 +23,8 @@ _DATASETS = _with_plugins(("kitti", "euroc", "tum", "synthetic"), plugins.READER
 _SOURCES = ("images", "video", "bag", "camera")
 _DETECTORS = _with_plugins(
     (
-        "none", "bow", "both", "capsule", "capsule-pruned", "alexnet", "vgg16", "darknet19",
-        "googlenet", "mobilenet", "squeezenet", "pcanet",
+        "none", "bow", "both", "capsule", "capsule-pruned", "capsule-paper", "alexnet", "vgg16",
+        "darknet19", "googlenet", "mobilenet", "squeezenet", "pcanet",
     ),
     plugins.DETECTORS,
 )  # fmt: skip

@@ -90,7 +90,7 @@ def run(
         DetectorName | None,
         typer.Option(
             help="Loop detector: [b]both[/b] is the capsule network beside the bag of words, "
-            "[b]none[/b] odometry only; those after capsule-pruned need [b]--weights[/b].",
+            "[b]none[/b] odometry only; those after capsule-paper need [b]--weights[/b].",
             show_default="both, or that of --map",
         ),
     ] = None,

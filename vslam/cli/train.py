@@ -44,8 +44,8 @@ def register(app: typer.Typer) -> None:
 
 
 NetworkName = Literal[
-    "capsule", "capsule-pruned", "alexnet", "vgg16", "darknet19", "googlenet", "mobilenet",
-    "squeezenet", "pcanet",
+    "capsule", "capsule-pruned", "capsule-paper", "alexnet", "vgg16", "darknet19", "googlenet",
+    "mobilenet", "squeezenet", "pcanet",
 ]  # fmt: skip
 PresetName = Literal["paper", "best", "pretrained", "rivals"]
 DeviceName = Literal["cpu", "cuda"]
@@ -84,8 +84,8 @@ def train(
     weights: Annotated[
         Path | None,
         typer.Option(
-            help="Network to start from; for capsule-pruned the one to prune; for alexnet and "
-            "vgg16 a weight file of torchvision."
+            help="Network to start from; for capsule-pruned and capsule-paper the one to prune; "
+            "for alexnet and vgg16 a weight file of torchvision."
         ),
     ] = None,
     pixels: Annotated[
@@ -97,7 +97,7 @@ def train(
     ] = None,
     prune_share: Annotated[
         float | None,
-        typer.Option(min=0.01, max=0.99, help="Share of the capsules that capsule-pruned lacks."),
+        typer.Option(min=0.01, max=0.99, help="Share of the capsules that pruning removes."),
     ] = None,
     out: Annotated[
         Path | None,

@@ -21,6 +21,7 @@ from vslam.loopbench.sets import QuerySet, TestSet
 from vslam.loopclosure.local_matching import homography_share, match_coarse
 from vslam.loopclosure.precision_recall import (
     PrecisionRecall,
+    accepted_at,
     average_precision,
     balanced_accuracy,
     precision_recall,
@@ -83,6 +84,7 @@ def _score(
         str(threshold): balanced_accuracy(same, score, threshold) if scorer.probability else None
         for threshold in (0.5, 0.9)
     }
+    curve = precision_recall(same, score)
     answerable = (query_set.relation == SAME).any(1)
     best, truth = _best_images(scores, query_set.relation)
     sequence_right = None
@@ -108,11 +110,12 @@ def _score(
         detector=scorer.name,
         figures=summary(same, score),
         accuracy=accuracy,
+        accepted=accepted_at(curve, 0.9) if scorer.probability else None,
         queries=int(answerable.sum()),
         first_right=float(right.mean()),
         sequence_right=sequence_right,
         verified=verified,
-        curve=thinned(precision_recall(same, score)),
+        curve=thinned(curve),
     )
 
 

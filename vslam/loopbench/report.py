@@ -50,6 +50,9 @@ _ABOUT_SEQUENCES = (
 )
 _ABOUT_WRONG = "Queries whose best image shows another place and passes those tests, too."
 _ABOUT_ACCURACY = "Balanced: mean of the shares of true and of false pairs judged rightly by p."
+_ABOUT_ACCEPTED = (
+    "Of the pairs with p of at least 0.9; where there are none, precision counts as 1."
+)
 _ABOUT_COST = (
     "Each in a process of its own, one thread, medians. An image: what is needed beyond the ORB "
     "features that tracking has anyway. Parameters of bow: weights of its words."
@@ -141,6 +144,9 @@ def tables(report: LoopsJson) -> list[Table]:
                lambda c: ", ".join(str(v.wrong) for v in c.verified.values()), _ABOUT_WRONG),
         _table(report, "Largest F1", lambda c: f"{c.figures['max_f1']:.3f}", ""),
         _table(report, "Accuracy at p = 0.5, 0.9", _accuracies, _ABOUT_ACCURACY),
+        _table(report, "Precision, recall at p = 0.9",
+               lambda c: "-" if c.accepted is None else
+               f"{c.accepted[0]:.3f}, {c.accepted[1]:.3f}", _ABOUT_ACCEPTED),
     ]  # fmt: skip
     if report.costs:
         heads = [f"query of {n} (ms)" for n in report.costs[0].query_ms]

@@ -31,7 +31,8 @@ class Score(_Model):
     """One detector on one set of images under one condition.
 
     ``figures`` are those of :func:`vslam.loopclosure.precision_recall.summary`, of descriptors
-    alone; ``accuracy`` is balanced, at thresholds on p, None for detectors without.
+    alone; ``accuracy`` is balanced, at thresholds on p, None for detectors without. ``accepted``:
+    precision and recall of the pairs with p of at least 0.9, None likewise, and in older files.
     ``first_right``: share of the ``queries`` that have a place in the gallery whose best image
     shows it; ``sequence_right``: the same where scores are added along sequences, None of images
     without order. ``verified``: by ``orb``, by ``learned`` local descriptors, by ``both``, one
@@ -43,6 +44,7 @@ class Score(_Model):
     detector: str
     figures: dict[str, float]
     accuracy: dict[str, float | None]
+    accepted: tuple[float, float] | None = None
     queries: int
     first_right: float
     sequence_right: float | None = None

@@ -142,13 +142,12 @@ def test_same_bytes_with_one_thread_and_two():
 
 def test_two_slams_may_share_the_features_of_their_frames():
     """As those of compared detectors do: neither writes to them, one closes the loop. All that is
-    corrected in features is: disparities, and a right side that seems late."""
-    ring, late = Ring.create(focal_error=0.015), 0.004
+    corrected in features is: disparities, and a right side that is late."""
+    late = 0.004
+    ring = replace(Ring.create(focal_error=0.015), right_delay=late)
 
     def start(detector, threads):
-        slam = Slam(CAMERA, None, detector, threads=threads)
-        slam.side_delay.applied = late
-        return slam
+        return Slam(replace(CAMERA, right_delay=late), None, detector, threads=threads)
 
     def drive(slams, shown):
         for i, features in enumerate(shown):

@@ -145,8 +145,8 @@ class StereoConfig(_Section):
     least_delay: float = Field(
         1.2e-3,
         gt=0,
-        description="Delay between the sides from which it is corrected, seconds "
-        "(docs/stress.md). [own]",
+        description="Difference between the measured delay of the right side and the calibration's "
+        "from which the report warns, seconds (docs/stress.md). [own]",
     )
     delay_sigmas: float = Field(
         5.0, gt=0, description="The same in standard deviations of what was measured. [own]"

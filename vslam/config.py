@@ -681,12 +681,6 @@ class ConsistencyConfig(_Section):
         30, ge=1, description="Shared landmarks that put a keyframe into a candidate's group. [own]"
     )
     min_verified: int = Field(2, ge=1, description="Verified keyframes that must agree. [own]")
-    min_against: int = Field(
-        4,
-        ge=2,
-        description="Verified keyframes that must agree for a loop to say that the map is wrong at "
-        "a keyframe that hangs by a thread. [own]",
-    )
     verified_memory: int = Field(
         5, ge=1, description="Keyframes during which a verified loop counts. [own]"
     )

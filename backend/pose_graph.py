@@ -78,7 +78,6 @@ def essential_graph(
     weak: Collection[int] = (),
     unpredicted: Collection[int] = (),
     driven: bool = False,
-    broken: int | None = None,
 ) -> PoseGraph:
     """The essential graph of a map, *before* anything of the new loop has been written to it.
 
@@ -97,8 +96,6 @@ def essential_graph(
         unpredicted: those of them that not even a prediction led to: always WEAK.
         driven: trust such an edge as far as a car's motion can be predicted over that time (GAP);
             otherwise the camera may have been carried anywhere (WEAK).
-        broken: a keyframe (``loosest_keyframe``) whose place is taken to be wrong: tree edges that
-            lead past it are WEAK.
 
     Raises:
         ValueError: a loop has no pose.
@@ -116,9 +113,7 @@ def essential_graph(
         parent = map_.parents[child]
         if parent >= 0:
             pair = (min(parent, child), max(parent, child))
-            if broken is not None and pair[0] < broken <= pair[1]:
-                kind[pair] = WEAK
-            elif not _passes(pair, restarts) or pair in seen:
+            if not _passes(pair, restarts) or pair in seen:
                 kind[pair] = TREE
             else:
                 kind[pair] = GAP if driven and not _passes(pair, unpredicted_restarts) else WEAK
@@ -165,25 +160,6 @@ def held_by(map_: Map) -> NDArray[np.int64]:
     for (one, other), n in zip(pairs[order].tolist(), shared[order].tolist(), strict=True):
         held[one + 1 : other + 1] = n
     return held
-
-
-def loosest_keyframe(map_: Map, first: int, last: int, config: PoseGraphConfig) -> int | None:
-    """The keyframe behind ``first``, and not behind ``last``, at which the map hangs by a thread.
-
-    Where a camera sees what it saw a moment ago hundreds of landmarks hold the map together
-    (``held_by``); at a pose after a cut or a gap that wrong matches agreed on, no more than those.
-    None if there are as many as a strong covisibility edge has, if a second place is not twice as
-    strong, or where mapping began anew.
-    """
-    living = map_.living_keyframes()
-    between = living[(first < living) & (living <= last)]
-    if not len(between):
-        return None
-    strength = held_by(map_)[between]
-    loosest = int(between[np.argmin(strength)])
-    weakest, next_weakest = np.sort(np.append(strength, config.min_shared))[:2].tolist()
-    thread = 2 * weakest <= min(next_weakest, config.min_shared)
-    return loosest if thread and loosest not in map_.restarts else None
 
 
 def _passes(pair: tuple[int, int], keyframes: NDArray[np.int64]) -> bool:

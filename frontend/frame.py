@@ -71,12 +71,18 @@ class Frame:
             self.features = self.features.with_larger_disparities(change)
             self.disparity_offset = offset
 
-    def correct_delay(self, delay: float, twist: Matrix, camera: Camera) -> None:
-        """Take so much more of a delay of the right side out of the features' columns there."""
+    def take_out_right_delay(self, twist: Matrix | None, camera: Camera) -> None:
+        """Move the features' columns in the right image to where they were when the left image was
+        taken (``Camera.right_delay``). Call it once; without a known motion nothing changes.
+
+        Args:
+            twist: ``(6,)`` how points move past the camera, per second; None if unknown.
+        """
+        if camera.right_delay == 0.0 or twist is None:
+            return
         xy, u_right = self.features.xy, self.features.u_right
-        self.features = replace(
-            self.features, u_right=columns_without_delay(xy, u_right, twist, delay, camera)
-        )
+        u_right = columns_without_delay(xy, u_right, twist, camera.right_delay, camera)
+        self.features = replace(self.features, u_right=u_right)
 
     @property
     def aligned(self) -> NDArray[np.bool_]:

@@ -2,14 +2,16 @@
 
 In a rectified pair a point is in the same row of both images. If the right one is taken later, its
 row is moved on by the image's speed times the delay. Columns are moved as well, and bend the map:
-there, bundle adjustment takes much of the delay for depth and motion. Rows say nothing of depth, so
-that nothing can hide in them, and no map is asked. A rig whose rows do not correspond, as one
-calibrated badly, shows the same at every speed: a polynomial of the position takes that.
+there, bundle adjustment takes much of the delay for depth and motion. A row shift does not depend
+on depth, so bundle adjustment cannot absorb a delay there, and no map is needed. A rig whose rows
+do not correspond, because its calibration is wrong, shows the same shift at every speed; a
+polynomial of the position in the image takes that.
+
+The delay is measured and reported, never corrected on the way: it is known only after some seconds,
+when the map is bent already. ``Camera.right_delay`` corrects it wherever the motion is known.
 """
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +21,7 @@ from vslam.config import StereoConfig
 from vslam.features import Features, level_pixel
 from vslam.frontend.orb import Extraction
 from vslam.geometry import Matrix
-from vslam.image_motion import columns_without_delay, rays, row_speeds
+from vslam.image_motion import rays, row_speeds
 from vslam.kernels import inner_kernel, kernel
 
 EVERY = 8  # of that many features one is measured: they are a hundred an image
@@ -27,7 +29,6 @@ ROUNDS = 3  # of Gauss-Newton, at most
 STILL = 0.05  # pixels; a smaller step ends them
 LARGEST = 3.0  # pixels of the feature's level: beyond, it is another thing
 HUBER_PX = 0.3
-NEWS = 0.25  # of the least delay: a change by which all is corrected once more
 FRAMES_OF_A_GROUP, FEWEST_GROUPS, MOST_GROUPS = 5, 5, 16
 _DEGREE = 3  # of the polynomial
 _NUISANCES = (_DEGREE + 1) * (_DEGREE + 2) // 2
@@ -134,12 +135,11 @@ class SideDelay:
     Attributes:
         seconds: by which the right side is late.
         sigma: of that, from how much groups of frames contradict each other (Liang and Zeger,
-            Biometrika 1986); infinite as long as nothing tells.
-        applied: by which features are corrected: 0 for a sound rig.
+            Biometrika 1986); infinite until there are enough groups.
     """
 
     def __init__(self, camera: Camera, config: StereoConfig) -> None:
-        self.seconds, self.sigma, self.applied = 0.0, np.inf, 0.0
+        self.seconds, self.sigma = 0.0, np.inf
         self._camera, self._config = camera, config
         self._solution = np.zeros(1 + _NUISANCES)
         self._twist = np.zeros(6)
@@ -148,17 +148,12 @@ class SideDelay:
         self._groups: list[NDArray[np.float64]] = []
         self._n_group, self._length = 0, FRAMES_OF_A_GROUP
 
-    def adopt(self) -> float:
-        """Correct features from now on by what is known, if it is beyond doubt and news; returns
-        by how much more than before."""
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the delay differs from that of the calibration (``Camera.right_delay``) by more
+        than can be chance."""
         least = max(self._config.least_delay, self._config.delay_sigmas * self.sigma)
-        if self.applied == 0.0 and abs(self.seconds) <= least:
-            return 0.0
-        change = self.seconds - self.applied
-        if abs(change) <= NEWS * self._config.least_delay:
-            return 0.0
-        self.applied = self.seconds
-        return change
+        return abs(self.seconds - self._camera.right_delay) > least
 
     def add(self, features: Features, twist: Matrix | None, scales: NDArray[np.float64]) -> None:
         """Learn from a tracked frame.
@@ -176,20 +171,10 @@ class SideDelay:
         self._twist = twist
         self._waiting = self._moments(features, twist, scales)
 
-    def corrected(self, features: Features, twist: Matrix | None) -> Features:
-        """Features with their columns in the right image as these were when the left one was taken;
-        ``twist`` as in ``add``."""
-        if self.applied == 0.0 or twist is None:
-            return features
-        u_right = columns_without_delay(
-            features.xy, features.u_right, twist, self.applied, self._camera
-        )
-        return replace(features, u_right=u_right)
-
     def memory(self) -> tuple[float, ...]:
         """All that was learned."""
         arrays = (*self._state(), *self._groups)
-        counts = (float(self._n_group), float(self._length), self.applied)
+        counts = (float(self._n_group), float(self._length))
         return (*counts, *np.concatenate([each.ravel() for each in arrays]).tolist())
 
     def restore(self, memory: tuple[float, ...]) -> None:
@@ -200,13 +185,12 @@ class SideDelay:
         """
         if not memory:
             return
-        fixed = 3 + sum(each.size for each in self._state())
+        fixed = 2 + sum(each.size for each in self._state())
         if len(memory) < fixed or (len(memory) - fixed) % self._group.size:
             raise ValueError("what it knows of the delay between the sides is damaged")
         self._n_group, self._length = int(memory[0]), int(memory[1])
-        self.applied = memory[2]
         ends = np.cumsum([each.size for each in self._state()])
-        *state, groups = np.split(np.array(memory[3:]), ends)
+        *state, groups = np.split(np.array(memory[2:]), ends)
         for array, values in zip(self._state(), state, strict=True):
             array[...] = values.reshape(array.shape)
         self._groups = list(groups.reshape(-1, *self._group.shape))

@@ -85,21 +85,17 @@ class LoopConsistency:
             return edge
         oldest = self._turn - self.config.verified_memory
         self._verified = [(turn, e) for turn, e in self._verified if turn >= oldest]
-        votes = self.votes(edge, map_)
-        self._verified.append((self._turn, edge))
-        if votes >= self.config.min_verified:
-            return edge
-        reason = f"verified by {votes} of {self.config.min_verified} keyframes"
-        return replace(edge, accepted=False, reason=reason)
-
-    def votes(self, edge: LoopEdge, map_: Map) -> int:
-        """How many recent keyframes, that of the edge included, were verified with its drift."""
         agreeing = {
             other.query
             for _, other in self._verified
             if other.query != edge.query and self.agree(edge, other, map_)
         }
-        return 1 + len(agreeing)
+        votes = 1 + len(agreeing)  # that of the edge's own keyframe included
+        self._verified.append((self._turn, edge))
+        if votes >= self.config.min_verified:
+            return edge
+        reason = f"verified by {votes} of {self.config.min_verified} keyframes"
+        return replace(edge, accepted=False, reason=reason)
 
     def waiting(self) -> list[LoopEdge]:
         """Verified edges that would count at the next keyframe, the newest first."""

@@ -23,13 +23,15 @@ class Ring:
 
     The camera is told a focal length that is ``focal_error`` too long: it takes every turn for
     wider or narrower than it is, and a lap ends off its start. With ``zoom`` a point is found in
-    the octave that its distance asks for, else in octave 0.
+    the octave that its distance asks for, else in octave 0. The right image is taken
+    ``right_delay`` seconds late, at ten frames a second.
     """
 
     points: np.ndarray
     descriptors: np.ndarray
     focal_error: float = 0.0
     zoom: bool = False
+    right_delay: float = 0.0
 
     @classmethod
     def create(
@@ -67,7 +69,10 @@ class Ring:
         seen = np.flatnonzero(ahead & inside)[:1200]
         n = len(seen)
         xy = np.stack([u[seen], v[seen]], axis=1) + rng.normal(0, 0.5, (n, 2))
-        u_right = xy[:, 0] - CAMERA.bf * (1.0 + self.focal_error) / z[seen]
+        T_late = inverse(self.pose(k + 10.0 * self.right_delay))
+        late = self.points[seen] @ T_late[:3, :3].T + T_late[:3, 3]
+        moved = focal * late[:, 0] / late[:, 2] + CAMERA.cx - u[seen]
+        u_right = xy[:, 0] + moved - CAMERA.bf * (1.0 + self.focal_error) / late[:, 2]
         u_right += rng.normal(0, 0.17, n)
         octave = np.log(30.0 / np.linalg.norm(p[seen], axis=1)) / np.log(1.2) * self.zoom
         bits = np.unpackbits(self.descriptors[seen], axis=1)

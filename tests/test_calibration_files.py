@@ -12,6 +12,7 @@ import pytest
 
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration, CameraModel
+from vslam.calibration.rectification import rectify
 from vslam.errors import InputError
 from vslam.geometry import inverse, se3_exp
 
@@ -309,6 +310,7 @@ def test_settings_of_an_rgbd_camera(tmp_path):
 ONE = "{focal: [458, 457], centre: [367, 248], size: [752, 480]}"
 PAIR = f"left: {ONE}\nright: {ONE}\n"
 SETTINGS = "Camera.fx: 517\nCamera.fy: 516\nCamera.cx: 318\nCamera.cy: 255\n"
+TURNED = "T_left_right: [0.9998, 0, 0.02, 0.5, 0, 1, 0, 0, -0.02, 0, 0.9998, 0, 0, 0, 0, 1]\n"
 IDENTITY = "T_left_right: [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
 
 
@@ -318,8 +320,11 @@ IDENTITY = "T_left_right: [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
         (f"left: {ONE}\ndepth_scale: 0\n", "depth_scale is 0 but must be positive"),
         (f"left: {ONE}\nvirtual_baseline: -0.1\n", "virtual_baseline is -0.1 but must be"),
         (f"{PAIR}{IDENTITY}baseline: 0.1\n", "T_left_right and baseline say the same thing"),
-        (f"left: {ONE}\nbaseline: 0.1\n", "baseline leads to a right camera, which is missing"),
-        (f"left: {ONE}\n{IDENTITY}", "T_left_right leads to a right camera, which is missing"),
+        (f"left: {ONE}\nbaseline: 0.1\n", "baseline is of a stereo pair, but right is missing"),
+        (f"left: {ONE}\n{IDENTITY}", "T_left_right is of a stereo pair, but right is missing"),
+        (f"left: {ONE}\nright_delay: 0.01\n", "right_delay is of a stereo pair, but right is"),
+        (f"{PAIR}{IDENTITY}right_delay: 4.7\n", "right_delay is 4.7 s but must be between"),
+        (f"{PAIR}{IDENTITY}right_delay: -0.1\n", "right_delay is -0.1 s but must be between"),
         (f"{PAIR}baseline: 0.1\ndepth_scale: 5000\n", "depth_scale is of a camera with depth"),
         (f"{SETTINGS}DepthMapFactor: 0\n", "DepthMapFactor is 0 but must be positive"),
         (f"{SETTINGS}Camera.bf: -40\nDepthMapFactor: 5000\n", "Camera.bf is -40 but must be"),
@@ -343,6 +348,7 @@ def test_a_rectified_pair_by_its_baseline(tmp_path):
     found = read_calibration([path])
     assert found.left == found.right
     assert found.T_left_right[0, 3] == 0.54
+    assert rectify(found).camera.right_delay == 0.0
     path.write_text(
         "Camera.fx: 718.9\nCamera.fy: 718.9\nCamera.cx: 607.2\nCamera.cy: 185.2\n"
         f"Camera.bf: {718.9 * 0.54}\nCamera.width: 1241\nCamera.height: 376\n"
@@ -350,6 +356,15 @@ def test_a_rectified_pair_by_its_baseline(tmp_path):
     settings = read_calibration([path])
     assert settings.left == found.left
     np.testing.assert_allclose(settings.T_left_right, found.T_left_right)
+
+
+@pytest.mark.parametrize("transformation", ["baseline: 0.54\n", TURNED])
+def test_a_delay_of_the_right_side_reaches_the_rectified_camera(tmp_path, transformation):
+    path = tmp_path / "late.yaml"
+    path.write_text(f"{PAIR}{transformation}right_delay: -4.7e-3\n")
+    found = read_calibration([path])
+    assert rectify(found).camera.right_delay == -0.0047
+    assert rectify(found.left_alone()).camera.right_delay == 0.0
 
 
 def test_the_names_of_the_manual_of_opencv(tmp_path):

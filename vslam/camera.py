@@ -35,6 +35,8 @@ class Camera:
         width, height: image size in pixels.
         depth: whether the second image is not that of a right camera but the depth of the left
             one's pixels.
+        right_delay: seconds by which the right image of a pair is taken later than the left one,
+            negative if it is taken earlier; 0 for cameras that share a trigger.
     """
 
     fx: float
@@ -45,6 +47,7 @@ class Camera:
     width: int
     height: int
     depth: bool = False
+    right_delay: float = 0.0
 
     @property
     def sensor(self) -> Sensor:
@@ -60,7 +63,7 @@ class Camera:
 
     def left_camera(self) -> Camera:
         """The left camera alone."""
-        return replace(self, baseline=0.0, depth=False)
+        return replace(self, baseline=0.0, depth=False, right_delay=0.0)
 
     @property
     def T_right_left(self) -> NDArray[np.float64]:
@@ -99,7 +102,8 @@ class Camera:
 def same_camera(one: Camera, other: Camera) -> bool:
     """Whether two cameras are one, up to the rounding of calibration files."""
     shapes = [(c.width, c.height, c.depth, c.monocular) for c in (one, other)]
-    return shapes[0] == shapes[1] and bool(np.allclose(one.intrinsics, other.intrinsics, rtol=1e-6))
+    numbers = [[*c.intrinsics, c.right_delay] for c in (one, other)]
+    return shapes[0] == shapes[1] and bool(np.allclose(*numbers, rtol=1e-6))
 
 
 Given = TypeVar("Given")

@@ -29,7 +29,6 @@ from vslam.backend.pose_graph import (
     PoseGraph,
     check_pose_graph,
     essential_graph,
-    loosest_keyframe,
     optimise,
 )
 from vslam.backend.similarity_graph import (
@@ -235,9 +234,6 @@ class LoopClosing:
         solved = self._solve(map_, edge, driven=True)
         if not solved.verdict.consistent and np.isin(solved.graph.kind, (GAP, WEAK)).any():
             solved = self._solve(map_, edge, driven=False)
-        broken = None
-        if not solved.verdict.consistent and (broken := self._wrong_keyframe(map_, edge)):
-            solved = self._solve(map_, edge, driven=False, broken=broken)
         if not solved.verdict.consistent:
             return replace(edge, accepted=False, reason=solved.verdict.reason)
         if self._global is not None:  # it knows nothing of this loop
@@ -248,8 +244,6 @@ class LoopClosing:
         query_side = [edge.query, *strong_neighbours(map_, edge.query, config)]
         match_side = [edge.match, *strong_neighbours(map_, edge.match, config)]
         self.closed.append(edge)
-        if broken is not None:
-            map_.tear(broken)
         if self._camera.monocular:
             growth = move_keyframes_similarly(map_, keyframes, solved.S_wc)
             self.closed = [loop_in_new_units(closed, growth) for closed in self.closed]
@@ -265,23 +259,9 @@ class LoopClosing:
         self._global = self._start_global(map_, edge.query)
         return edge
 
-    def _wrong_keyframe(self, map_: Map, edge: LoopEdge) -> int | None:
-        """The keyframe that is wrong if a loop is right that contradicts the map: the one between
-        its ends at which the map hangs by a thread. Several keyframes must say so; a map that has
-        no such place is never doubted, whatever resembles what."""
-        if self._camera.monocular:  # a scale of its own would explain too much
-            return None
-        if self._consistency.votes(edge, map_) < self._config.consistency.min_against:
-            return None
-        first, last = sorted((edge.query, edge.match))
-        return loosest_keyframe(map_, first, last, self._config.pose_graph)
-
-    def _solve(
-        self, map_: Map, edge: LoopEdge, *, driven: bool, broken: int | None = None
-    ) -> _Solution:
-        """The pose graph with a new loop, under one of three hypotheses. Where tracking was lost
-        the camera drove on about as predicted, or it was carried to where the loop puts it; or it
-        was never lost, but its place is wrong from the keyframe ``broken`` on."""
+    def _solve(self, map_: Map, edge: LoopEdge, *, driven: bool) -> _Solution:
+        """The pose graph with a new loop, under one of two hypotheses: where tracking was lost the
+        camera drove on about as predicted, or it was carried to where the loop puts it."""
         config, loops = self._config.pose_graph, [*self.closed, edge]
         graph = essential_graph(
             map_,
@@ -290,7 +270,6 @@ class LoopClosing:
             weak=map_.restarts,
             unpredicted=map_.unpredicted_restarts,
             driven=driven,
-            broken=broken,
         )
         now = map_.arrays.T_cw[: map_.n_keyframes]
         if self._camera.monocular:
@@ -299,19 +278,16 @@ class LoopClosing:
             S_wc = optimise_similarities(graph, start, config)
             verdict = check_similarity_graph(graph, start, S_wc, config)
             return _Solution(graph, inverses(rigid(S_wc)), S_wc, verdict)
-        start = now if driven else self._aligned(map_, edge, broken)
+        start = now if driven else self._aligned(map_, edge)
         graph = replace(graph, T_cw=start[graph.keyframes])
         T_cw = optimise(graph, config)
         return _Solution(graph, T_cw, inverses(T_cw), check_pose_graph(graph, T_cw, config))
 
-    def _aligned(self, map_: Map, edge: LoopEdge, broken: int | None) -> Matrix:
+    def _aligned(self, map_: Map, edge: LoopEdge) -> Matrix:
         """Poses ``T_cw`` to start from: a sub-map that the loop joins is moved to where the loop
-        puts it as a whole, since its own place was only a prediction, or what was mapped from a
-        wrong keyframe on."""
+        puts it as a whole, since its own place was only a prediction."""
         T_cw = map_.arrays.T_cw[: map_.n_keyframes].copy()
         moving, keyframes = self._moving(map_, edge)
-        if broken is not None:
-            moving, keyframes = max(edge.query, edge.match), np.arange(broken, map_.n_keyframes)
         assert edge.T_query_match is not None
         if moving == edge.query:
             T_new = compose(edge.T_query_match, T_cw[edge.match])

@@ -145,8 +145,8 @@ class StereoConfig(_Section):
     least_delay: float = Field(
         1.2e-3,
         gt=0,
-        description="Delay between the sides from which it is corrected, seconds "
-        "(docs/stress.md). [own]",
+        description="Difference between the measured delay of the right side and the calibration's "
+        "from which the report warns, seconds (docs/stress.md). [own]",
     )
     delay_sigmas: float = Field(
         5.0, gt=0, description="The same in standard deviations of what was measured. [own]"
@@ -681,12 +681,6 @@ class ConsistencyConfig(_Section):
         30, ge=1, description="Shared landmarks that put a keyframe into a candidate's group. [own]"
     )
     min_verified: int = Field(2, ge=1, description="Verified keyframes that must agree. [own]")
-    min_against: int = Field(
-        4,
-        ge=2,
-        description="Verified keyframes that must agree for a loop to say that the map is wrong at "
-        "a keyframe that hangs by a thread. [own]",
-    )
     verified_memory: int = Field(
         5, ge=1, description="Keyframes during which a verified loop counts. [own]"
     )

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.geometry import Matrix, inverse, orthonormalised, se3_log
+from vslam.geometry import Matrix, inverse, orthonormalised
 from vslam.trajectory import Trajectory, bridge_gaps
 
 
@@ -140,16 +140,6 @@ class FramePoses:
         if unit != measured:
             T_c_reference[:3, 3] *= unit / measured
         return T_c_reference @ self._keyframes.keyframe_pose(reference)
-
-    def twist(self, index: int) -> Matrix:
-        """``(6,)`` how points moved past the camera at a frame, per second: from the frame before
-        it to the one after, where they are there."""
-        before, behind = max(0, index - 1), min(self._n - 1, index + 1)
-        if before == behind:
-            return np.zeros(6)
-        step = orthonormalised(self.pose(behind) @ inverse(self.pose(before)))
-        twist: Matrix = se3_log(step) / (self.timestamp(behind) - self.timestamp(before))
-        return twist
 
     def trajectory(self) -> Trajectory:
         """Pose of every frame, those that were only predicted interpolated between the frames

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from vslam.features import Features
 from vslam.geometry import compose, inverse, orthonormalised
 from vslam.loops import LoopEdge
-from vslam.map_kernels import collect_landmarks, count_shared, detach_keyframe, resolve, unlink
+from vslam.map_kernels import collect_landmarks, count_shared, detach_keyframe, resolve
 
 NONE = -1
 _FEW_LANDMARKS = 8192  # 1 MB
@@ -295,31 +295,6 @@ class Map:
         self.restarts.append(keyframe)
         if not predicted:
             self.unpredicted_restarts.append(keyframe)
-
-    def tear(self, keyframe: int) -> None:
-        """Make what was mapped from a keyframe on a sub-map of its own: its place was wrong, and
-        the landmarks that both sides observe are not the same things. The later side loses them."""
-        a = self.arrays
-        rows = np.arange(int(a.first_row[keyframe]), self.n_rows)
-        rows = rows[a.landmark[rows] != NONE]
-        first = np.full(self.n_landmarks, self.n_keyframes, np.int32)
-        observing = np.flatnonzero(a.landmark[: self.n_rows] != NONE)
-        np.minimum.at(first, a.landmark[observing], a.keyframe[observing])
-        for row in rows[first[a.landmark[rows]] < keyframe].tolist():
-            unlink(a, row)
-        for child in range(keyframe + 1, self.n_keyframes):
-            if self.parents[child] >= keyframe:
-                continue
-            if not a.keyframe_alive[child]:
-                T = compose(self.keyframe_pose(child), inverse(a.T_cw[keyframe]))
-                self.T_c_parent[child], self.parents[child] = orthonormalised(T), keyframe
-                continue
-            shared = count_shared(a, child, self.n_keyframes)
-            shared[child:] = 0
-            best = int(np.argmax(shared))
-            self.parents[child] = best if shared[best] else keyframe
-        self.restarts = sorted({*self.restarts, keyframe})
-        self.unpredicted_restarts = sorted({*self.unpredicted_restarts, keyframe})
 
     def submaps(self) -> NDArray[np.int64]:
         """``(n_keyframes,)`` the sub-map of each keyframe, by the keyframe at which it began."""

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.backend.late_side import correct_delay
 from vslam.camera import Camera, DepthImage, Image, same_camera
 from vslam.closing import LoopClosing
 from vslam.config import Config
@@ -71,7 +70,7 @@ class Slam:
     Attributes:
         frame: the last frame tracked, for drawing; None before the first.
         context: camera, thresholds and pyramid scales, as ``extract_features`` takes them.
-        side_delay: by how much the right side of the pair seems late.
+        side_delay: by how much the right side of the pair is measured to be late.
         world: where the map that was loaded lies in that of a ground truth, None if unknown.
         on_merge: called where local mapping was merged, also in the middle of a step: the frame
             of that step may be placed, and the map can be read.
@@ -344,7 +343,7 @@ class Slam:
         if self._mapping.is_due(frame.index):
             self._merge()
         frame.correct_disparities(self._mapping.disparity_offset)
-        frame.features = self.side_delay.corrected(frame.features, self._velocity)
+        frame.take_out_right_delay(self._velocity, self.camera)
         clock.lap("wait_for_mapping")
         self._is_between = False
         result = (
@@ -763,29 +762,9 @@ class Slam:
     def _insert_keyframe(self, frame: Frame, *, predicted: bool = True) -> None:
         """Make a keyframe of the frame placed last (``MappingThread.insert``)."""
         self._merge(frame)
-        self._correct_delay(frame)
         self._mapping.insert(frame, predicted=predicted)
         self._close_gain.begin()
         self._poses.replace(frame.index, self._mapping.reference)
-
-    def _correct_delay(self, frame: Frame) -> None:
-        """Where the right side turns out to be late, or later than it was thought to be: correct
-        the map, and the frames that tracking goes on from. Merge first."""
-        if self.is_adjusting or not self._mapping.n_keyframes:
-            return
-        change = self.side_delay.adopt()
-        if change == 0.0:
-            return
-        map_, camera = self.map, self.camera
-        own = [k for k in map_.living_keyframes() if map_.sessions[k] == map_.session]
-        twists = {int(k): self._poses.twist(map_.frames[k]) for k in own}
-        correct_delay(map_, twists, change, camera, self.config)
-        for each in {id(one): one for one in (self.frame, frame) if one is not None}.values():
-            each.correct_delay(change, self._poses.twist(each.index), camera)
-        self._mapping.set_reference(self._mapping.reference)
-        self._follow_map(self.frame)
-        if frame is not self.frame:
-            self._follow_map(frame)
 
     def _merge(self, current: Frame | None = None, *, renumber: bool = True) -> None:
         """Show tracking what local mapping has done: poses, landmarks, merged identities.

@@ -9,6 +9,7 @@ settings files of ORB-SLAM2 and ``Calibration_Tutorial.pdf`` of ORB-SLAM3.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,14 +34,24 @@ _LENSES: dict[str, Lens] = {
     "rational_polynomial": "pinhole",
     "equidistant": "fisheye",
 }
-_OWN_KEYS = {"left", "right", "T_left_right", "baseline", "depth_scale", "virtual_baseline"}
+_OWN_KEYS = {
+    "left",
+    "right",
+    "T_left_right",
+    "baseline",
+    "right_delay",
+    "depth_scale",
+    "virtual_baseline",
+}
 _OWN_CAMERA_KEYS = {"lens", "size", "focal", "centre", "distortion"}
 _OFF_CENTRE = 0.2  # of the size: at half the resolution it is 0.5, at twice 0.25
 _ROUNDED = 1e-3  # rotations in files are rounded
+_LONGEST_DELAY_S = 0.1  # between both images of a pair
 
 
 def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """vslam's own: ``left``, ``right``, ``T_left_right`` or ``baseline``, ``depth_scale``."""
+    """vslam's own: ``left``, ``right``, ``T_left_right`` or ``baseline``, ``right_delay``,
+    ``depth_scale``."""
     (document,) = documents
     _refuse_unknown(document, _OWN_KEYS)
     _refuse_contradictions(document)
@@ -59,21 +70,37 @@ def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
         T_left_right = document.matrix("T_left_right", 4, 4)
     else:
         T_left_right = _shift(document.number("baseline"))
-    return _pair(document.source, left, rest[0], T_left_right)
+    pair = _pair(document.source, left, rest[0], T_left_right)
+    return replace(pair, right_delay=_right_delay(document))
+
+
+def _right_delay(document: Document) -> float:
+    """Seconds by which the right image is late, 0 where the file does not say."""
+    if "right_delay" not in document:
+        return 0.0
+    delay = document.number("right_delay")
+    if not abs(delay) < _LONGEST_DELAY_S:
+        raise InputError(
+            f"{document.source}: right_delay is {delay:g} s but must be between "
+            f"-{_LONGEST_DELAY_S} and {_LONGEST_DELAY_S} s; write how many seconds after the left "
+            "image the right one is taken."
+        )
+    return delay
 
 
 def _refuse_contradictions(document: Document) -> None:
     """A pair has one transformation and no depth, one camera has no transformation."""
     transformations = [key for key in ("T_left_right", "baseline") if key in document]
+    of_pair = [*transformations, *(key for key in ("right_delay",) if key in document)]
     of_depth = [key for key in ("depth_scale", "virtual_baseline") if key in document]
     if len(transformations) == 2:
         raise InputError(
             f"{document.source}: T_left_right and baseline say the same thing; leave one out."
         )
-    if transformations and "right" not in document:
+    if of_pair and "right" not in document:
         raise InputError(
-            f"{document.source}: {transformations[0]} leads to a right camera, which is missing; "
-            "add right or leave it out."
+            f"{document.source}: {of_pair[0]} is of a stereo pair, but right is missing; add right "
+            f"or leave {of_pair[0]} out."
         )
     if of_depth and "right" in document:
         raise InputError(

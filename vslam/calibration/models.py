@@ -61,6 +61,7 @@ class Calibration:
             without a right camera.
         depth_scale: what a depth image counts in a metre, None where the file does not say.
         virtual_baseline: metres, with which depth is turned into disparity, None likewise.
+        right_delay: seconds by which the right image is taken later than the left one.
         source: file or files that it was read from, for messages.
     """
 
@@ -69,11 +70,12 @@ class Calibration:
     T_left_right: Array | None = None
     depth_scale: float | None = None
     virtual_baseline: float | None = None
+    right_delay: float = 0.0
     source: str = field(default="the calibration", compare=False)
 
     def left_alone(self) -> Calibration:
         """The left camera without the right one."""
-        return replace(self, right=None, T_left_right=None)
+        return replace(self, right=None, T_left_right=None, right_delay=0.0)
 
 
 def project(model: CameraModel, rays: Array) -> Array:

@@ -9,7 +9,7 @@ border would be features that stand still. (``cv2.stereoRectify`` estimates that
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -63,7 +63,8 @@ def rectify(calibration: Calibration) -> Rectification:
     """
     if calibration.right is None or calibration.T_left_right is None:
         return _rectify_one(calibration)
-    return _rectify_pair(calibration, calibration.right, calibration.T_left_right)
+    pair = _rectify_pair(calibration, calibration.right, calibration.T_left_right)
+    return replace(pair, camera=replace(pair.camera, right_delay=calibration.right_delay))
 
 
 def unchanged(image: Pixels) -> Pixels:

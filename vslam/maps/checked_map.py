@@ -280,7 +280,9 @@ def camera_of(header: dict[str, Any]) -> Camera:
     camera = Camera(**header["camera"])
     numbers = [camera.fx, camera.fy, camera.width, camera.height]
     sound = all(isinstance(x, int | float) and 0 < x < 1e6 for x in numbers)
-    sound = sound and bool(np.isfinite([camera.cx, camera.cy, camera.baseline]).all())
+    sound = sound and bool(
+        np.isfinite([camera.cx, camera.cy, camera.baseline, camera.right_delay]).all()
+    )
     _require(sound and camera.baseline >= 0, "camera")
     return replace(camera, width=int(camera.width), height=int(camera.height))
 

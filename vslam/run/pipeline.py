@@ -33,7 +33,7 @@ from vslam.run.preparation import PreparedFrame, in_their_time
 from vslam.run.progress import Progress, TrackLog, in_frames
 from vslam.run.realtime import Played
 from vslam.run.recorder import Recorder
-from vslam.run.rig import measure_rig, residual_warnings, rig_warnings
+from vslam.run.rig import delay_warnings, measure_rig, residual_warnings, rig_warnings
 from vslam.slam import Slam
 
 _log = logging.getLogger(__name__)
@@ -252,7 +252,10 @@ def _outcome(
         skipped=run.skipped,
         warnings=[
             *rig_warnings(run.sides),
-            *residual_warnings(residuals, sequence.camera, slam.side_delay.applied),
+            *(
+                delay_warnings(slam.side_delay, sequence.camera)
+                or residual_warnings(residuals, sequence.camera)
+            ),
         ],
         wall_s=seconds[0],
         cpu_s=seconds[1],

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera
+from vslam.frontend.side_delay import SideDelay
 from vslam.frontend.sides import Sides
 from vslam.geometry import compose, inverse, orthonormalised, se3_log
 from vslam.map import Map
@@ -100,21 +101,24 @@ def _twists(map_: Map) -> NDArray[np.float64]:
     return twists
 
 
-def residual_warnings(
-    found: RigResiduals | None, camera: Camera, corrected_s: float = 0.0
-) -> list[str]:
-    """What residuals say of the rig, nothing of a sound one.
+def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
+    """What the rows of stereo matches say of the delay between the sides, nothing if it is that of
+    the calibration."""
+    if not delay.is_wrong:
+        return []
+    known = camera.right_delay
+    side = "right" if delay.seconds > 0 else "left"
+    instead = f" instead of {1e3 * known:.1f} ms (right_delay)" if known else ""
+    return [
+        f"The sides are not synchronised: by the rows of stereo matches, the {side} one is "
+        f"{1e3 * abs(delay.seconds):.1f} ms late{instead}. Trigger both by one signal, or write "
+        f"right_delay: {delay.seconds:.4f} (seconds) into the file that --calib names and run "
+        "again, see docs/cameras.md."
+    ]
 
-    Args:
-        corrected_s: the delay of the right side that stereo matches were corrected by.
-    """
-    if corrected_s:
-        side = "right" if corrected_s > 0 else "left"
-        return [
-            f"The sides are not synchronised: the {side} one is {1e3 * abs(corrected_s):.1f} ms "
-            "late, by the rows of stereo matches. These were corrected by that, as well as it can "
-            "be measured. Trigger both by one signal."
-        ]
+
+def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
+    """What residuals say of the rig, nothing of a sound one."""
     if found is None:
         return []
     said = []

@@ -102,8 +102,8 @@ class Camera:
 def same_camera(one: Camera, other: Camera) -> bool:
     """Whether two cameras are one, up to the rounding of calibration files."""
     shapes = [(c.width, c.height, c.depth, c.monocular) for c in (one, other)]
-    numbers = [[*c.intrinsics, c.right_delay] for c in (one, other)]
-    return shapes[0] == shapes[1] and bool(np.allclose(*numbers, rtol=1e-6))
+    first, second = ([*c.intrinsics, c.right_delay] for c in (one, other))
+    return shapes[0] == shapes[1] and bool(np.allclose(first, second, rtol=1e-6))
 
 
 Given = TypeVar("Given")

@@ -276,7 +276,7 @@ def test_localise_by_the_command_line(kitti_tree, mapped, tmp_path):
     assert "first after 0.00 s; 1 of the 1 times" in result.output
     report = report_of(tmp_path)
     assert report["localize"]
-    assert report["detector"] == "bow"
+    assert report["detector"] == "both"
     figures = report["in_map"]
     assert (figures["in_map_percent"], figures["found"], figures["sought"]) == (100.0, 1, 1)
     assert figures["first_fix_s"] == 0.0
@@ -345,7 +345,7 @@ def test_refusals(kitti_tree, mapped, tmp_path):
         *run, "--map", mapped, "--localize", "--save-map", tmp_path / "m.npz"
     )
     assert "cannot be read" in refusal(*run, "--map", tmp_path)
-    assert "made with the detector bow" in refusal(*run, "--map", mapped, "--detector", "none")
+    assert "made with the detector both" in refusal(*run, "--map", mapped, "--detector", "none")
     assert "camera is not that of the images" in refusal(*run, "--map", mapped, "--sensor", "mono")
     config = tmp_path / "config.json"
     config.write_text(json.dumps({"orb": {"n_levels": 4}}))

@@ -245,7 +245,9 @@ def test_reach_grows_with_the_way_and_knows_nothing_of_lost_cameras_and_units():
 def test_the_network_sees_nothing_until_the_camera_may_be_back():
     network = CountingNetwork()
     images = KeyframeImages(LocalDescriptors())
-    config = SiameseConfig(recent_keyframes=3, offered=0.0, embedded_at_once=2)
+    config = SiameseConfig(
+        recent_keyframes=3, offered=0.0, embedded_at_once=2, reach=20.0, reach_share=0.1
+    )
     one = SiameseDetector(network, config, images=images)
     x = [50.0 * k for k in range(10)] + [0.0]
     map_ = driven(x)

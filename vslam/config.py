@@ -512,7 +512,10 @@ class SiameseConfig(_Section):
         "and by a share of the drive since. [own]",
     )
     reach_share: float = Field(
-        0.1, ge=0, description="Share of the drive that `reach` grows by. [own]"
+        0.05,
+        ge=0,
+        description="Share of the drive that `reach` grows by: several times the drift of a stereo "
+        "camera in a street, which is about one per cent. [own]",
     )
     monocular_reach_share: float = Field(
         0.3,

@@ -29,7 +29,7 @@ def see(k):
     return replace(features, octave=octave.astype(np.uint8), u_right=nothing)
 
 
-def run(frames, detector=None, *, threads=1, dark=()):
+def run(frames, detector="none", *, threads=1, dark=()):
     slam = Slam(LEFT_CAMERA, None, detector, threads=threads)
     results = []
     for i, k in enumerate(frames):

@@ -65,12 +65,18 @@ ALWAYS = (
 )
 RULES = {
     "README.md": Rules(
+        (
+            (
+                "vslam bench    #",
+                f"vslam bench --seqs 00 --runs 1 --perturb none --max-frames {N} #",
+            ),
+        ),
         not_run=(
             ("git clone", "it needs the address of the repository"),
             ("make ", "CI runs it, and this test in it"),
             ("source .venv", "there is no other environment here"),
             ("vslam report runs --serve", "it serves until it is stopped"),
-        )
+        ),
     ),
     "CONTRIBUTING.md": Rules(
         not_run=(("make ", "CI runs it"), (".ci/run", "CI runs it"), (".venv", "it is this test"))
@@ -130,7 +136,11 @@ RULES = {
         )
     ),
     "docs/local_descriptors.md": Rules(
-        not_run=(("python tools/", HOURS), ("vslam loops bench", REAL), ("vslam bench", HOURS))
+        not_run=(
+            ("python tools/", HOURS),
+            ("vslam loops bench", REAL),
+            ("vslam synth block", AGAIN),
+        )
     ),
     "docs/loops.md": Rules(
         not_run=(

@@ -20,7 +20,8 @@ _FIGURES = (
 )
 _NOTE = (
     "All detectors saw the same frames. The time is that of tracking and mapping: images are read "
-    "and features extracted once for all."
+    "and features extracted once for all. It is wall time on cores that all of them share, and the "
+    "first one waits longest; to compare costs, time runs of their own."
 )
 
 

@@ -188,7 +188,9 @@ def run(
         require_place(save_map, "--save-map")
     if map_file is not None:
         if compare:
-            raise InputError("--compare: not for a run that goes on in a map; leave it out.")
+            raise InputError(
+                "--compare: a run that continues a map has the detector of that map; leave it out."
+            )
         map_file, detector = _map_to_go_on_in(map_file, detector)
     detector = detector or DEFAULT_DETECTOR
     require_detector(detector, weights)

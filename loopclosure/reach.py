@@ -12,10 +12,10 @@ from vslam.map import Map
 def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.float64]:
     """How far each keyframe lies beyond what the error of odometry may hide.
 
-    The error of a position grows with the way driven. A monocular map has no metres, and its unit
-    drifts: there the error is a larger share of the way, and nothing else. Where the camera was
-    lost between two keyframes, nothing is known of how they lie, nor of the unit of a monocular
-    map.
+    The error of a position grows with the way driven. A monocular map has no metres and its unit
+    drifts, so there the error is a larger share of the way alone. Keyframes of different sub-maps
+    are always within reach: where the camera was lost between them, their relative pose is unknown,
+    and in a monocular map so is the ratio of their units.
 
     Args:
         keyframe: where the camera is.

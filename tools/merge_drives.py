@@ -25,7 +25,7 @@ from vslam.datasets.stream import TimedFrame, timed_frames
 from vslam.evaluation.loops import LoopLimits
 from vslam.evaluation.trajectories import evaluate_trajectory, path_length
 from vslam.geometry import inverses
-from vslam.loopclosure.registry import create_detector, create_images
+from vslam.loopclosure.registry import detector_with_images
 from vslam.loops import LoopEdge
 from vslam.map import Map
 from vslam.maps.stored_map import StoredMap
@@ -68,8 +68,7 @@ def parts(n: int, number: int, overlap: int) -> list[range]:
 
 
 def memory(detector: str):
-    images = create_images(detector, Config())
-    return create_detector(detector, Config(), None, images), images
+    return detector_with_images(detector, Config())
 
 
 def lit_frames(sequence: Sequence, frames: range, perturb: str, seed: int) -> Iterator[TimedFrame]:

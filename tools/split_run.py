@@ -20,7 +20,6 @@ from vslam.datasets import open_sequence
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import timed_frames
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.loopclosure.registry import create_detector, create_images
 from vslam.run.outcome import alignment_of
 from vslam.run.preparation import prepared_frames
 from vslam.slam import Slam
@@ -74,10 +73,7 @@ def compare(sequence: Sequence, detector: str, at: float, threads: int, folder: 
 
 
 def begin(sequence: Sequence, detector: str, threads: int) -> Slam:
-    config = Config()
-    images = create_images(detector, config)
-    made = create_detector(detector, config, None, images)
-    return Slam(sequence.camera, config, made, threads=threads, images=images)
+    return Slam(sequence.camera, Config(), detector, threads=threads)
 
 
 def drive(slam: Slam, sequence: Sequence, frames: range, threads: int) -> int:

@@ -1,10 +1,10 @@
-"""Write docs/thresholds.md: every threshold of vslam/config.py with its unit and source.
+"""Write docs/thresholds.md: every threshold of vslam/config/ with its unit and source.
 
     python tools/threshold_table.py            # writes it
     python tools/threshold_table.py --check    # exits 1 if the file differs
 
-A field's description ends with its source in brackets: paper, section and status of the value, as
-in "[OS1 V-D, customary]", or "[own]" where the rule has no paper either.
+The docstring below a field ends with its source in brackets: paper, section and status of the
+value, as in "[OS1 V-D, customary]", or "[own]" where the rule has no paper either.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ DESCRIPTION = re.compile(
 )
 HEAD = """# Thresholds
 
-Written by `python tools/threshold_table.py` from `vslam/config.py`; `tests/test_threshold_table.py` compares the two. `vslam run --config FILE` sets any of them: `{"orb": {"n_features": 1500}}`. [design.md](design.md) describes the methods.
+Written by `python tools/threshold_table.py` from `vslam/config/`; `tests/test_threshold_table.py` compares the two. `vslam run --config FILE` sets any of them: `{"orb": {"n_features": 1500}}`. [design.md](design.md) describes the methods.
 
 The source names the paper and section of the rule and says what the value is: *printed* in that section, *customary* in the programs and KITTI configurations of the ORB-SLAM family, or our *own*. OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS: Zhou and Sun, Sci Rep 15, 7644 (2025). Descriptor distances and ratios of best over second-best distance are upper bounds; a descriptor has 256 bits. A search radius at octave 0 grows with the scale of the pyramid level.
 
@@ -50,11 +50,11 @@ def rows(config: Config, section: str) -> list[Row]:
     part = getattr(config, section)
     found = []
     for field, info in type(part).model_fields.items():
-        parsed = DESCRIPTION.fullmatch(info.description or "")
+        parsed = DESCRIPTION.fullmatch(" ".join((info.description or "").split()))
         if parsed is None:
             raise ValueError(f"{section}.{field}: no source in {info.description!r}")
         default = str(getattr(part, field))
-        found.append(Row(f"{section}.{field}", default, parsed["text"][:-1], parsed["source"]))
+        found.append(Row(f"{section}.{field}", default, parsed["text"], parsed["source"]))
     return found
 
 
@@ -84,7 +84,7 @@ def main() -> None:
     if not options.check:
         options.out.write_text(text)
     elif not options.out.is_file() or options.out.read_text() != text:
-        sys.exit(f"{options.out} differs from vslam/config.py: python tools/threshold_table.py")
+        sys.exit(f"{options.out} differs from vslam/config/: python tools/threshold_table.py")
 
 
 if __name__ == "__main__":

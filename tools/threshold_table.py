@@ -28,7 +28,7 @@ Written by `python tools/threshold_table.py` from `vslam/config/`; `tests/test_t
 
 The source names the paper and section of the rule and says what the value is: *printed* in that section, *customary* in the programs and KITTI configurations of the ORB-SLAM family, or our *own*. OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS: Zhou and Sun, Sci Rep 15, 7644 (2025). Descriptor distances and ratios of best over second-best distance are upper bounds; a descriptor has 256 bits. A search radius at octave 0 grows with the scale of the pyramid level.
 
-Some numbers of the method are constants in the code and not here, because they are mathematics or depend on another constant. The most important ones are the chi-square quantiles, the viewing angle of 60 degrees and the search radius 1.6 times as wide for landmarks seen obliquely (OS1 V-D), the distance range of a landmark with 20 % slack, the 30 bins of the orientation check, 3 keyframes of probation for a landmark (OS1 VI-B).
+The other numbers of the method are constants in the code: mathematics, numerical tolerances, sizes of arrays and kernels, and numbers that belong to another constant or to trained weights. The most important ones are the chi-square quantiles, the viewing angle of 60 degrees and the search radius 1.6 times as wide for landmarks seen obliquely (OS1 V-D), the distance range of a landmark with 20 % slack, the 30 bins of the orientation check, 3 keyframes of probation for a landmark (OS1 VI-B).
 """  # noqa: E501
 
 

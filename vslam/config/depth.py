@@ -24,6 +24,12 @@ class StereoConfig(Section):
     max_gain_disagreement: float = Field(0.75, gt=0)
     """A difference in brightness is taken for a gain only if the gains of dark and of bright pixels
     differ by at most this, in stops. [own]"""
+    clipped_from: int = Field(250, ge=1, le=255)
+    """Grey value from which a pixel is overexposed, and left out when the gain is measured. Video
+    of limited range (16 to 235) needs about 230. [own]"""
+    black_below: float = Field(6.0, gt=0, le=255)
+    """An image is black, and not used, if its 95 % quantile is below this while the other image
+    shows something, in grey levels. Video of limited range (16 to 235) needs about 22. [own]"""
     close_depth_baselines: float = Field(40.0, gt=0)
     """A point is close if its depth is below this, in baselines. [OS2 III-A, printed]"""
     offset_sigma: float = Field(0.2, ge=0)

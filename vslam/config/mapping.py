@@ -31,6 +31,9 @@ class MappingConfig(Section):
     [OS1 VI-C, customary]"""
     fuse_window: float = Field(3.0, gt=0)
     """Search radius when landmarks are fused, in pixels at octave 0. [OS1 VI-C, customary]"""
+    min_stereo_points: int = Field(100, ge=0)
+    """If fewer stereo features of a keyframe than this are close, this many of the nearest are
+    mapped. [OS2 III-E, printed]"""
     min_found_ratio: float = Field(0.25, ge=0, le=1)
     """A recent landmark is culled if it is found in less than this share of the frames that should
     see it. [OS1 VI-B, printed]"""

@@ -10,10 +10,16 @@ value, as in "[OS1 V-D, customary]", or "[own]" where the rule has no paper eith
 from __future__ import annotations
 
 import argparse
+import ast
+import inspect
 import re
 import sys
+import textwrap
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
+
+from pydantic import BaseModel
 
 from vslam.config import Config
 
@@ -41,18 +47,32 @@ class Row(NamedTuple):
     source: str
 
 
+def descriptions(model: type[BaseModel]) -> dict[str, str]:
+    """The docstring below each field that a class defines, on one line; "" where there is none."""
+    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
+    assert isinstance(definition, ast.ClassDef)
+    found = {}
+    for field, below in pairwise([*definition.body, None]):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+            text = ""
+            if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+                text = str(below.value.value)
+            found[field.target.id] = " ".join(text.split())
+    return found
+
+
 def rows(config: Config, section: str) -> list[Row]:
     """The thresholds of one section.
 
     Raises:
-        ValueError: a description is missing or does not end with a source.
+        ValueError: a docstring is missing or does not end with a source.
     """
     part = getattr(config, section)
     found = []
-    for field, info in type(part).model_fields.items():
-        parsed = DESCRIPTION.fullmatch(" ".join((info.description or "").split()))
+    for field, text in descriptions(type(part)).items():
+        parsed = DESCRIPTION.fullmatch(text)
         if parsed is None:
-            raise ValueError(f"{section}.{field}: no source in {info.description!r}")
+            raise ValueError(f"{section}.{field}: no source in {text!r}")
         default = str(getattr(part, field))
         found.append(Row(f"{section}.{field}", default, parsed["text"], parsed["source"]))
     return found

@@ -365,7 +365,7 @@ def two_keyframes():
 
     config = Config()
     closing = LoopClosing(NoDetector(), CAMERA, config, threads=1)
-    mapper = Mapper(CONTEXT.scales, CAMERA, config, closing, executor=None)
+    mapper = Mapper(CONTEXT, closing, None)
     frames = []
     for index in range(2):
         frame = Frame.untracked(features_at(100, 50, 0, 3), CAMERA, index, 0.1 * index)

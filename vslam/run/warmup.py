@@ -53,7 +53,6 @@ from vslam.features import Features
 from vslam.frontend import pnp
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.frame import Frame
-from vslam.frontend.orb import scale_factors
 from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracking import TrackingContext
 from vslam.loopclosure import bow, local_matching, sim3_ransac
@@ -212,7 +211,7 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     """
     config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
     closing = LoopClosing(NoDetector(), CAMERA, config, threads=1)
-    mapper = Mapper(scale_factors(config.orb), CAMERA, config, closing, executor=None)
+    mapper = Mapper(TrackingContext.create(CAMERA, config), closing, None)
     rng = np.random.default_rng(0)
     n = 400
     points = rng.uniform([-5.0, -4.0, 9.0], [9.0, 4.0, 12.0], (n, 3))

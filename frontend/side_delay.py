@@ -155,21 +155,28 @@ class SideDelay:
         least = max(self._config.least_delay, self._config.delay_sigmas * self.sigma)
         return abs(self.seconds - self._camera.right_delay) > least
 
-    def add(self, features: Features, twist: Matrix | None, scales: NDArray[np.float64]) -> None:
+    def add(
+        self,
+        features: Features,
+        row_offset: NDArray[np.float32] | None,
+        twist: Matrix | None,
+        scales: NDArray[np.float64],
+    ) -> None:
         """Learn from a tracked frame.
 
         Args:
-            features: with ``row_offset``; without, there is nothing to learn.
+            features: N of them.
+            row_offset: ``Extracted.row_offset``; without it, there is nothing to learn.
             twist: ``(6,)`` per second, maps points of the camera before to those of this one; None
                 if unknown.
             scales: ``(levels,)`` of the pyramid.
         """
-        if features.row_offset is None or twist is None:
+        if row_offset is None or twist is None:
             self._waiting[:] = 0.0
             return
         self._take_in(0.5 * (self._twist + twist))
         self._twist = twist
-        self._waiting = self._moments(features, twist, scales)
+        self._waiting = self._moments(features, row_offset, twist, scales)
 
     def memory(self) -> tuple[float, ...]:
         """All that was learned."""
@@ -200,18 +207,21 @@ class SideDelay:
         return self._solution, self._twist, self._waiting, self._group
 
     def _moments(
-        self, features: Features, twist: Matrix, scales: NDArray[np.float64]
+        self,
+        features: Features,
+        row_offset: NDArray[np.float32],
+        twist: Matrix,
+        scales: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """Weighted second moments of the derivatives of the speed by the twist, the polynomial and
         the row offsets of a frame. What contradicts the rest weighs little (Huber)."""
-        assert features.row_offset is not None
-        chosen = np.flatnonzero(np.isfinite(features.row_offset) & np.isfinite(features.u_right))
+        chosen = np.flatnonzero(np.isfinite(row_offset) & np.isfinite(features.u_right))
         xy = features.xy[chosen]
         x, y = rays(xy, self._camera)
         inverse_depth = (xy[:, 0].astype(np.float64) - features.u_right[chosen]) / self._camera.bf
         speeds = self._camera.fy * row_speeds(x, y, inverse_depth)
         powers = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-        found = features.row_offset[chosen].astype(np.float64)
+        found = row_offset[chosen].astype(np.float64)
         A = np.column_stack([speeds, *powers, found])
         residual = found - (speeds @ twist) * self._solution[0] - A[:, 6:-1] @ self._solution[1:]
         robust = np.minimum(1.0, HUBER_PX / np.maximum(np.abs(residual), 1e-9))

@@ -9,7 +9,7 @@ from stereo_noise import white_noise
 from vslam.backend.bundle_adjustment import BundleProblem
 from vslam.backend.disparity_offset import remaining_offset
 from vslam.camera import Camera
-from vslam.features import MIN_DISPARITY, Features, shifted_columns
+from vslam.features import MIN_DISPARITY, Extracted, Features, shifted_columns
 from vslam.frontend.frame import Frame
 
 CAMERA = Camera(700.0, 700.0, 600.0, 180.0, 0.54, 1200, 370)
@@ -82,7 +82,7 @@ def test_a_frame_is_corrected_once_whatever_it_was_corrected_by_before() -> None
         xy, np.zeros(1, np.uint8), np.zeros(1, np.float32), np.zeros((1, 32), np.uint8),
         np.array([40.0], np.float32),
     )  # fmt: skip
-    frame = Frame.untracked(features, CAMERA)
+    frame = Frame.of(Extracted(features), CAMERA)
     for offset in (0.1, 0.1, 0.3):
         frame.correct_disparities(offset)
     assert frame.features.u_right[0] == pytest.approx(40.0 - 0.3, abs=1e-5)

@@ -13,7 +13,7 @@ from test_closing import errors
 
 from vslam.config import Config
 from vslam.errors import InputError
-from vslam.features import Features
+from vslam.features import Extracted, Features
 from vslam.geometry import inverse
 from vslam.loops import LoopEdge
 from vslam.slam import Slam
@@ -40,7 +40,7 @@ def laps(known_after_s: float, threads: int = 1) -> tuple[Slam, tuple[int, ...],
     keyframes, results = [], []
     for i, place in enumerate(PLACES):
         image = np.array([[i & 255, i >> 8]], np.uint8)
-        results.append(slam.step_features(view(int(place)), 0.1 * i, image))
+        results.append(slam.step_features(Extracted(view(int(place))), 0.1 * i, image))
         if i % LAP == LAP - 1:
             while slam.is_mapping:
                 slam._merge()
@@ -74,7 +74,7 @@ def test_known_streets_give_the_same_bytes_with_one_thread_and_two():
 def test_a_frame_that_is_found_nowhere_better_stays_as_it_is(monkeypatch):
     slam = Slam(CAMERA, None, Oracle(RING, PLACES), threads=1)
     for k in range(12):
-        slam.step_features(view(k), 0.1 * k)
+        slam.step_features(Extracted(view(k)), 0.1 * k)
     slam._merge()
     frame, reference = slam.frame, slam._mapping.reference
     assert frame is not None
@@ -101,10 +101,10 @@ def test_a_frame_that_is_found_nowhere_better_stays_as_it_is(monkeypatch):
 def test_only_a_frame_after_a_gap_that_tracks_little_is_doubtful(seconds, share, doubtful):
     slam = Slam(CAMERA, None, threads=1)
     for k in range(12):
-        slam.step_features(view(k), 0.1 * k)
+        slam.step_features(Extracted(view(k)), 0.1 * k)
     slam._merge()
     assert slam.frame is not None
-    frame = slam._next_frame(view(12), slam.frame.timestamp + seconds, None)
+    frame = slam._next_frame(Extracted(view(12)), slam.frame.timestamp + seconds, None)
     assert slam._is_doubtful(frame, int(share * slam._mapping.n_reference)) == doubtful
 
 
@@ -129,7 +129,7 @@ def drive_to_a_cut(places: list[float], busy: bool) -> Slam:
             if busy:
                 assert slam.frame is not None
                 slam._insert_keyframe(slam.frame)
-        slam.step_features(features, 0.1 * i, image)
+        slam.step_features(Extracted(features), 0.1 * i, image)
     return slam
 
 

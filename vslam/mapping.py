@@ -317,21 +317,21 @@ class MappingThread:
     def _certainty(self, frame: Frame) -> NDArray[np.uint8] | int:
         """Of the features of a frame. What a landmark is first seen as is where it is seen; a
         match that was not aligned is half a pixel off."""
-        if frame.features.pyramid is None:
+        if frame.pyramid is None:
             return 1
         unaligned = (frame.landmark >= 0) & ~frame.aligned
         return np.where(unaligned, 1, self._config.alignment.certainty).astype(np.uint8)
 
     def _remember_patches(self, frame: Frame, keyframe: int) -> None:
         features = frame.features
-        if features.pyramid is None:
+        if frame.pyramid is None:
             return
         shift = np.zeros((len(features), 2), np.float32)
         if frame.shift is not None:
             aligned = frame.aligned
             scale = self._map.scales[features.octave[aligned]]
             shift[aligned] = frame.shift[aligned] / scale[:, None]
-        pixels = patches_around(features.pyramid, features.xy, features.octave)
+        pixels = patches_around(frame.pyramid, features.xy, features.octave)
         self.recent.add(KeyframePatches(keyframe, pixels, shift))
 
     def _set_newest(self, keyframe: int, frame: Frame) -> None:

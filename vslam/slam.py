@@ -17,8 +17,9 @@ from vslam.camera import Camera, DepthImage, Image, same_camera
 from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.errors import InputError
-from vslam.features import Features, TrackingState, TrackResult
+from vslam.features import Extracted, Side, TrackingState, TrackResult
 from vslam.frame_poses import FramePoses, FrameTable
+from vslam.frontend.extraction import extract_features
 from vslam.frontend.frame import Frame
 from vslam.frontend.keyframes import (
     CloseGain,
@@ -32,7 +33,6 @@ from vslam.frontend.relocalization import relocalise
 from vslam.frontend.side_delay import SideDelay
 from vslam.frontend.tracking import (
     TrackingContext,
-    extract_features,
     feature_depth,
     track_descriptors,
     track_local_map,
@@ -259,7 +259,7 @@ class Slam:
         gain = self._close_gain
         gain.mean, gain.awaited = checkpoint.gained_close, checkpoint.gain_awaited
         index, timestamp = checkpoint.index, checkpoint.timestamp
-        frame = Frame.untracked(checkpoint.features, self.camera, index, timestamp)
+        frame = Frame.of(Extracted(checkpoint.features), self.camera, index, timestamp)
         tracked = checkpoint.landmark >= 0
         frame.T_cw, frame.landmark = checkpoint.T_cw, checkpoint.landmark
         frame.disparity_offset = self._mapping.disparity_offset
@@ -320,14 +320,14 @@ class Slam:
         """
         _check_images(left, second, self.camera)
         start = time.perf_counter()
-        features = extract_features(left, second, self.context)
+        extracted = extract_features(left, second, self.context)
         stage_ms = {"extract": 1e3 * (time.perf_counter() - start)}
-        image = np.array(second if features.from_right else left, np.uint8)
-        return self.step_features(features, timestamp, image, stage_ms)
+        image = np.array(second if extracted.side == Side.RIGHT else left, np.uint8)
+        return self.step_features(extracted, timestamp, image, stage_ms)
 
     def step_features(
         self,
-        features: Features,
+        extracted: Extracted,
         timestamp: float,
         image: Image | None = None,
         stage_ms: dict[str, float] | None = None,
@@ -339,7 +339,7 @@ class Slam:
                 look at it. It is kept as it is: do not write to it afterwards.
         """
         clock = _Clock(dict(stage_ms or {}))
-        frame = self._next_frame(features, timestamp, image)
+        frame = self._next_frame(extracted, timestamp, image)
         if self._mapping.is_due(frame.index):
             self._merge()
         frame.correct_disparities(self._mapping.disparity_offset)
@@ -355,18 +355,14 @@ class Slam:
     def _track(self, frame: Frame, clock: _Clock) -> TrackResult:
         """Where the camera is, and what is new there."""
         T_cw = self._predict(frame.timestamp)
-        if frame.features.from_right:
-            found = self._locate(frame, self.camera.T_right_left @ T_cw, clock)
-            frame.T_cw = inverse(self.camera.T_right_left) @ frame.T_cw
-        else:
-            found = self._locate(frame, T_cw, clock)
+        found = self._locate(frame, T_cw, clock)
         if found.state == TrackingState.LOST:
             frame.T_cw = T_cw
             restarted = self._lose(frame)
             return _result(frame, found, restarted, clock)
 
         self._update_motion(frame, found.relocalised)
-        self.side_delay.add(frame.features, self._velocity, self.context.scales)
+        self.side_delay.add(frame.features, frame.row_offset, self._velocity, self.context.scales)
         is_keyframe = self._extend_map(frame, found.inliers, found.visible)
         clock.lap("keyframe")
         return _result(frame, found, is_keyframe, clock)
@@ -374,7 +370,7 @@ class Slam:
     def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
         """Account for a frame without images, at the predicted pose: it is LOST, or DROPPED if
         there was only no time for it."""
-        frame = self._next_frame(Features.none(), timestamp, None)
+        frame = self._next_frame(Extracted.nothing(), timestamp, None)
         if len(self._poses) or self._mapping.n_keyframes:
             frame.T_cw = self._predict(timestamp)
         if self._mapping.n_keyframes and not dropped:
@@ -451,10 +447,10 @@ class Slam:
 
     # Tracking
 
-    def _next_frame(self, features: Features, timestamp: float, image: Image | None) -> Frame:
+    def _next_frame(self, extracted: Extracted, timestamp: float, image: Image | None) -> Frame:
         if len(self._poses) and not timestamp > (last := self._poses.timestamp(-1)):
             raise ValueError(f"timestamp {timestamp} s is not later than the last one, {last} s")
-        return Frame.untracked(features, self.camera, len(self._poses), timestamp, image)
+        return Frame.of(extracted, self.camera, len(self._poses), timestamp, image)
 
     def _predict(self, timestamp: float) -> Matrix:
         """Constant velocity, in seconds: dropped frames do not disturb it. In a map that was
@@ -609,7 +605,7 @@ class Slam:
                 self.map, maps, frame.features, candidate.match, images, self.camera, self.config
             )
             if found is not None:
-                frame.T_cw = found.T_cw
+                frame.set_camera_pose(found.T_cw)
                 frame.landmark[found.feature] = found.landmark
                 frame.shift = None
                 frame.xyz[found.feature] = self.map.arrays.xyz[found.landmark]
@@ -709,9 +705,8 @@ class Slam:
             self._look_around(frame)
             return False
         self._mapping.count(visible, frame.landmark[frame.landmark >= 0])
-        # The map is made of left images.
         is_keyframe = (
-            not frame.features.from_right
+            frame.can_become_keyframe
             and self._needs_keyframe(frame, inliers)
             and not self._follow_known(frame)
         )

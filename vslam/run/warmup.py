@@ -49,7 +49,7 @@ from vslam.camera import Camera
 from vslam.closing import LoopClosing
 from vslam.config import Config, DepthConfig, KeyframeConfig, MappingConfig
 from vslam.datasets.png import unfilter
-from vslam.features import Features
+from vslam.features import Extracted, Features
 from vslam.frontend import pnp
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.frame import Frame
@@ -229,7 +229,7 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
             descriptors,
             uvr[:, 2].astype(np.float32),
         )
-        frame = Frame.untracked(features, CAMERA, k, 0.1 * k)
+        frame = Frame.of(Extracted(features), CAMERA, k, 0.1 * k)
         frame.T_cw, frame.landmark = T_cw, landmark
         mapping.insert(frame)
         mapping.merge()
@@ -246,7 +246,7 @@ def compile_recognition() -> None:
 
     place = local_map(map_, 0, 1)
     context = TrackingContext.create(CAMERA, config)
-    relocalise(Frame.untracked(features, CAMERA), place, place, context, seed=0)
+    relocalise(Frame.of(Extracted(features), CAMERA), place, place, context, seed=0)
 
     detector = BowDetector(smallest_vocabulary())
     detector.add(0, None, features)

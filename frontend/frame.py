@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from vslam.camera import Camera
 from vslam.features import Extracted, FeatureGrid, Features, Pyramid, Side
 from vslam.geometry import Matrix, inverse
-from vslam.image_motion import columns_without_delay
 
 
 @dataclass
@@ -31,7 +30,8 @@ class Frame:
         T_cw: ``(4, 4)`` pose estimate of the left camera.
         landmark: ``(N,)`` int32, landmark that each feature tracks, or -1.
         xyz: ``(N, 3)`` float64, its position; NaN without one.
-        disparity_offset: pixels that the disparities of the features were corrected by.
+        disparity_offset: pixels that were added to the disparities of the features; None until
+            ``RigCalibration.prepare`` has corrected them for the first time.
         shift: ``(N, 2)`` float32, pixels from each feature to where its match was aligned, NaN for
             those that were not; None if none was.
     """
@@ -48,7 +48,7 @@ class Frame:
     T_cw: NDArray[np.float64]
     landmark: NDArray[np.int32]
     xyz: NDArray[np.float64]
-    disparity_offset: float = 0.0
+    disparity_offset: float | None = None
     shift: NDArray[np.float32] | None = None
 
     @classmethod
@@ -91,26 +91,6 @@ class Frame:
     def can_become_keyframe(self) -> bool:
         """Whether the frame can join the map, which is made of left images."""
         return self.side == Side.LEFT
-
-    def correct_disparities(self, offset: float) -> None:
-        """Correct the features by the whole offset of the pair (``Map.disparity_offset``)."""
-        if offset != self.disparity_offset:
-            change = offset - self.disparity_offset
-            self.features = self.features.with_larger_disparities(change)
-            self.disparity_offset = offset
-
-    def take_out_right_delay(self, twist: Matrix | None, camera: Camera) -> None:
-        """Move the features' columns in the right image to where they were when the left image was
-        taken (``Camera.right_delay``). Call it once; without a known motion nothing changes.
-
-        Args:
-            twist: ``(6,)`` how points move past the camera, per second; None if unknown.
-        """
-        if camera.right_delay == 0.0 or twist is None:
-            return
-        xy, u_right = self.features.xy, self.features.u_right
-        u_right = columns_without_delay(xy, u_right, twist, camera.right_delay, camera)
-        self.features = replace(self.features, u_right=u_right)
 
     @property
     def aligned(self) -> NDArray[np.bool_]:

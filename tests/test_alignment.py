@@ -19,6 +19,7 @@ from vslam.frontend.alignment import align, align_frame, warps
 from vslam.frontend.frame import Frame
 from vslam.frontend.orb import build_pyramid, extract
 from vslam.frontend.patches import RecentPatches, patches_around
+from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import TrackingContext, refine
 from vslam.geometry import inverse, se3_exp, transform
 from vslam.map import Map
@@ -364,7 +365,8 @@ def two_keyframes():
 
     config = Config()
     closing = LoopClosing(NoDetector(), CAMERA, config, threads=1)
-    mapping = MappingThread(CONTEXT.scales, CAMERA, config, closing, threads=1)
+    rig = RigCalibration(CAMERA, config.stereo, CONTEXT.scales)
+    mapping = MappingThread(CONTEXT.scales, CAMERA, config, closing, rig, threads=1)
     frames = []
     for index in range(2):
         frame = Frame.of(extracted_at(100, 50, 0, 3), CAMERA, index, 0.1 * index)

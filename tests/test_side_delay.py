@@ -1,5 +1,5 @@
-"""A right side that is late shows in the rows of stereo matches; a delay that the calibration
-gives is taken out of their columns."""
+"""A right side that is late shows in the rows of stereo matches; a delay that the calibration gives
+costs a drive little."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from vslam.camera import Camera
 from vslam.config import Config
 from vslam.features import Extracted, Features
 from vslam.frontend.extraction import extract_features
-from vslam.frontend.frame import Frame
-from vslam.frontend.side_delay import EVERY, SideDelay
+from vslam.frontend.side_delay import EVERY, DelayState, SideDelay
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp
 from vslam.image_motion import columns_without_delay, rays, row_speeds
@@ -102,19 +101,6 @@ def test_a_delay_is_measured_and_reported_unless_the_calibration_gives_it(delay)
     assert not learned(delay, known=delay).is_wrong
 
 
-@pytest.mark.parametrize("delay", [-8e-3, 3e-3, 12e-3])
-def test_a_known_delay_is_taken_out_of_the_columns(delay):
-    twist, camera = drive(6)[5], replace(CAMERA, right_delay=delay)
-    extracted, columns = seen(twist, delay)
-    before = np.abs(extracted.features.u_right - columns).mean()
-    frame = Frame.of(extracted, camera)
-    frame.take_out_right_delay(None, camera)
-    assert frame.features is extracted.features
-    frame.take_out_right_delay(twist, camera)
-    assert before > 0.15
-    assert np.abs(frame.features.u_right - columns).mean() < 0.15 * before
-
-
 def test_a_known_delay_costs_a_drive_little():
     """A quarter of a ring road at 15 m/s, the right image 5 ms late. What is left comes from the
     first frame, whose motion is not known."""
@@ -159,21 +145,22 @@ def test_contradicting_frames_are_doubted():
 
 def test_what_was_learned_can_be_kept():
     one, other = learned(5e-3, frames=43), SideDelay(CAMERA, CONFIG)
-    other.restore(one.memory())
+    other.restore(DelayState.of_numbers(one.state().numbers()))
+    assert (other.seconds, other.sigma) == (one.seconds, one.sigma)
     for k, twist in enumerate(drive(30)):
         for each in (one, other):
             add(each, seen(twist, 5e-3, seed=k)[0], twist)
-    assert other.memory() == one.memory()
+    assert other.state().numbers() == one.state().numbers()
     assert (other.seconds, other.sigma) == (one.seconds, one.sigma)
-    fresh = SideDelay(CAMERA, CONFIG)
-    fresh.restore(())
-    assert fresh.memory() == SideDelay(CAMERA, CONFIG).memory()
+    other.restore(DelayState.of_numbers(()))
+    assert other.state().numbers() == SideDelay(CAMERA, CONFIG).state().numbers()
+    assert (other.seconds, other.sigma) == (0.0, np.inf)
     with pytest.raises(ValueError, match="damaged"):
-        fresh.restore((1.0, 5.0, 0.0, 2.0))
+        DelayState.of_numbers((1.0, 5.0, 0.0, 2.0))
 
 
 def test_many_frames_take_no_more_memory():
-    assert len(learned(0.0, frames=400).memory()) < 16 * 12 * 12 + 1000
+    assert len(learned(0.0, frames=400).state().numbers()) < 16 * 12 * 12 + 1000
 
 
 def test_matches_without_a_row_offset_teach_nothing():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -68,10 +68,6 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.xy)
-
-    def with_larger_disparities(self, change: float) -> Features:
-        """The same with ``change`` pixels added to the disparity of each stereo match."""
-        return replace(self, u_right=shifted_columns(self.u_right, self.xy[:, 0], change))
 
     @classmethod
     def none(cls) -> Features:

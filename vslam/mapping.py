@@ -26,6 +26,7 @@ from vslam.config import Config
 from vslam.features import Features, KeyframePatches, LandmarkPatches
 from vslam.frontend.frame import Frame
 from vslam.frontend.patches import RecentPatches, patches_around
+from vslam.frontend.rig import RigCalibration
 from vslam.geometry import Matrix
 from vslam.map import LocalMap, Map, local_map
 from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
@@ -45,14 +46,12 @@ class MappingThread:
         recent: the patches of these keyframes.
         reference_view: landmarks of the reference keyframe alone.
         n_reference: of these, those that at least three keyframes see (all in a young map).
-        disparity_offset: ``Map.disparity_offset``.
     """
 
     local: LocalMap
     patches: LandmarkPatches
     reference_view: LocalMap
     n_reference: int
-    disparity_offset: float
 
     def __init__(
         self,
@@ -60,6 +59,7 @@ class MappingThread:
         camera: Camera,
         config: Config,
         closing: LoopClosing,
+        rig: RigCalibration,
         *,
         threads: int,
         map_: Map | None = None,
@@ -67,7 +67,6 @@ class MappingThread:
         """``map_``: to go on in; an empty one by default."""
         self.reference = 0
         self.n_keyframes = 0
-        self.disparity_offset = 0.0
         self.last_frame = -1
         self.last_timestamp = -np.inf
         self.recent = RecentPatches(config.alignment.keyframes)
@@ -75,6 +74,7 @@ class MappingThread:
         self._camera = camera
         self._config = config
         self._closing = closing
+        self._rig = rig
         self._executor = ThreadPoolExecutor(1, "mapping") if threads > 1 else None
         self._pending: Callable[[], None] | None = None
         self._T_reference = np.eye(4)
@@ -263,7 +263,7 @@ class MappingThread:
         Two landmarks may have become one: the first feature keeps it.
         """
         arrays = self.map.arrays
-        frame.correct_disparities(self.disparity_offset)
+        self._rig.prepare(frame)
         ids = resolve(arrays, frame.landmark)
         _, first = np.unique(ids, return_index=True)
         repeated = np.ones(len(ids), np.bool_)
@@ -363,7 +363,7 @@ class MappingThread:
 
     def _copy_view(self) -> None:
         map_, reference = self._map, self.reference
-        self.disparity_offset = map_.disparity_offset
+        self._rig.disparity_offset = map_.disparity_offset
         self.local = local_map(map_, reference, self._config.tracking.local_keyframes)
         self.patches = self.recent.of(map_, self.local.ids)
         self.reference_view = local_map(map_, reference, 1)

@@ -30,7 +30,8 @@ from vslam.frontend.keyframes import (
     needs_monocular_keyframe,
 )
 from vslam.frontend.relocalization import relocalise
-from vslam.frontend.side_delay import SideDelay
+from vslam.frontend.rig import RigCalibration
+from vslam.frontend.side_delay import DelayState
 from vslam.frontend.tracking import (
     TrackingContext,
     feature_depth,
@@ -70,7 +71,7 @@ class Slam:
     Attributes:
         frame: the last frame tracked, for drawing; None before the first.
         context: camera, thresholds and pyramid scales, as ``extract_features`` takes them.
-        side_delay: by how much the right side of the pair is measured to be late.
+        rig: what is known of the stereo pair, the measured delay of its right side for example.
         world: where the map that was loaded lies in that of a ground truth, None if unknown.
         on_merge: called where local mapping was merged, also in the middle of a step: the frame
             of that step may be placed, and the map can be read.
@@ -114,7 +115,7 @@ class Slam:
         self.config = config or Config()
         self.context = TrackingContext.create(camera, self.config)
         self.frame: Frame | None = None
-        self.side_delay = SideDelay(camera, self.config.stereo)
+        self.rig = RigCalibration(camera, self.config.stereo, self.context.scales)
         if isinstance(detector, str):
             detector, images = detector_with_images(detector, self.config)
         self._detector = detector
@@ -131,6 +132,7 @@ class Slam:
             camera,
             self.config,
             self._closing,
+            self.rig,
             threads=threads,
             map_=None if start is None else start.map,
         )
@@ -247,13 +249,13 @@ class Slam:
             gain_awaited=self._close_gain.awaited,
             closing=self._closing.memory(),
             patches=self._mapping.recent.all(),
-            side_delay=self.side_delay.memory(),
+            side_delay=self.rig.state().numbers(),
         )
 
     def _return_to(self, checkpoint: Checkpoint) -> None:
         self._mapping.return_to(checkpoint)
         self._closing.restore(checkpoint.closing)
-        self.side_delay.restore(checkpoint.side_delay)
+        self.rig.restore(DelayState.of_numbers(checkpoint.side_delay))
         self._velocity = checkpoint.velocity
         self._lost_frames, self._n_tracked = checkpoint.lost_frames, checkpoint.n_tracked
         gain = self._close_gain
@@ -262,7 +264,7 @@ class Slam:
         frame = Frame.of(Extracted(checkpoint.features), self.camera, index, timestamp)
         tracked = checkpoint.landmark >= 0
         frame.T_cw, frame.landmark = checkpoint.T_cw, checkpoint.landmark
-        frame.disparity_offset = self._mapping.disparity_offset
+        frame.disparity_offset = self.rig.disparity_offset  # it was corrected before it was saved
         frame.xyz[tracked] = self.map.arrays.xyz[checkpoint.landmark[tracked]]
         self.frame = frame
 
@@ -342,8 +344,7 @@ class Slam:
         frame = self._next_frame(extracted, timestamp, image)
         if self._mapping.is_due(frame.index):
             self._merge()
-        frame.correct_disparities(self._mapping.disparity_offset)
-        frame.take_out_right_delay(self._velocity, self.camera)
+        self.rig.prepare(frame, self._velocity)
         clock.lap("wait_for_mapping")
         self._is_between = False
         result = (
@@ -362,7 +363,7 @@ class Slam:
             return _result(frame, found, restarted, clock)
 
         self._update_motion(frame, found.relocalised)
-        self.side_delay.add(frame.features, frame.row_offset, self._velocity, self.context.scales)
+        self.rig.observe(frame, self._velocity)
         is_keyframe = self._extend_map(frame, found.inliers, found.visible)
         clock.lap("keyframe")
         return _result(frame, found, is_keyframe, clock)

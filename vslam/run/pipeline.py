@@ -255,7 +255,7 @@ def _outcome(
         warnings=[
             *rig_warnings(run.sides),
             *(
-                delay_warnings(slam.side_delay, sequence.camera)
+                delay_warnings(slam.rig.delay, sequence.camera)
                 or residual_warnings(residuals, sequence.camera)
             ),
         ],

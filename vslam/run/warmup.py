@@ -55,6 +55,7 @@ from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.frame import Frame
 from vslam.frontend.orb import scale_factors
 from vslam.frontend.relocalization import relocalise
+from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import TrackingContext
 from vslam.loopclosure import bow, local_matching, sim3_ransac
 from vslam.loopclosure.bow import BowDetector
@@ -211,7 +212,9 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     """
     config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
     closing = LoopClosing(NoDetector(), CAMERA, config, threads=1)
-    mapping = MappingThread(scale_factors(config.orb), CAMERA, config, closing, threads=1)
+    scales = scale_factors(config.orb)
+    rig = RigCalibration(CAMERA, config.stereo, scales)
+    mapping = MappingThread(scales, CAMERA, config, closing, rig, threads=1)
     rng = np.random.default_rng(0)
     n = 400
     points = rng.uniform([-5.0, -4.0, 9.0], [9.0, 4.0, 12.0], (n, 3))

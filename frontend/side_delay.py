@@ -156,8 +156,15 @@ class DelayState:
     @classmethod
     def nothing(cls) -> DelayState:
         """Before the first frame."""
-        zeros = (np.zeros(shape) for shape in (_SOLUTION, _TWIST, _WAITING, _GROUP, (0, *_GROUP)))
-        return cls(0, FRAMES_OF_A_GROUP, *zeros)
+        return cls(
+            n_group=0,
+            length=FRAMES_OF_A_GROUP,
+            solution=np.zeros(_SOLUTION),
+            twist=np.zeros(_TWIST),
+            waiting=np.zeros(_WAITING),
+            group=np.zeros(_GROUP),
+            groups=np.zeros((0, *_GROUP)),
+        )
 
     def numbers(self) -> tuple[float, ...]:
         """The state as a map file keeps it; ``of_numbers`` reads it."""
@@ -174,14 +181,20 @@ class DelayState:
         """
         if not numbers:
             return cls.nothing()
-        shapes = (_SOLUTION, _TWIST, _WAITING, _GROUP)
-        ends = np.cumsum([np.prod(shape) for shape in shapes])
+        ends = np.cumsum([np.prod(shape) for shape in (_SOLUTION, _TWIST, _WAITING, _GROUP)])
         values = np.array(numbers[2:])
         if len(values) < ends[-1] or (len(values) - ends[-1]) % np.prod(_GROUP):
             raise ValueError("what it knows of the delay between the sides is damaged")
-        *arrays, groups = np.split(values, ends)
-        shaped = (array.reshape(shape) for array, shape in zip(arrays, shapes, strict=True))
-        return cls(int(numbers[0]), int(numbers[1]), *shaped, groups.reshape(-1, *_GROUP))
+        solution, twist, waiting, group, groups = np.split(values, ends)
+        return cls(
+            n_group=int(numbers[0]),
+            length=int(numbers[1]),
+            solution=solution,
+            twist=twist,
+            waiting=waiting.reshape(_WAITING),
+            group=group.reshape(_GROUP),
+            groups=groups.reshape(-1, *_GROUP),
+        )
 
 
 class SideDelay:
@@ -195,6 +208,12 @@ class SideDelay:
         sigma: of that, from how much groups of frames contradict each other (Liang and Zeger,
             Biometrika 1986); infinite until there are enough groups.
     """
+
+    _solution: NDArray[np.float64]
+    _twist: NDArray[np.float64]
+    _waiting: NDArray[np.float64]
+    _group: NDArray[np.float64]
+    _groups: list[NDArray[np.float64]]
 
     def __init__(self, camera: Camera, config: StereoConfig) -> None:
         self._camera, self._config = camera, config
@@ -246,8 +265,10 @@ class SideDelay:
         """Continue from what ``state`` gave."""
         self.seconds, self.sigma = 0.0, np.inf
         self._n_group, self._length = state.n_group, state.length
-        self._solution, self._twist = state.solution.copy(), state.twist.copy()
-        self._waiting, self._group = state.waiting.copy(), state.group.copy()
+        self._solution = state.solution.copy()
+        self._twist = state.twist.copy()
+        self._waiting = state.waiting.copy()
+        self._group = state.group.copy()
         self._groups = list(state.groups.copy())
         self._conclude()
 

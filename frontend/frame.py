@@ -30,10 +30,12 @@ class Frame:
         T_cw: ``(4, 4)`` pose estimate of the left camera.
         landmark: ``(N,)`` int32, landmark that each feature tracks, or -1.
         xyz: ``(N, 3)`` float64, its position; NaN without one.
-        disparity_offset: pixels that were added to the disparities of the features; None until
-            ``RigCalibration.prepare`` has corrected them for the first time.
+        disparity_offset, delay_removed: what the disparities of the features were corrected by:
+            the pixels added to each, and whether the delay of the right image was removed
+            (``RigCalibration``).
         shift: ``(N, 2)`` float32, pixels from each feature to where its match was aligned, NaN for
             those that were not; None if none was.
+        twist: ``(6,)`` speed of the camera when the frame was tracked, per second; None if unknown.
     """
 
     index: int
@@ -48,8 +50,10 @@ class Frame:
     T_cw: NDArray[np.float64]
     landmark: NDArray[np.int32]
     xyz: NDArray[np.float64]
-    disparity_offset: float | None = None
+    disparity_offset: float = 0.0
+    delay_removed: bool = False
     shift: NDArray[np.float32] | None = None
+    twist: Matrix | None = None
 
     @classmethod
     def of(
@@ -82,6 +86,15 @@ class Frame:
         """``(4, 4)`` pose of the camera, by which landmarks are projected to the features."""
         T: Matrix = self.T_camera_left @ self.T_cw
         return T
+
+    def snapshot(self) -> Frame:
+        """A copy that keeps what the frame tracks now."""
+        return replace(self, landmark=self.landmark.copy(), xyz=self.xyz.copy())
+
+    def restore(self, snapshot: Frame) -> None:
+        """Track again what the frame tracked when the snapshot was taken."""
+        self.T_cw, self.shift = snapshot.T_cw, snapshot.shift
+        self.landmark, self.xyz = snapshot.landmark, snapshot.xyz
 
     def set_camera_pose(self, T_camera_w: Matrix) -> None:
         """Set the pose of the frame from the ``(4, 4)`` pose of the camera."""

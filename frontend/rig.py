@@ -22,12 +22,12 @@ from vslam.image_motion import columns_without_delay
 
 
 class RigCalibration:
-    """The corrections of a stereo pair. After stereo matching, only ``prepare`` writes the
-    ``u_right`` of a frame.
+    """The corrections of a stereo pair. After stereo matching, nothing else writes the ``u_right``
+    of a frame.
 
     Attributes:
-        disparity_offset: pixels to be added to every measured disparity. Whoever owns the map sets
-            it to ``Map.disparity_offset`` when it merges the map.
+        disparity_offset: pixels to be added to every measured disparity: ``Map.disparity_offset``
+            as of the last merge, which the owner of the map sets.
         delay: the measured delay of the right side.
     """
 
@@ -41,28 +41,35 @@ class RigCalibration:
         self._camera = camera
         self._scales = scales
 
-    def prepare(self, frame: Frame, twist: Matrix | None = None) -> None:
-        """Correct the columns of a frame's features in the right image.
-
-        The first call for a frame removes the delay of the right image; a frame whose motion is
-        unknown then keeps it. Each call corrects the disparities by the present offset, whatever
-        they were corrected by before.
+    def prepare(self, frame: Frame, twist: Matrix | None) -> None:
+        """Correct the columns of a frame's features in the right image: remove the delay of the
+        right image, if the motion is known, and correct the offset. Neither is done twice.
 
         Args:
-            twist: ``(6,)`` motion of the points past the camera, per second; None if unknown. Only
-                the first call for a frame uses it.
+            twist: ``(6,)`` motion of the points past the camera, per second; None if unknown.
         """
-        xy, u_right = frame.features.xy, frame.features.u_right
-        is_new = frame.disparity_offset is None
-        change = self.disparity_offset - (frame.disparity_offset or 0.0)
-        if change != 0.0:
-            u_right = shifted_columns(u_right, xy[:, 0], change)
+        self.correct_offset(frame)
         late = self._camera.right_delay
-        if is_new and twist is not None and late != 0.0:
-            u_right = columns_without_delay(xy, u_right, twist, late, self._camera)
-        if u_right is not frame.features.u_right:
-            frame.features = replace(frame.features, u_right=u_right)
+        if frame.delay_removed or twist is None or late == 0.0:
+            return
+        xy, u_right = frame.features.xy, frame.features.u_right
+        u_right = columns_without_delay(xy, u_right, twist, late, self._camera)
+        frame.features = replace(frame.features, u_right=u_right)
+        frame.delay_removed = True
+
+    def correct_offset(self, frame: Frame) -> None:
+        """Correct the disparities of a frame by the present offset, whatever offset they were
+        corrected by before."""
+        change = self.disparity_offset - frame.disparity_offset
+        if change == 0.0:
+            return
+        u_right = shifted_columns(frame.features.u_right, frame.features.xy[:, 0], change)
+        frame.features = replace(frame.features, u_right=u_right)
         frame.disparity_offset = self.disparity_offset
+
+    def adopt(self, frame: Frame) -> None:
+        """Take the columns of a frame as corrected: it was prepared before it was saved."""
+        frame.disparity_offset, frame.delay_removed = self.disparity_offset, True
 
     def observe(self, frame: Frame, twist: Matrix | None) -> None:
         """Measure the delay in a tracked frame.

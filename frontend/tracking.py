@@ -27,7 +27,7 @@ from vslam.frontend.matching import (
 from vslam.frontend.orb import scale_factors
 from vslam.frontend.pose import optimise_pose
 from vslam.geometry import compose, inverse, transform
-from vslam.map import LocalMap
+from vslam.map_view import LocalMap
 from vslam.reprojection import stack_uvr
 
 NEVER = np.iinfo(np.int64).max

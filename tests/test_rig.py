@@ -41,10 +41,20 @@ def test_a_known_delay_is_removed_once(delay):
     assert frame.features is once
 
 
-def test_without_motion_the_delay_stays_and_is_not_removed_later():
-    extracted, _ = seen(TWIST, 5e-3)
+def test_the_delay_stays_until_the_motion_is_known():
+    extracted, columns = seen(TWIST, 5e-3)
     calibration = rig(5e-3)
     frame = prepared(extracted, calibration, twist=None)
+    assert frame.features is extracted.features
+    calibration.prepare(frame, TWIST)
+    assert np.abs(frame.features.u_right - columns).mean() < 0.03
+
+
+def test_a_frame_that_was_saved_is_not_corrected_again():
+    extracted, _ = seen(TWIST, 5e-3)
+    calibration = rig(5e-3, offset=0.25)
+    frame = Frame.of(extracted, CAMERA)
+    calibration.adopt(frame)
     calibration.prepare(frame, TWIST)
     assert frame.features is extracted.features
 
@@ -54,24 +64,24 @@ def test_the_offset_is_applied_once_and_again_when_it_changes():
     u_right = extracted.features.u_right.copy()
     calibration = rig(offset=0.25)
     frame = prepared(extracted, calibration)
-    calibration.prepare(frame)
+    calibration.correct_offset(frame)
     assert_allclose(frame.features.u_right, u_right - 0.25, atol=1e-4)
     for offset in (0.75, 0.5):
         calibration.disparity_offset = offset
-        calibration.prepare(frame)
+        calibration.correct_offset(frame)
         assert_allclose(frame.features.u_right, u_right - offset, atol=1e-4)
     assert_array_equal(extracted.features.u_right, u_right)
 
 
 def test_both_corrections_add_up_and_nothing_else_changes():
     extracted, columns = seen(TWIST, 5e-3)
-    frame = prepared(extracted, rig(5e-3, offset=0.25))
+    calibration = rig(5e-3, offset=0.25)
+    frame = prepared(extracted, calibration)
     assert np.abs(frame.features.u_right - (columns - 0.25)).mean() < 0.03
     for name in ("xy", "octave", "angle", "descriptors"):
         assert getattr(frame.features, name) is getattr(extracted.features, name)
-    # A later offset, as the map finds it, leaves the delay removed.
-    later = rig(5e-3, offset=0.5)
-    later.prepare(frame, TWIST)
+    calibration.disparity_offset = 0.5
+    calibration.correct_offset(frame)
     assert np.abs(frame.features.u_right - (columns - 0.5)).mean() < 0.03
 
 

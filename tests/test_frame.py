@@ -14,8 +14,9 @@ from vslam.frontend.frame import Frame
 from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracking import TrackingContext, refine
 from vslam.geometry import compose, se3_exp, transform
-from vslam.map import LocalMap, Map, local_map
+from vslam.map import Map
 from vslam.map_kernels import link_many
+from vslam.map_view import LocalMap, local_map
 from vslam.maps.checkpoint import FEATURES
 
 CAMERA = Camera(400.0, 400.0, 320.0, 240.0, 0.5, 640, 480)

@@ -99,7 +99,7 @@ class Relocaliser:
         sighting = self._recognise(map_, frame.image, frame.features, candidates)
         if sighting is None:
             return Found(TrackingState.LOST)
-        frame.T_cw = sighting.T_cw
+        frame.set_camera_pose(sighting.T_cw)
         frame.landmark[sighting.feature] = sighting.landmark
         frame.shift = None
         frame.xyz[sighting.feature] = map_.arrays.xyz[sighting.landmark]

@@ -8,7 +8,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import TrackingState, TrackResult
+from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frame_poses import FramePoses
 from vslam.frontend.frame import Frame
 from vslam.frontend.tracking import (
@@ -185,20 +185,21 @@ class Tracker:
             n_tracked=self._n_tracked,
         )
 
-    def restore(self, state: TrackerState, xyz: Matrix, disparity_offset: float) -> None:
-        """Remember what ``state`` gave.
+    def restore(self, state: TrackerState, xyz: Matrix) -> Frame:
+        """Remember what ``state`` gave, and return the last frame.
 
         Args:
             xyz: ``(N, 3)`` where the landmarks of the last frame are; NaN without one.
-            disparity_offset: that its disparities were corrected by, pixels.
         """
-        last = Frame.untracked(state.features, self._context.camera, state.index, state.timestamp)
+        extracted = Extracted(state.features)
+        last = Frame.of(extracted, self._context.camera, state.index, state.timestamp)
         last.T_cw, last.landmark, last.xyz = state.T_cw, state.landmark, xyz
-        last.twist, last.disparity_offset = state.twist, disparity_offset
+        last.twist = state.twist
         self.start_from(last)
         self.lost_frames, self._n_tracked = state.lost_frames, state.n_tracked
         if self.lost_frames:
             self.status = TrackerStatus.LOST
+        return last
 
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
         """Track along the prediction; where there is none or it fails, against the reference

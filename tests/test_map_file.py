@@ -18,7 +18,7 @@ from ring import CAMERA, Ring
 
 from vslam.config import Config, OrbConfig
 from vslam.errors import InputError
-from vslam.features import Features
+from vslam.features import Extracted, Features
 from vslam.geometry import se3_exp
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.registry import create_detector, create_images
@@ -36,7 +36,7 @@ CONFIG = Config()
 def driven(slam: Slam, ring: Ring, places, start: float = 0.0) -> Slam:
     """Drive along the ring at ten frames a second."""
     for i, k in enumerate(places):
-        slam.step_features(ring.see(k, seed=int(start)), start + 0.1 * i)
+        slam.step_features(Extracted(ring.see(k, seed=int(start))), start + 0.1 * i)
     slam.finish()
     return slam
 

@@ -92,7 +92,6 @@ def update_landmarks(frame: Frame, map_: Map) -> None:
     Two landmarks may have become one: the first feature keeps it.
     """
     arrays = map_.arrays
-    frame.correct_disparities(map_.disparity_offset)
     ids = resolve(arrays, frame.landmark)
     _, first = np.unique(ids, return_index=True)
     repeated = np.ones(len(ids), np.bool_)

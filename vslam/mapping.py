@@ -24,6 +24,7 @@ from vslam.features import Features
 from vslam.frame_poses import FramePoses, FrameTable
 from vslam.frontend.aligner import Aligner
 from vslam.frontend.frame import Frame
+from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix, inverse, orthonormalised
 from vslam.map import Map
@@ -58,12 +59,14 @@ class Mapper:
         self,
         context: TrackingContext,
         closing: LoopClosing,
+        rig: RigCalibration,
         executor: Executor | None,
         map_: Map | None = None,
         frames: FrameTable | None = None,
     ) -> None:
         """
         Args:
+            rig: corrects frames; it is told the map's disparity offset.
             executor: runs mapping jobs, one at a time; None runs each where its result is needed.
             map_: a map to continue in; None begins an empty one.
             frames: frames of the same drive that are placed already.
@@ -75,6 +78,7 @@ class Mapper:
         self._camera = context.camera
         self._config = context.config
         self._closing = closing
+        self._rig = rig
         self._aligner = Aligner(context.config.alignment)
         self._is_merged = True
         self._held: tuple[Frame, ...] = ()
@@ -298,8 +302,8 @@ class Mapper:
             nearest=local_map(map_, keyframe, 1),
             n_reference=count_seen_by(map_.arrays, keyframe, min(3, len(living))),
             patches=self._aligner.patches_of(map_, around.ids),
-            disparity_offset=map_.disparity_offset,
         )
+        self._rig.disparity_offset = map_.disparity_offset
 
     def refer_to_nearest(self, frame: Frame) -> None:
         """Make the keyframe that shares the most landmarks with a frame the reference (ORB-SLAM,
@@ -361,6 +365,7 @@ class Mapper:
         """Bring a frame to where the map is now. One that is placed moves with its keyframe, one
         that is not yet with the reference keyframe."""
         grown = self.view.unit_scale / before.unit_scale
+        self._rig.correct_offset(frame)
         update_landmarks(frame, self.map)
         if frame.index < len(self.frames):
             frame.T_cw = self.frames.pose(frame.index)

@@ -129,7 +129,7 @@ class MapBuilding:
     def extend(self, frame: Frame, found: Found) -> bool:
         self.starter.reset()
         self._mapper.count(found.visible, frame.landmark[frame.landmark >= 0])
-        if frame.features.from_right:  # the map is made of left images
+        if not frame.can_become_keyframe:
             return False
         evidence = self.policy.observe(
             frame,

@@ -9,7 +9,8 @@ import numpy as np
 from vslam.camera import same_camera
 from vslam.closing import LoopClosing
 from vslam.frame_poses import FrameTable
-from vslam.frontend.side_delay import SideDelay
+from vslam.frontend.rig import RigCalibration
+from vslam.frontend.side_delay import DelayState
 from vslam.frontend.tracker import Tracker
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, orthonormalised, se3_log
@@ -88,7 +89,7 @@ class Session:
     closing: LoopClosing
     mapper: Mapper
     tracker: Tracker
-    side_delay: SideDelay
+    rig: RigCalibration
     mode: Mode
     start: Start
 
@@ -125,7 +126,7 @@ class Session:
             self.mapper.state(),
             policy,
             self.closing.memory(),
-            self.side_delay.memory(),
+            self.rig.state().numbers(),
         )
 
     def restore(self, state: Checkpoint) -> None:
@@ -133,11 +134,11 @@ class Session:
         self.mapper.restore(state.mapper)
         self.mode.restore(state.policy)
         self.closing.restore(state.closing)
-        self.side_delay.restore(state.rig)
+        self.rig.restore(DelayState.of_numbers(state.rig))
         landmark = state.tracker.landmark
         xyz = np.full((len(landmark), 3), np.nan)
         xyz[landmark >= 0] = self.mapper.map.arrays.xyz[landmark[landmark >= 0]]
-        self.tracker.restore(state.tracker, xyz, self.mapper.view.disparity_offset)
+        self.rig.adopt(self.tracker.restore(state.tracker, xyz))
 
     def resume(self) -> None:
         """Expect the next frame after the last one of the drive that is continued, if one is: to

@@ -12,12 +12,13 @@ from vslam.camera import Camera, DepthImage, Image, check_images
 from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.errors import InputError
-from vslam.features import Features, TrackingState, TrackResult
+from vslam.features import Extracted, Side, TrackingState, TrackResult
+from vslam.frontend.extraction import extract_features
 from vslam.frontend.frame import Frame
 from vslam.frontend.relocaliser import Relocaliser
-from vslam.frontend.side_delay import SideDelay
+from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Found, Tracker, result_of
-from vslam.frontend.tracking import TrackingContext, extract_features
+from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverses
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_relocalization import LearnedRelocalisation
@@ -52,7 +53,7 @@ class Slam:
     Attributes:
         context: camera, thresholds and pyramid scales, as ``extract_features`` takes them.
         detector: finds loops and relocalises.
-        side_delay: by how much the right side of the pair is measured to be late.
+        rig: what is known of the stereo pair, the measured delay of its right side for example.
     """
 
     def __init__(
@@ -92,11 +93,11 @@ class Slam:
             detector, images = detector_with_images(detector, config)
         self.context = context = TrackingContext.create(camera, config)
         self.detector = detector
-        self.side_delay = SideDelay(camera, config.stereo)
+        self.rig = RigCalibration(camera, config.stereo, context.scales)
         self._closing = LoopClosing(detector, camera, config, threads=threads, images=images)
         begin = open_map(start, context, self._closing, localize=localize, resume=resume)
         executor = mapping_executor(threads)
-        self._mapper = Mapper(context, self._closing, executor, begin.map, begin.frames)
+        self._mapper = Mapper(context, self._closing, self.rig, executor, begin.map, begin.frames)
         self._tracker = Tracker(context)
         recognise = LearnedRelocalisation(images, camera, config)
         self._relocaliser = Relocaliser(context, detector.locate, recognise)
@@ -107,7 +108,7 @@ class Slam:
             self._closing,
             self._mapper,
             self._tracker,
-            self.side_delay,
+            self.rig,
             self._mode,
             begin,
         )
@@ -184,14 +185,14 @@ class Slam:
         """
         check_images(left, second, self.context.camera)
         clock = StageClock()
-        features = extract_features(left, second, self.context)
+        extracted = extract_features(left, second, self.context)
         clock.lap("extract")
-        image = np.array(second if features.from_right else left, np.uint8)
-        return self.step_features(features, timestamp, image, clock.ms)
+        image = np.array(second if extracted.side == Side.RIGHT else left, np.uint8)
+        return self.step_features(extracted, timestamp, image, clock.ms)
 
     def step_features(
         self,
-        features: Features,
+        extracted: Extracted,
         timestamp: float,
         image: Image | None = None,
         stage_ms: dict[str, float] | None = None,
@@ -204,12 +205,11 @@ class Slam:
             stage_ms: wall time by stage so far, milliseconds, for the result.
         """
         clock = StageClock(dict(stage_ms or {}))
-        frame = self._next_frame(features, timestamp, image)
+        frame = self._next_frame(extracted, timestamp, image)
         mapper, tracker = self._mapper, self._tracker
         mapper.hold(tracker.last, frame)
         mapper.merge_if_due(frame.index)
-        frame.correct_disparities(mapper.view.disparity_offset)
-        frame.take_out_right_delay(tracker.twist, self.context.camera)
+        self.rig.prepare(frame, tracker.twist)
         clock.lap("wait_for_mapping")
         if not mapper.n_keyframes:
             mapper.place(frame, tracked=False)
@@ -233,7 +233,7 @@ class Slam:
         else:
             tracker.accept(frame, found, mapper.frames)
             mapper.place(frame, tracked=True, near=found.keyframe)
-            self.side_delay.add(frame.features, frame.twist, self.context.scales)
+            self.rig.observe(frame, frame.twist)
             is_keyframe = self._mode.extend(frame, found)
         clock.lap("keyframe")
         return result_of(frame, found, is_keyframe, clock.ms)
@@ -241,7 +241,7 @@ class Slam:
     def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
         """Account for a frame without images, at the predicted pose: it is LOST, or DROPPED if
         there was only no time for it."""
-        frame = self._next_frame(Features.none(), timestamp, None)
+        frame = self._next_frame(Extracted.nothing(), timestamp, None)
         frame.T_cw = self._tracker.predict(timestamp, self._mapper.frames, self._mapper.view)
         self._mapper.place(frame, tracked=False)
         if self._mapper.n_keyframes and not dropped:
@@ -253,11 +253,11 @@ class Slam:
         """Complete what is being mapped; map and trajectory are final until the next step."""
         self._mapper.finish()
 
-    def _next_frame(self, features: Features, timestamp: float, image: Image | None) -> Frame:
+    def _next_frame(self, extracted: Extracted, timestamp: float, image: Image | None) -> Frame:
         frames = self._mapper.frames
         if len(frames) and not timestamp > (last := frames.timestamp(-1)):
             raise ValueError(f"timestamp {timestamp} s is not later than the last one, {last} s")
-        return Frame.untracked(features, self.context.camera, len(frames), timestamp, image)
+        return Frame.of(extracted, self.context.camera, len(frames), timestamp, image)
 
     @property
     def map(self) -> Map:

@@ -144,7 +144,7 @@ def test_same_bytes_with_one_thread_and_two_and_again(corridor, config):
 def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, monkeypatch):
     """Mapping as late as can be (when it is merged) and as early as can be: a race would show."""
     late = bytes_of(*run(corridor, config, threads=1))
-    monkeypatch.setattr("vslam.mapping.ThreadPoolExecutor", InstantExecutor)
+    monkeypatch.setattr("vslam.shared_map.ThreadPoolExecutor", InstantExecutor)
     assert bytes_of(*run(corridor, config, threads=2)) == late
 
 

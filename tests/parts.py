@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vslam.camera import Camera
-from vslam.features import Features
+from vslam.features import Extracted, Features
 from vslam.frontend.frame import Frame
 from vslam.geometry import se3_exp, transform
 from vslam.map_view import LocalMap, MapView
@@ -39,8 +39,8 @@ def frame_of(
     image: np.ndarray | None = None,
     camera: Camera = CAMERA,
 ) -> Frame:
-    """A frame of which nothing is known but its features."""
-    return Frame.untracked(features, camera, index, timestamp, image)
+    """A frame that is not tracked yet."""
+    return Frame.of(Extracted(features), camera, index, timestamp, image)
 
 
 def ahead(metres: float, turn: float = 0.0) -> np.ndarray:

@@ -11,11 +11,14 @@ from test_relocalization import KEYFRAMES, lost_frame, mapped_street
 from test_verification import forward
 
 from vslam.config import Config
+from vslam.features import TrackingState
 from vslam.frontend.frame import Frame
 from vslam.frontend.relocaliser import Relocaliser
+from vslam.frontend.tracker import Found
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp, se3_log
 from vslam.loops import LoopCandidate
+from vslam.map import Map
 
 HERE, NOT_HERE = 1, KEYFRAMES  # keyframes: one near the frame, and one without landmarks
 T_TRUE = forward(1.2, 0.3)
@@ -74,13 +77,36 @@ class Place:
         context = TrackingContext.create(CAMERA, config)
         return cls(world, frame, Relocaliser(context, locate, recognise), candidates)
 
-    def find(self) -> tuple[int, int]:
-        """Inliers, and the keyframe near which a frame was found that was lost."""
-        return self.relocaliser.find(self.frame, self.world.map)
+    def check(self, found: Found) -> Found:
+        """What the relocaliser makes of the frame while no keyframe is being mapped."""
+        return self.relocaliser.check(self.frame, found, Owner(self.world.map, is_merged=True))
 
-    def find_better(self, n_inliers: int) -> tuple[int, int]:
-        """The same for a frame that was tracked, with so many inliers, and is doubtful."""
-        return self.relocaliser.find_better(self.frame, self.world.map, n_inliers)
+    def find(self) -> Found:
+        """Where the frame is found if it was lost."""
+        return self.check(LOST)
+
+    def find_better(self, n_inliers: int) -> Found:
+        """Where the frame is found if it was tracked with so many inliers, and is doubtful."""
+        return self.check(doubtful(n_inliers))
+
+
+class Owner:
+    """The owner of a map, which may have to wait for a keyframe before it gives it."""
+
+    def __init__(self, map_: Map, is_merged: bool) -> None:
+        self.is_merged = is_merged
+        self._map = map_
+
+    def merge(self) -> Map:
+        self.is_merged = True
+        return self._map
+
+
+LOST = Found(TrackingState.LOST)
+
+
+def doubtful(n_inliers: int) -> Found:
+    return Found(TrackingState.OK, n_inliers, n_inliers, is_doubtful=True)
 
 
 def track_elsewhere(frame: Frame) -> None:
@@ -113,9 +139,9 @@ def test_a_lost_frame_is_found_near_the_first_candidate_that_shows_it():
     recognise = Recognise(30)
     place = Place.create([NOT_HERE, HERE, 0], recognise)
     before = map_bytes(place.world)
-    n_inliers, keyframe = place.find()
-    assert keyframe == HERE
-    assert n_inliers == np.count_nonzero(place.frame.landmark >= 0) > 100
+    found = place.find()
+    assert (found.state, found.keyframe) == (TrackingState.OK, HERE)
+    assert found.n_inliers == np.count_nonzero(place.frame.landmark >= 0) > 100
     assert offset(place.frame) < 0.03
     assert not recognise.asked  # ORB descriptors were enough
     assert map_bytes(place.world) == before
@@ -125,7 +151,7 @@ def test_a_lost_frame_is_found_near_the_first_candidate_that_shows_it():
 def test_only_so_many_candidates_are_tried(max_candidates, found):
     matches = [NOT_HERE, NOT_HERE, HERE]
     place = Place.create(matches, Recognise(), max_candidates=max_candidates)
-    assert place.find()[1] == (HERE if found else -1)
+    assert place.find().keyframe == (HERE if found else -1)
 
 
 @pytest.mark.parametrize("matches", [[], [NOT_HERE]])
@@ -135,7 +161,8 @@ def test_where_orb_finds_nothing_the_frame_may_be_recognised_in_another_way(matc
     before = map_bytes(place.world)
     frame, sighting = place.frame, recognise.sighting
     frame.shift = np.zeros((len(frame.features), 2), np.float32)  # of matches that are no more
-    assert place.find() == (30, 2)
+    found = place.find()
+    assert (found.state, found.n_inliers, found.keyframe) == (TrackingState.OK, 30, 2)
     assert len(recognise.asked) == 1
     for given, expected in zip(
         recognise.asked[0],
@@ -155,13 +182,15 @@ def test_where_orb_finds_nothing_the_frame_may_be_recognised_in_another_way(matc
 
 def test_a_frame_that_nothing_recognises_is_found_nowhere():
     recognise = Recognise()
-    assert Place.create([NOT_HERE], recognise).find() == (0, -1)
+    found = Place.create([NOT_HERE], recognise).find()
+    assert found.is_lost
+    assert (found.n_inliers, found.keyframe) == (0, -1)
     assert len(recognise.asked) == 1
 
 
 def by_orb(**thresholds: float) -> tuple[Place, int]:
     """A place where ORB descriptors find the frame, and with how many inliers they do."""
-    n = Place.create([HERE], Recognise()).find()[0]
+    n = Place.create([HERE], Recognise()).find().n_inliers
     return Place.create([HERE], Recognise(), **thresholds), n
 
 
@@ -181,10 +210,12 @@ def test_a_doubtful_frame_stays_exactly_as_it_is_unless_it_is_clearly_better_els
     track_elsewhere(place.frame)
     tracked, before = everything(place.frame), map_bytes(place.world)
     enough = int(np.ceil(n_there / better))
-    assert place.find_better(enough) == (0, -1)
+    stays = doubtful(enough)
+    assert place.check(stays) is stays
     assert everything(place.frame) == tracked
-    n_inliers, keyframe = place.find_better(enough - 1)
-    assert (n_inliers, keyframe) == (n_there, 2 if found_by is by_others else HERE)
+    found = place.find_better(enough - 1)
+    assert (found.n_inliers, found.keyframe) == (n_there, 2 if found_by is by_others else HERE)
+    assert found.state is TrackingState.OK
     assert everything(place.frame) != tracked
     assert place.frame.shift is None
     assert map_bytes(place.world) == before
@@ -194,7 +225,8 @@ def test_a_doubtful_frame_that_is_found_nowhere_stays_exactly_as_it_is():
     place = Place.create([NOT_HERE], Recognise())
     track_elsewhere(place.frame)
     tracked = everything(place.frame)
-    assert place.find_better(0) == (0, -1)
+    stays = doubtful(0)
+    assert place.check(stays) is stays
     assert everything(place.frame) == tracked
 
 
@@ -205,3 +237,47 @@ def test_what_a_frame_tracked_before_is_gone_where_it_is_found():
     place.find_better(10)
     assert np.count_nonzero(place.frame.landmark >= 0) == n_there
     assert offset(place.frame) < 0.03
+
+
+@pytest.mark.parametrize(("n", "state", "keyframe"), [
+    (30, TrackingState.OK, 2),
+    (29, TrackingState.WEAK, 2),
+    (15, TrackingState.WEAK, 2),
+    (14, TrackingState.LOST, -1),
+])  # fmt: skip
+def test_few_inliers_make_a_frame_that_is_found_weak_or_lost(n, state, keyframe):
+    found = Place.create([], Recognise(n)).find()
+    assert (found.state, found.keyframe, found.n_inliers) == (state, keyframe, n)
+    assert found.relocalised == (keyframe >= 0)
+
+
+def test_a_frame_of_the_right_camera_is_found_where_the_left_one_is():
+    recognise = Recognise(30)
+    place = Place.create([], recognise)
+    place.frame.T_camera_left = CAMERA.T_right_left
+    place.find()
+    expected = inverse(CAMERA.T_right_left) @ recognise.sighting.T_cw
+    np.testing.assert_allclose(place.frame.T_cw, expected, atol=1e-12)
+
+
+def test_a_frame_that_is_not_doubtful_is_not_looked_for():
+    place, _ = by_orb()
+    track_elsewhere(place.frame)
+    tracked = everything(place.frame)
+    good = Found(TrackingState.OK, 20, 20)
+    assert place.check(good) is good
+    assert everything(place.frame) == tracked
+
+
+def test_a_lost_frame_does_not_wait_for_a_keyframe_that_is_being_mapped():
+    place, _ = by_orb()
+    owner = Owner(place.world.map, is_merged=False)
+    assert place.relocaliser.check(place.frame, LOST, owner) is LOST
+    assert not owner.is_merged
+
+
+def test_a_doubtful_frame_waits_for_a_keyframe_that_is_being_mapped():
+    place, n_there = by_orb()
+    owner = Owner(place.world.map, is_merged=False)
+    assert place.relocaliser.check(place.frame, doubtful(20), owner).n_inliers == n_there
+    assert owner.is_merged

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from vslam.config import Config
 from vslam.features import Features, TrackingState
 from vslam.frame_poses import FramePoses
 from vslam.frontend.frame import Frame
-from vslam.frontend.tracker import Found, Tracker, TrackerState
+from vslam.frontend.tracker import Found, Tracker, TrackerStatus, judge
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import se3_exp
 from vslam.map_view import MapView
@@ -30,17 +30,11 @@ def at(k: float) -> np.ndarray:
     return se3_exp(k * STEP)
 
 
-def track(
-    tracker: Tracker, frame: Frame, T_cw: np.ndarray, view: MapView, frames: FramePoses
-) -> tuple[Found, bool]:
-    """Track a frame; returns where it was found, and whether that is doubtful."""
-    found = tracker.track(frame, T_cw, view)
-    return found, tracker.is_doubtful(frame, found, frames, view)
-
-
-def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingState:
-    """What so many matches and inliers are worth."""
-    return Tracker(context).judged(n_matches, n_inliers).state
+def restored(tracker: Tracker) -> Tracker:
+    """A new tracker that remembers what this one does, in the same map."""
+    state, other = tracker.state(), Tracker(CONTEXT)
+    other.restore(state, np.where((state.landmark >= 0)[:, None], POINTS.xyz, np.nan))
+    return other
 
 
 def select(features: Features, n: int) -> Features:
@@ -95,11 +89,11 @@ class Drive:
     def track(self, frame: Frame, view: MapView, T_cw: np.ndarray | None = None) -> Found:
         """Track a frame where it is expected, by default where it really is."""
         T_cw = at(10.0 * frame.timestamp) if T_cw is None else T_cw
-        return track(self.tracker, frame, T_cw, view, self.frames)[0]
+        return self.tracker.track(frame, T_cw, view, self.frames)
 
     def doubts(self, frame: Frame, view: MapView) -> bool:
         """Whether the frame, tracked where it is, is doubtful."""
-        return track(self.tracker, frame, at(10.0 * frame.timestamp), view, self.frames)[1]
+        return self.track(frame, view).is_doubtful
 
 
 # -- prediction -----------------------------------------------------------------------------------
@@ -154,7 +148,7 @@ def test_the_leap_to_where_a_frame_was_found_in_the_map_is_no_motion():
 
 def test_a_tracker_that_has_nothing_to_go_on_does_not_track():
     drive = Drive()
-    assert drive.tracker.state is TrackerState.UNKNOWN
+    assert drive.tracker.status is TrackerStatus.UNKNOWN
     frame = POINTS.frame(0, 0.0, np.eye(4))
     found = drive.track(frame, POINTS.view(), np.eye(4))
     assert found.is_lost
@@ -164,7 +158,7 @@ def test_a_tracker_that_has_nothing_to_go_on_does_not_track():
 def test_a_drive_that_is_continued_is_tracked_from_the_reference_keyframe():
     drive = Drive()
     drive.tracker.resume()
-    assert drive.tracker.state is TrackerState.RESUMED
+    assert drive.tracker.status is TrackerStatus.RESUMED
     frame = POINTS.frame(0, 0.0, ahead(0.7, 0.1))
     found = drive.track(frame, POINTS.view(), np.eye(4))
     assert (found.state, found.n_inliers) == (TrackingState.OK, 240)
@@ -347,55 +341,63 @@ def test_where_no_frame_was_tracked_before_nothing_is_doubtful():
 def test_lost_frames_are_counted_until_one_is_found_or_begins_a_map():
     drive = Drive.of_two_frames()
     tracker = drive.tracker
-    assert (tracker.state, tracker.lost_frames) == (TrackerState.TRACKING, 0)
+    assert (tracker.status, tracker.lost_frames) == (TrackerStatus.TRACKING, 0)
     last = tracker.last
     drive.lose(2)
     drive.lose(3)
-    assert (tracker.state, tracker.lost_frames) == (TrackerState.LOST, 2)
+    assert (tracker.status, tracker.lost_frames) == (TrackerStatus.LOST, 2)
     assert tracker.last is last
     frame = drive.accept(4)
-    assert (tracker.state, tracker.lost_frames) == (TrackerState.TRACKING, 0)
+    assert (tracker.status, tracker.lost_frames) == (TrackerStatus.TRACKING, 0)
     assert tracker.last is frame
     drive.lose(5)
     start = POINTS.tracked_frame(6, 0.6, at(6))
     tracker.start_from(start)
-    assert (tracker.state, tracker.lost_frames) == (TrackerState.TRACKING, 0)
+    assert (tracker.status, tracker.lost_frames) == (TrackerStatus.TRACKING, 0)
     assert tracker.last is start
 
 
 def test_before_the_first_frame_there_is_nothing_to_remember():
     tracker = Tracker(CONTEXT)
-    assert tracker.memory() is None
+    assert tracker.state() is None
     tracker.resume(TWIST)
-    assert tracker.memory() is None
+    assert tracker.state() is None
 
 
 @pytest.mark.parametrize("lost", [0, 2])
 def test_a_tracker_that_is_restored_goes_on_as_the_one_that_was_not(lost):
-    drive = Drive.of_two_frames(slice(0, 121))
+    """Its last frame tracked 121 landmarks; the next one tracks 60."""
+    drive = Drive()
+    drive.accept(0)
+    last = POINTS.tracked_frame(1, 0.1, at(1))
+    last.landmark[121:], last.xyz[121:] = -1, np.nan
+    drive.tracker.accept(last, Found(TrackingState.OK), drive.frames)
+    drive.frames.append(0.1, last.T_cw, tracked=True)
     for k in range(lost):
         drive.lose(2 + k)
-    restored = Tracker(CONTEXT)
-    restored.restore(drive.tracker.memory())
-    assert restored.state is drive.tracker.state
-    assert restored.lost_frames == lost
+    other = restored(drive.tracker)
+    assert other.status is drive.tracker.status
+    assert other.lost_frames == lost
+    for field in fields(drive.tracker.state()):
+        mine, theirs = (getattr(one.state(), field.name) for one in (other, drive.tracker))
+        np.testing.assert_equal(mine, theirs, field.name)
     view, outcomes = POINTS.view(nearest=NOTHING, n_reference=240, n_keyframes=OLD), []
-    for tracker in (drive.tracker, restored):
+    for tracker in (drive.tracker, other):
         frame = drive.next_frame(FEW)
         T_cw = tracker.predict(frame.timestamp, drive.frames, view)
-        found, doubtful = track(tracker, frame, T_cw, view, drive.frames)
-        assert doubtful  # it tracked 121 landmarks and tracks 60
-        outcomes.append((found.n_inliers, T_cw.tobytes(), frame.T_cw.tobytes()))
+        found = tracker.track(frame, T_cw, view, drive.frames)
+        assert (found.n_inliers, found.is_doubtful) == (60, True)
         tracker.accept(frame, found, drive.frames)
-        outcomes[-1] += (tracker.twist.tobytes(),)
-    assert outcomes[0][0] == 60
+        outcomes.append((T_cw.tobytes(), frame.T_cw.tobytes(), tracker.twist.tobytes()))
     assert outcomes[1] == outcomes[0]
 
 
 def test_what_is_remembered_does_not_change_with_the_frame():
     drive = Drive.of_two_frames()
-    memory = drive.tracker.memory()
-    drive.tracker.last.landmark[:] = -1
-    restored = Tracker(CONTEXT)
-    restored.restore(memory)
-    assert restored.last.landmark.tolist() == list(range(240))
+    state, last = drive.tracker.state(), drive.tracker.last
+    last.landmark[:] = -1
+    last.twist[:] = 0.0
+    last.T_cw[:] = 0.0
+    assert state.landmark.tolist() == list(range(240))
+    np.testing.assert_allclose(state.twist, TWIST, atol=1e-9)
+    np.testing.assert_array_equal(state.T_cw, at(1))

@@ -211,7 +211,7 @@ def _write_video(folder: Path) -> None:
 
 def _write_map(folder: Path) -> None:
     from vslam.features import PATCH_PIXELS, Features, KeyframePatches
-    from vslam.loops import ClosingMemory, LoopEdge, ResembledPlace
+    from vslam.loops import ClosingState, ConsistencyState, LoopEdge, ResembledPlace
     from vslam.map import Map
     from vslam.map_kernels import link_many, merge_landmarks, refresh_landmarks
     from vslam.maps.checkpoint import Checkpoint
@@ -254,7 +254,9 @@ def _write_map(folder: Path) -> None:
         n_tracked=n,
         gained_close=100.0,
         gain_awaited=False,
-        closing=ClosingMemory((ResembledPlace(frozenset((0,)), 1),), ((3, waits),), 3),
+        closing=ClosingState(
+            ConsistencyState((ResembledPlace(frozenset((0,)), 1),), ((3, waits),), 3)
+        ),
         patches=(
             KeyframePatches(2, np.zeros((n, PATCH_PIXELS), np.uint8), np.zeros((n, 2), np.float32)),
         ),

@@ -39,10 +39,12 @@ from vslam.frontend.tracking import (
     track_motion,
 )
 from vslam.geometry import Matrix, inverse, inverses, orthonormalised, se3_exp, se3_log
+from vslam.hypotheses import joined_submaps
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_verification import rated, recognise
 from vslam.loopclosure.registry import DEFAULT_DETECTOR, detector_with_images
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
+from vslam.loopclosure.verifier import verifier_for
 from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map, local_map
 from vslam.mapping import MappingThread
@@ -122,9 +124,8 @@ class Slam:
         self._drives: tuple[str, ...] = ()
         self.world: World | None = None
         self.on_merge: Callable[[], None] = lambda: None
-        self._closing = LoopClosing(
-            self._detector, camera, self.config, threads=threads, images=images
-        )
+        verifier = verifier_for(self.config, camera, images)
+        self._closing = LoopClosing(self._detector, verifier, camera, self.config, threads=threads)
         before = None if start is None else self._begin_in(start, resume=resume)
         self._mapping = MappingThread(
             self.context.scales,
@@ -208,7 +209,7 @@ class Slam:
         Raises:
             RuntimeError: a keyframe is being mapped.
         """
-        map_, images = self.map, self._closing.images
+        map_, images = self.map, self._closing.verifier.images
         self._mapping.write_counts()
         return StoredMap(
             map=map_,
@@ -245,7 +246,7 @@ class Slam:
             n_tracked=self._n_tracked,
             gained_close=self._close_gain.mean,
             gain_awaited=self._close_gain.awaited,
-            closing=self._closing.memory(),
+            closing=self._closing.state(),
             patches=self._mapping.recent.all(),
             side_delay=self.side_delay.memory(),
         )
@@ -404,7 +405,7 @@ class Slam:
         frames = self._poses.table()
         if not self.map.n_keyframes:
             return frames.tracked
-        part = self._closing.joined_submaps(self.map)
+        part = joined_submaps(self.map, self._closing.closed)
         return frames.tracked & (part[frames.reference] == part[0])
 
     def keyframe_trajectory(self) -> Trajectory:
@@ -426,8 +427,9 @@ class Slam:
         if not same_camera(start.camera, self.camera):
             raise ValueError("made with another camera")
         self._detector.restore(start.detector)
-        if self._closing.images is not None and start.images is not None:
-            self._closing.images.restore(start.images, self.camera.width)
+        images = self._closing.verifier.images
+        if images is not None and start.images is not None:
+            images.restore(start.images, self.camera.width)
         self._closing.closed = list(start.loops)
         self._drives, self.world = start.drives, start.world
         if not start.map.n_keyframes:
@@ -594,7 +596,7 @@ class Slam:
 
     def _relocalise_learned(self, frame: Frame, candidates: list[LoopCandidate]) -> int:
         """By local descriptors of the network: where the light has changed ORB's find nothing."""
-        images, config = self._closing.images, self.config.learned
+        images, config = self._closing.verifier.images, self.config.learned
         image = frame.image
         if images is None or image is None:
             return 0

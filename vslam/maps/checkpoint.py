@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from vslam.features import PATCH_PIXELS, Features, KeyframePatches
 from vslam.geometry import Matrix
-from vslam.loops import ClosingMemory, ResembledPlace, loop_entry, loop_of
+from vslam.loops import (
+    ClosingState,
+    ConsistencyState,
+    ResembledPlace,
+    VerifierState,
+    loop_entry,
+    loop_of,
+)
 
 # N features of the last frame tracked; M keyframes with patches, R rows in all.
 ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
@@ -63,7 +70,7 @@ class Checkpoint:
     n_tracked: int
     gained_close: float
     gain_awaited: bool
-    closing: ClosingMemory
+    closing: ClosingState
     patches: tuple[KeyframePatches, ...]
     side_delay: tuple[float, ...] = ()
 
@@ -84,15 +91,17 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
 
 def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
     """All else of a checkpoint, for JSON, which keeps every bit of a number."""
-    closing = checkpoint.closing
+    consistency, closing = checkpoint.closing.consistency, checkpoint.closing
     return {name: getattr(checkpoint, name) for name in _NUMBERS} | {
         "T_cw": checkpoint.T_cw.tolist(),
         "velocity": None if checkpoint.velocity is None else checkpoint.velocity.tolist(),
         "side_delay": list(checkpoint.side_delay),
         "closing": {
-            **asdict(closing),
-            "places": [[sorted(one.keyframes), one.length, one.age] for one in closing.places],
-            "verified": [[turn, loop_entry(edge)] for turn, edge in closing.verified],
+            "places": [[sorted(one.keyframes), one.length, one.age] for one in consistency.places],
+            "verified": [[turn, loop_entry(edge)] for turn, edge in consistency.verified],
+            "turn": consistency.turn,
+            **asdict(closing.verifier),
+            "followed": closing.followed,
         },
     }
 
@@ -172,21 +181,19 @@ def _patches_of(
     return tuple(map(KeyframePatches, keyframes.tolist(), *parts)) if len(last) else ()
 
 
-def _closing_of(entry: dict[str, Any], n_keyframes: int) -> ClosingMemory:
+def _closing_of(entry: dict[str, Any], n_keyframes: int) -> ClosingState:
     verified = tuple((int(turn), loop_of(edge)) for turn, edge in entry["verified"])
     for _, edge in verified:
         T = edge.T_query_match
         known = min(edge.query, edge.match) >= 0 and max(edge.query, edge.match) < n_keyframes
         if not known or T is None or not np.isfinite(T).all() or not edge.scale > 0:
             raise ValueError("a loop that waits is out of range")
-    return ClosingMemory(
-        places=tuple(
-            ResembledPlace(frozenset(map(int, keyframes)), int(length), int(age))
-            for keyframes, length, age in entry["places"]
-        ),
-        verified=verified,
-        turn=int(entry["turn"]),
-        resting_until=int(entry["resting_until"]),
-        in_vain=float(entry["in_vain"]),
-        followed=int(entry["followed"]),
+    places = tuple(
+        ResembledPlace(frozenset(map(int, keyframes)), int(length), int(age))
+        for keyframes, length, age in entry["places"]
+    )
+    return ClosingState(
+        ConsistencyState(places, verified, int(entry["turn"])),
+        VerifierState(int(entry["resting_until"]), float(entry["in_vain"])),
+        int(entry["followed"]),
     )

@@ -346,15 +346,28 @@ def test_a_global_adjustment_that_fails_leaves_the_map_as_it_was(monkeypatch, ca
     assert len(caplog.records) == 1
 
 
-def test_what_loop_closing_remembers_comes_back():
-    """A loop waits for a second keyframe; loop closing that is restored closes it there."""
-    slam, _ = run(ZOOMING, ENDS_EARLY, Oracle(ZOOMING, ENDS_EARLY), finish=False)
-    state = slam._closing.state()
-    assert state.consistency.verified
-    other = LoopClosing(NoDetector(), Accepting(None), CAMERA, Config(), threads=1)
-    assert other.state() != state
-    other.restore(state)
-    assert other.state() == state
+def test_loop_closing_restored_from_its_state_closes_the_loop_that_waits():
+    """A loop that one keyframe verifies waits for the next one."""
+    ring, frames = EXACT, [*ROUND[:80], *ROUND[140:]]
+    map_ = copy.deepcopy(open_loop("carried")[0])
+    oracle, last = Oracle(ring, frames), map_.n_keyframes - 1
+    config = Config(consistency=ConsistencyConfig(min_keyframes=1, min_verified=2))
+
+    def create():
+        return LoopClosing(NoDetector(), OrbVerifier(config, CAMERA), CAMERA, config, threads=1)
+
+    stopped, restored, fresh = create(), create(), create()
+    stopped.follow(last - 1)
+    stopped.consider(map_, last - 1, oracle.query(last - 1, map_))
+    assert stopped.edges[-1].reason == "verified by 1 of 2 keyframes"
+    assert fresh.state() != stopped.state()
+    restored.restore(stopped.state())
+    assert restored.state() == stopped.state()
+    candidates = oracle.query(last, map_)
+    for closing in (fresh, restored):
+        closing.consider(map_, last, candidates)
+    assert not fresh.corrections
+    assert len(restored.corrections) == 1
 
 
 def test_where_no_speed_was_known_a_restart_is_unpredicted():

@@ -29,6 +29,7 @@ class Frame:
         disparity_offset: pixels that the disparities of the features were corrected by.
         shift: ``(N, 2)`` float32, pixels from each feature to where its match was aligned, NaN for
             those that were not; None if none was.
+        twist: ``(6,)`` speed of the camera when the frame was tracked, per second; None if unknown.
     """
 
     index: int
@@ -41,6 +42,7 @@ class Frame:
     xyz: NDArray[np.float64]
     disparity_offset: float = 0.0
     shift: NDArray[np.float32] | None = None
+    twist: Matrix | None = None
 
     @classmethod
     def untracked(
@@ -63,6 +65,15 @@ class Frame:
             landmark=np.full(n, -1, np.int32),
             xyz=np.full((n, 3), np.nan),
         )
+
+    def snapshot(self) -> Frame:
+        """A copy that keeps what the frame tracks now."""
+        return replace(self, landmark=self.landmark.copy(), xyz=self.xyz.copy())
+
+    def restore(self, snapshot: Frame) -> None:
+        """Track again what the frame tracked when the snapshot was taken."""
+        self.T_cw, self.shift = snapshot.T_cw, snapshot.shift
+        self.landmark, self.xyz = snapshot.landmark, snapshot.xyz
 
     def correct_disparities(self, offset: float) -> None:
         """Correct the features by the whole offset of the pair (``Map.disparity_offset``)."""

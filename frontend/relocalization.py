@@ -8,7 +8,7 @@ from vslam.frontend.frame import Frame
 from vslam.frontend.matching import count_elsewhere, search_all
 from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.tracking import TrackingContext, observations, refine, track_local_map
-from vslam.map import LocalMap
+from vslam.map_view import LocalMap
 
 
 def relocalise(

@@ -32,7 +32,7 @@ from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import match_stereo
 from vslam.frontend.weak_images import extract_in_any_light
 from vslam.geometry import compose, inverse, transform
-from vslam.map import LocalMap
+from vslam.map_view import LocalMap
 from vslam.reprojection import stack_uvr
 
 NEVER = np.iinfo(np.int64).max

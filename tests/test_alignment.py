@@ -22,7 +22,7 @@ from vslam.frontend.tracking import TrackingContext, refine
 from vslam.geometry import inverse, se3_exp, transform
 from vslam.map import Map
 from vslam.map_kernels import link_many, unlink
-from vslam.mapping import MappingThread
+from vslam.mapping import Mapper
 
 CONFIG = Config().alignment
 NO_SHIFT = np.zeros((1, 2), np.float32)
@@ -344,15 +344,17 @@ def test_a_pose_follows_aligned_matches():
 
 
 def test_the_map_knows_how_sure_each_observation_is(two_keyframes):
-    frame, map_, recent = two_keyframes
+    frame, mapper = two_keyframes
+    known = mapper.view.patches
+    pixels, shift = known.pixels[known.where], known.shift[known.where]
+    map_ = mapper.complete()
     sure = Config().alignment.certainty
     # Tracked and aligned; tracked only; the first to see its landmark.
     assert map_.arrays.certainty[map_.rows(1)].tolist() == [sure, 1, sure]
     assert map_.arrays.xy[map_.rows(1)][0].tolist() == [100.5, 49.75]
-    known, pixels, shift = patches_of(map_, np.sort(frame.landmark), recent.all())
     assert np.array_equal(pixels[0], IMAGE[42:59, 92:109].ravel())
     assert shift[known.ids == frame.landmark[0]].tolist() == [[0.5, -0.25]]
-    assert shift[known.ids != frame.landmark[0]].tolist() == [[0.0, 0.0]] * 2
+    assert shift[np.isin(known.ids, frame.landmark[1:])].tolist() == [[0.0, 0.0]] * 2
 
 
 @pytest.fixture
@@ -364,14 +366,15 @@ def two_keyframes():
 
     config = Config()
     closing = LoopClosing(NoDetector(), verifier_for(config, CAMERA), CAMERA, config, threads=1)
-    mapping = MappingThread(CONTEXT.scales, CAMERA, config, closing, threads=1)
+    mapper = Mapper(CONTEXT.scales, CAMERA, config, closing, executor=None)
     frames = []
     for index in range(2):
         frame = Frame.untracked(features_at(100, 50, 0, 3), CAMERA, index, 0.1 * index)
         frames.append(frame)
-    mapping.insert(frames[0])
+        mapper.place(frame, tracked=True)
+    mapper.insert(frames[0])
     frames[1].landmark = frames[0].landmark.copy()
     frames[1].landmark[2] = -1
     frames[1].shift = np.array([[0.5, -0.25], [np.nan] * 2, [np.nan] * 2], np.float32)
-    mapping.insert(frames[1])
-    return frames[1], mapping._map, mapping.recent
+    mapper.insert(frames[1])
+    return frames[1], mapper

@@ -13,7 +13,7 @@ from vslam.frontend.frame import Frame
 from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp, se3_log
-from vslam.map import local_map
+from vslam.map_view import local_map
 
 CONTEXT = TrackingContext.create(CAMERA, Config())
 KEYFRAMES = 4

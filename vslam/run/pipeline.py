@@ -77,7 +77,6 @@ def run_sequence(
     others = [] if resume is not None else _compared(sequence.camera, settings)
     recorder.begin(sequence.camera, ground_truth_of(sequence))
     main = _Run(slam, settings, Progress() if resume is None else resume.progress)
-    slam.on_merge = lambda: autosave.offer_amid(slam, main.so_far)
     n_told = 0  # loops that the recorder knows of
     broken: list[str] = []
     with _stop_on_interrupt() as interrupted:

@@ -65,8 +65,9 @@ from vslam.loopclosure.verifier import verifier_for
 from vslam.loopclosure.vocabulary import Vocabulary, from_children
 from vslam.loops import LoopCandidate, LoopEdge
 from vslam.machine import available_cores
-from vslam.map import Map, local_map
-from vslam.mapping import MappingThread
+from vslam.map import Map
+from vslam.map_view import local_map
+from vslam.mapping import Mapper
 from vslam.slam import Slam
 
 WIDTH, HEIGHT, DISPARITY, STEP, FRAMES = 480, 240, 12, 6, 6
@@ -213,7 +214,7 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
     verifier = verifier_for(config, CAMERA)
     closing = LoopClosing(NoDetector(), verifier, CAMERA, config, threads=1)
-    mapping = MappingThread(scale_factors(config.orb), CAMERA, config, closing, threads=1)
+    mapper = Mapper(scale_factors(config.orb), CAMERA, config, closing, executor=None)
     rng = np.random.default_rng(0)
     n = 400
     points = rng.uniform([-5.0, -4.0, 9.0], [9.0, 4.0, 12.0], (n, 3))
@@ -233,11 +234,12 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
         )
         frame = Frame.untracked(features, CAMERA, k, 0.1 * k)
         frame.T_cw, frame.landmark = T_cw, landmark
-        mapping.insert(frame)
-        mapping.merge()
-        mapping.update(frame)
+        mapper.hold(frame)
+        mapper.place(frame, tracked=True)
+        mapper.insert(frame)
+        mapper.merge()
         landmark = frame.landmark
-    return mapping.map, features
+    return mapper.map, features
 
 
 def compile_recognition() -> None:

@@ -1,0 +1,100 @@
+"""What passes between a frame and the map: observations, landmarks, places.
+
+Free functions; whoever calls them is the one who may read, or write, the map at that moment.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.frontend.frame import Frame
+from vslam.map import Map
+from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
+
+
+def add_frame(
+    map_: Map, frame: Frame, certainty: NDArray[np.uint8] | int, reference: int, *, predicted: bool
+) -> int:
+    """Add a frame to the map as a keyframe that observes the landmarks it tracks.
+
+    A frame that tracks no landmark of another keyframe begins a sub-map.
+
+    Args:
+        certainty: ``(N,)`` of its features (``Arrays.certainty``).
+        reference: the parent of such a sub-map's first keyframe.
+        predicted: whether the pose of such a keyframe is at least a prediction.
+
+    Returns:
+        The keyframe.
+    """
+    keyframe = map_.add_keyframe(
+        frame.observed(), frame.T_cw, frame.timestamp, frame.index, certainty
+    )
+    tracked = np.flatnonzero(frame.landmark >= 0)
+    link_many(map_.arrays, map_.rows(keyframe).start + tracked, frame.landmark[tracked])
+    if keyframe > 0:
+        neighbours, _ = map_.covisible(keyframe)
+        if len(neighbours):
+            map_.parents[keyframe] = int(neighbours[0])
+        else:
+            map_.begin_submap(keyframe, reference, predicted=predicted)
+    return keyframe
+
+
+def observe_keyframe(frame: Frame, map_: Map, keyframe: int) -> None:
+    """Let a frame track all landmarks that the keyframe it became observes."""
+    frame.landmark = map_.arrays.landmark[map_.rows(keyframe)]
+    update_landmarks(frame, map_)
+
+
+def update_landmarks(frame: Frame, map_: Map) -> None:
+    """Bring the landmarks of a frame up to date: those that were merged into others are replaced,
+    those that are gone become -1, and ``frame.xyz`` is where they are now.
+
+    Two landmarks may have become one: the first feature keeps it.
+    """
+    arrays = map_.arrays
+    frame.correct_disparities(map_.disparity_offset)
+    ids = resolve(arrays, frame.landmark)
+    _, first = np.unique(ids, return_index=True)
+    repeated = np.ones(len(ids), np.bool_)
+    repeated[first] = False
+    ids[repeated] = -1
+    frame.landmark = ids
+    frame.xyz = np.where((ids >= 0)[:, None], arrays.xyz[ids], np.nan)
+
+
+def count_shared_landmarks(map_: Map, frame: Frame) -> NDArray[np.int64]:
+    """``(n_keyframes,)`` how many of the landmarks that a frame tracks each keyframe observes."""
+    a, n = map_.arrays, map_.n_keyframes
+    _, rows = gather_observations(a, frame.landmark[frame.landmark >= 0], np.arange(n))
+    return np.bincount(a.keyframe[rows], minlength=n)
+
+
+class OldPlace(NamedTuple):
+    """A place that was mapped some time ago, or on an earlier drive.
+
+    Attributes:
+        keyframe: that shares the most landmarks with a frame.
+        n_shared: how many it shares.
+        n_place: how many of the keyframe's landmarks at least three keyframes observe.
+    """
+
+    keyframe: int
+    n_shared: int
+    n_place: int
+
+
+def find_old_place(map_: Map, frame: Frame, known_after_s: float) -> OldPlace | None:
+    """The place that shares the most landmarks with a frame, among the keyframes that are at least
+    ``known_after_s`` seconds old; None if none shares any."""
+    young = np.array(map_.sessions) == map_.session
+    young &= np.array(map_.timestamps) > frame.timestamp - known_after_s
+    shared = np.where(young, 0, count_shared_landmarks(map_, frame))
+    best = int(np.argmax(shared))
+    if shared[best] == 0:
+        return None
+    return OldPlace(best, int(shared[best]), count_seen_by(map_.arrays, best, 3))

@@ -20,10 +20,12 @@ from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Found, Tracker, result_of
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverses
+from vslam.hypotheses import joined_submaps
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_relocalization import LearnedRelocalisation
 from vslam.loopclosure.registry import DEFAULT_DETECTOR, detector_with_images
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
+from vslam.loopclosure.verifier import verifier_for
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.machine import StageClock
 from vslam.map import Map
@@ -94,7 +96,8 @@ class Slam:
         self.context = context = TrackingContext.create(camera, config)
         self.detector = detector
         self.rig = RigCalibration(camera, config.stereo, context.scales)
-        self._closing = LoopClosing(detector, camera, config, threads=threads, images=images)
+        verifier = verifier_for(config, camera, images)
+        self._closing = LoopClosing(detector, verifier, camera, config, threads=threads)
         begin = open_map(start, context, self._closing, localize=localize, resume=resume)
         executor = mapping_executor(threads)
         self._mapper = Mapper(context, self._closing, self.rig, executor, begin.map, begin.frames)
@@ -317,7 +320,7 @@ class Slam:
         frames, map_ = self._mapper.frames.table(), self.map
         if not map_.n_keyframes:
             return frames.tracked
-        part = self._closing.joined_submaps(map_)
+        part = joined_submaps(map_, self._closing.closed)
         return frames.tracked & (part[frames.reference] == part[0])
 
     def keyframe_trajectory(self) -> Trajectory:

@@ -364,9 +364,10 @@ def two_keyframes():
     """A second keyframe that tracks two landmarks of the first."""
     from vslam.closing import LoopClosing
     from vslam.loopclosure.detector import NoDetector
+    from vslam.loopclosure.verifier import verifier_for
 
     config = Config()
-    closing = LoopClosing(NoDetector(), CAMERA, config, threads=1)
+    closing = LoopClosing(NoDetector(), verifier_for(config, CAMERA), CAMERA, config, threads=1)
     rig = RigCalibration(CAMERA, config.stereo, CONTEXT.scales)
     mapper = Mapper(CONTEXT, closing, rig, None)
     frames = []

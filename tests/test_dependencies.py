@@ -39,6 +39,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.map", "vslam.frame_poses", "vslam.states"),
     ("vslam.map_view", "vslam.shared_map"),
     ("vslam.frontend", "vslam.backend", "vslam.loopclosure", "vslam.datasets", "vslam.maps"),
+    ("vslam.hypotheses",),
     ("vslam.starter", "vslam.closing"),
     ("vslam.map_frames",),
     ("vslam.mapping", "vslam.merging"),

@@ -66,7 +66,9 @@ def test_the_first_landmarks_make_the_unit():
     slam, results = run(ROUND[:6])
     second = next(r.index for r in results if r.is_keyframe)
     depth = slam.map.arrays.xyz[slam.map.landmarks_of(0), 2]
-    assert np.median(depth) == pytest.approx(slam.config.initialization.median_depth, rel=0.2)
+    assert np.median(depth) == pytest.approx(
+        slam.context.config.initialization.median_depth, rel=0.2
+    )
     assert second >= 1
 
 

@@ -211,7 +211,7 @@ def _write_video(folder: Path) -> None:
 
 def _write_map(folder: Path) -> None:
     from vslam.features import PATCH_PIXELS, Features, KeyframePatches
-    from vslam.loops import ClosingMemory, LoopEdge, ResembledPlace
+    from vslam.loops import ClosingState, ConsistencyState, LoopEdge, ResembledPlace
     from vslam.map import Map
     from vslam.map_kernels import link_many, merge_landmarks, refresh_landmarks
     from vslam.maps.storage import save_map
@@ -247,7 +247,7 @@ def _write_map(folder: Path) -> None:
         TrackerState(2, 0.2, features, ids.astype(np.int32), np.eye(4), np.zeros(6), 0, n),
         MapperState(2, 2, 0.2, (patches,)),
         PolicyState(100.0, False),
-        ClosingMemory((ResembledPlace(frozenset((0,)), 1),), ((3, waits),), 3),
+        ClosingState(ConsistencyState((ResembledPlace(frozenset((0,)), 1),), ((3, waits),), 3)),
     )
     stored = StoredMap(map_, _camera(), checkpoint=checkpoint)
     save_map(folder / "map.npz", stored, resumable=True)

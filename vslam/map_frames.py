@@ -5,16 +5,22 @@ Free functions; whoever calls them is the one who may read, or write, the map at
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.two_views import map_two_views
+from vslam.frame_poses import FrameTable
 from vslam.frontend.frame import Frame
+from vslam.geometry import inverses
+from vslam.hypotheses import joined_submaps
+from vslam.loops import LoopEdge
 from vslam.map import Map
 from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
 from vslam.starter import TwoViewStart
+from vslam.trajectory import Trajectory
 
 
 def add_frame(
@@ -132,3 +138,23 @@ def find_old_place(map_: Map, frame: Frame, known_after_s: float) -> OldPlace | 
     if shared[best] == 0:
         return None
     return OldPlace(best, int(shared[best]), count_seen_by(map_.arrays, best, 3))
+
+
+def keyframe_trajectory(map_: Map) -> Trajectory:
+    """Pose of every keyframe of the last drive that was not culled."""
+    living = map_.living_keyframes()
+    living = living[np.array(map_.sessions, np.int64)[living] == map_.session]
+    times = np.array([map_.timestamps[k] for k in living], np.float64)
+    return Trajectory(times, inverses(map_.arrays.T_cw[living]))
+
+
+def in_first_part(map_: Map, closed: Sequence[LoopEdge], frames: FrameTable) -> NDArray[np.bool_]:
+    """``(N,)`` frames tracked in the part of the map that holds its first keyframe.
+
+    Args:
+        closed: loops; sub-maps that they join are one part.
+    """
+    if not map_.n_keyframes:
+        return frames.tracked
+    part = joined_submaps(map_, closed)
+    return frames.tracked & (part[frames.reference] == part[0])

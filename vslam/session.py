@@ -61,7 +61,7 @@ def open_map(
         raise ValueError("there is no map to localise in")
     if stored is None:
         return Start()
-    map_, images = stored.map, closing.images
+    map_, images = stored.map, closing.verifier.images
     if not np.array_equal(map_.scales, context.scales):
         raise ValueError(
             f"made with another pyramid, of {len(map_.scales)} levels by "
@@ -99,7 +99,7 @@ class Session:
         Args:
             drive: what the images since the start were.
         """
-        map_, images, start = self.mapper.complete(), self.closing.images, self.start
+        map_, images, start = self.mapper.complete(), self.closing.verifier.images, self.start
         return StoredMap(
             map=map_,
             camera=self.context.camera,
@@ -125,7 +125,7 @@ class Session:
             tracker,
             self.mapper.state(),
             policy,
-            self.closing.memory(),
+            self.closing.state(),
             self.rig.state().numbers(),
         )
 

@@ -19,14 +19,15 @@ from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Found, Tracker, result_of
 from vslam.frontend.tracking import TrackingContext
-from vslam.geometry import inverses
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_relocalization import LearnedRelocalisation
 from vslam.loopclosure.registry import DEFAULT_DETECTOR, detector_with_images
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
+from vslam.loopclosure.verifier import verifier_for
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.machine import StageClock
 from vslam.map import Map
+from vslam.map_frames import in_first_part, keyframe_trajectory
 from vslam.mapping import Mapper
 from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, World
@@ -93,25 +94,17 @@ class Slam:
             detector, images = detector_with_images(detector, config)
         self.context = context = TrackingContext.create(camera, config)
         self.detector = detector
-        self.rig = RigCalibration(camera, config.stereo, context.scales)
-        self._closing = LoopClosing(detector, camera, config, threads=threads, images=images)
-        begin = open_map(start, context, self._closing, localize=localize, resume=resume)
+        self.rig = rig = RigCalibration(camera, config.stereo, context.scales)
+        verifier = verifier_for(config, camera, images)
+        self._closing = closing = LoopClosing(detector, verifier, camera, config, threads=threads)
+        begin = open_map(start, context, closing, localize=localize, resume=resume)
         executor = mapping_executor(threads)
-        self._mapper = Mapper(context, self._closing, self.rig, executor, begin.map, begin.frames)
-        self._tracker = Tracker(context)
+        self._mapper = mapper = Mapper(context, closing, rig, executor, begin.map, begin.frames)
+        self._tracker = tracker = Tracker(context)
         recognise = LearnedRelocalisation(images, camera, config)
         self._relocaliser = Relocaliser(context, detector.locate, recognise)
-        building = MapBuilding(context, self._mapper, self._tracker)
-        self._mode = Localising(self._mapper) if localize else building
-        self._session = Session(
-            context,
-            self._closing,
-            self._mapper,
-            self._tracker,
-            self.rig,
-            self._mode,
-            begin,
-        )
+        self._mode = Localising(mapper) if localize else MapBuilding(context, mapper, tracker)
+        self._session = Session(context, closing, mapper, tracker, rig, self._mode, begin)
         self._session.resume()
 
     @classmethod
@@ -300,34 +293,14 @@ class Slam:
 
     def trajectory(self) -> Trajectory:
         """Pose of every frame as the map is now, lost frames included: where the camera was lost,
-        its motion is interpolated between the frames tracked before and after.
-
-        Raises:
-            RuntimeError: as ``map``.
-        """
+        its motion is interpolated between the frames tracked before and after."""
         return self._mapper.trajectory()
+
+    def keyframe_trajectory(self) -> Trajectory:
+        """Pose of every keyframe of this drive that was not culled."""
+        return keyframe_trajectory(self.map)
 
     def in_map(self) -> NDArray[np.bool_]:
         """``(N,)`` frames tracked in the part of the map that holds its first keyframe, sub-maps
-        joined to it by loops included.
-
-        Raises:
-            RuntimeError: as ``map``.
-        """
-        frames, map_ = self._mapper.frames.table(), self.map
-        if not map_.n_keyframes:
-            return frames.tracked
-        part = self._closing.joined_submaps(map_)
-        return frames.tracked & (part[frames.reference] == part[0])
-
-    def keyframe_trajectory(self) -> Trajectory:
-        """Pose of every keyframe of this drive that was not culled.
-
-        Raises:
-            RuntimeError: as ``map``.
-        """
-        map_ = self.map
-        living = map_.living_keyframes()
-        living = living[np.array(map_.sessions, np.int64)[living] == map_.session]
-        times = np.array([map_.timestamps[k] for k in living], np.float64)
-        return Trajectory(times, inverses(map_.arrays.T_cw[living]))
+        joined to it by loops included."""
+        return in_first_part(self.map, self._closing.closed, self._mapper.frames.table())

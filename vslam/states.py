@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vslam.features import Features, KeyframePatches
 from vslam.geometry import Matrix
-from vslam.loops import ClosingMemory
+from vslam.loops import ClosingState
 
 
 @dataclass(frozen=True)
@@ -80,5 +80,5 @@ class Checkpoint:
     tracker: TrackerState
     mapper: MapperState
     policy: PolicyState
-    closing: ClosingMemory
+    closing: ClosingState
     rig: tuple[float, ...] = ()

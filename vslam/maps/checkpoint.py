@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.features import PATCH_PIXELS, Features, KeyframePatches
-from vslam.loops import ClosingMemory, ResembledPlace, loop_entry, loop_of
+from vslam.loops import (
+    ClosingState,
+    ConsistencyState,
+    ResembledPlace,
+    VerifierState,
+    loop_entry,
+    loop_of,
+)
 from vslam.states import Checkpoint, MapperState, PolicyState, TrackerState
 
 # N features of the last frame tracked; M keyframes with patches, R rows in all.
@@ -45,6 +52,7 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
 def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
     """All else of a checkpoint, for JSON, which keeps every bit of a number."""
     tracker, closing = checkpoint.tracker, checkpoint.closing
+    consistency = closing.consistency
     return {
         "tracker": {name: getattr(tracker, name) for name in _OF_TRACKER}
         | {
@@ -55,9 +63,11 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
         "policy": asdict(checkpoint.policy),
         "rig": list(checkpoint.rig),
         "closing": {
-            **asdict(closing),
-            "places": [[sorted(one.keyframes), one.length, one.age] for one in closing.places],
-            "verified": [[turn, loop_entry(edge)] for turn, edge in closing.verified],
+            "places": [[sorted(one.keyframes), one.length, one.age] for one in consistency.places],
+            "verified": [[turn, loop_entry(edge)] for turn, edge in consistency.verified],
+            "turn": consistency.turn,
+            **asdict(closing.verifier),
+            "followed": closing.followed,
         },
     }
 
@@ -129,21 +139,19 @@ def _patches_of(
     return tuple(map(KeyframePatches, keyframes.tolist(), *parts)) if len(last) else ()
 
 
-def _closing_of(entry: dict[str, Any], n_keyframes: int) -> ClosingMemory:
+def _closing_of(entry: dict[str, Any], n_keyframes: int) -> ClosingState:
     verified = tuple((int(turn), loop_of(edge)) for turn, edge in entry["verified"])
     for _, edge in verified:
         T = edge.T_query_match
         known = min(edge.query, edge.match) >= 0 and max(edge.query, edge.match) < n_keyframes
         if not known or T is None or not np.isfinite(T).all() or not edge.scale > 0:
             raise ValueError("a loop that waits is out of range")
-    return ClosingMemory(
-        places=tuple(
-            ResembledPlace(frozenset(map(int, keyframes)), int(length), int(age))
-            for keyframes, length, age in entry["places"]
-        ),
-        verified=verified,
-        turn=int(entry["turn"]),
-        resting_until=int(entry["resting_until"]),
-        in_vain=float(entry["in_vain"]),
-        followed=int(entry["followed"]),
+    places = tuple(
+        ResembledPlace(frozenset(map(int, keyframes)), int(length), int(age))
+        for keyframes, length, age in entry["places"]
+    )
+    return ClosingState(
+        ConsistencyState(places, verified, int(entry["turn"])),
+        VerifierState(int(entry["resting_until"]), float(entry["in_vain"])),
+        int(entry["followed"]),
     )

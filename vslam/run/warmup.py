@@ -61,6 +61,7 @@ from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.detector import NoDetector
 from vslam.loopclosure.local_matching import DescriptorMaps, locate, locate_near, match_coarse
 from vslam.loopclosure.verification import verify
+from vslam.loopclosure.verifier import verifier_for
 from vslam.loopclosure.vocabulary import Vocabulary, from_children
 from vslam.loops import LoopCandidate, LoopEdge
 from vslam.machine import available_cores
@@ -211,7 +212,8 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     insertion culls one.
     """
     config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
-    closing = LoopClosing(NoDetector(), CAMERA, config, threads=1)
+    verifier = verifier_for(config, CAMERA)
+    closing = LoopClosing(NoDetector(), verifier, CAMERA, config, threads=1)
     context = TrackingContext.create(CAMERA, config)
     rig = RigCalibration(CAMERA, config.stereo, context.scales)
     mapper = Mapper(context, closing, rig, None)

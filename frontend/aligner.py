@@ -30,13 +30,13 @@ class Aligner:
             scales: ``(levels,)`` full-resolution pixels for a pixel of each octave.
         """
         features = frame.features
-        if features.pyramid is None:
+        if frame.pyramid is None:
             return
         shift = np.zeros((len(features), 2), np.float32)
         if frame.shift is not None:
             aligned = frame.aligned
             shift[aligned] = frame.shift[aligned] / scales[features.octave[aligned]][:, None]
-        pixels = patches_around(features.pyramid, features.xy, features.octave)
+        pixels = patches_around(frame.pyramid, features.xy, features.octave)
         self._recent.add(KeyframePatches(keyframe, pixels, shift))
 
     def certainty(self, frame: Frame) -> NDArray[np.uint8] | int:
@@ -46,7 +46,7 @@ class Aligner:
         A landmark that is new with this frame is defined by where the frame saw it, so that this
         position has no error; a match that was not aligned is half a pixel off.
         """
-        if frame.features.pyramid is None:
+        if frame.pyramid is None:
             return 1
         unaligned = (frame.landmark >= 0) & ~frame.aligned
         return np.where(unaligned, 1, self._config.certainty).astype(np.uint8)

@@ -10,6 +10,7 @@ from vslam.config import KeyframeConfig
 from vslam.frontend.frame import Frame
 from vslam.frontend.tracking import TrackingContext, feature_depth
 from vslam.map_view import MapView
+from vslam.states import PolicyState
 
 
 @dataclass(frozen=True)
@@ -79,14 +80,6 @@ def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig)
     urgent = tracked < max(config.monocular_urgent_ratio * reference, config.monocular_min_tracked)
     late = evidence.seconds_since_keyframe >= config.max_interval_s
     return evidence.mapping_idle or urgent or late
-
-
-@dataclass(frozen=True)
-class CloseGainState:
-    """What ``CloseGain`` remembers."""
-
-    mean: float
-    awaited: bool
 
 
 class CloseGain:
@@ -188,10 +181,10 @@ class KeyframePolicy:
         """Expect the first frame after a keyframe."""
         self._gain.begin()
 
-    def state(self) -> CloseGainState:
+    def state(self) -> PolicyState:
         """What is remembered of earlier keyframes."""
-        return CloseGainState(self._gain.mean, self._gain.awaited)
+        return PolicyState(self._gain.mean, self._gain.awaited)
 
-    def restore(self, state: CloseGainState) -> None:
+    def restore(self, state: PolicyState) -> None:
         """Remember what ``state`` gave."""
-        self._gain.mean, self._gain.awaited = state.mean, state.awaited
+        self._gain.mean, self._gain.awaited = state.gained_close, state.gain_awaited

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Image
-from vslam.features import Features
+from vslam.features import Features, TrackingState
 from vslam.frontend.frame import Frame
 from vslam.frontend.relocalization import relocalise
+from vslam.frontend.tracker import Found, judge
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix
 from vslam.loops import LoopCandidate
@@ -43,6 +44,19 @@ class Recognise(Protocol):
     ) -> Sighting | None: ...
 
 
+class MapOwner(Protocol):
+    """Gives the map when it may be read."""
+
+    @property
+    def is_merged(self) -> bool:
+        """Whether tracking sees all that was mapped."""
+        ...
+
+    def merge(self) -> Map:
+        """Wait for the keyframe that is being mapped, show it to tracking, and return the map."""
+        ...
+
+
 class Relocaliser:
     """Looks for a frame at the places that resemble it."""
 
@@ -56,36 +70,42 @@ class Relocaliser:
         self._locate = locate
         self._recognise = recognise
 
-    def find(self, frame: Frame, map_: Map) -> tuple[int, int]:
-        """Look for a frame in the whole map.
-
-        Returns:
-            Inliers, and the keyframe near which it was found; the frame has its pose and landmarks.
-            0 and -1 if it was found nowhere; the frame is left as it may be.
+    def check(self, frame: Frame, found: Found, owner: MapOwner) -> Found:
+        """Look for a lost frame in the whole map, unless a keyframe is being mapped, and for a
+        doubtful one in any case: it stays as it is unless there are clearly more inliers elsewhere.
         """
+        if found.is_lost:
+            return self._find(frame, owner.merge()) if owner.is_merged else found
+        if not found.is_doubtful:
+            return found
+        map_ = owner.merge()  # worth waiting for: a doubtful frame asks for a keyframe
+        before = frame.snapshot()
+        elsewhere = self._find(frame, map_)
+        if elsewhere.n_inliers > self._context.config.relocalization.better * found.n_inliers:
+            return elsewhere
+        frame.restore(before)
+        return found
+
+    def _find(self, frame: Frame, map_: Map) -> Found:
+        """Look for a frame in the whole map, first by ORB descriptors."""
         config = self._context.config.relocalization
         candidates = self._locate(frame.image, frame.features, map_)
         for candidate in candidates[: config.max_candidates]:
             place = local_map(map_, candidate.match, 1)
             around = local_map(map_, candidate.match, config.neighbours)
-            inliers = relocalise(frame, place, around, self._context, seed=candidate.match)
-            if inliers:
-                return inliers, candidate.match
-        found = self._recognise(map_, frame.image, frame.features, candidates)
-        if found is None:
-            return 0, -1
-        frame.T_cw = found.T_cw
-        frame.landmark[found.feature] = found.landmark
+            n_inliers = relocalise(frame, place, around, self._context, seed=candidate.match)
+            if n_inliers:
+                return self._found(n_inliers, candidate.match)
+        sighting = self._recognise(map_, frame.image, frame.features, candidates)
+        if sighting is None:
+            return Found(TrackingState.LOST)
+        frame.set_camera_pose(sighting.T_cw)
+        frame.landmark[sighting.feature] = sighting.landmark
         frame.shift = None
-        frame.xyz[found.feature] = map_.arrays.xyz[found.landmark]
-        return len(found.feature), found.keyframe
+        frame.xyz[sighting.feature] = map_.arrays.xyz[sighting.landmark]
+        return self._found(len(sighting.feature), sighting.keyframe)
 
-    def find_better(self, frame: Frame, map_: Map, n_inliers: int) -> tuple[int, int]:
-        """Look for a frame that was tracked with so few inliers that it may be elsewhere. It stays
-        as it is, and 0 and -1 are returned, unless there are clearly more inliers there."""
-        before = frame.snapshot()
-        inliers, keyframe = self.find(frame, map_)
-        if inliers > self._context.config.relocalization.better * n_inliers:
-            return inliers, keyframe
-        frame.restore(before)
-        return 0, -1
+    def _found(self, n_inliers: int, keyframe: int) -> Found:
+        state = judge(n_inliers, n_inliers, self._context)
+        lost = state == TrackingState.LOST
+        return Found(state, n_inliers, n_inliers, keyframe=-1 if lost else keyframe)

@@ -8,7 +8,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import TrackingState
+from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frame_poses import FramePoses
 from vslam.frontend.frame import Frame
 from vslam.frontend.tracking import (
@@ -19,9 +19,10 @@ from vslam.frontend.tracking import (
 )
 from vslam.geometry import Matrix, inverse, orthonormalised, se3_exp, se3_log
 from vslam.map_view import MapView
+from vslam.states import TrackerState
 
 
-class TrackerState(Enum):
+class TrackerStatus(Enum):
     """What the tracker has to go on."""
 
     UNKNOWN = "unknown"
@@ -35,21 +36,6 @@ class TrackerState(Enum):
 
 
 @dataclass(frozen=True)
-class TrackerMemory:
-    """What the tracker remembers between two frames.
-
-    Attributes:
-        last: the frame that was tracked last.
-        lost_frames: lost since then.
-        n_tracked: landmarks that it tracked at the time.
-    """
-
-    last: Frame
-    lost_frames: int
-    n_tracked: int
-
-
-@dataclass(frozen=True)
 class Found:
     """Where a frame was found, which holds its pose and its landmarks.
 
@@ -58,6 +44,7 @@ class Found:
         n_matches, n_inliers: of landmarks, before and after the last pose optimisation.
         visible: ``(N,)`` int32, the landmarks that the frame should see.
         keyframe: where it was found by searching the whole map; -1 if it was tracked.
+        is_doubtful: whether it has so few inliers that its matches may be wrong.
     """
 
     state: TrackingState
@@ -65,6 +52,14 @@ class Found:
     n_inliers: int = 0
     visible: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     keyframe: int = -1
+    is_doubtful: bool = False
+
+    @classmethod
+    def at_start(cls, frame: Frame, *, begun: bool) -> Found:
+        """What is found before there is a map: all that a map begins with, if it has begun."""
+        n_landmarks = int(np.count_nonzero(frame.landmark >= 0))
+        state = TrackingState.OK if begun else TrackingState.LOST
+        return cls(state, n_landmarks, n_landmarks)
 
     @property
     def is_lost(self) -> bool:
@@ -77,17 +72,27 @@ class Found:
         return self.keyframe >= 0
 
 
+def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingState:
+    """What matches, and inliers of the pose optimisation, are worth."""
+    config = context.config.tracking
+    # In the wide windows of an RGB-D camera, a wrong pose too finds some inliers.
+    share = config.depth_min_inlier_ratio if context.camera.depth else 0.0
+    if n_inliers < config.min_inliers_lost or n_inliers < share * n_matches:
+        return TrackingState.LOST
+    return TrackingState.WEAK if n_inliers < config.min_inliers else TrackingState.OK
+
+
 class Tracker:
     """Tracks one frame after the other. It never sees the map, only a view of it.
 
     Attributes:
-        state: what there is to go on.
+        status: what there is to go on.
         last: the frame that was tracked last, None before the first.
         lost_frames: lost since then.
     """
 
     def __init__(self, context: TrackingContext) -> None:
-        self.state = TrackerState.UNKNOWN
+        self.status = TrackerStatus.UNKNOWN
         self.last: Frame | None = None
         self.lost_frames = 0
         self._context = context
@@ -116,53 +121,22 @@ class Tracker:
         elapsed = timestamp - frames.timestamp(-1)
         return orthonormalised(se3_exp(self.twist * elapsed) @ T_last)
 
-    def track(self, frame: Frame, T_cw: Matrix, view: MapView) -> Found:
+    def track(self, frame: Frame, T_cw: Matrix, view: MapView, frames: FramePoses) -> Found:
         """Track a frame that is expected at ``T_cw``: first by what the last frame or the reference
-        keyframe saw, then by all landmarks around."""
+        keyframe saw, then by all landmarks around.
+
+        Args:
+            frames: all frames before.
+        """
         n_inliers = self._track_previous_frame(frame, T_cw, view)
         if n_inliers < self._config.tracking.min_inliers_frame:
-            return self.judged(n_inliers, 0)
+            return Found(TrackingState.LOST, n_matches=n_inliers)
         n_matches, n_inliers, visible = track_local_map(
             frame, view.around, self._context, patches=view.patches
         )
-        return self.judged(n_matches, n_inliers, visible)
-
-    def judged(
-        self,
-        n_matches: int,
-        n_inliers: int,
-        visible: NDArray[np.int32] | None = None,
-        keyframe: int = -1,
-    ) -> Found:
-        """What matches and inliers are worth; ``keyframe`` where they were found by searching."""
-        config = self._config.tracking
-        # In the wide windows of an RGB-D camera, a wrong pose too finds some inliers.
-        share = config.depth_min_inlier_ratio if self._context.camera.depth else 0.0
-        if n_inliers < config.min_inliers_lost or n_inliers < share * n_matches:
-            state = TrackingState.LOST
-        elif n_inliers < config.min_inliers:
-            state = TrackingState.WEAK
-        else:
-            state = TrackingState.OK
-        visible = np.empty(0, np.int32) if visible is None else visible
-        if state == TrackingState.LOST:
-            keyframe = -1
-        return Found(state, n_matches, n_inliers, visible, keyframe)
-
-    def is_doubtful(self, frame: Frame, found: Found, frames: FramePoses, view: MapView) -> bool:
-        """Whether a tracked frame has so few inliers that its matches may be wrong: one whose pose
-        could hardly be predicted, after a gap or next to one found in the map, or that has lost
-        most of what the frame before tracked, as where the camera was carried."""
-        if self.last is None:
-            return False
-        config = self._config.relocalization
-        usual = frames.timestamp(-1) - frames.timestamp(-2) if len(frames) > 1 else 0
-        gap = frame.timestamp - self.last.timestamp > config.doubtful_gap * usual > 0.0
-        old = view.n_keyframes > self._config.tracking.young_keyframes
-        unpredicted = self.last.twist is None and old
-        few = found.n_inliers < config.doubtful_share * view.n_reference
-        sudden = found.n_inliers < config.doubtful_share * self._n_tracked and old
-        return few and (gap or unpredicted or sudden)
+        doubtful = self._is_doubtful(frame, n_inliers, view, frames)
+        state = judge(n_matches, n_inliers, self._context)
+        return Found(state, n_matches, n_inliers, visible, is_doubtful=doubtful)
 
     def accept(self, frame: Frame, found: Found, frames: FramePoses) -> None:
         """Go on from a frame that was found, and measure its twist: the motion since the last frame
@@ -180,12 +154,12 @@ class Tracker:
 
     def start_from(self, frame: Frame) -> None:
         """Go on from a frame with which a map or a sub-map began."""
-        self.last, self.lost_frames, self.state = frame, 0, TrackerState.TRACKING
+        self.last, self.lost_frames, self.status = frame, 0, TrackerStatus.TRACKING
 
     def lose(self) -> None:
         """A frame was not tracked."""
         self.lost_frames += 1
-        self.state = TrackerState.LOST
+        self.status = TrackerStatus.LOST
 
     def resume(self, twist: Matrix | None = None) -> None:
         """Continue a drive of which no frame is kept.
@@ -193,24 +167,44 @@ class Tracker:
         Args:
             twist: ``(6,)`` the speed of the camera at its end, per second; None if unknown.
         """
-        self.state, self._resumed_twist = TrackerState.RESUMED, twist
+        self.status, self._resumed_twist = TrackerStatus.RESUMED, twist
 
-    def memory(self) -> TrackerMemory | None:
-        """What ``restore`` needs to go on to the byte; None before the first frame is tracked."""
-        if self.last is None:
+    def state(self) -> TrackerState | None:
+        """What is remembered between two frames; None before the first frame is tracked."""
+        last = self.last
+        if last is None:
             return None
-        return TrackerMemory(self.last.snapshot(), self.lost_frames, self._n_tracked)
+        return TrackerState(
+            index=last.index,
+            timestamp=last.timestamp,
+            features=last.features,
+            landmark=last.landmark.copy(),
+            T_cw=last.T_cw.copy(),
+            twist=None if last.twist is None else last.twist.copy(),
+            lost_frames=self.lost_frames,
+            n_tracked=self._n_tracked,
+        )
 
-    def restore(self, memory: TrackerMemory) -> None:
-        """Remember what ``memory`` gave."""
-        self.last, self.lost_frames = memory.last, memory.lost_frames
-        self._n_tracked = memory.n_tracked
-        self.state = TrackerState.LOST if self.lost_frames else TrackerState.TRACKING
+    def restore(self, state: TrackerState, xyz: Matrix) -> Frame:
+        """Remember what ``state`` gave, and return the last frame.
+
+        Args:
+            xyz: ``(N, 3)`` where the landmarks of the last frame are; NaN without one.
+        """
+        extracted = Extracted(state.features)
+        last = Frame.of(extracted, self._context.camera, state.index, state.timestamp)
+        last.T_cw, last.landmark, last.xyz = state.T_cw, state.landmark, xyz
+        last.twist = state.twist
+        self.start_from(last)
+        self.lost_frames, self._n_tracked = state.lost_frames, state.n_tracked
+        if self.lost_frames:
+            self.status = TrackerStatus.LOST
+        return last
 
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
         """Track along the prediction; where there is none or it fails, against the reference
         keyframe. Returns inliers."""
-        if self.last is None and self.state is not TrackerState.RESUMED:
+        if self.last is None and self.status is not TrackerStatus.RESUMED:
             return 0
         if self.last is not None and self.last.twist is not None:
             n_matches, n_inliers = track_motion(frame, self.last, T_cw, self._context)
@@ -238,3 +232,37 @@ class Tracker:
     def _moves_as_predicted(self, n_matches: int, n_inliers: int) -> bool:
         config = self._config.tracking
         return n_inliers >= max(config.min_inliers_motion, config.min_inlier_ratio * n_matches)
+
+    def _is_doubtful(self, frame: Frame, n_inliers: int, view: MapView, frames: FramePoses) -> bool:
+        """Whether a frame has so few inliers that its matches may be wrong: one whose pose could
+        hardly be predicted, after a gap or next to a frame found in the map, or one that has lost
+        most of what the frame before tracked, as where the camera was carried."""
+        if self.last is None:
+            return False
+        config = self._config.relocalization
+        usual = frames.timestamp(-1) - frames.timestamp(-2) if len(frames) > 1 else 0
+        gap = frame.timestamp - self.last.timestamp > config.doubtful_gap * usual > 0.0
+        old = view.n_keyframes > self._config.tracking.young_keyframes
+        unpredicted = self.last.twist is None and old
+        few = n_inliers < config.doubtful_share * view.n_reference
+        sudden = n_inliers < config.doubtful_share * self._n_tracked and old
+        return few and (gap or unpredicted or sudden)
+
+
+def result_of(
+    frame: Frame, found: Found, is_keyframe: bool, stage_ms: dict[str, float]
+) -> TrackResult:
+    """What a caller is told of a frame."""
+    return TrackResult(
+        index=frame.index,
+        timestamp=frame.timestamp,
+        T_wc=inverse(frame.T_cw),
+        state=found.state,
+        n_features=len(frame.features),
+        n_stereo=frame.n_stereo,
+        n_matches=found.n_matches,
+        n_inliers=found.n_inliers,
+        is_keyframe=is_keyframe,
+        relocalised=found.relocalised,
+        stage_ms=stage_ms,
+    )

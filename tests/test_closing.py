@@ -13,7 +13,7 @@ from ring import CAMERA, LAP, Oracle, Ring
 from vslam.backend.pose_graph import GAP, WEAK, held_by
 from vslam.closing import LoopClosing
 from vslam.config import Config, ConsistencyConfig, KeyframeConfig, PoseGraphConfig
-from vslam.features import Features, TrackingState
+from vslam.features import Extracted, Features, TrackingState
 from vslam.geometry import inverse
 from vslam.hypotheses import Hypothesis, joined_submaps, solve
 from vslam.loopclosure.detector import NoDetector
@@ -65,7 +65,7 @@ def run(ring, frames, detector="none", *, threads=1, dark=(), finish=True, confi
     for i, k in enumerate(frames):
         image = np.array([[i & 255, i >> 8]], np.uint8)  # tells the oracle which frame it is
         features = Features.none() if i in dark else ring.see(k, 1)
-        results.append(slam.step_features(features, 0.1 * i, image))
+        results.append(slam.step_features(Extracted(features), 0.1 * i, image))
     if finish:
         slam.finish()
     return slam, results
@@ -157,7 +157,7 @@ def test_two_slams_may_share_the_features_of_their_frames():
         for i, features in enumerate(shown):
             image = np.array([[i & 255, i >> 8]], np.uint8)
             for slam in slams:
-                slam.step_features(features, 0.1 * i, image)
+                slam.step_features(Extracted(features), 0.1 * i, image)
         for slam in slams:
             slam.finish()
 

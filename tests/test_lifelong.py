@@ -13,7 +13,7 @@ from test_closing import errors
 
 from vslam.config import Config
 from vslam.errors import InputError
-from vslam.features import Features
+from vslam.features import Extracted, Features
 from vslam.geometry import inverse
 from vslam.loops import LoopEdge
 from vslam.slam import Slam
@@ -40,7 +40,7 @@ def laps(known_after_s: float, threads: int = 1) -> tuple[Slam, tuple[int, ...],
     keyframes, results = [], []
     for i, place in enumerate(PLACES):
         image = np.array([[i & 255, i >> 8]], np.uint8)
-        results.append(slam.step_features(view(int(place)), 0.1 * i, image))
+        results.append(slam.step_features(Extracted(view(int(place))), 0.1 * i, image))
         if i % LAP == LAP - 1:
             slam.stored_map()  # waits for the keyframe that is being mapped
             keyframes.append(len(slam.map.living_keyframes()))
@@ -92,7 +92,7 @@ def test_a_camera_that_is_carried_is_not_left_where_little_agrees(merge_after_fr
         if i == len(places) - 1:
             assert slam.is_mapping
             features = with_some_of(features, view(int(places[i - 1]) + 1), LOOK_ALIKES)
-        slam.step_features(features, 0.1 * i, image)
+        slam.step_features(Extracted(features), 0.1 * i, image)
     slam.finish()
     truth = inverse(RING.pose(0)) @ RING.pose(3)
     off = inverse(truth) @ slam.trajectory().T_wc[-1]

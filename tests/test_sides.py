@@ -10,8 +10,9 @@ from scipy.ndimage import gaussian_filter
 
 from vslam.camera import Camera
 from vslam.config import Config
+from vslam.frontend.extraction import extract_features
 from vslam.frontend.sides import Sides, balanced, compare_sides
-from vslam.frontend.tracking import TrackingContext, extract_features
+from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp
 from vslam.run.rig import RigResiduals, measure_rig, residual_warnings, rig_warnings
 
@@ -131,7 +132,9 @@ def test_disparities_stay_true_when_a_side_is_dark(stops):
     """Without the mend, a side two stops darker leaves few matches and wrong ones."""
     left, right = scene()
     context = TrackingContext.create(CAMERA, Config())
-    clean, dark = (extract_features(left, r, context) for r in (right, darker(right, stops)))
+    clean, dark = (
+        extract_features(left, r, context).features for r in (right, darker(right, stops))
+    )
     for features, least in ((clean, 0.9), (dark, 0.7)):
         d = features.xy[:, 0] - features.u_right
         found = np.isfinite(d)

@@ -159,7 +159,7 @@ class InstantExecutor:
 def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, monkeypatch):
     """Mapping as late as can be (when it is merged) and as early as can be: a race would show."""
     late = bytes_of(*run(corridor, config, threads=1))
-    monkeypatch.setattr("vslam.mapping.ThreadPoolExecutor", InstantExecutor)
+    monkeypatch.setattr("vslam.shared_map.ThreadPoolExecutor", InstantExecutor)
     assert bytes_of(*run(corridor, config, threads=2)) == late
 
 

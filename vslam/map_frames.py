@@ -10,9 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.backend.two_views import map_two_views
 from vslam.frontend.frame import Frame
 from vslam.map import Map
 from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
+from vslam.starter import TwoViewStart
 
 
 def add_frame(
@@ -44,6 +46,39 @@ def add_frame(
     return keyframe
 
 
+def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, int]:
+    """Add the two keyframes of a monocular map or sub-map, and the points that both see.
+
+    Args:
+        reference: the parent of a sub-map's first keyframe.
+
+    Returns:
+        The keyframes.
+    """
+    frames = start.first, start.second
+    first, second = map_two_views(
+        map_,
+        (frames[0].features, frames[1].features),
+        start.features,
+        start.first.T_cw,
+        start.T_2_1,
+        start.points,
+        (frames[0].timestamp, frames[1].timestamp),
+        (frames[0].index, frames[1].index),
+    )
+    if first > 0:
+        map_.begin_submap(first, reference, predicted=start.predicted)
+    map_.parents[second] = first
+    return first, second
+
+
+def has_more_points(map_: Map, keyframe: int, frame: Frame) -> bool:
+    """Whether a keyframe is the first of a map or sub-map, no other follows it yet, and a frame is
+    the one that it was made of: then its far stereo points are not mapped yet."""
+    begins = keyframe == 0 or keyframe in map_.restarts
+    return begins and keyframe == map_.n_keyframes - 1 and map_.frames[keyframe] == frame.index
+
+
 def observe_keyframe(frame: Frame, map_: Map, keyframe: int) -> None:
     """Let a frame track all landmarks that the keyframe it became observes."""
     frame.landmark = map_.arrays.landmark[map_.rows(keyframe)]
@@ -57,7 +92,6 @@ def update_landmarks(frame: Frame, map_: Map) -> None:
     Two landmarks may have become one: the first feature keeps it.
     """
     arrays = map_.arrays
-    frame.correct_disparities(map_.disparity_offset)
     ids = resolve(arrays, frame.landmark)
     _, first = np.unique(ids, return_index=True)
     repeated = np.ones(len(ids), np.bool_)

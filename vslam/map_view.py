@@ -68,7 +68,6 @@ class MapView:
         nearest: landmarks of the reference keyframe alone.
         n_reference: how many of these at least three keyframes observe (all, in a young map).
         patches: image patches of those landmarks around that the newest keyframes observe.
-        disparity_offset: ``Map.disparity_offset``, pixels.
     """
 
     reference: int = 0
@@ -79,4 +78,3 @@ class MapView:
     nearest: LocalMap = NO_LANDMARKS
     n_reference: int = 0
     patches: LandmarkPatches = NO_PATCHES
-    disparity_offset: float = 0.0

@@ -10,8 +10,7 @@ wherever a merge moves it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from concurrent.futures import Executor
 from functools import partial
 
 import numpy as np
@@ -20,43 +19,31 @@ from numpy.typing import NDArray
 from vslam.backend.disparity_offset import map_and_calibrate
 from vslam.backend.local_mapping import refresh_keyframe
 from vslam.backend.triangulation import map_stereo_points
-from vslam.backend.two_views import map_two_views
-from vslam.camera import Camera
 from vslam.closing import LoopClosing
-from vslam.config import Config
-from vslam.features import Features, KeyframePatches
+from vslam.features import Features
 from vslam.frame_poses import FramePoses, FrameTable
 from vslam.frontend.aligner import Aligner
 from vslam.frontend.frame import Frame
+from vslam.frontend.rig import RigCalibration
+from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix, inverse, orthonormalised
 from vslam.map import Map
 from vslam.map_frames import (
     OldPlace,
     add_frame,
+    add_two_views,
     count_shared_landmarks,
     find_old_place,
+    has_more_points,
     observe_keyframe,
     update_landmarks,
 )
 from vslam.map_kernels import count_seen_by
 from vslam.map_view import MapView, local_map
+from vslam.shared_map import SharedMap
 from vslam.starter import TwoViewStart
-
-
-@dataclass(frozen=True)
-class MapperState:
-    """What the mapper remembers between two frames besides the map.
-
-    Attributes:
-        reference: the keyframe that frames are tracked against and placed by.
-        last_frame, last_timestamp: index and seconds of the frame that became the last keyframe.
-        patches: of the newest keyframes, oldest first.
-    """
-
-    reference: int
-    last_frame: int
-    last_timestamp: float
-    patches: tuple[KeyframePatches, ...]
+from vslam.states import MapperState
+from vslam.trajectory import Trajectory
 
 
 class Mapper:
@@ -70,18 +57,16 @@ class Mapper:
 
     def __init__(
         self,
-        scales: NDArray[np.float64],
-        camera: Camera,
-        config: Config,
+        context: TrackingContext,
         closing: LoopClosing,
-        *,
+        rig: RigCalibration,
         executor: Executor | None,
         map_: Map | None = None,
         frames: FrameTable | None = None,
     ) -> None:
         """
         Args:
-            scales: ``(levels,)`` pyramid scale factors.
+            rig: corrects frames; it is told the map's disparity offset.
             executor: runs mapping jobs, one at a time; None runs each where its result is needed.
             map_: a map to continue in; None begins an empty one.
             frames: frames of the same drive that are placed already.
@@ -89,21 +74,19 @@ class Mapper:
         self.view = MapView()
         self.last_frame = -1
         self.last_timestamp = -np.inf
-        self._map = map_ or Map(scales)
-        self._camera = camera
-        self._config = config
+        self._shared = SharedMap(map_ or Map(context.scales), executor)
+        self._camera = context.camera
+        self._config = context.config
         self._closing = closing
-        self._aligner = Aligner(config.alignment)
-        self._executor = executor
-        self._job: Callable[[], None] | None = None
+        self._rig = rig
+        self._aligner = Aligner(context.config.alignment)
         self._is_merged = True
-        self._failure = ""
         self._held: tuple[Frame, ...] = ()
         self._visible: list[NDArray[np.int32]] = []
         self._found: list[NDArray[np.int32]] = []
         self.frames = FramePoses(self, frames)
-        if self._map.n_keyframes:
-            self.refer_to(int(self._map.living_keyframes()[-1]))
+        if self.map.n_keyframes:
+            self.refer_to(int(self.map.living_keyframes()[-1]))
 
     # What may be seen at any time
 
@@ -125,7 +108,7 @@ class Mapper:
     @property
     def is_mapping(self) -> bool:
         """Whether a keyframe is being mapped, so that another thread may be writing the map."""
-        return self._job is not None
+        return self._shared.is_busy
 
     @property
     def map(self) -> Map:
@@ -134,11 +117,7 @@ class Mapper:
         Raises:
             RuntimeError: a keyframe is being mapped, or its mapping failed.
         """
-        if self._failure:
-            raise RuntimeError(self._failure)
-        if self._job is not None:
-            raise RuntimeError("a keyframe is being mapped: call finish() first")
-        return self._map
+        return self._shared.map
 
     def keyframe_pose(self, keyframe: int) -> Matrix:
         """``T_cw`` as of the last merge; before the next one, of the reference keyframe only."""
@@ -152,6 +131,15 @@ class Mapper:
             return self.view.unit_scale
         return self.map.unit_scale[keyframe]
 
+    def trajectory(self) -> Trajectory:
+        """Pose of every frame (``FramePoses.trajectory``).
+
+        Raises:
+            RuntimeError: as ``map``.
+        """
+        self.map  # noqa: B018
+        return self.frames.trajectory()
+
     # The schedule
 
     def hold(self, *frames: Frame | None) -> None:
@@ -159,12 +147,16 @@ class Mapper:
         landmarks and speed change with it at every merge."""
         self._held = tuple(frame for frame in frames if frame is not None)
 
-    def place(self, frame: Frame, *, tracked: bool) -> None:
+    def place(self, frame: Frame, *, tracked: bool, near: int = -1) -> None:
         """Record the pose of the next frame.
 
         Args:
             tracked: False for a pose that is only predicted.
+            near: the keyframe near which the frame was found, which becomes the reference; -1 if
+                the frame was not looked for.
         """
+        if near >= 0:
+            self.refer_to(near)
         self.frames.append(frame.timestamp, frame.T_cw, tracked=tracked)
 
     def count(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
@@ -178,46 +170,41 @@ class Mapper:
         if frame - self.last_frame >= self._config.keyframes.merge_after_frames:
             self.merge()
 
-    def merge(self) -> None:
-        """Wait for the keyframe that is being mapped, and show the result to tracking."""
-        if self._is_merged:
-            return
-        self.complete()
-        self._is_merged = True
-        self._write_counts()
-        self._renew_view()
+    def merge(self) -> Map:
+        """Wait for the keyframe that is being mapped, show the result to tracking, and return the
+        map.
 
-    def merged(self) -> Map:
-        """Merge, and return the map."""
-        self.merge()
-        return self.map
+        Raises:
+            RuntimeError: an earlier keyframe's mapping failed, so that the map is incomplete.
+        """
+        map_ = self.complete()
+        if not self._is_merged:
+            self._is_merged = True
+            self._renew_view()
+        return map_
 
     def complete(self) -> Map:
         """Wait for the keyframe that is being mapped without showing the result to tracking, and
         return the map. Whether and when this is called changes no result.
 
         Raises:
-            RuntimeError: an earlier keyframe's mapping failed, so that the map is incomplete.
+            RuntimeError: as ``merge``.
         """
-        if self._job is not None:
-            job, self._job = self._job, None
-            try:
-                job()
-            except BaseException as error:
-                self._failure = (
-                    f"mapping keyframe {self.n_keyframes - 1} failed ({error!r}), which leaves the "
-                    "map incomplete; continue from a map that was saved before"
-                )
-                raise
-        self.map  # noqa: B018 - raises where an earlier job failed
-        self._write_counts()
-        return self._map
+        map_ = self._shared.wait()
+        for seen, counter in (
+            (self._visible, map_.arrays.visible),
+            (self._found, map_.arrays.found),
+        ):
+            for ids in seen:
+                counter[ids] += 1
+            seen.clear()
+        return map_
 
     def finish(self) -> None:
         """Complete all that is under way, global bundle adjustment included."""
-        self.merge()
-        self._closing.conclude(self._map)
-        self._closing.finish(self._map)
+        map_ = self.merge()
+        self._closing.conclude(map_)
+        self._closing.finish(map_)
         if self.n_keyframes:
             self._renew_view()
 
@@ -232,16 +219,12 @@ class Mapper:
         Args:
             predicted: whether the pose of such a frame is at least a prediction.
         """
-        self.merge()
-        self._begin_change(frame)
-        map_ = self._map
+        map_ = self._change(frame)
         certainty = self._aligner.certainty(frame)
         keyframe = add_frame(map_, frame, certainty, self.reference, predicted=predicted)
         map_stereo_points(map_, keyframe, self._camera, self._config)
         refresh_keyframe(map_, keyframe)
-        self._aligner.remember(frame, keyframe, map_.scales)
         self._set_newest(keyframe, frame)
-        observe_keyframe(frame, map_, keyframe)
         self.frames.replace(frame.index, keyframe)
         if keyframe > 0:
             self._start(partial(self._map_keyframe, keyframe, frame.features, frame.image))
@@ -255,10 +238,8 @@ class Mapper:
         ORB-SLAM2 (III-B) begins with all of them. Far points bend the first poses by the error of
         the pair's calibration; but at speed close points leave the view within a frame.
         """
-        self.merge()
-        map_, keyframe = self._map, self.reference
-        begins = keyframe == 0 or keyframe in map_.restarts
-        if not begins or keyframe != map_.n_keyframes - 1 or map_.frames[keyframe] != frame.index:
+        map_, keyframe = self.merge(), self.reference
+        if not has_more_points(map_, keyframe, frame):
             return False
         new = map_stereo_points(map_, keyframe, self._camera, self._config, far=True)
         refresh_keyframe(map_, keyframe)
@@ -275,29 +256,13 @@ class Mapper:
             twist: asked after the merge: the speed of the camera before, None if unknown. A
                 sub-map takes its unit from it.
         """
-        self.merge()
-        self._begin_change(start.second)
+        map_ = self._change(start.second)
         start = start.at_speed(twist(), self._config.initialization.max_rescaling)
-        map_, frames = self._map, (start.first, start.second)
-        keyframes = map_two_views(
-            map_,
-            (start.first.features, start.second.features),
-            start.features,
-            start.first.T_cw,
-            start.T_2_1,
-            start.points,
-            (start.first.timestamp, start.second.timestamp),
-            (start.first.index, start.second.index),
-        )
-        one, two = keyframes
-        if one > 0:
-            map_.begin_submap(one, self.reference, predicted=start.predicted)
-        map_.parents[two] = one
-        self._aligner.remember(start.second, two, map_.scales)
+        frames = start.first, start.second
+        keyframes = add_two_views(map_, start, self.reference)
         for keyframe, frame in zip(keyframes, frames, strict=True):
             self._closing.process(map_, keyframe, frame.features, frame.image)
-        self._set_newest(two, start.second)
-        observe_keyframe(start.second, map_, two)
+        self._set_newest(keyframes[1], start.second)
         for keyframe, frame in zip(keyframes, frames, strict=True):
             self.frames.replace(frame.index, keyframe)
         start.second.T_cw = self.frames.pose(start.second.index)
@@ -305,19 +270,18 @@ class Mapper:
 
     def old_place(self, frame: Frame) -> OldPlace | None:
         """Where the frame has come back to, if that was mapped long enough ago."""
-        return find_old_place(self.merged(), frame, self._config.keyframes.known_after_s)
+        return find_old_place(self.merge(), frame, self._config.keyframes.known_after_s)
 
     def follow(self, place: OldPlace, frame: Frame) -> None:
         """Track by an old keyframe from now on, in place of a new one made of the frame placed
         last."""
         self.merge()
-        self._write_counts()
         self.last_timestamp = frame.timestamp
         self.refer_to(place.keyframe)
         self.frames.follow_reference(frame.index, frame.T_cw)
         if self._closing.follow(self.n_keyframes - 1):
             self.last_frame = frame.index
-            self._start(lambda: self._closing.finish(self._map))
+            self._start(self._closing.finish)
 
     # The reference keyframe, which is no part of the map
 
@@ -338,13 +302,13 @@ class Mapper:
             nearest=local_map(map_, keyframe, 1),
             n_reference=count_seen_by(map_.arrays, keyframe, min(3, len(living))),
             patches=self._aligner.patches_of(map_, around.ids),
-            disparity_offset=map_.disparity_offset,
         )
+        self._rig.disparity_offset = map_.disparity_offset
 
     def refer_to_nearest(self, frame: Frame) -> None:
         """Make the keyframe that shares the most landmarks with a frame the reference (ORB-SLAM,
         V-D)."""
-        shared = count_shared_landmarks(self.merged(), frame)
+        shared = count_shared_landmarks(self.merge(), frame)
         best = int(np.argmax(shared))
         if shared[best] and best != self.reference:
             self.refer_to(best)
@@ -364,37 +328,32 @@ class Mapper:
 
     def continue_drive(self) -> None:
         """Take the newest keyframe for the last one made, unless an earlier drive made it."""
-        map_, newest = self._map, self.reference
+        map_, newest = self.map, self.reference
         if map_.n_keyframes and map_.sessions[newest] == map_.session:
             self.last_frame, self.last_timestamp = map_.frames[newest], map_.timestamps[newest]
 
-    def _begin_change(self, frame: Frame) -> None:
-        """Tell the map what frames saw, and make room in it.
+    def _change(self, frame: Frame) -> Map:
+        """Merge, make room in the map, and return it to be changed.
 
         Landmarks get other ids where dead ones are dropped, except while a global bundle adjustment
         is under way, which knows its landmarks by their ids.
         """
-        self._write_counts()
-        if self._closing.is_adjusting or not self._map.many_dead_landmarks:
-            return
-        new_id = self._map.drop_dead_landmarks()
-        for one in {id(one): one for one in (*self._held, frame)}.values():
-            tracked = one.landmark >= 0
-            one.landmark = one.landmark.copy()
-            one.landmark[tracked] = new_id[one.landmark[tracked]]
+        map_ = self.merge()
+        if not self._closing.is_adjusting and map_.many_dead_landmarks:
+            new_id = map_.drop_dead_landmarks()
+            for one in {id(one): one for one in (*self._held, frame)}.values():
+                tracked = one.landmark >= 0
+                one.landmark = one.landmark.copy()
+                one.landmark[tracked] = new_id[one.landmark[tracked]]
+        return map_
 
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
+        """The frame has become the newest keyframe: later ones are tracked against it."""
+        map_ = self.map
+        self._aligner.remember(frame, keyframe, map_.scales)
         self.last_frame, self.last_timestamp = frame.index, frame.timestamp
         self.refer_to(keyframe)
-
-    def _write_counts(self) -> None:
-        for seen, counter in (
-            (self._visible, self._map.arrays.visible),
-            (self._found, self._map.arrays.found),
-        ):
-            for ids in seen:
-                counter[ids] += 1
-            seen.clear()
+        observe_keyframe(frame, map_, keyframe)
 
     def _renew_view(self) -> None:
         before = self.view
@@ -406,7 +365,8 @@ class Mapper:
         """Bring a frame to where the map is now. One that is placed moves with its keyframe, one
         that is not yet with the reference keyframe."""
         grown = self.view.unit_scale / before.unit_scale
-        update_landmarks(frame, self._map)
+        self._rig.correct_offset(frame)
+        update_landmarks(frame, self.map)
         if frame.index < len(self.frames):
             frame.T_cw = self.frames.pose(frame.index)
         else:
@@ -417,21 +377,12 @@ class Mapper:
             frame.twist[:3] *= grown
 
     def _map_keyframe(
-        self, keyframe: int, features: Features, image: NDArray[np.uint8] | None
+        self, keyframe: int, features: Features, image: NDArray[np.uint8] | None, map_: Map
     ) -> None:
-        map_and_calibrate(self._map, keyframe, self._camera, self._config)
-        self._closing.process(self._map, keyframe, features, image)
+        map_and_calibrate(map_, keyframe, self._camera, self._config)
+        self._closing.process(map_, keyframe, features, image)
 
-    def _start(self, job: Callable[[], None]) -> None:
-        """From here on the map is the job's, until it is waited for."""
+    def _start(self, job: Callable[[Map], None]) -> None:
+        """Start a job that maps; tracking goes on with the view as it is."""
         self._is_merged = False
-        if self._executor is None:
-            self._job = job
-            return
-        future: Future[None] = self._executor.submit(job)
-        self._job = future.result
-
-
-def mapping_executor(threads: int) -> Executor | None:
-    """What runs mapping jobs: a thread beside tracking, or nothing with one thread in all."""
-    return ThreadPoolExecutor(1, "mapping") if threads > 1 else None
+        self._shared.start(job)

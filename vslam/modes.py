@@ -7,26 +7,35 @@ from typing import Protocol
 import numpy as np
 
 from vslam.frontend.frame import Frame
-from vslam.frontend.keyframes import CloseGainState, KeyframePolicy, PlaceEvidence
+from vslam.frontend.keyframes import KeyframePolicy, PlaceEvidence
 from vslam.frontend.tracker import Found, Tracker
 from vslam.frontend.tracking import TrackingContext
 from vslam.mapping import Mapper
 from vslam.starter import OneViewStart, Starter
+from vslam.states import PolicyState
 
 
 class Mode(Protocol):
-    """What becomes of the map. All methods return whether they changed what tracking sees."""
+    """What becomes of the map.
+
+    Attributes:
+        changes_map: whether a drive in this mode leaves anything in the map.
+    """
+
+    changes_map: bool
 
     def begin(self, frame: Frame) -> bool:
-        """Begin a map, or a sub-map, with a frame that is placed but not tracked."""
+        """Begin a map, or a sub-map, with a frame that is placed but not tracked, if it can be;
+        returns whether."""
         ...
 
     def begin_after_loss(self, frame: Frame) -> bool:
-        """``begin`` if the camera was lost for long enough."""
+        """``begin``, but only if the camera was lost for long enough."""
         ...
 
     def see_farther(self) -> bool:
-        """Let a frame that is lost right after a map or sub-map began see more of it."""
+        """Let a frame that is lost right after a map or sub-map began see more of it; returns
+        whether there is more."""
         ...
 
     def extend(self, frame: Frame, found: Found) -> bool:
@@ -34,9 +43,19 @@ class Mode(Protocol):
         keyframe."""
         ...
 
+    def state(self) -> PolicyState | None:
+        """What ``restore`` needs, None if that is more than can be kept now."""
+        ...
+
+    def restore(self, state: PolicyState) -> None:
+        """Remember what ``state`` gave."""
+        ...
+
 
 class Localising:
     """Leaves the map as it is."""
+
+    changes_map = False
 
     def __init__(self, mapper: Mapper) -> None:
         self._mapper = mapper
@@ -54,6 +73,12 @@ class Localising:
         self._mapper.refer_to_nearest(frame)
         return False
 
+    def state(self) -> PolicyState | None:
+        return None
+
+    def restore(self, state: PolicyState) -> None:
+        pass
+
 
 class MapBuilding:
     """Makes keyframes of frames that see something new.
@@ -62,6 +87,8 @@ class MapBuilding:
         starter: finds the frames with which a map or a sub-map begins.
         policy: decides which frames become keyframes.
     """
+
+    changes_map = True
 
     def __init__(self, context: TrackingContext, mapper: Mapper, tracker: Tracker) -> None:
         self.starter = Starter(context)
@@ -102,7 +129,7 @@ class MapBuilding:
     def extend(self, frame: Frame, found: Found) -> bool:
         self.starter.reset()
         self._mapper.count(found.visible, frame.landmark[frame.landmark >= 0])
-        if frame.features.from_right:  # the map is made of left images
+        if not frame.can_become_keyframe:
             return False
         evidence = self.policy.observe(
             frame,
@@ -122,15 +149,10 @@ class MapBuilding:
         self.policy.keyframe_made()
         return True
 
-    @property
-    def can_pause(self) -> bool:
-        """Whether ``state`` is all that is remembered: no frame waits for a second one."""
-        return not self.starter.is_waiting
+    def state(self) -> PolicyState | None:
+        """What is remembered between two frames; None while a frame waits for a second one to begin
+        a map with."""
+        return None if self.starter.is_waiting else self.policy.state()
 
-    def state(self) -> CloseGainState:
-        """What is remembered between two frames."""
-        return self.policy.state()
-
-    def restore(self, state: CloseGainState) -> None:
-        """Remember what ``state`` gave."""
+    def restore(self, state: PolicyState) -> None:
         self.policy.restore(state)

@@ -49,12 +49,12 @@ from vslam.camera import Camera
 from vslam.closing import LoopClosing
 from vslam.config import Config, DepthConfig, KeyframeConfig, MappingConfig
 from vslam.datasets.png import unfilter
-from vslam.features import Features
+from vslam.features import Extracted, Features
 from vslam.frontend import pnp
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.frame import Frame
-from vslam.frontend.orb import scale_factors
 from vslam.frontend.relocalization import relocalise
+from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import TrackingContext
 from vslam.loopclosure import bow, local_matching, sim3_ransac
 from vslam.loopclosure.bow import BowDetector
@@ -214,7 +214,9 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
     verifier = verifier_for(config, CAMERA)
     closing = LoopClosing(NoDetector(), verifier, CAMERA, config, threads=1)
-    mapper = Mapper(scale_factors(config.orb), CAMERA, config, closing, executor=None)
+    context = TrackingContext.create(CAMERA, config)
+    rig = RigCalibration(CAMERA, config.stereo, context.scales)
+    mapper = Mapper(context, closing, rig, None)
     rng = np.random.default_rng(0)
     n = 400
     points = rng.uniform([-5.0, -4.0, 9.0], [9.0, 4.0, 12.0], (n, 3))
@@ -232,7 +234,7 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
             descriptors,
             uvr[:, 2].astype(np.float32),
         )
-        frame = Frame.untracked(features, CAMERA, k, 0.1 * k)
+        frame = Frame.of(Extracted(features), CAMERA, k, 0.1 * k)
         frame.T_cw, frame.landmark = T_cw, landmark
         mapper.hold(frame)
         mapper.place(frame, tracked=True)
@@ -250,7 +252,7 @@ def compile_recognition() -> None:
 
     place = local_map(map_, 0, 1)
     context = TrackingContext.create(CAMERA, config)
-    relocalise(Frame.untracked(features, CAMERA), place, place, context, seed=0)
+    relocalise(Frame.of(Extracted(features), CAMERA), place, place, context, seed=0)
 
     detector = BowDetector(smallest_vocabulary())
     detector.add(0, None, features)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import contextmanager
 
 from vslam.map import Map
 
@@ -33,7 +34,7 @@ class SharedMap:
         """The map.
 
         Raises:
-            RuntimeError: a job may be writing it, or one failed.
+            RuntimeError: a job may be writing it, or an earlier change failed.
         """
         if self._failure:
             raise RuntimeError(self._failure)
@@ -54,16 +55,28 @@ class SharedMap:
         """The map, once the job is done.
 
         Raises:
-            RuntimeError: an earlier job failed. This one's own error is raised as it is.
+            RuntimeError: an earlier change failed. This job's own error is raised as it is.
         """
         if self._job is not None:
             job, self._job = self._job, None
-            try:
+            with self.changing():
                 job()
-            except BaseException as error:
-                self._failure = (
-                    f"mapping a keyframe failed ({error!r}), which leaves the map incomplete; "
-                    "continue from a map that was saved before"
-                )
-                raise
         return self.map
+
+    @contextmanager
+    def changing(self) -> Iterator[Map]:
+        """The map, for a change that is made here and now. An error leaves the map incomplete: it
+        is raised as it is, and whoever asks for the map later is told of it.
+
+        Raises:
+            RuntimeError: as ``map``.
+        """
+        map_ = self.map
+        try:
+            yield map_
+        except BaseException as error:
+            self._failure = (
+                f"mapping a keyframe failed ({error!r}), which leaves the map incomplete; "
+                "continue from a map that was saved before"
+            )
+            raise

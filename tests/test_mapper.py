@@ -33,8 +33,12 @@ ids = {"argnames": "executor", "argvalues": EXECUTORS, "ids": ["late", "instant"
 both = pytest.mark.parametrize(**ids)  # as late as can be, and as early
 
 
+AT_THE_END = -1  # in place of a keyframe
+
+
 class Closing:
-    """Loop closing that does to the map what a test wants, at the end of each mapping job."""
+    """Loop closing that does to the map what a test wants, at the end of each mapping job and at
+    the end of the drive."""
 
     def __init__(self, job: Callable[[Map, int], None] | None = None) -> None:
         self.is_adjusting = False
@@ -50,7 +54,8 @@ class Closing:
         return self.is_due
 
     def conclude(self, map_: Map) -> None:
-        pass
+        if self._job is not None:
+            self._job(map_, AT_THE_END)
 
     def finish(self, map_: Map) -> None:
         self.finished += 1
@@ -329,25 +334,30 @@ def test_held_frames_track_what_became_of_their_landmarks(executor):
     assert drive.rig.disparity_offset == 0.125
 
 
+def see_without_depth(k: int) -> Features:
+    features = POINTS.see(at(k))
+    features.u_right[:] = np.nan
+    return features
+
+
 def monocular_drive(executor, closing: Closing) -> Drive:
     """A monocular map of two keyframes, 0.6 m apart."""
-
-    def see(k: int) -> Features:
-        features = POINTS.see(at(k))
-        features.u_right[:] = np.nan
-        return features
-
-    drive = Drive(executor, closing, CAMERA.left_camera(), see, merge_after_frames=9)
-    first, second = drive.next_frame(), None
-    drive.mapper.place(first, tracked=False)
-    for _ in range(3):
-        second = drive.next_frame()
-        drive.mapper.place(second, tracked=False)
-    every = np.arange(len(POINTS.xyz))
-    T_2_1 = at(3)
-    drive.mapper.begin(TwoViewStart(first, second, T_2_1, (every, every), POINTS.xyz), lambda: None)
-    drive.last = second
+    camera = CAMERA.left_camera()
+    drive = Drive(executor, closing, camera, see_without_depth, merge_after_frames=9)
+    begin_with_two_views(drive)
     return drive
+
+
+def begin_with_two_views(drive: Drive) -> None:
+    """Begin the map with frames 0 and 3."""
+    frames = []
+    for _ in range(4):
+        frames.append(drive.next_frame())
+        drive.mapper.place(frames[-1], tracked=False)
+    every = np.arange(len(POINTS.xyz))
+    start = TwoViewStart(frames[0], frames[3], at(3), (every, every), POINTS.xyz)
+    drive.mapper.begin(start, lambda: None)
+    drive.last = frames[3]
 
 
 def test_a_monocular_map_begins_with_two_keyframes():
@@ -561,6 +571,29 @@ def test_a_job_that_fails_says_so_once_and_the_map_says_so_from_then_on(executor
             use()
     assert mapper.view is view
     assert mapper.frames.pose(4).tobytes() == pose
+
+
+@pytest.mark.parametrize(
+    ("failing", "change"),
+    [
+        (0, lambda drive: drive.step(keyframe=True)),
+        (0, begin_with_two_views),
+        (1, begin_with_two_views),
+        (AT_THE_END, lambda drive: drive.mapper.finish()),
+    ],
+    ids=["first keyframe", "first view", "second view", "end"],
+)
+def test_a_change_that_fails_where_no_job_runs_leaves_no_other_map(failing, change):
+    def fail(map_: Map, keyframe: int) -> None:
+        if keyframe == failing:
+            raise BrokenError
+
+    drive = Drive(closing=Closing(fail), see=see_without_depth)
+    with pytest.raises(BrokenError):
+        change(drive)
+    for use in (lambda: drive.mapper.map, drive.mapper.complete, drive.mapper.finish):
+        with pytest.raises(RuntimeError, match=INCOMPLETE):
+            use()
 
 
 @pytest.mark.parametrize("failing", [0, 2])

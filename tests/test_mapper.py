@@ -255,6 +255,17 @@ def test_the_map_is_not_to_be_had_while_a_keyframe_is_mapped(executor):
         drive.mapper.keyframe_pose(0)
 
 
+def test_a_trajectory_is_not_to_be_had_even_if_all_frames_follow_the_reference_keyframe():
+    """As at the beginning of another drive in a map."""
+    drive = Drive()
+    drive.steps([0, 3], 6)
+    map_ = drive.mapper.complete()
+    drive.mapper = Mapper(drive.context, drive.closing, drive.rig, None, map_)
+    drive.step(keyframe=True)
+    with pytest.raises(RuntimeError, match="a keyframe is being mapped"):
+        drive.mapper.trajectory()
+
+
 @both
 def test_the_map_counts_what_frames_saw_when_it_is_free(executor):
     drive = Drive(executor(), merge_after_frames=9)
@@ -353,6 +364,7 @@ def begin_with_two_views(drive: Drive) -> None:
     frames = []
     for _ in range(4):
         frames.append(drive.next_frame())
+        frames[-1].T_cw = np.eye(4)
         drive.mapper.place(frames[-1], tracked=False)
     every = np.arange(len(POINTS.xyz))
     start = TwoViewStart(frames[0], frames[3], at(3), (every, every), POINTS.xyz)
@@ -514,8 +526,9 @@ def test_far_points_are_mapped_of_the_first_keyframe_while_it_is_the_only_one():
     drive = Drive()
     first = drive.step(keyframe=True)
     second = drive.step(keyframe=True)
-    assert not drive.mapper.map_far_points(first)
     assert not drive.mapper.map_far_points(second)
+    drive.mapper.refer_to(0)
+    assert not drive.mapper.map_far_points(first)
 
 
 # -- failures -------------------------------------------------------------------------------------

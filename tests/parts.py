@@ -88,7 +88,7 @@ class Points:
             xy=uvr[:, :2],
             octave=np.zeros(n, np.uint8),
             angle=np.zeros(n, np.float32),
-            descriptors=self.descriptors[among],
+            descriptors=self.descriptors[among].copy(),
             u_right=uvr[:, 2],
         )
 

@@ -83,7 +83,7 @@ class MapView:
 def view_of(
     map_: Map, keyframe: int, around: LocalMap, patches: LandmarkPatches, *, monocular: bool
 ) -> MapView:
-    """What tracking sees from a reference keyframe; ``around`` and ``patches`` as in ``MapView``."""
+    """What tracking sees from a reference keyframe; the rest as in ``MapView``."""
     living = map_.living_keyframes()
     if monocular and map_.restarts:
         # A sub-map is young once more: without stereo nothing but this tells when to go on.

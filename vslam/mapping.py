@@ -9,8 +9,9 @@ wherever a merge moves it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
@@ -194,9 +195,9 @@ class Mapper:
 
     def finish(self) -> None:
         """Complete all that is under way, global bundle adjustment included."""
-        map_ = self.merge()
-        self._closing.conclude(map_)
-        self._closing.finish(map_)
+        with self._changing() as map_:
+            self._closing.conclude(map_)
+            self._closing.finish(map_)
         if self.n_keyframes:
             self._renew_view()
 
@@ -211,17 +212,18 @@ class Mapper:
         Args:
             predicted: whether the pose of such a frame is at least a prediction.
         """
-        map_ = self._change(frame)
-        certainty = self._aligner.certainty(frame)
-        keyframe = add_frame(map_, frame, certainty, self.reference, predicted=predicted)
-        map_stereo_points(map_, keyframe, self._camera, self._config)
-        refresh_keyframe(map_, keyframe)
-        self._set_newest(keyframe, frame)
-        self.frames.replace(frame.index, keyframe)
-        if keyframe > 0:
-            self._start(partial(self._map_keyframe, keyframe, frame.features, frame.image))
-        else:
-            self._closing.process(map_, keyframe, frame.features, frame.image)
+        with self._changing() as map_:
+            self._make_room(map_, frame)
+            certainty = self._aligner.certainty(frame)
+            keyframe = add_frame(map_, frame, certainty, self.reference, predicted=predicted)
+            map_stereo_points(map_, keyframe, self._camera, self._config)
+            refresh_keyframe(map_, keyframe)
+            self._set_newest(keyframe, frame)
+            self.frames.replace(frame.index, keyframe)
+            if keyframe > 0:
+                self._start(partial(self._map_keyframe, keyframe, frame.features, frame.image))
+            else:
+                self._closing.process(map_, keyframe, frame.features, frame.image)
 
     def map_far_points(self, frame: Frame) -> bool:
         """Map all stereo points of a frame that is the first keyframe of a map or sub-map, if no
@@ -230,13 +232,14 @@ class Mapper:
         ORB-SLAM2 (III-B) begins with all of them. Far points bend the first poses by the error of
         the pair's calibration; but at speed close points leave the view within a frame.
         """
-        map_, keyframe = self.merge(), self.reference
-        if not has_more_points(map_, keyframe, frame):
+        keyframe = self.reference
+        if not has_more_points(self.merge(), keyframe, frame):
             return False
-        new = map_stereo_points(map_, keyframe, self._camera, self._config, far=True)
-        refresh_keyframe(map_, keyframe)
-        self.refer_to(keyframe)
-        observe_keyframe(frame, map_, keyframe)
+        with self._changing() as map_:
+            new = map_stereo_points(map_, keyframe, self._camera, self._config, far=True)
+            refresh_keyframe(map_, keyframe)
+            self.refer_to(keyframe)
+            observe_keyframe(frame, map_, keyframe)
         return len(new) > 0
 
     def begin(self, start: TwoViewStart, twist: Callable[[], Matrix | None]) -> None:
@@ -248,17 +251,18 @@ class Mapper:
             twist: asked after the merge: the speed of the camera before, None if unknown. A
                 sub-map takes its unit from it.
         """
-        map_ = self._change(start.second)
-        start = start.at_speed(twist(), self._config.initialization.max_rescaling)
-        frames = start.first, start.second
-        keyframes = add_two_views(map_, start, self.reference)
-        for keyframe, frame in zip(keyframes, frames, strict=True):
-            self._closing.process(map_, keyframe, frame.features, frame.image)
-        self._set_newest(keyframes[1], start.second)
-        for keyframe, frame in zip(keyframes, frames, strict=True):
-            self.frames.replace(frame.index, keyframe)
-        start.second.T_cw = self.frames.pose(start.second.index)
-        start.second.twist = start.twist
+        with self._changing() as map_:
+            start = start.at_speed(twist(), self._config.initialization.max_rescaling)
+            frames = start.first, start.second
+            self._make_room(map_, start.second)
+            keyframes = add_two_views(map_, start, self.reference)
+            for keyframe, frame in zip(keyframes, frames, strict=True):
+                self._closing.process(map_, keyframe, frame.features, frame.image)
+            self._set_newest(keyframes[1], start.second)
+            for keyframe, frame in zip(keyframes, frames, strict=True):
+                self.frames.replace(frame.index, keyframe)
+            start.second.T_cw = self.frames.pose(start.second.index)
+            start.second.twist = start.twist
 
     def old_place(self, frame: Frame) -> OldPlace | None:
         """Where the frame has come back to, if that was mapped long enough ago."""
@@ -312,16 +316,18 @@ class Mapper:
         if map_.n_keyframes and map_.sessions[newest] == map_.session:
             self.last_frame, self.last_timestamp = map_.frames[newest], map_.timestamps[newest]
 
-    def _change(self, frame: Frame) -> Map:
-        """Merge, make room in the map, and return it to be changed.
+    @contextmanager
+    def _changing(self) -> Iterator[Map]:
+        """The merged map; a change that fails half way leaves it to nobody."""
+        self.merge()
+        with self._shared.change() as map_:
+            yield map_
 
-        Landmarks get other ids where dead ones are dropped, except while a global bundle adjustment
-        is under way, which knows its landmarks by their ids.
-        """
-        map_ = self.merge()
+    def _make_room(self, map_: Map, frame: Frame) -> None:
+        """Drop dead landmarks where they are many. The others get new ids, so that it has to wait
+        while a global bundle adjustment is under way, which knows its landmarks by their ids."""
         if not self._closing.is_adjusting and map_.many_dead_landmarks:
             drop_dead_landmarks(map_, (*self._held, frame))
-        return map_
 
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
         """The frame has become the newest keyframe: later ones are tracked against it."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import contextmanager
 
 from vslam.map import Map
 
@@ -58,12 +59,29 @@ class SharedMap:
         """
         if self._job is not None:
             job, self._job = self._job, None
-            try:
+            with self._whole():
                 job()
-            except BaseException as error:
-                self._failure = (
-                    f"mapping a keyframe failed ({error!r}), which leaves the map incomplete; "
-                    "continue from a map that was saved before"
-                )
-                raise
         return self.map
+
+    @contextmanager
+    def change(self) -> Iterator[Map]:
+        """The map, once no job is working on it, to be changed.
+
+        Raises:
+            RuntimeError: as ``wait``.
+        """
+        map_ = self.wait()
+        with self._whole():
+            yield map_
+
+    @contextmanager
+    def _whole(self) -> Iterator[None]:
+        """Give the map to nobody any more if what changes it fails half way."""
+        try:
+            yield
+        except BaseException as error:
+            self._failure = (
+                f"mapping a keyframe failed ({error!r}), which leaves the map incomplete; continue "
+                "from a map that was saved before"
+            )
+            raise

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from concurrent.futures import Future
 
 import numpy as np
 import pytest
+from parts import InstantExecutor
 
 from vslam.backend.local_mapping import local_window
 from vslam.config import Config, KeyframeConfig, MappingConfig, OrbConfig, TrackingConfig
@@ -138,21 +138,6 @@ def test_landmarks_lie_on_the_walls_and_the_ground(corridor):
 def test_same_bytes_with_one_thread_and_two_and_again(corridor, config):
     runs = [bytes_of(*run(corridor, config, threads=threads)) for threads in (1, 2, 2, 1)]
     assert len(set(runs)) == 1
-
-
-class InstantExecutor:
-    """A thread so fast that it is done before ``submit`` returns."""
-
-    def __init__(self, *_: object) -> None:
-        pass
-
-    def submit(self, function, *arguments) -> Future:
-        future: Future = Future()
-        future.set_result(function(*arguments))
-        return future
-
-    def shutdown(self) -> None:
-        pass
 
 
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])

@@ -461,3 +461,36 @@ def test_the_capsule_network_beside_the_bag_of_words_is_the_default(corridor):
     assert Slam(corridor.camera, detector="none").detector.name == "none"
     with pytest.raises(ValueError, match="no loop detector 'bwo'"):
         Slam(corridor.camera, detector="bwo")
+
+
+def test_a_keyframe_that_cannot_be_mapped_is_the_last_thing_that_happens(
+    corridor, monkeypatch, tmp_path
+):
+    """The step that merges it raises; after that, nothing is made of half a map."""
+    slam = Slam(corridor.camera, EAGER, "none", threads=1)
+
+    def drive(frames: range) -> None:
+        for k in frames:
+            slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
+
+    drive(range(3))
+
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("injected")
+
+    monkeypatch.setattr("vslam.mapping.map_and_calibrate", fail)
+    with pytest.raises(ZeroDivisionError, match="injected"):
+        drive(range(3, 6))
+    monkeypatch.undo()
+    for use in (
+        lambda: drive(range(6, 7)),
+        lambda: slam.save(tmp_path / "map.npz"),
+        lambda: slam.map,
+        slam.finish,
+        slam.trajectory,
+    ):
+        with pytest.raises(
+            RuntimeError, match=r"mapping a keyframe failed.*injected.*saved before"
+        ):
+            use()
+    assert not (tmp_path / "map.npz").exists()

@@ -30,17 +30,18 @@ from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix, inverse, orthonormalised
 from vslam.map import Map
 from vslam.map_frames import (
+    LandmarkCounts,
     OldPlace,
     add_frame,
     add_two_views,
     count_shared_landmarks,
+    drop_dead_landmarks,
     find_old_place,
     has_more_points,
     observe_keyframe,
     update_landmarks,
 )
-from vslam.map_kernels import count_seen_by
-from vslam.map_view import MapView, local_map
+from vslam.map_view import MapView, local_map, view_of
 from vslam.shared_map import SharedMap
 from vslam.starter import TwoViewStart
 from vslam.states import MapperState
@@ -83,8 +84,7 @@ class Mapper:
         self._aligner = Aligner(context.config.alignment)
         self._is_merged = True
         self._held: tuple[Frame, ...] = ()
-        self._visible: list[NDArray[np.int32]] = []
-        self._found: list[NDArray[np.int32]] = []
+        self._counts = LandmarkCounts()
         self.frames = FramePoses(self, frames)
         if self.map.n_keyframes:
             self.refer_to(int(self.map.living_keyframes()[-1]))
@@ -161,10 +161,8 @@ class Mapper:
         self.frames.append(frame.timestamp, frame.T_cw, tracked=tracked)
 
     def count(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
-        """Remember which landmarks a frame should have seen and which it did see; the map is told
-        when it is free."""
-        self._visible.append(visible)
-        self._found.append(found)
+        """Let the map count that a frame should have seen some landmarks and did see others."""
+        self._counts.add(visible, found)
 
     def merge_if_due(self, frame: int) -> None:
         """Merge if the last keyframe was made so many frames ago that this is the frame for it."""
@@ -192,19 +190,12 @@ class Mapper:
             RuntimeError: as ``merge``.
         """
         map_ = self._shared.wait()
-        for seen, counter in (
-            (self._visible, map_.arrays.visible),
-            (self._found, map_.arrays.found),
-        ):
-            for ids in seen:
-                counter[ids] += 1
-            seen.clear()
+        self._counts.write(map_)
         return map_
 
     def finish(self) -> None:
         """Complete all that is under way, global bundle adjustment included."""
-        self.merge()
-        with self._shared.changing() as map_:
+        with self._changing() as map_:
             self._closing.conclude(map_)
             self._closing.finish(map_)
         if self.n_keyframes:
@@ -221,7 +212,8 @@ class Mapper:
         Args:
             predicted: whether the pose of such a frame is at least a prediction.
         """
-        with self._change(frame) as map_:
+        with self._changing() as map_:
+            self._make_room(map_, frame)
             certainty = self._aligner.certainty(frame)
             keyframe = add_frame(map_, frame, certainty, self.reference, predicted=predicted)
             map_stereo_points(map_, keyframe, self._camera, self._config)
@@ -240,14 +232,14 @@ class Mapper:
         ORB-SLAM2 (III-B) begins with all of them. Far points bend the first poses by the error of
         the pair's calibration; but at speed close points leave the view within a frame.
         """
-        map_, keyframe = self.merge(), self.reference
-        if not has_more_points(map_, keyframe, frame):
+        keyframe = self.reference
+        if not has_more_points(self.merge(), keyframe, frame):
             return False
-        with self._shared.changing():
+        with self._changing() as map_:
             new = map_stereo_points(map_, keyframe, self._camera, self._config, far=True)
             refresh_keyframe(map_, keyframe)
-        self.refer_to(keyframe)
-        observe_keyframe(frame, map_, keyframe)
+            self.refer_to(keyframe)
+            observe_keyframe(frame, map_, keyframe)
         return len(new) > 0
 
     def begin(self, start: TwoViewStart, twist: Callable[[], Matrix | None]) -> None:
@@ -259,9 +251,10 @@ class Mapper:
             twist: asked after the merge: the speed of the camera before, None if unknown. A
                 sub-map takes its unit from it.
         """
-        with self._change(start.second) as map_:
+        with self._changing() as map_:
             start = start.at_speed(twist(), self._config.initialization.max_rescaling)
             frames = start.first, start.second
+            self._make_room(map_, start.second)
             keyframes = add_two_views(map_, start, self.reference)
             for keyframe, frame in zip(keyframes, frames, strict=True):
                 self._closing.process(map_, keyframe, frame.features, frame.image)
@@ -290,22 +283,10 @@ class Mapper:
 
     def refer_to(self, keyframe: int) -> None:
         """Make a keyframe the reference, so that tracking sees what is around it."""
-        map_ = self.map
-        around = local_map(map_, keyframe, self._config.tracking.local_keyframes)
-        living = map_.living_keyframes()
-        if self._camera.monocular and map_.restarts:
-            # A sub-map is young once more: without stereo nothing but this tells when to go on.
-            living = living[living >= map_.restarts[-1]]
-        self.view = MapView(
-            reference=keyframe,
-            T_reference=map_.keyframe_pose(keyframe),
-            unit_scale=map_.unit_scale[keyframe],
-            n_keyframes=map_.n_keyframes,
-            around=around,
-            nearest=local_map(map_, keyframe, 1),
-            n_reference=count_seen_by(map_.arrays, keyframe, min(3, len(living))),
-            patches=self._aligner.patches_of(map_, around.ids),
-        )
+        map_, config = self.map, self._config.tracking
+        around = local_map(map_, keyframe, config.local_keyframes)
+        patches = self._aligner.patches_of(map_, around.ids)
+        self.view = view_of(map_, keyframe, around, patches, monocular=self._camera.monocular)
         self._rig.disparity_offset = map_.disparity_offset
 
     def refer_to_nearest(self, frame: Frame) -> None:
@@ -336,21 +317,17 @@ class Mapper:
             self.last_frame, self.last_timestamp = map_.frames[newest], map_.timestamps[newest]
 
     @contextmanager
-    def _change(self, frame: Frame) -> Iterator[Map]:
-        """Merge, make room in the map, and give it to a block that changes it.
-
-        Landmarks get other ids where dead ones are dropped, except while a global bundle adjustment
-        is under way, which knows its landmarks by their ids.
-        """
+    def _changing(self) -> Iterator[Map]:
+        """The merged map; a change that fails half way leaves it to nobody."""
         self.merge()
-        with self._shared.changing() as map_:
-            if not self._closing.is_adjusting and map_.many_dead_landmarks:
-                new_id = map_.drop_dead_landmarks()
-                for one in {id(one): one for one in (*self._held, frame)}.values():
-                    tracked = one.landmark >= 0
-                    one.landmark = one.landmark.copy()
-                    one.landmark[tracked] = new_id[one.landmark[tracked]]
+        with self._shared.change() as map_:
             yield map_
+
+    def _make_room(self, map_: Map, frame: Frame) -> None:
+        """Drop dead landmarks where they are many. The others get new ids, so that it has to wait
+        while a global bundle adjustment is under way, which knows its landmarks by their ids."""
+        if not self._closing.is_adjusting and map_.many_dead_landmarks:
+            drop_dead_landmarks(map_, (*self._held, frame))
 
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
         """The frame has become the newest keyframe: later ones are tracked against it."""

@@ -34,7 +34,7 @@ class SharedMap:
         """The map.
 
         Raises:
-            RuntimeError: a job may be writing it, or an earlier change failed.
+            RuntimeError: a job may be writing it, or one failed.
         """
         if self._failure:
             raise RuntimeError(self._failure)
@@ -55,28 +55,33 @@ class SharedMap:
         """The map, once the job is done.
 
         Raises:
-            RuntimeError: an earlier change failed. This job's own error is raised as it is.
+            RuntimeError: an earlier job failed. This one's own error is raised as it is.
         """
         if self._job is not None:
             job, self._job = self._job, None
-            with self.changing():
+            with self._whole():
                 job()
         return self.map
 
     @contextmanager
-    def changing(self) -> Iterator[Map]:
-        """The map, for a change that is made here and now. An error leaves the map incomplete: it
-        is raised as it is, and whoever asks for the map later is told of it.
+    def change(self) -> Iterator[Map]:
+        """The map, once no job is working on it, to be changed.
 
         Raises:
-            RuntimeError: as ``map``.
+            RuntimeError: as ``wait``.
         """
-        map_ = self.map
-        try:
+        map_ = self.wait()
+        with self._whole():
             yield map_
+
+    @contextmanager
+    def _whole(self) -> Iterator[None]:
+        """Give the map to nobody any more if what changes it fails half way."""
+        try:
+            yield
         except BaseException as error:
             self._failure = (
-                f"mapping a keyframe failed ({error!r}), which leaves the map incomplete; "
-                "continue from a map that was saved before"
+                f"mapping a keyframe failed ({error!r}), which leaves the map incomplete; continue "
+                "from a map that was saved before"
             )
             raise

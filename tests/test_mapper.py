@@ -80,9 +80,10 @@ class Drive:
         camera: Camera = CAMERA,
         see: Callable[[int], Features] = see_points,
         poses: Callable[[int], np.ndarray] = at,
+        tracking: dict[str, int] | None = None,
         **keyframes: float,
     ) -> None:
-        config = Config.model_validate({"keyframes": keyframes})
+        config = Config.model_validate({"keyframes": keyframes, "tracking": tracking or {}})
         self.context = TrackingContext.create(camera, config)
         self.closing = closing or Closing()
         self.rig = RigCalibration(camera, config.stereo, self.context.scales)

@@ -28,10 +28,10 @@ from vslam.states import MapperState
 
 POINTS = Points.create()
 RING = ring.Ring.create(zoom=True)
-EXECUTORS = [lambda: None, InstantExecutor]
-ids = {"argnames": "executor", "argvalues": EXECUTORS, "ids": ["late", "instant"]}
-both = pytest.mark.parametrize(**ids)  # as late as can be, and as early
-
+# A job runs as late as can be, where its result is needed, or as early as can be, at once.
+late_and_early = pytest.mark.parametrize(
+    "executor", [lambda: None, InstantExecutor], ids=["late", "early"]
+)
 
 AT_THE_END = -1  # in place of a keyframe
 
@@ -146,7 +146,7 @@ def test_the_first_keyframe_is_mapped_at_once():
     assert len(drive.mapper.view.around.ids) == drive.mapper.map.n_landmarks > 50
 
 
-@both
+@late_and_early
 @pytest.mark.parametrize("after", [1, 2, 4])
 def test_a_keyframe_is_merged_at_the_frame_that_is_due_and_no_other(executor, after):
     drive = Drive(executor(), merge_after_frames=after)
@@ -166,7 +166,7 @@ def test_a_keyframe_is_merged_at_the_frame_that_is_due_and_no_other(executor, af
     assert mapper.view is merged
 
 
-@both
+@late_and_early
 def test_whoever_needs_the_map_merges(executor):
     for use in (
         lambda drive: drive.mapper.merge(),
@@ -225,7 +225,7 @@ def test_completing_a_keyframe_early_changes_no_result():
     assert trace_on_the_ring(None, Mapper.complete) == trace_on_the_ring(None)
 
 
-@both
+@late_and_early
 def test_completing_shows_tracking_nothing(executor):
     drive = Drive(executor(), merge_after_frames=9)
     drive.steps([0, 3], 5)
@@ -243,7 +243,7 @@ def test_completing_shows_tracking_nothing(executor):
     assert mapper.view is not shown
 
 
-@both
+@late_and_early
 def test_the_map_is_not_to_be_had_while_a_keyframe_is_mapped(executor):
     drive = Drive(executor(), merge_after_frames=9)
     drive.steps([0, 3], 5)
@@ -267,7 +267,7 @@ def test_a_trajectory_is_not_to_be_had_even_if_all_frames_follow_the_reference_k
         drive.mapper.trajectory()
 
 
-@both
+@late_and_early
 def test_the_map_counts_what_frames_saw_when_it_is_free(executor):
     drive = Drive(executor(), merge_after_frames=9)
     drive.steps([0, 3], 4)
@@ -293,7 +293,7 @@ def test_the_map_counts_what_frames_saw_when_it_is_free(executor):
 MOVES = [se3_exp(np.array(twist)) for twist in ([0.3, 0, 0, 0, 0.02, 0], [0, 0, -0.4, 0.03, 0, 0])]
 
 
-@both
+@late_and_early
 def test_held_frames_follow_a_merge(executor):
     """One that is placed follows its keyframe, one that is not follows the reference keyframe."""
 
@@ -319,7 +319,7 @@ def test_held_frames_follow_a_merge(executor):
     np.testing.assert_array_equal(placed.T_cw, drive.mapper.frames.pose(placed.index))
 
 
-@both
+@late_and_early
 def test_held_frames_track_what_became_of_their_landmarks(executor):
     gone = 7
 
@@ -392,7 +392,7 @@ def drive_twist(k: int) -> np.ndarray:
     return np.array([0.0, 0.0, -0.2 * k, 0.0, -0.002 * k, 0.0])
 
 
-@both
+@late_and_early
 def test_where_the_unit_of_a_monocular_map_changes_speeds_and_poses_change_with_it(executor):
     def double(map_: Map, keyframe: int) -> None:
         if keyframe == 2:
@@ -546,7 +546,7 @@ def fail(map_: Map, keyframe: int) -> None:
         raise BrokenError
 
 
-@both
+@late_and_early
 @pytest.mark.parametrize(
     "first",
     [

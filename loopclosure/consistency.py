@@ -18,8 +18,9 @@ from vslam.camera import Camera
 from vslam.config import ConsistencyConfig, VerificationConfig
 from vslam.geometry import inverse, se3_log
 from vslam.loopclosure.verification import verify_near
-from vslam.loops import ConsistencyState, LoopCandidate, LoopEdge, ResembledPlace
+from vslam.loops import LoopCandidate, LoopEdge, ResembledPlace
 from vslam.map import Map
+from vslam.states import ConsistencyState
 
 
 class LoopConsistency:

@@ -26,9 +26,10 @@ from vslam.loopclosure.verification import (
     relative_scale,
     spread_reason,
 )
-from vslam.loops import LoopCandidate, LoopEdge, VerifierState
+from vslam.loops import LoopCandidate, LoopEdge
 from vslam.map import Map
 from vslam.map_kernels import collect_landmarks
+from vslam.states import VerifierState
 
 _DEPTHS_AGREE = 0.15  # a keypoint that observes a landmark has its depth, to this share
 

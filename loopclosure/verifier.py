@@ -22,8 +22,9 @@ from vslam.loopclosure.learned_verification import (
 )
 from vslam.loopclosure.reach import beyond_reach
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
-from vslam.loops import LoopCandidate, LoopEdge, VerifierState
+from vslam.loops import LoopCandidate, LoopEdge
 from vslam.map import Map
+from vslam.states import VerifierState
 
 
 class Verifier(Protocol):

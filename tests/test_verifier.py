@@ -19,7 +19,8 @@ from vslam.loopclosure.verifier import (
     OrbVerifier,
     verifier_for,
 )
-from vslam.loops import LoopCandidate, LoopEdge, VerifierState
+from vslam.loops import LoopCandidate, LoopEdge
+from vslam.states import VerifierState
 
 PLAIN = LoopCandidate(1, 0, 0.9, alike=0.5)
 PROMISING = replace(PLAIN, promising=True)

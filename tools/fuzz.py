@@ -211,12 +211,19 @@ def _write_video(folder: Path) -> None:
 
 def _write_map(folder: Path) -> None:
     from vslam.features import PATCH_PIXELS, Features, KeyframePatches
-    from vslam.loops import ClosingState, ConsistencyState, LoopEdge, ResembledPlace
+    from vslam.loops import LoopEdge, ResembledPlace
     from vslam.map import Map
     from vslam.map_kernels import link_many, merge_landmarks, refresh_landmarks
     from vslam.maps.storage import save_map
     from vslam.maps.stored_map import StoredMap
-    from vslam.states import Checkpoint, MapperState, PolicyState, TrackerState
+    from vslam.states import (
+        Checkpoint,
+        ClosingState,
+        ConsistencyState,
+        MapperState,
+        PolicyState,
+        TrackerState,
+    )
 
     rng = np.random.default_rng(3)
     map_ = Map(1.2 ** np.arange(8))

@@ -31,8 +31,9 @@ from vslam.hypotheses import Hypothesis, Solution, solve
 from vslam.loopclosure.consistency import LoopConsistency
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.verifier import Verifier
-from vslam.loops import ClosingState, LoopCandidate, LoopCorrection, LoopEdge
+from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map
+from vslam.states import ClosingState
 
 _log = logging.getLogger(__name__)
 

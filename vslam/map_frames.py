@@ -78,6 +78,36 @@ def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, 
     return first, second
 
 
+class LandmarkCounts:
+    """Which landmarks frames should have seen and did see, until the map is free to count them."""
+
+    def __init__(self) -> None:
+        self._visible: list[NDArray[np.int32]] = []
+        self._found: list[NDArray[np.int32]] = []
+
+    def add(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
+        """Remember those of a frame, ``(N,)`` and ``(M,)`` ids."""
+        self._visible.append(visible)
+        self._found.append(found)
+
+    def write(self, map_: Map) -> None:
+        """Add what is remembered to the counters of the map."""
+        a = map_.arrays
+        for seen, counter in ((self._visible, a.visible), (self._found, a.found)):
+            for ids in seen:
+                counter[ids] += 1
+            seen.clear()
+
+
+def drop_dead_landmarks(map_: Map, frames: Sequence[Frame]) -> None:
+    """Make room in the map; the landmarks that frames track keep their meaning under new ids."""
+    new_id = map_.drop_dead_landmarks()
+    for frame in {id(frame): frame for frame in frames}.values():
+        tracked = frame.landmark >= 0
+        frame.landmark = frame.landmark.copy()
+        frame.landmark[tracked] = new_id[frame.landmark[tracked]]
+
+
 def has_more_points(map_: Map, keyframe: int, frame: Frame) -> bool:
     """Whether a keyframe is the first of a map or sub-map, no other follows it yet, and a frame is
     the one that it was made of: then its far stereo points are not mapped yet."""

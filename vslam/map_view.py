@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vslam.features import NO_PATCHES, LandmarkPatches
 from vslam.geometry import Matrix
 from vslam.map import Map
-from vslam.map_kernels import collect_landmarks
+from vslam.map_kernels import collect_landmarks, count_seen_by
 
 
 class LocalMap(NamedTuple):
@@ -78,3 +78,23 @@ class MapView:
     nearest: LocalMap = NO_LANDMARKS
     n_reference: int = 0
     patches: LandmarkPatches = NO_PATCHES
+
+
+def view_of(
+    map_: Map, keyframe: int, around: LocalMap, patches: LandmarkPatches, *, monocular: bool
+) -> MapView:
+    """What tracking sees from a reference keyframe; the rest as in ``MapView``."""
+    living = map_.living_keyframes()
+    if monocular and map_.restarts:
+        # A sub-map is young once more: without stereo nothing but this tells when to go on.
+        living = living[living >= map_.restarts[-1]]
+    return MapView(
+        reference=keyframe,
+        T_reference=map_.keyframe_pose(keyframe),
+        unit_scale=map_.unit_scale[keyframe],
+        n_keyframes=map_.n_keyframes,
+        around=around,
+        nearest=local_map(map_, keyframe, 1),
+        n_reference=count_seen_by(map_.arrays, keyframe, min(3, len(living))),
+        patches=patches,
+    )

@@ -29,17 +29,18 @@ from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix, inverse, orthonormalised
 from vslam.map import Map
 from vslam.map_frames import (
+    LandmarkCounts,
     OldPlace,
     add_frame,
     add_two_views,
     count_shared_landmarks,
+    drop_dead_landmarks,
     find_old_place,
     has_more_points,
     observe_keyframe,
     update_landmarks,
 )
-from vslam.map_kernels import count_seen_by
-from vslam.map_view import MapView, local_map
+from vslam.map_view import MapView, local_map, view_of
 from vslam.shared_map import SharedMap
 from vslam.starter import TwoViewStart
 from vslam.states import MapperState
@@ -82,8 +83,7 @@ class Mapper:
         self._aligner = Aligner(context.config.alignment)
         self._is_merged = True
         self._held: tuple[Frame, ...] = ()
-        self._visible: list[NDArray[np.int32]] = []
-        self._found: list[NDArray[np.int32]] = []
+        self._counts = LandmarkCounts()
         self.frames = FramePoses(self, frames)
         if self.map.n_keyframes:
             self.refer_to(int(self.map.living_keyframes()[-1]))
@@ -160,10 +160,8 @@ class Mapper:
         self.frames.append(frame.timestamp, frame.T_cw, tracked=tracked)
 
     def count(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
-        """Remember which landmarks a frame should have seen and which it did see; the map is told
-        when it is free."""
-        self._visible.append(visible)
-        self._found.append(found)
+        """Let the map count that a frame should have seen some landmarks and did see others."""
+        self._counts.add(visible, found)
 
     def merge_if_due(self, frame: int) -> None:
         """Merge if the last keyframe was made so many frames ago that this is the frame for it."""
@@ -191,13 +189,7 @@ class Mapper:
             RuntimeError: as ``merge``.
         """
         map_ = self._shared.wait()
-        for seen, counter in (
-            (self._visible, map_.arrays.visible),
-            (self._found, map_.arrays.found),
-        ):
-            for ids in seen:
-                counter[ids] += 1
-            seen.clear()
+        self._counts.write(map_)
         return map_
 
     def finish(self) -> None:
@@ -287,22 +279,10 @@ class Mapper:
 
     def refer_to(self, keyframe: int) -> None:
         """Make a keyframe the reference, so that tracking sees what is around it."""
-        map_ = self.map
-        around = local_map(map_, keyframe, self._config.tracking.local_keyframes)
-        living = map_.living_keyframes()
-        if self._camera.monocular and map_.restarts:
-            # A sub-map is young once more: without stereo nothing but this tells when to go on.
-            living = living[living >= map_.restarts[-1]]
-        self.view = MapView(
-            reference=keyframe,
-            T_reference=map_.keyframe_pose(keyframe),
-            unit_scale=map_.unit_scale[keyframe],
-            n_keyframes=map_.n_keyframes,
-            around=around,
-            nearest=local_map(map_, keyframe, 1),
-            n_reference=count_seen_by(map_.arrays, keyframe, min(3, len(living))),
-            patches=self._aligner.patches_of(map_, around.ids),
-        )
+        map_, config = self.map, self._config.tracking
+        around = local_map(map_, keyframe, config.local_keyframes)
+        patches = self._aligner.patches_of(map_, around.ids)
+        self.view = view_of(map_, keyframe, around, patches, monocular=self._camera.monocular)
         self._rig.disparity_offset = map_.disparity_offset
 
     def refer_to_nearest(self, frame: Frame) -> None:
@@ -340,11 +320,7 @@ class Mapper:
         """
         map_ = self.merge()
         if not self._closing.is_adjusting and map_.many_dead_landmarks:
-            new_id = map_.drop_dead_landmarks()
-            for one in {id(one): one for one in (*self._held, frame)}.values():
-                tracked = one.landmark >= 0
-                one.landmark = one.landmark.copy()
-                one.landmark[tracked] = new_id[one.landmark[tracked]]
+            drop_dead_landmarks(map_, (*self._held, frame))
         return map_
 
     def _set_newest(self, keyframe: int, frame: Frame) -> None:

@@ -6,14 +6,14 @@ and the map as it was, a run continues to the byte as if it had not stopped.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.features import Features, KeyframePatches
 from vslam.geometry import Matrix
-from vslam.loops import ClosingState
+from vslam.loops import LoopEdge, ResembledPlace
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,48 @@ class PolicyState:
 
     gained_close: float
     gain_awaited: bool
+
+
+@dataclass(frozen=True)
+class ConsistencyState:
+    """Of the consistency test of loop candidates.
+
+    Attributes:
+        places: that recent keyframes resembled.
+        verified: loops that wait for others to agree, each with the ``turn`` of its keyframe.
+        turn: keyframes asked about so far.
+    """
+
+    places: tuple[ResembledPlace, ...] = ()
+    verified: tuple[tuple[int, LoopEdge], ...] = ()
+    turn: int = 0
+
+
+@dataclass(frozen=True)
+class VerifierState:
+    """Of the verifier of loop candidates: its last failed attempt by learned descriptors.
+
+    Attributes:
+        resting_until: before this keyframe, only clearly more alike candidates are tried.
+        in_vain: how alike the images of the failed attempt were.
+    """
+
+    resting_until: int = 0
+    in_vain: float = 0.0
+
+
+@dataclass(frozen=True)
+class ClosingState:
+    """Of loop closing.
+
+    Attributes:
+        consistency, verifier: the states of its parts.
+        followed: times that an old keyframe served instead of a new one.
+    """
+
+    consistency: ConsistencyState = field(default_factory=ConsistencyState)
+    verifier: VerifierState = field(default_factory=VerifierState)
+    followed: int = 0
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.features import PATCH_PIXELS, Features, KeyframePatches
-from vslam.loops import (
+from vslam.loops import ResembledPlace, loop_entry, loop_of
+from vslam.states import (
+    Checkpoint,
     ClosingState,
     ConsistencyState,
-    ResembledPlace,
+    MapperState,
+    PolicyState,
+    TrackerState,
     VerifierState,
-    loop_entry,
-    loop_of,
 )
-from vslam.states import Checkpoint, MapperState, PolicyState, TrackerState
 
 # N features of the last frame tracked; M keyframes with patches, R rows in all.
 ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {

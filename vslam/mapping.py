@@ -3,8 +3,8 @@
 ``Mapper`` owns the map. A keyframe is mapped in a thread of its own, the mapping job. The job is
 merged, which means that its result is shown to tracking, at a frame that is found by counting
 frames and never by looking whether the job is done. Tracking reads a ``MapView``, a copy that the
-last merge left. Methods that need the merged map merge first; frames that are held follow the map
-wherever a merge moves it.
+last merge left. Methods that need the merged map begin with a merge themselves; frames that are
+held follow the map wherever a merge moves it.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ class Mapper:
         if self.n_keyframes:
             self._renew_view()
 
-    # Changes of the map, each of which merges first
+    # Changes of the map, each of which begins with a merge
 
     def insert(self, frame: Frame, *, predicted: bool = True) -> None:
         """Make the frame placed last a keyframe, map its stereo points and start its mapping job.

@@ -50,7 +50,7 @@ class Closing:
         if self._job is not None:
             self._job(map_, keyframe)
 
-    def follow(self, keyframe: int) -> bool:
+    def count_reused_keyframe(self, keyframe: int) -> bool:
         return self.is_due
 
     def conclude(self, map_: Map) -> None:
@@ -98,7 +98,9 @@ class Drive:
         frame.T_cw = self._at(k)
         self.rig.prepare(frame, None)
         if mapper.n_keyframes:
-            _, _, visible = track_local_map(frame, mapper.view.around, self.context, window=8.0)
+            _, _, visible = track_local_map(
+                frame, mapper.view.local_landmarks, self.context, window=8.0
+            )
             mapper.count(visible, frame.landmark[frame.landmark >= 0])
         return frame
 
@@ -107,7 +109,7 @@ class Drive:
         self.mapper.merge_if_due(len(self.mapper.frames))
         frame = self.next_frame()
         self.mapper.hold(self.last, frame)
-        self.mapper.place(frame, tracked=True)
+        self.mapper.append_pose(frame, tracked=True)
         if keyframe:
             self.mapper.insert(frame)
         self.last = frame
@@ -143,7 +145,7 @@ def test_the_first_keyframe_is_mapped_at_once():
     assert drive.mapper.n_keyframes == 1
     assert drive.mapper.is_merged
     assert not drive.mapper.is_mapping
-    assert len(drive.mapper.view.around.ids) == drive.mapper.map.n_landmarks > 50
+    assert len(drive.mapper.view.local_landmarks.ids) == drive.mapper.map.n_landmarks > 50
 
 
 @late_and_early
@@ -160,7 +162,9 @@ def test_a_keyframe_is_merged_at_the_frame_that_is_due_and_no_other(executor, af
     drive.step()
     assert (mapper.is_merged, mapper.is_mapping) == (True, False)
     assert mapper.view is not shown
-    assert len(mapper.view.around.ids) > len(shown.around.ids)  # two keyframes triangulate
+    assert len(mapper.view.local_landmarks.ids) > len(
+        shown.local_landmarks.ids
+    )  # two keyframes triangulate
     merged = mapper.view
     drive.step()
     assert mapper.view is merged
@@ -171,7 +175,7 @@ def test_whoever_needs_the_map_merges(executor):
     for use in (
         lambda drive: drive.mapper.merge(),
         lambda drive: drive.mapper.finish(),
-        lambda drive: drive.mapper.old_place(drive.last),
+        lambda drive: drive.mapper.find_old_place(drive.last),
         lambda drive: drive.mapper.refer_to_nearest(drive.last),
         lambda drive: drive.mapper.map_far_points(drive.last),
     ):
@@ -180,7 +184,7 @@ def test_whoever_needs_the_map_merges(executor):
         shown = drive.mapper.view
         use(drive)
         assert drive.mapper.is_merged
-        assert len(drive.mapper.view.around.ids) > len(shown.around.ids)
+        assert len(drive.mapper.view.local_landmarks.ids) > len(shown.local_landmarks.ids)
 
 
 def test_a_keyframe_merges_the_one_before():
@@ -366,7 +370,7 @@ def begin_with_two_views(drive: Drive) -> None:
     for _ in range(4):
         frames.append(drive.next_frame())
         frames[-1].T_cw = np.eye(4)
-        drive.mapper.place(frames[-1], tracked=False)
+        drive.mapper.append_pose(frames[-1], tracked=False)
     every = np.arange(len(POINTS.xyz))
     start = TwoViewStart(frames[0], frames[3], at(3), (every, every), POINTS.xyz)
     drive.mapper.begin(start, lambda: None)
@@ -435,7 +439,7 @@ def test_where_dead_landmarks_are_dropped_frames_track_the_same_points(adjusting
     drive.closing.is_adjusting = adjusting
     monkeypatch.setattr(Map, "many_dead_landmarks", True)
     held, new = drive.step(), drive.next_frame()
-    drive.mapper.place(new, tracked=True)
+    drive.mapper.append_pose(new, tracked=True)
     drive.mapper.hold(held, new)
     numbers, xyz = [frame.landmark.copy() for frame in (held, new)], held.xyz.copy()
     drive.mapper.insert(new)
@@ -455,7 +459,7 @@ def test_a_frame_may_be_placed_by_the_keyframe_near_which_it_was_found():
     drive.steps([0, 3], 6)
     assert drive.mapper.reference == 1
     frame = drive.next_frame()
-    drive.mapper.place(frame, tracked=True, near=0)
+    drive.mapper.append_pose(frame, tracked=True, near=0)
     assert drive.mapper.reference == 0
     assert drive.mapper.frames.table().reference[-1] == 0
     np.testing.assert_allclose(drive.mapper.frames.pose(-1), frame.T_cw, atol=1e-12)
@@ -484,7 +488,7 @@ def test_a_place_is_old_when_its_keyframe_is(known_after_s, known):
     drive.steps([0, 3], 5)
     frame = drive.step()
     assert frame.timestamp == 0.5
-    place = drive.mapper.old_place(frame)
+    place = drive.mapper.find_old_place(frame)
     assert (place is not None) == known
     if place is not None:
         map_ = drive.mapper.map
@@ -500,7 +504,7 @@ def test_an_old_keyframe_can_serve_in_place_of_a_new_one(is_due):
     drive.steps([0, 3], 6)
     mapper, frame = drive.mapper, drive.last
     drive.closing.is_due = is_due
-    mapper.follow(mapper.old_place(frame), frame)
+    mapper.use_existing_keyframe(mapper.find_old_place(frame), frame)
     assert (mapper.reference, mapper.n_keyframes) == (0, 2)
     assert mapper.last_timestamp == frame.timestamp
     assert mapper.frames.table().reference[-1] == 0
@@ -521,7 +525,7 @@ def test_far_points_are_mapped_of_the_first_keyframe_while_it_is_the_only_one():
     assert not drive.mapper.map_far_points(drive.next_frame())  # another frame
     assert drive.mapper.map_far_points(frame)
     assert n < np.count_nonzero(frame.landmark >= 0) == 240
-    assert len(drive.mapper.view.around.ids) == 240 > len(near.around.ids)
+    assert len(drive.mapper.view.local_landmarks.ids) == 240 > len(near.local_landmarks.ids)
     assert np.isfinite(frame.xyz).all()
     assert not drive.mapper.map_far_points(frame)  # there are no more
     drive = Drive()
@@ -576,7 +580,7 @@ def test_a_job_that_fails_says_so_once_and_the_map_says_so_from_then_on(executor
         lambda: mapper.insert(frame),
         lambda: mapper.map_far_points(frame),
         lambda: mapper.begin(start, lambda: None),
-        lambda: mapper.old_place(frame),
+        lambda: mapper.find_old_place(frame),
         lambda: mapper.refer_to(0),
         lambda: mapper.refer_to_nearest(frame),
         lambda: mapper.keyframe_pose(0),
@@ -653,7 +657,7 @@ def test_a_mapper_that_is_restored_goes_on_as_the_one_that_was_not():
     """The reference keyframe is not the newest, as after a frame was found in the map."""
     one = Drive()
     one.steps([0, 3], 6)
-    one.mapper.place(one.next_frame(), tracked=True, near=0)
+    one.mapper.append_pose(one.next_frame(), tracked=True, near=0)
     state, map_ = one.mapper.state(), one.mapper.complete()
     other = Drive()
     other.mapper = Mapper(

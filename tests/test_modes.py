@@ -42,7 +42,7 @@ class Building(Drive):
         if not tracked:
             frame.landmark[:], frame.xyz[:] = -1, np.nan
         self.mapper.hold(frame)
-        self.mapper.place(frame, tracked=tracked)
+        self.mapper.append_pose(frame, tracked=tracked)
         return frame
 
     def lost_frame(self, n: int) -> Frame:
@@ -69,8 +69,8 @@ def test_localising_leaves_the_map_alone():
     before = bytes_of_map(mapper.complete())
     assert not mode.begin(lost)
     assert not mode.begin_after_loss(lost)
-    assert not mode.see_farther()
-    assert not mode.extend(tracked, found(tracked))
+    assert not mode.map_far_points()
+    assert not mode.update_map(tracked, found(tracked))
     mode.restore(PolicyState(1.0, True))
     mapper.finish()
     assert bytes_of_map(mapper.map) == before
@@ -85,7 +85,7 @@ def test_localising_tracks_by_the_keyframe_that_shares_the_most_with_a_frame():
     drive.mapper.merge()
     frame = drive.next_frame()
     drive.mapper.refer_to(0)
-    Localising(drive.mapper).extend(frame, found(frame))
+    Localising(drive.mapper).update_map(frame, found(frame))
     assert drive.mapper.reference == 1
 
 
@@ -169,17 +169,17 @@ def test_a_lost_monocular_camera_looks_for_a_first_view_after_four_frames():
 
 def test_a_frame_that_is_lost_right_after_a_map_began_may_see_more_of_it():
     drive = Building()
-    assert not drive.mode.see_farther()  # of what?
+    assert not drive.mode.map_far_points()  # of what?
     first = drive.placed_frame()
     drive.mode.begin(first)
-    shown = len(drive.mapper.view.around.ids)
+    shown = len(drive.mapper.view.local_landmarks.ids)
     first.twist = TWIST
-    assert not drive.mode.see_farther()  # the camera was tracked since then
-    assert len(drive.mapper.view.around.ids) == shown
+    assert not drive.mode.map_far_points()  # the camera was tracked since then
+    assert len(drive.mapper.view.local_landmarks.ids) == shown
     first.twist = None
-    assert drive.mode.see_farther()
-    assert len(drive.mapper.view.around.ids) == 240 > shown
-    assert not drive.mode.see_farther()  # there is no more
+    assert drive.mode.map_far_points()
+    assert len(drive.mapper.view.local_landmarks.ids) == 240 > shown
+    assert not drive.mode.map_far_points()  # there is no more
 
 
 def test_a_monocular_map_has_no_far_points_to_show():
@@ -188,7 +188,7 @@ def test_a_monocular_map_has_no_far_points_to_show():
     drive.tracker.start_from(drive.last)
     drive.last.twist = None
     drive.mapper.map_far_points = lambda frame: pytest.fail("a map without depths was asked")
-    assert not drive.mode.see_farther()
+    assert not drive.mode.map_far_points()
 
 
 # -- a tracked frame ------------------------------------------------------------------------------
@@ -202,7 +202,7 @@ def test_a_frame_that_shows_nothing_new_is_only_counted():
     gone = frame.landmark[lost].copy()
     says = found(frame)
     frame.landmark[lost] = -1
-    assert not drive.mode.extend(frame, says)
+    assert not drive.mode.update_map(frame, says)
     assert drive.mapper.n_keyframes == 2
     after = drive.mapper.complete().used_arrays()
     seen = np.zeros(len(before.visible), int)
@@ -217,7 +217,7 @@ def test_a_frame_becomes_a_keyframe_when_it_is_time():
     made = []
     for _ in range(3):
         frame = drive.placed_frame()
-        made.append(drive.mode.extend(frame, found(frame)))
+        made.append(drive.mode.update_map(frame, found(frame)))
     assert made == [False, False, True]  # frames 6, 7 and 8; the keyframe before is 3
     assert drive.mapper.last_frame == 8
     assert drive.mode.state().gain_awaited
@@ -228,9 +228,9 @@ def test_a_frame_of_the_right_camera_becomes_no_keyframe():
     drive = Building.with_a_map(max_interval_s=0.05)
     frame = drive.placed_frame()
     frame.side = Side.RIGHT
-    assert not drive.mode.extend(frame, found(frame))
+    assert not drive.mode.update_map(frame, found(frame))
     frame.side = Side.LEFT
-    assert drive.mode.extend(frame, found(frame))
+    assert drive.mode.update_map(frame, found(frame))
 
 
 @pytest.mark.parametrize(("idle", "made"), [(True, True), (False, False)])
@@ -242,8 +242,8 @@ def test_a_frame_that_is_not_urgent_waits_for_mapping(idle, made):
     assert drive.mapper.is_merged == idle
     frame = drive.next_frame()
     frame.landmark[int(0.7 * drive.mapper.view.n_reference) :] = -1
-    drive.mapper.place(frame, tracked=True)
-    assert drive.mode.extend(frame, found(frame)) == made
+    drive.mapper.append_pose(frame, tracked=True)
+    assert drive.mode.update_map(frame, found(frame)) == made
 
 
 @pytest.mark.parametrize(("known_after_s", "known"), [(0.5, True), (5.0, False)])
@@ -251,7 +251,7 @@ def test_at_an_old_place_no_keyframe_is_made(known_after_s, known):
     drive = Building.with_a_map(max_interval_s=0.05, known_after_s=known_after_s)
     frame = drive.placed_frame()
     before = drive.mode.state()
-    assert drive.mode.extend(frame, found(frame)) != known
+    assert drive.mode.update_map(frame, found(frame)) != known
     assert drive.mapper.n_keyframes == (2 if known else 3)
     assert drive.mapper.reference == (0 if known else 2)
     assert drive.mapper.last_timestamp == frame.timestamp
@@ -271,8 +271,8 @@ def test_an_old_place_must_be_tracked_as_well_as_its_keyframe_was(
     drive = Building.with_a_map(max_interval_s=0.05)
     frame = drive.placed_frame()
     frame.landmark[np.flatnonzero(frame.landmark >= 0)[n_tracked:]] = -1
-    drive.mapper.old_place = lambda frame: OldPlace(0, n_shared, n_place)
-    assert drive.mode.extend(frame, found(frame)) != known
+    drive.mapper.find_old_place = lambda frame: OldPlace(0, n_shared, n_place)
+    assert drive.mode.update_map(frame, found(frame)) != known
 
 
 def test_a_frame_that_is_tracked_ends_the_wait_for_a_second_view():
@@ -281,7 +281,7 @@ def test_a_frame_that_is_tracked_ends_the_wait_for_a_second_view():
     drive.mode.begin_after_loss(drive.lost_frame(4))
     assert drive.mode.state() is None
     frame = drive.placed_frame()
-    drive.mode.extend(frame, found(frame))
+    drive.mode.update_map(frame, found(frame))
     assert drive.mode.state() is not None
 
 

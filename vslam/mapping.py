@@ -2,8 +2,8 @@
 
 ``Mapper`` owns the map. Each keyframe is mapped by a job in another thread. Tracking sees the job's
 result from a fixed frame number on, however long the job took; this is called the merge. Between
-two merges tracking reads a ``MapView``, a copy that the last merge left. Every method that needs the
-merged map merges by itself, and the frames that are held follow the map when a merge moves it.
+two merges tracking reads a ``MapView``, a copy that the last merge left. Every method that needs
+the merged map merges by itself, and frames that are held follow the map when a merge moves it.
 """
 
 from __future__ import annotations

@@ -40,11 +40,6 @@ RESTRICTED = FAMILY | LINKS | {
 }  # fmt: skip
 
 
-def columns(map_: Map) -> dict[str, NDArray]:
-    arrays, keyframes = map_.used()
-    return arrays._asdict() | keyframes._asdict()
-
-
 def assert_same(found: dict[str, NDArray], expected: dict[str, NDArray]) -> None:
     assert found.keys() == expected.keys()
     for name, column in expected.items():
@@ -69,7 +64,7 @@ def map_() -> Map:
     ids = found.add_landmarks(np.zeros((N + 2, 3)), np.zeros((N + 2, 4), np.uint64), 0)
     for k in range(N):
         link_many(found.arrays, found.rows(k).start + np.arange(3), ids[k : k + 3])
-    for name, column in columns(found).items():
+    for name, column in found.columns().items():
         if name not in RESTRICTED:
             numbers = np.arange(1, len(column) + 1).reshape(-1, *[1] * (column.ndim - 1))
             column[:] = np.broadcast_to(numbers, column.shape)
@@ -82,33 +77,33 @@ def map_() -> Map:
 
 
 def test_a_copy_holds_all_and_shares_nothing(map_):
-    before, copy = columns(map_), map_.copy()
-    assert_same(columns(copy), before)
+    before, copy = map_.columns(), map_.copy()
+    assert_same(copy.columns(), before)
     assert copy.scalars == map_.scalars
-    for name, column in columns(copy).items():
+    for name, column in copy.columns().items():
         assert not np.shares_memory(column, before[name]), name
 
 
 def test_growing_keeps_all(map_):
-    before, grown = columns(map_), map_.copy()  # the copy has no room for another one
+    before, grown = map_.columns(), map_.copy()  # the copy has no room for another one
     grown.add_keyframe(Features.none(), np.eye(4), 0.0, 0)
     grown.add_landmarks(np.zeros((1, 3)), np.zeros((1, 4), np.uint64), N)
     assert len(grown.timestamps) == N + 1
     assert len(grown.keyframes.timestamp) == len(grown.arrays.keyframe_alive)
-    assert_same({name: c[: len(before[name])] for name, c in columns(grown).items()}, before)
+    assert_same({name: c[: len(before[name])] for name, c in grown.columns().items()}, before)
 
 
 def test_a_file_holds_all(map_, tmp_path):
     save_map(tmp_path / "map.npz", StoredMap(map_, CAMERA))
     found = load_map(tmp_path / "map.npz").map
-    assert_same(columns(found), columns(map_))
+    assert_same(found.columns(), map_.columns())
     assert found.scalars == map_.scalars
 
 
 def test_a_selection_has_all_of_what_is_selected(map_):
     keyframes = np.array([0, 2, 3, 5])
     found = selected(map_, keyframes)
-    before, after = columns(map_), columns(found)
+    before, after = map_.columns(), found.columns()
     rows = np.concatenate([np.arange(PER * k, PER * (k + 1)) for k in keyframes])
     landmarks = np.unique(np.concatenate([map_.landmarks_of(k) for k in keyframes]))
     for names, kept in (
@@ -126,7 +121,7 @@ def test_a_selection_has_all_of_what_is_selected(map_):
 
 def test_maps_that_are_appended_keep_all(map_):
     both = appended(StoredMap(map_, CAMERA), StoredMap(map_.copy(), CAMERA)).map
-    before, after = columns(map_), columns(both)
+    before, after = map_.columns(), both.columns()
     for name in before.keys() - FAMILY - LINKS - {"session"}:
         assert np.array_equal(after[name], np.concatenate([before[name]] * 2)), name
     drives = map_.scalars.session + 1

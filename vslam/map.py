@@ -199,7 +199,7 @@ class Map:
         self._reserve(KEYFRAME_FIELDS, self.n_keyframes, extra)
         capacity = len(self.arrays.keyframe_alive)
         if len(self.keyframes.parent) < capacity:
-            self.keyframes = KeyframeTable(*(_grown(c, capacity) for c in self.keyframes))
+            self.keyframes = KeyframeTable._make(_grown(c, capacity) for c in self.keyframes)
 
     def add_keyframe(
         self,
@@ -259,35 +259,35 @@ class Map:
         self.n_landmarks += n
         return np.arange(start, start + n, dtype=np.int32)
 
-    def used(self) -> tuple[Arrays, KeyframeTable]:
-        """Views of ``arrays`` and ``keyframes`` without the capacity that is not in use."""
-        sizes = (
-            *([self.n_keyframes] * len(KEYFRAME_FIELDS)),
-            *([self.n_landmarks] * len(LANDMARK_FIELDS)),
-            *([self.n_rows] * len(ROW_FIELDS)),
-        )
-        arrays = Arrays(*(column[:n] for column, n in zip(self.arrays, sizes, strict=True)))
-        return (
-            arrays._replace(first_row=self.arrays.first_row[: self.n_keyframes + 1]),
-            KeyframeTable(*(column[: self.n_keyframes] for column in self.keyframes)),
-        )
+    def columns(self) -> dict[str, NDArray]:
+        """Views of all columns of ``arrays`` and ``keyframes`` by name, without the capacity that
+        is not in use."""
+        of_arrays = {
+            name: getattr(self.arrays, name)[:size]
+            for fields, size in (
+                (KEYFRAME_FIELDS, self.n_keyframes),
+                (LANDMARK_FIELDS, self.n_landmarks),
+                (ROW_FIELDS, self.n_rows),
+            )
+            for name in fields
+        }
+        of_arrays["first_row"] = self.arrays.first_row[: self.n_keyframes + 1]
+        of_keyframes = self.keyframes._asdict().items()
+        return of_arrays | {name: column[: self.n_keyframes] for name, column in of_keyframes}
+
+    def with_columns(self, columns: dict[str, NDArray]) -> Map:
+        """This map with other columns, as ``columns`` returns them; they are not copied."""
+        found = copy.copy(self)
+        found.arrays = Arrays(**{name: columns[name] for name in Arrays._fields})
+        found.keyframes = KeyframeTable(**{name: columns[name] for name in KeyframeTable._fields})
+        found.n_keyframes = len(found.arrays.keyframe_alive)
+        found.n_landmarks = len(found.arrays.landmark_alive)
+        found.n_rows = len(found.arrays.keyframe)
+        return found
 
     def copy(self) -> Map:
         """A copy without the capacity that is not in use."""
-        arrays, keyframes = self.used()
-        return self.with_tables(
-            Arrays(*(column.copy() for column in arrays)),
-            KeyframeTable(*(column.copy() for column in keyframes)),
-        )
-
-    def with_tables(self, arrays: Arrays, keyframes: KeyframeTable) -> Map:
-        """This map with other tables, all of whose capacity is in use."""
-        found = copy.copy(self)
-        found.arrays, found.keyframes = arrays, keyframes
-        found.n_keyframes = len(arrays.keyframe_alive)
-        found.n_landmarks = len(arrays.landmark_alive)
-        found.n_rows = len(arrays.keyframe)
-        return found
+        return self.with_columns({name: column.copy() for name, column in self.columns().items()})
 
     def begin_drive(self) -> None:
         """Let the keyframes to come belong to another drive."""

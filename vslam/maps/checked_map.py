@@ -190,9 +190,8 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
     _require(bool(living[keyframe[rows]].all()), "a keyframe that was culled observes something")
     _require(bool(living[parent[parent >= 0]].all() and living[parent < 0].all()), "family tree")
     columns = {name: data[in_file] for name, in_file in FILE_NAMES.items()}
-    table = KeyframeTable(**{name: columns.pop(name) for name in KeyframeTable._fields})
-    observing = observations(rows, first, data["row_u_right"])
-    return Map(scales).with_tables(Arrays(**columns, **observing, keyframe=keyframe), table)
+    columns |= observations(rows, first, data["row_u_right"]) | {"keyframe": keyframe}
+    return Map(scales).with_columns(columns)
 
 
 def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> None:

@@ -91,8 +91,7 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
     index = np.arange(map_.n_keyframes, dtype=np.int64)
     landmarks = np.arange(map_.n_landmarks, dtype=np.int32)
     first, rows = gather_observations(map_.arrays, landmarks, index)
-    used, table = map_.used()
-    columns = used._asdict() | table._asdict()
+    columns = map_.columns()
     loops = stored.loops
     T = [loop.T_query_match for loop in loops]
     frames = stored.frames or FrameTable(

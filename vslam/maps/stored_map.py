@@ -17,7 +17,6 @@ from vslam.map import (
     NONE,
     ROW_FIELDS,
     UNPREDICTED,
-    Arrays,
     KeyframeTable,
     Map,
     loop_of_living,
@@ -142,27 +141,25 @@ def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> M
         a.u_right[kept_rows],
     )
     all_kept = len(kept_rows) == map_.n_rows
-    of_rows = slice(map_.n_rows) if all_kept and not copy else kept_rows
-    special = {
+    of_rows = slice(None) if all_kept and not copy else kept_rows
+    parent, restart = _family(map_, keyframes, new_id)
+    renumbered: dict[str, NDArray] = {
         "first_row": first_row,
         "first_keyframe": anchor[kept].astype(np.int32),
         "keyframe": np.repeat(np.arange(n, dtype=np.int32), np.diff(first_row)),
+        "parent": parent,
+        "restart": restart,
         **links,
     }
-    columns = {
-        name: getattr(a, name)[kept_ones]
-        for fields, kept_ones in (
-            (KEYFRAME_FIELDS, keyframes),
-            (LANDMARK_FIELDS, landmarks),
-            (ROW_FIELDS, of_rows),
-        )
-        for name in fields
-        if name not in special
-    }
-    parent, restart = _family(map_, keyframes, new_id)
-    table = KeyframeTable(*(column[keyframes] for column in map_.keyframes))
-    table = table._replace(parent=parent, restart=restart)
-    found = map_.with_tables(Arrays(**columns, **special), table)
+    columns = map_.columns()
+    for fields, chosen in (
+        (KEYFRAME_FIELDS + KeyframeTable._fields, keyframes),
+        (LANDMARK_FIELDS, landmarks),
+        (ROW_FIELDS, of_rows),
+    ):
+        for name in fields:
+            columns[name] = renumbered[name] if name in renumbered else columns[name][chosen]
+    found = map_.with_columns(columns)
     found.scalars = replace(map_.scalars, calibrated_until=n - 1)
     return found
 
@@ -208,21 +205,15 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
         "session": drives,
     }  # fmt: skip
 
-    def joined(name: str, first: NDArray, second: NDArray) -> NDArray:
-        if name in shift:
-            second = np.where(second >= 0, second + shift[name], NONE).astype(second.dtype)
-        if name == "first_row":  # the last entry of the first map is the first of the second
-            first = first[:-1]
-        return np.concatenate([first, second])
-
-    arrays, table = (
-        type(first)(*map(joined, first._fields, first, second))
-        for first, second in zip(a.used(), b.used(), strict=True)
-    )
-    roots = n + np.flatnonzero(b.parents < 0)
-    table.parent[roots] = 0
-    table.restart[n : n + 1] = UNPREDICTED
-    found = a.with_tables(arrays, table)
+    first, second = a.columns(), b.columns()
+    for name, by in shift.items():
+        column = second[name]
+        second[name] = np.where(column >= 0, column + by, NONE).astype(column.dtype)
+    first["first_row"] = first["first_row"][:-1]  # its last entry is the first of the second map
+    columns = {name: np.concatenate([column, second[name]]) for name, column in first.items()}
+    columns["parent"][n + np.flatnonzero(b.parents < 0)] = 0
+    columns["restart"][n : n + 1] = UNPREDICTED
+    found = a.with_columns(columns)
     found.scalars = replace(
         a.scalars, session=drives + b.scalars.session, calibrated_until=found.n_keyframes - 1
     )

@@ -5,9 +5,10 @@ from __future__ import annotations
 import atexit
 import gc
 import os
+import signal
 import sys
 from collections.abc import Collection
-from types import ModuleType
+from types import FrameType, ModuleType
 from typing import Annotated
 
 import typer
@@ -65,6 +66,14 @@ def version(
 app = application(_GROUPS)
 
 
+def _treat_as_ctrl_c(signal_number: int, stack: FrameType | None) -> None:
+    """What a machine that shuts down sends (SIGTERM) ends a run as Ctrl-C does."""
+    handler = signal.getsignal(signal.SIGINT)
+    if not callable(handler):  # a shell's background jobs ignore Ctrl-C
+        raise KeyboardInterrupt
+    handler(signal.SIGINT, stack)
+
+
 def main() -> None:
     """Entry point: bad input becomes one line on stderr and exit code 2."""
     # Imports and kernels from the cache make a million objects that stay. To look through them for
@@ -75,6 +84,7 @@ def main() -> None:
     keep_memory()
     # OpenBLAS's threads spin while they wait, and no product of a run is large enough to share.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    signal.signal(signal.SIGTERM, _treat_as_ctrl_c)
     try:
         # typer prepares every option of every command that it knows: 30 ms.
         (application((run,)) if sys.argv[1:2] == ["run"] else app)()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 
@@ -22,6 +23,7 @@ class SharedMap:
         self._executor = executor
         self._job: Callable[[], None] | None = None
         self._failure = ""
+        self._process = os.getpid()
 
     @property
     def is_busy(self) -> bool:
@@ -33,8 +35,9 @@ class SharedMap:
         """The map.
 
         Raises:
-            RuntimeError: a job may be writing it, or one failed.
+            RuntimeError: a job may be writing it, or one failed, or this process is a fork.
         """
+        self._refuse_fork()
         if self._failure:
             raise RuntimeError(self._failure)
         if self._job is not None:
@@ -54,8 +57,10 @@ class SharedMap:
         """The map, once the job is done.
 
         Raises:
-            RuntimeError: an earlier job failed. This one's own error is raised as it is.
+            RuntimeError: an earlier job failed, or this process is a fork. This job's own error is
+                raised as it is.
         """
+        self._refuse_fork()
         if self._job is not None:
             job, self._job = self._job, None
             try:
@@ -67,3 +72,11 @@ class SharedMap:
                 )
                 raise
         return self.map
+
+    def _refuse_fork(self) -> None:
+        """A fork has no copy of the thread that does the jobs: it would wait for ever."""
+        if self._executor is not None and os.getpid() != self._process:
+            raise RuntimeError(
+                "this Slam was made by another process, whose threads a fork does not copy; make "
+                "one after the fork, or use threads=1"
+            )

@@ -8,6 +8,8 @@ import os
 import signal
 import sys
 from collections.abc import Collection
+from contextlib import suppress
+from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Annotated
 
@@ -31,6 +33,7 @@ from vslam.cli import (
 from vslam.cli import map as map_
 from vslam.errors import InputError, ResultsError
 from vslam.machine import keep_memory
+from vslam.untrusted import require_utf8
 
 _GROUPS: tuple[ModuleType, ...] = (
     run, evaluate, perturb, info, doctor, bench, stress, report, synth, train, export, map_,
@@ -86,6 +89,10 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     signal.signal(signal.SIGTERM, _treat_as_ctrl_c)
     try:
+        for word in sys.argv[1:]:
+            require_utf8(Path(word))
+        with suppress(FileNotFoundError):  # the folder was removed
+            require_utf8(Path.cwd())
         # typer prepares every option of every command that it knows: 30 ms.
         (application((run,)) if sys.argv[1:2] == ["run"] else app)()
     except InputError as error:

@@ -23,6 +23,7 @@ from vslam.errors import InputError
 from vslam.report.finished_run import read_report
 from vslam.report.page import render_page
 from vslam.report.schema import ReportJson
+from vslam.untrusted import require_utf8
 
 HOST = "127.0.0.1"
 _NAMES = (HOST, "localhost")
@@ -61,6 +62,7 @@ def list_runs(folders: Collection[Path]) -> list[ListedRun]:
             if place in found or hidden or not _is_own(place / path.name):
                 continue
             try:
+                require_utf8(place)
                 report = read_report(path.parent)
             except InputError:
                 continue

@@ -162,7 +162,8 @@ def _use_temporary_cache() -> None:
             "NUMBA_CACHE_DIR to a writable folder."
         ) from error
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = folder
+    config: Any = numba.config
+    config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = folder
     _warn(
         "There is no writable folder to keep compiled kernels in; each run compiles them, which "
         "takes a minute. Set NUMBA_CACHE_DIR to a writable folder."

@@ -25,8 +25,8 @@ FOLDERS = {
 # From the ground up; a module belongs to the longest name here that it lies within. What stands
 # together on one level may not import each other, save where SIBLINGS says so.
 LEVELS: tuple[tuple[str, ...], ...] = (
-    ("vslam.errors", "vslam.machine", "vslam.kernels"),
-    ("vslam.plugins", "vslam.untrusted", "vslam.lock_file"),
+    ("vslam.errors", "vslam.machine"),
+    ("vslam.kernels", "vslam.plugins", "vslam.untrusted", "vslam.lock_file"),
     ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.features", "vslam.camera"),
     (
         "vslam.loops",

@@ -19,6 +19,7 @@ import pytest
 from test_report import make_outcome, report_of
 
 from vslam.calibration.documents import read_document
+from vslam.datasets.bag import open_bag
 from vslam.datasets.image_files import read_grey
 from vslam.errors import InputError, UnreadableImageError
 from vslam.loopclosure.vocabulary import load
@@ -222,3 +223,17 @@ def test_no_source_executes_what_it_reads():
             if owner == "torch" and method == "load" and words.get("weights_only") != "True":
                 found.append(where)
     assert found == []
+
+
+def test_yaml_is_bounded_by_its_size(tmp_path: Path):
+    """6 MB of it once took 2.3 GB and a minute."""
+    pytest.importorskip("rosbags")
+    path = tmp_path / "a.yaml"
+    path.write_text("a: [" + "1, " * 40_000 + "1]\n")
+    with pytest.raises(InputError, match=r"a\.yaml: larger than 100 kB, which no calibration is"):
+        read_document(path)
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    (bag / "metadata.yaml").write_text("a: [" + "1, " * 400_000 + "1]\n")
+    with pytest.raises(InputError, match=r"metadata\.yaml is larger than 1 MB"):
+        open_bag(bag)

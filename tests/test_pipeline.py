@@ -216,7 +216,7 @@ def test_run_without_pages_is_enough_for_a_report_later(kitti_tree, tmp_path):
     assert [int(frame["frame"]) for frame in frames] == list(range(28))
     assert {frame["state"] for frame in frames} == {"OK"}
     assert float(frames[0]["extract_ms"]) > 0.0
-    assert frames[0]["track_frame_ms"] == ""  # the first frame has nothing to be tracked against
+    assert frames[0]["track_ms"] == ""  # the first frame has nothing to be tracked against
     assert "report.html" not in done.stdout
     later = vslam("report", folder, "--out", "later", cwd=tmp_path)
     assert later.returncode == 0, later.stderr

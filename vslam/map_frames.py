@@ -39,7 +39,7 @@ def add_frame(
         The keyframe.
     """
     keyframe = map_.add_keyframe(
-        frame.observed(), frame.T_cw, frame.timestamp, frame.index, certainty
+        frame.refined_features(), frame.T_cw, frame.timestamp, frame.index, certainty
     )
     tracked = np.flatnonzero(frame.landmark >= 0)
     link_many(map_.arrays, map_.rows(keyframe).start + tracked, frame.landmark[tracked])

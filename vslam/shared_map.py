@@ -59,7 +59,7 @@ class SharedMap:
         """
         if self._job is not None:
             job, self._job = self._job, None
-            with self._whole():
+            with self._invalidated_on_error():
                 job()
         return self.map
 
@@ -71,12 +71,12 @@ class SharedMap:
             RuntimeError: as ``wait``.
         """
         map_ = self.wait()
-        with self._whole():
+        with self._invalidated_on_error():
             yield map_
 
     @contextmanager
-    def _whole(self) -> Iterator[None]:
-        """Give the map to nobody any more if what changes it fails half way."""
+    def _invalidated_on_error(self) -> Iterator[None]:
+        """After an exception, the map is incomplete: every later access raises."""
         try:
             yield
         except BaseException as error:

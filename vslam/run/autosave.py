@@ -1,10 +1,11 @@
 """What a run leaves on the disk while it goes on, so that a killed one costs a minute at most.
 
 ``trajectory_online.tum`` has the pose of each frame as it was tracked, a line when it comes. Every
-so often the map is copied where no keyframe is being mapped, and a thread writes it with all that
-the report tells of the frames so far: ``autosave_progress.npz``, then ``autosave.npz``, a map file
-as any other. Each takes the place of the one before in one step. A run killed between the two finds
-the progress of a few frames more than the map has, and passes over them.
+so often the map is copied between two frames, if possible while no keyframe is being mapped, and a
+thread writes it with all that the report tells of the frames so far: ``autosave_progress.npz``,
+then ``autosave.npz``, a map file as any other. Each takes the place of the one before in one step.
+A run killed between the two finds the progress of a few frames more than the map has, and passes
+over them.
 """
 
 from __future__ import annotations

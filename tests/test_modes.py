@@ -123,7 +123,7 @@ def test_a_monocular_map_begins_with_the_second_view():
         if drive.mode.begin(second):
             break
     assert drive.mapper.n_keyframes == 2
-    assert drive.mapper.map.frames == [0, second.index]
+    assert drive.mapper.map.frames.tolist() == [0, second.index]
     assert drive.tracker.last is second
     assert drive.mode.state() is not None
     assert drive.mode.state().gain_awaited is False
@@ -197,14 +197,14 @@ def test_a_monocular_map_has_no_far_points_to_show():
 def test_a_frame_that_shows_nothing_new_is_only_counted():
     drive = Building.with_a_map(min_tracked_close=0)
     frame = drive.placed_frame()
-    before = drive.mapper.complete().used_arrays()
+    before = drive.mapper.complete().copy().arrays
     lost = np.flatnonzero(frame.landmark >= 0)[:5]
     gone = frame.landmark[lost].copy()
     says = found(frame)
     frame.landmark[lost] = -1
     assert not drive.mode.update_map(frame, says)
     assert drive.mapper.n_keyframes == 2
-    after = drive.mapper.complete().used_arrays()
+    after = drive.mapper.complete().copy().arrays
     seen = np.zeros(len(before.visible), int)
     seen[says.visible] = 1
     np.testing.assert_array_equal(after.visible - before.visible, seen)

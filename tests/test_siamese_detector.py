@@ -42,7 +42,7 @@ from vslam.loopclosure.siamese.scoring import NetworkScorer
 from vslam.loopclosure.siamese.siamese import build_network, for_inference, load_network
 from vslam.loopclosure.siamese.weights import SHIPPED
 from vslam.loopclosure.verifier import verifier_for
-from vslam.map import Map
+from vslam.map import PREDICTED, Map
 from vslam.map_kernels import link
 
 
@@ -240,7 +240,7 @@ def test_reach_grows_with_the_way_and_knows_nothing_of_lost_cameras_and_units():
         [30 - 185, 70 - 135, 170 - 85, 70 - 35, 0],
     )
     lost = driven(x)
-    lost.restarts = [3]
+    lost.keyframes.restart[3] = PREDICTED
     lost.parents[:] = [0, 0, 1, 2, 3]
     assert (beyond_reach(lost, 4, config)[:3] == 0).all()
     assert beyond_reach(lost, 4, config)[3] == pytest.approx(70 - 20 - 7)

@@ -207,7 +207,7 @@ class Drive:
         known = np.flatnonzero(tracked)
         error = evaluate_trajectory(slam.trajectory().select(known), truth.select(known))
         loops = [edge for edge in slam.loops if edge.accepted]
-        frames = np.array(slam.map.frames)
+        frames = slam.map.frames
         return [
             self.laps.lap[first],
             self.laps.light[first],

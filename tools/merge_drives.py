@@ -55,7 +55,7 @@ def main() -> None:
         for number, frames in enumerate(parts(len(sequence), options.parts, options.overlap)):
             drives.append((sequence, frames, route))
             maps.append(drive(sequence, frames, options.detector, options.perturb, number))
-            truth = sequence.ground_truth[np.array(maps[-1].map.frames)]
+            truth = sequence.ground_truth[maps[-1].map.frames]
             name = f"{route}, frames {frames.start} to {frames[-1]}"
             print(f"{name}: ATE {ate(maps[-1].map, truth):.4f} m", flush=True)
     merged = merge_maps(maps, Config(), lambda: memory(options.detector))
@@ -85,7 +85,7 @@ def drive(sequence: Sequence, frames: range, detector: str, perturb: str, seed: 
         slam.step_features(prepared.extracted, timestamp, prepared.image)
     slam.finish()
     stored = slam.stored_map(f"{sequence.name} {frames.start}-{frames[-1]}").compact()
-    stored.map.frames = [frames[k] for k in stored.map.frames]
+    stored.map.frames[:] = [frames[k] for k in stored.map.frames]
     return stored
 
 
@@ -109,7 +109,7 @@ def tell(merged: MergedMaps, drives, whole: StoredMap | None) -> None:
         kept = [truth[order[s]][f] for s, f in zip(map_.sessions, map_.frames, strict=True)]
         print(f"keyframes of the merged map: ATE {ate(map_, np.array(kept)):.4f} m")
     if whole is not None:
-        frames = np.array(whole.map.frames)
+        frames = whole.map.frames
         print(f"keyframes of one long drive: ATE {ate(whole.map, truth[0][frames]):.4f} m")
 
 

@@ -97,7 +97,7 @@ def view_of(
     return MapView(
         reference=keyframe,
         T_reference=map_.keyframe_pose(keyframe),
-        unit_scale=map_.unit_scale[keyframe],
+        unit_scale=float(map_.unit_scale[keyframe]),
         n_keyframes=map_.n_keyframes,
         local_landmarks=local,
         reference_landmarks=local_map(map_, keyframe, 1),

@@ -129,7 +129,7 @@ class Mapper:
         """``Map.unit_scale``, of the keyframes that ``keyframe_pose`` knows."""
         if not self._is_merged and keyframe == self.view.reference:
             return self.view.unit_scale
-        return self.map.unit_scale[keyframe]
+        return float(self.map.unit_scale[keyframe])
 
     def trajectory(self) -> Trajectory:
         """Pose of every frame (``FramePoses.trajectory``).
@@ -286,7 +286,7 @@ class Mapper:
         local = local_map(map_, keyframe, config.local_keyframes)
         patches = self._aligner.patches_of(map_, local.ids)
         self.view = view_of(map_, keyframe, local, patches, monocular=self._camera.monocular)
-        self._rig.disparity_offset = map_.disparity_offset
+        self._rig.disparity_offset = map_.scalars.disparity_offset
 
     def refer_to_nearest(self, frame: Frame) -> None:
         """Make the keyframe that shares the most landmarks with a frame the reference (ORB-SLAM,
@@ -312,8 +312,9 @@ class Mapper:
     def continue_drive(self) -> None:
         """Take the newest keyframe for the last one made, unless an earlier drive made it."""
         map_, newest = self.map, self.reference
-        if map_.n_keyframes and map_.sessions[newest] == map_.session:
-            self.last_frame, self.last_timestamp = map_.frames[newest], map_.timestamps[newest]
+        if map_.n_keyframes and map_.sessions[newest] == map_.scalars.session:
+            self.last_frame = int(map_.frames[newest])
+            self.last_timestamp = float(map_.timestamps[newest])
 
     @contextmanager
     def _changing(self) -> Iterator[Map]:

@@ -78,7 +78,7 @@ def open_map(
     if resume:
         return Start(map_, stored.frames, stored.checkpoint, drives[:-1], stored.world)
     if map_.n_keyframes and not localize:
-        map_.session += 1
+        map_.begin_drive()
     return Start(map_, drives=drives, world=stored.world)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -11,43 +11,52 @@ from numpy.typing import NDArray
 from vslam.camera import Camera
 from vslam.frame_poses import FrameTable
 from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe
-from vslam.map import NONE, Arrays, Map
+from vslam.map import (
+    KEYFRAME_FIELDS,
+    LANDMARK_FIELDS,
+    NONE,
+    ROW_FIELDS,
+    UNPREDICTED,
+    Arrays,
+    KeyframeTable,
+    Map,
+    Scalars,
+)
 from vslam.maps.checkpoint import ARRAYS as CHECKPOINT_ARRAYS
 from vslam.maps.checkpoint import checked_checkpoint
 from vslam.maps.stored_map import StoredMap, World, observations
+
+# These follow from the list of observations by landmark that the file has instead, and from
+# keyframe_first_row.
+_NOT_IN_FILE = ("head", "n_observations", "keyframe", "landmark", "next_row")
+# The columns of the map, and what they are called in the file.
+FILE_NAMES = {
+    name: f"{prefix}_{name.removeprefix(f'{prefix}_')}"
+    for prefix, fields in (
+        ("keyframe", KEYFRAME_FIELDS + KeyframeTable._fields),
+        ("landmark", LANDMARK_FIELDS),
+        ("row", ROW_FIELDS),
+    )
+    for name in fields
+    if name not in _NOT_IN_FILE
+}
+_SIZES = {"keyframe": "K", "landmark": "L", "row": "R"}
+
+
+def _kind(name: str, in_file: str) -> tuple[type, tuple[str | int, ...]]:
+    """Type and shape that a column of the map must have in the file."""
+    empty = (Arrays()._asdict() | KeyframeTable()._asdict())[name]
+    size = "K+1" if name == "first_row" else _SIZES[in_file.partition("_")[0]]
+    return empty.dtype.type, (size, *empty.shape[1:])
+
 
 # K keyframes, L landmarks, R keypoints, O observations, E loops, F frames of the last drive.
 # A number more than one of them: where each begins, and where the last one ends.
 ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "scales": (np.float64, ("levels",)),
-    "keyframe_T_cw": (np.float64, ("K", 4, 4)),
-    "keyframe_first_row": (np.int64, ("K+1",)),
-    "keyframe_alive": (np.bool_, ("K",)),
-    "keyframe_T_c_parent": (np.float64, ("K", 4, 4)),
-    "keyframe_timestamp": (np.float64, ("K",)),
-    "keyframe_frame": (np.int64, ("K",)),
-    "keyframe_parent": (np.int64, ("K",)),
-    "keyframe_session": (np.int64, ("K",)),
-    "keyframe_unit_scale": (np.float64, ("K",)),
-    "restarts": (np.int64, ("restarts",)),
-    "unpredicted_restarts": (np.int64, ("unpredicted",)),
-    "landmark_xyz": (np.float64, ("L", 3)),
-    "landmark_normal": (np.float64, ("L", 3)),
-    "landmark_distance_range": (np.float64, ("L", 2)),
-    "landmark_descriptor": (np.uint64, ("L", 4)),
-    "landmark_first_keyframe": (np.int32, ("L",)),
-    "landmark_visible": (np.int32, ("L",)),
-    "landmark_found": (np.int32, ("L",)),
-    "landmark_alive": (np.bool_, ("L",)),
-    "landmark_merged_into": (np.int32, ("L",)),
+    **{in_file: _kind(name, in_file) for name, in_file in FILE_NAMES.items()},
     "landmark_first_observation": (np.int64, ("L+1",)),
     "observation_row": (np.int64, ("O",)),
-    "row_xy": (np.float32, ("R", 2)),
-    "row_u_right": (np.float32, ("R",)),
-    "row_octave": (np.uint8, ("R",)),
-    "row_angle": (np.float32, ("R",)),
-    "row_descriptor": (np.uint64, ("R", 4)),
-    "row_certainty": (np.uint8, ("R",)),
     "loop_ends": (np.int64, ("E", 2)),
     "loop_T_query_match": (np.float64, ("E", 4, 4)),
     "loop_scale": (np.float64, ("E",)),
@@ -63,18 +72,20 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
 _MAY_BE_NAN = {"row_u_right"}
 _ROTATION_TOLERANCE = 1e-6
 _MAX_OFFSET = 100.0  # pixels
+_MAX_SESSION = 2**31  # it must fit into a column of the map
 
 
 class DamagedMapError(Exception):
     """What is wrong with the arrays of a file."""
 
 
-def _set_offset(map_: Map, header: dict[str, Any]) -> None:
-    """The disparity offset, and what measured it."""
-    offset, information, until = header["disparity_offset"]
-    _require(abs(offset) < _MAX_OFFSET and 0.0 <= information < np.inf, "the disparity offset")
-    map_.disparity_offset, map_.offset_information = float(offset), float(information)
-    map_.calibrated_until = int(until)
+def _scalars(entry: dict[str, Any]) -> Scalars:
+    names = asdict(Scalars())
+    found = Scalars(**{name: type(default)(entry[name]) for name, default in names.items()})
+    sound = abs(found.disparity_offset) < _MAX_OFFSET and 0.0 <= found.offset_information < np.inf
+    _require(sound, "the disparity offset")
+    _require(0 <= found.session < _MAX_SESSION, "the number of the drive")
+    return found
 
 
 def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
@@ -85,8 +96,8 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
             wrong with them.
     """
     sizes = _check_shapes(data)
-    map_ = _build_map(data, sizes, int(header["session"]))
-    _set_offset(map_, header)
+    map_ = _build_map(data, sizes)
+    map_.scalars = _scalars(header["scalars"])
     checkpoint = None
     if header["checkpoint"] is not None:
         arrays = {name: data[f"checkpoint_{name}"] for name in CHECKPOINT_ARRAYS}
@@ -145,7 +156,7 @@ def _require(holds: bool, otherwise: str) -> None:
         raise DamagedMapError(otherwise)
 
 
-def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) -> Map:
+def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
     n, n_landmarks, n_rows = sizes["K"], sizes["L"], sizes["R"]
     scales, parent = data["scales"], data["keyframe_parent"]
     _require(len(scales) > 1 and bool((np.diff(scales) > 0).all()), "scales do not grow")
@@ -157,8 +168,8 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) ->
     _require(bool((parent[1:] >= 0).all() and (parent < np.arange(n)).all()), "keyframe_parent")
     _check_ids("keyframe_parent", parent, n, least=NONE)
     _require(bool((data["keyframe_unit_scale"] > 0).all()), "keyframe_unit_scale")
-    for name in ("restarts", "unpredicted_restarts"):
-        _check_ids(name, data[name], n, least=1)
+    _check_ids("keyframe_restart", data["keyframe_restart"], UNPREDICTED + 1)
+    _require(not data["keyframe_restart"][:1].any(), "keyframe_restart of the first keyframe")
     _check_ids("row_octave", data["row_octave"], len(scales))
     _require(not np.isinf(data["row_u_right"]).any(), "row_u_right is infinite")
     _require(bool((data["row_certainty"] > 0).all()), "row_certainty")
@@ -178,40 +189,9 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) ->
     living = data["keyframe_alive"]
     _require(bool(living[keyframe[rows]].all()), "a keyframe that was culled observes something")
     _require(bool(living[parent[parent >= 0]].all() and living[parent < 0].all()), "family tree")
-    map_ = Map(scales)
-    map_.n_keyframes, map_.n_landmarks, map_.n_rows = n, n_landmarks, n_rows
-    map_.arrays = Arrays(
-        T_cw=data["keyframe_T_cw"],
-        first_row=first_row,
-        keyframe_alive=living,
-        xyz=data["landmark_xyz"],
-        normal=data["landmark_normal"],
-        distance_range=data["landmark_distance_range"],
-        landmark_descriptor=data["landmark_descriptor"],
-        first_keyframe=data["landmark_first_keyframe"],
-        visible=data["landmark_visible"],
-        found=data["landmark_found"],
-        landmark_alive=alive,
-        merged_into=data["landmark_merged_into"],
-        xy=data["row_xy"],
-        u_right=data["row_u_right"],
-        octave=data["row_octave"],
-        angle=data["row_angle"],
-        descriptor=data["row_descriptor"],
-        certainty=data["row_certainty"],
-        keyframe=keyframe,
-        **observations(rows, first, data["row_u_right"]),
-    )
-    map_.timestamps = data["keyframe_timestamp"].tolist()
-    map_.frames = data["keyframe_frame"].tolist()
-    map_.parents = parent.tolist()
-    map_.T_c_parent = {int(k): data["keyframe_T_c_parent"][k] for k in np.flatnonzero(~living)}
-    map_.sessions = data["keyframe_session"].tolist()
-    map_.session = session
-    map_.unit_scale = data["keyframe_unit_scale"].tolist()
-    map_.restarts = data["restarts"].tolist()
-    map_.unpredicted_restarts = data["unpredicted_restarts"].tolist()
-    return map_
+    columns = {name: data[in_file] for name, in_file in FILE_NAMES.items()}
+    columns |= observations(rows, first, data["row_u_right"]) | {"keyframe": keyframe}
+    return Map(scales).with_columns(columns)
 
 
 def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> None:

@@ -72,7 +72,7 @@ STARTED = {
 ONLY_IN = {
     "torch": "vslam.loopclosure.siamese",
     "torchvision": "vslam.loopclosure.siamese",
-    "onnx": "vslam.loopclosure.siamese.export",
+    "onnx": ("vslam.loopclosure.siamese.export", "vslam.loopclosure.siamese.onnx_limits"),
     "onnxruntime": "vslam.loopclosure.siamese.inference",
     "gtsam": "vslam.backend",
     "rerun": "vslam.run.recorder",

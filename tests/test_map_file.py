@@ -337,6 +337,8 @@ def damage(name: str, position: tuple[int, ...], value: float):
         damage("keyframe_timestamp", (1,), np.inf),
         damage("keyframe_unit_scale", (1,), 0.0),
         damage("landmark_xyz", (7, 1), np.nan),
+        damage("landmark_xyz", (7, 1), 1e200),
+        damage("row_xy", (5, 0), 1e30),
         damage("landmark_first_keyframe", (-1,), 10**6),
         damage("landmark_first_keyframe", (5,), -1),
         damage("landmark_first_observation", (3,), 0),
@@ -420,15 +422,29 @@ def alive_that_died(file: Path, to: Path) -> Path:
         damage("checkpoint_landmark", (3,), 10**6),
         damage("checkpoint_landmark", (3,), -2),
         damage("checkpoint_xy", (3, 0), np.nan),
+        damage("checkpoint_xy", (3, 0), 1e30),
+        damage("checkpoint_octave", (3,), 8),
+        damage("checkpoint_u_right", (3,), np.inf),
         damage("keyframe_alive", (1,), False),
         damage("landmark_merged_into", (0,), 10**6),
         entry("mapper", reference=10**6),
+        entry("mapper", reference=0.5),
+        entry("mapper", last_frame=2**31),
+        entry("mapper", last_timestamp=np.inf),
+        entry("tracker", index=2**31),
+        entry("tracker", index=-1),
+        entry("tracker", lost_frames=10**30),
+        entry("tracker", timestamp=np.inf),
         entry("tracker", twist=[1.0, 2.0]),
         entry("tracker", T_cw=[[1.0]]),
         entry("tracker", n_tracked="many"),
         entry("tracker", unknown=1),
         entry("closing", places=[[1]]),
+        entry("closing", places=[[[10**6], 1, 0]]),
+        entry("closing", turn=np.inf),
+        entry("closing", in_vain=np.nan),
         entry("policy", gained_close="many"),
+        entry("policy", gained_close=np.inf),
         pytest.param(without_checkpoint, id="none"),
         pytest.param(merged_in_a_circle, id="circle"),
         pytest.param(alive_that_died, id="alive"),
@@ -436,6 +452,19 @@ def alive_that_died(file: Path, to: Path) -> Path:
 )
 def test_a_damaged_checkpoint_is_refused(apply, at_checkpoint, tmp_path):
     assert "damaged" in refusal(apply(at_checkpoint, tmp_path / "hand.npz"))
+
+
+def test_a_drive_that_has_made_no_keyframe_yet_is_resumed(at_checkpoint, tmp_path):
+    """One that began in the map of another drive."""
+    path = tmp_path / "m.npz"
+    begun = {"last_frame": -1, "last_timestamp": -np.inf}
+    checkpoint = header_of(at_checkpoint)["checkpoint"]
+    checkpoint["mapper"] |= begun
+    changed(
+        at_checkpoint, path, header=as_header(header_of(at_checkpoint) | {"checkpoint": checkpoint})
+    )
+    mapper = load_checkpoint(path).checkpoint.mapper
+    assert {name: getattr(mapper, name) for name in begun} == begun
 
 
 def test_observations_that_contradict_each_other_are_refused(file, tmp_path):
@@ -476,8 +505,9 @@ def test_headers_that_lack_something_are_refused(file, tmp_path):
     for wrong in ({"session": -1}, {"session": np.inf}, {"disparity_offset": np.nan}):
         scalars = as_header(header | {"scalars": header["scalars"] | wrong})
         assert "damaged" in refusal(changed(file, tmp_path / "m.npz", header=scalars))
-    no_camera = as_header(header | {"camera": header["camera"] | {"fx": -1.0}})
-    assert "camera" in refusal(changed(file, tmp_path / "m.npz", header=no_camera))
+    for wrong in ({"fx": -1.0}, {"height": 0.5}, {"cx": np.inf}, {"baseline": 1e200}):
+        no_camera = as_header(header | {"camera": header["camera"] | wrong})
+        assert "camera" in refusal(changed(file, tmp_path / "m.npz", header=no_camera))
 
 
 def test_a_full_disk_leaves_the_file_that_was_there(slam, file, tmp_path, monkeypatch):

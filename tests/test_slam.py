@@ -415,8 +415,11 @@ def test_refuses_images_of_another_size_and_time_that_stands_still(corridor):
     slam = Slam(corridor.camera, CONFIG, "none", threads=1)
     with pytest.raises(ValueError, match="camera"):
         slam.step(corridor.left[0][:-1], corridor.right[0], 0.0)
+    for time in (float("nan"), float("inf"), float("-inf")):
+        with pytest.raises(ValueError, match="must be a finite number"):
+            slam.step(corridor.left[0], corridor.right[0], time)
     slam.step(corridor.left[0], corridor.right[0], 1.0)
-    for time in (1.0, 0.5, float("nan")):
+    for time in (1.0, 0.5, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="timestamp"):
             slam.step(corridor.left[1], corridor.right[1], time)
         with pytest.raises(ValueError, match="timestamp"):

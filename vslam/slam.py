@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -173,7 +174,8 @@ class Slam:
             timestamp: seconds, later than that of the last call.
 
         Raises:
-            ValueError: images of another size or type, or a timestamp that goes back.
+            ValueError: images of another size or type, or a timestamp that goes back or is
+                not finite.
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         check_images(left, second, self.context.camera)
@@ -249,6 +251,8 @@ class Slam:
 
     def _next_frame(self, extracted: Extracted, timestamp: float, image: Image | None) -> Frame:
         frames = self._mapper.frames
+        if not math.isfinite(timestamp):
+            raise ValueError(f"timestamp {timestamp} s must be a finite number")
         if len(frames) and not timestamp > (last := frames.timestamp(-1)):
             raise ValueError(f"timestamp {timestamp} s is not later than the last one, {last} s")
         return Frame.of(extracted, self.context.camera, len(frames), timestamp, image)

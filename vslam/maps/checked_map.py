@@ -70,7 +70,9 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "frame_unit_scale": (np.float64, ("F",)),
 }
 _MAY_BE_NAN = {"row_u_right"}
+_MOST = 1e12  # metres, pixels, seconds: products of a few of them are finite, too
 _ROTATION_TOLERANCE = 1e-6
+_MOST_PIXELS = 1e6  # of a side of an image, and of a focal length
 _MAX_OFFSET = 100.0  # pixels
 _MAX_SESSION = 2**31  # it must fit into a column of the map
 
@@ -102,7 +104,7 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
     if header["checkpoint"] is not None:
         arrays = {name: data[f"checkpoint_{name}"] for name in CHECKPOINT_ARRAYS}
         checkpoint = checked_checkpoint(
-            arrays, header["checkpoint"], data["keyframe_first_row"], sizes["L"]
+            arrays, header["checkpoint"], map_, sizes["F"] if header["frames"] else 0
         )
     else:
         a = map_.arrays
@@ -142,8 +144,9 @@ def _check_shapes(data: dict[str, NDArray]) -> dict[str, int]:
                 wanted = sizes.setdefault(key, size)
             if size != wanted:
                 raise DamagedMapError(f"{name} has shape {array.shape}")
-        if dtype in (np.float32, np.float64) and name not in _MAY_BE_NAN:
-            _require(bool(np.isfinite(array).all()), f"{name} is not finite")
+        if dtype in (np.float32, np.float64):
+            nan = np.isnan(array) & (name in _MAY_BE_NAN)
+            _require(bool((nan | (np.abs(array) < _MOST)).all()), f"{name} is out of range")
     return sizes
 
 
@@ -167,11 +170,10 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
         _check_rigid(name, data[name])
     _require(bool((parent[1:] >= 0).all() and (parent < np.arange(n)).all()), "keyframe_parent")
     _check_ids("keyframe_parent", parent, n, least=NONE)
-    _require(bool((data["keyframe_unit_scale"] > 0).all()), "keyframe_unit_scale")
+    _require(bool((data["keyframe_unit_scale"] > 1 / _MOST).all()), "keyframe_unit_scale")
     _check_ids("keyframe_restart", data["keyframe_restart"], UNPREDICTED + 1)
     _require(not data["keyframe_restart"][:1].any(), "keyframe_restart of the first keyframe")
     _check_ids("row_octave", data["row_octave"], len(scales))
-    _require(not np.isinf(data["row_u_right"]).any(), "row_u_right is infinite")
     _require(bool((data["row_certainty"] > 0).all()), "row_certainty")
 
     first, rows = data["landmark_first_observation"], data["observation_row"]
@@ -209,7 +211,7 @@ def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> N
 def _loops(data: dict[str, NDArray], n: int) -> tuple[LoopEdge, ...]:
     _check_ids("loop_ends", data["loop_ends"], n)
     _check_rigid("loop_T_query_match", data["loop_T_query_match"])
-    _require(bool((data["loop_scale"] > 0).all()), "loop_scale")
+    _require(bool((data["loop_scale"] > 1 / _MOST).all()), "loop_scale")
     return tuple(
         LoopEdge(
             query=query,
@@ -240,7 +242,7 @@ def _frames(data: dict[str, NDArray], n: int) -> FrameTable:
     _check_ids("frame_reference", frames.reference, max(n, 1))
     _check_rigid("frame_T_c_reference", frames.T_c_reference)
     _require(bool((np.diff(frames.timestamp) > 0).all()), "frame_timestamp")
-    _require(bool((frames.unit_scale > 0).all()), "frame_unit_scale")
+    _require(bool((frames.unit_scale > 1 / _MOST).all()), "frame_unit_scale")
     return frames
 
 
@@ -258,18 +260,17 @@ def camera_of(header: dict[str, Any]) -> Camera:
         DamagedMapError, KeyError, TypeError, ValueError: as ``checked_map``.
     """
     camera = Camera(**header["camera"])
-    numbers = [camera.fx, camera.fy, camera.width, camera.height]
-    sound = all(isinstance(x, int | float) and 0 < x < 1e6 for x in numbers)
-    sound = sound and bool(
-        np.isfinite([camera.cx, camera.cy, camera.baseline, camera.right_delay]).all()
-    )
-    _require(sound and camera.baseline >= 0, "camera")
+    sizes = [camera.fx, camera.fy, camera.width, camera.height]
+    places = [camera.cx, camera.cy, camera.baseline, camera.right_delay]
+    sound = all(isinstance(x, int | float) and 1 <= x < _MOST_PIXELS for x in sizes)
+    sound = sound and all(isinstance(x, int | float) and abs(x) < _MOST for x in places)
+    _require(sound and camera.baseline >= 0 and isinstance(camera.depth, bool), "camera")
     return replace(camera, width=int(camera.width), height=int(camera.height))
 
 
 def _world(fields: dict[str, Any]) -> World:
     S = np.array(fields["S_truth_world"], np.float64)
-    _require(S.shape == (4, 4) and bool(np.isfinite(S).all()), "world")
+    _require(S.shape == (4, 4) and bool((np.abs(S) < _MOST).all()), "world")
     return World(str(fields["name"]), S)
 
 

@@ -26,7 +26,7 @@ from vslam.maps.checked_map import FILE_NAMES, DamagedMapError, camera_of, check
 from vslam.maps.checkpoint import checkpoint_arrays, checkpoint_entry
 from vslam.maps.new_output import replaced_file
 from vslam.maps.stored_map import StoredMap
-from vslam.untrusted import ARCHIVE_ERRORS, require_memory
+from vslam.untrusted import ARCHIVE_ERRORS, read_json, require_memory
 
 SCHEMA = 6
 _FOREIGN = "not a map of vslam; name a map.npz, or the folder of a run"
@@ -75,14 +75,7 @@ def load_checkpoint(path: Path) -> StoredMap:
 def _as_damage(path: Path) -> Iterator[None]:
     try:
         yield
-    except (
-        DamagedMapError,
-        KeyError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        OverflowError,
-    ) as error:
+    except (*ARCHIVE_ERRORS, DamagedMapError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: the map is damaged ({error}); save it again.") from error
 
 
@@ -180,7 +173,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
                     f"{path}: a map of schema {int(file['schema'])}, this version reads {SCHEMA}; "
                     "run again with it."
                 )
-            header = json.loads(bytes(file["header"]))
+            header = read_json(file["header"])
             if not isinstance(header, dict) or header.get("kind") != "vslam map":
                 raise InputError(f"{path}: {_FOREIGN}.")
             if header.get("schema") != SCHEMA:

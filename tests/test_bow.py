@@ -14,7 +14,7 @@ from vslam.datasets.synthetic import store
 from vslam.datasets.synthetic.site import Variation
 from vslam.features import Features
 from vslam.frontend.orb import extract
-from vslam.loopbench.node_matching import index_nodes, match_by_node
+from vslam.lab.loopbench.node_matching import index_nodes, match_by_node
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.bow_index import InvertedIndex
 from vslam.loopclosure.detector import LoopDetector

@@ -22,7 +22,7 @@ from test_report import make_outcome
 
 from vslam.errors import InputError
 from vslam.features import Features
-from vslam.overview.serve import list_runs, make_server
+from vslam.lab.overview.serve import list_runs, make_server
 from vslam.report.explorer import explorer_data
 from vslam.report.folder import evaluate_run, matched_ground_truth, write_results
 from vslam.run.moments import MomentRecorder

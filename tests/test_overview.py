@@ -18,11 +18,11 @@ from vslam.cli import main as cli
 from vslam.cli.tables import show_tables, table_lines
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.overview import write_overview
-from vslam.overview.collect import Found, collect, read_aligned
-from vslam.overview.render import tables
-from vslam.overview.schema import ALL, MEASURES, Drive, OverviewJson, RunEntry, Spread
-from vslam.overview.summary import (
+from vslam.lab.overview import write_overview
+from vslam.lab.overview.collect import Found, collect, read_aligned
+from vslam.lab.overview.render import tables
+from vslam.lab.overview.schema import ALL, MEASURES, Drive, OverviewJson, RunEntry, Spread
+from vslam.lab.overview.summary import (
     compare,
     least_pairs,
     make_rows,
@@ -30,7 +30,7 @@ from vslam.overview.summary import (
     summarize,
     systems,
 )
-from vslam.overview.versus import versus
+from vslam.lab.overview.versus import versus
 from vslam.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 
 LAWS = ("none", "brightness:0.5", "brightness:1")

@@ -139,7 +139,7 @@ def test_a_plain_installation_stays_lean():
     assert not [name for name in extras if re.search(rf"\b{name}\b", plain)]
     for library, extra, where in (
         ("rosbags", "bag", "vslam/datasets/bag.py"),
-        ("distributed", "cluster", "vslam/bench/cluster.py"),
+        ("distributed", "cluster", "vslam/lab/bench/cluster.py"),
         ("torch", "train", "vslam/cli/train.py"),
     ):
         assert library in extras

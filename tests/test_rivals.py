@@ -20,7 +20,7 @@ from vslam.cli.main import app
 from vslam.cli.options import DetectorName
 from vslam.cli.train import NetworkName, PresetName
 from vslam.errors import InputError
-from vslam.loopbench.schema import Cost, Curve, LoopsJson, Score
+from vslam.lab.loopbench.schema import Cost, Curve, LoopsJson, Score
 from vslam.loopclosure.registry import DETECTORS
 from vslam.loopclosure.siamese.branches import CapsuleShape
 from vslam.loopclosure.siamese.component_training import learn_components

@@ -497,7 +497,7 @@ def _read_config(folder: Path) -> None:
 
 
 def _read_report(folder: Path) -> None:
-    from vslam.overview import write_overview
+    from vslam.lab.overview import write_overview
     from vslam.report.finished_run import read_report
     from vslam.report.render import render_html, render_markdown
 

@@ -32,15 +32,15 @@ from matplotlib import style
 from vslam.cli.progress import count_bar
 from vslam.datasets.synthetic import store
 from vslam.errors import InputError
-from vslam.loopbench.conditions import parse_conditions
-from vslam.loopbench.cost import cost
-from vslam.loopbench.detectors import DetectorSet
-from vslam.loopbench.kept import digest, keep_conditions
-from vslam.loopbench.measure import measure
-from vslam.loopbench.registry import comparable_scorer
-from vslam.loopbench.report import draw
-from vslam.loopbench.schema import LoopsJson, Score
-from vslam.loopbench.sets import open_set
+from vslam.lab.loopbench.conditions import parse_conditions
+from vslam.lab.loopbench.cost import cost
+from vslam.lab.loopbench.detectors import DetectorSet
+from vslam.lab.loopbench.kept import digest, keep_conditions
+from vslam.lab.loopbench.measure import measure
+from vslam.lab.loopbench.registry import comparable_scorer
+from vslam.lab.loopbench.report import draw
+from vslam.lab.loopbench.schema import LoopsJson, Score
+from vslam.lab.loopbench.sets import open_set
 from vslam.loopclosure.siamese.inference import OnnxNetwork, open_network
 from vslam.loopclosure.siamese.weights import NETWORKS, TO_THE_LETTER, find_weights
 from vslam.loopclosure.vocabulary import load

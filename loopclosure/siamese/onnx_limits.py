@@ -127,7 +127,8 @@ def _compute_shapes(graph: GraphProto) -> None:
         if node.op_type not in _OF_SHAPES or not all(name in there for name in node.input):
             continue
         given = {name: there[name] for name in node.input}
-        (value,) = ReferenceEvaluator(node).run(None, given)
+        (result,) = ReferenceEvaluator(node).run(None, given)
+        value = np.asarray(result)
         if value.size <= _SMALL:
             known[node.output[0]] = value
             graph.initializer.append(numpy_helper.from_array(value, node.output[0]))

@@ -345,7 +345,7 @@ class Sleeper:
 
 
 def test_the_tables_of_the_page(tmp_path, monkeypatch):
-    tool = script("tools/rivals_table.py")
+    tool = script("tools/experiments/rivals/rivals_table.py")
     names = {"images": ("capsule", "capsule-pruned", "pcanet"), "minutes": ("capsule", "pcanet"),
              "untrained": ("lsgd",), "shipped": ("bow", "capsule", "capsule-pruned")}  # fmt: skip
     for way, detectors in names.items():

@@ -482,10 +482,10 @@ def test_stress_refuses_before_it_starts(tmp_path, words, said):
 
 def test_the_table_of_boundaries_is_that_of_the_csv(monkeypatch):
     root = Path(__file__).parents[1]
-    monkeypatch.syspath_prepend(str(root / "tools"))
+    monkeypatch.syspath_prepend(str(root / "tools" / "experiments" / "stress"))
     import boundary_table
 
     page = (root / "docs" / "stress.md").read_text()
     for name, theirs in (("kitti00", "orbslam3"), ("demo", "both")):
         made = boundary_table.table(root / "docs" / "stress" / f"{name}.csv", "bow", theirs)
-        assert made in page, "run: python tools/boundary_table.py"
+        assert made in page, "run: python tools/experiments/stress/boundary_table.py"

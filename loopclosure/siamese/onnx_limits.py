@@ -56,7 +56,8 @@ def check_graph(file: bytes) -> None:
     for tensor in graph.initializer:
         if math.prod(tensor.dims) > tensor.ByteSize():
             raise ValueError("its weights are not in it")
-        if math.prod(tensor.dims) > _SMALL:  # only the shape matters from here on
+        is_weight = tensor.data_type in (TensorProto.FLOAT, TensorProto.FLOAT16)
+        if is_weight and math.prod(tensor.dims) > _SMALL:  # only the shape matters from here on
             tensor.CopyFrom(
                 TensorProto(name=tensor.name, data_type=tensor.data_type, dims=tensor.dims)
             )

@@ -1,6 +1,6 @@
 """How cost and memory grow with the keyframes of a map, by simulation.
 
-    python tools/growth.py --write docs/scale.md --figure docs/scale.svg
+    python tools/experiments/scale/growth.py --write docs/scale.md --figure docs/scale.svg
 
 A town of streets that cross, each driven once: a keyframe every 5 m has 2,000 features, of which
 560 see landmarks, 140 of them new (565 and 132 in the rendered town along KITTI 05); at a crossing

@@ -1,7 +1,7 @@
 """One route driven in parts, each in another light: are their maps made one, and how good is it?
 
     vslam synth 05                                    # once
-    python tools/merge_drives.py 05 --parts 4
+    python tools/experiments/maps/merge_drives.py 05 --parts 4
 
 The parts overlap by ``--overlap`` frames, and meet where the route comes back. Each has a
 brightness walk of another seed; the long drive beside it has that of the first. Prints which pairs

@@ -1,6 +1,7 @@
-"""What loop detectors cost whole runs, side by side, as a Markdown table.
+r"""What loop detectors cost whole runs, side by side, as a Markdown table.
 
-    python tools/detector_cost.py --case "demo=$HOME/.cache/vslam/synthetic/v2-seed0:demo:477" \
+    python tools/experiments/local_descriptors/detector_cost.py \
+        --case "demo=$HOME/.cache/vslam/synthetic/v2-seed0:demo:477" \
         [--detectors bow,both] [--repeats 5]
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The detectors run in
@@ -17,6 +18,8 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import NamedTuple
+
+sys.path.insert(0, str(Path(__file__).parents[2]))  # tools/
 
 import compare_orbslam3
 from bench_speed import Case, parse_case

@@ -1,8 +1,8 @@
 """One route as a camera sees it that is carried about: its parts, out of order, in one sequence.
 
-    python tools/cut_drive.py demo --parts 4 --overlap 60 --out cut
+    python tools/experiments/maps/cut_drive.py demo --parts 4 --overlap 60 --out cut
     vslam stress --data cut --seqs 00 --laws jpeg --steps 1 --seeds 1 --systems vslam,orbslam3 ...
-    python tools/cut_drive.py --score STRESS/kitti-00-none-*
+    python tools/experiments/maps/cut_drive.py --score STRESS/kitti-00-none-*
 
 Writes a KITTI tree whose sequence 00 is the parts of ``merge_drives.py``, each in a light of its
 own, first those with even numbers: after each one the camera is somewhere else, a second later. A

@@ -1,7 +1,7 @@
 """SLAM on a rendered fisheye pair against its rectified twin: ATE of both.
 
     vslam synth block --fisheye --max-frames 100 --out fisheye
-    python tools/fisheye_twin.py fisheye block
+    python tools/experiments/cameras/fisheye_twin.py fisheye block
 
 The twin is cut out of the pinhole images that the fisheye ones were warped from, pixel by pixel
 without resampling: of the size of the fisheye images, about the route's own principal point.

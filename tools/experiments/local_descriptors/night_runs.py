@@ -2,7 +2,7 @@
 candidates verified by ORB, by learned descriptors, or by both.
 
     vslam synth block --seed 501 --change 1    # and so on, with other seeds and drives
-    python tools/night_runs.py --runs FOLDER --seeds 501-516
+    python tools/experiments/local_descriptors/night_runs.py --runs FOLDER --seeds 501-516
 
 Drives that are not rendered completely are left out: the column ``towns`` counts the others. A run
 whose report lies in FOLDER is not repeated, so the same command continues; a new version of vslam
@@ -25,7 +25,7 @@ from vslam.datasets.synthetic import parse_drive
 from vslam.datasets.synthetic.store import cache_folder, folder_name, list_stored
 from vslam.report.schema import ReportJson
 
-OUT = Path(__file__).parent.parent / "docs" / "loops" / "night_runs.csv"
+OUT = Path(__file__).parents[3] / "docs" / "loops" / "night_runs.csv"
 DRIVES = ("block+change:1", "lane+change:0.9", "block+aliased")
 DETECTORS = ("both", "bow", "capsule")  # the first one is the run's, the others are compared
 VERIFIED_BY = ("usual", "both", "orb", "learned")  # of verification.descriptors

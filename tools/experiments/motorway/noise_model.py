@@ -1,6 +1,6 @@
 """How sure the rows, columns and disparities of features are, told by finished stereo maps.
 
-    python tools/noise_model.py runs/one runs/two
+    python tools/experiments/motorway/noise_model.py runs/one runs/two
 
 Adjusts the map of each run and prints the standard deviations of the errors of u, v and the
 disparity, in pixels of the feature's octave, that explain its residuals: variance components

@@ -1,7 +1,8 @@
-"""Noise, spikes and contrast of a sequence's left images, as ``frontend/weak_images.py`` measures
+r"""Noise, spikes and contrast of a sequence's left images, as ``frontend/weak_images.py`` measures
 them, and the features that ``extract`` finds.
 
-python tools/image_noise.py --data "$KITTI_ROOT" --seq 00 --max-frames 216 --perturb night:3.75
+python tools/experiments/stress/image_noise.py --data "$KITTI_ROOT" --seq 00 \
+    --max-frames 216 --perturb night:3.75
 """
 
 from __future__ import annotations

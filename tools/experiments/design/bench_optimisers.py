@@ -1,6 +1,6 @@
 """Time what runs behind a closed loop, on simulated drives with loops.
 
-    python tools/bench_optimisers.py [bundle] [graph] [covisibility]
+    python tools/experiments/design/bench_optimisers.py [bundle] [graph] [covisibility]
 
 prints, for each: its size, the time of the whole call (best of three, and the first one with
 compilation left out), and how well it did.

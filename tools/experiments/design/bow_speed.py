@@ -3,7 +3,7 @@
 Words are drawn as often as training images had them, which is harder than real streets: there,
 rare words come together. Every keyframe shares landmarks with those around it.
 
-usage: python tools/bow_speed.py [KEYFRAMES] [FEATURES]
+usage: python tools/experiments/design/bow_speed.py [KEYFRAMES] [FEATURES]
 """
 
 from __future__ import annotations

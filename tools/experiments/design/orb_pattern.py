@@ -6,7 +6,7 @@ vocabularies trained elsewhere stay usable. The sampling pattern (learned by Rub
 patch of a keypoint at angle 0, and every bit tells for which positions its second (first) point
 outshines the other. OpenCV smooths the image before it samples, so that a dot acts within 3 px.
 
-usage: python tools/orb_pattern.py frontend/orb_pattern.npy
+usage: python tools/experiments/design/orb_pattern.py frontend/orb_pattern.npy
 """
 
 import sys

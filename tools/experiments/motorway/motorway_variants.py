@@ -1,6 +1,6 @@
 """Rendered motorways that are harder than `01`: vslam and ORB-SLAM3 on the same images, in a table.
 
-    python tools/motorway_variants.py --csv docs/results/motorway.csv \
+    python tools/experiments/motorway/motorway_variants.py --csv docs/results/motorway.csv \
         --orbslam3-python PY --orbslam3-script run_orbslam3.py --vocabulary voc.txt
 
 More speed: every second or third frame, with its own time, so that the car drives 5 or 7.5 m a
@@ -15,11 +15,14 @@ from __future__ import annotations
 
 import argparse
 import csv
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
+
+sys.path.insert(0, str(Path(__file__).parents[2]))  # tools/
 
 from changed_drive import changed_drive, run_over
 

@@ -1,6 +1,6 @@
 """How alike right and wrong best images are: what a threshold of the learned image test costs.
 
-    python tools/image_test_shares.py block+change:1+seed:18:4:6 05:8:20 ...
+    python tools/experiments/online/image_test_shares.py block+change:1+seed:18:4:6 05:8:20 ...
 
 Each drive, every so many frames (4, 8), is asked as ``vslam loops bench --protocol online`` asks:
 of the images older by so many seconds (6, 20), the one most like by `capsule`, once among those of

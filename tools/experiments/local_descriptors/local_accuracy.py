@@ -1,10 +1,11 @@
-"""How well local descriptors match under each condition: learned ones and ORB, on rendered pairs.
+r"""How well local descriptors match under each condition: learned ones and ORB, on rendered pairs.
 
 Pairs of views of test towns, whose depth and motion are exact: share of the matches within 3 pixels
 of the truth, and the error of the pose that P3P and its refinement make of them. The keypoints of
 the first view are ORB's in both cases. Writes a CSV table.
 
-    python tools/local_accuracy.py --pairs 24 --out docs/loops/local_descriptors.csv
+    python tools/experiments/local_descriptors/local_accuracy.py --pairs 24 \
+        --out docs/loops/local_descriptors.csv
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Where the scale of a stereo drive goes wrong: errors of disparities and of motion, and an offset.
+r"""Where the scale of a stereo drive goes wrong: errors of disparity and motion, and an offset.
 
-    python tools/motorway.py errors 01 --frames 10:200:8 --csv docs/motorway.csv
-    python tools/motorway.py offset runs/latest
+    python tools/experiments/motorway/motorway.py errors 01 --frames 10:200:8 \
+        --csv docs/motorway.csv
+    python tools/experiments/motorway/motorway.py offset runs/latest
 
 ``errors`` extracts features of a rendered route and compares, with its exact depth and poses, the
 disparity of each and where its best match in the next frame lies: along the motion (away from the

@@ -1,7 +1,7 @@
 """Which observations make a finished stereo map too small or too large.
 
     vslam run --dataset synthetic --seq 01 --max-frames 200 --detector none
-    python tools/scale_probe.py runs/latest
+    python tools/experiments/motorway/scale_probe.py runs/latest
 
 Global bundle adjustment of the map of a run, again with a part of its stereo observations taken
 for monocular ones. Prints the scale that brings the keyframes onto the ground truth (above 1: the

@@ -1,6 +1,6 @@
 """Write Table 6 of the paper and its companions, for all networks of docs/rivals.md.
 
-python tools/rivals_table.py --trained DIR --data SOURCE [--data SOURCE ...]
+python tools/experiments/rivals/rivals_table.py --trained DIR --data SOURCE [--data SOURCE ...]
         [--page docs/rivals.md] [--section NAME] [--ways NAMES] [--retime]
 
 DIR is what tools/training/train_rivals.py wrote, SOURCE as of ``vslam loops bench``. Measured are,

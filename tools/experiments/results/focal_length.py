@@ -1,7 +1,7 @@
 """Does the scale of a monocular drive drift because the focal length is wrong?
 
-    python tools/focal_length.py --data $KITTI_ROOT --seq 00 --frames 500
-    python tools/focal_length.py --dataset synthetic --seq 05 --frames 600
+    python tools/experiments/results/focal_length.py --data $KITTI_ROOT --seq 00 --frames 500
+    python tools/experiments/results/focal_length.py --dataset synthetic --seq 05 --frames 600
 
 Runs the left camera without loop closing, with its focal length as it is given and multiplied by
 ``--factors``. Where the camera turns, a wrong focal length changes the scale; where it drives

@@ -1,7 +1,7 @@
 """A run that is split by saving and loading its map, beside the whole run, and localisation in it.
 
-    python tools/split_run.py --data KITTI --seq 06
-    python tools/split_run.py --dataset synthetic --seq demo --detector both
+    python tools/experiments/maps/split_run.py --data KITTI --seq 06
+    python tools/experiments/maps/split_run.py --dataset synthetic --seq demo --detector both
 
 Prints ATE (m) of the whole run, of the run that was saved after some of its frames, loaded and
 resumed, and of all frames localised in the map of the whole run, with their share.

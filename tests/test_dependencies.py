@@ -25,8 +25,8 @@ FOLDERS = {
 # From the ground up; a module belongs to the longest name here that it lies within. What stands
 # together on one level may not import each other, save where SIBLINGS says so.
 LEVELS: tuple[tuple[str, ...], ...] = (
-    ("vslam.errors", "vslam.machine", "vslam.kernels"),
-    ("vslam.plugins", "vslam.untrusted", "vslam.lock_file"),
+    ("vslam.errors", "vslam.machine"),
+    ("vslam.kernels", "vslam.plugins", "vslam.untrusted", "vslam.lock_file"),
     ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.features", "vslam.camera"),
     (
         "vslam.loops",
@@ -73,6 +73,7 @@ ONLY_IN = {
     "torch": "vslam.loopclosure.siamese",
     "torchvision": "vslam.loopclosure.siamese",
     "onnx": ("vslam.loopclosure.siamese.export", "vslam.loopclosure.siamese.onnx_limits"),
+    "safetensors": "vslam.loopclosure.siamese.siamese",
     "onnxruntime": "vslam.loopclosure.siamese.inference",
     "gtsam": "vslam.backend",
     "rerun": "vslam.run.recorder",
@@ -84,6 +85,9 @@ ONLY_IN = {
     "deflate": "vslam.datasets.png",
     "typer": "vslam.cli",
 }
+
+# Imports torch inside its functions, and only after it has looked for it.
+TRAINING_COMMANDS = "vslam.cli.train"
 
 
 def sources() -> dict[str, Path]:
@@ -228,6 +232,18 @@ def test_heavy_libraries_stay_where_they_belong(library):
     places = ONLY_IN[library] if isinstance(ONLY_IN[library], tuple) else (ONLY_IN[library],)
     assert {m for m in users if not any(within(m, place) for place in places)} == set()
     assert users or library == "torchvision"
+
+
+def test_only_training_reaches_the_libraries_of_the_extra_train():
+    """However long the chain of imports: runs, maps, loops and benchmarks do without them."""
+    extra = {"torch", "safetensors", "onnx", "onnxscript"}
+    need = {m for m, names in IMPORTS.items() if {name.partition(".")[0] for name in names} & extra}
+    found: set[str] = set()
+    while need - found:
+        found |= need
+        need = {m for m, targets in ARROWS.items() if targets & (found - {TRAINING_COMMANDS})}
+    outside = {m for m in found if not within(m, "vslam.loopclosure.siamese")}
+    assert outside == {TRAINING_COMMANDS}
 
 
 def test_the_library_does_not_print():

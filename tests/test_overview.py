@@ -360,6 +360,12 @@ def test_changes_of_a_rendered_town_are_perturbations(run_folder: Path, tmp_path
     assert list(strengths(drives, "change").values()) == [0.0, 0.5]
 
 
+def test_a_name_is_never_a_formula(run_folder: Path, tmp_path: Path):
+    copy_run(run_folder, tmp_path / "runs" / "one", sequence="$\\frac$")
+    write_overview([tmp_path / "runs"], [], tmp_path / "out")
+    assert re.search(r"<text[^>]*>[^<]*\$\\frac\$", (tmp_path / "out" / "report.html").read_text())
+
+
 def test_a_drive_with_a_name_of_its_own_keeps_it(run_folder: Path, tmp_path: Path):
     for name in ("night", "night+moving:2"):
         copy_run(run_folder, tmp_path / name, dataset="synthetic", sequence=name, perturb="none")

@@ -130,7 +130,7 @@ def everything(frame: Frame) -> list[bytes]:
 
 
 def map_bytes(world: World) -> bytes:
-    return b"".join(array.tobytes() for array in world.map.used_arrays())
+    return b"".join(array.tobytes() for array in world.map.copy().arrays)
 
 
 def offset(frame: Frame) -> float:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Iterable
+from multiprocessing.connection import Connection
 
 import numpy as np
 import pytest
@@ -98,6 +100,37 @@ def test_while_the_left_side_is_black_the_right_one_tracks(corridor, check_map):
     online = np.array([results[k].T_wc[:3, 3] - corridor.T_wc[k, :3, 3] for k in dark])
     assert np.linalg.norm(online, axis=1).max() < 0.2 * corridor.camera.baseline
     check_map(slam.map)
+
+
+@pytest.mark.parametrize(
+    ("threads", "said"), [(1, "every frame was tracked"), (2, "make one after the fork")]
+)
+def test_a_fork_tracks_with_one_thread_and_is_refused_with_more(corridor, threads, said):
+    """Its copy of the map has no thread that works on it: it would wait for ever."""
+    slam = Slam(corridor.camera, EAGER, "none", threads=threads)
+
+    def go_on(frames: range) -> None:
+        for k in frames:
+            slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
+
+    def child(told: Connection) -> None:
+        try:
+            go_on(range(6, 12))
+            told.send("every frame was tracked")
+        except RuntimeError as error:
+            told.send(str(error))
+
+    go_on(range(6))
+    here, there = multiprocessing.Pipe()
+    process = multiprocessing.get_context("fork").Process(target=child, args=(there,))
+    process.start()
+    try:
+        assert here.poll(30), "the child hangs"
+        assert said in here.recv()
+    finally:
+        process.kill()
+        process.join()
+    go_on(range(6, 12))  # the parent's is as it was
 
 
 def test_results_account_for_every_frame(corridor):

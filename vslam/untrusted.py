@@ -37,6 +37,19 @@ def limit_images() -> None:
     os.environ.setdefault(_OPENCV_LIMIT, str(MOST_PIXELS))
 
 
+def require_utf8(path: Path) -> None:
+    """Refuse a name that reports, which are text, cannot hold.
+
+    Raises:
+        InputError: it is not UTF-8.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        shown = os.fsencode(path).decode(errors="replace")
+        raise InputError(f"{shown}: this name is not UTF-8; rename it.") from None
+
+
 def read_npz(path: Path, what: str, fix: str = "name another file") -> dict[str, NDArray[Any]]:
     """All arrays of an npz file; Python objects (pickles) are refused.
 

@@ -189,8 +189,13 @@ def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
 
 
 def _refuse_beyond_limits(path: Path, file: bytes) -> None:
-    from vslam.loopclosure.siamese.onnx_limits import check_graph
-
+    try:
+        from vslam.loopclosure.siamese.onnx_limits import check_graph
+    except ImportError as error:
+        raise InputError(
+            f"{path}: weights that vslam does not ship are checked by the package onnx, which is "
+            "not installed; pip install 'vslam[train]'."
+        ) from error
     try:
         check_graph(file)
     except ValueError as error:

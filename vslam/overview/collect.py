@@ -15,6 +15,7 @@ from vslam.overview.schema import MEASURES, Drive, RunEntry
 from vslam.report.schema import ReportJson
 from vslam.run.outcome import alignment_of
 from vslam.trajectory import Trajectory, read_trajectory
+from vslam.untrusted import require_utf8
 
 MONOCULAR = ", mono"  # ends the name of a monocular system
 
@@ -100,6 +101,7 @@ def _run_folders(folders: Collection[Path]) -> list[Path]:
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder; name folders of runs.")
         for path in sorted(folder.rglob("report.json")):
+            require_utf8(path)
             if not any(part.startswith(".") for part in path.relative_to(folder).parts):
                 found.setdefault(path.parent.resolve(), path.parent)
     return list(found.values())

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib import style
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
 
 from vslam.errors import InputError
 from vslam.overview.collect import Found, read_aligned
@@ -29,6 +29,7 @@ from vslam.report.drawing import (
     ReportFigure,
     add_legend,
     new_figure,
+    plain_ticks,
     save,
 )
 
@@ -206,9 +207,7 @@ def _logarithmic(axes: Axes) -> None:
     low, high = axes.dataLim.intervaly
     axes.set_yscale("log")
     axes.set_ylim(max(low, 1e-4) / 3.0, max(high, 1e-4) * 3.0)
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_major_formatter("{x:g}")
+    plain_ticks(axes.yaxis)
 
 
 def _light(perturb: str) -> str:

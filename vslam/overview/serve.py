@@ -3,6 +3,10 @@
 Only reports that were found are served, by number: no path of a request reaches the disk. Requests
 for another host's name are refused, so that no page of the web can read reports through the
 browser (DNS rebinding).
+
+A report may come from a stranger and hold any script. It is sandboxed: its scripts run in an origin
+of their own and reach neither other reports nor the network. A ``report.html`` or ``report.json``
+that is a link out of its folder is not read.
 """
 
 from __future__ import annotations
@@ -19,10 +23,16 @@ from vslam.errors import InputError
 from vslam.report.finished_run import read_report
 from vslam.report.page import render_page
 from vslam.report.schema import ReportJson
+from vslam.untrusted import require_utf8
 
 HOST = "127.0.0.1"
 _NAMES = (HOST, "localhost")
 _MOST_BESIDE = 4
+_LISTS_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-src 'self'"
+_REPORT_POLICY = (
+    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; img-src data:"
+)
 _NUMBER = re.compile("[0-9]{1,9}")
 
 
@@ -48,18 +58,24 @@ def list_runs(folders: Collection[Path]) -> list[ListedRun]:
         for path in sorted(folder.rglob("report.json")):
             place = path.parent.resolve()
             parts = path.parent.relative_to(folder).parts
-            if place in found or any(part.startswith(".") for part in parts):
+            hidden = any(part.startswith(".") for part in parts)
+            if place in found or hidden or not _is_own(place / path.name):
                 continue
             try:
+                require_utf8(place)
                 report = read_report(path.parent)
             except InputError:
                 continue
-            page = path.with_name("report.html")
-            name = place.name if not parts else path.parent.resolve().name
-            found[place] = ListedRun(name, report, page if page.is_file() else None)
+            page = place / "report.html"
+            found[place] = ListedRun(place.name, report, page if _is_own(page) else None)
     if not found:
         raise InputError(f"{', '.join(map(str, folders))}: no run here; name folders of runs.")
     return sorted(found.values(), key=lambda run: (run.report.created, run.name), reverse=True)
+
+
+def _is_own(path: Path) -> bool:
+    """Whether a path without links is a file, and not itself a link to another place."""
+    return path.is_file() and path.resolve() == path
 
 
 def make_server(folders: Sequence[Path], port: int = 0) -> http.server.ThreadingHTTPServer:
@@ -79,10 +95,13 @@ def make_server(folders: Sequence[Path], port: int = 0) -> http.server.Threading
         def do_GET(self) -> None:
             host = (self.headers.get("Host") or "").partition(":")[0]
             status, text = pages.answer(self.path) if host in _NAMES else (403, "forbidden")
+            is_ours = self.path == "/" or self.path.startswith("/compare?")
             body = text.encode()
             self.send_response(status)
             self.send_header("Content-Type", "text/html; charset=utf-8")
             self.send_header("Content-Length", str(len(body)))
+            policy = _LISTS_POLICY if is_ours else _REPORT_POLICY
+            self.send_header("Content-Security-Policy", policy)
             self.send_header("X-Content-Type-Options", "nosniff")
             self.send_header("Cache-Control", "no-store")
             self.end_headers()
@@ -112,7 +131,10 @@ class _Pages:
 
     def answer(self, request: str) -> tuple[int, str]:
         """Status and page for a path with its query."""
-        url = urlsplit(request)
+        try:
+            url = urlsplit(request)
+        except ValueError:
+            return 400, "bad request"
         if url.path == "/":
             try:
                 with self._lock:
@@ -132,7 +154,7 @@ class _Pages:
         return 404, "not found"
 
     def _run(self, number: int) -> tuple[int, str]:
-        if number >= len(self._pages):
+        if number >= len(self._pages) or not _is_own(self._pages[number]):
             return 404, "not found"
         try:
             return 200, self._pages[number].read_text("utf-8")

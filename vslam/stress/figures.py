@@ -19,6 +19,7 @@ from vslam.report.drawing import (
     ReportFigure,
     add_legend,
     new_figure,
+    plain_ticks,
     save,
 )
 
@@ -82,6 +83,7 @@ def _curves(
     panels[2].set_xlabel("strength" if kind.unit == "x" else kind.unit)
     if kind.logarithmic:
         panels[2].set_xscale("log")
+        plain_ticks(panels[2].xaxis)
     if kind.strongest < kind.weakest:
         panels[2].invert_xaxis()
     add_legend(figure, panels[0])

@@ -126,7 +126,12 @@ RULES = {
     "docs/exports.md": Rules((("colmap RUN", "colmap RUN --out again"), ("RUN", "runs/latest"))),
     "docs/howto/euroc.md": Rules(),
     "docs/howto/install.md": Rules(
-        not_run=(("pip", INSTALL), ("uvx", INSTALL), ("python tools/wheel_test.py", INSTALL))
+        not_run=(
+            ("pip", INSTALL),
+            ("uvx", INSTALL),
+            ("python tools/wheel_test.py", INSTALL),
+            ("python3 -m venv clean", INSTALL),
+        )
     ),
     "docs/howto/kitti.md": Rules(),
     "docs/howto/tum.md": Rules(),

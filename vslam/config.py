@@ -523,6 +523,13 @@ class SiameseConfig(_Section):
         description="The same share in monocular maps, whose unit drifts: twice what KITTI 00 "
         "needs, where it drifts by a factor of 2.3. [own]",
     )
+    reach_angle: float = Field(
+        60.0,
+        gt=0,
+        le=180,
+        description="Only keyframes that look within this angle of where the camera looks are "
+        "compared, degrees: a place is not recognised from the side. [own]",
+    )
     embedded_at_once: int = Field(
         8, ge=1, description="Keyframes that a query has the network see, the nearest. [own]"
     )

@@ -15,7 +15,6 @@ from vslam.reprojection import chi_square_ratio, unpacked
 
 EPIPOLAR_CHI2 = 3.84  # 95 % quantile with 1 degree of freedom
 SECTIONS = 512  # of the directions of epipolar planes
-MIN_CLOSE = 100  # stereo points mapped even if none is close (ORB-SLAM2, III-E)
 
 
 def map_stereo_points(
@@ -23,7 +22,8 @@ def map_stereo_points(
 ) -> NDArray[np.int32]:
     """Map the close stereo features of a keyframe that observe no landmark yet.
 
-    If fewer than 100 features are close, the 100 nearest count (ORB-SLAM2, section III-E).
+    If fewer than ``mapping.min_stereo_points`` are close, that many of the nearest are mapped
+    (ORB-SLAM2, section III-E).
 
     Args:
         far: far ones, too.
@@ -37,7 +37,8 @@ def map_stereo_points(
     nearest = np.argsort(depth, kind="stable")
     nearest = nearest[: np.count_nonzero(np.isfinite(depth))]
     close = depth[nearest] < config.stereo.close_depth_baselines * camera.baseline
-    nearest = nearest[far | close | (np.arange(len(nearest)) < MIN_CLOSE)]
+    among_nearest = np.arange(len(nearest)) < config.mapping.min_stereo_points
+    nearest = nearest[far | close | among_nearest]
     new = nearest[a.landmark[rows][nearest] == NONE]
     T_wc = inverse(a.T_cw[keyframe])
     xyz = camera.backproject(xy[new], depth[new]) @ T_wc[:3, :3].T + T_wc[:3, 3]

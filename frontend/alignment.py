@@ -40,7 +40,7 @@ def align_frame(
         scales: full-resolution pixels for a pixel of each octave.
     """
     features = frame.features
-    if features.pyramid is None or not len(known.ids):
+    if frame.pyramid is None or not len(known.ids):
         return None
     matched = np.flatnonzero(frame.landmark >= 0)
     landmark = frame.landmark[matched]
@@ -50,10 +50,16 @@ def align_frame(
     octave = features.octave[matched]
     size = scales[octave]
     warp = warps(
-        frame.T_cw, frame.xyz[matched], known.T_cw, known.view[at], known.size[at], size, intrinsics
+        frame.T_camera_w,
+        frame.xyz[matched],
+        known.T_cw,
+        known.view[at],
+        known.size[at],
+        size,
+        intrinsics,
     )
     found = align(
-        patches_around(features.pyramid, features.xy[matched], octave),
+        patches_around(frame.pyramid, features.xy[matched], octave),
         known.pixels,
         known.shift,
         known.where[at],

@@ -8,27 +8,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera
-from vslam.features import FeatureGrid, Features
-from vslam.geometry import Matrix
-from vslam.image_motion import columns_without_delay
+from vslam.features import Extracted, FeatureGrid, Features, Pyramid, Side
+from vslam.geometry import Matrix, inverse
 
 
 @dataclass
 class Frame:
     """A frame being tracked.
 
+    "The camera" is the one that took the image of the features: as a rule the left one, and the
+    right one if the left image is black. The pose of the frame is always that of the left camera.
+
     Attributes:
         index: number of the frame in the run, from 0.
         timestamp: seconds.
-        image: ``(H, W)`` uint8 left image, for loop detectors that look at it, or None.
-        features, grid: of the left image, or of the right one (``Features.from_right``).
-        T_cw: ``(4, 4)`` pose estimate, of the left camera once the frame is tracked; while it is,
-            of the camera that its features are of.
+        image: ``(H, W)`` uint8 image of the camera, for loop detectors that look at it, or None.
+        features, grid: N features of that image.
+        pyramid, row_offset, side: see ``Extracted``.
+        T_camera_left: ``(4, 4)`` the left camera in the camera: the identity, or
+            ``Camera.T_right_left``.
+        T_cw: ``(4, 4)`` pose estimate of the left camera.
         landmark: ``(N,)`` int32, landmark that each feature tracks, or -1.
         xyz: ``(N, 3)`` float64, its position; NaN without one.
-        disparity_offset: pixels that the disparities of the features were corrected by.
+        disparity_offset, delay_removed: what the disparities of the features were corrected by:
+            the pixels added to each, and whether the delay of the right image was removed
+            (``RigCalibration``).
         shift: ``(N, 2)`` float32, pixels from each feature to where its match was aligned, NaN for
             those that were not; None if none was.
+        twist: ``(6,)`` speed of the camera when the frame was tracked, per second; None if unknown.
     """
 
     index: int
@@ -36,53 +43,67 @@ class Frame:
     image: NDArray[np.uint8] | None
     features: Features
     grid: FeatureGrid
+    pyramid: Pyramid | None
+    row_offset: NDArray[np.float32] | None
+    side: Side
+    T_camera_left: NDArray[np.float64]
     T_cw: NDArray[np.float64]
     landmark: NDArray[np.int32]
     xyz: NDArray[np.float64]
     disparity_offset: float = 0.0
+    delay_removed: bool = False
     shift: NDArray[np.float32] | None = None
+    twist: Matrix | None = None
 
     @classmethod
-    def untracked(
+    def of(
         cls,
-        features: Features,
+        extracted: Extracted,
         camera: Camera,
         index: int = 0,
         timestamp: float = 0.0,
         image: NDArray[np.uint8] | None = None,
     ) -> Frame:
-        """A frame of which nothing is known but its features."""
-        n = len(features)
+        """A frame that is not tracked yet: nothing is known but what its images gave."""
+        features, n = extracted.features, len(extracted.features)
         return cls(
             index=index,
             timestamp=timestamp,
             image=image,
             features=features,
             grid=FeatureGrid.of_positions(features.xy, camera.width, camera.height),
+            pyramid=extracted.pyramid,
+            row_offset=extracted.row_offset,
+            side=extracted.side,
+            T_camera_left=camera.T_right_left if extracted.side == Side.RIGHT else np.eye(4),
             T_cw=np.eye(4),
             landmark=np.full(n, -1, np.int32),
             xyz=np.full((n, 3), np.nan),
         )
 
-    def correct_disparities(self, offset: float) -> None:
-        """Correct the features by the whole offset of the pair (``Map.disparity_offset``)."""
-        if offset != self.disparity_offset:
-            change = offset - self.disparity_offset
-            self.features = self.features.with_larger_disparities(change)
-            self.disparity_offset = offset
+    @property
+    def T_camera_w(self) -> Matrix:
+        """``(4, 4)`` pose of the camera, by which landmarks are projected to the features."""
+        T: Matrix = self.T_camera_left @ self.T_cw
+        return T
 
-    def take_out_right_delay(self, twist: Matrix | None, camera: Camera) -> None:
-        """Move the features' columns in the right image to where they were when the left image was
-        taken (``Camera.right_delay``). Call it once; without a known motion nothing changes.
+    def snapshot(self) -> Frame:
+        """A copy that keeps what the frame tracks now."""
+        return replace(self, landmark=self.landmark.copy(), xyz=self.xyz.copy())
 
-        Args:
-            twist: ``(6,)`` how points move past the camera, per second; None if unknown.
-        """
-        if camera.right_delay == 0.0 or twist is None:
-            return
-        xy, u_right = self.features.xy, self.features.u_right
-        u_right = columns_without_delay(xy, u_right, twist, camera.right_delay, camera)
-        self.features = replace(self.features, u_right=u_right)
+    def restore(self, snapshot: Frame) -> None:
+        """Track again what the frame tracked when the snapshot was taken."""
+        self.T_cw, self.shift = snapshot.T_cw, snapshot.shift
+        self.landmark, self.xyz = snapshot.landmark, snapshot.xyz
+
+    def set_camera_pose(self, T_camera_w: Matrix) -> None:
+        """Set the pose of the frame from the ``(4, 4)`` pose of the camera."""
+        self.T_cw = inverse(self.T_camera_left) @ T_camera_w
+
+    @property
+    def can_become_keyframe(self) -> bool:
+        """Whether the frame can join the map, which is made of left images."""
+        return self.side == Side.LEFT
 
     @property
     def aligned(self) -> NDArray[np.bool_]:

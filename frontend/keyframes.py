@@ -7,6 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from vslam.config import KeyframeConfig
+from vslam.frontend.frame import Frame
+from vslam.frontend.tracking import TrackingContext, feature_depth
+from vslam.map_view import MapView
+from vslam.states import PolicyState
 
 
 @dataclass(frozen=True)
@@ -133,3 +137,54 @@ def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
         and evidence.n_inliers >= config.max_tracked_ratio * evidence.n_place
         and evidence.n_shared >= config.known_ratio * evidence.n_place
     )
+
+
+class KeyframePolicy:
+    """Decides whether a tracked frame becomes a keyframe. Only ``observe``, ``keyframe_made`` and
+    ``restore`` change what it remembers."""
+
+    def __init__(self, context: TrackingContext) -> None:
+        self._context = context
+        self._config = context.config.keyframes
+        self._gain = CloseGain(self._config)
+
+    def observe(
+        self, frame: Frame, view: MapView, *, seconds_since_keyframe: float, mapping_idle: bool
+    ) -> KeyframeEvidence:
+        """Take in a tracked frame; returns what speaks for and against making it a keyframe."""
+        depth = feature_depth(frame.features, self._context.camera)
+        close, tracked = depth < self._context.close_depth, frame.landmark >= 0
+        tracked_close = int(np.count_nonzero(close & tracked))
+        self._gain.add(tracked_close)
+        return KeyframeEvidence(
+            seconds_since_keyframe=seconds_since_keyframe,
+            n_inliers=int(np.count_nonzero(tracked)),
+            n_reference=view.n_reference,
+            tracked_close=tracked_close,
+            untracked_close=int(np.count_nonzero(close & ~tracked)),
+            mapping_idle=mapping_idle,
+            gained_close=self._gain.mean,
+        )
+
+    def wants_keyframe(self, evidence: KeyframeEvidence) -> bool:
+        """Whether the frame should become a keyframe, unless its place is known."""
+        camera = self._context.camera
+        if camera.monocular:
+            return needs_monocular_keyframe(evidence, self._config)
+        return needs_keyframe(evidence, self._config, depth=camera.depth)
+
+    def is_known(self, evidence: PlaceEvidence) -> bool:
+        """Whether an old keyframe serves in place of a new one."""
+        return is_known_place(evidence, self._config)
+
+    def keyframe_made(self) -> None:
+        """Expect the first frame after a keyframe."""
+        self._gain.begin()
+
+    def state(self) -> PolicyState:
+        """What is remembered of earlier keyframes."""
+        return PolicyState(self._gain.mean, self._gain.awaited)
+
+    def restore(self, state: PolicyState) -> None:
+        """Remember what ``state`` gave."""
+        self._gain.mean, self._gain.awaited = state.gained_close, state.gain_awaited

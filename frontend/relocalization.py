@@ -8,7 +8,7 @@ from vslam.frontend.frame import Frame
 from vslam.frontend.matching import count_elsewhere, search_all
 from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.tracking import TrackingContext, observations, refine, track_local_map
-from vslam.map import LocalMap
+from vslam.map_view import LocalMap
 
 
 def relocalise(
@@ -21,7 +21,7 @@ def relocalise(
     wide and in the usual window.
 
     Args:
-        frame: untracked; on success it has its pose and its landmarks, else it is left untracked.
+        frame: on success it gets its pose and its landmarks, otherwise it is left without both.
         place: the landmarks of a candidate keyframe.
         surroundings: those of the candidate and its covisible keyframes.
         seed: of the draws; the same seed gives the same result.
@@ -55,7 +55,7 @@ def _locate(
     if len(hit) < config.min_matches:
         return 0
     feature = found[hit]
-    T_cw, inlier = ransac_pose(
+    T_camera_w, inlier = ransac_pose(
         place.xyz[hit],
         *observations(frame, feature, context),
         context.camera.intrinsics,
@@ -70,7 +70,8 @@ def _locate(
     frame.xyz[:] = np.nan
     frame.landmark[feature[inlier]] = place.ids[hit[inlier]]
     frame.xyz[feature[inlier]] = place.xyz[hit[inlier]]
-    inliers = refine(frame, T_cw, context)
+    frame.set_camera_pose(T_camera_w)
+    inliers = refine(frame, frame.T_cw, context)
     for window in (config.first_window, context.config.tracking.local_window):
         if inliers < config.min_consensus:
             return 0

@@ -13,6 +13,8 @@ when the map is bent already. ``Camera.right_delay`` corrects it wherever the mo
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,6 +34,8 @@ HUBER_PX = 0.3
 FRAMES_OF_A_GROUP, FEWEST_GROUPS, MOST_GROUPS = 5, 5, 16
 _DEGREE = 3  # of the polynomial
 _NUISANCES = (_DEGREE + 1) * (_DEGREE + 2) // 2
+_SOLUTION, _TWIST = (1 + _NUISANCES,), (6,)
+_WAITING, _GROUP = (7 + _NUISANCES, 7 + _NUISANCES), (2 + _NUISANCES, 2 + _NUISANCES)
 
 
 def row_offsets(
@@ -126,6 +130,73 @@ def _between(image, x, y, a, b):
     return (1.0 - b) * upper + b * lower
 
 
+@dataclass(frozen=True, eq=False)
+class DelayState:
+    """What ``SideDelay`` has learned.
+
+    Attributes:
+        n_group: frames in the group that is being filled.
+        length: frames in a full group.
+        solution: ``(1 + P,)`` the delay and the P coefficients of the polynomial, as of the last
+            full group.
+        twist: ``(6,)`` of the last frame, per second.
+        waiting: ``(7 + P, 7 + P)`` sums of the last frame.
+        group: ``(2 + P, 2 + P)`` sums of the group that is being filled.
+        groups: ``(G, 2 + P, 2 + P)`` sums of the full groups.
+    """
+
+    n_group: int
+    length: int
+    solution: NDArray[np.float64]
+    twist: NDArray[np.float64]
+    waiting: NDArray[np.float64]
+    group: NDArray[np.float64]
+    groups: NDArray[np.float64]
+
+    @classmethod
+    def nothing(cls) -> DelayState:
+        """Before the first frame."""
+        return cls(
+            n_group=0,
+            length=FRAMES_OF_A_GROUP,
+            solution=np.zeros(_SOLUTION),
+            twist=np.zeros(_TWIST),
+            waiting=np.zeros(_WAITING),
+            group=np.zeros(_GROUP),
+            groups=np.zeros((0, *_GROUP)),
+        )
+
+    def numbers(self) -> tuple[float, ...]:
+        """The state as a map file keeps it; ``of_numbers`` reads it."""
+        arrays = (self.solution, self.twist, self.waiting, self.group, self.groups)
+        flat = np.concatenate([array.ravel() for array in arrays])
+        return (float(self.n_group), float(self.length), *flat.tolist())
+
+    @classmethod
+    def of_numbers(cls, numbers: tuple[float, ...]) -> DelayState:
+        """The state that ``numbers`` gave; of no numbers, that before the first frame.
+
+        Raises:
+            ValueError: the numbers are no state.
+        """
+        if not numbers:
+            return cls.nothing()
+        ends = np.cumsum([np.prod(shape) for shape in (_SOLUTION, _TWIST, _WAITING, _GROUP)])
+        values = np.array(numbers[2:])
+        if len(values) < ends[-1] or (len(values) - ends[-1]) % np.prod(_GROUP):
+            raise ValueError("what it knows of the delay between the sides is damaged")
+        solution, twist, waiting, group, groups = np.split(values, ends)
+        return cls(
+            n_group=int(numbers[0]),
+            length=int(numbers[1]),
+            solution=solution,
+            twist=twist,
+            waiting=waiting.reshape(_WAITING),
+            group=group.reshape(_GROUP),
+            groups=groups.reshape(-1, *_GROUP),
+        )
+
+
 class SideDelay:
     """What all frames so far tell of the delay, by least squares.
 
@@ -138,15 +209,15 @@ class SideDelay:
             Biometrika 1986); infinite until there are enough groups.
     """
 
+    _solution: NDArray[np.float64]
+    _twist: NDArray[np.float64]
+    _waiting: NDArray[np.float64]
+    _group: NDArray[np.float64]
+    _groups: list[NDArray[np.float64]]
+
     def __init__(self, camera: Camera, config: StereoConfig) -> None:
-        self.seconds, self.sigma = 0.0, np.inf
         self._camera, self._config = camera, config
-        self._solution = np.zeros(1 + _NUISANCES)
-        self._twist = np.zeros(6)
-        self._waiting = np.zeros((7 + _NUISANCES, 7 + _NUISANCES))
-        self._group = np.zeros((2 + _NUISANCES, 2 + _NUISANCES))
-        self._groups: list[NDArray[np.float64]] = []
-        self._n_group, self._length = 0, FRAMES_OF_A_GROUP
+        self.restore(DelayState.nothing())
 
     @property
     def is_wrong(self) -> bool:
@@ -155,63 +226,68 @@ class SideDelay:
         least = max(self._config.least_delay, self._config.delay_sigmas * self.sigma)
         return abs(self.seconds - self._camera.right_delay) > least
 
-    def add(self, features: Features, twist: Matrix | None, scales: NDArray[np.float64]) -> None:
+    def add(
+        self,
+        features: Features,
+        row_offset: NDArray[np.float32] | None,
+        twist: Matrix | None,
+        scales: NDArray[np.float64],
+    ) -> None:
         """Learn from a tracked frame.
 
         Args:
-            features: with ``row_offset``; without, there is nothing to learn.
+            features: N of them.
+            row_offset: ``Extracted.row_offset``; without it, there is nothing to learn.
             twist: ``(6,)`` per second, maps points of the camera before to those of this one; None
                 if unknown.
             scales: ``(levels,)`` of the pyramid.
         """
-        if features.row_offset is None or twist is None:
+        if row_offset is None or twist is None:
             self._waiting[:] = 0.0
             return
         self._take_in(0.5 * (self._twist + twist))
         self._twist = twist
-        self._waiting = self._moments(features, twist, scales)
+        self._waiting = self._moments(features, row_offset, twist, scales)
 
-    def memory(self) -> tuple[float, ...]:
+    def state(self) -> DelayState:
         """All that was learned."""
-        arrays = (*self._state(), *self._groups)
-        counts = (float(self._n_group), float(self._length))
-        return (*counts, *np.concatenate([each.ravel() for each in arrays]).tolist())
+        return DelayState(
+            self._n_group,
+            self._length,
+            self._solution.copy(),
+            self._twist.copy(),
+            self._waiting.copy(),
+            self._group.copy(),
+            np.array(self._groups).reshape(-1, *_GROUP),
+        )
 
-    def restore(self, memory: tuple[float, ...]) -> None:
-        """Go on from there; from nothing if that is empty.
-
-        Raises:
-            ValueError: it is none.
-        """
-        if not memory:
-            return
-        fixed = 2 + sum(each.size for each in self._state())
-        if len(memory) < fixed or (len(memory) - fixed) % self._group.size:
-            raise ValueError("what it knows of the delay between the sides is damaged")
-        self._n_group, self._length = int(memory[0]), int(memory[1])
-        ends = np.cumsum([each.size for each in self._state()])
-        *state, groups = np.split(np.array(memory[2:]), ends)
-        for array, values in zip(self._state(), state, strict=True):
-            array[...] = values.reshape(array.shape)
-        self._groups = list(groups.reshape(-1, *self._group.shape))
+    def restore(self, state: DelayState) -> None:
+        """Continue from what ``state`` gave."""
+        self.seconds, self.sigma = 0.0, np.inf
+        self._n_group, self._length = state.n_group, state.length
+        self._solution = state.solution.copy()
+        self._twist = state.twist.copy()
+        self._waiting = state.waiting.copy()
+        self._group = state.group.copy()
+        self._groups = list(state.groups.copy())
         self._conclude()
 
-    def _state(self) -> tuple[NDArray[np.float64], ...]:
-        return self._solution, self._twist, self._waiting, self._group
-
     def _moments(
-        self, features: Features, twist: Matrix, scales: NDArray[np.float64]
+        self,
+        features: Features,
+        row_offset: NDArray[np.float32],
+        twist: Matrix,
+        scales: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """Weighted second moments of the derivatives of the speed by the twist, the polynomial and
         the row offsets of a frame. What contradicts the rest weighs little (Huber)."""
-        assert features.row_offset is not None
-        chosen = np.flatnonzero(np.isfinite(features.row_offset) & np.isfinite(features.u_right))
+        chosen = np.flatnonzero(np.isfinite(row_offset) & np.isfinite(features.u_right))
         xy = features.xy[chosen]
         x, y = rays(xy, self._camera)
         inverse_depth = (xy[:, 0].astype(np.float64) - features.u_right[chosen]) / self._camera.bf
         speeds = self._camera.fy * row_speeds(x, y, inverse_depth)
         powers = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-        found = features.row_offset[chosen].astype(np.float64)
+        found = row_offset[chosen].astype(np.float64)
         A = np.column_stack([speeds, *powers, found])
         residual = found - (speeds @ twist) * self._solution[0] - A[:, 6:-1] @ self._solution[1:]
         robust = np.minimum(1.0, HUBER_PX / np.maximum(np.abs(residual), 1e-9))

@@ -20,11 +20,10 @@ Grey = NDArray[np.uint8]
 
 _STRIDE = 8  # a few thousand pixels tell quantiles to a grey level
 _LOW, _HIGH = 0.05, 0.95
-_CLIPPED = 250  # from that grey value on pixels tell nothing; those below it in both sides do
 _WITHIN = 0.98  # of their share, so that no quantile lies on its edge
 _LEAST_SHARE = 0.25  # of the pixels, for a gain to be told by
 _LEAST_RANGE = 4.0  # grey levels: below that a quantile's rounding is the gain
-_BLACK, _SEES = 6.0, 16.0  # upper quantile of a black side, range of grey values of one that sees
+_SEES = 16.0  # least range of the grey values of a side that shows something
 
 
 @dataclass(frozen=True)
@@ -44,9 +43,9 @@ class Sides:
 def compare_sides(left: Grey, right: Grey, config: StereoConfig) -> Sides:
     """Compare the light of both ``(H, W)`` images of a rectified pair."""
     ours, theirs = _shares(left), _shares(right)
-    if _is_black(ours, theirs):
+    if _is_black(ours, theirs, config):
         return Sides(black="left")
-    if _is_black(theirs, ours):
+    if _is_black(theirs, ours, config):
         return Sides(black="right")
     return Sides(_stops(ours, theirs, config))
 
@@ -79,16 +78,20 @@ def _quantiles(shares: NDArray[np.float64], *at: float) -> list[float]:
     return values
 
 
-def _is_black(side: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+def _is_black(side: NDArray[np.float64], other: NDArray[np.float64], config: StereoConfig) -> bool:
     low, high = _quantiles(side, _LOW, _HIGH)
     other_low, other_high = _quantiles(other, _LOW, _HIGH)
-    return high < _BLACK and other_high - other_low > max(_SEES, 10.0 * (high - low))
+    if high >= config.black_below:
+        return False
+    return other_high - other_low > max(_SEES, 10.0 * (high - low))
 
 
 def _stops(ours: NDArray[np.float64], theirs: NDArray[np.float64], config: StereoConfig) -> float:
     """Logarithm of the gain from theirs to ours, 0 where it is below the threshold or no gain
-    explains dark and bright pixels alike. What is white on either side is left out of both."""
-    top, dull = _HIGH, float(min(ours[_CLIPPED - 1], theirs[_CLIPPED - 1]))
+    explains dark and bright pixels alike. Pixels that are overexposed on
+    either side are left out of both."""
+    below = config.clipped_from - 1
+    top, dull = _HIGH, float(min(ours[below], theirs[below]))
     if dull <= top:
         top = _WITHIN * dull
     if top < _LOW + _LEAST_SHARE:

@@ -6,16 +6,15 @@ is never touched, so that local mapping can write it meanwhile.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import DISPARITY_WEIGHT, Camera, ImageMap
+from vslam.camera import DISPARITY_WEIGHT, Camera
 from vslam.config import Config
 from vslam.features import NO_PATCHES, Features, LandmarkPatches
 from vslam.frontend.alignment import align_frame
-from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.frame import Frame
 from vslam.frontend.matching import (
     Projections,
@@ -25,14 +24,10 @@ from vslam.frontend.matching import (
     search_all,
     search_windows,
 )
-from vslam.frontend.orb import Extraction, scale_factors
+from vslam.frontend.orb import scale_factors
 from vslam.frontend.pose import optimise_pose
-from vslam.frontend.side_delay import row_offsets
-from vslam.frontend.sides import Sides, balanced, compare_sides
-from vslam.frontend.stereo import match_stereo
-from vslam.frontend.weak_images import extract_in_any_light
 from vslam.geometry import compose, inverse, transform
-from vslam.map import LocalMap
+from vslam.map_view import LocalMap
 from vslam.reprojection import stack_uvr
 
 NEVER = np.iinfo(np.int64).max
@@ -68,61 +63,6 @@ class TrackingContext:
         return config.depth_local_window if self.camera.depth else config.local_window
 
 
-def extract_features(
-    left: NDArray[np.uint8],
-    second: NDArray[np.uint8] | NDArray[np.float32] | None,
-    context: TrackingContext,
-    image_map: ImageMap = map,
-    sides: Sides | None = None,
-) -> Features:
-    """ORB features of the left image with their columns in the right one. Where the left image is
-    black, those of the right one, without columns in the other.
-
-    A pure function, whatever ``image_map`` is.
-
-    Args:
-        second: right image; with ``camera.depth`` that of the depth in metres; or None, and no
-            feature has a column in a right image.
-        sides: what ``compare_sides`` says of both images, if that is known.
-    """
-    camera, config = context.camera, context.config
-    rows = None
-    if second is None:
-        return _features_alone(left, config)
-    if camera.depth:
-        (found,) = extract_in_any_light([left], config)
-        scale, depth = context.scales[found.octave], np.asarray(second, np.float32)
-        u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
-        # A rolling shutter, as depth cameras have, moves points by more than alignment mends.
-        return replace(_features(found, u_right), pyramid=None)
-    right_image = np.asarray(second, np.uint8)
-    sides = sides or compare_sides(left, right_image, config.stereo)
-    if sides.black == "left":
-        return _features_alone(right_image, config, from_right=True)
-    pair = balanced(left, right_image, config.stereo, sides)
-    found, right = extract_in_any_light(pair, config, image_map)
-    u_right = match_stereo(found, right, camera, config.stereo)
-    rows = row_offsets(found, right, u_right, config.stereo)
-    return replace(_features(found, u_right), row_offset=rows)
-
-
-def _features_alone(
-    image: NDArray[np.uint8], config: Config, *, from_right: bool = False
-) -> Features:
-    """Those of an image whose columns in another one nobody knows."""
-    (found,) = extract_in_any_light([image], config)
-    u_right = np.full(len(found.xy), np.nan, np.float32)
-    return _features(found, u_right, from_right=from_right)
-
-
-def _features(
-    found: Extraction, u_right: NDArray[np.float32], *, from_right: bool = False
-) -> Features:
-    return Features(
-        found.xy, found.octave, found.angle, found.descriptors, u_right, from_right, found.pyramid
-    )
-
-
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
     """``(N,)`` depth in metres from stereo, NaN without a match."""
     return camera.bf / (features.xy[:, 0].astype(np.float64) - features.u_right)
@@ -136,6 +76,9 @@ def track_motion(
     Besides landmarks, close stereo points of the previous frame that are not in the map take part
     (ORB-SLAM2's visual-odometry points): they steady the pose and are then forgotten.
 
+    Args:
+        T_cw: ``(4, 4)`` predicted pose of the left camera.
+
     Returns:
         Matches, and inliers of the pose optimisation; ``frame`` holds the pose and the matched
         landmarks.
@@ -144,7 +87,7 @@ def track_motion(
     points, source = trackable_points(previous, context)
     before = previous.features
     octave = before.octave[source].astype(np.int64)
-    in_camera = transform(T_cw, points)
+    in_camera = transform(frame.T_camera_left @ T_cw, points)
     ahead = in_camera[:, 2] > 0.1
     uvr = camera.project(np.where(ahead[:, None], in_camera, 1.0))
     advance = compose(previous.T_cw, inverse(T_cw))[2, 3]
@@ -206,6 +149,7 @@ def track_descriptors(
 
     Args:
         reference: the landmarks of the reference keyframe.
+        T_cw: ``(4, 4)`` pose of the left camera to start from.
 
     Returns:
         Inliers of the pose optimisation; ``frame`` holds the pose and the matched landmarks.
@@ -249,7 +193,7 @@ def track_local_map(
     frame.xyz[points] = np.nan  # points outside the map have done their work
     tracked = np.isin(local.ids, frame.landmark[frame.landmark >= 0])
     uvr, radius, octave = predict_view(
-        frame.T_cw,
+        frame.T_camera_w,
         local.xyz,
         local.normal,
         local.distance_range,
@@ -298,6 +242,7 @@ def refine(
     """Optimise the pose from all matches, drop the outliers, return the number of inliers.
 
     Args:
+        T_cw: ``(4, 4)`` pose of the left camera to start from.
         shift: what ``frame.shift`` is to be; None: no match is aligned.
     """
     frame.shift = shift
@@ -309,14 +254,15 @@ def refine(
         aligned = np.isfinite(moved[:, 0])
         uvr[aligned] += moved[aligned][:, [0, 1, 0]]
         certainty[aligned] = context.config.alignment.certainty
-    frame.T_cw, inlier = optimise_pose(
-        T_cw,
+    T_camera_w, inlier = optimise_pose(
+        frame.T_camera_left @ T_cw,
         frame.xyz[matched],
         uvr,
         weight * certainty,
         context.camera.intrinsics,
         DISPARITY_WEIGHT / np.sqrt(certainty),
     )
+    frame.set_camera_pose(T_camera_w)
     outliers = matched[~inlier]
     frame.landmark[outliers] = -1
     frame.xyz[outliers] = np.nan

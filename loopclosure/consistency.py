@@ -8,15 +8,19 @@ the same idea: verify first, then ask other keyframes to confirm).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import ConsistencyConfig
+from vslam.camera import Camera
+from vslam.config import ConsistencyConfig, VerificationConfig
 from vslam.geometry import inverse, se3_log
-from vslam.loops import ClosingMemory, LoopCandidate, LoopEdge, ResembledPlace
+from vslam.loopclosure.verification import verify_near
+from vslam.loops import LoopCandidate, LoopEdge, ResembledPlace
 from vslam.map import Map
+from vslam.states import ConsistencyState
 
 
 class LoopConsistency:
@@ -97,10 +101,41 @@ class LoopConsistency:
         reason = f"verified by {votes} of {self.config.min_verified} keyframes"
         return replace(edge, accepted=False, reason=reason)
 
-    def waiting(self) -> list[LoopEdge]:
-        """Verified edges that would count at the next keyframe, the newest first."""
+    def confirmed_by_earlier(
+        self, map_: Map, camera: Camera, config: VerificationConfig
+    ) -> Iterator[LoopEdge]:
+        """Verified loops that wait for a second keyframe, the newest first, of which an earlier
+        keyframe confirms the drift: seen from there, the place passes the same tests.
+
+        ORB-SLAM3 (section VI) asks covisible keyframes first, too, and later ones after them.
+        """
         oldest = self._turn + 1 - self.config.verified_memory
-        return [edge for turn, edge in reversed(self._verified) if turn >= oldest]
+        for waiting in [edge for turn, edge in reversed(self._verified) if turn >= oldest]:
+            if not map_.arrays.keyframe_alive[[waiting.query, waiting.match]].all():
+                continue
+            edge = verify_near(map_, waiting, camera, config)
+            if edge.accepted and self._is_confirmed(edge, map_, camera, config):
+                yield edge
+
+    def _is_confirmed(
+        self, edge: LoopEdge, map_: Map, camera: Camera, config: VerificationConfig
+    ) -> bool:
+        """Whether a keyframe that shares landmarks with the query of an edge, and is some way off,
+        is verified with the same drift."""
+        assert edge.T_query_match is not None
+        T_w_query = inverse(map_.keyframe_pose(edge.query))
+        for keyframe in map_.covisible(edge.query)[0].tolist():
+            T_keyframe_query = map_.keyframe_pose(keyframe) @ T_w_query
+            if np.linalg.norm(T_keyframe_query[:3, 3]) < self.config.min_moved:
+                continue
+            T_keyframe_query[:3, 3] /= edge.scale
+            expected = replace(
+                edge, query=keyframe, T_query_match=T_keyframe_query @ edge.T_query_match
+            )
+            other = verify_near(map_, expected, camera, config)
+            if other.accepted and self.agree(edge, other, map_):
+                return True
+        return False
 
     def agree(self, edge: LoopEdge, other: LoopEdge, map_: Map) -> bool:
         """Whether two edges imply the same drift at the query of the first."""
@@ -113,14 +148,14 @@ class LoopConsistency:
             and np.degrees(np.linalg.norm(twist[3:])) <= self.config.max_turn
         )
 
-    def memory(self) -> ClosingMemory:
-        """What is remembered, for a file."""
-        return ClosingMemory(tuple(self._groups), tuple(self._verified), self._turn)
+    def state(self) -> ConsistencyState:
+        """What ``restore`` needs to continue from here."""
+        return ConsistencyState(tuple(self._groups), tuple(self._verified), self._turn)
 
-    def restore(self, memory: ClosingMemory) -> None:
-        """Remember that, in place of ``update`` and ``confirm`` for each keyframe."""
-        self._groups, self._verified = list(memory.places), list(memory.verified)
-        self._turn = memory.turn
+    def restore(self, state: ConsistencyState) -> None:
+        """Continue from what ``state`` returned."""
+        self._groups, self._verified = list(state.places), list(state.verified)
+        self._turn = state.turn
 
     def reset(self) -> None:
         """Forget everything: closing a loop has moved the map."""

@@ -29,6 +29,7 @@ from vslam.loopclosure.verification import (
 from vslam.loops import LoopCandidate, LoopEdge
 from vslam.map import Map
 from vslam.map_kernels import collect_landmarks
+from vslam.states import VerifierState
 
 _DEPTHS_AGREE = 0.15  # a keypoint that observes a landmark has its depth, to this share
 
@@ -43,36 +44,40 @@ class Recognised(NamedTuple):
 
 
 class LearnedTrials:
-    """Which candidates learned descriptors are asked about: they take forty times as long as ORB's.
+    """Chooses the candidates for learned verification, which takes forty times as long as ORB's.
 
-    Those whose images local descriptors find most alike, and alike enough; and after a try in
-    vain, for some keyframes, only what is clearly more alike than that was.
+    These are the ones whose images local descriptors find most alike, and alike enough. After a
+    failed attempt only clearly more alike candidates are chosen for some keyframes.
 
     Attributes:
-        resting_until, in_vain: those keyframes end here, and how alike that was.
+        state: what is remembered of the last attempt.
     """
 
     def __init__(self, config: LearnedMatchingConfig) -> None:
         self._config = config
-        self.resting_until, self.in_vain = 0, 0.0
+        self.state = VerifierState()
 
     def choose(self, keyframe: int, candidates: Collection[LoopCandidate]) -> set[int]:
-        """Keyframes that are matches to try, of the candidates that are rated."""
+        """Matches to try, of the candidates that are rated."""
         config = self._config
         least = config.min_alike
-        if keyframe < self.resting_until:
-            least = max(least, config.more_alike * self.in_vain)
+        if keyframe < self.state.resting_until:
+            least = max(least, config.more_alike * self.state.in_vain)
         alike = [(one.alike, one.match) for one in candidates if one.alike is not None]
         best = sorted(alike, reverse=True)[: config.max_candidates]
         return {match for likeness, match in best if likeness >= least}
 
     def record(self, candidate: LoopCandidate, *, located: bool) -> None:
-        """Whether a try found a pose, be it refused later on."""
+        """Remember an attempt.
+
+        Args:
+            located: whether it found a pose, even if that was refused later.
+        """
         if located:
-            self.resting_until = 0
+            self.state = replace(self.state, resting_until=0)
         else:
-            self.resting_until = candidate.query + 1 + self._config.rest
-            self.in_vain = candidate.alike or 0.0
+            until = candidate.query + 1 + self._config.rest
+            self.state = VerifierState(until, candidate.alike or 0.0)
 
 
 def rated(

@@ -95,7 +95,7 @@ def create_detector(
 
     Args:
         weights: of a learned detector; None for those that vslam ships.
-        images: of the keyframes, from :func:`create_images`; given to ``LoopClosing``, too.
+        images: of the keyframes, from :func:`create_images`; given to ``verifier_for``, too.
         late: load a network that vslam ships when the first image is shown to it.
 
     Raises:

@@ -11,6 +11,7 @@ from vslam.features import (
     NO_PATCHES,
     PATCH_PIXELS,
     PATCH_RADIUS,
+    Extracted,
     Features,
     KeyframePatches,
 )
@@ -18,11 +19,12 @@ from vslam.frontend.alignment import align, align_frame, warps
 from vslam.frontend.frame import Frame
 from vslam.frontend.orb import build_pyramid, extract
 from vslam.frontend.patches import RecentPatches, patches_around
+from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import TrackingContext, refine
 from vslam.geometry import inverse, se3_exp, transform
 from vslam.map import Map
 from vslam.map_kernels import link_many, unlink
-from vslam.mapping import MappingThread
+from vslam.mapping import Mapper
 
 CONFIG = Config().alignment
 NO_SHIFT = np.zeros((1, 2), np.float32)
@@ -149,8 +151,11 @@ def features_at(u, v, octave, n):
         np.zeros(n, np.float32),
         np.zeros((n, 32), np.uint8),
         xy[:, 0] - 20.0,
-        pyramid=build_pyramid(IMAGE, Config().orb),
     )
+
+
+def extracted_at(u, v, octave, n):
+    return Extracted(features_at(u, v, octave, n), build_pyramid(IMAGE, Config().orb))
 
 
 def one_landmark(shift=0.0):
@@ -256,12 +261,9 @@ def test_matches_are_aligned_however_the_camera_has_moved(motion):
 
     def frame_at(T, off):
         uvr = CAMERA.project(transform(T, points)).astype(np.float32)
-        features = replace(
-            features_at(0, 0, 0, n),
-            xy=np.rint(uvr[:, :2] + off).astype(np.float32),
-            pyramid=build_pyramid(image(T), Config().orb),
-        )
-        frame = Frame.untracked(features, CAMERA)
+        xy = np.rint(uvr[:, :2] + off).astype(np.float32)
+        features = replace(features_at(0, 0, 0, n), xy=xy)
+        frame = Frame.of(Extracted(features, build_pyramid(image(T), Config().orb)), CAMERA)
         frame.T_cw, frame.landmark, frame.xyz = T, np.arange(n, dtype=np.int32), points
         return frame, uvr[:, :2]
 
@@ -271,7 +273,7 @@ def test_matches_are_aligned_however_the_camera_has_moved(motion):
     ids = map_.add_landmarks(points, np.zeros((n, 4), np.uint64), 0)
     link_many(map_.arrays, np.arange(n), ids)
     recent = RecentPatches(2)
-    pixels = patches_around(first.features.pyramid, first.features.xy, first.features.octave)
+    pixels = patches_around(first.pyramid, first.features.xy, first.features.octave)
     recent.add(KeyframePatches(0, pixels, seen_at - first.features.xy))
 
     frame, truth = frame_at(T_cw, rng.uniform(-0.5, 0.5, (n, 2)))
@@ -305,17 +307,17 @@ def test_what_lies_behind_a_camera_or_is_seen_from_behind_has_no_warp():
 def test_matches_without_a_patch_are_not_aligned():
     map_, recent = one_landmark()
     known, _, _ = patches_of(map_, [0], [recent])
-    frame = Frame.untracked(features_at(100, 50, 0, 1), CAMERA)
+    frame = Frame.of(extracted_at(100, 50, 0, 1), CAMERA)
     frame.landmark[:], frame.xyz[:] = 7, 1.0
     arguments = CONTEXT.scales, CAMERA.intrinsics, Config().alignment
     assert np.isnan(align_frame(frame, known, *arguments)).all()
     assert align_frame(frame, NO_PATCHES, *arguments) is None
-    frame.features = replace(frame.features, pyramid=None)
+    frame.pyramid = None
     assert align_frame(frame, known, *arguments) is None
 
 
 def test_an_aligned_frame_observes_where_matches_were_aligned_to():
-    frame = Frame.untracked(features_at(100, 50, 0, 3), CAMERA)
+    frame = Frame.of(extracted_at(100, 50, 0, 3), CAMERA)
     frame.landmark[:] = 0, 1, -1
     frame.shift = np.array([[0.5, -0.25], [np.nan, np.nan], [1.0, 1.0]], np.float32)
     assert frame.aligned.tolist() == [True, False, False]
@@ -330,7 +332,7 @@ def test_a_pose_follows_aligned_matches():
     have four times the weight."""
     rng = np.random.default_rng(0)
     n = 100
-    frame = Frame.untracked(features_at(100, 50, 0, n), CAMERA)
+    frame = Frame.of(extracted_at(100, 50, 0, n), CAMERA)
     frame.xyz = np.column_stack([rng.uniform(-8, 8, (n, 2)), rng.uniform(8, 30, n)])
     uvr = CAMERA.project(frame.xyz).astype(np.float32)
     frame.landmark = np.arange(n, dtype=np.int32)
@@ -344,15 +346,17 @@ def test_a_pose_follows_aligned_matches():
 
 
 def test_the_map_knows_how_sure_each_observation_is(two_keyframes):
-    frame, map_, recent = two_keyframes
+    frame, mapper = two_keyframes
+    known = mapper.view.patches
+    pixels, shift = known.pixels[known.where], known.shift[known.where]
+    map_ = mapper.complete()
     sure = Config().alignment.certainty
     # Tracked and aligned; tracked only; the first to see its landmark.
     assert map_.arrays.certainty[map_.rows(1)].tolist() == [sure, 1, sure]
     assert map_.arrays.xy[map_.rows(1)][0].tolist() == [100.5, 49.75]
-    known, pixels, shift = patches_of(map_, np.sort(frame.landmark), recent.all())
     assert np.array_equal(pixels[0], IMAGE[42:59, 92:109].ravel())
     assert shift[known.ids == frame.landmark[0]].tolist() == [[0.5, -0.25]]
-    assert shift[known.ids != frame.landmark[0]].tolist() == [[0.0, 0.0]] * 2
+    assert shift[np.isin(known.ids, frame.landmark[1:])].tolist() == [[0.0, 0.0]] * 2
 
 
 @pytest.fixture
@@ -360,17 +364,20 @@ def two_keyframes():
     """A second keyframe that tracks two landmarks of the first."""
     from vslam.closing import LoopClosing
     from vslam.loopclosure.detector import NoDetector
+    from vslam.loopclosure.verifier import verifier_for
 
     config = Config()
-    closing = LoopClosing(NoDetector(), CAMERA, config, threads=1)
-    mapping = MappingThread(CONTEXT.scales, CAMERA, config, closing, threads=1)
+    closing = LoopClosing(NoDetector(), verifier_for(config, CAMERA), CAMERA, config, threads=1)
+    rig = RigCalibration(CAMERA, config.stereo, CONTEXT.scales)
+    mapper = Mapper(CONTEXT, closing, rig, None)
     frames = []
     for index in range(2):
-        frame = Frame.untracked(features_at(100, 50, 0, 3), CAMERA, index, 0.1 * index)
+        frame = Frame.of(extracted_at(100, 50, 0, 3), CAMERA, index, 0.1 * index)
         frames.append(frame)
-    mapping.insert(frames[0])
+        mapper.place(frame, tracked=True)
+    mapper.insert(frames[0])
     frames[1].landmark = frames[0].landmark.copy()
     frames[1].landmark[2] = -1
     frames[1].shift = np.array([[0.5, -0.25], [np.nan] * 2, [np.nan] * 2], np.float32)
-    mapping.insert(frames[1])
-    return frames[1], mapping._map, mapping.recent
+    mapper.insert(frames[1])
+    return frames[1], mapper

@@ -9,8 +9,7 @@ from stereo_noise import white_noise
 from vslam.backend.bundle_adjustment import BundleProblem
 from vslam.backend.disparity_offset import remaining_offset
 from vslam.camera import Camera
-from vslam.features import MIN_DISPARITY, Features, shifted_columns
-from vslam.frontend.frame import Frame
+from vslam.features import MIN_DISPARITY, shifted_columns
 
 CAMERA = Camera(700.0, 700.0, 600.0, 180.0, 0.54, 1200, 370)
 N_CAMERAS = 8
@@ -74,16 +73,3 @@ def test_columns_move_left_but_no_point_gets_behind_the_camera() -> None:
     moved = shifted_columns(u_right, u, -0.5)
     np.testing.assert_allclose(moved, [90.5, 100.0 - MIN_DISPARITY, np.nan], atol=1e-5)
     np.testing.assert_allclose(shifted_columns(u_right, u, 0.5), [89.5, 99.4, np.nan], atol=1e-5)
-
-
-def test_a_frame_is_corrected_once_whatever_it_was_corrected_by_before() -> None:
-    xy = np.array([[50.0, 50.0]], np.float32)
-    features = Features(
-        xy, np.zeros(1, np.uint8), np.zeros(1, np.float32), np.zeros((1, 32), np.uint8),
-        np.array([40.0], np.float32),
-    )  # fmt: skip
-    frame = Frame.untracked(features, CAMERA)
-    for offset in (0.1, 0.1, 0.3):
-        frame.correct_disparities(offset)
-    assert frame.features.u_right[0] == pytest.approx(40.0 - 0.3, abs=1e-5)
-    assert features.u_right[0] == 40.0

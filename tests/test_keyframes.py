@@ -1,4 +1,4 @@
-"""Each clause of the keyframe decision, and its threshold from both sides."""
+"""Each clause of the keyframe decision, and its threshold from both sides; the policy alone."""
 
 from __future__ import annotations
 
@@ -6,16 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from parts import CAMERA, Points
 
-from vslam.config import KeyframeConfig
+from vslam.config import Config, KeyframeConfig
+from vslam.frontend.frame import Frame
 from vslam.frontend.keyframes import (
     CloseGain,
     KeyframeEvidence,
+    KeyframePolicy,
     PlaceEvidence,
     is_known_place,
     needs_keyframe,
     needs_monocular_keyframe,
 )
+from vslam.frontend.tracking import TrackingContext
 
 CONFIG = KeyframeConfig(
     max_interval_s=1.0,
@@ -145,3 +149,133 @@ KNOWN = PlaceEvidence(n_inliers=150, n_shared=100, n_place=200)
 def test_a_place_is_known_that_is_tracked_like_its_old_keyframe(changes, known):
     config = KeyframeConfig(max_tracked_ratio=0.75, known_ratio=0.5)
     assert is_known_place(replace(KNOWN, **changes), config) == known
+
+
+# -- the policy -----------------------------------------------------------------------------------
+
+POINTS = Points.create()  # 16 to 30 m away; those nearer than 20 m are close
+CLOSE = np.count_nonzero(POINTS.xyz[:, 2] < 20.0)
+
+
+def policy(camera=CAMERA) -> KeyframePolicy:
+    return KeyframePolicy(TrackingContext.create(camera, Config(keyframes=CONFIG)))
+
+
+def frame(*, close: int, far: int = 0) -> Frame:
+    """A frame that tracks so many of the points that are close, and of those that are far."""
+    tracked = POINTS.tracked_frame(3, 0.3, np.eye(4))
+    is_close = POINTS.xyz[:, 2] < 20.0
+    for among, n in ((is_close, close), (~is_close, far)):
+        lost = np.flatnonzero(among)[n:]
+        tracked.landmark[lost], tracked.xyz[lost] = -1, np.nan
+    return tracked
+
+
+def observe(of: KeyframePolicy, seen: Frame, **changes) -> KeyframeEvidence:
+    """What a policy makes of a frame 0.3 s after a keyframe, while nothing is being mapped."""
+    known = {"seconds_since_keyframe": 0.3, "mapping_idle": True}
+    return of.observe(seen, POINTS.view(n_reference=200), **known | changes)
+
+
+def test_evidence_is_counted_in_the_frame_and_taken_from_the_view():
+    evidence = observe(policy(), frame(close=20, far=30))
+    assert 20 < CLOSE < 100
+    assert evidence == KeyframeEvidence(
+        seconds_since_keyframe=0.3,
+        n_inliers=50,
+        n_reference=200,
+        tracked_close=20,
+        untracked_close=CLOSE - 20,
+        mapping_idle=True,
+        gained_close=200.0,  # first_gain times min_tracked_close
+    )
+    changed = observe(policy(), frame(close=0), seconds_since_keyframe=0.7, mapping_idle=False)
+    assert (changed.seconds_since_keyframe, changed.mapping_idle) == (0.7, False)
+
+
+def test_points_without_a_depth_are_not_close():
+    seen = frame(close=20)
+    near = np.flatnonzero(POINTS.xyz[:, 2] < 20.0)
+    seen.features.u_right[near[:5]] = np.nan
+    evidence = observe(policy(), seen)
+    assert (evidence.n_inliers, evidence.tracked_close) == (20, 15)
+    assert evidence.untracked_close == CLOSE - 20
+
+
+def test_only_the_first_frame_after_a_keyframe_tells_what_keyframes_gain():
+    one = policy()
+    assert observe(one, frame(close=10)).gained_close == 200.0  # no keyframe was made
+    one.keyframe_made()
+    # It counts at once: a fifth of the way from 200 to 10.
+    assert observe(one, frame(close=10)).gained_close == pytest.approx(162.0)
+    assert observe(one, frame(close=40)).gained_close == pytest.approx(162.0)
+
+
+@pytest.mark.parametrize("awaited", [True, False])
+def test_deciding_changes_nothing(awaited):
+    one = policy()
+    if awaited:
+        one.keyframe_made()
+    before = one.state()
+    assert not one.wants_keyframe(CONTENT)
+    assert one.wants_keyframe(replace(CONTENT, seconds_since_keyframe=1.0))
+    assert not one.is_known(replace(KNOWN, n_shared=0))
+    assert one.is_known(KNOWN)
+    assert one.state() == before
+    observe(one, frame(close=10))
+    assert (one.state() != before) == awaited
+
+
+@pytest.mark.parametrize(("changes", "wanted"), [
+    ({}, False),
+    ({"seconds_since_keyframe": 0.999}, False),
+    ({"seconds_since_keyframe": 1.0}, True),
+    ({"n_inliers": 150}, False),
+    ({"n_inliers": 149}, True),
+    ({"n_inliers": 149, "mapping_idle": False}, False),
+    ({"n_inliers": 49, "mapping_idle": False}, True),
+    ({"tracked_close": 99, "untracked_close": 70}, False),
+    ({"tracked_close": 99, "untracked_close": 71, "mapping_idle": False}, True),
+])  # fmt: skip
+def test_a_policy_decides_for_a_stereo_pair(changes, wanted):
+    assert policy().wants_keyframe(replace(CONTENT, **changes)) == wanted
+
+
+@pytest.mark.parametrize(("changes", "wanted"), [
+    ({"seconds_since_keyframe": 0.299}, False),
+    ({"seconds_since_keyframe": 0.3}, True),
+])  # fmt: skip
+def test_a_policy_makes_keyframes_of_a_depth_camera_sooner(changes, wanted):
+    """``depth_max_interval_s`` is 0.3 s."""
+    assert policy(replace(CAMERA, depth=True)).wants_keyframe(replace(CONTENT, **changes)) == wanted
+
+
+@pytest.mark.parametrize(("changes", "wanted"), [
+    ({"n_inliers": 180, "seconds_since_keyframe": 60.0}, False),
+    ({"n_inliers": 179}, True),
+    ({"n_inliers": 179, "mapping_idle": False}, False),
+    ({"n_inliers": 99, "mapping_idle": False}, True),
+])  # fmt: skip
+def test_a_policy_decides_for_one_camera(changes, wanted):
+    one = policy(CAMERA.left_camera())
+    assert one.wants_keyframe(replace(CONTENT, **changes)) == wanted
+
+
+@pytest.mark.parametrize(("n_shared", "known"), [(100, True), (99, False)])
+def test_a_policy_knows_a_place_by_what_it_shares(n_shared, known):
+    assert policy().is_known(replace(KNOWN, n_shared=n_shared)) == known
+
+
+@pytest.mark.parametrize("awaited", [True, False])
+def test_a_policy_that_is_restored_goes_on_as_the_one_that_was_not(awaited):
+    one = policy()
+    one.keyframe_made()
+    observe(one, frame(close=10))
+    if awaited:
+        one.keyframe_made()
+    other = policy()
+    other.restore(one.state())
+    assert other.state() == one.state()
+    gains = [observe(each, frame(close=30)).gained_close for each in (one, other)]
+    assert gains[0] == gains[1]
+    assert gains[0] == pytest.approx(135.6 if awaited else 162.0)

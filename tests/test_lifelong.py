@@ -13,7 +13,7 @@ from test_closing import errors
 
 from vslam.config import Config
 from vslam.errors import InputError
-from vslam.features import Features
+from vslam.features import Extracted, Features
 from vslam.geometry import inverse
 from vslam.loops import LoopEdge
 from vslam.slam import Slam
@@ -40,10 +40,9 @@ def laps(known_after_s: float, threads: int = 1) -> tuple[Slam, tuple[int, ...],
     keyframes, results = [], []
     for i, place in enumerate(PLACES):
         image = np.array([[i & 255, i >> 8]], np.uint8)
-        results.append(slam.step_features(view(int(place)), 0.1 * i, image))
+        results.append(slam.step_features(Extracted(view(int(place))), 0.1 * i, image))
         if i % LAP == LAP - 1:
-            while slam.is_mapping:
-                slam._merge()
+            slam.stored_map()  # waits for the keyframe that is being mapped
             keyframes.append(len(slam.map.living_keyframes()))
     slam.finish()
     return slam, tuple(keyframes), results
@@ -71,43 +70,6 @@ def test_known_streets_give_the_same_bytes_with_one_thread_and_two():
     assert one.trajectory().T_wc.tobytes() == two.trajectory().T_wc.tobytes()
 
 
-def test_a_frame_that_is_found_nowhere_better_stays_as_it_is(monkeypatch):
-    slam = Slam(CAMERA, None, Oracle(RING, PLACES), threads=1)
-    for k in range(12):
-        slam.step_features(view(k), 0.1 * k)
-    slam._merge()
-    frame, reference = slam.frame, slam._mapping.reference
-    assert frame is not None
-    before = frame.T_cw.copy(), frame.landmark.copy(), frame.xyz.copy()
-
-    def elsewhere(frame) -> int:
-        frame.T_cw = np.eye(4)
-        frame.landmark[:] = -1
-        slam._mapping.set_reference(0)
-        return 100
-
-    monkeypatch.setattr(slam, "_relocalise", elsewhere)
-    assert slam._find_better(frame, inliers=67) == 0
-    assert slam._mapping.reference == reference
-    for was, now in zip(before, (frame.T_cw, frame.landmark, frame.xyz), strict=True):
-        assert np.array_equal(was, now, equal_nan=True)
-    assert slam._find_better(frame, inliers=66) == 100
-    assert slam._mapping.reference == 0
-
-
-@pytest.mark.parametrize(("seconds", "share", "doubtful"), [
-    (0.1, 0.4, False), (0.14, 0.4, False), (0.16, 0.4, True), (0.16, 0.6, False),
-])  # fmt: skip
-def test_only_a_frame_after_a_gap_that_tracks_little_is_doubtful(seconds, share, doubtful):
-    slam = Slam(CAMERA, None, threads=1)
-    for k in range(12):
-        slam.step_features(view(k), 0.1 * k)
-    slam._merge()
-    assert slam.frame is not None
-    frame = slam._next_frame(view(12), slam.frame.timestamp + seconds, None)
-    assert slam._is_doubtful(frame, int(share * slam._mapping.n_reference)) == doubtful
-
-
 def with_some_of(features: Features, other: Features, n: int) -> Features:
     """Features and n of another view, as where a street repeats itself."""
     some = np.linspace(0, len(other) - 1, n).astype(int)
@@ -116,27 +78,21 @@ def with_some_of(features: Features, other: Features, n: int) -> Features:
     return Features(*(np.concatenate([mine, theirs[some]]) for mine, theirs in columns))
 
 
-def drive_to_a_cut(places: list[float], busy: bool) -> Slam:
-    """Drive the ring to the last place but one; at the last some things look like those of the
-    place that was due. ``busy``: a keyframe is being mapped when it comes."""
-    slam = Slam(CAMERA, None, Oracle(RING, places), threads=1)
+@pytest.mark.parametrize("merge_after_frames", [1, 3])
+def test_a_camera_that_is_carried_is_not_left_where_little_agrees(merge_after_frames):
+    """Every frame becomes a keyframe, which is merged when the next frame comes, or is still being
+    mapped. Of 80 things that look like those expected enough agree on a pose, a wrong one."""
+    places = [*map(float, range(14)), 3.0]
+    keyframes = {"max_interval_s": 0.05, "merge_after_frames": merge_after_frames}
+    config = Config.model_validate({"keyframes": keyframes})
+    slam = Slam(CAMERA, config, Oracle(RING, places), threads=1)
     for i, place in enumerate(places):
         image = np.array([[i & 255, i >> 8]], np.uint8)
         features = view(int(place))
         if i == len(places) - 1:
+            assert slam.is_mapping
             features = with_some_of(features, view(int(places[i - 1]) + 1), LOOK_ALIKES)
-            slam._merge()
-            if busy:
-                assert slam.frame is not None
-                slam._insert_keyframe(slam.frame)
-        slam.step_features(features, 0.1 * i, image)
-    return slam
-
-
-@pytest.mark.parametrize("busy", [False, True])
-def test_a_camera_that_is_carried_is_not_left_where_little_agrees(busy):
-    """Of 80 things that look like those expected enough agree on a pose, a wrong one."""
-    slam = drive_to_a_cut([*map(float, range(14)), 3.0], busy)
+        slam.step_features(Extracted(features), 0.1 * i, image)
     slam.finish()
     truth = inverse(RING.pose(0)) @ RING.pose(3)
     off = inverse(truth) @ slam.trajectory().T_wc[-1]

@@ -162,14 +162,16 @@ def test_stereo_points_are_mapped_where_they_are(check_map):
     check_map(world.map)
 
 
-def test_the_100_nearest_are_mapped_if_fewer_are_close(check_map):
+@pytest.mark.parametrize("least", [100, 60])
+def test_the_nearest_are_mapped_if_too_few_are_close(check_map, least):
     world = make_world()
     k = world.add_keyframe(np.eye(4))
     depth = world.points[world.point_of_row, 2]
-    config = Config(stereo=StereoConfig(close_depth_baselines=2 * np.sort(depth)[30]))
+    close = StereoConfig(close_depth_baselines=2 * np.sort(depth)[30])
+    config = Config(stereo=close, mapping=MappingConfig(min_stereo_points=least))
     map_stereo_points(world.map, k, CAMERA, config)
     mapped = world.map.arrays.landmark[: world.map.n_rows] >= 0
-    assert np.count_nonzero(mapped) == 100
+    assert np.count_nonzero(mapped) == least
     assert depth[mapped].max() < depth[~mapped].min()
     check_map(world.map)
 

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from vslam.cli.main import app
 from vslam.config import Config
 from vslam.errors import InputError, ResultsError
-from vslam.features import Features, TrackingState, TrackResult
+from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.geometry import inverse
 from vslam.loopclosure.registry import create_detector
 from vslam.maps.storage import load_map
@@ -23,7 +23,7 @@ from vslam.report import folder
 from vslam.slam import Slam
 
 CONFIG = Config()
-NOTHING = Features.none()
+NOTHING = Extracted.nothing()
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def new(threads: int = 1) -> Slam:
 def drive(slam: Slam, ring: Ring, places, seed: int, start: float = 0.0) -> list[TrackResult]:
     """Ten frames a second; None is a black image."""
     results = [
-        slam.step_features(NOTHING if k is None else ring.see(k, seed), start + 0.1 * i)
+        slam.step_features(NOTHING if k is None else Extracted(ring.see(k, seed)), start + 0.1 * i)
         for i, k in enumerate(places)
     ]
     slam.finish()
@@ -57,7 +57,7 @@ def off(slam: Slam, ring: Ring, places, first: float = 0.0) -> np.ndarray:
 
 def everything(slam: Slam) -> bytes:
     """All that a map file would hold, and what it leaves out."""
-    map_, memory = slam.map, slam._detector.memory()
+    map_, memory = slam.map, slam.detector.memory()
     lists = (map_.timestamps, map_.frames, map_.parents, map_.sessions, map_.restarts)
     arrays = [*map_.arrays, *(table.values for table in memory.tables.values())]
     return b"".join(np.ascontiguousarray(a).tobytes() for a in arrays) + repr(lists).encode()
@@ -222,9 +222,9 @@ def test_the_first_frame_after_a_cut_tells_the_speed(ring, tmp_path):
     first.save(tmp_path / "half.npz", "half")
     second = Slam.load(tmp_path / "half.npz", threads=1, resume=True)
     before = first.trajectory().T_wc[-1]
-    now = second.step_features(ring.see(60, seed=8), 6.0).T_wc
+    now = second.step_features(Extracted(ring.see(60, seed=8)), 6.0).T_wc
     expected = now @ inverse(before) @ now
-    np.testing.assert_allclose(inverse(second._predict(6.1)), expected, atol=0.05)
+    np.testing.assert_allclose(second.skip(6.1).T_wc, expected, atol=0.05)
 
 
 @pytest.mark.parametrize("localize", [False, True])

@@ -9,7 +9,7 @@ import pytest
 
 from vslam.features import Features
 from vslam.geometry import se3_exp
-from vslam.map import KEYFRAME_FIELDS, LANDMARK_FIELDS, ROW_FIELDS, Map, local_map
+from vslam.map import KEYFRAME_FIELDS, LANDMARK_FIELDS, ROW_FIELDS, Map
 from vslam.map_kernels import (
     collect_landmarks,
     count_seen_by,
@@ -23,6 +23,7 @@ from vslam.map_kernels import (
     resolve,
     unlink,
 )
+from vslam.map_view import local_map
 
 SCALES = 1.2 ** np.arange(8)
 

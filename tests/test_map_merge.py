@@ -13,6 +13,7 @@ from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.config import Config
 from vslam.errors import InputError
+from vslam.features import Extracted
 from vslam.geometry import inverse, inverses
 from vslam.loopclosure.registry import create_detector
 from vslam.maps.crop import in_box, near_frames, near_point
@@ -27,7 +28,7 @@ CONFIG = Config()
 def driven(ring: Ring, places: range, seed: int) -> StoredMap:
     slam = Slam(CAMERA, CONFIG, create_detector("bow", CONFIG), threads=1)
     for i, k in enumerate(places):
-        slam.step_features(ring.see(k, seed), 0.1 * i)
+        slam.step_features(Extracted(ring.see(k, seed)), 0.1 * i)
     slam.finish()
     return slam.stored_map(f"ring {places.start}").compact()
 
@@ -110,7 +111,7 @@ def test_drives_that_meet_become_one_map(drives, ring, check_map, tmp_path):
     save_map(tmp_path / "town.npz", merged.stored)
     for place in (10, 90, 170):
         slam = Slam.load(tmp_path / "town.npz", threads=1, localize=True)
-        assert slam.step_features(ring.see(place, seed=7), 0.0).relocalised
+        assert slam.step_features(Extracted(ring.see(place, seed=7)), 0.0).relocalised
         true = inverse(ring.pose(0)) @ ring.pose(place)
         assert np.linalg.norm(slam.trajectory().T_wc[0, :3, 3] - true[:3, 3]) < 1.0
 
@@ -219,7 +220,7 @@ def test_crop_writes_a_map_to_localise_in(files, ring, tmp_path):
     assert run(*words).exit_code == 0
     assert 5 < load_map(out).map.n_keyframes < load_map(files[0]).map.n_keyframes
     slam = Slam.load(out, threads=1, localize=True)
-    assert slam.step_features(ring.see(45, seed=7), 0.0).relocalised
+    assert slam.step_features(Extracted(ring.see(45, seed=7)), 0.0).relocalised
     true = inverse(ring.pose(0)) @ ring.pose(45)
     assert np.linalg.norm(slam.trajectory().T_wc[0, :3, 3] - true[:3, 3]) < 0.5
 

@@ -10,7 +10,7 @@ import pytest
 from ring import CAMERA, LAP, Oracle, Ring
 
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.features import Features, TrackingState
+from vslam.features import Extracted, Features, TrackingState
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory
 
@@ -35,7 +35,7 @@ def run(frames, detector="none", *, threads=1, dark=()):
     for i, k in enumerate(frames):
         image = np.array([[i & 255, i >> 8]], np.uint8)  # tells the oracle which frame it is
         features = Features.none() if i in dark else see(k)
-        results.append(slam.step_features(features, 0.1 * i, image))
+        results.append(slam.step_features(Extracted(features), 0.1 * i, image))
     slam.finish()
     return slam, results
 
@@ -66,7 +66,9 @@ def test_the_first_landmarks_make_the_unit():
     slam, results = run(ROUND[:6])
     second = next(r.index for r in results if r.is_keyframe)
     depth = slam.map.arrays.xyz[slam.map.landmarks_of(0), 2]
-    assert np.median(depth) == pytest.approx(slam.config.initialization.median_depth, rel=0.2)
+    assert np.median(depth) == pytest.approx(
+        slam.context.config.initialization.median_depth, rel=0.2
+    )
     assert second >= 1
 
 

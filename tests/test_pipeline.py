@@ -85,13 +85,13 @@ def test_both_cameras_at_once_are_prepared_to_the_same_bytes(kitti_tree, monocul
             one = prepare_frame(frame, context)
             other = prepare_frame(frame, context, at_once)
             assert one.image.tobytes() == other.image.tobytes()
-            pixels = [vars(prepared.features).pop("pyramid").pixels for prepared in (one, other)]
+            pixels = [prepared.extracted.pyramid.pixels for prepared in (one, other)]
             assert np.array_equal(*pixels)
-            for name, value in vars(one.features).items():
-                if value is None:
-                    assert getattr(other.features, name) is None, name
-                    continue
-                assert np.array_equal(value, getattr(other.features, name), equal_nan=True), name
+            rows = [prepared.extracted.row_offset for prepared in (one, other)]
+            assert rows == [None, None] if monocular else np.array_equal(*rows, equal_nan=True)
+            for name, value in vars(one.extracted.features).items():
+                same = getattr(other.extracted.features, name)
+                assert np.array_equal(value, same, equal_nan=True), name
 
 
 def test_corridor_is_tracked_to_centimetres(kitti_tree):

@@ -8,12 +8,12 @@ from test_local_mapping import CAMERA, World, make_world
 from test_verification import forward, in_strip, link_pass
 
 from vslam.config import Config, RelocalizationConfig
-from vslam.features import Features
+from vslam.features import Extracted, Features
 from vslam.frontend.frame import Frame
 from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp, se3_log
-from vslam.map import local_map
+from vslam.map_view import local_map
 
 CONTEXT = TrackingContext.create(CAMERA, Config())
 KEYFRAMES = 4
@@ -43,7 +43,7 @@ def lost_frame(world: World, T_cw: np.ndarray, *, mono: bool = False, among=None
         a.descriptor[rows].copy().view(np.uint8),
         a.u_right[rows].copy(),
     )
-    return Frame.untracked(features, CAMERA)
+    return Frame.of(Extracted(features), CAMERA)
 
 
 def find(world: World, frame: Frame, seed: int = 0) -> int:
@@ -94,7 +94,7 @@ def test_a_frame_that_is_not_found_is_left_untracked(case):
     among = {"elsewhere": [], "too few": in_strip(world, 250, 290)}.get(case)
     frame = lost_frame(world, forward(1.2, 0.3), among=among)
     if case == "no features":
-        frame = Frame.untracked(Features.none(), CAMERA)
+        frame = Frame.of(Extracted.nothing(), CAMERA)
     if case == "no landmarks":
         world = mapped_street()
         nothing = local_map(world.map, 1, 1)

@@ -22,8 +22,9 @@ from vslam.datasets.tum import associate, open_tum
 from vslam.errors import InputError, UnreadableImageError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.frontend.depth import columns_of_depth
+from vslam.frontend.extraction import extract_features
 from vslam.frontend.keyframes import KeyframeEvidence, needs_keyframe
-from vslam.frontend.tracking import TrackingContext, extract_features
+from vslam.frontend.tracking import TrackingContext
 from vslam.maps.storage import load_map, save_map
 from vslam.run.outcome import RunOutcome, RunSettings
 from vslam.run.pipeline import run_sequence
@@ -118,14 +119,15 @@ def test_features_without_depth_are_monocular(corridor):
     context = TrackingContext.create(camera, Config())
     depth = corridor_depth(camera, corridor.T_wc[0]).astype(np.float32)
     depth[:, :240] = 0.0
-    features = extract_features(corridor.left[0], depth, context)
+    extracted = extract_features(corridor.left[0], depth, context)
+    features = extracted.features
     rows, columns = np.rint(features.xy).astype(int).T[::-1]
     known = np.isfinite(features.u_right)
     assert (depth[rows, columns][known] > 0).all()
     assert 100 < np.count_nonzero(known) < len(known) - 100
     found = camera.bf / (features.xy[known, 0] - features.u_right[known])
     np.testing.assert_allclose(found, depth[rows, columns][known], rtol=1e-3)
-    assert features.pyramid is None  # matches are not aligned
+    assert extracted.pyramid is None  # matches are not aligned
 
 
 def test_a_corner_at_an_edge_of_depth_has_none():

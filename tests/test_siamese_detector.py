@@ -38,6 +38,7 @@ from vslam.loopclosure.siamese.preprocessing import to_tensor
 from vslam.loopclosure.siamese.scoring import NetworkScorer
 from vslam.loopclosure.siamese.siamese import build_network, for_inference, load_network
 from vslam.loopclosure.siamese.weights import SHIPPED
+from vslam.loopclosure.verifier import verifier_for
 from vslam.map import Map
 from vslam.map_kernels import link
 
@@ -403,7 +404,8 @@ def test_the_paper_s_detector_compares_with_all_keyframes_and_verifies_by_orb():
     detector, images = detector_with_images("capsule-paper", config)
     assert images is None  # so that no local descriptors rerank or verify
     camera = Camera(400.0, 400.0, 310.0, 94.0, 0.5, 620, 188)
-    closing = LoopClosing(detector, camera, config, threads=1, images=images)
+    verifier = verifier_for(config, camera, images)
+    closing = LoopClosing(detector, verifier, camera, config, threads=1)
     # Odometry puts the last keyframe 700 m from the first one, whose place it shows, darker.
     map_ = driven([50.0 * k for k in range(15)])
     for keyframe, place in enumerate([*range(14), 0]):

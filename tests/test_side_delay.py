@@ -1,5 +1,5 @@
-"""A right side that is late shows in the rows of stereo matches; a delay that the calibration
-gives is taken out of their columns."""
+"""A right side that is late shows in the rows of stereo matches; a delay that the calibration gives
+costs a drive little."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from scipy.ndimage import gaussian_filter, shift
 
 from vslam.camera import Camera
 from vslam.config import Config
-from vslam.features import Features
-from vslam.frontend.frame import Frame
-from vslam.frontend.side_delay import EVERY, SideDelay
-from vslam.frontend.tracking import TrackingContext, extract_features
+from vslam.features import Extracted, Features
+from vslam.frontend.extraction import extract_features
+from vslam.frontend.side_delay import EVERY, DelayState, SideDelay
+from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp
 from vslam.image_motion import columns_without_delay, rays, row_speeds
 from vslam.run.rig import delay_warnings
@@ -29,7 +29,7 @@ SCALES = 1.2 ** np.arange(8)
 
 def seen(
     twist: np.ndarray, delay: float, n: int = 200, seed: int = 0, noise: float = 0.1
-) -> tuple[Features, np.ndarray]:
+) -> tuple[Extracted, np.ndarray]:
     """Points in both images by their exact projections, the right one so much later; and the
     columns there without delay."""
     rng = np.random.default_rng(seed)
@@ -50,9 +50,12 @@ def seen(
         angle=np.zeros(n, np.float32),
         descriptors=np.zeros((n, 32), np.uint8),
         u_right=later[:, 0].astype(np.float32),
-        row_offset=rows.astype(np.float32),
     )
-    return features, here[:, 0]
+    return Extracted(features, row_offset=rows.astype(np.float32)), here[:, 0]
+
+
+def add(found: SideDelay, extracted: Extracted, twist: np.ndarray | None) -> None:
+    found.add(extracted.features, extracted.row_offset, twist, SCALES)
 
 
 def drive(frames: int) -> list[np.ndarray]:
@@ -67,23 +70,24 @@ def drive(frames: int) -> list[np.ndarray]:
 def learned(delay: float, frames: int = 80, turned: float = 0.0, known: float = 0.0) -> SideDelay:
     found = SideDelay(replace(CAMERA, right_delay=known), CONFIG)
     for k, twist in enumerate(drive(frames)):
-        features, _ = seen(twist, delay, seed=k)
-        assert features.row_offset is not None
-        features.row_offset[:] += turned * (0.3 + features.xy[:, 0] / 400)
-        found.add(features, twist, SCALES)
+        extracted, _ = seen(twist, delay, seed=k)
+        assert extracted.row_offset is not None
+        extracted.row_offset[:] += turned * (0.3 + extracted.features.xy[:, 0] / 400)
+        add(found, extracted, twist)
     return found
 
 
 def test_speeds_are_the_derivatives_of_projections():
     for k in range(6):
         twist = np.eye(6)[k]
-        features, _ = seen(twist, 1e-5, noise=0.0)
-        x, y = rays(features.xy, CAMERA)
+        late, _ = seen(twist, 1e-5, noise=0.0)
+        xy = late.features.xy
+        x, y = rays(xy, CAMERA)
         still, columns = seen(twist, 0.0, noise=0.0)
-        inverse_depth = (features.xy[:, 0] - columns) / CAMERA.bf
+        inverse_depth = (xy[:, 0] - columns) / CAMERA.bf
         assert still.row_offset is not None
-        assert features.row_offset is not None
-        moved = (features.row_offset - still.row_offset) / 1e-5
+        assert late.row_offset is not None
+        moved = (late.row_offset - still.row_offset) / 1e-5
         expected = CAMERA.fy * row_speeds(x, y, inverse_depth)[:, k]
         assert moved == pytest.approx(expected, abs=2.0)  # pixels a second, of up to 400
 
@@ -97,19 +101,6 @@ def test_a_delay_is_measured_and_reported_unless_the_calibration_gives_it(delay)
     assert not learned(delay, known=delay).is_wrong
 
 
-@pytest.mark.parametrize("delay", [-8e-3, 3e-3, 12e-3])
-def test_a_known_delay_is_taken_out_of_the_columns(delay):
-    twist, camera = drive(6)[5], replace(CAMERA, right_delay=delay)
-    features, columns = seen(twist, delay)
-    before = np.abs(features.u_right - columns).mean()
-    frame = Frame.untracked(features, camera)
-    frame.take_out_right_delay(None, camera)
-    assert frame.features is features
-    frame.take_out_right_delay(twist, camera)
-    assert before > 0.15
-    assert np.abs(frame.features.u_right - columns).mean() < 0.15 * before
-
-
 def test_a_known_delay_costs_a_drive_little():
     """A quarter of a ring road at 15 m/s, the right image 5 ms late. What is left comes from the
     first frame, whose motion is not known."""
@@ -121,7 +112,7 @@ def test_a_known_delay_costs_a_drive_little():
         ring = replace(Ring.create(), right_delay=seen_late)
         slam = Slam(replace(RING_CAMERA, right_delay=known), detector="none", threads=1)
         for k in frames:
-            slam.step_features(ring.see(k, 1), 0.1 * k)
+            slam.step_features(Extracted(ring.see(k, 1)), 0.1 * k)
         slam.finish()
         off = np.linalg.norm(slam.trajectory().T_wc[:, :3, 3] - truth, axis=1)
         return float(np.sqrt((off**2).mean()))
@@ -147,36 +138,37 @@ def test_contradicting_frames_are_doubted():
     """A delay in every other group of frames is none of the rig."""
     found = SideDelay(CAMERA, CONFIG)
     for k, twist in enumerate(drive(60)):
-        found.add(seen(twist, 6e-3 * (k // 5 % 2), seed=k)[0], twist, SCALES)
+        add(found, seen(twist, 6e-3 * (k // 5 % 2), seed=k)[0], twist)
     assert found.seconds > CONFIG.least_delay
     assert not found.is_wrong
 
 
 def test_what_was_learned_can_be_kept():
     one, other = learned(5e-3, frames=43), SideDelay(CAMERA, CONFIG)
-    other.restore(one.memory())
+    other.restore(DelayState.of_numbers(one.state().numbers()))
+    assert (other.seconds, other.sigma) == (one.seconds, one.sigma)
     for k, twist in enumerate(drive(30)):
         for each in (one, other):
-            each.add(seen(twist, 5e-3, seed=k)[0], twist, SCALES)
-    assert other.memory() == one.memory()
+            add(each, seen(twist, 5e-3, seed=k)[0], twist)
+    assert other.state().numbers() == one.state().numbers()
     assert (other.seconds, other.sigma) == (one.seconds, one.sigma)
-    fresh = SideDelay(CAMERA, CONFIG)
-    fresh.restore(())
-    assert fresh.memory() == SideDelay(CAMERA, CONFIG).memory()
+    other.restore(DelayState.of_numbers(()))
+    assert other.state().numbers() == SideDelay(CAMERA, CONFIG).state().numbers()
+    assert (other.seconds, other.sigma) == (0.0, np.inf)
     with pytest.raises(ValueError, match="damaged"):
-        fresh.restore((1.0, 5.0, 0.0, 2.0))
+        DelayState.of_numbers((1.0, 5.0, 0.0, 2.0))
 
 
 def test_many_frames_take_no_more_memory():
-    assert len(learned(0.0, frames=400).memory()) < 16 * 12 * 12 + 1000
+    assert len(learned(0.0, frames=400).state().numbers()) < 16 * 12 * 12 + 1000
 
 
 def test_matches_without_a_row_offset_teach_nothing():
     found = SideDelay(CAMERA, CONFIG)
     for k, twist in enumerate(drive(60)):
-        features, _ = seen(twist, 5e-3, seed=k)
-        found.add(features if k % 2 else Features.none(), twist, SCALES)
-        found.add(features, None, SCALES)
+        extracted, _ = seen(twist, 5e-3, seed=k)
+        add(found, extracted if k % 2 else Extracted.nothing(), twist)
+        add(found, extracted, None)
     assert found.sigma == np.inf
 
 
@@ -193,14 +185,14 @@ def test_rows_are_measured_to_a_fraction_of_a_pixel(rows):
     rough = gaussian_filter(np.random.default_rng(0).normal(size=(200, 420)), 1.5)
     grey = np.clip(110 + 35 * rough / rough.std(), 0, 255)
     left, right = grey[:, :400], shift(grey, (rows, -7.3), order=3, mode="nearest")[:, :400]
-    features = extract_features(
+    extracted = extract_features(
         left.astype(np.uint8), right.astype(np.uint8), TrackingContext.create(CAMERA, Config())
     )
-    assert features.row_offset is not None
-    measured = np.isfinite(features.row_offset)
-    matched = np.isfinite(features.u_right[::EVERY])
+    assert extracted.row_offset is not None
+    measured = np.isfinite(extracted.row_offset)
+    matched = np.isfinite(extracted.features.u_right[::EVERY])
     assert matched.sum() >= measured.sum() > 0.8 * matched.sum() > 10
-    assert np.median(features.row_offset[measured]) == pytest.approx(rows, abs=0.05)
+    assert np.median(extracted.row_offset[measured]) == pytest.approx(rows, abs=0.05)
 
 
 def test_the_warning_says_what_to_write_into_the_calibration():

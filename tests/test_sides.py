@@ -10,8 +10,9 @@ from scipy.ndimage import gaussian_filter
 
 from vslam.camera import Camera
 from vslam.config import Config
+from vslam.frontend.extraction import extract_features
 from vslam.frontend.sides import Sides, balanced, compare_sides
-from vslam.frontend.tracking import TrackingContext, extract_features
+from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp
 from vslam.run.rig import RigResiduals, measure_rig, residual_warnings, rig_warnings
 
@@ -114,12 +115,26 @@ def test_a_black_side_is_named_but_not_by_night():
     assert compare_sides(darker(left, 5), darker(right, 5), CONFIG).black == ""
 
 
+def test_video_of_limited_range_needs_other_limits():
+    """Its black is 16 and its white 235."""
+    limited = CONFIG.model_copy(update={"black_below": 22.0, "clipped_from": 230})
+    left, right = scene()
+    black = np.full_like(left, 16)
+    assert compare_sides(left, black, CONFIG) == Sides()
+    assert compare_sides(left, black, limited) == Sides(black="right")
+    bright = np.minimum(2.0 * left, 235).astype(np.uint8)
+    assert compare_sides(bright, right, CONFIG) == Sides()
+    assert compare_sides(bright, right, limited).darker_stops == pytest.approx(1.0, abs=0.1)
+
+
 @pytest.mark.parametrize("stops", [1.0, 2.0])
 def test_disparities_stay_true_when_a_side_is_dark(stops):
     """Without the mend, a side two stops darker leaves few matches and wrong ones."""
     left, right = scene()
     context = TrackingContext.create(CAMERA, Config())
-    clean, dark = (extract_features(left, r, context) for r in (right, darker(right, stops)))
+    clean, dark = (
+        extract_features(left, r, context).features for r in (right, darker(right, stops))
+    )
     for features, least in ((clean, 0.9), (dark, 0.7)):
         d = features.xy[:, 0] - features.u_right
         found = np.isfinite(d)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from concurrent.futures import Future
 
 import numpy as np
 import pytest
+from parts import InstantExecutor
 
 from vslam.backend.local_mapping import local_window
 from vslam.config import Config, KeyframeConfig, MappingConfig, OrbConfig, TrackingConfig
@@ -140,26 +140,11 @@ def test_same_bytes_with_one_thread_and_two_and_again(corridor, config):
     assert len(set(runs)) == 1
 
 
-class InstantExecutor:
-    """A thread so fast that it is done before ``submit`` returns."""
-
-    def __init__(self, *_: object) -> None:
-        pass
-
-    def submit(self, function, *arguments) -> Future:
-        future: Future = Future()
-        future.set_result(function(*arguments))
-        return future
-
-    def shutdown(self) -> None:
-        pass
-
-
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
 def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, monkeypatch):
     """Mapping as late as can be (when it is merged) and as early as can be: a race would show."""
     late = bytes_of(*run(corridor, config, threads=1))
-    monkeypatch.setattr("vslam.mapping.ThreadPoolExecutor", InstantExecutor)
+    monkeypatch.setattr("vslam.shared_map.ThreadPoolExecutor", InstantExecutor)
     assert bytes_of(*run(corridor, config, threads=2)) == late
 
 
@@ -476,3 +461,36 @@ def test_the_capsule_network_beside_the_bag_of_words_is_the_default(corridor):
     assert Slam(corridor.camera, detector="none").detector.name == "none"
     with pytest.raises(ValueError, match="no loop detector 'bwo'"):
         Slam(corridor.camera, detector="bwo")
+
+
+def test_a_keyframe_that_cannot_be_mapped_is_the_last_thing_that_happens(
+    corridor, monkeypatch, tmp_path
+):
+    """The step that merges it raises; after that, nothing is made of half a map."""
+    slam = Slam(corridor.camera, EAGER, "none", threads=1)
+
+    def drive(frames: range) -> None:
+        for k in frames:
+            slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
+
+    drive(range(3))
+
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("injected")
+
+    monkeypatch.setattr("vslam.mapping.map_and_calibrate", fail)
+    with pytest.raises(ZeroDivisionError, match="injected"):
+        drive(range(3, 6))
+    monkeypatch.undo()
+    for use in (
+        lambda: drive(range(6, 7)),
+        lambda: slam.save(tmp_path / "map.npz"),
+        lambda: slam.map,
+        slam.finish,
+        slam.trajectory,
+    ):
+        with pytest.raises(
+            RuntimeError, match=r"mapping a keyframe failed.*injected.*saved before"
+        ):
+            use()
+    assert not (tmp_path / "map.npz").exists()

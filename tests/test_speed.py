@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 
 from vslam.config import Config, KeyframeConfig
-from vslam.frontend.tracking import TrackingContext, extract_features
+from vslam.frontend.extraction import extract_features
+from vslam.frontend.tracking import TrackingContext
 from vslam.kernels import kernel
 from vslam.run.warmup import map_synthetic
 from vslam.slam import Slam
@@ -72,15 +73,15 @@ def test_extraction_of_a_pair(corridor):
 def test_a_frame_tracked(corridor):
     context = TrackingContext.create(corridor.camera, Config())
     pairs = zip(corridor.left, corridor.right, strict=True)
-    features = [extract_features(left, right, context) for left, right in pairs]
+    extracted = [extract_features(left, right, context) for left, right in pairs]
     seldom = KeyframeConfig(max_interval_s=1e9, max_tracked_ratio=1e-6, min_tracked_close=0)
 
     def drive() -> None:
         slam = Slam(corridor.camera, Config(keyframes=seldom), "none", threads=1)
-        for k in range(len(features)):
-            slam.step_features(features[k], corridor.timestamps[k], corridor.left[k], {})
+        for k in range(len(extracted)):
+            slam.step_features(extracted[k], corridor.timestamps[k], corridor.left[k], {})
 
-    assert units(drive) / len(features) < 2.5 * 0.112
+    assert units(drive) / len(extracted) < 2.5 * 0.112
 
 
 def test_a_keyframe_mapped():

@@ -48,7 +48,7 @@ def main() -> None:
         fx, fy = sequence.camera.fx * factor, sequence.camera.fy * factor
         slam = Slam(replace(sequence.camera, fx=fx, fy=fy), Config())
         for timestamp, prepared in prepared_frames(timed_frames(sequence), slam.context, 2):
-            slam.step_features(prepared.features, timestamp)
+            slam.step_features(prepared.extracted, timestamp)
         slam.finish()
         estimate = slam.trajectory()
         by_turn, by_metre = scale_drift(estimate.T_wc, truth.T_wc, options.piece)

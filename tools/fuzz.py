@@ -211,12 +211,19 @@ def _write_video(folder: Path) -> None:
 
 def _write_map(folder: Path) -> None:
     from vslam.features import PATCH_PIXELS, Features, KeyframePatches
-    from vslam.loops import ClosingMemory, LoopEdge, ResembledPlace
+    from vslam.loops import LoopEdge, ResembledPlace
     from vslam.map import Map
     from vslam.map_kernels import link_many, merge_landmarks, refresh_landmarks
-    from vslam.maps.checkpoint import Checkpoint
     from vslam.maps.storage import save_map
     from vslam.maps.stored_map import StoredMap
+    from vslam.states import (
+        Checkpoint,
+        ClosingState,
+        ConsistencyState,
+        MapperState,
+        PolicyState,
+        TrackerState,
+    )
 
     rng = np.random.default_rng(3)
     map_ = Map(1.2 ** np.arange(8))
@@ -240,24 +247,14 @@ def _write_map(folder: Path) -> None:
     merge_landmarks(map_.arrays, 0, 1)
     map_.cull_keyframe(1)
     waits = LoopEdge(2, 0, 0.5, True, "", T_query_match=np.eye(4))
+    patches = KeyframePatches(
+        2, np.zeros((n, PATCH_PIXELS), np.uint8), np.zeros((n, 2), np.float32)
+    )
     checkpoint = Checkpoint(
-        index=2,
-        timestamp=0.2,
-        features=features,
-        landmark=ids.astype(np.int32),
-        T_cw=np.eye(4),
-        velocity=np.zeros(6),
-        reference=2,
-        last_frame=2,
-        last_timestamp=0.2,
-        lost_frames=0,
-        n_tracked=n,
-        gained_close=100.0,
-        gain_awaited=False,
-        closing=ClosingMemory((ResembledPlace(frozenset((0,)), 1),), ((3, waits),), 3),
-        patches=(
-            KeyframePatches(2, np.zeros((n, PATCH_PIXELS), np.uint8), np.zeros((n, 2), np.float32)),
-        ),
+        TrackerState(2, 0.2, features, ids.astype(np.int32), np.eye(4), np.zeros(6), 0, n),
+        MapperState(2, 2, 0.2, (patches,)),
+        PolicyState(100.0, False),
+        ClosingState(ConsistencyState((ResembledPlace(frozenset((0,)), 1),), ((3, waits),), 3)),
     )
     stored = StoredMap(map_, _camera(), checkpoint=checkpoint)
     save_map(folder / "map.npz", stored, resumable=True)
@@ -384,7 +381,7 @@ def _read_map(folder: Path) -> None:
             map_.covisible(k)
             map_.keyframe_pose(k)
     if stored.checkpoint is not None:
-        resolve(stored.map.arrays, stored.checkpoint.landmark)
+        resolve(stored.map.arrays, stored.checkpoint.tracker.landmark)
 
 
 def _read_config(folder: Path) -> None:

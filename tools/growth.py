@@ -32,8 +32,9 @@ from vslam.geometry import compose, inverse, inverses, se3_exp
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.vocabulary import load
 from vslam.loops import LoopEdge, PerKeyframe
-from vslam.map import Map, local_map
+from vslam.map import Map
 from vslam.map_kernels import link_many
+from vslam.map_view import local_map
 
 CONFIG = Config()
 CAMERA = Camera(718.856, 718.856, 607.2, 185.2, 0.54, 1241, 376)

@@ -36,7 +36,7 @@ from vslam.datasets.stream import TimedFrame
 from vslam.errors import InputError
 from vslam.evaluation.loops import LoopLimits
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.features import Features, TrackingState, TrackResult
+from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_log
 from vslam.loopclosure.registry import create_detector
@@ -147,17 +147,17 @@ class PreparedRoute:
 
     def __init__(self, route: Sequence, context: TrackingContext, threads: int, seed: int) -> None:
         self._route, self._context, self._threads, self._seed = route, context, threads, seed
-        self._lights: dict[int, list[Features]] = {}
+        self._lights: dict[int, list[Extracted]] = {}
 
-    def features(self, frame: int, light: int) -> Features:
+    def extracted(self, frame: int, light: int) -> Extracted:
         """Of a frame of the route, or of a black one."""
         if frame == BLACK:
-            return Features.none()
+            return Extracted.nothing()
         if light not in self._lights:
             self._lights[light] = list(self._prepare(light))
         return self._lights[light][frame]
 
-    def _prepare(self, light: int) -> Iterator[Features]:
+    def _prepare(self, light: int) -> Iterator[Extracted]:
         spec = LIGHT if light else "none"
         frames = (
             TimedFrame(float(time), partial(self._route.read, index))
@@ -165,8 +165,8 @@ class PreparedRoute:
         )
         changed = perturbed(frames, parse_perturbation(spec, self._seed + light))
         for _, prepared in prepared_frames(changed, self._context, self._threads):
-            assert prepared.features is not None, prepared.problem
-            yield prepared.features
+            assert prepared.extracted is not None, prepared.problem
+            yield prepared.extracted
 
 
 def is_right(edge: LoopEdge, frames: NDArray[np.int64], T_wc: NDArray[np.float64]) -> bool:
@@ -229,9 +229,9 @@ def drive(run: Drive, prepared: PreparedRoute) -> Iterator[list[int | str]]:
     """Run SLAM over the laps; yields a row when each is done."""
     laps, slam, first, cpu = run.laps, run.slam, 0, 0.0
     for done in range(len(laps.frame)):
-        features = prepared.features(laps.frame[done], laps.light[done])
+        extracted = prepared.extracted(laps.frame[done], laps.light[done])
         start = time.process_time()
-        run.tracks.append(slam.step_features(features, run.seconds * laps.step[done]))
+        run.tracks.append(slam.step_features(extracted, run.seconds * laps.step[done]))
         cpu += time.process_time() - start
         last = done + 1 == len(laps.frame)
         if last:

@@ -81,7 +81,7 @@ def drive(slam: Slam, sequence: Sequence, frames: range, threads: int) -> int:
     lost = 0
     chosen = (frame for k, frame in enumerate(timed_frames(sequence)) if k in frames)
     for timestamp, prepared in prepared_frames(chosen, slam.context, threads):
-        result = slam.step_features(prepared.features, timestamp, prepared.image)
+        result = slam.step_features(prepared.extracted, timestamp, prepared.image)
         lost += result.state == "LOST"
     slam.finish()
     return lost

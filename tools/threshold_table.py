@@ -1,19 +1,25 @@
-"""Write docs/thresholds.md: every threshold of vslam/config.py with its unit and source.
+"""Write docs/thresholds.md: every threshold of vslam/config/ with its unit and source.
 
     python tools/threshold_table.py            # writes it
     python tools/threshold_table.py --check    # exits 1 if the file differs
 
-A field's description ends with its source in brackets: paper, section and status of the value, as
-in "[OS1 V-D, customary]", or "[own]" where the rule has no paper either.
+The docstring below a field ends with its source in brackets: paper, section and status of the
+value, as in "[OS1 V-D, customary]", or "[own]" where the rule has no paper either.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
+import inspect
 import re
 import sys
+import textwrap
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
+
+from pydantic import BaseModel
 
 from vslam.config import Config
 
@@ -24,11 +30,11 @@ DESCRIPTION = re.compile(
 )
 HEAD = """# Thresholds
 
-Written by `python tools/threshold_table.py` from `vslam/config.py`; `tests/test_threshold_table.py` compares the two. `vslam run --config FILE` sets any of them: `{"orb": {"n_features": 1500}}`. [design.md](design.md) describes the methods.
+Written by `python tools/threshold_table.py` from `vslam/config/`; `tests/test_threshold_table.py` compares the two. `vslam run --config FILE` sets any of them: `{"orb": {"n_features": 1500}}`. [design.md](design.md) describes the methods.
 
 The source names the paper and section of the rule and says what the value is: *printed* in that section, *customary* in the programs and KITTI configurations of the ORB-SLAM family, or our *own*. OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS: Zhou and Sun, Sci Rep 15, 7644 (2025). Descriptor distances and ratios of best over second-best distance are upper bounds; a descriptor has 256 bits. A search radius at octave 0 grows with the scale of the pyramid level.
 
-Some numbers of the method are constants in the code and not here, because they are mathematics or depend on another constant. The most important ones are the chi-square quantiles, the viewing angle of 60 degrees and the search radius 1.6 times as wide for landmarks seen obliquely (OS1 V-D), the distance range of a landmark with 20 % slack, the 30 bins of the orientation check, 3 keyframes of probation for a landmark (OS1 VI-B).
+The other numbers of the method are constants in the code: mathematics, numerical tolerances, sizes of arrays and kernels, and numbers that belong to another constant or to trained weights. The most important ones are the chi-square quantiles, the viewing angle of 60 degrees and the search radius 1.6 times as wide for landmarks seen obliquely (OS1 V-D), the distance range of a landmark with 20 % slack, the 30 bins of the orientation check, 3 keyframes of probation for a landmark (OS1 VI-B).
 """  # noqa: E501
 
 
@@ -41,20 +47,34 @@ class Row(NamedTuple):
     source: str
 
 
+def descriptions(model: type[BaseModel]) -> dict[str, str]:
+    """The docstring below each field that a class defines, on one line; "" where there is none."""
+    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
+    assert isinstance(definition, ast.ClassDef)
+    found = {}
+    for field, below in pairwise([*definition.body, None]):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+            text = ""
+            if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+                text = str(below.value.value)
+            found[field.target.id] = " ".join(text.split())
+    return found
+
+
 def rows(config: Config, section: str) -> list[Row]:
     """The thresholds of one section.
 
     Raises:
-        ValueError: a description is missing or does not end with a source.
+        ValueError: a docstring is missing or does not end with a source.
     """
     part = getattr(config, section)
     found = []
-    for field, info in type(part).model_fields.items():
-        parsed = DESCRIPTION.fullmatch(info.description or "")
+    for field, text in descriptions(type(part)).items():
+        parsed = DESCRIPTION.fullmatch(text)
         if parsed is None:
-            raise ValueError(f"{section}.{field}: no source in {info.description!r}")
+            raise ValueError(f"{section}.{field}: no source in {text!r}")
         default = str(getattr(part, field))
-        found.append(Row(f"{section}.{field}", default, parsed["text"][:-1], parsed["source"]))
+        found.append(Row(f"{section}.{field}", default, parsed["text"], parsed["source"]))
     return found
 
 
@@ -84,7 +104,7 @@ def main() -> None:
     if not options.check:
         options.out.write_text(text)
     elif not options.out.is_file() or options.out.read_text() != text:
-        sys.exit(f"{options.out} differs from vslam/config.py: python tools/threshold_table.py")
+        sys.exit(f"{options.out} differs from vslam/config/: python tools/threshold_table.py")
 
 
 if __name__ == "__main__":

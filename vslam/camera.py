@@ -117,3 +117,24 @@ class ImageMap(Protocol):
     def __call__(
         self, function: Callable[[Given], Made], images: Iterable[Given], /
     ) -> Iterator[Made]: ...
+
+
+def check_images(left: Image, second: Image | DepthImage | None, camera: Camera) -> None:
+    """Refuse images that a camera does not give (``Slam.step``).
+
+    Raises:
+        ValueError: in one sentence what is wrong with their sizes, types or number.
+    """
+    if (second is None) != camera.monocular:
+        what = "depth" if camera.depth else "right"
+        raise ValueError(f"a {what} image belongs to a camera of {camera.sensor}")
+    expected = (camera.height, camera.width)
+    images = [left] if second is None else [left, second]
+    if any(image.shape != expected for image in images):
+        shapes = " and ".join(str(image.shape) for image in images)
+        raise ValueError(f"images are {shapes}, the camera's {expected}")
+    wanted = [np.uint8, np.float32 if camera.depth else np.uint8]
+    if any(image.dtype != dtype for image, dtype in zip(images, wanted, strict=False)):
+        types = " and ".join(str(image.dtype) for image in images)
+        expected_types = "uint8 and float32" if camera.depth else "uint8"
+        raise ValueError(f"images are of {types}, not of {expected_types}")

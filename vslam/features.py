@@ -1,8 +1,8 @@
-"""Image features and what tracking says of a frame."""
+"""Image features, what the images of a frame give, and what tracking says of a frame."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -50,8 +50,7 @@ def level_pixel(x, ratio):
 
 @dataclass(frozen=True)
 class Features:
-    """ORB features of one left image, with the stereo match of each where there is one; or of the
-    right image, where the left one is black.
+    """ORB features of one image, with the stereo match of each where there is one.
 
     Attributes:
         xy: ``(N, 2)`` float32, position at full resolution (pixels).
@@ -59,11 +58,6 @@ class Features:
         angle: ``(N,)`` float32, orientation in radians.
         descriptors: ``(N, 32)`` uint8, 256-bit rotated BRIEF.
         u_right: ``(N,)`` float32, column of the match in the right image, NaN without one.
-        from_right: whether the image is the right one; ``xy`` is in it then, and all ``u_right``
-            are NaN.
-        pyramid: of the image; None where matches are not to be aligned, or no longer.
-        row_offset: ``(N,)`` float32, pixels by which a stereo match is lower in the right image
-            than here, of some matches; NaN else. None where nobody measured it.
     """
 
     xy: NDArray[np.float32]
@@ -71,16 +65,9 @@ class Features:
     angle: NDArray[np.float32]
     descriptors: NDArray[np.uint8]
     u_right: NDArray[np.float32]
-    from_right: bool = False
-    pyramid: Pyramid | None = None
-    row_offset: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.xy)
-
-    def with_larger_disparities(self, change: float) -> Features:
-        """The same with ``change`` pixels added to the disparity of each stereo match."""
-        return replace(self, u_right=shifted_columns(self.u_right, self.xy[:, 0], change))
 
     @classmethod
     def none(cls) -> Features:
@@ -92,6 +79,38 @@ class Features:
             np.empty((0, 32), np.uint8),
             np.empty(0, np.float32),
         )
+
+
+class Side(StrEnum):
+    """One camera of a stereo pair. A camera without a second one counts as the left one."""
+
+    LEFT = "left"
+    RIGHT = "right"
+
+
+@dataclass(frozen=True)
+class Extracted:
+    """What the images of one frame give.
+
+    Attributes:
+        features: N features of one of the images.
+        pyramid: of that image; None if matches are not to be aligned in it.
+        row_offset: ``(N,)`` float32, by how many pixels a stereo match is lower in the right image
+            than in the left one; NaN for features of which this was not measured. None if it was
+            measured for none.
+        side: the camera that took that image: the right one only where the left image is black,
+            and no feature has a stereo match then.
+    """
+
+    features: Features
+    pyramid: Pyramid | None = None
+    row_offset: NDArray[np.float32] | None = None
+    side: Side = Side.LEFT
+
+    @classmethod
+    def nothing(cls) -> Extracted:
+        """What a frame without images gives."""
+        return cls(Features.none())
 
 
 class KeyframePatches(NamedTuple):

@@ -20,6 +20,7 @@ class LoopCandidate:
         score: the detector's own measure, greater is more alike.
         alike: how much of the two images local descriptors of a network find alike, so that they
             may verify what ORB's do not; None where they were not asked.
+        promising: whether its verifier wants to try it even if the consistency test refuses it.
         proposed_by: name of the detector that found it; several are joined by ``+``.
     """
 
@@ -28,6 +29,7 @@ class LoopCandidate:
     score: float
     alike: float | None = None
     proposed_by: str = ""
+    promising: bool = False
 
 
 @dataclass(frozen=True)
@@ -184,24 +186,3 @@ class ResembledPlace:
     keyframes: frozenset[int]
     length: int
     age: int = 0
-
-
-@dataclass(frozen=True)
-class ClosingMemory:
-    """What loop closing remembers of recent keyframes, for a file.
-
-    Attributes:
-        places: that resembled them.
-        verified: loops that wait for others to agree, each with the ``turn`` of its keyframe.
-        turn: keyframes asked about so far.
-        resting_until, in_vain: the keyframe until which learned descriptors rest after a try in
-            vain, and how alike the images of that were.
-        followed: times that an old keyframe served instead of a new one.
-    """
-
-    places: tuple[ResembledPlace, ...] = ()
-    verified: tuple[tuple[int, LoopEdge], ...] = ()
-    turn: int = 0
-    resting_until: int = 0
-    in_vain: float = 0.0
-    followed: int = 0

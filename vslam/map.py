@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from vslam.features import Features
 from vslam.geometry import compose, inverse, orthonormalised
 from vslam.loops import LoopEdge
-from vslam.map_kernels import collect_landmarks, count_shared, detach_keyframe, resolve
+from vslam.map_kernels import count_shared, detach_keyframe, resolve
 
 NONE = -1
 _FEW_LANDMARKS = 8192  # 1 MB
@@ -331,34 +331,3 @@ def loop_of_living(map_: Map, loop: LoopEdge) -> LoopEdge:
         T = compose(T, map_.T_c_parent[match])
         match = map_.parents[match]
     return replace(loop, query=query, match=match, T_query_match=orthonormalised(T))
-
-
-class LocalMap(NamedTuple):
-    """A copy of the landmarks around a keyframe, so that tracking can go on while mapping writes.
-
-    ``ids`` (N,) i4; ``xyz``, ``normal`` (N, 3) f8; ``distance_range`` (N, 2) f8; ``descriptor``
-    (N, 4) u8.
-    """
-
-    ids: NDArray[np.int32]
-    xyz: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    distance_range: NDArray[np.float64]
-    descriptor: NDArray[np.uint64]
-
-
-def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
-    """Copy the landmarks of a keyframe and of its covisible keyframes (ORB-SLAM, V-D).
-
-    ORB-SLAM adds neighbours of neighbours; those changed no figure here (docs/design.md).
-
-    Args:
-        limit: at most this many keyframes, nearest in covisibility first.
-    """
-    first, _ = map_.covisible(keyframe)
-    chosen = [keyframe, *first[: limit - 1].tolist()]
-    a = map_.arrays
-    ids = collect_landmarks(a, np.array(chosen, np.int64), map_.n_landmarks)
-    return LocalMap(
-        ids, a.xyz[ids], a.normal[ids], a.distance_range[ids], a.landmark_descriptor[ids]
-    )

@@ -19,6 +19,7 @@ from vslam.config import Config
 from vslam.features import Features
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
+from vslam.loopclosure.verifier import verifier_for
 from vslam.loops import LoopCandidate, LoopEdge
 from vslam.map import Map
 from vslam.maps.stored_map import StoredMap, appended
@@ -102,7 +103,8 @@ def join(
     if images is not None and both.images is not None:
         images.restore(both.images, one.camera.width)
     # One thread: the global adjustment waits until it is asked for, after the last loop.
-    closing = LoopClosing(detector, one.camera, config, threads=1, images=images)
+    verifier = verifier_for(config, one.camera, images)
+    closing = LoopClosing(detector, verifier, one.camera, config, threads=1)
     closing.closed = list(both.loops)
     map_, n = both.map, one.map.n_keyframes
     for keyframe in range(n, map_.n_keyframes):

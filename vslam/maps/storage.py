@@ -29,7 +29,7 @@ from vslam.maps.new_output import replaced_file
 from vslam.maps.stored_map import StoredMap
 from vslam.untrusted import ARCHIVE_ERRORS, require_memory
 
-SCHEMA = 4
+SCHEMA = 5
 _FOREIGN = "not a map of vslam; name a map.npz, or the folder of a run"
 
 

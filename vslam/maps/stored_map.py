@@ -21,7 +21,7 @@ from vslam.map import (
     loop_of_living,
 )
 from vslam.map_kernels import gather_observations
-from vslam.maps.checkpoint import Checkpoint
+from vslam.states import Checkpoint
 
 
 @dataclass(frozen=True)

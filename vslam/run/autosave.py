@@ -33,7 +33,7 @@ MAP, PROGRESS, ONLINE = "autosave.npz", "autosave_progress.npz", "trajectory_onl
 LOCK = ".lock"
 _BEGIN = 0.75  # of the period: writing, and waiting for a merge, take the rest
 _PATIENCE = 0.95  # of the period: until then no global bundle adjustment is cut off
-_MISSED = 5  # frames without a moment to save, until one amid a frame is taken
+_MISSED = 5  # frames that end while a keyframe is mapped, until its mapping is waited for
 
 _log = logging.getLogger(__name__)
 
@@ -96,11 +96,6 @@ class Autosave(Protocol):
         """The frame is done with: this is the moment to save, if it is time."""
         ...
 
-    def offer_amid(self, slam: Slam, progress: Callable[[], Progress]) -> None:
-        """Mapping was merged in the middle of a frame: the last resort where no moment is left
-        between frames, since every frame becomes a keyframe."""
-        ...
-
     def close(self, slam: Slam, progress: Callable[[], Progress], *, whole: bool) -> None:
         """The run is over, and finished; if not ``whole``, it may be resumed."""
         ...
@@ -113,9 +108,6 @@ class NoAutosave:
         pass
 
     def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
-        pass
-
-    def offer_amid(self, slam: Slam, progress: Callable[[], Progress]) -> None:
         pass
 
     def close(self, slam: Slam, progress: Callable[[], Progress], *, whole: bool) -> None:
@@ -164,17 +156,13 @@ class FolderAutosave:
         waited = time.monotonic() - self._last
         if not self._seconds or waited < _BEGIN * self._seconds:
             return
-        if slam.is_mapping:
+        if slam.is_mapping and self._missed < _MISSED:
             self._missed += 1
             return
         if slam.is_adjusting and waited < _PATIENCE * self._seconds:
             return
         if self._writing is None or self._writing.done():
             self._save(slam, progress)
-
-    def offer_amid(self, slam: Slam, progress: Callable[[], Progress]) -> None:
-        if self._missed >= _MISSED:
-            self.offer(slam, progress)
 
     def close(self, slam: Slam, progress: Callable[[], Progress], *, whole: bool) -> None:
         if self._seconds and not whole:
@@ -186,8 +174,6 @@ class FolderAutosave:
     def _save(self, slam: Slam, progress: Callable[[], Progress]) -> None:
         self._last, self._missed = time.monotonic(), 0
         stored, done = _copy(slam.stored_map(self._drive)), progress()
-        if stored.frames is not None:  # one more in the middle of a step
-            stored = replace(stored, frames=stored.frames.until(len(done.tracks)))
         self._writing = self._writer.submit(self._write, stored, done)
 
     def _write(self, stored: StoredMap, progress: Progress) -> None:

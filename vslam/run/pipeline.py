@@ -77,7 +77,6 @@ def run_sequence(
     others = [] if resume is not None else _compared(sequence.camera, settings)
     recorder.begin(sequence.camera, ground_truth_of(sequence))
     main = _Run(slam, settings, Progress() if resume is None else resume.progress)
-    slam.on_merge = lambda: autosave.offer_amid(slam, main.so_far)
     n_told = 0  # loops that the recorder knows of
     broken: list[str] = []
     with _stop_on_interrupt() as interrupted:
@@ -154,11 +153,13 @@ class _Run:
         timestamp, frame = played.timestamp, played.made
         if frame is None or frame.dropped:
             result, sides = self.slam.skip(timestamp, dropped=True), None
-        elif frame.features is None or frame.image is None:
+        elif frame.extracted is None or frame.image is None:
             result, sides = self.slam.skip(timestamp), frame.sides
             self.skipped.append(f"frame {len(self.tracks)}: {frame.problem}")
         else:
-            result = self.slam.step_features(frame.features, timestamp, frame.image, frame.stage_ms)
+            result = self.slam.step_features(
+                frame.extracted, timestamp, frame.image, frame.stage_ms
+            )
             sides = frame.sides
             if self.settings.realtime:
                 self.latency_ms.append(1e3 * (time.perf_counter() - played.came))
@@ -253,7 +254,7 @@ def _outcome(
         warnings=[
             *rig_warnings(run.sides),
             *(
-                delay_warnings(slam.side_delay, sequence.camera)
+                delay_warnings(slam.rig.delay, sequence.camera)
                 or residual_warnings(residuals, sequence.camera)
             ),
         ],

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from vslam.camera import DepthImage, Image, ImageMap
 from vslam.datasets.stream import TimedFrame
 from vslam.errors import DroppedFrameError, UnreadableImageError
-from vslam.features import Features
+from vslam.features import Extracted, Side
+from vslam.frontend.extraction import extract_features
 from vslam.frontend.sides import Sides, compare_sides
-from vslam.frontend.tracking import TrackingContext, extract_features
+from vslam.frontend.tracking import TrackingContext
 from vslam.run.outcome import RunSettings
 from vslam.run.realtime import Played, play
 
@@ -32,7 +33,7 @@ class PreparedFrame:
     cannot be read; ``dropped`` by a perturbation."""
 
     image: NDArray[np.uint8] | None
-    features: Features | None
+    extracted: Extracted | None
     stage_ms: dict[str, float]
     problem: str | None = None
     dropped: bool = False
@@ -92,11 +93,11 @@ def prepare_frame(
         return PreparedFrame(None, None, {}, str(error), dropped)
     read = time.perf_counter()
     sides = _sides(left, second, context)
-    features = extract_features(left, second, context, image_map, sides)
+    extracted = extract_features(left, second, context, image_map, sides)
     done = time.perf_counter()
     stage_ms = {"read": 1e3 * (read - start), "extract": 1e3 * (done - read)}
-    image = np.asarray(second, np.uint8) if features.from_right else left
-    return PreparedFrame(image, features, stage_ms, sides=sides)
+    image = np.asarray(second, np.uint8) if extracted.side == Side.RIGHT else left
+    return PreparedFrame(image, extracted, stage_ms, sides=sides)
 
 
 def _sides(left: Image, second: Image | DepthImage | None, context: TrackingContext) -> Sides:

@@ -49,23 +49,25 @@ from vslam.camera import Camera
 from vslam.closing import LoopClosing
 from vslam.config import Config, DepthConfig, KeyframeConfig, MappingConfig
 from vslam.datasets.png import unfilter
-from vslam.features import Features
+from vslam.features import Extracted, Features
 from vslam.frontend import pnp
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.frame import Frame
-from vslam.frontend.orb import scale_factors
 from vslam.frontend.relocalization import relocalise
+from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import TrackingContext
 from vslam.loopclosure import bow, local_matching, sim3_ransac
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.detector import NoDetector
 from vslam.loopclosure.local_matching import DescriptorMaps, locate, locate_near, match_coarse
 from vslam.loopclosure.verification import verify
+from vslam.loopclosure.verifier import verifier_for
 from vslam.loopclosure.vocabulary import Vocabulary, from_children
 from vslam.loops import LoopCandidate, LoopEdge
 from vslam.machine import available_cores
-from vslam.map import Map, local_map
-from vslam.mapping import MappingThread
+from vslam.map import Map
+from vslam.map_view import local_map
+from vslam.mapping import Mapper
 from vslam.slam import Slam
 
 WIDTH, HEIGHT, DISPARITY, STEP, FRAMES = 480, 240, 12, 6, 6
@@ -210,8 +212,11 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     insertion culls one.
     """
     config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
-    closing = LoopClosing(NoDetector(), CAMERA, config, threads=1)
-    mapping = MappingThread(scale_factors(config.orb), CAMERA, config, closing, threads=1)
+    verifier = verifier_for(config, CAMERA)
+    closing = LoopClosing(NoDetector(), verifier, CAMERA, config, threads=1)
+    context = TrackingContext.create(CAMERA, config)
+    rig = RigCalibration(CAMERA, config.stereo, context.scales)
+    mapper = Mapper(context, closing, rig, None)
     rng = np.random.default_rng(0)
     n = 400
     points = rng.uniform([-5.0, -4.0, 9.0], [9.0, 4.0, 12.0], (n, 3))
@@ -229,13 +234,14 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
             descriptors,
             uvr[:, 2].astype(np.float32),
         )
-        frame = Frame.untracked(features, CAMERA, k, 0.1 * k)
+        frame = Frame.of(Extracted(features), CAMERA, k, 0.1 * k)
         frame.T_cw, frame.landmark = T_cw, landmark
-        mapping.insert(frame)
-        mapping.merge()
-        mapping.update(frame)
+        mapper.hold(frame)
+        mapper.place(frame, tracked=True)
+        mapper.insert(frame)
+        mapper.merge()
         landmark = frame.landmark
-    return mapping.map, features
+    return mapper.map, features
 
 
 def compile_recognition() -> None:
@@ -246,7 +252,7 @@ def compile_recognition() -> None:
 
     place = local_map(map_, 0, 1)
     context = TrackingContext.create(CAMERA, config)
-    relocalise(Frame.untracked(features, CAMERA), place, place, context, seed=0)
+    relocalise(Frame.of(Extracted(features), CAMERA), place, place, context, seed=0)
 
     detector = BowDetector(smallest_vocabulary())
     detector.add(0, None, features)

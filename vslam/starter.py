@@ -1,4 +1,8 @@
-"""How a monocular map begins: a frame is kept until a later one forms a pair with it."""
+"""How a map, or a sub-map after the camera was lost, begins.
+
+A frame of a stereo or RGB-D camera begins a map alone, if it has enough points. A monocular map
+needs two: a frame is kept until a later one forms a pair with it.
+"""
 
 from __future__ import annotations
 
@@ -34,21 +38,21 @@ class TwoViewStart:
     predicted: bool = False
 
     @property
-    def velocity(self) -> Matrix:
+    def twist(self) -> Matrix:
         """``(6,)`` twist per second from the first frame to the second."""
         return se3_log(self.T_2_1) / (self.second.timestamp - self.first.timestamp)
 
-    def at_speed(self, velocity: Matrix | None, max_rescaling: float) -> TwoViewStart:
+    def at_speed(self, twist: Matrix | None, max_rescaling: float) -> TwoViewStart:
         """The start of a sub-map in the unit of the map before it, as far as anything tells: the
         camera drives on as fast as it did.
 
         Args:
-            velocity: ``(6,)`` twist per second before, None if unknown.
+            twist: ``(6,)`` speed of the camera before, per second; None if unknown.
             max_rescaling: beyond this factor the speed tells nothing.
         """
-        if velocity is None:
+        if twist is None:
             return self
-        moved = np.linalg.norm(velocity[:3]) * (self.second.timestamp - self.first.timestamp)
+        moved = np.linalg.norm(twist[:3]) * (self.second.timestamp - self.first.timestamp)
         factor = float(moved / np.linalg.norm(self.T_2_1[:3, 3]))
         if not 1.0 / max_rescaling < factor < max_rescaling:
             return self
@@ -57,24 +61,42 @@ class TwoViewStart:
         return replace(self, T_2_1=T_2_1, points=factor * self.points, predicted=True)
 
 
-class Initialiser:
-    """Looks for two views that make a map, one frame after the other."""
+@dataclass(frozen=True)
+class OneViewStart:
+    """A frame whose stereo points make a map."""
+
+    frame: Frame
+
+
+Start = OneViewStart | TwoViewStart
+
+
+class Starter:
+    """Looks for the frames that a map, or a sub-map, can begin with."""
 
     def __init__(self, context: TrackingContext) -> None:
         self._context = context
         self._first: Frame | None = None
 
     @property
-    def is_idle(self) -> bool:
-        """Whether no frame is kept."""
-        return self._first is None
+    def is_waiting(self) -> bool:
+        """Whether a frame is kept that waits for a second one."""
+        return self._first is not None
 
     def reset(self) -> None:
-        """Forget the frame kept."""
+        """Forget the frame that is kept."""
         self._first = None
 
-    def offer(self, frame: Frame) -> TwoViewStart | None:
-        """Try a frame with the one kept; where they have too little in common, keep this one."""
+    def offer(self, frame: Frame) -> Start | None:
+        """Try to begin with a frame, which is untracked; None if that is not possible yet."""
+        if self._context.camera.monocular:
+            return self._offer_monocular(frame)
+        enough = frame.n_stereo >= self._context.config.tracking.min_stereo_start
+        return OneViewStart(frame) if enough else None
+
+    def _offer_monocular(self, frame: Frame) -> TwoViewStart | None:
+        """Try a frame with the one that is kept; where they have too little in common, keep this
+        one instead."""
         config = self._context.config.initialization
         if self._first is None or frame.timestamp - self._first.timestamp > config.max_seconds:
             self._keep(frame)

@@ -1,0 +1,67 @@
+"""From the images of a frame to its features, whichever sensor took them and whatever the light."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import ImageMap
+from vslam.features import Extracted, Features, Side
+from vslam.frontend.depth import columns_of_depth
+from vslam.frontend.orb import Extraction
+from vslam.frontend.side_delay import row_offsets
+from vslam.frontend.sides import Sides, balanced, compare_sides
+from vslam.frontend.stereo import match_stereo
+from vslam.frontend.tracking import TrackingContext
+from vslam.frontend.weak_images import extract_in_any_light
+
+
+def extract_features(
+    left: NDArray[np.uint8],
+    second: NDArray[np.uint8] | NDArray[np.float32] | None,
+    context: TrackingContext,
+    image_map: ImageMap = map,
+    sides: Sides | None = None,
+) -> Extracted:
+    """ORB features of the left image with their columns in the right one. If the left image is
+    black, the features are those of the right image, without columns in the other.
+
+    A pure function, whatever ``image_map`` is.
+
+    Args:
+        left: ``(H, W)`` uint8.
+        second: ``(H, W)``: the right image, uint8; with ``camera.depth`` the depth in metres,
+            float32; or None, and no feature has a column in a right image.
+        image_map: applies a function to both images, one after the other or both at once.
+        sides: the result of ``compare_sides``, if it is known.
+    """
+    camera, config = context.camera, context.config
+    if second is None:
+        return _extract_alone(left, context, Side.LEFT)
+    if camera.depth:
+        (found,) = extract_in_any_light([left], config)
+        scale, depth = context.scales[found.octave], np.asarray(second, np.float32)
+        u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
+        # No pyramid: depth cameras have a rolling shutter, which moves points by more than
+        # alignment corrects.
+        return Extracted(_features(found, u_right))
+    right_image = np.asarray(second, np.uint8)
+    sides = sides or compare_sides(left, right_image, config.stereo)
+    if sides.black == "left":
+        return _extract_alone(right_image, context, Side.RIGHT)
+    pair = balanced(left, right_image, config.stereo, sides)
+    found, right = extract_in_any_light(pair, config, image_map)
+    u_right = match_stereo(found, right, camera, config.stereo)
+    rows = row_offsets(found, right, u_right, config.stereo)
+    return Extracted(_features(found, u_right), found.pyramid, rows)
+
+
+def _extract_alone(image: NDArray[np.uint8], context: TrackingContext, side: Side) -> Extracted:
+    """Features of one image, without columns in another one."""
+    (found,) = extract_in_any_light([image], context.config)
+    u_right = np.full(len(found.xy), np.nan, np.float32)
+    return Extracted(_features(found, u_right), found.pyramid, side=side)
+
+
+def _features(found: Extraction, u_right: NDArray[np.float32]) -> Features:
+    return Features(found.xy, found.octave, found.angle, found.descriptors, u_right)

@@ -1,0 +1,111 @@
+"""Finding a lost frame in the whole map (ORB-SLAM, T-RO 2015, V-C)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Image
+from vslam.features import Features, TrackingState
+from vslam.frontend.frame import Frame
+from vslam.frontend.relocalization import relocalise
+from vslam.frontend.tracker import Found, judge
+from vslam.frontend.tracking import TrackingContext
+from vslam.geometry import Matrix
+from vslam.loops import LoopCandidate
+from vslam.map import Map
+from vslam.map_view import local_map
+
+Locate = Callable[[Image | None, Features, Map], list[LoopCandidate]]
+
+
+class Sighting(Protocol):
+    """Where a frame was recognised: near ``keyframe``, at ``T_cw``; feature ``feature[i]`` of the
+    frame observes landmark ``landmark[i]``."""
+
+    @property
+    def keyframe(self) -> int: ...
+    @property
+    def T_cw(self) -> Matrix: ...
+    @property
+    def feature(self) -> NDArray[np.int64]: ...
+    @property
+    def landmark(self) -> NDArray[np.int32]: ...
+
+
+class Recognise(Protocol):
+    """Finds a frame at one of the candidates where ORB descriptors do not."""
+
+    def __call__(
+        self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
+    ) -> Sighting | None: ...
+
+
+class MapOwner(Protocol):
+    """Gives the map when it may be read."""
+
+    @property
+    def is_merged(self) -> bool:
+        """Whether tracking sees all that was mapped."""
+        ...
+
+    def merge(self) -> Map:
+        """Wait for the keyframe that is being mapped, show it to tracking, and return the map."""
+        ...
+
+
+class Relocaliser:
+    """Looks for a frame at the places that resemble it."""
+
+    def __init__(self, context: TrackingContext, locate: Locate, recognise: Recognise) -> None:
+        """
+        Args:
+            locate: gives the keyframes that a frame resembles, best first.
+            recognise: asked where ORB descriptors find the frame at none of them.
+        """
+        self._context = context
+        self._locate = locate
+        self._recognise = recognise
+
+    def check(self, frame: Frame, found: Found, owner: MapOwner) -> Found:
+        """Look for a lost frame in the whole map, unless a keyframe is being mapped, and for a
+        doubtful one in any case: it stays as it is unless there are clearly more inliers elsewhere.
+        """
+        if found.is_lost:
+            return self._find(frame, owner.merge()) if owner.is_merged else found
+        if not found.is_doubtful:
+            return found
+        map_ = owner.merge()  # worth waiting for: a doubtful frame asks for a keyframe
+        before = frame.snapshot()
+        elsewhere = self._find(frame, map_)
+        if elsewhere.n_inliers > self._context.config.relocalization.better * found.n_inliers:
+            return elsewhere
+        frame.restore(before)
+        return found
+
+    def _find(self, frame: Frame, map_: Map) -> Found:
+        """Look for a frame in the whole map, first by ORB descriptors."""
+        config = self._context.config.relocalization
+        candidates = self._locate(frame.image, frame.features, map_)
+        for candidate in candidates[: config.max_candidates]:
+            place = local_map(map_, candidate.match, 1)
+            around = local_map(map_, candidate.match, config.neighbours)
+            n_inliers = relocalise(frame, place, around, self._context, seed=candidate.match)
+            if n_inliers:
+                return self._found(n_inliers, candidate.match)
+        sighting = self._recognise(map_, frame.image, frame.features, candidates)
+        if sighting is None:
+            return Found(TrackingState.LOST)
+        frame.set_camera_pose(sighting.T_cw)
+        frame.landmark[sighting.feature] = sighting.landmark
+        frame.shift = None
+        frame.xyz[sighting.feature] = map_.arrays.xyz[sighting.landmark]
+        return self._found(len(sighting.feature), sighting.keyframe)
+
+    def _found(self, n_inliers: int, keyframe: int) -> Found:
+        state = judge(n_inliers, n_inliers, self._context)
+        lost = state == TrackingState.LOST
+        return Found(state, n_inliers, n_inliers, keyframe=-1 if lost else keyframe)

@@ -1,0 +1,55 @@
+"""Finding a lost frame by local descriptors of the network, where ORB's fail in another light."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Camera, Image
+from vslam.config import Config
+from vslam.features import Features
+from vslam.geometry import Matrix
+from vslam.loopclosure.learned_verification import rated, recognise
+from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
+from vslam.loops import LoopCandidate
+from vslam.map import Map
+
+
+class Sighting(NamedTuple):
+    """Where a frame was recognised: near ``keyframe``, at ``T_cw`` (4, 4); feature ``feature[i]``
+    of the frame observes landmark ``landmark[i]``."""
+
+    keyframe: int
+    T_cw: Matrix
+    feature: NDArray[np.int64]
+    landmark: NDArray[np.int32]
+
+
+class LearnedRelocalisation:
+    """Recognises places by their keyframes' images; none without images."""
+
+    def __init__(self, images: KeyframeImages | None, camera: Camera, config: Config) -> None:
+        self._images = images
+        self._camera = camera
+        self._config = config
+
+    def __call__(
+        self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
+    ) -> Sighting | None:
+        """Look for a frame at the candidates whose images are most alike."""
+        images, config = self._images, self._config
+        if images is None or image is None:
+            return None
+        candidates = rated(candidates, lambda: images.glance_at(image), images, config.learned)
+        alike = [one for one in candidates if one.alike is not None]
+        alike.sort(key=lambda one: -(one.alike or 0.0))
+        if not alike:
+            return None
+        maps = images.network.describe(image)
+        for candidate in alike[: config.learned.max_candidates]:
+            found = recognise(map_, maps, features, candidate.match, images, self._camera, config)
+            if found is not None:
+                return Sighting(candidate.match, *found)
+        return None

@@ -1,0 +1,135 @@
+"""A small world and stand-ins with which one part of SLAM is tested alone."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass
+
+import numpy as np
+
+from vslam.camera import Camera
+from vslam.features import Extracted, Features
+from vslam.frontend.frame import Frame
+from vslam.geometry import se3_exp, transform
+from vslam.map_view import LocalMap, MapView
+
+CAMERA = Camera(400.0, 400.0, 320.0, 120.0, 0.5, 640, 240)
+ALL, NOTHING = slice(None), slice(0, 0)  # of the points of a ``Points``
+
+
+class InstantExecutor(Executor):
+    """A thread so fast that it is done before ``submit`` returns."""
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def submit(self, function, /, *arguments, **options) -> Future:
+        future: Future = Future()
+        try:
+            future.set_result(function(*arguments, **options))
+        except BaseException as error:
+            future.set_exception(error)
+        return future
+
+
+def frame_of(
+    features: Features,
+    index: int = 0,
+    timestamp: float = 0.0,
+    image: np.ndarray | None = None,
+    camera: Camera = CAMERA,
+) -> Frame:
+    """A frame that is not tracked yet."""
+    return Frame.of(Extracted(features), camera, index, timestamp, image)
+
+
+def ahead(metres: float, turn: float = 0.0) -> np.ndarray:
+    """``T_cw`` of a camera that moved forward from the origin and turned right, in radians."""
+    return se3_exp(np.array([0.0, 0.0, -metres, 0.0, -turn, 0.0]))
+
+
+class OneKeyframe:
+    """What frames are placed by in a map of one keyframe, at the origin."""
+
+    n_keyframes = 1
+    reference = 0
+
+    def keyframe_pose(self, keyframe: int) -> np.ndarray:
+        return np.eye(4)
+
+    def unit_scale(self, keyframe: int) -> float:
+        return 1.0
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points in front of the origin, each with a descriptor of its own. Nothing is noisy, so that
+    whoever looks for them where they are finds every one of them.
+
+    A point is landmark ``i`` of the views that ``view`` makes.
+    """
+
+    xyz: np.ndarray
+    descriptors: np.ndarray
+
+    @classmethod
+    def create(cls, n: int = 240, seed: int = 0) -> Points:
+        rng = np.random.default_rng(seed)
+        z = rng.uniform(16.0, 30.0, n)
+        x, y = rng.uniform(-0.6, 0.6, n) * z, rng.uniform(-0.22, 0.22, n) * z
+        descriptors = rng.integers(0, 256, (n, 32), dtype=np.uint8)
+        return cls(np.stack([x, y, z], axis=1), descriptors)
+
+    def see(self, T_cw: np.ndarray, among: slice = ALL) -> Features:
+        """The features of some of the points, in their order; the camera must see them all."""
+        uvr = CAMERA.project(transform(T_cw, self.xyz[among])).astype(np.float32)
+        n = len(uvr)
+        return Features(
+            xy=uvr[:, :2],
+            octave=np.zeros(n, np.uint8),
+            angle=np.zeros(n, np.float32),
+            descriptors=self.descriptors[among],
+            u_right=uvr[:, 2],
+        )
+
+    def frame(self, index: int, timestamp: float, T_cw: np.ndarray, among: slice = ALL) -> Frame:
+        """A frame that sees some of the points and is not tracked yet."""
+        return frame_of(self.see(T_cw, among), index, timestamp)
+
+    def tracked_frame(
+        self, index: int, timestamp: float, T_cw: np.ndarray, among: slice = ALL
+    ) -> Frame:
+        """A frame at its true pose that tracks all the points that it sees."""
+        frame = self.frame(index, timestamp, T_cw, among)
+        frame.T_cw = T_cw
+        frame.landmark[:] = np.arange(len(self.xyz), dtype=np.int32)[among]
+        frame.xyz[:] = self.xyz[among]
+        return frame
+
+    def landmarks(self, among: slice = ALL) -> LocalMap:
+        """Some of the points as tracking sees landmarks."""
+        xyz = self.xyz[among]
+        distance = np.linalg.norm(xyz, axis=1)
+        return LocalMap(
+            ids=np.arange(len(self.xyz), dtype=np.int32)[among],
+            xyz=xyz,
+            normal=xyz / distance[:, None],
+            distance_range=np.stack([0.1 * distance, distance], axis=1),
+            descriptor=self.descriptors[among].view(np.uint64),
+        )
+
+    def view(
+        self,
+        around: slice = ALL,
+        nearest: slice = ALL,
+        *,
+        n_reference: int = 0,
+        n_keyframes: int = 20,
+    ) -> MapView:
+        """A view of a map in which some points are around, and some in the reference keyframe."""
+        return MapView(
+            n_keyframes=n_keyframes,
+            around=self.landmarks(around),
+            nearest=self.landmarks(nearest),
+            n_reference=n_reference,
+        )

@@ -1,0 +1,82 @@
+"""A frame: what its images gave, and one pose whichever camera of the pair saw it."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from vslam.camera import Camera
+from vslam.config import Config
+from vslam.features import Extracted, Features, Side
+from vslam.frontend.frame import Frame
+from vslam.frontend.relocalization import relocalise
+from vslam.frontend.tracking import TrackingContext, refine
+from vslam.geometry import compose, se3_exp, transform
+from vslam.map import Map
+from vslam.map_kernels import link_many
+from vslam.map_view import LocalMap, local_map
+from vslam.maps.checkpoint import FEATURES
+
+CAMERA = Camera(400.0, 400.0, 320.0, 240.0, 0.5, 640, 480)
+CONTEXT = TrackingContext.create(CAMERA, Config())
+T_CW = se3_exp(np.array([0.4, -0.1, -1.0, 0.02, 0.1, -0.05]))
+N = 150
+
+
+def points() -> np.ndarray:
+    """``(N, 3)`` metres, in front of the world's origin."""
+    rng = np.random.default_rng(0)
+    return np.column_stack([rng.uniform(-5, 5, (N, 2)), rng.uniform(8, 20, N)])
+
+
+def descriptors() -> np.ndarray:
+    return np.random.default_rng(1).integers(0, 256, (N, 32), dtype=np.uint8)
+
+
+def seen_from(T_camera_w: np.ndarray) -> Features:
+    """The points in the image of a camera, without stereo matches."""
+    xy = CAMERA.project(transform(T_camera_w, points()))[:, :2]
+    nothing = np.full(N, np.nan, np.float32)
+    octave, angle = np.zeros(N, np.uint8), np.zeros(N, np.float32)
+    return Features(xy.astype(np.float32), octave, angle, descriptors(), nothing)
+
+
+def place() -> LocalMap:
+    """The landmarks of a map whose only keyframe, at the world's origin, sees all points."""
+    map_ = Map(CONTEXT.scales)
+    map_.add_keyframe(seen_from(np.eye(4)), np.eye(4), 0.0, 0)
+    ids = map_.add_landmarks(points(), descriptors().view(np.uint64), 0)
+    link_many(map_.arrays, np.arange(N), ids)
+    return local_map(map_, 0, 1)
+
+
+def test_features_are_a_table_and_a_checkpoint_keeps_all_of_it():
+    names = tuple(field.name for field in fields(Features))
+    assert names == ("xy", "octave", "angle", "descriptors", "u_right") == FEATURES
+    assert all(len(getattr(seen_from(T_CW), name)) == N for name in names)
+
+
+@pytest.mark.parametrize("side", Side)
+def test_the_pose_of_a_frame_is_that_of_the_left_camera(side):
+    T_camera_w = T_CW if side == Side.LEFT else compose(CAMERA.T_right_left, T_CW)
+    frame = Frame.of(Extracted(seen_from(T_camera_w), side=side), CAMERA)
+    assert frame.can_become_keyframe == (side == Side.LEFT)
+    frame.set_camera_pose(T_camera_w)
+    np.testing.assert_allclose(frame.T_cw, T_CW, atol=1e-12)
+    np.testing.assert_allclose(frame.T_camera_w, T_camera_w, atol=1e-12)
+
+
+@pytest.mark.parametrize("side", Side)
+def test_whichever_camera_saw_a_frame_the_left_one_is_found(side):
+    """Refined from a pose nearby, and looked for in a map."""
+    T_camera_w = T_CW if side == Side.LEFT else compose(CAMERA.T_right_left, T_CW)
+    extracted = Extracted(seen_from(T_camera_w), side=side)
+    refined = Frame.of(extracted, CAMERA)
+    refined.landmark, refined.xyz = np.arange(N, dtype=np.int32), points()
+    assert refine(refined, se3_exp(np.full(6, 0.02)) @ T_CW, CONTEXT) == N
+    found = Frame.of(extracted, CAMERA)
+    assert relocalise(found, place(), place(), CONTEXT, seed=0) > 0.8 * N
+    for frame in (refined, found):
+        np.testing.assert_allclose(frame.T_cw, T_CW, atol=1e-4)

@@ -1,0 +1,718 @@
+"""The owner of the map alone: when it merges, what follows the map, and what a failure leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import fields
+
+import numpy as np
+import pytest
+import ring
+from parts import CAMERA, InstantExecutor, Points, ahead, frame_of
+
+from vslam.camera import Camera
+from vslam.config import Config
+from vslam.features import PATCH_PIXELS, Extracted, Features, KeyframePatches
+from vslam.frontend.frame import Frame
+from vslam.frontend.rig import RigCalibration
+from vslam.frontend.tracking import TrackingContext, track_local_map
+from vslam.geometry import inverse, se3_exp
+from vslam.loopclosure.detector import NoDetector
+from vslam.map import Map
+from vslam.map_kernels import erase_landmark
+from vslam.map_view import MapView
+from vslam.mapping import Mapper
+from vslam.slam import Slam
+from vslam.starter import TwoViewStart
+from vslam.states import MapperState
+
+POINTS = Points.create()
+RING = ring.Ring.create(zoom=True)
+EXECUTORS = [lambda: None, InstantExecutor]
+ids = {"argnames": "executor", "argvalues": EXECUTORS, "ids": ["late", "instant"]}
+both = pytest.mark.parametrize(**ids)  # as late as can be, and as early
+
+
+AT_THE_END = -1  # in place of a keyframe
+
+
+class Closing:
+    """Loop closing that does to the map what a test wants, at the end of each mapping job and at
+    the end of the drive."""
+
+    def __init__(self, job: Callable[[Map, int], None] | None = None) -> None:
+        self.is_adjusting = False
+        self.is_due = False
+        self.finished = 0
+        self._job = job
+
+    def process(self, map_: Map, keyframe: int, features: Features, image) -> None:
+        if self._job is not None:
+            self._job(map_, keyframe)
+
+    def follow(self, keyframe: int) -> bool:
+        return self.is_due
+
+    def conclude(self, map_: Map) -> None:
+        if self._job is not None:
+            self._job(map_, AT_THE_END)
+
+    def finish(self, map_: Map) -> None:
+        self.finished += 1
+
+
+def see_points(k: int) -> Features:
+    return POINTS.see(at(k))
+
+
+def at(k: int) -> np.ndarray:
+    """``T_cw`` of a camera that drives on by 0.2 m a frame."""
+    return ahead(0.2 * k, 0.002 * k)
+
+
+class Drive:
+    """A mapper, and frames that are tracked in what it shows: ten a second, 0.2 m apart."""
+
+    def __init__(
+        self,
+        executor=None,
+        closing: Closing | None = None,
+        camera: Camera = CAMERA,
+        see: Callable[[int], Features] = see_points,
+        poses: Callable[[int], np.ndarray] = at,
+        **keyframes: float,
+    ) -> None:
+        config = Config.model_validate({"keyframes": keyframes})
+        self.context = TrackingContext.create(camera, config)
+        self.closing = closing or Closing()
+        self.rig = RigCalibration(camera, config.stereo, self.context.scales)
+        self.mapper = Mapper(self.context, self.closing, self.rig, executor)
+        self.last: Frame | None = None
+        self._see, self._at = see, poses
+
+    def next_frame(self) -> Frame:
+        """The frame to come, at its true pose, tracked in what the mapper shows."""
+        k, mapper = len(self.mapper.frames), self.mapper
+        frame = frame_of(self._see(k), k, 0.1 * k, camera=self.context.camera)
+        frame.T_cw = self._at(k)
+        self.rig.prepare(frame, None)
+        if mapper.n_keyframes:
+            _, _, visible = track_local_map(frame, mapper.view.around, self.context, window=8.0)
+            mapper.count(visible, frame.landmark[frame.landmark >= 0])
+        return frame
+
+    def step(self, *, keyframe: bool = False) -> Frame:
+        """Track another frame, place it and, if asked to, make it a keyframe."""
+        self.mapper.merge_if_due(len(self.mapper.frames))
+        frame = self.next_frame()
+        self.mapper.hold(self.last, frame)
+        self.mapper.place(frame, tracked=True)
+        if keyframe:
+            self.mapper.insert(frame)
+        self.last = frame
+        return frame
+
+    def steps(self, keyframes: Iterable[int], n: int) -> None:
+        """n frames of which some become keyframes."""
+        for k in range(n):
+            self.step(keyframe=k in keyframes)
+
+
+def bytes_of_view(view: MapView) -> bytes:
+    """All that a view shows."""
+    values = (getattr(view, field.name) for field in fields(view))
+    arrays = (x for value in values for x in (value if isinstance(value, tuple) else (value,)))
+    return b"".join(np.ascontiguousarray(x).tobytes() for x in arrays)
+
+
+def bytes_of_map(map_: Map) -> bytes:
+    return (
+        b"".join(array.tobytes() for array in map_.used_arrays())
+        + repr([map_.parents, map_.unit_scale, map_.restarts, map_.disparity_offset]).encode()
+    )
+
+
+# -- the schedule ---------------------------------------------------------------------------------
+
+
+def test_the_first_keyframe_is_mapped_at_once():
+    drive = Drive()
+    assert (drive.mapper.n_keyframes, drive.mapper.is_merged) == (0, True)
+    drive.step(keyframe=True)
+    assert drive.mapper.n_keyframes == 1
+    assert drive.mapper.is_merged
+    assert not drive.mapper.is_mapping
+    assert len(drive.mapper.view.around.ids) == drive.mapper.map.n_landmarks > 50
+
+
+@both
+@pytest.mark.parametrize("after", [1, 2, 4])
+def test_a_keyframe_is_merged_at_the_frame_that_is_due_and_no_other(executor, after):
+    drive = Drive(executor(), merge_after_frames=after)
+    drive.steps([0, 3], 4)
+    mapper, shown = drive.mapper, drive.mapper.view
+    assert (mapper.last_frame, shown.reference, shown.n_keyframes) == (3, 1, 2)
+    for _ in range(after - 1):
+        drive.step()
+        assert (mapper.is_merged, mapper.is_mapping) == (False, True)
+        assert mapper.view is shown
+    drive.step()
+    assert (mapper.is_merged, mapper.is_mapping) == (True, False)
+    assert mapper.view is not shown
+    assert len(mapper.view.around.ids) > len(shown.around.ids)  # two keyframes triangulate
+    merged = mapper.view
+    drive.step()
+    assert mapper.view is merged
+
+
+@both
+def test_whoever_needs_the_map_merges(executor):
+    for use in (
+        lambda drive: drive.mapper.merge(),
+        lambda drive: drive.mapper.finish(),
+        lambda drive: drive.mapper.old_place(drive.last),
+        lambda drive: drive.mapper.refer_to_nearest(drive.last),
+        lambda drive: drive.mapper.map_far_points(drive.last),
+    ):
+        drive = Drive(executor(), merge_after_frames=9)
+        drive.steps([0, 3], 4)
+        shown = drive.mapper.view
+        use(drive)
+        assert drive.mapper.is_merged
+        assert len(drive.mapper.view.around.ids) > len(shown.around.ids)
+
+
+def test_a_keyframe_merges_the_one_before():
+    processed = []
+    drive = Drive(closing=Closing(lambda map_, keyframe: processed.append(keyframe)))
+    drive.steps([0, 3, 4], 4)
+    assert processed == [0]
+    drive.step(keyframe=True)
+    assert processed == [0, 1]
+    assert not drive.mapper.is_merged  # the new one is not, though
+
+
+def trace_on_the_ring(executor, look: Callable[[Mapper], object] = lambda mapper: None) -> list:
+    """What tracking sees at each frame of a drive on the ring, where images are noisy, and the map
+    at its end; ``look`` is called after each frame."""
+    drive = Drive(
+        executor,
+        camera=ring.CAMERA,
+        see=lambda k: RING.see(0.4 * k, 1),
+        poses=lambda k: inverse(RING.pose(0.4 * k)) @ RING.pose(0),
+    )
+    seen = []
+    for k in range(16):
+        frame = drive.step(keyframe=k in (0, 2, 5, 6, 9, 13))
+        mapper = drive.mapper
+        assert np.count_nonzero(frame.landmark >= 0) > 200
+        counts = (mapper.is_merged, mapper.reference, mapper.n_keyframes)
+        poses = [frame.T_cw, *(mapper.frames.pose(i) for i in (-1, mapper.last_frame))]
+        seen.append((counts, bytes_of_view(mapper.view), np.array(poses).tobytes()))
+        look(mapper)
+    drive.mapper.finish()
+    assert len({view for _, view, _ in seen}) == 10  # each keyframe and each merge changes it
+    trajectory = drive.mapper.trajectory().T_wc.tobytes()
+    return [*seen, bytes_of_map(drive.mapper.map), trajectory]
+
+
+def test_nothing_tells_whether_a_keyframe_is_mapped_early_or_late():
+    assert trace_on_the_ring(InstantExecutor()) == trace_on_the_ring(None)
+
+
+def test_completing_a_keyframe_early_changes_no_result():
+    assert trace_on_the_ring(None, Mapper.complete) == trace_on_the_ring(None)
+
+
+@both
+def test_completing_shows_tracking_nothing(executor):
+    drive = Drive(executor(), merge_after_frames=9)
+    drive.steps([0, 3], 5)
+    mapper, shown = drive.mapper, drive.mapper.view
+    held = [drive.last, drive.next_frame()]
+    mapper.hold(*held)
+    before = [(frame.T_cw.tobytes(), frame.landmark.tobytes()) for frame in held]
+    map_ = mapper.complete()
+    assert len(np.unique(map_.arrays.first_keyframe[: map_.n_landmarks])) == 2
+    assert (mapper.is_merged, mapper.is_mapping) == (False, False)
+    assert mapper.view is shown
+    assert [(frame.T_cw.tobytes(), frame.landmark.tobytes()) for frame in held] == before
+    assert mapper.complete() is map_  # and again
+    mapper.merge()
+    assert mapper.view is not shown
+
+
+@both
+def test_the_map_is_not_to_be_had_while_a_keyframe_is_mapped(executor):
+    drive = Drive(executor(), merge_after_frames=9)
+    drive.steps([0, 3], 5)
+    for use in (lambda: drive.mapper.map, drive.mapper.trajectory):
+        with pytest.raises(RuntimeError, match="a keyframe is being mapped"):
+            use()
+    # Frames are placed by the reference keyframe, which is known; others may be moving.
+    np.testing.assert_array_equal(drive.mapper.keyframe_pose(1), drive.mapper.view.T_reference)
+    with pytest.raises(RuntimeError, match="a keyframe is being mapped"):
+        drive.mapper.keyframe_pose(0)
+
+
+def test_a_trajectory_is_not_to_be_had_even_if_all_frames_follow_the_reference_keyframe():
+    """As at the beginning of another drive in a map."""
+    drive = Drive()
+    drive.steps([0, 3], 6)
+    map_ = drive.mapper.complete()
+    drive.mapper = Mapper(drive.context, drive.closing, drive.rig, None, map_)
+    drive.step(keyframe=True)
+    with pytest.raises(RuntimeError, match="a keyframe is being mapped"):
+        drive.mapper.trajectory()
+
+
+@both
+def test_the_map_counts_what_frames_saw_when_it_is_free(executor):
+    drive = Drive(executor(), merge_after_frames=9)
+    drive.steps([0, 3], 4)
+    visible, found = np.array([3, 4, 5], np.int32), np.array([4], np.int32)
+    for _ in range(2):
+        drive.mapper.count(visible, found)
+    counters = [], []
+    for one in (drive, Drive(executor(), merge_after_frames=9)):
+        if one is not drive:
+            one.steps([0, 3], 4)
+        arrays = one.mapper.complete().arrays
+        counters[0].append(arrays.visible[3:6].copy())
+        counters[1].append(arrays.found[3:6].copy())
+    np.testing.assert_array_equal(counters[0][0] - counters[0][1], [2, 2, 2])
+    np.testing.assert_array_equal(counters[1][0] - counters[1][1], [0, 2, 0])
+    before = arrays.visible[3]
+    drive.mapper.complete()
+    assert arrays.visible[3] == before  # each frame counts once
+
+
+# -- what follows the map -------------------------------------------------------------------------
+
+MOVES = [se3_exp(np.array(twist)) for twist in ([0.3, 0, 0, 0, 0.02, 0], [0, 0, -0.4, 0.03, 0, 0])]
+
+
+@both
+def test_held_frames_follow_a_merge(executor):
+    """One that is placed follows its keyframe, one that is not follows the reference keyframe."""
+
+    def move(map_: Map, keyframe: int) -> None:
+        for k in range(keyframe + 1 if keyframe else 0):
+            map_.arrays.T_cw[k] = map_.arrays.T_cw[k] @ MOVES[k]
+
+    drive = Drive(executor(), Closing(move), merge_after_frames=9)
+    drive.step(keyframe=True)
+    placed = drive.step()
+    T_0 = drive.mapper.view.T_reference
+    free = drive.step()
+    drive.step(keyframe=True)
+    T_1 = drive.mapper.view.T_reference
+    unplaced = drive.next_frame()
+    before = [frame.T_cw.copy() for frame in (placed, unplaced, free)]
+    drive.mapper.hold(placed, unplaced)
+    after = drive.mapper.merge().arrays.T_cw
+    assert np.linalg.norm((after[0] @ inverse(T_0))[:3, 3]) > 0.1
+    np.testing.assert_allclose(placed.T_cw, before[0] @ inverse(T_0) @ after[0], atol=1e-12)
+    np.testing.assert_allclose(unplaced.T_cw, before[1] @ inverse(T_1) @ after[1], atol=1e-12)
+    np.testing.assert_array_equal(free.T_cw, before[2])  # not held
+    np.testing.assert_array_equal(placed.T_cw, drive.mapper.frames.pose(placed.index))
+
+
+@both
+def test_held_frames_track_what_became_of_their_landmarks(executor):
+    gone = 7
+
+    def change(map_: Map, keyframe: int) -> None:
+        if keyframe == 1:
+            erase_landmark(map_.arrays, gone)
+            map_.arrays.xyz[: map_.n_landmarks] += 0.25
+            map_.disparity_offset = 0.125
+
+    drive = Drive(executor(), Closing(change), merge_after_frames=9)
+    drive.steps([0, 3], 4)
+    held = [drive.last, drive.next_frame()]
+    drive.mapper.hold(*held)
+    tracked = [frame.landmark.copy() for frame in held]
+    columns = [frame.features.u_right.copy() for frame in held]
+    arrays = drive.mapper.merge().arrays
+    for frame, landmark, u_right in zip(held, tracked, columns, strict=True):
+        assert gone in landmark
+        np.testing.assert_array_equal(frame.landmark, np.where(landmark == gone, -1, landmark))
+        known = frame.landmark >= 0
+        np.testing.assert_array_equal(frame.xyz[known], arrays.xyz[frame.landmark[known]])
+        assert np.isnan(frame.xyz[~known]).all()
+        np.testing.assert_allclose(frame.features.u_right, u_right - 0.125, atol=1e-4)
+    assert drive.rig.disparity_offset == 0.125
+
+
+def see_without_depth(k: int) -> Features:
+    features = POINTS.see(at(k))
+    features.u_right[:] = np.nan
+    return features
+
+
+def monocular_drive(executor, closing: Closing) -> Drive:
+    """A monocular map of two keyframes, 0.6 m apart."""
+    camera = CAMERA.left_camera()
+    drive = Drive(executor, closing, camera, see_without_depth, merge_after_frames=9)
+    begin_with_two_views(drive)
+    return drive
+
+
+def begin_with_two_views(drive: Drive) -> None:
+    """Begin the map with frames 0 and 3."""
+    frames = []
+    for _ in range(4):
+        frames.append(drive.next_frame())
+        frames[-1].T_cw = np.eye(4)
+        drive.mapper.place(frames[-1], tracked=False)
+    every = np.arange(len(POINTS.xyz))
+    start = TwoViewStart(frames[0], frames[3], at(3), (every, every), POINTS.xyz)
+    drive.mapper.begin(start, lambda: None)
+    drive.last = frames[3]
+
+
+def test_a_monocular_map_begins_with_two_keyframes():
+    processed = []
+    drive = monocular_drive(None, Closing(lambda map_, k: processed.append(k)))
+    map_, second = drive.mapper.map, drive.last
+    assert processed == [0, 1]
+    assert (drive.mapper.is_merged, drive.mapper.last_frame) == (True, 3)
+    assert drive.mapper.last_timestamp == second.timestamp
+    assert (map_.frames, map_.parents, map_.n_landmarks) == ([0, 3], [-1, 0], 240)
+    scale = np.linalg.norm(map_.arrays.T_cw[1][:3, 3]) / np.linalg.norm(at(3)[:3, 3])
+    np.testing.assert_array_equal(second.T_cw, map_.arrays.T_cw[1])
+    np.testing.assert_array_equal(second.xyz, map_.arrays.xyz[second.landmark])
+    np.testing.assert_allclose(second.twist[:3] * 0.3, scale * drive_twist(3)[:3], atol=1e-9)
+
+
+def drive_twist(k: int) -> np.ndarray:
+    """``(6,)`` twist from frame 0 to frame k."""
+    return np.array([0.0, 0.0, -0.2 * k, 0.0, -0.002 * k, 0.0])
+
+
+@both
+def test_where_the_unit_of_a_monocular_map_changes_speeds_and_poses_change_with_it(executor):
+    def double(map_: Map, keyframe: int) -> None:
+        if keyframe == 2:
+            map_.arrays.xyz[: map_.n_landmarks] *= 2.0
+            map_.arrays.T_cw[:3, :3, 3] *= 2.0
+            map_.unit_scale[:] = [2.0] * 3
+
+    drive = monocular_drive(executor(), Closing(double))
+    placed = drive.step()
+    drive.step(keyframe=True)
+    unplaced = drive.next_frame()
+    held = [placed, unplaced]
+    for frame in held:
+        frame.twist = np.arange(1.0, 7.0)
+    poses = [frame.T_cw.copy() for frame in held]
+    drive.mapper.hold(*held)
+    drive.mapper.merge()
+    for frame, before in zip(held, poses, strict=True):
+        np.testing.assert_allclose(frame.twist, [2, 4, 6, 4, 5, 6])
+        # All positions are measured from the first keyframe, which is the origin.
+        np.testing.assert_allclose(frame.T_cw[:3, 3], 2.0 * before[:3, 3], atol=2e-3)
+        np.testing.assert_allclose(frame.T_cw[:3, :3], before[:3, :3], atol=1e-4)
+    drive.mapper.hold(*held)
+    drive.mapper.finish()  # nothing more has changed
+    np.testing.assert_allclose(held[0].twist, [2, 4, 6, 4, 5, 6])
+
+
+@pytest.mark.parametrize("adjusting", [False, True])
+def test_where_dead_landmarks_are_dropped_frames_track_the_same_points(adjusting, monkeypatch):
+    """Not while a global bundle adjustment runs, which knows landmarks by their numbers."""
+
+    def kill(map_: Map, keyframe: int) -> None:
+        if keyframe == 1:
+            for landmark in range(0, 60, 3):
+                erase_landmark(map_.arrays, landmark)
+
+    drive = Drive(None, Closing(kill), merge_after_frames=9)
+    drive.steps([0, 3], 4)
+    drive.mapper.merge()
+    drive.closing.is_adjusting = adjusting
+    monkeypatch.setattr(Map, "many_dead_landmarks", True)
+    held, new = drive.step(), drive.next_frame()
+    drive.mapper.place(new, tracked=True)
+    drive.mapper.hold(held, new)
+    numbers, xyz = [frame.landmark.copy() for frame in (held, new)], held.xyz.copy()
+    drive.mapper.insert(new)
+    map_ = drive.mapper.complete()
+    assert map_.arrays.landmark_alive[: map_.n_landmarks].all() != adjusting
+    assert np.array_equal(held.landmark, numbers[0]) == adjusting
+    known = held.landmark >= 0
+    assert np.count_nonzero(known) == np.count_nonzero(numbers[0] >= 0)
+    np.testing.assert_allclose(map_.arrays.xyz[held.landmark[known]], xyz[known], atol=0.05)
+
+
+# -- the reference keyframe -----------------------------------------------------------------------
+
+
+def test_a_frame_may_be_placed_by_the_keyframe_near_which_it_was_found():
+    drive = Drive()
+    drive.steps([0, 3], 6)
+    assert drive.mapper.reference == 1
+    frame = drive.next_frame()
+    drive.mapper.place(frame, tracked=True, near=0)
+    assert drive.mapper.reference == 0
+    assert drive.mapper.frames.table().reference[-1] == 0
+    np.testing.assert_allclose(drive.mapper.frames.pose(-1), frame.T_cw, atol=1e-12)
+
+
+def test_the_reference_can_be_the_keyframe_that_shares_the_most_with_a_frame():
+    drive = Drive(see=lambda k: POINTS.see(at(k), slice(20 * k, 20 * k + 100)))
+    drive.steps([0, 3], 6)
+    mapper, frame = drive.mapper, drive.next_frame()
+    mapper.refer_to(0)
+    mapper.refer_to_nearest(frame)
+    assert mapper.reference == 1
+    other = np.isin(frame.landmark, mapper.map.landmarks_of(1))
+    frame.landmark[other], frame.xyz[other] = -1, np.nan
+    mapper.refer_to_nearest(frame)
+    assert mapper.reference == 1  # the frame shares none with any
+    frame.landmark[:] = -1
+    frame.landmark[:20] = np.setdiff1d(mapper.map.landmarks_of(0), mapper.map.landmarks_of(1))[:20]
+    mapper.refer_to_nearest(frame)
+    assert mapper.reference == 0
+
+
+@pytest.mark.parametrize(("known_after_s", "known"), [(0.5, True), (0.51, False)])
+def test_a_place_is_old_when_its_keyframe_is(known_after_s, known):
+    drive = Drive(known_after_s=known_after_s)
+    drive.steps([0, 3], 5)
+    frame = drive.step()
+    assert frame.timestamp == 0.5
+    place = drive.mapper.old_place(frame)
+    assert (place is not None) == known
+    if place is not None:
+        map_ = drive.mapper.map
+        shared = np.intersect1d(frame.landmark, map_.landmarks_of(0))
+        assert (place.keyframe, place.n_shared) == (0, len(shared))
+        assert place.n_place == 0  # only two keyframes see anything
+
+
+@pytest.mark.parametrize("is_due", [False, True])
+def test_an_old_keyframe_can_serve_in_place_of_a_new_one(is_due):
+    """If a global bundle adjustment is due then, it is merged as a keyframe would be."""
+    drive = Drive(known_after_s=0.3)
+    drive.steps([0, 3], 6)
+    mapper, frame = drive.mapper, drive.last
+    drive.closing.is_due = is_due
+    mapper.follow(mapper.old_place(frame), frame)
+    assert (mapper.reference, mapper.n_keyframes) == (0, 2)
+    assert mapper.last_timestamp == frame.timestamp
+    assert mapper.frames.table().reference[-1] == 0
+    np.testing.assert_allclose(mapper.frames.pose(-1), frame.T_cw, atol=1e-12)
+    assert mapper.last_frame == (frame.index if is_due else 3)
+    assert (mapper.is_mapping, mapper.is_merged) == (is_due, not is_due)
+    drive.step()
+    assert drive.closing.finished == 0
+    drive.step()  # two frames after
+    assert drive.closing.finished == is_due
+    assert mapper.is_merged
+
+
+def test_far_points_are_mapped_of_the_first_keyframe_while_it_is_the_only_one():
+    drive = Drive()
+    frame = drive.step(keyframe=True)
+    near, n = drive.mapper.view, np.count_nonzero(frame.landmark >= 0)
+    assert not drive.mapper.map_far_points(drive.next_frame())  # another frame
+    assert drive.mapper.map_far_points(frame)
+    assert n < np.count_nonzero(frame.landmark >= 0) == 240
+    assert len(drive.mapper.view.around.ids) == 240 > len(near.around.ids)
+    assert np.isfinite(frame.xyz).all()
+    assert not drive.mapper.map_far_points(frame)  # there are no more
+    drive = Drive()
+    first = drive.step(keyframe=True)
+    second = drive.step(keyframe=True)
+    assert not drive.mapper.map_far_points(second)
+    drive.mapper.refer_to(0)
+    assert not drive.mapper.map_far_points(first)
+
+
+# -- failures -------------------------------------------------------------------------------------
+
+INCOMPLETE = r"^mapping [^.]*failed [^.]*incomplete; continue from a map that was saved before$"
+
+
+class BrokenError(Exception):
+    """What a mapping job fails with in these tests."""
+
+
+def fail(map_: Map, keyframe: int) -> None:
+    if keyframe == 1:
+        raise BrokenError
+
+
+@both
+@pytest.mark.parametrize(
+    "first",
+    [
+        lambda drive: drive.mapper.merge(),
+        lambda drive: drive.mapper.complete(),
+        lambda drive: drive.mapper.finish(),
+        lambda drive: drive.mapper.insert(drive.last),
+        lambda drive: drive.steps([], 6),
+    ],
+    ids=["merge", "complete", "finish", "insert", "drive"],
+)
+def test_a_job_that_fails_says_so_once_and_the_map_says_so_from_then_on(executor, first):
+    drive = Drive(executor(), Closing(fail), merge_after_frames=3)
+    drive.steps([0, 3], 5)
+    mapper, frame = drive.mapper, drive.last
+    view, pose = mapper.view, mapper.frames.pose(-1).tobytes()
+    with pytest.raises(BrokenError):
+        first(drive)
+    start = TwoViewStart(frame, frame, at(1), (np.arange(2), np.arange(2)), POINTS.xyz[:2])
+    for use in (
+        lambda: mapper.map,
+        mapper.merge,
+        mapper.complete,
+        mapper.finish,
+        mapper.trajectory,
+        lambda: mapper.merge_if_due(99),
+        lambda: mapper.insert(frame),
+        lambda: mapper.map_far_points(frame),
+        lambda: mapper.begin(start, lambda: None),
+        lambda: mapper.old_place(frame),
+        lambda: mapper.refer_to(0),
+        lambda: mapper.refer_to_nearest(frame),
+        lambda: mapper.keyframe_pose(0),
+    ):
+        with pytest.raises(RuntimeError, match=INCOMPLETE):
+            use()
+    assert mapper.view is view
+    assert mapper.frames.pose(4).tobytes() == pose
+
+
+@pytest.mark.parametrize(
+    ("failing", "change"),
+    [
+        (0, lambda drive: drive.step(keyframe=True)),
+        (0, begin_with_two_views),
+        (1, begin_with_two_views),
+        (AT_THE_END, lambda drive: drive.mapper.finish()),
+    ],
+    ids=["first keyframe", "first view", "second view", "end"],
+)
+def test_a_change_that_fails_where_no_job_runs_leaves_no_other_map(failing, change):
+    def fail(map_: Map, keyframe: int) -> None:
+        if keyframe == failing:
+            raise BrokenError
+
+    drive = Drive(closing=Closing(fail), see=see_without_depth)
+    with pytest.raises(BrokenError):
+        change(drive)
+    for use in (lambda: drive.mapper.map, drive.mapper.complete, drive.mapper.finish):
+        with pytest.raises(RuntimeError, match=INCOMPLETE):
+            use()
+
+
+@pytest.mark.parametrize("failing", [0, 2])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_map_that_is_incomplete_is_not_saved(failing, threads, tmp_path):
+    class Detector(NoDetector):
+        """Fails at one of the keyframes."""
+
+        def add(self, keyframe, image, features):
+            if keyframe == failing:
+                raise BrokenError
+
+    path = tmp_path / "map.npz"
+    path.write_bytes(b"an older map")
+    slam = Slam(CAMERA, detector=Detector(), threads=threads)
+    results = []
+
+    def drive() -> None:
+        for k in range(40):
+            results.append(slam.step_features(Extracted(POINTS.see(at(k))), 0.1 * k))
+
+    with pytest.raises(BrokenError):
+        drive()
+    assert sum(result.is_keyframe for result in results) == (failing + 1 if failing else 0)
+    for use in (
+        lambda: slam.save(path),
+        slam.stored_map,
+        lambda: slam.map,
+        slam.trajectory,
+        slam.finish,
+        lambda: slam.step_features(Extracted(POINTS.see(at(41))), 4.1),
+    ):
+        with pytest.raises(RuntimeError, match=INCOMPLETE):
+            use()
+    assert path.read_bytes() == b"an older map"
+    assert [file.name for file in tmp_path.iterdir()] == ["map.npz"]
+
+
+# -- state ----------------------------------------------------------------------------------------
+
+
+def test_a_mapper_that_is_restored_goes_on_as_the_one_that_was_not():
+    """The reference keyframe is not the newest, as after a frame was found in the map."""
+    one = Drive()
+    one.steps([0, 3], 6)
+    one.mapper.place(one.next_frame(), tracked=True, near=0)
+    state, map_ = one.mapper.state(), one.mapper.complete()
+    other = Drive()
+    other.mapper = Mapper(
+        other.context, other.closing, other.rig, None, copy_of(map_), one.mapper.frames.table()
+    )
+    assert other.mapper.reference == 1  # the newest keyframe, where nothing else is known
+    other.mapper.restore(state)
+    assert other.mapper.state() == state == MapperState(0, 3, pytest.approx(0.3), ())
+    assert bytes_of_view(other.mapper.view) == bytes_of_view(one.mapper.view)
+    for drive in (one, other):
+        drive.last = None
+        drive.step(keyframe=True)
+        drive.step()
+        drive.mapper.finish()
+    assert bytes_of_map(other.mapper.map) == bytes_of_map(one.mapper.map)
+    tables = [drive.mapper.frames.table() for drive in (one, other)]
+    for mine, theirs in zip(*tables, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def copy_of(map_: Map) -> Map:
+    """A map that holds the same."""
+    other = Map(map_.scales)
+    vars(other).update(
+        {name: list(x) if isinstance(x, list) else x for name, x in vars(map_).items()}
+    )
+    other.arrays = type(map_.arrays)(*(array.copy() for array in map_.arrays))
+    return other
+
+
+def test_the_patches_of_keyframes_are_part_of_the_state():
+    drive = Drive()
+    drive.steps([0, 3], 6)
+    rng = np.random.default_rng(0)
+    patches = tuple(
+        KeyframePatches(
+            keyframe,
+            rng.integers(0, 256, (240, PATCH_PIXELS), dtype=np.uint8),
+            rng.normal(size=(240, 2)).astype(np.float32),
+        )
+        for keyframe in (0, 1)
+    )
+    drive.mapper.restore(MapperState(1, 3, 0.3, patches))
+    again = drive.mapper.state().patches
+    assert len(again) == 2
+    for mine, theirs in zip(again, patches, strict=True):
+        assert mine.keyframe == theirs.keyframe
+        np.testing.assert_array_equal(mine.pixels, theirs.pixels)
+        np.testing.assert_array_equal(mine.shift, theirs.shift)
+    shown = drive.mapper.view.patches
+    assert set(shown.ids) == set(drive.mapper.map.landmarks_of(1))
+
+
+@pytest.mark.parametrize("same_drive", [True, False])
+def test_only_the_same_drive_counts_frames_from_its_newest_keyframe(same_drive):
+    one = Drive()
+    one.steps([0, 3], 6)
+    map_ = copy_of(one.mapper.map)
+    map_.session += not same_drive
+    other = Mapper(one.context, one.closing, one.rig, None, map_, one.mapper.frames.table())
+    other.continue_drive()
+    assert other.last_frame == (3 if same_drive else -1)
+    assert other.last_timestamp == (map_.timestamps[1] if same_drive else -np.inf)

@@ -1,0 +1,87 @@
+"""Every threshold of the pipeline in one tree; docs/thresholds.md is made from it.
+
+Each module holds the thresholds of one stage.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from vslam.config.closing import LoopConfig, PoseGraphConfig
+from vslam.config.depth import DepthConfig, StereoConfig
+from vslam.config.detection import BowConfig, SiameseConfig
+from vslam.config.extraction import OrbConfig, WeakImageConfig
+from vslam.config.initialization import InitializationConfig
+from vslam.config.keyframes import KeyframeConfig
+from vslam.config.mapping import MappingConfig
+from vslam.config.relocalization import RelocalizationConfig
+from vslam.config.section import Section
+from vslam.config.tracking import AlignmentConfig, TrackingConfig
+from vslam.config.verification import (
+    ConsistencyConfig,
+    LearnedMatchingConfig,
+    VerificationConfig,
+)
+from vslam.errors import InputError
+
+__all__ = [
+    "AlignmentConfig",
+    "BowConfig",
+    "Config",
+    "ConsistencyConfig",
+    "DepthConfig",
+    "InitializationConfig",
+    "KeyframeConfig",
+    "LearnedMatchingConfig",
+    "LoopConfig",
+    "MappingConfig",
+    "OrbConfig",
+    "PoseGraphConfig",
+    "RelocalizationConfig",
+    "SiameseConfig",
+    "StereoConfig",
+    "TrackingConfig",
+    "VerificationConfig",
+    "WeakImageConfig",
+    "load_config",
+]
+
+
+class Config(Section):
+    """The whole configuration, written to ``config.json`` of each run and read by --config."""
+
+    orb: OrbConfig = OrbConfig()
+    weak_images: WeakImageConfig = WeakImageConfig()
+    stereo: StereoConfig = StereoConfig()
+    depth: DepthConfig = DepthConfig()
+    alignment: AlignmentConfig = AlignmentConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    initialization: InitializationConfig = InitializationConfig()
+    keyframes: KeyframeConfig = KeyframeConfig()
+    mapping: MappingConfig = MappingConfig()
+    verification: VerificationConfig = VerificationConfig()
+    learned: LearnedMatchingConfig = LearnedMatchingConfig()
+    consistency: ConsistencyConfig = ConsistencyConfig()
+    relocalization: RelocalizationConfig = RelocalizationConfig()
+    loops: LoopConfig = LoopConfig()
+    bow: BowConfig = BowConfig()
+    pose_graph: PoseGraphConfig = PoseGraphConfig()
+    siamese: SiameseConfig = SiameseConfig()
+
+
+def load_config(path: Path) -> Config:
+    """Read a configuration in JSON; keys left out keep their defaults.
+
+    Raises:
+        InputError: missing file, no JSON, unknown key or value out of range.
+    """
+    try:
+        return Config.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the configuration ({error.strerror}).") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "file"
+        raise InputError(f"{path}: {where}: {first['msg']}.") from error

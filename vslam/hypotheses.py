@@ -1,0 +1,158 @@
+"""The pose graph of a loop under two hypotheses about where the camera was lost.
+
+Where tracking was lost a new sub-map begins, and its place in the map is only predicted. Either the
+camera went on about as predicted, so that the prediction is a measurement with a known error; or it
+was kidnapped, that is carried to an unknown place, and the prediction says nothing. A loop is tried
+under the first hypothesis, then under the second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.backend.pose_graph import (
+    GAP,
+    WEAK,
+    GraphCheck,
+    PoseGraph,
+    check_pose_graph,
+    essential_graph,
+    optimise,
+)
+from vslam.backend.similarity_graph import (
+    check_similarity_graph,
+    optimise_similarities,
+    rigid,
+)
+from vslam.config import PoseGraphConfig
+from vslam.geometry import Matrix, compose, inverse, inverses, orthonormalised
+from vslam.loops import LoopEdge
+from vslam.map import Map
+
+
+class Hypothesis(Enum):
+    """What the camera did while tracking was lost."""
+
+    PREDICTED = "it went on about as predicted"
+    KIDNAPPED = "it was carried to an unknown place"
+
+
+@dataclass(frozen=True)
+class Solution:
+    """An optimised pose graph.
+
+    Attributes:
+        graph: N keyframes, with the poses that the optimisation started from.
+        T_cw: ``(N, 4, 4)`` optimised poses.
+        S_wc: ``(N, 4, 4)`` the same as similarities, whose scale is 1 in a metric map.
+        verdict: whether the edges of the optimised graph agree.
+    """
+
+    graph: PoseGraph
+    T_cw: Matrix
+    S_wc: Matrix
+    verdict: GraphCheck
+
+    @property
+    def has_gaps(self) -> bool:
+        """Whether tracking was lost between keyframes of the graph, so that the other hypothesis
+        may give another solution."""
+        return bool(np.isin(self.graph.kind, (GAP, WEAK)).any())
+
+
+def solve(
+    map_: Map,
+    closed: Sequence[LoopEdge],
+    edge: LoopEdge,
+    hypothesis: Hypothesis,
+    config: PoseGraphConfig,
+    *,
+    monocular: bool,
+) -> Solution:
+    """Build and optimise the pose graph with a new loop. Only reads the map.
+
+    Args:
+        closed: loops that were closed before, in today's units.
+        edge: the new loop, with its pose.
+        monocular: whether scale drifts, too, so that keyframes have similarities.
+    """
+    predicted = hypothesis is Hypothesis.PREDICTED
+    graph = essential_graph(
+        map_,
+        [*closed, edge],
+        config,
+        weak=map_.restarts,
+        unpredicted=map_.unpredicted_restarts,
+        driven=predicted,
+    )
+    T_cw = map_.arrays.T_cw[: map_.n_keyframes]
+    if monocular:
+        S_wc = inverses(T_cw) if predicted else _similarly_aligned(map_, closed, edge)
+        start = S_wc[graph.keyframes]
+        found = optimise_similarities(graph, start, config)
+        verdict = check_similarity_graph(graph, start, found, config)
+        return Solution(graph, inverses(rigid(found)), found, verdict)
+    start = T_cw if predicted else _aligned(map_, closed, edge)
+    graph = replace(graph, T_cw=start[graph.keyframes])
+    found = optimise(graph, config)
+    return Solution(graph, found, inverses(found), check_pose_graph(graph, found, config))
+
+
+def joined_submaps(map_: Map, closed: Sequence[LoopEdge]) -> NDArray[np.int64]:
+    """``(n_keyframes,)`` sub-map of each keyframe; those joined by closed loops count as one."""
+    submap = map_.submaps()
+    for edge in closed:
+        one, other = submap[edge.query], submap[edge.match]
+        submap[submap == max(one, other)] = min(one, other)
+    return submap
+
+
+def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
+    """Start poses ``T_cw`` ``(n_keyframes, 4, 4)`` of a kidnapped camera: the sub-map that a loop
+    joins to another is moved as a whole to where the loop puts it."""
+    T_cw = map_.arrays.T_cw[: map_.n_keyframes].copy()
+    moving, keyframes = _moving_submap(map_, closed, edge)
+    assert edge.T_query_match is not None
+    if moving == edge.query:
+        T_new = compose(edge.T_query_match, T_cw[edge.match])
+    else:
+        T_new = compose(inverse(edge.T_query_match), T_cw[edge.query])
+    T_old_new = compose(inverse(T_cw[moving]), T_new)  # new world to old world
+    for keyframe in keyframes:
+        T_cw[keyframe] = orthonormalised(compose(T_cw[keyframe], T_old_new))
+    return T_cw
+
+
+def _similarly_aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
+    """``_aligned`` for a monocular map: similarities ``S_wc``, since the sub-map that moves takes
+    on the unit of the other one."""
+    T_cw = map_.arrays.T_cw[: map_.n_keyframes]
+    S_wc = inverses(T_cw)
+    moving, keyframes = _moving_submap(map_, closed, edge)
+    assert edge.T_query_match is not None
+    S_query_match = edge.T_query_match.copy()
+    S_query_match[:3] *= edge.scale
+    if moving == edge.query:
+        S_new = S_wc[edge.match] @ np.linalg.inv(S_query_match)
+    else:
+        S_new = S_wc[edge.query] @ S_query_match
+    S_wc[keyframes] = S_new @ T_cw[moving] @ S_wc[keyframes]
+    return S_wc
+
+
+def _moving_submap(
+    map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge
+) -> tuple[int, NDArray[np.int64]]:
+    """The end of a loop whose sub-map is moved to the other end's, and the keyframes of that
+    sub-map; no keyframes if both ends are in one sub-map."""
+    submap = joined_submaps(map_, closed)
+    if submap[edge.query] == submap[edge.match]:
+        return edge.query, np.empty(0, np.int64)
+    # The sub-map of the first keyframe defines the world. Of two others, the query's moves.
+    moving = edge.match if submap[edge.query] == submap[0] else edge.query
+    return moving, np.flatnonzero(submap == submap[moving])

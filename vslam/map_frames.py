@@ -1,0 +1,190 @@
+"""What passes between a frame and the map: observations, landmarks, places.
+
+Free functions; whoever calls them is the one who may read, or write, the map at that moment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.backend.two_views import map_two_views
+from vslam.frame_poses import FrameTable
+from vslam.frontend.frame import Frame
+from vslam.geometry import inverses
+from vslam.hypotheses import joined_submaps
+from vslam.loops import LoopEdge
+from vslam.map import Map
+from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
+from vslam.starter import TwoViewStart
+from vslam.trajectory import Trajectory
+
+
+def add_frame(
+    map_: Map, frame: Frame, certainty: NDArray[np.uint8] | int, reference: int, *, predicted: bool
+) -> int:
+    """Add a frame to the map as a keyframe that observes the landmarks it tracks.
+
+    A frame that tracks no landmark of another keyframe begins a sub-map.
+
+    Args:
+        certainty: ``(N,)`` of its features (``Arrays.certainty``).
+        reference: the parent of such a sub-map's first keyframe.
+        predicted: whether the pose of such a keyframe is at least a prediction.
+
+    Returns:
+        The keyframe.
+    """
+    keyframe = map_.add_keyframe(
+        frame.observed(), frame.T_cw, frame.timestamp, frame.index, certainty
+    )
+    tracked = np.flatnonzero(frame.landmark >= 0)
+    link_many(map_.arrays, map_.rows(keyframe).start + tracked, frame.landmark[tracked])
+    if keyframe > 0:
+        neighbours, _ = map_.covisible(keyframe)
+        if len(neighbours):
+            map_.parents[keyframe] = int(neighbours[0])
+        else:
+            map_.begin_submap(keyframe, reference, predicted=predicted)
+    return keyframe
+
+
+def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, int]:
+    """Add the two keyframes of a monocular map or sub-map, and the points that both see.
+
+    Args:
+        reference: the parent of a sub-map's first keyframe.
+
+    Returns:
+        The keyframes.
+    """
+    frames = start.first, start.second
+    first, second = map_two_views(
+        map_,
+        (frames[0].features, frames[1].features),
+        start.features,
+        start.first.T_cw,
+        start.T_2_1,
+        start.points,
+        (frames[0].timestamp, frames[1].timestamp),
+        (frames[0].index, frames[1].index),
+    )
+    if first > 0:
+        map_.begin_submap(first, reference, predicted=start.predicted)
+    map_.parents[second] = first
+    return first, second
+
+
+class LandmarkCounts:
+    """Which landmarks frames should have seen and did see, until the map is free to count them."""
+
+    def __init__(self) -> None:
+        self._visible: list[NDArray[np.int32]] = []
+        self._found: list[NDArray[np.int32]] = []
+
+    def add(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
+        """Remember those of a frame, ``(N,)`` and ``(M,)`` ids."""
+        self._visible.append(visible)
+        self._found.append(found)
+
+    def write(self, map_: Map) -> None:
+        """Add what is remembered to the counters of the map."""
+        a = map_.arrays
+        for seen, counter in ((self._visible, a.visible), (self._found, a.found)):
+            for ids in seen:
+                counter[ids] += 1
+            seen.clear()
+
+
+def drop_dead_landmarks(map_: Map, frames: Sequence[Frame]) -> None:
+    """Make room in the map; the landmarks that frames track keep their meaning under new ids."""
+    new_id = map_.drop_dead_landmarks()
+    for frame in {id(frame): frame for frame in frames}.values():
+        tracked = frame.landmark >= 0
+        frame.landmark = frame.landmark.copy()
+        frame.landmark[tracked] = new_id[frame.landmark[tracked]]
+
+
+def has_more_points(map_: Map, keyframe: int, frame: Frame) -> bool:
+    """Whether a keyframe is the first of a map or sub-map, no other follows it yet, and a frame is
+    the one that it was made of: then its far stereo points are not mapped yet."""
+    begins = keyframe == 0 or keyframe in map_.restarts
+    return begins and keyframe == map_.n_keyframes - 1 and map_.frames[keyframe] == frame.index
+
+
+def observe_keyframe(frame: Frame, map_: Map, keyframe: int) -> None:
+    """Let a frame track all landmarks that the keyframe it became observes."""
+    frame.landmark = map_.arrays.landmark[map_.rows(keyframe)]
+    update_landmarks(frame, map_)
+
+
+def update_landmarks(frame: Frame, map_: Map) -> None:
+    """Bring the landmarks of a frame up to date: those that were merged into others are replaced,
+    those that are gone become -1, and ``frame.xyz`` is where they are now.
+
+    Two landmarks may have become one: the first feature keeps it.
+    """
+    arrays = map_.arrays
+    ids = resolve(arrays, frame.landmark)
+    _, first = np.unique(ids, return_index=True)
+    repeated = np.ones(len(ids), np.bool_)
+    repeated[first] = False
+    ids[repeated] = -1
+    frame.landmark = ids
+    frame.xyz = np.where((ids >= 0)[:, None], arrays.xyz[ids], np.nan)
+
+
+def count_shared_landmarks(map_: Map, frame: Frame) -> NDArray[np.int64]:
+    """``(n_keyframes,)`` how many of the landmarks that a frame tracks each keyframe observes."""
+    a, n = map_.arrays, map_.n_keyframes
+    _, rows = gather_observations(a, frame.landmark[frame.landmark >= 0], np.arange(n))
+    return np.bincount(a.keyframe[rows], minlength=n)
+
+
+class OldPlace(NamedTuple):
+    """A place that was mapped some time ago, or on an earlier drive.
+
+    Attributes:
+        keyframe: that shares the most landmarks with a frame.
+        n_shared: how many it shares.
+        n_place: how many of the keyframe's landmarks at least three keyframes observe.
+    """
+
+    keyframe: int
+    n_shared: int
+    n_place: int
+
+
+def find_old_place(map_: Map, frame: Frame, known_after_s: float) -> OldPlace | None:
+    """The place that shares the most landmarks with a frame, among the keyframes that are at least
+    ``known_after_s`` seconds old; None if none shares any."""
+    young = np.array(map_.sessions) == map_.session
+    young &= np.array(map_.timestamps) > frame.timestamp - known_after_s
+    shared = np.where(young, 0, count_shared_landmarks(map_, frame))
+    best = int(np.argmax(shared))
+    if shared[best] == 0:
+        return None
+    return OldPlace(best, int(shared[best]), count_seen_by(map_.arrays, best, 3))
+
+
+def keyframe_trajectory(map_: Map) -> Trajectory:
+    """Pose of every keyframe of the last drive that was not culled."""
+    living = map_.living_keyframes()
+    living = living[np.array(map_.sessions, np.int64)[living] == map_.session]
+    times = np.array([map_.timestamps[k] for k in living], np.float64)
+    return Trajectory(times, inverses(map_.arrays.T_cw[living]))
+
+
+def in_first_part(map_: Map, closed: Sequence[LoopEdge], frames: FrameTable) -> NDArray[np.bool_]:
+    """``(N,)`` frames tracked in the part of the map that holds its first keyframe.
+
+    Args:
+        closed: loops; sub-maps that they join are one part.
+    """
+    if not map_.n_keyframes:
+        return frames.tracked
+    part = joined_submaps(map_, closed)
+    return frames.tracked & (part[frames.reference] == part[0])

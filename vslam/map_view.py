@@ -1,0 +1,100 @@
+"""Copies of the map that tracking reads, so that local mapping can write the map meanwhile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.features import NO_PATCHES, LandmarkPatches
+from vslam.geometry import Matrix
+from vslam.map import Map
+from vslam.map_kernels import collect_landmarks, count_seen_by
+
+
+class LocalMap(NamedTuple):
+    """Landmarks around a keyframe.
+
+    ``ids`` (N,) i4; ``xyz``, ``normal`` (N, 3) f8; ``distance_range`` (N, 2) f8; ``descriptor``
+    (N, 4) u8.
+    """
+
+    ids: NDArray[np.int32]
+    xyz: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    distance_range: NDArray[np.float64]
+    descriptor: NDArray[np.uint64]
+
+
+def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
+    """Copy the landmarks of a keyframe and of its covisible keyframes (ORB-SLAM, V-D).
+
+    ORB-SLAM adds neighbours of neighbours; those changed no figure here (docs/design.md).
+
+    Args:
+        limit: at most this many keyframes, nearest in covisibility first.
+    """
+    first, _ = map_.covisible(keyframe)
+    chosen = [keyframe, *first[: limit - 1].tolist()]
+    a = map_.arrays
+    ids = collect_landmarks(a, np.array(chosen, np.int64), map_.n_landmarks)
+    return LocalMap(
+        ids, a.xyz[ids], a.normal[ids], a.distance_range[ids], a.landmark_descriptor[ids]
+    )
+
+
+NO_LANDMARKS = LocalMap(
+    np.empty(0, np.int32),
+    np.empty((0, 3)),
+    np.empty((0, 3)),
+    np.empty((0, 2)),
+    np.empty((0, 4), np.uint64),
+)
+
+
+@dataclass(frozen=True)
+class MapView:
+    """What tracking sees of the map: as of the last merge of local mapping, whatever the mapping
+    thread writes meanwhile. The defaults are those of an empty map.
+
+    Attributes:
+        reference: the keyframe that frames are tracked against and placed by, usually the newest.
+        T_reference: ``(4, 4)`` its ``T_cw``.
+        unit_scale: ``Map.unit_scale`` of it.
+        n_keyframes: keyframes made so far, culled ones included.
+        around: landmarks of the reference keyframe and of its covisible keyframes.
+        nearest: landmarks of the reference keyframe alone.
+        n_reference: how many of these at least three keyframes observe (all, in a young map).
+        patches: image patches of those landmarks around that the newest keyframes observe.
+    """
+
+    reference: int = 0
+    T_reference: Matrix = field(default_factory=lambda: np.eye(4))
+    unit_scale: float = 1.0
+    n_keyframes: int = 0
+    around: LocalMap = NO_LANDMARKS
+    nearest: LocalMap = NO_LANDMARKS
+    n_reference: int = 0
+    patches: LandmarkPatches = NO_PATCHES
+
+
+def view_of(
+    map_: Map, keyframe: int, around: LocalMap, patches: LandmarkPatches, *, monocular: bool
+) -> MapView:
+    """What tracking sees from a reference keyframe; the rest as in ``MapView``."""
+    living = map_.living_keyframes()
+    if monocular and map_.restarts:
+        # A sub-map is young once more: without stereo nothing but this tells when to go on.
+        living = living[living >= map_.restarts[-1]]
+    return MapView(
+        reference=keyframe,
+        T_reference=map_.keyframe_pose(keyframe),
+        unit_scale=map_.unit_scale[keyframe],
+        n_keyframes=map_.n_keyframes,
+        around=around,
+        nearest=local_map(map_, keyframe, 1),
+        n_reference=count_seen_by(map_.arrays, keyframe, min(3, len(living))),
+        patches=patches,
+    )

@@ -1,0 +1,158 @@
+"""What SLAM does with a frame that was tracked or lost: build the map, or leave it as it is."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from vslam.frontend.frame import Frame
+from vslam.frontend.keyframes import KeyframePolicy, PlaceEvidence
+from vslam.frontend.tracker import Found, Tracker
+from vslam.frontend.tracking import TrackingContext
+from vslam.mapping import Mapper
+from vslam.starter import OneViewStart, Starter
+from vslam.states import PolicyState
+
+
+class Mode(Protocol):
+    """What becomes of the map.
+
+    Attributes:
+        changes_map: whether a drive in this mode leaves anything in the map.
+    """
+
+    changes_map: bool
+
+    def begin(self, frame: Frame) -> bool:
+        """Begin a map, or a sub-map, with a frame that is placed but not tracked, if it can be;
+        returns whether."""
+        ...
+
+    def begin_after_loss(self, frame: Frame) -> bool:
+        """``begin``, but only if the camera was lost for long enough."""
+        ...
+
+    def see_farther(self) -> bool:
+        """Let a frame that is lost right after a map or sub-map began see more of it; returns
+        whether there is more."""
+        ...
+
+    def extend(self, frame: Frame, found: Found) -> bool:
+        """Take up what a frame saw that is tracked and placed. Returns whether the frame became a
+        keyframe."""
+        ...
+
+    def state(self) -> PolicyState | None:
+        """What ``restore`` needs, None if that is more than can be kept now."""
+        ...
+
+    def restore(self, state: PolicyState) -> None:
+        """Remember what ``state`` gave."""
+        ...
+
+
+class Localising:
+    """Leaves the map as it is."""
+
+    changes_map = False
+
+    def __init__(self, mapper: Mapper) -> None:
+        self._mapper = mapper
+
+    def begin(self, frame: Frame) -> bool:
+        return False
+
+    def begin_after_loss(self, frame: Frame) -> bool:
+        return False
+
+    def see_farther(self) -> bool:
+        return False
+
+    def extend(self, frame: Frame, found: Found) -> bool:
+        self._mapper.refer_to_nearest(frame)
+        return False
+
+    def state(self) -> PolicyState | None:
+        return None
+
+    def restore(self, state: PolicyState) -> None:
+        pass
+
+
+class MapBuilding:
+    """Makes keyframes of frames that see something new.
+
+    Attributes:
+        starter: finds the frames with which a map or a sub-map begins.
+        policy: decides which frames become keyframes.
+    """
+
+    changes_map = True
+
+    def __init__(self, context: TrackingContext, mapper: Mapper, tracker: Tracker) -> None:
+        self.starter = Starter(context)
+        self.policy = KeyframePolicy(context)
+        self._monocular = context.camera.monocular
+        self._config = context.config.tracking
+        self._mapper = mapper
+        self._tracker = tracker
+
+    def begin(self, frame: Frame) -> bool:
+        start = self.starter.offer(frame)
+        if start is None:
+            return False
+        if isinstance(start, OneViewStart):
+            frame.landmark[:] = -1
+            self._mapper.insert(frame, predicted=self._tracker.twist is not None)
+            self.policy.keyframe_made()
+        else:
+            self._mapper.begin(start, lambda: self._tracker.twist)
+            self.starter.reset()
+        self._tracker.start_from(frame)
+        return True
+
+    def begin_after_loss(self, frame: Frame) -> bool:
+        config = self._config
+        young = self._mapper.n_keyframes <= config.young_keyframes
+        patience = 1 if young else config.lost_frames_before_restart
+        if self._monocular:
+            patience = config.monocular_lost_frames
+        return self._tracker.lost_frames >= patience and self.begin(frame)
+
+    def see_farther(self) -> bool:
+        last = self._tracker.last
+        if last is None or last.twist is not None or self._monocular:
+            return False
+        return self._mapper.map_far_points(last)
+
+    def extend(self, frame: Frame, found: Found) -> bool:
+        self.starter.reset()
+        self._mapper.count(found.visible, frame.landmark[frame.landmark >= 0])
+        if not frame.can_become_keyframe:
+            return False
+        evidence = self.policy.observe(
+            frame,
+            self._mapper.view,
+            seconds_since_keyframe=frame.timestamp - self._mapper.last_timestamp,
+            mapping_idle=self._mapper.is_merged,
+        )
+        if not self.policy.wants_keyframe(evidence):
+            return False
+        place = self._mapper.old_place(frame)
+        if place is not None:
+            n_inliers = int(np.count_nonzero(frame.landmark >= 0))
+            if self.policy.is_known(PlaceEvidence(n_inliers, place.n_shared, place.n_place)):
+                self._mapper.follow(place, frame)
+                return False
+        self._mapper.insert(frame)
+        self.policy.keyframe_made()
+        return True
+
+    def state(self) -> PolicyState | None:
+        """What is remembered between two frames; None while a frame waits for a second one to begin
+        a map with."""
+        return None if self.starter.is_waiting else self.policy.state()
+
+    def restore(self, state: PolicyState) -> None:
+        self.policy.restore(state)

@@ -12,10 +12,7 @@ RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheel .
 FROM python:3.11-slim
 COPY --from=wheel /wheel /wheel
 COPY constraints.txt /wheel/constraints.txt
-# torch for the CPU first: the one on PyPI brings gigabytes of CUDA.
-RUN pip install --no-cache-dir torch --index-url https://download.pytorch.org/whl/cpu \
-        --constraint /wheel/constraints.txt \
-    && pip install --no-cache-dir "$(ls /wheel/vslam-*.whl)[bag]" \
+RUN pip install --no-cache-dir "$(ls /wheel/vslam-*.whl)[bag]" \
         --constraint /wheel/constraints.txt \
     && useradd --create-home --uid 1000 vslam \
     && install --directory --owner vslam /work /work/runs \

@@ -1,27 +1,30 @@
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help install demo test check format docs clean
+.PHONY: help install dev demo test check format docs clean
 
 VENV ?= .venv
 BIN := $(abspath $(VENV))/bin
 INSTALLED := $(VENV)/.installed
+DEVELOPED := $(VENV)/.developed
 # Where torch for the CPU is; empty: take what pip finds.
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 help:  ## show this list
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
 
-install: $(INSTALLED)  ## make .venv and install vslam with its tools into it
+install: $(INSTALLED)  ## make .venv and install what a run needs into it
+
+dev: $(DEVELOPED)  ## add what training, tests, lint and documentation need
 
 demo: $(INSTALLED)  ## drive a street by day and again by night: the default detector against bow
 	$(BIN)/vslam run --dataset synthetic --seq night --compare bow
 
-test: $(INSTALLED)  ## run the tests, then the built wheel in a clean environment
+test: $(DEVELOPED)  ## run the tests, then the built wheel in a clean environment
 	$(BIN)/python -m pytest
 	$(BIN)/python tools/wheel_test.py
 
 # mypy cannot follow the folders' mapping to vslam.* (pyproject.toml): it reads a plain installation.
-check: $(INSTALLED)  ## check format, lint and types
+check: $(DEVELOPED)  ## check format, lint and types
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
 	rm -rf build
@@ -29,11 +32,11 @@ check: $(INSTALLED)  ## check format, lint and types
 	cd build/typecheck && \
 	  $(BIN)/mypy --config-file $(CURDIR)/pyproject.toml --cache-dir $(CURDIR)/.mypy_cache -p vslam
 
-format: $(INSTALLED)  ## format the code and repair what lint can
+format: $(DEVELOPED)  ## format the code and repair what lint can
 	$(BIN)/ruff format
 	$(BIN)/ruff check --fix
 
-docs: $(INSTALLED)  ## build the documentation site, warnings are errors: build/site/index.html
+docs: $(DEVELOPED)  ## build the documentation site, warnings are errors: build/site/index.html
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs build/site
 
 clean:  ## remove build products and caches (.venv, data and runs stay)
@@ -55,6 +58,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 	  $$python -m venv $(VENV) || { \
 	    echo "$$python has no venv module: install it (Debian, Ubuntu: python3-venv)" >&2; exit 1; }; \
 	fi
+	@echo 'Installing vslam into $(VENV): a minute or two'
+	@$(BIN)/python -m pip install --quiet -e . -c constraints.txt
+	@touch $@
+
+$(DEVELOPED): $(INSTALLED)
 	@# PyPI's torch for Linux brings gigabytes of CUDA; the CPU's build has an index of its own.
 	@if [ -n "$(TORCH_INDEX)" ] && $(BIN)/python -m pip install --quiet --dry-run --no-deps \
 	    --report - torch -c constraints.txt | grep -qE '"(nvidia|cuda)-'; then \
@@ -62,6 +70,6 @@ $(INSTALLED): pyproject.toml constraints.txt
 	    torch -c constraints.txt --index-url $(TORCH_INDEX) 2>/dev/null || \
 	    echo "$(TORCH_INDEX) does not answer: torch comes from PyPI, with gigabytes of CUDA" >&2; \
 	fi
-	@echo 'Installing vslam and its tools into $(VENV): a few minutes'
+	@echo 'Installing torch and the tools of development into $(VENV): a few minutes'
 	@$(BIN)/python -m pip install --quiet -e '.[dev]' -c constraints.txt
 	@touch $@

@@ -36,20 +36,24 @@ def map_and_calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) 
 
 
 def _calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    window = map_.living_keyframes()
-    window = window[window > max([map_.calibrated_until, *(k - 1 for k in map_.restarts)])]
+    known, window = map_.scalars, map_.living_keyframes()
+    window = window[window > max([known.calibrated_until, *(k - 1 for k in map_.restarts)])]
     if len(window) < config.stereo.offset_keyframes:
         return
-    map_.calibrated_until = keyframe
+    map_.scalars = replace(known, calibrated_until=keyframe)
     landmarks = collect_landmarks(map_.arrays, window, map_.n_landmarks)
     problem, _ = assemble(map_, window[1:], window[:1], landmarks, camera)
     found, information = remaining_offset(problem)
     if information <= 0.0:
         return
     prior = config.stereo.offset_sigma**-2.0
-    map_.offset_information += information
-    change = found * information / (prior + map_.offset_information)
-    map_.disparity_offset += change
+    total = known.offset_information + information
+    change = found * information / (prior + total)
+    map_.scalars = replace(
+        map_.scalars,
+        disparity_offset=known.disparity_offset + change,
+        offset_information=total,
+    )
     a, n = map_.arrays, map_.n_rows
     a.u_right[:n] = shifted_columns(a.u_right[:n], a.xy[:n, 0], change)
     adjust_locally(map_, keyframe, camera, config)

@@ -180,8 +180,9 @@ def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
     at the same or a finer scale (ORB-SLAM, VI-E). Without stereo all landmarks count."""
     neighbours, shared = map_.covisible(keyframe)
     close = config.stereo.close_depth_baselines * camera.baseline
+    restarts = map_.restarts
     for neighbour in neighbours[shared >= config.mapping.min_shared]:
-        if neighbour == 0 or neighbour in map_.restarts:
+        if neighbour == 0 or neighbour in restarts:
             continue  # the world of its sub-map
         seen, redundant = count_redundant(map_.arrays, int(neighbour), camera.bf, close)
         if redundant > config.mapping.redundant_ratio * seen:

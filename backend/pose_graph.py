@@ -109,8 +109,7 @@ def essential_graph(
     # Edge by the pair of its ends: what is written later wins.
     kind = dict.fromkeys(map(tuple, pairs[shared >= config.min_shared].tolist()), COVISIBLE)
     restarts, unpredicted_restarts = (np.array(sorted(at), np.int64) for at in (weak, unpredicted))
-    for child in living.tolist():
-        parent = map_.parents[child]
+    for child, parent in zip(living.tolist(), map_.parents[living].tolist(), strict=True):
         if parent >= 0:
             pair = (min(parent, child), max(parent, child))
             if not _passes(pair, restarts) or pair in seen:
@@ -137,7 +136,7 @@ def essential_graph(
     for e in loop_edges.tolist():
         i, j = living[edges[e]].tolist()
         T_i_j[e], scales[e] = measured[i, j]
-    seconds = np.array([map_.timestamps[k] for k in living.tolist()], np.float64)
+    seconds = map_.timestamps[living]
     return PoseGraph(
         keyframes=living,
         T_cw=T_cw,

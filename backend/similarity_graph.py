@@ -136,12 +136,10 @@ def move_keyframes_similarly(
     carry_landmarks_by(map_, motion, moved)
     growth = np.ones(n)
     growth[keyframes] = scale_of(S_wc)
-    for k in np.flatnonzero(~a.keyframe_alive[:n]).tolist():
-        growth[k] = growth[map_.parents[k]]
-        map_.T_c_parent[k] = map_.T_c_parent[k].copy()
-        map_.T_c_parent[k][:3, 3] *= growth[k]
-    for k in range(n):
-        map_.unit_scale[k] *= float(growth[k])
+    culled = np.flatnonzero(~a.keyframe_alive[:n])
+    growth[culled] = growth[map_.parents[culled]]
+    map_.keyframes.T_c_parent[culled, :3, 3] *= growth[culled, None]
+    map_.keyframes.unit_scale[:n] *= growth
     refresh_landmarks(a, map_.living_landmarks().astype(np.int32), map_.scales)
     return growth
 

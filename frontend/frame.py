@@ -112,8 +112,8 @@ class Frame:
             return np.zeros(len(self.features), np.bool_)
         return (self.landmark >= 0) & np.isfinite(self.shift[:, 0])
 
-    def observed(self) -> Features:
-        """The features, those that were aligned where they were aligned to; disparities stay."""
+    def refined_features(self) -> Features:
+        """The features at their aligned positions; disparities are unchanged."""
         aligned = self.aligned
         if self.shift is None or not aligned.any():
             return self.features

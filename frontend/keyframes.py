@@ -24,8 +24,8 @@ class KeyframeEvidence:
             (all of them in a young map).
         tracked_close: close stereo features of this frame that track a landmark.
         untracked_close: close stereo features that do not.
-        gained_close: ``tracked_close`` of the first frame after a keyframe, as the last keyframes
-            made one expect; by default all that is wanted, as where nothing is known yet.
+        gained_close: how many close points the first frame after a keyframe tracks, a running
+            mean over the last keyframes; infinite if unknown.
         mapping_idle: the last keyframe's local mapping is finished and merged.
     """
 
@@ -43,10 +43,11 @@ def needs_keyframe(
 ) -> bool:
     """Decide. Enough new must be visible, and either mapping is free or it is urgent.
 
-    Too few close points are evidence only where a keyframe brings enough of them. On a motorway
-    they are few by nature and leave the view before they are seen twice: even the frame after a
-    keyframe tracks too few. There a share of what that frame tracks is all that is asked for, as
-    long as as many far points hold the pose: in fog there are none.
+    Few close points ask for a keyframe only if keyframes usually bring enough. On a motorway
+    they are few by nature and leave the view before they are seen twice, so that even the frame
+    after a keyframe tracks too few. There a share of what that frame tracks is all that is asked
+    for, provided that far points hold the pose: as many of them as the close points that are
+    wanted. In fog there are none.
 
     Args:
         depth: of an RGB-D camera. Nearly all it sees is close and mapped at once, so that the
@@ -125,12 +126,12 @@ class PlaceEvidence:
 
 
 def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
-    """Whether a keyframe here would repeat an old one: the frame tracks as much of the map as one
-    may that is next to that keyframe, and a good part of it is that keyframe's.
+    """Whether a keyframe here would repeat an old one: the frame tracks enough landmarks for one
+    next to the old keyframe, and shares enough of them with it.
 
-    Few close points are no reason to map the place once more: mapping it has not made them more.
-    At the end of a map its last keyframe has few landmarks that three keyframes see; there the
-    camera would be taken for somewhere known until it is lost, so that it must track some at least.
+    Few close points are no reason to map the place once more, since mapping it did not make them
+    more. At the end of a map the last keyframe has few landmarks that three keyframes observe, and
+    the camera would count as being at a known place until it is lost; so a minimum is asked for.
     """
     return (
         evidence.n_inliers >= config.known_min_inliers

@@ -44,8 +44,8 @@ class Recognise(Protocol):
     ) -> Sighting | None: ...
 
 
-class MapOwner(Protocol):
-    """Gives the map when it may be read."""
+class MapAccess(Protocol):
+    """Access to the map, while it may be read."""
 
     @property
     def is_merged(self) -> bool:
@@ -70,10 +70,10 @@ class Relocaliser:
         self._locate = locate
         self._recognise = recognise
 
-    def check(self, frame: Frame, found: Found, owner: MapOwner) -> Found:
-        """Look for a lost frame in the whole map, unless a keyframe is being mapped, and for a
-        doubtful one in any case: it stays as it is unless there are clearly more inliers elsewhere.
-        """
+    def relocalise_if_needed(self, frame: Frame, found: Found, owner: MapAccess) -> Found:
+        """Search the whole map for a frame that is lost, if no keyframe is being mapped, or
+        doubtful, which waits for the mapping. A doubtful frame keeps its tracked pose unless
+        relocalisation finds ``relocalization.better`` times as many inliers."""
         if found.is_lost:
             return self._find(frame, owner.merge()) if owner.is_merged else found
         if not found.is_doubtful:

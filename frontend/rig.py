@@ -42,8 +42,9 @@ class RigCalibration:
         self._scales = scales
 
     def prepare(self, frame: Frame, twist: Matrix | None) -> None:
-        """Correct the columns of a frame's features in the right image: remove the delay of the
-        right image, if the motion is known, and correct the offset. Neither is done twice.
+        """Correct the columns of a frame's features in the right image for the disparity offset
+        and, if the motion is known, for the delay of the right image. Calling it again changes
+        nothing.
 
         Args:
             twist: ``(6,)`` motion of the points past the camera, per second; None if unknown.
@@ -67,8 +68,8 @@ class RigCalibration:
         frame.features = replace(frame.features, u_right=u_right)
         frame.disparity_offset = self.disparity_offset
 
-    def adopt(self, frame: Frame) -> None:
-        """Take the columns of a frame as corrected: it was prepared before it was saved."""
+    def mark_corrected(self, frame: Frame) -> None:
+        """Mark the columns of a frame as corrected: it was prepared before it was saved."""
         frame.disparity_offset, frame.delay_removed = self.disparity_offset, True
 
     def observe(self, frame: Frame, twist: Matrix | None) -> None:

@@ -37,7 +37,7 @@ class TrackerStatus(Enum):
 
 @dataclass(frozen=True)
 class Found:
-    """Where a frame was found, which holds its pose and its landmarks.
+    """The result of tracking or relocalising a frame; pose and matches are in the frame itself.
 
     Attributes:
         state: OK, WEAK or LOST.
@@ -132,7 +132,7 @@ class Tracker:
         if n_inliers < self._config.tracking.min_inliers_frame:
             return Found(TrackingState.LOST, n_matches=n_inliers)
         n_matches, n_inliers, visible = track_local_map(
-            frame, view.around, self._context, patches=view.patches
+            frame, view.local_landmarks, self._context, patches=view.patches
         )
         doubtful = self._is_doubtful(frame, n_inliers, view, frames)
         state = judge(n_matches, n_inliers, self._context)
@@ -210,7 +210,7 @@ class Tracker:
             n_matches, n_inliers = track_motion(frame, self.last, T_cw, self._context)
             if self._moves_as_predicted(n_matches, n_inliers):
                 return n_inliers
-        n_inliers = track_descriptors(frame, view.nearest, T_cw, self._context)
+        n_inliers = track_descriptors(frame, view.reference_landmarks, T_cw, self._context)
         if n_inliers >= self._config.tracking.min_inliers_frame or self.twist is None:
             return n_inliers
         return self._track_predicted(frame, T_cw, view)
@@ -222,7 +222,7 @@ class Tracker:
         frame.landmark[:], frame.xyz[:] = -1, np.nan
         window = self._config.tracking.predicted_window
         n_matches, n_inliers, _ = track_local_map(
-            frame, view.around, self._context, window, view.patches
+            frame, view.local_landmarks, self._context, window, view.patches
         )
         if self._moves_as_predicted(n_matches, n_inliers):
             return n_inliers
@@ -234,9 +234,9 @@ class Tracker:
         return n_inliers >= max(config.min_inliers_motion, config.min_inlier_ratio * n_matches)
 
     def _is_doubtful(self, frame: Frame, n_inliers: int, view: MapView, frames: FramePoses) -> bool:
-        """Whether a frame has so few inliers that its matches may be wrong: one whose pose could
-        hardly be predicted, after a gap or next to a frame found in the map, or one that has lost
-        most of what the frame before tracked, as where the camera was carried."""
+        """Whether a frame has so few inliers that its matches may be wrong, and a reason for it:
+        a gap in time, no known motion to predict the pose with, or a sudden drop of the inliers, as
+        where the camera was carried."""
         if self.last is None:
             return False
         config = self._config.relocalization

@@ -107,7 +107,7 @@ def rated(
     return [replace(one, alike=alike.get(one.match, one.alike)) for one in candidates]
 
 
-def shows_known(
+def is_image_redundant(
     map_: Map, keyframe: int, images: KeyframeImages, config: LearnedMatchingConfig
 ) -> bool:
     """Whether a keyframe shows mostly what a keyframe with an image shows: no network need see it.

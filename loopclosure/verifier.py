@@ -16,8 +16,8 @@ from vslam.config import Config
 from vslam.loopclosure import verification
 from vslam.loopclosure.learned_verification import (
     LearnedTrials,
+    is_image_redundant,
     rated,
-    shows_known,
     verify_learned,
 )
 from vslam.loopclosure.reach import beyond_reach
@@ -43,7 +43,7 @@ class Verifier(Protocol):
         """For how many keyframes a verified loop waits for a second one that agrees with it."""
         ...
 
-    def shows_known(self, map_: Map, keyframe: int) -> bool:
+    def is_image_redundant(self, map_: Map, keyframe: int) -> bool:
         """Whether a keyframe shows so much of what other images show that its own is not needed."""
         ...
 
@@ -108,7 +108,7 @@ class OrbVerifier:
         self._config = config.verification
         self._camera = camera
 
-    def shows_known(self, map_: Map, keyframe: int) -> bool:
+    def is_image_redundant(self, map_: Map, keyframe: int) -> bool:
         """False: ORB descriptors need no images."""
         return False
 
@@ -154,9 +154,9 @@ class LearnedVerifier:
         self._camera = camera
         self._trials = LearnedTrials(config.learned)
 
-    def shows_known(self, map_: Map, keyframe: int) -> bool:
+    def is_image_redundant(self, map_: Map, keyframe: int) -> bool:
         """See :class:`Verifier`."""
-        return shows_known(map_, keyframe, self.images, self._config.learned)
+        return is_image_redundant(map_, keyframe, self.images, self._config.learned)
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
         """Keep the image, and forget those of keyframes that were culled."""

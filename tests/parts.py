@@ -88,7 +88,7 @@ class Points:
             xy=uvr[:, :2],
             octave=np.zeros(n, np.uint8),
             angle=np.zeros(n, np.float32),
-            descriptors=self.descriptors[among],
+            descriptors=self.descriptors[among].copy(),
             u_right=uvr[:, 2],
         )
 
@@ -129,7 +129,7 @@ class Points:
         """A view of a map in which some points are around, and some in the reference keyframe."""
         return MapView(
             n_keyframes=n_keyframes,
-            around=self.landmarks(around),
-            nearest=self.landmarks(nearest),
+            local_landmarks=self.landmarks(around),
+            reference_landmarks=self.landmarks(nearest),
             n_reference=n_reference,
         )

@@ -321,7 +321,7 @@ def test_an_aligned_frame_observes_where_matches_were_aligned_to():
     frame.landmark[:] = 0, 1, -1
     frame.shift = np.array([[0.5, -0.25], [np.nan, np.nan], [1.0, 1.0]], np.float32)
     assert frame.aligned.tolist() == [True, False, False]
-    observed = frame.observed()
+    observed = frame.refined_features()
     assert observed.xy.tolist() == [[100.5, 49.75], [100.0, 50.0], [100.0, 50.0]]
     assert observed.u_right.tolist() == [80.5, 80.0, 80.0]
     assert frame.features.xy[0].tolist() == [100.0, 50.0]
@@ -374,7 +374,7 @@ def two_keyframes():
     for index in range(2):
         frame = Frame.of(extracted_at(100, 50, 0, 3), CAMERA, index, 0.1 * index)
         frames.append(frame)
-        mapper.place(frame, tracked=True)
+        mapper.append_pose(frame, tracked=True)
     mapper.insert(frames[0])
     frames[1].landmark = frames[0].landmark.copy()
     frames[1].landmark[2] = -1

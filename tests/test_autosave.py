@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import errno
+import json
 import logging
-import os
 import signal
 import subprocess
 import sys
@@ -377,18 +377,33 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
         busy = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
     assert busy.returncode == 2
     assert busy.stderr == (
-        f"error: {folder}: process {os.getpid()} runs here still; wait until it is done, or "
-        f"delete {folder / LOCK} if that process is not vslam.\n"
+        f"error: {folder}: another process runs here still; wait until it is done.\n"
     )
-    (folder / LOCK).write_text("999999999")  # killed
-    resumed = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
+    (folder / LOCK).touch()  # killed
+    elsewhere = tmp_path / "elsewhere.txt"
+    elsewhere.write_text("kept")
+    (folder / "report.md").symlink_to(elsewhere)
+    linked = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
+    assert linked.returncode == 2
+    assert f"{folder / 'report.md'}: this is a link" in linked.stderr
+    (folder / "report.md").unlink()
+    resumed = vslam("run", "--resume", folder, *brief, "--save-map", "town.npz", cwd=tmp_path)
     assert resumed.returncode == 0, resumed.stderr
+    assert elsewhere.read_text() == "kept"
+    assert (tmp_path / "town.npz").read_bytes() == (folder / "map.npz").read_bytes()
     assert not (folder / LOCK).exists()
     assert len(read_trajectory(folder / "trajectory.tum")) == FRAMES
     frames = load_map(folder / "map.npz").frames
     assert frames is not None
     assert len(frames.timestamp) == FRAMES
     assert not (folder / MAP).exists()
+
+
+def test_a_resumed_run_writes_to_no_place_that_its_folder_names(kitti_tree, tmp_path):
+    options = {"data": str(kitti_tree), "save_map": str(tmp_path / "elsewhere.npz")}
+    (tmp_path / "run.json").write_text(json.dumps(options))
+    with pytest.raises(InputError, match=r"run\.json: damaged, or of another version; run again"):
+        read_options(tmp_path)
 
 
 def test_a_run_that_cannot_begin_leaves_no_folder(kitti_tree, tmp_path):

@@ -18,12 +18,12 @@ from source_files import write_calibration, write_video
 from stub_runner import COMMAND, started, wait_for
 from typer.testing import CliRunner
 
-from vslam.bench import estimate, execute, grid, table
-from vslam.bench.grid import Cell
 from vslam.cli import main as cli
 from vslam.cli.main import app
 from vslam.config import Config
 from vslam.errors import InputError, ResultsError
+from vslam.lab.bench import estimate, execute, grid, table
+from vslam.lab.bench.grid import Cell
 
 CONFIG = Config().model_dump_json(indent=2) + "\n"
 

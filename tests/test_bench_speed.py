@@ -80,8 +80,8 @@ def test_a_keyframe_costs_what_memory_grew_by(speed):
 
 
 def test_frames_are_averaged_by_blocks(speed):
-    table = [{"frame": str(k), "read_ms": "10", "track_frame_ms": "2"} for k in range(150)]
-    table[120]["track_frame_ms"] = ""  # a stage that the frame did not go through
+    table = [{"frame": str(k), "read_ms": "10", "track_ms": "2"} for k in range(150)]
+    table[120]["track_ms"] = ""  # a stage that the frame did not go through
     everything, in_turn = speed.blocks(table)
     assert everything == pytest.approx([12.0, 12.0 - 2 / 50])
     assert in_turn == pytest.approx([2.0, 2.0 - 2 / 50])

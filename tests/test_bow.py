@@ -14,7 +14,7 @@ from vslam.datasets.synthetic import store
 from vslam.datasets.synthetic.site import Variation
 from vslam.features import Features
 from vslam.frontend.orb import extract
-from vslam.loopbench.node_matching import index_nodes, match_by_node
+from vslam.lab.loopbench.node_matching import index_nodes, match_by_node
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.bow_index import InvertedIndex
 from vslam.loopclosure.detector import LoopDetector
@@ -285,7 +285,7 @@ def test_matching_by_node_is_matching_within_nodes():
 
 
 def test_a_query_among_many_keyframes_is_fast():
-    """1,000 keyframes of 2,000 features; tools/bow_speed.py gives the figure for 5,000."""
+    """1,000 keyframes of 2,000 features; tools/experiments/design/bow_speed.py takes 5,000."""
     rng = np.random.default_rng(4)
     tree = load()
     leaves = tree.descriptors[tree.word >= 0]

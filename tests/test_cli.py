@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -81,6 +83,25 @@ def call(monkeypatch, capsys, tmp_path):
         return code, output.out, output.err
 
     return run
+
+
+NOT_UTF8 = os.fsdecode(b"dir\xff")
+
+
+def test_names_that_are_not_utf8_are_refused(call, kitti_tree, tmp_path):
+    said = (2, "", "error: dir\ufffd: this name is not UTF-8; rename it.\n")
+    assert call("run", "--data", kitti_tree, "--out", NOT_UTF8) == said
+    assert call("doctor", NOT_UTF8) == said
+    shutil.copytree(kitti_tree / "sequences" / "00" / "image_0", tmp_path / "images")
+    (tmp_path / "images" / f"{NOT_UTF8}.png").write_bytes(b"damaged")
+    folder = tmp_path / NOT_UTF8
+    folder.mkdir()
+    (folder / "report.json").write_text("{}")
+    for command in (("run", "images", "--fps", 10), ("report", ".")):
+        code, _, err = call(*command)
+        assert (code, err.count("\n")) == (2, 1)
+        assert "dir\ufffd" in err
+        assert err.endswith("this name is not UTF-8; rename it.\n")
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from vslam.loopclosure.detector import NoDetector
 from vslam.loopclosure.verification import verify
 from vslam.loopclosure.verifier import OrbVerifier
 from vslam.loops import LoopCandidate
+from vslam.map import UNPREDICTED
 from vslam.slam import Slam
 
 ROUND = [float(k) for k in range(LAP + 40)]
@@ -168,7 +169,7 @@ def test_two_slams_may_share_the_features_of_their_frames():
     shown = see()
     drive(together, shown)
     assert [len(slam.corrections) > 0 for slam in together] == [True, False]
-    assert all(slam.map.disparity_offset != 0.0 for slam in together)
+    assert all(slam.map.scalars.disparity_offset != 0.0 for slam in together)
     for features, as_seen in zip(shown, see(), strict=True):
         for name in ("xy", "octave", "angle", "descriptors", "u_right"):
             assert getattr(features, name).tobytes() == getattr(as_seen, name).tobytes()
@@ -283,7 +284,7 @@ def test_a_camera_is_taken_for_kidnapped_only_if_it_cannot_have_gone_on_as_predi
 ):
     map_, edge = copy.deepcopy(open_loop(gap))
     if unpredicted:
-        map_.unpredicted_restarts = list(map_.restarts)
+        map_.keyframes.restart[map_.restarts] = UNPREDICTED
     solutions = {
         one: solve(map_, [], edge, one, config.pose_graph, monocular=False) for one in Hypothesis
     }
@@ -329,10 +330,10 @@ def test_a_global_adjustment_that_fails_leaves_the_map_as_it_was(monkeypatch, ca
         patched.setattr("vslam.closing.adjust_globally", fail)
         closing.consider(map_, edge.query, candidates)
         assert closing.is_adjusting
-        before = map_.used_arrays()
+        before = map_.copy().arrays
         closing.finish(map_)
     assert not closing.is_adjusting
-    for name, array in zip(before._fields, map_.used_arrays(), strict=True):
+    for name, array in zip(before._fields, map_.copy().arrays, strict=True):
         assert array.tobytes() == getattr(before, name).tobytes()
     (record,) = caplog.records
     assert record.levelname == "WARNING"
@@ -340,9 +341,9 @@ def test_a_global_adjustment_that_fails_leaves_the_map_as_it_was(monkeypatch, ca
     # The next loop is closed, and its adjustment merged.
     closing.consider(map_, edge.query, candidates)
     assert len(closing.corrections) == 2
-    before = map_.used_arrays()
+    before = map_.copy().arrays
     closing.finish(map_)
-    assert map_.used_arrays().T_cw.tobytes() != before.T_cw.tobytes()
+    assert map_.copy().arrays.T_cw.tobytes() != before.T_cw.tobytes()
     assert len(caplog.records) == 1
 
 
@@ -357,7 +358,7 @@ def test_loop_closing_restored_from_its_state_closes_the_loop_that_waits():
         return LoopClosing(NoDetector(), OrbVerifier(config, CAMERA), CAMERA, config, threads=1)
 
     stopped, restored, fresh = create(), create(), create()
-    stopped.follow(last - 1)
+    stopped.count_reused_keyframe(last - 1)
     stopped.consider(map_, last - 1, oracle.query(last - 1, map_))
     assert stopped.edges[-1].reason == "verified by 1 of 2 keyframes"
     assert fresh.state() != stopped.state()
@@ -389,7 +390,7 @@ def test_a_wrong_keyframe_bends_the_map_and_the_loops_that_tell_are_refused():
     assert found[60:].min() > 40.0
     assert sum("contradicted" in edge.reason for edge in slam.loops) > 4
     assert not slam.corrections
-    wrong = slam.map.frames.index(60)
+    wrong = slam.map.frames.tolist().index(60)
     held = held_by(slam.map)
     assert int(held[1:].argmin()) + 1 == wrong
     expected = max(

@@ -15,11 +15,11 @@ import psutil
 import pytest
 from stub_runner import COMMAND, started, wait_for
 
-from vslam.bench import execute
-from vslam.bench.cluster import run_on_cluster
-from vslam.bench.grid import make_grid
 from vslam.config import Config
 from vslam.errors import InputError
+from vslam.lab.bench import execute
+from vslam.lab.bench.cluster import run_on_cluster
+from vslam.lab.bench.grid import make_grid
 
 CONFIG = Config().model_dump_json(indent=2) + "\n"
 CELLS = make_grid("kitti", ["00", "05"], ["none", "brightness:1"], ["none", "bow"], 1)
@@ -94,7 +94,7 @@ def test_leaving_stops_the_workers_runs(cluster, stub: Path, tmp_path: Path):
 
 
 def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("vslam.bench.cluster._CONNECT_S", 1)
+    monkeypatch.setattr("vslam.lab.bench.cluster._CONNECT_S", 1)
     options = execute.RunOptions(None, CONFIG, 1)
     with (
         pytest.raises(InputError, match=r"--scheduler tcp://127\.0\.0\.1:9: nothing answers"),
@@ -110,8 +110,8 @@ def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
 def test_an_address_that_cannot_be_used_leaves_no_client_behind(address: str, said: str):
     """A client that never began cannot close: that took 20 s, and ended in a traceback."""
     code = (
-        "from vslam.bench.cluster import run_on_cluster\n"
-        "from vslam.bench.execute import RunOptions\n"
+        "from vslam.lab.bench.cluster import run_on_cluster\n"
+        "from vslam.lab.bench.execute import RunOptions\n"
         "from vslam.errors import InputError\n"
         "try:\n"
         f"    next(run_on_cluster([], RunOptions(None, '', 1), {address!r}, None))\n"

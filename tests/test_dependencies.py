@@ -25,8 +25,8 @@ FOLDERS = {
 # From the ground up; a module belongs to the longest name here that it lies within. What stands
 # together on one level may not import each other, save where SIBLINGS says so.
 LEVELS: tuple[tuple[str, ...], ...] = (
-    ("vslam.errors", "vslam.machine", "vslam.kernels"),
-    ("vslam.plugins", "vslam.untrusted", "vslam.lock_file"),
+    ("vslam.errors", "vslam.machine"),
+    ("vslam.kernels", "vslam.plugins", "vslam.untrusted", "vslam.lock_file"),
     ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.features", "vslam.camera"),
     (
         "vslam.loops",
@@ -49,8 +49,9 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.run",),
     ("vslam.evaluation",),
     ("vslam.report",),
-    ("vslam.overview", "vslam.bench", "vslam.loopbench", "vslam.doctor"),
-    ("vslam.stress",),
+    ("vslam.doctor",),
+    ("vslam.lab", "vslam.lab.overview", "vslam.lab.bench", "vslam.lab.loopbench"),
+    ("vslam.lab.stress",),
     ("vslam.cli",),
     ("vslam.__main__", "vslam"),
 )
@@ -64,26 +65,30 @@ SIBLINGS = {
 }
 # A benchmark starts the command line in processes of its own: nothing comes back but files.
 STARTED = {
-    ("vslam.bench.execute", "vslam.cli.child"),
+    ("vslam.lab.bench.execute", "vslam.cli.child"),
     ("vslam.cli.stress", "vslam.cli.child"),
-    ("vslam.loopbench.cost", "vslam.loopbench.cost"),
+    ("vslam.lab.loopbench.cost", "vslam.lab.loopbench.cost"),
     ("vslam.run.warmup", "vslam.run.warmup"),
 }
 ONLY_IN = {
     "torch": "vslam.loopclosure.siamese",
     "torchvision": "vslam.loopclosure.siamese",
-    "onnx": "vslam.loopclosure.siamese.export",
+    "onnx": ("vslam.loopclosure.siamese.export", "vslam.loopclosure.siamese.onnx_limits"),
+    "safetensors": "vslam.loopclosure.siamese.siamese",
     "onnxruntime": "vslam.loopclosure.siamese.inference",
     "gtsam": "vslam.backend",
     "rerun": "vslam.run.recorder",
     "evo": "vslam.evaluation.trajectories",
-    "distributed": "vslam.bench.cluster",
+    "distributed": "vslam.lab.bench.cluster",
     "rosbags": ("vslam.datasets.bag", "vslam.datasets.bag_limits"),
     "PIL": "vslam.datasets.image_folders",
-    "pyorbslam3": "vslam.stress.orbslam3",
+    "pyorbslam3": "vslam.lab.stress.orbslam3",
     "deflate": "vslam.datasets.png",
     "typer": "vslam.cli",
 }
+
+# Imports torch inside its functions, and only after it has looked for it.
+TRAINING_COMMANDS = "vslam.cli.train"
 
 
 def sources() -> dict[str, Path]:
@@ -182,7 +187,7 @@ def test_the_modules_and_their_imports_are_found():
     assert {"vslam.frontend", "vslam.loopclosure", "vslam.backend", "vslam.cli"} <= set(SOURCES)
     assert "vslam.map_view" in ARROWS["vslam.frontend.tracking"]
     assert "vslam.frontend.tracker" in ARROWS["vslam.slam"]
-    assert "vslam.bench.execute" in ARROWS["vslam.cli.bench"]
+    assert "vslam.lab.bench.execute" in ARROWS["vslam.cli.bench"]
 
 
 def test_every_place_on_a_level_exists_and_every_module_has_one():
@@ -196,6 +201,13 @@ def test_no_import_leads_up():
     assert upward(ARROWS) == []
 
 
+def test_only_the_command_line_imports_the_laboratory():
+    users = {m for m, names in ARROWS.items() if any(within(name, "vslam.lab") for name in names)}
+    assert {m for m in users if not within(m, "vslam.lab")} <= {
+        m for m in SOURCES if within(m, "vslam.cli")
+    }
+
+
 def test_no_circle_of_imports():
     assert circle(ARROWS) == []
 
@@ -203,7 +215,7 @@ def test_no_circle_of_imports():
 def test_an_upward_import_and_a_circle_would_be_seen():
     assert upward({"vslam.map": {"vslam.slam"}}) == ["vslam.map -> vslam.slam"]
     assert upward({"vslam.backend.fusion": {"vslam.frontend.orb"}})
-    assert upward({"vslam.bench.table": {"vslam.cli.progress"}})
+    assert upward({"vslam.lab.bench.table": {"vslam.cli.progress"}})
     assert set(circle({"a": {"b"}, "b": {"c"}, "c": {"a"}})) == {"a", "b", "c"}
 
 
@@ -228,6 +240,20 @@ def test_heavy_libraries_stay_where_they_belong(library):
     places = ONLY_IN[library] if isinstance(ONLY_IN[library], tuple) else (ONLY_IN[library],)
     assert {m for m in users if not any(within(m, place) for place in places)} == set()
     assert users or library == "torchvision"
+
+
+def test_only_training_reaches_the_libraries_of_the_extra_train():
+    """However long the chain of imports: runs, maps, loops and benchmarks do without them, but for
+    the check of networks that vslam does not ship, which asks for onnx in one sentence."""
+    extra = {"torch", "safetensors", "onnx", "onnxscript"}
+    need = {m for m, names in IMPORTS.items() if {name.partition(".")[0] for name in names} & extra}
+    need -= {"vslam.loopclosure.siamese.onnx_limits"}
+    found: set[str] = set()
+    while need - found:
+        found |= need
+        need = {m for m, targets in ARROWS.items() if targets & (found - {TRAINING_COMMANDS})}
+    outside = {m for m in found if not within(m, "vslam.loopclosure.siamese")}
+    assert outside == {TRAINING_COMMANDS}
 
 
 def test_the_library_does_not_print():

@@ -1,4 +1,4 @@
-"""tools/detector_cost.py: its table, and one real run of each detector."""
+"""The table of detector_cost.py in tools/experiments, and one real run of each detector."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-TOOLS = Path(__file__).parents[1] / "tools"
+TOOLS = Path(__file__).parents[1] / "tools" / "experiments" / "local_descriptors"
 
 
 @pytest.fixture

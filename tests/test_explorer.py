@@ -22,7 +22,7 @@ from test_report import make_outcome
 
 from vslam.errors import InputError
 from vslam.features import Features
-from vslam.overview.serve import list_runs, make_server
+from vslam.lab.overview.serve import list_runs, make_server
 from vslam.report.explorer import explorer_data
 from vslam.report.folder import evaluate_run, matched_ground_truth, write_results
 from vslam.run.moments import MomentRecorder
@@ -284,9 +284,59 @@ def test_nothing_but_reports_is_served_and_to_nobody_else(server):
         assert ask(server, path)[0] == 404, path
     assert ask(server, "/", "evil.example:80")[0] == 403
     assert ask(server, "/compare?run=0&run=" + 5000 * "9")[0] == 400
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=30)
+    connection.putrequest("GET", "http://[x/", skip_host=True)  # it would parse the address itself
+    connection.putheader("Host", "localhost")
+    connection.endheaders()
+    assert connection.getresponse().status == 400
     assert ask(server, "/", f"localhost:{server.server_port}")[0] == 200
     assert ask(server, "/", "localhost")[0] == 200  # as at port 80
     assert server.server_address[0] == "127.0.0.1"
+
+
+def policy_of(server, path: str) -> str:
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=30)
+    connection.request("GET", path)
+    return connection.getresponse().getheader("Content-Security-Policy") or ""
+
+
+def test_a_report_of_a_stranger_is_sandboxed(server):
+    """Its scripts have no origin, so that they can read no other report, and load nothing."""
+    policy = policy_of(server, "/run/0").split("; ")
+    assert policy[:2] == ["sandbox allow-scripts", "default-src 'none'"]
+    for path in ("/", "/compare?run=0&run=1"):
+        assert "default-src 'none'" in policy_of(server, path)
+        assert "script-src" not in policy_of(server, path)
+
+
+SPY = """<p id="said">nothing</p><script>
+said.textContent = "ran";
+for (const path of ["/", "/run/0", "/run/1"])
+  fetch(path).then(answer => answer.text()).then(text => { said.textContent = "read " + path; });
+</script>"""
+
+
+def test_a_script_in_a_report_reads_no_other_one(server, run: Path, tmp_path: Path):
+    (tmp_path / "<b>second" / "report.html").write_text(SPY)
+    links = re.findall(r'href="(/run/\d)"[^>]*>&lt;b&gt;second', ask(server, "/")[1])
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--dump-dom",
+             "--virtual-time-budget=2000", f"--user-data-dir={tmp_path / 'profile'}"]  # fmt: skip
+    address = f"http://127.0.0.1:{server.server_port}{links[0]}"
+    shown = subprocess.run(
+        [chromium(), *flags, address], capture_output=True, text=True, timeout=180, check=True
+    )
+    assert '<p id="said">ran</p>' in shown.stdout
+
+
+@pytest.mark.parametrize("name", ["report.html", "report.json"])
+def test_a_report_that_is_a_link_out_of_its_folder_is_not_served(server, tmp_path: Path, name):
+    folder = tmp_path / "<b>second"
+    number = re.findall(r'href="/run/(\d)"[^>]*>&lt;b&gt;second', ask(server, "/")[1])[0]
+    (folder / name).rename(tmp_path / "elsewhere")
+    (folder / name).symlink_to(tmp_path / "elsewhere")
+    if name == "report.html":
+        assert ask(server, f"/run/{number}")[0] == 404
+    assert len(re.findall(r'href="/run/\d"', ask(server, "/")[1])) == 1
 
 
 def test_runs_may_go_while_they_are_served(tmp_path: Path):

@@ -299,7 +299,7 @@ def test_gtsam_reads_the_pose_graph_and_weighs_it_alike(tmp_path):
     loop = LoopEdge(6, 0, 0.5, True, "closed", T_query_match=np.eye(4))
     graph = essential_graph(map_, [loop], PoseGraphConfig(min_shared=30))
     T_i_j = np.array([T @ se3_exp(rng.normal(0, 0.01, 6)) for T in graph.T_i_j])
-    ids = np.array(map_.frames)[graph.keyframes]
+    ids = map_.frames[graph.keyframes]
     path = tmp_path / "graph.g2o"
     save_g2o(path, ids, inverses(graph.T_cw), graph.edges, T_i_j, graph.sigmas)
     factors, values = gtsam.readG2o(str(path), True)
@@ -330,13 +330,13 @@ def test_loops_and_gaps_of_a_run_become_edges(corridor_run, tmp_path):
     save_map(tmp_path / "map.npz", StoredMap(grown, CAMERA, (loop,)))
     stored = load_map(tmp_path / "map.npz")
     map_ = stored.map
-    assert map_.frames == [0, 3, 9, 12, 15, 18]
+    assert map_.frames.tolist() == [0, 3, 9, 12, 15, 18]
     report = read_report(corridor_run)
     graph = pose_graph(FinishedRun(corridor_run, report, map_, stored.camera, stored.loops))
     kinds = dict(zip(map(tuple, graph.edges.tolist()), graph.kind.tolist(), strict=True))
     tree = {(k, k + 1): TREE for k in range(5)}
     assert kinds == tree | {(3, 4): GAP, (1, 5): LOOP}
-    expected = np.linalg.inv(T_query_match @ grown.T_c_parent[2])
+    expected = np.linalg.inv(T_query_match @ grown.keyframes.T_c_parent[2])
     measured = graph.edges.tolist().index([1, 5])
     np.testing.assert_allclose(graph.T_i_j[measured], expected, atol=1e-9)
 
@@ -439,7 +439,7 @@ def test_export_files_into_the_folder_of_the_run(corridor_run, kitti_tree):
     xyz, rgb = read_ply(corridor_run / "landmarks.ply")
     assert len(xyz) == len(rgb) == len(reconstruction_of(finished.map, finished.camera).xyz)
     _, values = gtsam.readG2o(str(corridor_run / "pose_graph.g2o"), True)
-    assert sorted(values.keys()) == finished.map.frames
+    assert sorted(values.keys()) == finished.map.frames.tolist()
     rows = np.loadtxt(corridor_run / "trajectory_euroc.csv", delimiter=",")
     tum = np.loadtxt(corridor_run / "trajectory.tum")
     np.testing.assert_allclose(rows[:, 0] * 1e-9, tum[:, 0], atol=1e-9)

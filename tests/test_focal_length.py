@@ -1,4 +1,4 @@
-"""What tools/focal_length.py reads from a trajectory whose scale drifts."""
+"""What tools/experiments/results/focal_length.py reads from a trajectory whose scale drifts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools" / "experiments" / "results"))
 from focal_length import scale_drift
 
 BY_TURN, BY_METRE = 0.06, -2e-4

@@ -1,4 +1,4 @@
-"""The simulated town of tools/growth.py, and the laws that are fitted to it."""
+"""The simulated town of tools/experiments/scale/growth.py, and the laws that are fitted to it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools" / "experiments" / "scale"))
 from growth import AHEAD, NEW, SHARED, law, mapped, table, town
 
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numba
+import pytest
 
 # Writes what it loaded of Numba's compiler, then the result, in a process of its own.
 INNER = """
@@ -57,12 +58,14 @@ print("scipy.linalg" in sys.modules, "numba.np.arrayobj" in sys.modules)
 """
 
 
-def run(folder: Path, *words: str) -> list[str]:
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache")}
+def run(folder: Path, *words: str, **variables: str) -> list[str]:
+    """What Python prints; its warnings are in the file ``errors``."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache")} | variables
     done = subprocess.run(
         [sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
+    (folder / "errors").write_text(done.stderr)
     return done.stdout.splitlines()
 
 
@@ -91,6 +94,55 @@ def test_an_unknown_release_uses_its_own_cache(tmp_path: Path) -> None:
     (tmp_path / "inner.py").write_text(INNER.replace("from vslam.kernels", UNKNOWN, 1))
     for hits in "01":
         assert run(tmp_path, "-c", CALL)[0] == f"6.0 [0.0, 1.0, 2.0, 3.0] {hits}"
+
+
+def damage(path: Path, how: str) -> None:
+    size = path.stat().st_size
+    keep = path.read_bytes()[: {"emptied": 0, "cut": size // 2, "zeroed": size // 2}[how]]
+    path.write_bytes(keep.ljust(size, b"\0") if how == "zeroed" else keep)
+
+
+@pytest.mark.parametrize("how", ["emptied", "cut", "zeroed"])
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+def test_damaged_kernels_are_compiled_again(tmp_path: Path, how: str, kind: str) -> None:
+    """As a power cut leaves files that were just written."""
+    (tmp_path / "inner.py").write_text(INNER)
+    run(tmp_path, "-c", CALL)
+    for path in tmp_path.rglob(f"*.{kind}"):
+        damage(path, how)
+    errors = tmp_path / "errors"
+    assert run(tmp_path, "-c", CALL)[0] == "6.0 [0.0, 1.0, 2.0, 3.0] 0"
+    assert errors.read_text().count("damaged; they are compiled again") == 1
+    assert run(tmp_path, "-c", CALL)[0] == "6.0 [0.0, 1.0, 2.0, 3.0] 1"
+    assert errors.read_text() == ""
+
+
+SMALL_DISK = """
+import resource
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+"""
+
+
+def test_kernels_that_do_not_fit_on_the_disk(tmp_path: Path) -> None:
+    (tmp_path / "inner.py").write_text(INNER)
+    errors = tmp_path / "errors"
+    for _ in range(2):
+        assert run(tmp_path, "-c", SMALL_DISK + CALL)[0] == "6.0 [0.0, 1.0, 2.0, 3.0] 0"
+        assert errors.read_text().count("cannot be kept (File too large)") == 1
+
+
+@pytest.mark.parametrize("numba_of", ["from vslam.kernels", "UNKNOWN"])
+def test_an_installation_without_a_writable_folder(tmp_path: Path, numba_of: str) -> None:
+    source = INNER if numba_of != "UNKNOWN" else INNER.replace("from vslam.kernels", UNKNOWN, 1)
+    (tmp_path / "inner.py").write_text(source)
+    (tmp_path / "__pycache__").touch()  # no folder can be made, even by root
+    nowhere = {name: "/dev/null/none" for name in ("NUMBA_CACHE_DIR", "HOME", "XDG_CACHE_HOME")}
+    (tmp_path / "temporary").mkdir()
+    nowhere["TMPDIR"] = str(tmp_path / "temporary")
+    errors = tmp_path / "errors"
+    assert run(tmp_path, "-c", CALL, **nowhere)[0] == "6.0 [0.0, 1.0, 2.0, 3.0] 0"
+    assert errors.read_text().count("Set NUMBA_CACHE_DIR to a writable folder") == 1
+    assert list((tmp_path / "temporary").iterdir()) == []
 
 
 UNKNOWN = """kernels.TESTED_NUMBA = "unknown"

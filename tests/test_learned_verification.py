@@ -12,11 +12,11 @@ from vslam.features import Features
 from vslam.geometry import inverse, se3_exp, transform
 from vslam.loopclosure.learned_verification import (
     LearnedTrials,
+    is_image_redundant,
     joined,
     nearest_features,
     rated,
     recognise,
-    shows_known,
     verify_learned,
 )
 from vslam.loopclosure.local_matching import DescriptorMaps
@@ -251,9 +251,9 @@ def test_no_network_sees_what_an_image_shows_already(network):
         link_many(map_.arrays, np.arange(rows.start, rows.stop), seen_there)
     images = KeyframeImages(network)
     config = CONFIG.learned.model_copy(update={"most_shared": 0.4})
-    assert not shows_known(map_, 2, images, config)  # no image is kept
+    assert not is_image_redundant(map_, 2, images, config)  # no image is kept
     images.add(0, np.zeros((192, 640), np.uint8))
-    assert shows_known(map_, 2, images, config)
+    assert is_image_redundant(map_, 2, images, config)
     higher = config.model_copy(update={"most_shared": 0.41})
-    assert not shows_known(map_, 2, images, higher)
-    assert shows_known(map_, 1, images, config)  # two in a row are not seen
+    assert not is_image_redundant(map_, 2, images, higher)
+    assert is_image_redundant(map_, 1, images, config)  # two in a row are not seen

@@ -18,7 +18,7 @@ from vslam.geometry import inverse
 from vslam.loops import LoopEdge
 from vslam.slam import Slam
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools" / "experiments" / "lifelong"))
 from laps import BLACK, find_seam, is_right, plan_laps
 
 RING = Ring.create()

@@ -16,14 +16,14 @@ from typer.testing import CliRunner
 from vslam.cli.main import app
 from vslam.datasets.synthetic import store
 from vslam.errors import InputError
-from vslam.loopbench import report as reporting
-from vslam.loopbench.conditions import Condition, apply, clipped, parse_conditions, turned
-from vslam.loopbench.cost import cost
-from vslam.loopbench.detectors import BowScorer, DetectorSet, describe
-from vslam.loopbench.measure import epipolar_inliers, measure, thinned
-from vslam.loopbench.schema import LoopsJson, Verified
-from vslam.loopbench.sequences import LENGTH, log_odds, sequence_scores
-from vslam.loopbench.sets import QuerySet, TestSet, open_set
+from vslam.lab.loopbench import report as reporting
+from vslam.lab.loopbench.conditions import Condition, apply, clipped, parse_conditions, turned
+from vslam.lab.loopbench.cost import cost
+from vslam.lab.loopbench.detectors import BowScorer, DetectorSet, describe
+from vslam.lab.loopbench.measure import epipolar_inliers, measure, thinned
+from vslam.lab.loopbench.schema import LoopsJson, Verified
+from vslam.lab.loopbench.sequences import LENGTH, log_odds, sequence_scores
+from vslam.lab.loopbench.sets import QuerySet, TestSet, open_set
 from vslam.loopclosure.precision_recall import average_precision, precision_recall
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
 from vslam.loopclosure.vocabulary import load

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from vslam.errors import InputError
-from vslam.loopbench.detectors import DescribedImage
-from vslam.loopbench.lsgd import (
+from vslam.lab.loopbench.detectors import DescribedImage
+from vslam.lab.loopbench.lsgd import (
     LsgdScorer,
     centres,
     grid,
@@ -14,8 +14,8 @@ from vslam.loopbench.lsgd import (
     similarities,
     superpixels,
 )
-from vslam.loopbench.node_matching import index_nodes
-from vslam.loopbench.registry import comparable_scorer, require_comparable
+from vslam.lab.loopbench.node_matching import index_nodes
+from vslam.lab.loopbench.registry import comparable_scorer, require_comparable
 
 
 def textured(seed: int, height: int = 130, width: int = 210) -> np.ndarray:

@@ -9,7 +9,7 @@ import pytest
 
 from vslam.features import Features
 from vslam.geometry import se3_exp
-from vslam.map import KEYFRAME_FIELDS, LANDMARK_FIELDS, ROW_FIELDS, Map
+from vslam.map import KEYFRAME_FIELDS, LANDMARK_FIELDS, PREDICTED, ROW_FIELDS, Map
 from vslam.map_kernels import (
     collect_landmarks,
     count_seen_by,
@@ -407,16 +407,16 @@ def test_submaps_begin_at_restarts_and_pass_to_children():
     for keyframe in range(6):
         add_keyframe(map_, rng)
         map_.parents[keyframe] = keyframe - 1
-    map_.restarts.append(3)
+    map_.keyframes.restart[3] = PREDICTED
     map_.parents[5] = 1
     assert map_.submaps().tolist() == [0, 0, 0, 3, 3, 0]
 
 
-def test_used_arrays_are_a_copy_without_spare_capacity():
+def test_a_copy_is_without_spare_capacity():
     map_, rng = Map(SCALES), np.random.default_rng(5)
     keyframe = map_.add_keyframe(random_features(rng, 7), np.eye(4), 0.0, 0)
     map_.add_landmarks(rng.uniform(1, 9, (3, 3)), np.zeros((3, 4), np.uint64), keyframe)
-    used = map_.used_arrays()
+    used = map_.copy().arrays
     lengths = {name: len(getattr(used, name)) for name in used._fields}
     assert lengths == {
         name: 1 if name in KEYFRAME_FIELDS else 3 if name in LANDMARK_FIELDS else 7

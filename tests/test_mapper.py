@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -28,10 +28,10 @@ from vslam.states import MapperState
 
 POINTS = Points.create()
 RING = ring.Ring.create(zoom=True)
-EXECUTORS = [lambda: None, InstantExecutor]
-ids = {"argnames": "executor", "argvalues": EXECUTORS, "ids": ["late", "instant"]}
-both = pytest.mark.parametrize(**ids)  # as late as can be, and as early
-
+# A job runs as late as can be, where its result is needed, or as early as can be, at once.
+late_and_early = pytest.mark.parametrize(
+    "executor", [lambda: None, InstantExecutor], ids=["late", "early"]
+)
 
 AT_THE_END = -1  # in place of a keyframe
 
@@ -50,7 +50,7 @@ class Closing:
         if self._job is not None:
             self._job(map_, keyframe)
 
-    def follow(self, keyframe: int) -> bool:
+    def count_reused_keyframe(self, keyframe: int) -> bool:
         return self.is_due
 
     def conclude(self, map_: Map) -> None:
@@ -80,9 +80,10 @@ class Drive:
         camera: Camera = CAMERA,
         see: Callable[[int], Features] = see_points,
         poses: Callable[[int], np.ndarray] = at,
+        tracking: dict[str, int] | None = None,
         **keyframes: float,
     ) -> None:
-        config = Config.model_validate({"keyframes": keyframes})
+        config = Config.model_validate({"keyframes": keyframes, "tracking": tracking or {}})
         self.context = TrackingContext.create(camera, config)
         self.closing = closing or Closing()
         self.rig = RigCalibration(camera, config.stereo, self.context.scales)
@@ -97,7 +98,9 @@ class Drive:
         frame.T_cw = self._at(k)
         self.rig.prepare(frame, None)
         if mapper.n_keyframes:
-            _, _, visible = track_local_map(frame, mapper.view.around, self.context, window=8.0)
+            _, _, visible = track_local_map(
+                frame, mapper.view.local_landmarks, self.context, window=8.0
+            )
             mapper.count(visible, frame.landmark[frame.landmark >= 0])
         return frame
 
@@ -106,7 +109,7 @@ class Drive:
         self.mapper.merge_if_due(len(self.mapper.frames))
         frame = self.next_frame()
         self.mapper.hold(self.last, frame)
-        self.mapper.place(frame, tracked=True)
+        self.mapper.append_pose(frame, tracked=True)
         if keyframe:
             self.mapper.insert(frame)
         self.last = frame
@@ -126,10 +129,8 @@ def bytes_of_view(view: MapView) -> bytes:
 
 
 def bytes_of_map(map_: Map) -> bytes:
-    return (
-        b"".join(array.tobytes() for array in map_.used_arrays())
-        + repr([map_.parents, map_.unit_scale, map_.restarts, map_.disparity_offset]).encode()
-    )
+    columns = map_.copy().columns()
+    return b"".join(array.tobytes() for array in columns.values()) + repr(map_.scalars).encode()
 
 
 # -- the schedule ---------------------------------------------------------------------------------
@@ -142,10 +143,10 @@ def test_the_first_keyframe_is_mapped_at_once():
     assert drive.mapper.n_keyframes == 1
     assert drive.mapper.is_merged
     assert not drive.mapper.is_mapping
-    assert len(drive.mapper.view.around.ids) == drive.mapper.map.n_landmarks > 50
+    assert len(drive.mapper.view.local_landmarks.ids) == drive.mapper.map.n_landmarks > 50
 
 
-@both
+@late_and_early
 @pytest.mark.parametrize("after", [1, 2, 4])
 def test_a_keyframe_is_merged_at_the_frame_that_is_due_and_no_other(executor, after):
     drive = Drive(executor(), merge_after_frames=after)
@@ -159,18 +160,20 @@ def test_a_keyframe_is_merged_at_the_frame_that_is_due_and_no_other(executor, af
     drive.step()
     assert (mapper.is_merged, mapper.is_mapping) == (True, False)
     assert mapper.view is not shown
-    assert len(mapper.view.around.ids) > len(shown.around.ids)  # two keyframes triangulate
+    assert len(mapper.view.local_landmarks.ids) > len(
+        shown.local_landmarks.ids
+    )  # two keyframes triangulate
     merged = mapper.view
     drive.step()
     assert mapper.view is merged
 
 
-@both
+@late_and_early
 def test_whoever_needs_the_map_merges(executor):
     for use in (
         lambda drive: drive.mapper.merge(),
         lambda drive: drive.mapper.finish(),
-        lambda drive: drive.mapper.old_place(drive.last),
+        lambda drive: drive.mapper.find_old_place(drive.last),
         lambda drive: drive.mapper.refer_to_nearest(drive.last),
         lambda drive: drive.mapper.map_far_points(drive.last),
     ):
@@ -179,7 +182,7 @@ def test_whoever_needs_the_map_merges(executor):
         shown = drive.mapper.view
         use(drive)
         assert drive.mapper.is_merged
-        assert len(drive.mapper.view.around.ids) > len(shown.around.ids)
+        assert len(drive.mapper.view.local_landmarks.ids) > len(shown.local_landmarks.ids)
 
 
 def test_a_keyframe_merges_the_one_before():
@@ -224,7 +227,7 @@ def test_completing_a_keyframe_early_changes_no_result():
     assert trace_on_the_ring(None, Mapper.complete) == trace_on_the_ring(None)
 
 
-@both
+@late_and_early
 def test_completing_shows_tracking_nothing(executor):
     drive = Drive(executor(), merge_after_frames=9)
     drive.steps([0, 3], 5)
@@ -242,7 +245,7 @@ def test_completing_shows_tracking_nothing(executor):
     assert mapper.view is not shown
 
 
-@both
+@late_and_early
 def test_the_map_is_not_to_be_had_while_a_keyframe_is_mapped(executor):
     drive = Drive(executor(), merge_after_frames=9)
     drive.steps([0, 3], 5)
@@ -266,7 +269,7 @@ def test_a_trajectory_is_not_to_be_had_even_if_all_frames_follow_the_reference_k
         drive.mapper.trajectory()
 
 
-@both
+@late_and_early
 def test_the_map_counts_what_frames_saw_when_it_is_free(executor):
     drive = Drive(executor(), merge_after_frames=9)
     drive.steps([0, 3], 4)
@@ -292,7 +295,7 @@ def test_the_map_counts_what_frames_saw_when_it_is_free(executor):
 MOVES = [se3_exp(np.array(twist)) for twist in ([0.3, 0, 0, 0, 0.02, 0], [0, 0, -0.4, 0.03, 0, 0])]
 
 
-@both
+@late_and_early
 def test_held_frames_follow_a_merge(executor):
     """One that is placed follows its keyframe, one that is not follows the reference keyframe."""
 
@@ -318,7 +321,7 @@ def test_held_frames_follow_a_merge(executor):
     np.testing.assert_array_equal(placed.T_cw, drive.mapper.frames.pose(placed.index))
 
 
-@both
+@late_and_early
 def test_held_frames_track_what_became_of_their_landmarks(executor):
     gone = 7
 
@@ -326,7 +329,7 @@ def test_held_frames_track_what_became_of_their_landmarks(executor):
         if keyframe == 1:
             erase_landmark(map_.arrays, gone)
             map_.arrays.xyz[: map_.n_landmarks] += 0.25
-            map_.disparity_offset = 0.125
+            map_.scalars = replace(map_.scalars, disparity_offset=0.125)
 
     drive = Drive(executor(), Closing(change), merge_after_frames=9)
     drive.steps([0, 3], 4)
@@ -365,7 +368,7 @@ def begin_with_two_views(drive: Drive) -> None:
     for _ in range(4):
         frames.append(drive.next_frame())
         frames[-1].T_cw = np.eye(4)
-        drive.mapper.place(frames[-1], tracked=False)
+        drive.mapper.append_pose(frames[-1], tracked=False)
     every = np.arange(len(POINTS.xyz))
     start = TwoViewStart(frames[0], frames[3], at(3), (every, every), POINTS.xyz)
     drive.mapper.begin(start, lambda: None)
@@ -379,7 +382,8 @@ def test_a_monocular_map_begins_with_two_keyframes():
     assert processed == [0, 1]
     assert (drive.mapper.is_merged, drive.mapper.last_frame) == (True, 3)
     assert drive.mapper.last_timestamp == second.timestamp
-    assert (map_.frames, map_.parents, map_.n_landmarks) == ([0, 3], [-1, 0], 240)
+    assert (map_.frames.tolist(), map_.parents.tolist()) == ([0, 3], [-1, 0])
+    assert map_.n_landmarks == 240
     scale = np.linalg.norm(map_.arrays.T_cw[1][:3, 3]) / np.linalg.norm(at(3)[:3, 3])
     np.testing.assert_array_equal(second.T_cw, map_.arrays.T_cw[1])
     np.testing.assert_array_equal(second.xyz, map_.arrays.xyz[second.landmark])
@@ -391,7 +395,7 @@ def drive_twist(k: int) -> np.ndarray:
     return np.array([0.0, 0.0, -0.2 * k, 0.0, -0.002 * k, 0.0])
 
 
-@both
+@late_and_early
 def test_where_the_unit_of_a_monocular_map_changes_speeds_and_poses_change_with_it(executor):
     def double(map_: Map, keyframe: int) -> None:
         if keyframe == 2:
@@ -434,7 +438,7 @@ def test_where_dead_landmarks_are_dropped_frames_track_the_same_points(adjusting
     drive.closing.is_adjusting = adjusting
     monkeypatch.setattr(Map, "many_dead_landmarks", True)
     held, new = drive.step(), drive.next_frame()
-    drive.mapper.place(new, tracked=True)
+    drive.mapper.append_pose(new, tracked=True)
     drive.mapper.hold(held, new)
     numbers, xyz = [frame.landmark.copy() for frame in (held, new)], held.xyz.copy()
     drive.mapper.insert(new)
@@ -454,7 +458,7 @@ def test_a_frame_may_be_placed_by_the_keyframe_near_which_it_was_found():
     drive.steps([0, 3], 6)
     assert drive.mapper.reference == 1
     frame = drive.next_frame()
-    drive.mapper.place(frame, tracked=True, near=0)
+    drive.mapper.append_pose(frame, tracked=True, near=0)
     assert drive.mapper.reference == 0
     assert drive.mapper.frames.table().reference[-1] == 0
     np.testing.assert_allclose(drive.mapper.frames.pose(-1), frame.T_cw, atol=1e-12)
@@ -483,7 +487,7 @@ def test_a_place_is_old_when_its_keyframe_is(known_after_s, known):
     drive.steps([0, 3], 5)
     frame = drive.step()
     assert frame.timestamp == 0.5
-    place = drive.mapper.old_place(frame)
+    place = drive.mapper.find_old_place(frame)
     assert (place is not None) == known
     if place is not None:
         map_ = drive.mapper.map
@@ -499,7 +503,7 @@ def test_an_old_keyframe_can_serve_in_place_of_a_new_one(is_due):
     drive.steps([0, 3], 6)
     mapper, frame = drive.mapper, drive.last
     drive.closing.is_due = is_due
-    mapper.follow(mapper.old_place(frame), frame)
+    mapper.use_existing_keyframe(mapper.find_old_place(frame), frame)
     assert (mapper.reference, mapper.n_keyframes) == (0, 2)
     assert mapper.last_timestamp == frame.timestamp
     assert mapper.frames.table().reference[-1] == 0
@@ -520,7 +524,7 @@ def test_far_points_are_mapped_of_the_first_keyframe_while_it_is_the_only_one():
     assert not drive.mapper.map_far_points(drive.next_frame())  # another frame
     assert drive.mapper.map_far_points(frame)
     assert n < np.count_nonzero(frame.landmark >= 0) == 240
-    assert len(drive.mapper.view.around.ids) == 240 > len(near.around.ids)
+    assert len(drive.mapper.view.local_landmarks.ids) == 240 > len(near.local_landmarks.ids)
     assert np.isfinite(frame.xyz).all()
     assert not drive.mapper.map_far_points(frame)  # there are no more
     drive = Drive()
@@ -545,7 +549,7 @@ def fail(map_: Map, keyframe: int) -> None:
         raise BrokenError
 
 
-@both
+@late_and_early
 @pytest.mark.parametrize(
     "first",
     [
@@ -575,7 +579,7 @@ def test_a_job_that_fails_says_so_once_and_the_map_says_so_from_then_on(executor
         lambda: mapper.insert(frame),
         lambda: mapper.map_far_points(frame),
         lambda: mapper.begin(start, lambda: None),
-        lambda: mapper.old_place(frame),
+        lambda: mapper.find_old_place(frame),
         lambda: mapper.refer_to(0),
         lambda: mapper.refer_to_nearest(frame),
         lambda: mapper.keyframe_pose(0),
@@ -652,11 +656,11 @@ def test_a_mapper_that_is_restored_goes_on_as_the_one_that_was_not():
     """The reference keyframe is not the newest, as after a frame was found in the map."""
     one = Drive()
     one.steps([0, 3], 6)
-    one.mapper.place(one.next_frame(), tracked=True, near=0)
+    one.mapper.append_pose(one.next_frame(), tracked=True, near=0)
     state, map_ = one.mapper.state(), one.mapper.complete()
     other = Drive()
     other.mapper = Mapper(
-        other.context, other.closing, other.rig, None, copy_of(map_), one.mapper.frames.table()
+        other.context, other.closing, other.rig, None, map_.copy(), one.mapper.frames.table()
     )
     assert other.mapper.reference == 1  # the newest keyframe, where nothing else is known
     other.mapper.restore(state)
@@ -671,16 +675,6 @@ def test_a_mapper_that_is_restored_goes_on_as_the_one_that_was_not():
     tables = [drive.mapper.frames.table() for drive in (one, other)]
     for mine, theirs in zip(*tables, strict=True):
         np.testing.assert_array_equal(mine, theirs)
-
-
-def copy_of(map_: Map) -> Map:
-    """A map that holds the same."""
-    other = Map(map_.scales)
-    vars(other).update(
-        {name: list(x) if isinstance(x, list) else x for name, x in vars(map_).items()}
-    )
-    other.arrays = type(map_.arrays)(*(array.copy() for array in map_.arrays))
-    return other
 
 
 def test_the_patches_of_keyframes_are_part_of_the_state():
@@ -710,8 +704,9 @@ def test_the_patches_of_keyframes_are_part_of_the_state():
 def test_only_the_same_drive_counts_frames_from_its_newest_keyframe(same_drive):
     one = Drive()
     one.steps([0, 3], 6)
-    map_ = copy_of(one.mapper.map)
-    map_.session += not same_drive
+    map_ = one.mapper.map.copy()
+    if not same_drive:
+        map_.begin_drive()
     other = Mapper(one.context, one.closing, one.rig, None, map_, one.mapper.frames.table())
     other.continue_drive()
     assert other.last_frame == (3 if same_drive else -1)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_global_bundle_adjustment import loop_problem
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools" / "experiments" / "motorway"))
 from noise_model import variance_components
 
 PIXEL, TIMES_SURER = 0.5, 4.0  # px of noise in u and v; that of disparities is so much smaller

@@ -18,10 +18,10 @@ from typer.testing import CliRunner
 from vslam.cli.main import app
 from vslam.datasets.synthetic import store
 from vslam.errors import InputError
-from vslam.loopbench import report as reporting
-from vslam.loopbench.drives import open_drives
-from vslam.loopbench.measure_online import measure_drive
-from vslam.loopbench.online import (
+from vslam.lab.loopbench import report as reporting
+from vslam.lab.loopbench.drives import open_drives
+from vslam.lab.loopbench.measure_online import measure_drive
+from vslam.lab.loopbench.online import (
     Decisions,
     Detection,
     ScoredDetector,
@@ -31,7 +31,7 @@ from vslam.loopbench.online import (
     judge,
     parse_window,
 )
-from vslam.loopbench.schema import LoopsJson
+from vslam.lab.loopbench.schema import LoopsJson
 from vslam.loopclosure.precision_recall import max_f1, recall_at_full_precision
 from vslam.loopclosure.siamese.image_source import (
     DIFFERENT,

@@ -18,11 +18,11 @@ from vslam.cli import main as cli
 from vslam.cli.tables import show_tables, table_lines
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.overview import write_overview
-from vslam.overview.collect import Found, collect, read_aligned
-from vslam.overview.render import tables
-from vslam.overview.schema import ALL, MEASURES, Drive, OverviewJson, RunEntry, Spread
-from vslam.overview.summary import (
+from vslam.lab.overview import write_overview
+from vslam.lab.overview.collect import Found, collect, read_aligned
+from vslam.lab.overview.render import tables
+from vslam.lab.overview.schema import ALL, MEASURES, Drive, OverviewJson, RunEntry, Spread
+from vslam.lab.overview.summary import (
     compare,
     least_pairs,
     make_rows,
@@ -30,7 +30,7 @@ from vslam.overview.summary import (
     summarize,
     systems,
 )
-from vslam.overview.versus import versus
+from vslam.lab.overview.versus import versus
 from vslam.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 
 LAWS = ("none", "brightness:0.5", "brightness:1")
@@ -358,6 +358,12 @@ def test_changes_of_a_rendered_town_are_perturbations(run_folder: Path, tmp_path
     assert {drive.sequence for drive in drives} == {"05"}
     assert [drive.perturb for drive in drives] == ["none", "change:0.5", "change:1,blur:1"]
     assert list(strengths(drives, "change").values()) == [0.0, 0.5]
+
+
+def test_a_name_is_never_a_formula(run_folder: Path, tmp_path: Path):
+    copy_run(run_folder, tmp_path / "runs" / "one", sequence="$\\frac$")
+    write_overview([tmp_path / "runs"], [], tmp_path / "out")
+    assert re.search(r"<text[^>]*>[^<]*\$\\frac\$", (tmp_path / "out" / "report.html").read_text())
 
 
 def test_a_drive_with_a_name_of_its_own_keeps_it(run_folder: Path, tmp_path: Path):

@@ -91,7 +91,9 @@ def test_its_metadata_are_complete(wheels):
     classifiers = metadata.get_all("Classifier") or []
     for version in ("3.11", "3.12", "3.13"):
         assert f"Programming Language :: Python :: {version}" in classifiers
-    assert {"bag", "cluster", "docs", "dev"} == set(metadata.get_all("Provides-Extra") or [])
+    assert {"bag", "cluster", "docs", "dev", "train"} == set(
+        metadata.get_all("Provides-Extra") or []
+    )
     assert "vslam = vslam.cli.main:main" in points
     assert "# vslam" in str(metadata.get_payload())
 
@@ -137,11 +139,14 @@ def test_a_plain_installation_stays_lean():
     assert not [name for name in extras if re.search(rf"\b{name}\b", plain)]
     for library, extra, where in (
         ("rosbags", "bag", "vslam/datasets/bag.py"),
-        ("distributed", "cluster", "vslam/bench/cluster.py"),
+        ("distributed", "cluster", "vslam/lab/bench/cluster.py"),
+        ("torch", "train", "vslam/cli/train.py"),
     ):
         assert library in extras
         assert f"vslam[{extra}]" in (ROOT / where).read_text()
-    assert "vslam[bag,cluster,docs]" in PROJECT["optional-dependencies"]["dev"]  # make installs all
+    assert (
+        "vslam[bag,cluster,docs,train]" in PROJECT["optional-dependencies"]["dev"]
+    )  # make installs all
 
 
 def make_targets() -> set[str]:
@@ -176,4 +181,4 @@ def test_the_image_is_not_root_and_copies_what_exists():
 def test_the_development_container_names_targets_of_make():
     content = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text())
     named = set(re.findall(r"make (\w+)", json.dumps(content)))
-    assert {"install", "demo", "test"} <= named <= make_targets()
+    assert {"dev", "demo", "test"} <= named <= make_targets()

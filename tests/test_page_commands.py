@@ -110,14 +110,17 @@ RULES = {
     "docs/cameras.md": Rules(
         not_run=(
             ("vslam synth block --fisheye", AGAIN),
-            ("python tools/fisheye_twin.py", "it takes a minute to render a bend"),
+            (
+                "python tools/experiments/cameras/fisheye_twin.py",
+                "it takes a minute to render a bend",
+            ),
         )
     ),
     "docs/design.md": Rules(
         not_run=(
-            ("python tools/orb_pattern.py", "it takes 20 s"),
-            ("python tools/bow_speed.py", TIME),
-            ("python tools/bench_optimisers.py", TIME),
+            ("python tools/experiments/design/orb_pattern.py", "it takes 20 s"),
+            ("python tools/experiments/design/bow_speed.py", TIME),
+            ("python tools/experiments/design/bench_optimisers.py", TIME),
         )
     ),
     "docs/exports.md": Rules((("colmap RUN", "colmap RUN --out again"), ("RUN", "runs/latest"))),
@@ -130,7 +133,7 @@ RULES = {
     "docs/howto/untrusted.md": Rules((("--inputs 1000", "--inputs 2 --readers trajectory"),)),
     "docs/lifelong.md": Rules(
         not_run=(
-            ("python tools/laps.py", HOURS),
+            ("python tools/experiments/lifelong/laps.py", HOURS),
             ("vslam run --resume", "test_autosave.py resumes runs"),
             ("python tools/kill_test.py", "it runs for minutes; test_autosave.py kills runs"),
         )
@@ -160,10 +163,16 @@ RULES = {
     ),
     "docs/motorway.md": Rules(
         not_run=(
-            ("python tools/motorway.py errors", HOURS),
-            ("python tools/motorway_variants.py", HOURS),
-            ("python tools/motorway.py offset", "it needs a drive of hundreds of metres"),
-            ("python tools/noise_model.py", "it needs two runs; test_noise_model.py has a map"),
+            ("python tools/experiments/motorway/motorway.py errors", HOURS),
+            ("python tools/experiments/motorway/motorway_variants.py", HOURS),
+            (
+                "python tools/experiments/motorway/motorway.py offset",
+                "it needs a drive of hundreds of metres",
+            ),
+            (
+                "python tools/experiments/motorway/noise_model.py",
+                "it needs two runs; test_noise_model.py has a map",
+            ),
         )
     ),
     "docs/online.md": Rules(
@@ -179,7 +188,10 @@ RULES = {
             ("SYNTH=", ORBSLAM),
             ("$SYNTH", ORBSLAM),
             ("vslam bench --dataset synthetic", HOURS),
-            ("python tools/focal_length.py --dataset synthetic", "it renders 600 frames"),
+            (
+                "python tools/experiments/results/focal_length.py --dataset synthetic",
+                "it renders 600 frames",
+            ),
         )
     ),
     "docs/rgbd.md": Rules(
@@ -187,7 +199,7 @@ RULES = {
         (("vslam synth block", AGAIN), ("vslam run --data block", AGAIN)),
     ),
     "docs/rivals.md": Rules(not_run=(("python tools/", HOURS),)),
-    "docs/scale.md": Rules(not_run=(("python tools/growth.py", HOURS),)),
+    "docs/scale.md": Rules(not_run=(("python tools/experiments/scale/growth.py", HOURS),)),
     "docs/sources.md": Rules(
         not_run=(
             ("vslam run --dataset synthetic --seq demo", "test_site.py runs it"),

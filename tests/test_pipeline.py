@@ -216,7 +216,7 @@ def test_run_without_pages_is_enough_for_a_report_later(kitti_tree, tmp_path):
     assert [int(frame["frame"]) for frame in frames] == list(range(28))
     assert {frame["state"] for frame in frames} == {"OK"}
     assert float(frames[0]["extract_ms"]) > 0.0
-    assert frames[0]["track_frame_ms"] == ""  # the first frame has nothing to be tracked against
+    assert frames[0]["track_ms"] == ""  # the first frame has nothing to be tracked against
     assert "report.html" not in done.stdout
     later = vslam("report", folder, "--out", "later", cwd=tmp_path)
     assert later.returncode == 0, later.stderr
@@ -224,7 +224,8 @@ def test_run_without_pages_is_enough_for_a_report_later(kitti_tree, tmp_path):
     assert (tmp_path / "later" / "report.html").exists()
 
 
-def test_interrupt_finishes_the_report_of_the_frames_done(kitti_tree, tmp_path):
+@pytest.mark.parametrize("ended_by", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_finishes_the_report_of_the_frames_done(kitti_tree, tmp_path, ended_by):
     root = tmp_path / "kitti"
     shutil.copytree(kitti_tree, root)
     # The corridor there and back often enough to be still running when the signal comes.
@@ -252,7 +253,7 @@ def test_interrupt_finishes_the_report_of_the_frames_done(kitti_tree, tmp_path):
         character = process.stderr.read(1)
         assert character, f"ended too soon: {drawn}"
         drawn += character
-    process.send_signal(signal.SIGINT)
+    process.send_signal(ended_by)
     _, err = process.communicate(timeout=120)
     assert process.returncode == 1, err
     report = json.loads((tmp_path / "runs" / "latest" / "report.json").read_text())

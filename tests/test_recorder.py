@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import re
+import socket
 import subprocess
 import sys
 import textwrap
@@ -19,6 +22,7 @@ from vslam.errors import InputError
 from vslam.features import Features, TrackingState, TrackResult
 from vslam.loops import LoopEdge
 from vslam.map import Map
+from vslam.run import recorder as recorder_module
 from vslam.run.moments import LoopPictureRecorder
 from vslam.run.recorder import (
     NullRecorder,
@@ -307,15 +311,13 @@ time.sleep(60)
 @pytest.fixture
 def window(monkeypatch):
     """In place of the viewer's window: a process that receives what it is sent."""
-    import rerun
-
     started = []
 
-    def spawn(*, port, recording, **_):
-        assert rerun.is_enabled(recording)  # the real one does nothing otherwise
+    def start(port, words):
         started.append(subprocess.Popen([sys.executable, "-c", SERVER, str(port)]))
+        return started[-1]
 
-    monkeypatch.setattr(rerun, "spawn", spawn)
+    monkeypatch.setattr(recorder_module, "_start_viewer", start)
     monkeypatch.setenv("DISPLAY", ":0")
     yield started
     for process in started:
@@ -355,6 +357,10 @@ def test_a_page_shows_the_run(tmp_path, monkeypatch, caplog):
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     viewer = open_viewer("web")
     assert b"<html" in urlopen(viewer.address).read().lower()
+    # Who listens on all interfaces listens on every address of this machine.
+    for port in map(int, re.findall(r"(?:localhost|127\.0\.0\.1):(\d+)", viewer.address)):
+        with socket.socket() as elsewhere:
+            assert elsewhere.connect_ex(("127.0.0.2", port)) == errno.ECONNREFUSED
     record(RerunRecorder(viewer), frames=20)
     assert not caplog.records
 
@@ -368,12 +374,10 @@ def test_a_window_without_a_display_is_refused(monkeypatch):
 
 
 def test_a_viewer_that_cannot_be_started_is_refused(monkeypatch):
-    import rerun
-
-    def fail(**_):
-        raise RuntimeError("no such program")
-
     monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.setattr(rerun, "spawn", fail)
-    with pytest.raises(InputError, match=r"no viewer can be started \(no such program\)"):
+    monkeypatch.setattr(recorder_module, "_executable", lambda: "/no/such/program")
+    with pytest.raises(InputError, match=r"no viewer can be started .*No such file"):
+        open_viewer("native")
+    monkeypatch.setattr(recorder_module, "_executable", lambda: "/bin/false")
+    with pytest.raises(InputError, match="the viewer does not start here"):
         open_viewer("native")

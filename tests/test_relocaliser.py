@@ -79,7 +79,9 @@ class Place:
 
     def check(self, found: Found) -> Found:
         """What the relocaliser makes of the frame while no keyframe is being mapped."""
-        return self.relocaliser.check(self.frame, found, Owner(self.world.map, is_merged=True))
+        return self.relocaliser.relocalise_if_needed(
+            self.frame, found, Owner(self.world.map, is_merged=True)
+        )
 
     def find(self) -> Found:
         """Where the frame is found if it was lost."""
@@ -128,7 +130,7 @@ def everything(frame: Frame) -> list[bytes]:
 
 
 def map_bytes(world: World) -> bytes:
-    return b"".join(array.tobytes() for array in world.map.used_arrays())
+    return b"".join(array.tobytes() for array in world.map.copy().arrays)
 
 
 def offset(frame: Frame) -> float:
@@ -272,12 +274,15 @@ def test_a_frame_that_is_not_doubtful_is_not_looked_for():
 def test_a_lost_frame_does_not_wait_for_a_keyframe_that_is_being_mapped():
     place, _ = by_orb()
     owner = Owner(place.world.map, is_merged=False)
-    assert place.relocaliser.check(place.frame, LOST, owner) is LOST
+    assert place.relocaliser.relocalise_if_needed(place.frame, LOST, owner) is LOST
     assert not owner.is_merged
 
 
 def test_a_doubtful_frame_waits_for_a_keyframe_that_is_being_mapped():
     place, n_there = by_orb()
     owner = Owner(place.world.map, is_merged=False)
-    assert place.relocaliser.check(place.frame, doubtful(20), owner).n_inliers == n_there
+    assert (
+        place.relocaliser.relocalise_if_needed(place.frame, doubtful(20), owner).n_inliers
+        == n_there
+    )
     assert owner.is_merged

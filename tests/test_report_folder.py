@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import errno
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +10,10 @@ import pytest
 from test_report import make_outcome
 
 from vslam.errors import InputError, ResultsError
-from vslam.report import folder
+from vslam.map import Map
+from vslam.maps.storage import load_map
+from vslam.maps.stored_map import StoredMap
+from vslam.report import explorer, figures, folder, render
 from vslam.report.folder import Results, create_run_folder, write_results, write_trajectories
 from vslam.run.outcome import matched_ground_truth
 from vslam.trajectory import Trajectory, read_kitti_poses, read_trajectory
@@ -112,3 +115,46 @@ def test_on_a_full_disk_all_is_tried_and_nothing_is_incomplete(tmp_path, monkeyp
     there = {path.name for path in tmp_path.iterdir()}
     assert there >= {"trajectory.tum", "keyframes.tum", "frames.csv", "config.json", "report.json"}
     assert not there & {"trajectory_kitti.txt", "ground_truth_kitti.txt"}
+
+
+PARTS = {  # what fails: where it is looked up, the name of the result that it costs
+    "write_kitti": (folder, "trajectory_kitti.txt, ground_truth_kitti.txt"),
+    "causal_trajectory": (folder, "trajectory_causal.tum"),
+    "evaluate_run": (folder, "the evaluation"),
+    "save_map": (folder, "map.npz"),
+    "write_frames": (folder, "frames.csv"),
+    "summarize": (folder, "report.json"),
+    "draw_figures": (figures, "figures"),
+    "render_markdown": (render, "report.md"),
+    "explorer_data": (explorer, "report.html"),
+}
+ALL = {
+    "trajectory_kitti.txt", "trajectory.tum", "ground_truth_kitti.txt", "trajectory_causal.tum",
+    "keyframes.tum", "map.npz", "frames.csv", "config.json", "report.json", "figures", "report.md",
+    "report.html",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_result_that_fails_costs_itself_alone(tmp_path, monkeypatch, name):
+    """Whatever it raises: a fault of the figures once took the map with it."""
+
+    def fails(*args):
+        raise KeyError("a fault\nof vslam")
+
+    module, cost = PARTS[name]
+    monkeypatch.setattr(module, name, fails)
+    outcome = make_outcome(20)
+    stored = StoredMap(Map(1.2 ** np.arange(8)), outcome.sequence.camera)
+    outcome = replace(outcome, stored=stored)
+    with pytest.raises(ResultsError) as error:
+        write_results(tmp_path, outcome)
+    says = str(error.value)
+    assert says.startswith(f"{tmp_path}: {cost} failed (KeyError: 'a fault")
+    assert says.endswith("all other results are there; this is a fault of vslam, please report it.")
+    assert "\n" not in says
+    lost = {"report.md", "report.html", "figures"} if name == "summarize" else set()
+    assert {path.name for path in tmp_path.iterdir()} == ALL - set(cost.split(", ")) - lost
+    if "map.npz" in cost:
+        return
+    assert load_map(tmp_path / "map.npz").map.n_keyframes == 0

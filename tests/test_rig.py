@@ -54,7 +54,7 @@ def test_a_frame_that_was_saved_is_not_corrected_again():
     extracted, _ = seen(TWIST, 5e-3)
     calibration = rig(5e-3, offset=0.25)
     frame = Frame.of(extracted, CAMERA)
-    calibration.adopt(frame)
+    calibration.mark_corrected(frame)
     calibration.prepare(frame, TWIST)
     assert frame.features is extracted.features
 

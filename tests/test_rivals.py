@@ -20,7 +20,7 @@ from vslam.cli.main import app
 from vslam.cli.options import DetectorName
 from vslam.cli.train import NetworkName, PresetName
 from vslam.errors import InputError
-from vslam.loopbench.schema import Cost, Curve, LoopsJson, Score
+from vslam.lab.loopbench.schema import Cost, Curve, LoopsJson, Score
 from vslam.loopclosure.registry import DETECTORS
 from vslam.loopclosure.siamese.branches import CapsuleShape
 from vslam.loopclosure.siamese.component_training import learn_components
@@ -345,7 +345,7 @@ class Sleeper:
 
 
 def test_the_tables_of_the_page(tmp_path, monkeypatch):
-    tool = script("tools/rivals_table.py")
+    tool = script("tools/experiments/rivals/rivals_table.py")
     names = {"images": ("capsule", "capsule-pruned", "pcanet"), "minutes": ("capsule", "pcanet"),
              "untrained": ("lsgd",), "shipped": ("bow", "capsule", "capsule-pruned")}  # fmt: skip
     for way, detectors in names.items():

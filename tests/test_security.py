@@ -10,6 +10,7 @@ import re
 import struct
 import subprocess
 import sys
+import tracemalloc
 import zipfile
 import zlib
 from pathlib import Path
@@ -19,11 +20,13 @@ import pytest
 from test_report import make_outcome, report_of
 
 from vslam.calibration.documents import read_document
+from vslam.datasets.bag import open_bag
 from vslam.datasets.image_files import read_grey
 from vslam.errors import InputError, UnreadableImageError
 from vslam.loopclosure.vocabulary import load
 from vslam.maps.storage import load_map
 from vslam.report.render import render_html
+from vslam.run.progress import read_progress
 from vslam.untrusted import MOST_PIXELS, read_npz
 
 ROOT = Path(__file__).parents[1]
@@ -222,3 +225,38 @@ def test_no_source_executes_what_it_reads():
             if owner == "torch" and method == "load" and words.get("weights_only") != "True":
                 found.append(where)
     assert found == []
+
+
+def test_yaml_is_bounded_by_its_size(tmp_path: Path):
+    """6 MB of it once took 2.3 GB and a minute."""
+    pytest.importorskip("rosbags")
+    path = tmp_path / "a.yaml"
+    path.write_text("a: [" + "1, " * 40_000 + "1]\n")
+    with pytest.raises(InputError, match=r"a\.yaml: larger than 100 kB, which no calibration is"):
+        read_document(path)
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    (bag / "metadata.yaml").write_text("a: [" + "1, " * 400_000 + "1]\n")
+    with pytest.raises(InputError, match=r"metadata\.yaml is larger than 1 MB"):
+        open_bag(bag)
+
+
+@pytest.mark.parametrize("read", [load_map, read_progress])
+def test_a_header_that_is_a_number_is_not_that_many_bytes(tmp_path: Path, read):
+    """bytes(3_000_000_000) are 3 GB of zeros; the file that asked for them had 192 bytes."""
+    path = tmp_path / "a.npz"
+    np.savez(path, header=np.array(100_000_000))
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r"not a map of vslam|the header is no text"):
+        read(path)
+    assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("read", [lambda p: read_npz(p, "a map"), load_map, read_progress])
+def test_an_archive_may_not_unpack_to_far_more_than_its_size(tmp_path: Path, read):
+    """There may be memory for it, but not for a small file."""
+    path = write_zip(tmp_path / "a.npz", {"header.npy": npy((2**25,), bytes(2**28))})
+    assert path.stat().st_size < 300_000
+    with pytest.raises(InputError, match=r"0\.2 MB unpack to 256 MB; this is hardly"):
+        read(path)

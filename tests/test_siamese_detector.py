@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -11,8 +12,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import onnx
 import pytest
 import torch
+from onnx import TensorProto, helper
 from siamese_worlds import small_network, small_settings, views
 from typer.testing import CliRunner
 
@@ -39,7 +42,7 @@ from vslam.loopclosure.siamese.scoring import NetworkScorer
 from vslam.loopclosure.siamese.siamese import build_network, for_inference, load_network
 from vslam.loopclosure.siamese.weights import SHIPPED
 from vslam.loopclosure.verifier import verifier_for
-from vslam.map import Map
+from vslam.map import PREDICTED, Map
 from vslam.map_kernels import link
 
 
@@ -237,7 +240,7 @@ def test_reach_grows_with_the_way_and_knows_nothing_of_lost_cameras_and_units():
         [30 - 185, 70 - 135, 170 - 85, 70 - 35, 0],
     )
     lost = driven(x)
-    lost.restarts = [3]
+    lost.keyframes.restart[3] = PREDICTED
     lost.parents[:] = [0, 0, 1, 2, 3]
     assert (beyond_reach(lost, 4, config)[:3] == 0).all()
     assert beyond_reach(lost, 4, config)[3] == pytest.approx(70 - 20 - 7)
@@ -415,3 +418,96 @@ def test_the_paper_s_detector_compares_with_all_keyframes_and_verifies_by_orb():
     assert best.match == 0
     assert best.score >= config.siamese.threshold == 0.9
     assert {edge.matched_by for edge in closing.edges} == {"orb"}
+
+
+def graph_of(
+    nodes: list[onnx.NodeProto],
+    weights: list[onnx.TensorProto],
+    shape: tuple[int, ...] = (8, 8),
+    **more: object,
+) -> bytes:
+    image = helper.make_tensor_value_info("image", TensorProto.UINT8, shape)
+    result = helper.make_tensor_value_info("descriptor", TensorProto.UINT8, None)
+    graph = helper.make_graph(nodes, "g", [image], [result], weights, **more)
+    opsets = [helper.make_opsetid("", 20)]
+    return helper.make_model(graph, opset_imports=opsets, ir_version=9).SerializeToString()
+
+
+def number(name: str, *values: int) -> onnx.TensorProto:
+    return helper.make_tensor(name, TensorProto.INT64, [len(values)], values)
+
+
+def endless() -> bytes:
+    """A loop that goes on while a constant is true."""
+    outputs = [
+        helper.make_tensor_value_info("still", TensorProto.BOOL, []),
+        helper.make_tensor_value_info("kept", TensorProto.UINT8, [8, 8]),
+    ]
+    inputs = [
+        helper.make_tensor_value_info("turn", TensorProto.INT64, []),
+        helper.make_tensor_value_info("on", TensorProto.BOOL, []),
+        helper.make_tensor_value_info("now", TensorProto.UINT8, [8, 8]),
+    ]
+    copies = [
+        helper.make_node("Identity", ["on"], ["still"]),
+        helper.make_node("Identity", ["now"], ["kept"]),
+    ]
+    body = helper.make_graph(copies, "body", inputs, outputs)
+    loop = helper.make_node("Loop", ["", "true", "image"], ["descriptor"], body=body)
+    return graph_of([loop], [helper.make_tensor("true", TensorProto.BOOL, [], [True])])
+
+
+def promised() -> bytes:
+    """Weights that are not in the file."""
+    weights = TensorProto(name="w", data_type=TensorProto.UINT8, dims=[2**16, 2**16])
+    return graph_of([helper.make_node("Add", ["image", "w"], ["descriptor"])], [weights])
+
+
+def squares() -> bytes:
+    """A chain of products of an image with itself, which may have any size."""
+    cast = helper.make_node("Cast", ["image"], ["x0"], to=TensorProto.FLOAT)
+    nodes = [cast, *(helper.make_node("MatMul", [f"x{k}"] * 2, [f"x{k + 1}"]) for k in range(5000))]
+    nodes.append(helper.make_node("Cast", ["x5000"], ["descriptor"], to=TensorProto.UINT8))
+    return graph_of(nodes, [], ("H", "W"))
+
+
+HUGE = helper.make_node("Expand", ["image", "shape"], ["descriptor"])
+UNKNOWN = [
+    helper.make_node("Cast", ["image"], ["shape"], to=TensorProto.INT64),
+    helper.make_node("Expand", ["image", "shape"], ["descriptor"]),
+]
+
+
+@pytest.mark.parametrize(
+    ("file", "says"),
+    [
+        (endless(), "vslam uses no operator 'Loop'"),
+        (graph_of([HUGE], [number("shape", 2**27, 8, 8)]), "it asks for 8.6e+09 numbers"),
+        (squares(), "numbers and 6.7e+11 products"),
+        (graph_of(UNKNOWN, [], (2,)), "the sizes of its tensors are unknown"),
+        (promised(), "its weights are not in it"),
+    ],
+    ids=["endless", "huge", "slow", "unknown", "promised"],
+)
+def test_a_foreign_graph_is_refused_before_it_runs(tmp_path, file: bytes, says: str):
+    assert len(file) < 200_000
+    (tmp_path / "a.onnx").write_bytes(file)
+    with pytest.raises(InputError, match=re.escape(says)):
+        OnnxNetwork(tmp_path / "a.onnx")
+
+
+def test_metadata_that_say_something_else_are_told_in_a_sentence(tmp_path):
+    written = tmp_path / "capsule.onnx"
+    export_onnx(small_network(), written)
+    OnnxNetwork(written)
+    model = onnx.load(written)
+    metadata = {one.key: one.value for one in model.metadata_props}
+    for key, value in [
+        ("about", "{"), ("about", "[]"), ("about", "{}"), ("comparison", "no base64!"),
+        ("name", None), ("about", None), ("comparison", None),
+    ]:  # fmt: skip
+        changed = {k: v for k, v in {**metadata, key: value}.items() if v is not None}
+        helper.set_model_props(model, changed)
+        (tmp_path / "a.onnx").write_bytes(model.SerializeToString())
+        with pytest.raises(InputError, match="not a network of this version of vslam"):
+            OnnxNetwork(tmp_path / "a.onnx")

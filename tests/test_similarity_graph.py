@@ -184,7 +184,7 @@ def test_a_correction_leaves_every_keyframe_its_picture():
 
     before = [picture(k) for k in keyframes]
     depth = [transform(a.T_cw[k], a.xyz[map_.landmarks_of(k)])[:, 2] for k in keyframes]
-    offset = map_.T_c_parent[1].copy()
+    offset = map_.keyframes.T_c_parent[1].copy()
     S_wc = np.array([similarity(inverse(a.T_cw[k]), s) for k, s in ((0, 1.5), (2, 0.5))])
     S_wc[1, :3, 3] += [3.0, 0.0, 1.0]
     growth = move_keyframes_similarly(map_, keyframes, S_wc)
@@ -198,7 +198,7 @@ def test_a_correction_leaves_every_keyframe_its_picture():
         away = np.linalg.norm(a.xyz[ids] - inverse(a.T_cw[k])[:3, 3], axis=1)
         np.testing.assert_allclose(a.distance_range[ids, 1], away)
     # A culled keyframe keeps its place beside the one that took its place.
-    np.testing.assert_allclose(map_.T_c_parent[1][:3, 3], 1.5 * offset[:3, 3])
+    np.testing.assert_allclose(map_.keyframes.T_c_parent[1][:3, 3], 1.5 * offset[:3, 3])
     np.testing.assert_allclose(map_.unit_scale, [1.5, 1.5, 0.5])
 
 

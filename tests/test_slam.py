@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Iterable
+from multiprocessing.connection import Connection
 
 import numpy as np
 import pytest
@@ -100,6 +102,37 @@ def test_while_the_left_side_is_black_the_right_one_tracks(corridor, check_map):
     check_map(slam.map)
 
 
+@pytest.mark.parametrize(
+    ("threads", "said"), [(1, "every frame was tracked"), (2, "make one after the fork")]
+)
+def test_a_fork_tracks_with_one_thread_and_is_refused_with_more(corridor, threads, said):
+    """Its copy of the map has no thread that works on it: it would wait for ever."""
+    slam = Slam(corridor.camera, EAGER, "none", threads=threads)
+
+    def go_on(frames: range) -> None:
+        for k in frames:
+            slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
+
+    def child(told: Connection) -> None:
+        try:
+            go_on(range(6, 12))
+            told.send("every frame was tracked")
+        except RuntimeError as error:
+            told.send(str(error))
+
+    go_on(range(6))
+    here, there = multiprocessing.Pipe()
+    process = multiprocessing.get_context("fork").Process(target=child, args=(there,))
+    process.start()
+    try:
+        assert here.poll(30), "the child hangs"
+        assert said in here.recv()
+    finally:
+        process.kill()
+        process.join()
+    go_on(range(6, 12))  # the parent's is as it was
+
+
 def test_results_account_for_every_frame(corridor):
     slam, results = run(corridor)
     assert [r.index for r in results] == list(range(len(corridor)))
@@ -117,10 +150,10 @@ def test_keyframes_are_few_and_lie_on_the_trajectory(corridor):
     made = [r.index for r in results if r.is_keyframe]
     assert made[0] == 0
     assert 4 <= len(made) <= 14
-    assert slam.map.frames == made
+    assert slam.map.frames.tolist() == made
     living = slam.map.living_keyframes()
     keyframes, trajectory = slam.keyframe_trajectory(), slam.trajectory()
-    frames = np.array(slam.map.frames)[living]
+    frames = slam.map.frames[living]
     np.testing.assert_array_equal(keyframes.timestamps, corridor.timestamps[frames])
     np.testing.assert_allclose(keyframes.T_wc, trajectory.T_wc[frames], rtol=0, atol=1e-12)
 
@@ -382,8 +415,11 @@ def test_refuses_images_of_another_size_and_time_that_stands_still(corridor):
     slam = Slam(corridor.camera, CONFIG, "none", threads=1)
     with pytest.raises(ValueError, match="camera"):
         slam.step(corridor.left[0][:-1], corridor.right[0], 0.0)
+    for time in (float("nan"), float("inf"), float("-inf")):
+        with pytest.raises(ValueError, match="must be a finite number"):
+            slam.step(corridor.left[0], corridor.right[0], time)
     slam.step(corridor.left[0], corridor.right[0], 1.0)
-    for time in (1.0, 0.5, float("nan")):
+    for time in (1.0, 0.5, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="timestamp"):
             slam.step(corridor.left[1], corridor.right[1], time)
         with pytest.raises(ValueError, match="timestamp"):

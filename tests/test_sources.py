@@ -29,7 +29,9 @@ from source_files import (
     write_images,
     write_video,
 )
+from test_security import png
 
+from vslam.camera import Camera
 from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.bag_messages import grey_of
@@ -209,6 +211,15 @@ def test_times_in_exif(corridor, tmp_path):
     calib = write_calibration(tmp_path / "c.yaml", corridor.camera)
     found = open_source("images", str(tmp_path), "", SourceOptions((calib,)), sensor="mono")
     assert np.diff(found.timestamps)[0] == pytest.approx(0.5, abs=1e-6)
+
+
+def test_an_image_too_large_for_pillow_has_no_time_in_exif(tmp_path):
+    """Above 179 million pixels Pillow raises an error of its own, though only EXIF is asked for."""
+    for k in range(2):
+        (tmp_path / f"IMG_{k}.png").write_bytes(png(20_000, 20_000))
+    calib = write_calibration(tmp_path / "c.yaml", Camera(60.0, 60.0, 31.5, 23.5, 0.2, 64, 48))
+    with pytest.raises(InputError, match="no time stamps"):
+        open_source("images", str(tmp_path), "", SourceOptions((calib,)), sensor="mono")
 
 
 def test_frames_a_second_come_before_all_other_times(folder):

@@ -10,26 +10,26 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from vslam.bench.execute import Failed, Finished
-from vslam.bench.grid import Cell
 from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.config import Config
 from vslam.datasets.kitti import open_kitti
 from vslam.datasets.perturbation import LAWS, parse_perturbation, sheet_of_laws
 from vslam.errors import InputError
+from vslam.lab.bench.execute import Failed, Finished
+from vslam.lab.bench.grid import Cell
+from vslam.lab.stress.criterion import Criterion
+from vslam.lab.stress.external import check_template, export_kitti, run_external
+from vslam.lab.stress.figures import draw_curves
+from vslam.lab.stress.kitti_c import CORRUPTIONS
+from vslam.lab.stress.plan import Plan, parse_laws
+from vslam.lab.stress.report import cell as cell_text
+from vslam.lab.stress.report import render_boundaries, render_csv, title, write_report
+from vslam.lab.stress.run import Results, run_all
+from vslam.lab.stress.search import boundary, next_position, strength_at
+from vslam.lab.stress.summary import corruption_entries, mean_error, summarise
 from vslam.report.schema import Machine, ReportJson
 from vslam.run.outcome import RunSettings
-from vslam.stress.criterion import Criterion
-from vslam.stress.external import check_template, export_kitti, run_external
-from vslam.stress.figures import draw_curves
-from vslam.stress.kitti_c import CORRUPTIONS
-from vslam.stress.plan import Plan, parse_laws
-from vslam.stress.report import cell as cell_text
-from vslam.stress.report import render_boundaries, render_csv, title, write_report
-from vslam.stress.run import Results, run_all
-from vslam.stress.search import boundary, next_position, strength_at
-from vslam.stress.summary import corruption_entries, mean_error, summarise
 
 CONFIG = Config().model_dump_json(indent=2) + "\n"
 
@@ -482,10 +482,10 @@ def test_stress_refuses_before_it_starts(tmp_path, words, said):
 
 def test_the_table_of_boundaries_is_that_of_the_csv(monkeypatch):
     root = Path(__file__).parents[1]
-    monkeypatch.syspath_prepend(str(root / "tools"))
+    monkeypatch.syspath_prepend(str(root / "tools" / "experiments" / "stress"))
     import boundary_table
 
     page = (root / "docs" / "stress.md").read_text()
     for name, theirs in (("kitti00", "orbslam3"), ("demo", "both")):
         made = boundary_table.table(root / "docs" / "stress" / f"{name}.csv", "bow", theirs)
-        assert made in page, "run: python tools/boundary_table.py"
+        assert made in page, "run: python tools/experiments/stress/boundary_table.py"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 import shutil
 from dataclasses import replace
 from itertools import pairwise
@@ -22,6 +21,7 @@ from vslam.datasets.kitti import open_kitti
 from vslam.datasets.synthetic import houses, parse_drive, store, textures, vehicles, views
 from vslam.datasets.synthetic import town as town_module
 from vslam.datasets.synthetic.camera_effects import sensor_image
+from vslam.datasets.synthetic.files import lock_of
 from vslam.datasets.synthetic.pairs import render_pairs
 from vslam.datasets.synthetic.passes import Passes, pass_starts
 from vslam.datasets.synthetic.render import Light, Renderer
@@ -421,10 +421,12 @@ def test_two_processes_do_not_render_one_sequence(tmp_path, monkeypatch):
     monkeypatch.setattr(store, "_render", fake := Renderings())
     folder = tmp_path / store.folder_name(Variation()) / "sequences"
     folder.mkdir(parents=True)
-    (folder / ".short.lock").write_text(str(os.getppid()))
-    with pytest.raises(InputError, match=rf"process {os.getppid()} is rendering it"):
+    with (
+        lock_of(folder / "short"),
+        pytest.raises(InputError, match="another process is rendering it; wait"),
+    ):
         store.render_sequence(small, Variation(), tmp_path)
-    (folder / ".short.lock").write_text("999999999")  # killed long ago
+    (folder / ".short.lock").touch()  # killed long ago
     store.render_sequence(small, Variation(), tmp_path)
     assert fake.calls == 1
     assert not list(folder.glob(".short*"))

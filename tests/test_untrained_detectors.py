@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from vslam.loopbench import cost
-from vslam.loopbench.detectors import describe
-from vslam.loopbench.incremental_bow import IncrementalBow, Island, islands
-from vslam.loopbench.thumbnail import ThumbnailScorer, correlations, remember, thumbnail
-from vslam.loopbench.word_trees import empty_trees, insert, nearest_two, remove
+from vslam.lab.loopbench import cost
+from vslam.lab.loopbench.detectors import describe
+from vslam.lab.loopbench.incremental_bow import IncrementalBow, Island, islands
+from vslam.lab.loopbench.thumbnail import ThumbnailScorer, correlations, remember, thumbnail
+from vslam.lab.loopbench.word_trees import empty_trees, insert, nearest_two, remove
 from vslam.loopclosure.vocabulary import load
 
 STREET_STEP = 40  # pixels between the images of a street

@@ -80,7 +80,7 @@ def test_orb_verifies_a_candidate_unless_it_was_refused(by_night):
 def test_orb_needs_no_image_and_rates_nothing():
     verifier, map_ = OrbVerifier(CONFIG, STREET_CAMERA), street().map
     verifier.add(map_, 6, np.zeros((192, 640), np.uint8))
-    assert not verifier.shows_known(map_, 7)
+    assert not verifier.is_image_redundant(map_, 7)
     assert verifier.rate(map_, 6, [PLAIN]) == [PLAIN]
     verifier.restore(VerifierState(5, 0.5))
     assert verifier.state() == VerifierState()
@@ -165,8 +165,8 @@ def test_images_are_kept_while_their_keyframes_live(network, kind):
     assert 0 not in verifier.images
     verifier.add(map_, 0, image)
     assert 0 in verifier.images
-    assert verifier.shows_known(map_, 1)
-    assert not verifier.shows_known(map_, 6)  # of the second pass, which shares no landmarks
+    assert verifier.is_image_redundant(map_, 1)
+    assert not verifier.is_image_redundant(map_, 6)  # of the second pass, which shares no landmarks
     map_.arrays.keyframe_alive[0] = False
     verifier.add(map_, 6, image)
     assert 0 not in verifier.images

@@ -29,10 +29,16 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from ring import Ring
+
+    from vslam.slam import Slam
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
@@ -46,11 +52,12 @@ _SPECIAL = [0, 1, 0x7F, 0xFF, 0x7FFFFFFF, 0xFFFFFFFF, 0x80000000, 0x7FFFFFFFFFFF
 @dataclass(frozen=True)
 class Reader:
     """What is fuzzed: ``write`` makes valid files in a folder, ``read`` reads them, and one of
-    those that match ``changed`` is mutated."""
+    those that match ``changed`` is mutated, by ``mutate`` unless ``mutation`` is another one."""
 
     write: Callable[[Path], object]
     read: Callable[[Path], object]
     changed: str
+    mutation: Callable[[bytes, np.random.Generator, str], bytes] | None = None
 
 
 # -- valid files ----------------------------------------------------------------------------------
@@ -211,6 +218,7 @@ def _write_video(folder: Path) -> None:
 
 def _write_map(folder: Path) -> None:
     from vslam.features import PATCH_PIXELS, Features, KeyframePatches
+    from vslam.frame_poses import FrameTable
     from vslam.loops import LoopEdge, ResembledPlace
     from vslam.map import Map
     from vslam.map_kernels import link_many, merge_landmarks, refresh_landmarks
@@ -256,8 +264,56 @@ def _write_map(folder: Path) -> None:
         PolicyState(100.0, False),
         ClosingState(ConsistencyState((ResembledPlace(frozenset((0,)), 1),), ((3, waits),), 3)),
     )
-    stored = StoredMap(map_, _camera(), checkpoint=checkpoint)
+    frames = FrameTable(
+        0.1 * np.arange(3), np.array([0, 2, 2]), np.tile(np.eye(4), (3, 1, 1)), np.ones(3, bool),
+        np.ones(3),
+    )  # fmt: skip
+    stored = StoredMap(map_, _camera(), frames=frames, checkpoint=checkpoint)
     save_map(folder / "map.npz", stored, resumable=True)
+
+
+def _drive(places: range, seed: int) -> Slam:
+    """SLAM in a ring of landmarks, after a drive through these places."""
+    from ring import CAMERA
+
+    from vslam.slam import Slam
+
+    slam = Slam(CAMERA, None, "bow", threads=1)
+    _drive_on(slam, places, seed, 0.0)
+    slam.finish()
+    return slam
+
+
+def _drive_on(slam: Slam, places: range, seed: int, start: float) -> None:
+    from vslam.features import Extracted, Features
+
+    camera = slam.context.camera  # that of a map may be another one
+    for i, place in enumerate(places):
+        seen = _ring().see(place, seed)
+        inside = (seen.xy < (camera.width, camera.height)).all(1)
+        seen = Features(**{name: column[inside] for name, column in vars(seen).items()})
+        slam.step_features(Extracted(seen), start + 0.1 * i)
+
+
+@cache
+def _ring() -> Ring:
+    from ring import Ring
+
+    return Ring.create()
+
+
+def _write_drives(folder: Path) -> None:
+    """A map with a checkpoint, a loop and a place in the world, and one that meets it."""
+    from vslam.loops import LoopEdge
+    from vslam.maps.storage import save_map
+    from vslam.maps.stored_map import World
+
+    stored = _drive(range(24), 0).stored_map("ring 0")
+    n = stored.map.n_keyframes
+    loop = LoopEdge(n - 1, 0, 0.5, True, "closed", 40, 30, np.eye(4))
+    stored = replace(stored, loops=(loop,), world=World("ring", np.eye(4)))
+    save_map(folder / "map.npz", stored, resumable=True)
+    save_map(folder / "other.npz", _drive(range(18, 40), 1).stored_map("ring 1"))
 
 
 def _write_json(kind: str, folder: Path) -> None:
@@ -384,6 +440,56 @@ def _read_map(folder: Path) -> None:
         resolve(stored.map.arrays, stored.checkpoint.tracker.landmark)
 
 
+def _use_map(folder: Path) -> None:
+    """All that is done with maps: exports, a run that goes on in it, one that begins anew in it
+    and one that is only localised, and a merge with another map."""
+    with tempfile.TemporaryDirectory(dir=folder) as out:
+        _use_map_in(folder / "map.npz", folder / "other.npz", Path(out))
+
+
+def _use_map_in(file: Path, other: Path, out: Path) -> None:
+
+    from vslam.cli.export import g2o
+    from vslam.cli.map import info
+    from vslam.config import Config
+    from vslam.errors import InputError
+    from vslam.loopclosure.registry import detector_with_images
+    from vslam.maps.colmap import save_colmap
+    from vslam.maps.crop import in_box
+    from vslam.maps.ply import save_ply
+    from vslam.maps.reconstruction import reconstruction_of
+    from vslam.maps.storage import load_map
+    from vslam.merging import merge_maps
+    from vslam.slam import Slam
+
+    stored = load_map(file)
+    map_ = stored.map
+    save_ply(out / "a.ply", map_.arrays.xyz[: map_.n_landmarks])
+    g2o(file, out / "a.g2o", quiet=True)
+    info(file)
+    model = reconstruction_of(map_, stored.camera)
+    colours = np.zeros((len(model.xyz), 3), np.uint8)
+    save_colmap(out, model, [f"{k}.png" for k in range(len(model.frames))], colours)
+    stored.select(in_box(map_, (-5.0, 5.0, -5.0, 5.0)))
+    for options, start in (({"resume": True}, 2.4), ({}, 0.0), ({"localize": True}, 0.0)):
+        slam = Slam.load(file, detector="bow", threads=1, **options)
+        _drive_on(slam, range(24, 28), 0, start)
+        slam.finish()
+        slam.trajectory()
+        if "localize" not in options:
+            slam.save(out / "again.npz", resumable=True)
+            load_map(out / "again.npz")
+    config = Config()
+    try:
+        merge_maps(
+            [load_map(other), stored],
+            config,
+            lambda: detector_with_images("bow", config),
+        )
+    except ValueError as error:  # as ``vslam map merge`` does
+        raise InputError(str(error)) from error
+
+
 def _read_config(folder: Path) -> None:
     from vslam.config import load_config
 
@@ -391,7 +497,7 @@ def _read_config(folder: Path) -> None:
 
 
 def _read_report(folder: Path) -> None:
-    from vslam.overview import write_overview
+    from vslam.lab.overview import write_overview
     from vslam.report.finished_run import read_report
     from vslam.report.render import render_html, render_markdown
 
@@ -434,6 +540,69 @@ def _bag(kind: str, encoding: str, data: str, changed: str, compression: str = "
     return Reader(write, partial(_read_source, "bag", data), changed)
 
 
+# -- a mutation that reads the map ---------------------------------------------------------------
+
+_INTEGERS = [-(2**62), -(2**31), -2, -1, 0, 1, 2, 7, 255, 2**31 - 1, 2**40, 2**62]
+_FLOATS = [np.nan, np.inf, -np.inf, 0.0, -0.0, -1.0, 0.5, 5e-324, 1e-30, 1e6, 1e30, 1e200, -1e200]
+_OF_HEADER = [
+    np.nan, np.inf, -np.inf, -1, 0, 0.5, 1, 2, 2**31, 2**63, 10**30, 1e-300, 1e300, True, None,
+    "x", [], {}, [[]],
+]  # fmt: skip
+
+
+def _mutate_meaning(data: bytes, rng: np.random.Generator, name: str) -> bytes:
+    """One to three changes that leave kind and shape of every array as they were: what an array
+    says is wrong, or what the header says."""
+    with np.load(io.BytesIO(data)) as file:
+        arrays = {name: file[name].copy() for name in file.files}
+    for _ in range(int(rng.integers(1, 3))):
+        if rng.random() < 0.3:
+            header = json.loads(arrays["header"].tobytes())
+            text = json.dumps(_other_number(header, rng))
+            arrays["header"] = np.frombuffer(text.encode(), np.uint8)
+            continue
+        array = arrays[str(rng.choice([n for n in arrays if n != "header" and arrays[n].size]))]
+        _change(array.reshape(-1), rng, len(array))
+    out = io.BytesIO()
+    np.savez(out, **arrays)
+    return out.getvalue()
+
+
+def _change(flat: np.ndarray, rng: np.random.Generator, length: int) -> None:
+    """Change one number, some, or all, in place."""
+    share = rng.choice([0.0, 0.1, 1.0], p=[0.6, 0.2, 0.2])
+    at = np.flatnonzero(rng.random(len(flat)) < share)
+    if not len(at):
+        at = rng.integers(len(flat), size=1)
+    way = int(rng.integers(5))
+    if way == 0:  # another number of the array
+        flat[at] = flat[rng.integers(len(flat), size=len(at))]
+    elif way == 1:  # another order
+        flat[at] = flat[at][::-1] if len(at) > 1 else flat[len(flat) - 1 - at]
+    elif flat.dtype == bool:
+        flat[at] ^= True
+    elif flat.dtype.kind in "iu":
+        bounds = np.iinfo(flat.dtype)
+        value = int(rng.choice([*_INTEGERS, length, length - 1]))
+        if way == 2:
+            value = int(flat[at[0]]) + int(rng.choice([-1, 1]))
+        flat[at] = min(max(value, bounds.min), bounds.max)
+    else:
+        value = float(rng.choice(_FLOATS))
+        with np.errstate(all="ignore"):
+            flat[at] = flat[at] * value if way == 2 else value
+
+
+def _other_number(value: object, rng: np.random.Generator) -> object:
+    """JSON with another value somewhere."""
+    if isinstance(value, dict | list) and value and rng.random() < 0.95:
+        keys = list(value) if isinstance(value, dict) else list(range(len(value)))
+        key = keys[int(rng.integers(len(keys)))]
+        value[key] = _other_number(value[key], rng)
+        return value
+    return _OF_HEADER[int(rng.integers(len(_OF_HEADER)))]
+
+
 READERS: dict[str, Reader] = {
     "images": Reader(
         _write_images, partial(_read_source, "images", "", calib="stereo.yaml"), "**/*.*"
@@ -454,6 +623,7 @@ READERS: dict[str, Reader] = {
     "bag-zstd": _bag("folder", "mono8", "a", "a/*", "storage"),
     "video": Reader(_write_video, _read_video, "*.*"),
     "map": Reader(_write_map, _read_map, "map.npz"),
+    "map-meaning": Reader(_write_drives, _use_map, "map.npz", mutation=_mutate_meaning),
     "config": Reader(partial(_write_json, "config"), _read_config, "config.json"),
     "report": Reader(partial(_write_json, "report"), _read_report, "*.json"),
     "vocabulary": Reader(_write_vocabulary, _read_vocabulary, "words.*"),
@@ -661,7 +831,7 @@ def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
         print(json.dumps({"begin": number}), flush=True)
         rng = np.random.default_rng([seed, zlib.crc32(name.encode()), number])
         file = files[int(rng.integers(len(files)))]
-        data = mutate(file.read_bytes(), rng, file.name)
+        data = (reader.mutation or mutate)(file.read_bytes(), rng, file.name)
         folder = scratch / "now"
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(valid, folder)

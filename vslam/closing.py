@@ -77,7 +77,7 @@ class LoopClosing:
         """Look for loops at a keyframe whose local mapping is done; close the first real one."""
         if self._is_due(keyframe):
             self.finish(map_)
-        if self.verifier.shows_known(map_, keyframe):
+        if self.verifier.is_image_redundant(map_, keyframe):
             image = None  # no network needs to see it
         self.detector.add(keyframe, image, features)
         self.verifier.add(map_, keyframe, image)
@@ -116,9 +116,9 @@ class LoopClosing:
         """Whether a global bundle adjustment is yet to be merged."""
         return self._global is not None
 
-    def follow(self, keyframe: int) -> bool:
-        """Note that an old keyframe serves where the newest one's, ``keyframe``, successor would
-        be; returns whether ``finish`` is due."""
+    def count_reused_keyframe(self, keyframe: int) -> bool:
+        """Count a keyframe that was not inserted after ``keyframe``, since its place is mapped
+        already; returns whether the global bundle adjustment is due to be merged."""
         self._followed += 1
         return self._is_due(keyframe)
 

@@ -11,24 +11,40 @@ would be needed to inline the kernel into another one. A run that finds all kern
 compiles none, and needs none of these: ``_KernelCache`` leaves them out, or to when a kernel is
 compiled. Loading takes a fifth of the time. What is written is in Numba's format. This uses inner
 workings of Numba: with a release that it was not tested with, Numba's own cache is taken.
+
+A cache never ends a run. Files that a power cut damaged are found by their checksum and written
+again; code cut short would abort Python. Where no folder can be written to, neither beside the
+source nor in the home, the process has a temporary cache.
 """
 
 from __future__ import annotations
 
+import atexit
+import logging
+import os
+import shutil
+import tempfile
+import zlib
 from collections.abc import Callable
 from functools import cache, partial
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import llvmlite.binding as llvm
 import numba
 from numba.core import types
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime import rtsys
 from numba.extending import intrinsic
 
+from vslam.errors import InputError
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 TESTED_NUMBA = "0.68."
+_DAMAGED = "Compiled kernels in the cache are damaged; they are compiled again."
+
+_log = logging.getLogger(__name__)
 
 _OPTIONS: dict[str, Any] = {
     "nogil": True,
@@ -74,10 +90,57 @@ def _parsed(library: Any, bitcode: bytes) -> Any:
     return library._shared_module
 
 
+@cache
+def _warn(message: str) -> None:
+    """Log a message once."""
+    _log.warning(message)
+
+
+class _CheckedFiles(IndexDataCacheFile):
+    """The files of a kernel's cache: those with code end with the checksum of what goes before."""
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            return dict(super()._load_index())
+        except Exception:  # unpickling damaged bytes raises anything
+            _warn(_DAMAGED)
+            return {}
+
+    def _save_data(self, name: str, data: Any) -> None:
+        code = self._dump(data)
+        with self._open_for_write(self._data_path(name)) as file:
+            file.write(code)
+            file.write(_checksum(code))
+
+    def _load_data(self, name: str) -> Any:
+        code = Path(self._data_path(name)).read_bytes()
+        if code[-4:] != _checksum(code[:-4]):
+            _warn(_DAMAGED)
+            return None
+        return super()._load_data(name)
+
+
+def _checksum(code: bytes) -> bytes:
+    return zlib.crc32(code).to_bytes(4, "little")
+
+
 class _KernelCache(FunctionCache):
     """The cache of one kernel."""
 
     _impl_class = _KernelFormat
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        found = self._impl.locator
+        self._cache_file = _CheckedFiles(
+            found.get_cache_path(), self._impl.filename_base, found.get_source_stamp()
+        )
+
+    def save_overload(self, signature: Any, compiled: Any) -> None:
+        try:
+            super().save_overload(signature, compiled)
+        except OSError as error:
+            _warn(f"Compiled kernels cannot be kept ({error.strerror}); each run compiles them.")
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         rtsys.initialize(target_context)  # the functions that count references
@@ -86,7 +149,25 @@ class _KernelCache(FunctionCache):
 
     def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
         # Not what Numba wrote itself, with every environment.
-        return (*super()._index_key(signature, codegen), "vslam")
+        return (*super()._index_key(signature, codegen), "vslam, with checksums")
+
+
+def _use_temporary_cache() -> None:
+    """Keep the kernels of this process, and of those that it starts, in a temporary folder."""
+    try:
+        folder = tempfile.mkdtemp(prefix="vslam-kernels-")
+    except OSError as error:
+        raise InputError(
+            "No folder can be written to, and compiled kernels must be kept somewhere; set "
+            "NUMBA_CACHE_DIR to a writable folder."
+        ) from error
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    config: Any = numba.config
+    config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = folder
+    _warn(
+        "There is no writable folder to keep compiled kernels in; each run compiles them, which "
+        "takes a minute. Set NUMBA_CACHE_DIR to a writable folder."
+    )
 
 
 def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
@@ -95,11 +176,19 @@ def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     if not isinstance(made, Dispatcher):  # NUMBA_DISABLE_JIT
         return made
     dispatcher: Any = made
+    try:
+        _enable_cache(dispatcher, function)
+    except RuntimeError:  # no folder of Numba's can be written to
+        _use_temporary_cache()
+        _enable_cache(dispatcher, function)
+    return dispatcher
+
+
+def _enable_cache(dispatcher: Any, function: Callable[..., Any]) -> None:
     if numba.__version__.startswith(TESTED_NUMBA):
         dispatcher._cache = _KernelCache(function)
     else:
         dispatcher.enable_caching()
-    return dispatcher
 
 
 def kernel(function: Function) -> Function:

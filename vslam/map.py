@@ -5,11 +5,17 @@ the table of observations too: ``landmark[row]`` names the landmark that the key
 ``next_row`` chains the rows of each landmark. Nothing is derived twice: covisibility is counted
 from the rows when it is needed (after DPVO's PatchGraph, arrays instead of objects). Ids of
 keyframes are never reused, those of landmarks until dead ones are dropped; arrays grow by half.
+
+To add a column, declare it in ``Arrays`` or ``KeyframeTable`` with an empty array of its dtype and
+shape as the default. A number that describes the map as a whole belongs in ``Scalars``. It is then
+grown, copied, selected, appended, saved and loaded with the others. In a new row it is zero unless
+``Map.add_keyframe`` or ``Map.add_landmarks`` sets it.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+import copy
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -39,34 +45,80 @@ class Arrays(NamedTuple):
     ``certainty`` (R,) u1 how many times smaller the variance of ``xy`` is than that of a keypoint.
     """
 
-    T_cw: NDArray[np.float64]
-    first_row: NDArray[np.int64]
-    keyframe_alive: NDArray[np.bool_]
-    xyz: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    distance_range: NDArray[np.float64]
-    landmark_descriptor: NDArray[np.uint64]
-    first_keyframe: NDArray[np.int32]
-    visible: NDArray[np.int32]
-    found: NDArray[np.int32]
-    landmark_alive: NDArray[np.bool_]
-    merged_into: NDArray[np.int32]
-    head: NDArray[np.int32]
-    n_observations: NDArray[np.int32]
-    xy: NDArray[np.float32]
-    u_right: NDArray[np.float32]
-    octave: NDArray[np.uint8]
-    angle: NDArray[np.float32]
-    descriptor: NDArray[np.uint64]
-    keyframe: NDArray[np.int32]
-    landmark: NDArray[np.int32]
-    next_row: NDArray[np.int32]
-    certainty: NDArray[np.uint8]
+    T_cw: NDArray[np.float64] = np.zeros((0, 4, 4))
+    first_row: NDArray[np.int64] = np.zeros(1, np.int64)
+    keyframe_alive: NDArray[np.bool_] = np.zeros(0, np.bool_)
+    xyz: NDArray[np.float64] = np.zeros((0, 3))
+    normal: NDArray[np.float64] = np.zeros((0, 3))
+    distance_range: NDArray[np.float64] = np.zeros((0, 2))
+    landmark_descriptor: NDArray[np.uint64] = np.zeros((0, 4), np.uint64)
+    first_keyframe: NDArray[np.int32] = np.zeros(0, np.int32)
+    visible: NDArray[np.int32] = np.zeros(0, np.int32)
+    found: NDArray[np.int32] = np.zeros(0, np.int32)
+    landmark_alive: NDArray[np.bool_] = np.zeros(0, np.bool_)
+    merged_into: NDArray[np.int32] = np.zeros(0, np.int32)
+    head: NDArray[np.int32] = np.zeros(0, np.int32)
+    n_observations: NDArray[np.int32] = np.zeros(0, np.int32)
+    xy: NDArray[np.float32] = np.zeros((0, 2), np.float32)
+    u_right: NDArray[np.float32] = np.zeros(0, np.float32)
+    octave: NDArray[np.uint8] = np.zeros(0, np.uint8)
+    angle: NDArray[np.float32] = np.zeros(0, np.float32)
+    descriptor: NDArray[np.uint64] = np.zeros((0, 4), np.uint64)
+    keyframe: NDArray[np.int32] = np.zeros(0, np.int32)
+    landmark: NDArray[np.int32] = np.zeros(0, np.int32)
+    next_row: NDArray[np.int32] = np.zeros(0, np.int32)
+    certainty: NDArray[np.uint8] = np.zeros(0, np.uint8)
 
 
-KEYFRAME_FIELDS = Arrays._fields[:3]
-LANDMARK_FIELDS = Arrays._fields[3:14]
-ROW_FIELDS = Arrays._fields[14:]
+_FIRST_OF_LANDMARKS, _FIRST_OF_ROWS = (Arrays._fields.index(name) for name in ("xyz", "xy"))
+KEYFRAME_FIELDS = Arrays._fields[:_FIRST_OF_LANDMARKS]
+LANDMARK_FIELDS = Arrays._fields[_FIRST_OF_LANDMARKS:_FIRST_OF_ROWS]
+ROW_FIELDS = Arrays._fields[_FIRST_OF_ROWS:]
+
+PREDICTED, UNPREDICTED = 1, 2  # values of KeyframeTable.restart
+
+
+class KeyframeTable(NamedTuple):
+    """What is known of keyframes besides ``Arrays``; kernels do not need it. K keyframes (their
+    capacity, not their count).
+
+    ``timestamp`` (K,) f8 seconds; ``frame`` (K,) i8 index of the frame it was made of;
+    ``parent`` (K,) i8 its parent in the spanning tree, or -1;
+    ``session`` (K,) i8 the drive, counted from 0, that its time and its frame belong to;
+    ``unit_scale`` (K,) f8 how many of today's units of the map around it were one unit when it was
+    added: 1 in metric maps, while the loops of monocular maps change it;
+    ``T_c_parent`` (K, 4, 4) f8 the pose of a culled keyframe relative to its parent, identity while
+    the keyframe is alive;
+    ``restart`` (K,) u1 whether mapping began anew at this keyframe after the camera was lost, which
+    makes it the root of a sub-map: 0 if not; ``PREDICTED`` if its pose relative to its parent is a
+    prediction; ``UNPREDICTED`` if it is not even that, because the speed of the camera was unknown.
+    """
+
+    timestamp: NDArray[np.float64] = np.zeros(0)
+    frame: NDArray[np.int64] = np.zeros(0, np.int64)
+    parent: NDArray[np.int64] = np.zeros(0, np.int64)
+    session: NDArray[np.int64] = np.zeros(0, np.int64)
+    unit_scale: NDArray[np.float64] = np.zeros(0)
+    T_c_parent: NDArray[np.float64] = np.zeros((0, 4, 4))
+    restart: NDArray[np.uint8] = np.zeros(0, np.uint8)
+
+
+@dataclass(frozen=True)
+class Scalars:
+    """What is known of the map as a whole.
+
+    Attributes:
+        session: the drive of the keyframes to come.
+        disparity_offset: pixels by which the pair sees every disparity too small; ``u_right`` of
+            all rows is free of it (``backend/disparity_offset.py``).
+        offset_information: inverse variance of the measurements behind ``disparity_offset``.
+        calibrated_until: the newest keyframe that those measurements used, or -1.
+    """
+
+    session: int = 0
+    disparity_offset: float = 0.0
+    offset_information: float = 0.0
+    calibrated_until: int = NONE
 
 
 def _grown(array: NDArray, capacity: int) -> NDArray:
@@ -80,21 +132,9 @@ class Map:
 
     Attributes:
         arrays: everything that kernels touch.
+        keyframes: what else is known of each keyframe.
+        scalars: what is known of the map as a whole.
         n_keyframes, n_landmarks, n_rows: how much of the capacity is in use, dead ones included.
-        timestamps, frames, parents: of each keyframe: seconds, frame index, spanning-tree parent.
-        sessions: of each keyframe: the drive that its time and frame are of, from 0.
-        session: the drive of the keyframes to come.
-        T_c_parent: pose relative to the parent, set when a keyframe is culled.
-        unit_scale: of each keyframe: units of the map around it that were one when it was
-            added. 1 in metric maps; loops of monocular ones change it.
-        restarts: keyframes at which mapping began anew after the camera was lost, in order; each
-            is the root of a sub-map, its pose relative to its parent only a prediction.
-        unpredicted_restarts: those of them whose pose is not even that, since the speed of the
-            camera was not known.
-        disparity_offset: pixels that the pair sees too little of every disparity; ``u_right`` of
-            all rows is free of it (``backend/disparity_offset.py``).
-        offset_information: what measured it, an inverse variance.
-        calibrated_until: the newest keyframe that did.
     """
 
     def __init__(self, scales: NDArray[np.float64]) -> None:
@@ -103,44 +143,48 @@ class Map:
         self.n_keyframes = 0
         self.n_landmarks = 0
         self.n_rows = 0
-        self.timestamps: list[float] = []
-        self.frames: list[int] = []
-        self.parents: list[int] = []
-        self.sessions: list[int] = []
-        self.session = 0
-        self.T_c_parent: dict[int, NDArray[np.float64]] = {}
-        self.unit_scale: list[float] = []
-        self.restarts: list[int] = []
-        self.unpredicted_restarts: list[int] = []
-        self.disparity_offset = 0.0
-        self.offset_information = 0.0
-        self.calibrated_until = -1
-        k, n, r = 64, 8192, 65536
-        self.arrays = Arrays(
-            T_cw=np.zeros((k, 4, 4)),
-            first_row=np.zeros(k + 1, np.int64),
-            keyframe_alive=np.zeros(k, np.bool_),
-            xyz=np.zeros((n, 3)),
-            normal=np.zeros((n, 3)),
-            distance_range=np.zeros((n, 2)),
-            landmark_descriptor=np.zeros((n, 4), np.uint64),
-            first_keyframe=np.zeros(n, np.int32),
-            visible=np.zeros(n, np.int32),
-            found=np.zeros(n, np.int32),
-            landmark_alive=np.zeros(n, np.bool_),
-            merged_into=np.zeros(n, np.int32),
-            head=np.zeros(n, np.int32),
-            n_observations=np.zeros(n, np.int32),
-            xy=np.zeros((r, 2), np.float32),
-            u_right=np.zeros(r, np.float32),
-            octave=np.zeros(r, np.uint8),
-            angle=np.zeros(r, np.float32),
-            descriptor=np.zeros((r, 4), np.uint64),
-            keyframe=np.zeros(r, np.int32),
-            landmark=np.zeros(r, np.int32),
-            next_row=np.zeros(r, np.int32),
-            certainty=np.zeros(r, np.uint8),
-        )
+        self.scalars = Scalars()
+        self.arrays = Arrays()
+        self.keyframes = KeyframeTable()
+        self._reserve_keyframes(64)
+        self._reserve(LANDMARK_FIELDS, 0, 8192)
+        self._reserve(ROW_FIELDS, 0, 65536)
+
+    @property
+    def timestamps(self) -> NDArray[np.float64]:
+        """View ``(n_keyframes,)`` of ``KeyframeTable.timestamp``."""
+        return self.keyframes.timestamp[: self.n_keyframes]
+
+    @property
+    def frames(self) -> NDArray[np.int64]:
+        """View ``(n_keyframes,)`` of ``KeyframeTable.frame``."""
+        return self.keyframes.frame[: self.n_keyframes]
+
+    @property
+    def parents(self) -> NDArray[np.int64]:
+        """View ``(n_keyframes,)`` of ``KeyframeTable.parent``."""
+        return self.keyframes.parent[: self.n_keyframes]
+
+    @property
+    def sessions(self) -> NDArray[np.int64]:
+        """View ``(n_keyframes,)`` of ``KeyframeTable.session``."""
+        return self.keyframes.session[: self.n_keyframes]
+
+    @property
+    def unit_scale(self) -> NDArray[np.float64]:
+        """View ``(n_keyframes,)`` of ``KeyframeTable.unit_scale``."""
+        return self.keyframes.unit_scale[: self.n_keyframes]
+
+    @property
+    def restarts(self) -> list[int]:
+        """Keyframes at which mapping began anew after the camera was lost, in order."""
+        return np.flatnonzero(self.keyframes.restart[: self.n_keyframes]).tolist()
+
+    @property
+    def unpredicted_restarts(self) -> list[int]:
+        """Those of ``restarts`` whose pose is not even a prediction."""
+        unpredicted = self.keyframes.restart[: self.n_keyframes] == UNPREDICTED
+        return np.flatnonzero(unpredicted).tolist()
 
     def _reserve(self, fields: tuple[str, ...], used: int, extra: int) -> None:
         capacity = len(getattr(self.arrays, fields[-1]))
@@ -150,6 +194,12 @@ class Map:
         for name in fields:  # one after the other: two copies of all of them are much memory
             grown = _grown(getattr(self.arrays, name), target + (name == "first_row"))
             self.arrays = self.arrays._replace(**{name: grown})
+
+    def _reserve_keyframes(self, extra: int) -> None:
+        self._reserve(KEYFRAME_FIELDS, self.n_keyframes, extra)
+        capacity = len(self.arrays.keyframe_alive)
+        if len(self.keyframes.parent) < capacity:
+            self.keyframes = KeyframeTable._make(_grown(c, capacity) for c in self.keyframes)
 
     def add_keyframe(
         self,
@@ -165,7 +215,7 @@ class Map:
             certainty: ``(N,)`` of the features.
         """
         k, n = self.n_keyframes, len(features)
-        self._reserve(KEYFRAME_FIELDS, k, 1)
+        self._reserve_keyframes(1)
         self._reserve(ROW_FIELDS, self.n_rows, n)
         a = self.arrays
         rows = slice(self.n_rows, self.n_rows + n)
@@ -179,11 +229,12 @@ class Map:
         a.T_cw[k] = T_cw
         a.first_row[k], a.first_row[k + 1] = self.n_rows, self.n_rows + n
         a.keyframe_alive[k] = True
-        self.timestamps.append(timestamp)
-        self.frames.append(frame)
-        self.parents.append(NONE)
-        self.sessions.append(self.session)
-        self.unit_scale.append(1.0)
+        table = self.keyframes
+        table.timestamp[k], table.frame[k] = timestamp, frame
+        table.parent[k] = NONE
+        table.session[k] = self.scalars.session
+        table.unit_scale[k] = 1.0
+        table.T_c_parent[k] = np.eye(4)
         self.n_rows += n
         self.n_keyframes += 1
         return k
@@ -208,17 +259,39 @@ class Map:
         self.n_landmarks += n
         return np.arange(start, start + n, dtype=np.int32)
 
-    def used_arrays(self) -> Arrays:
-        """A copy of ``arrays`` without the capacity that is not in use."""
-        used = {"first_row": self.n_keyframes + 1}
-        for fields, size in (
-            (KEYFRAME_FIELDS, self.n_keyframes),
-            (LANDMARK_FIELDS, self.n_landmarks),
-            (ROW_FIELDS, self.n_rows),
-        ):
-            used |= {name: size for name in fields if name not in used}
-        a = self.arrays
-        return Arrays(*(getattr(a, name)[: used[name]].copy() for name in Arrays._fields))
+    def columns(self) -> dict[str, NDArray]:
+        """Views of all columns of ``arrays`` and ``keyframes`` by name, without the capacity that
+        is not in use."""
+        of_arrays = {
+            name: getattr(self.arrays, name)[:size]
+            for fields, size in (
+                (KEYFRAME_FIELDS, self.n_keyframes),
+                (LANDMARK_FIELDS, self.n_landmarks),
+                (ROW_FIELDS, self.n_rows),
+            )
+            for name in fields
+        }
+        of_arrays["first_row"] = self.arrays.first_row[: self.n_keyframes + 1]
+        of_keyframes = self.keyframes._asdict().items()
+        return of_arrays | {name: column[: self.n_keyframes] for name, column in of_keyframes}
+
+    def with_columns(self, columns: dict[str, NDArray]) -> Map:
+        """This map with other columns, as ``columns`` returns them; they are not copied."""
+        found = copy.copy(self)
+        found.arrays = Arrays(**{name: columns[name] for name in Arrays._fields})
+        found.keyframes = KeyframeTable(**{name: columns[name] for name in KeyframeTable._fields})
+        found.n_keyframes = len(found.arrays.keyframe_alive)
+        found.n_landmarks = len(found.arrays.landmark_alive)
+        found.n_rows = len(found.arrays.keyframe)
+        return found
+
+    def copy(self) -> Map:
+        """A copy without the capacity that is not in use."""
+        return self.with_columns({name: column.copy() for name, column in self.columns().items()})
+
+    def begin_drive(self) -> None:
+        """Let the keyframes to come belong to another drive."""
+        self.scalars = replace(self.scalars, session=self.scalars.session + 1)
 
     @property
     def many_dead_landmarks(self) -> bool:
@@ -270,38 +343,37 @@ class Map:
         """Copy of ``T_cw``; a culled keyframe follows the living one that took its place."""
         if self.arrays.keyframe_alive[keyframe]:
             return self.arrays.T_cw[keyframe].copy()
-        return self.T_c_parent[keyframe] @ self.arrays.T_cw[self.parents[keyframe]]
+        table = self.keyframes
+        return table.T_c_parent[keyframe] @ self.arrays.T_cw[table.parent[keyframe]]
 
     def cull_keyframe(self, keyframe: int) -> None:
         """Remove a keyframe and its observations; its children move to its parent.
 
         Keyframes culled before it are children too: every parent is alive.
         """
-        parent, a = self.parents[keyframe], self.arrays
+        a, table, parents = self.arrays, self.keyframes, self.parents
+        parent = parents[keyframe]
         T_c_parent = compose(a.T_cw[keyframe], inverse(a.T_cw[parent]))
-        for child in [k for k, p in enumerate(self.parents) if p == keyframe]:
-            self.parents[child] = parent
-            if not a.keyframe_alive[child]:
-                moved = compose(self.T_c_parent[child], T_c_parent)
-                self.T_c_parent[child] = orthonormalised(moved)
-        self.T_c_parent[keyframe] = T_c_parent
+        children = np.flatnonzero(parents == keyframe)
+        parents[children] = parent
+        for child in children[~a.keyframe_alive[children]]:
+            table.T_c_parent[child] = orthonormalised(compose(table.T_c_parent[child], T_c_parent))
+        table.T_c_parent[keyframe] = T_c_parent
         detach_keyframe(a, keyframe)
         a.keyframe_alive[keyframe] = False
 
     def begin_submap(self, keyframe: int, parent: int, *, predicted: bool) -> None:
         """Note that mapping began anew at a keyframe; its pose relative to the parent is a
         prediction, or not even that."""
-        self.parents[keyframe] = parent
-        self.restarts.append(keyframe)
-        if not predicted:
-            self.unpredicted_restarts.append(keyframe)
+        self.keyframes.parent[keyframe] = parent
+        self.keyframes.restart[keyframe] = PREDICTED if predicted else UNPREDICTED
 
     def submaps(self) -> NDArray[np.int64]:
         """``(n_keyframes,)`` the sub-map of each keyframe, by the keyframe at which it began."""
         root = np.zeros(self.n_keyframes, np.int64)
+        restart, parents = self.keyframes.restart.tolist(), self.parents.tolist()
         for keyframe in range(1, self.n_keyframes):
-            restarted = keyframe in self.restarts
-            root[keyframe] = keyframe if restarted else root[self.parents[keyframe]]
+            root[keyframe] = keyframe if restart[keyframe] else root[parents[keyframe]]
         return root
 
     def living_keyframes(self) -> NDArray[np.int64]:
@@ -323,11 +395,11 @@ def loop_of_living(map_: Map, loop: LoopEdge) -> LoopEdge:
         raise ValueError(f"The loop from keyframe {loop.query} to {loop.match} has no pose.")
     query, match, T = loop.query, loop.match, loop.T_query_match
     if not map_.arrays.keyframe_alive[query]:
-        T_parent_query = inverse(map_.T_c_parent[query])
+        T_parent_query = inverse(map_.keyframes.T_c_parent[query])
         T_parent_query[:3, 3] /= loop.scale  # to the unit of the match
         T = compose(T_parent_query, T)
-        query = map_.parents[query]
+        query = int(map_.parents[query])
     if not map_.arrays.keyframe_alive[match]:
-        T = compose(T, map_.T_c_parent[match])
-        match = map_.parents[match]
+        T = compose(T, map_.keyframes.T_c_parent[match])
+        match = int(map_.parents[match])
     return replace(loop, query=query, match=match, T_query_match=orthonormalised(T))

@@ -39,7 +39,7 @@ def add_frame(
         The keyframe.
     """
     keyframe = map_.add_keyframe(
-        frame.observed(), frame.T_cw, frame.timestamp, frame.index, certainty
+        frame.refined_features(), frame.T_cw, frame.timestamp, frame.index, certainty
     )
     tracked = np.flatnonzero(frame.landmark >= 0)
     link_many(map_.arrays, map_.rows(keyframe).start + tracked, frame.landmark[tracked])
@@ -161,8 +161,8 @@ class OldPlace(NamedTuple):
 def find_old_place(map_: Map, frame: Frame, known_after_s: float) -> OldPlace | None:
     """The place that shares the most landmarks with a frame, among the keyframes that are at least
     ``known_after_s`` seconds old; None if none shares any."""
-    young = np.array(map_.sessions) == map_.session
-    young &= np.array(map_.timestamps) > frame.timestamp - known_after_s
+    young = map_.sessions == map_.scalars.session
+    young &= map_.timestamps > frame.timestamp - known_after_s
     shared = np.where(young, 0, count_shared_landmarks(map_, frame))
     best = int(np.argmax(shared))
     if shared[best] == 0:
@@ -173,9 +173,8 @@ def find_old_place(map_: Map, frame: Frame, known_after_s: float) -> OldPlace | 
 def keyframe_trajectory(map_: Map) -> Trajectory:
     """Pose of every keyframe of the last drive that was not culled."""
     living = map_.living_keyframes()
-    living = living[np.array(map_.sessions, np.int64)[living] == map_.session]
-    times = np.array([map_.timestamps[k] for k in living], np.float64)
-    return Trajectory(times, inverses(map_.arrays.T_cw[living]))
+    living = living[map_.sessions[living] == map_.scalars.session]
+    return Trajectory(map_.timestamps[living], inverses(map_.arrays.T_cw[living]))
 
 
 def in_first_part(map_: Map, closed: Sequence[LoopEdge], frames: FrameTable) -> NDArray[np.bool_]:

@@ -64,26 +64,32 @@ class MapView:
         T_reference: ``(4, 4)`` its ``T_cw``.
         unit_scale: ``Map.unit_scale`` of it.
         n_keyframes: keyframes made so far, culled ones included.
-        around: landmarks of the reference keyframe and of its covisible keyframes.
-        nearest: landmarks of the reference keyframe alone.
+        local_landmarks: those of the reference keyframe and of its covisible keyframes.
+        reference_landmarks: those of the reference keyframe alone.
         n_reference: how many of these at least three keyframes observe (all, in a young map).
-        patches: image patches of those landmarks around that the newest keyframes observe.
+        patches: image patches of the local landmarks that the newest keyframes observe.
     """
 
     reference: int = 0
     T_reference: Matrix = field(default_factory=lambda: np.eye(4))
     unit_scale: float = 1.0
     n_keyframes: int = 0
-    around: LocalMap = NO_LANDMARKS
-    nearest: LocalMap = NO_LANDMARKS
+    local_landmarks: LocalMap = NO_LANDMARKS
+    reference_landmarks: LocalMap = NO_LANDMARKS
     n_reference: int = 0
     patches: LandmarkPatches = NO_PATCHES
 
 
 def view_of(
-    map_: Map, keyframe: int, around: LocalMap, patches: LandmarkPatches, *, monocular: bool
+    map_: Map, keyframe: int, local: LocalMap, patches: LandmarkPatches, *, monocular: bool
 ) -> MapView:
-    """What tracking sees from a reference keyframe; the rest as in ``MapView``."""
+    """The view of the map from a reference keyframe.
+
+    Args:
+        local: the landmarks around it.
+        patches: those of these landmarks.
+        monocular: whether the camera is.
+    """
     living = map_.living_keyframes()
     if monocular and map_.restarts:
         # A sub-map is young once more: without stereo nothing but this tells when to go on.
@@ -91,10 +97,10 @@ def view_of(
     return MapView(
         reference=keyframe,
         T_reference=map_.keyframe_pose(keyframe),
-        unit_scale=map_.unit_scale[keyframe],
+        unit_scale=float(map_.unit_scale[keyframe]),
         n_keyframes=map_.n_keyframes,
-        around=around,
-        nearest=local_map(map_, keyframe, 1),
+        local_landmarks=local,
+        reference_landmarks=local_map(map_, keyframe, 1),
         n_reference=count_seen_by(map_.arrays, keyframe, min(3, len(living))),
         patches=patches,
     )

@@ -1,10 +1,9 @@
 """Local mapping beside tracking, with the same result on every machine.
 
-``Mapper`` owns the map. A keyframe is mapped in a thread of its own, the mapping job. The job is
-merged, which means that its result is shown to tracking, at a frame that is found by counting
-frames and never by looking whether the job is done. Tracking reads a ``MapView``, a copy that the
-last merge left. Methods that need the merged map merge first; frames that are held follow the map
-wherever a merge moves it.
+``Mapper`` owns the map. Each keyframe is mapped by a job in another thread. Tracking sees the job's
+result from a fixed frame number on, however long the job took; this is called the merge. Between
+two merges tracking reads a ``MapView``, a copy that the last merge left. Every method that needs
+the merged map merges by itself, and frames that are held follow the map when a merge moves it.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ from vslam.trajectory import Trajectory
 
 
 class Mapper:
-    """The owner of the map, and the only one to change it.
+    """The owner of the map: all changes are made by its methods or by the jobs that it starts.
 
     Attributes:
         view: what tracking may see of the map.
@@ -130,7 +129,7 @@ class Mapper:
         """``Map.unit_scale``, of the keyframes that ``keyframe_pose`` knows."""
         if not self._is_merged and keyframe == self.view.reference:
             return self.view.unit_scale
-        return self.map.unit_scale[keyframe]
+        return float(self.map.unit_scale[keyframe])
 
     def trajectory(self) -> Trajectory:
         """Pose of every frame (``FramePoses.trajectory``).
@@ -144,11 +143,11 @@ class Mapper:
     # The schedule
 
     def hold(self, *frames: Frame | None) -> None:
-        """Let these frames, in place of those held before, follow the map from now on: their poses,
-        landmarks and speed change with it at every merge."""
+        """Choose the frames whose poses, landmarks and twists are updated whenever a merge changes
+        the map; they replace those held before."""
         self._held = tuple(frame for frame in frames if frame is not None)
 
-    def place(self, frame: Frame, *, tracked: bool, near: int = -1) -> None:
+    def append_pose(self, frame: Frame, *, tracked: bool, near: int = -1) -> None:
         """Record the pose of the next frame.
 
         Args:
@@ -201,7 +200,7 @@ class Mapper:
         if self.n_keyframes:
             self._renew_view()
 
-    # Changes of the map, each of which merges first
+    # Changes of the map, each of which begins with a merge
 
     def insert(self, frame: Frame, *, predicted: bool = True) -> None:
         """Make the frame placed last a keyframe, map its stereo points and start its mapping job.
@@ -264,18 +263,18 @@ class Mapper:
             start.second.T_cw = self.frames.pose(start.second.index)
             start.second.twist = start.twist
 
-    def old_place(self, frame: Frame) -> OldPlace | None:
-        """Where the frame has come back to, if that was mapped long enough ago."""
+    def find_old_place(self, frame: Frame) -> OldPlace | None:
+        """The place that the frame has come back to, if it was mapped long enough ago."""
         return find_old_place(self.merge(), frame, self._config.keyframes.known_after_s)
 
-    def follow(self, place: OldPlace, frame: Frame) -> None:
-        """Track by an old keyframe from now on, in place of a new one made of the frame placed
-        last."""
+    def use_existing_keyframe(self, place: OldPlace, frame: Frame) -> None:
+        """Make an existing keyframe the reference instead of inserting the frame placed last as a
+        new one."""
         self.merge()
         self.last_timestamp = frame.timestamp
         self.refer_to(place.keyframe)
         self.frames.follow_reference(frame.index, frame.T_cw)
-        if self._closing.follow(self.n_keyframes - 1):
+        if self._closing.count_reused_keyframe(self.n_keyframes - 1):
             self.last_frame = frame.index
             self._start(self._closing.finish)
 
@@ -284,10 +283,10 @@ class Mapper:
     def refer_to(self, keyframe: int) -> None:
         """Make a keyframe the reference, so that tracking sees what is around it."""
         map_, config = self.map, self._config.tracking
-        around = local_map(map_, keyframe, config.local_keyframes)
-        patches = self._aligner.patches_of(map_, around.ids)
-        self.view = view_of(map_, keyframe, around, patches, monocular=self._camera.monocular)
-        self._rig.disparity_offset = map_.disparity_offset
+        local = local_map(map_, keyframe, config.local_keyframes)
+        patches = self._aligner.patches_of(map_, local.ids)
+        self.view = view_of(map_, keyframe, local, patches, monocular=self._camera.monocular)
+        self._rig.disparity_offset = map_.scalars.disparity_offset
 
     def refer_to_nearest(self, frame: Frame) -> None:
         """Make the keyframe that shares the most landmarks with a frame the reference (ORB-SLAM,
@@ -313,12 +312,13 @@ class Mapper:
     def continue_drive(self) -> None:
         """Take the newest keyframe for the last one made, unless an earlier drive made it."""
         map_, newest = self.map, self.reference
-        if map_.n_keyframes and map_.sessions[newest] == map_.session:
-            self.last_frame, self.last_timestamp = map_.frames[newest], map_.timestamps[newest]
+        if map_.n_keyframes and map_.sessions[newest] == map_.scalars.session:
+            self.last_frame = int(map_.frames[newest])
+            self.last_timestamp = float(map_.timestamps[newest])
 
     @contextmanager
     def _changing(self) -> Iterator[Map]:
-        """The merged map; a change that fails half way leaves it to nobody."""
+        """The merged map, to be changed; after an exception it cannot be used any more."""
         self.merge()
         with self._shared.change() as map_:
             yield map_

@@ -33,18 +33,18 @@ class Mode(Protocol):
         """``begin``, but only if the camera was lost for long enough."""
         ...
 
-    def see_farther(self) -> bool:
-        """Let a frame that is lost right after a map or sub-map began see more of it; returns
-        whether there is more."""
+    def map_far_points(self) -> bool:
+        """Add the far stereo points of the first keyframe of a map or sub-map, if the frame right
+        after it was lost; returns whether any were added, so that tracking may be tried again."""
         ...
 
-    def extend(self, frame: Frame, found: Found) -> bool:
-        """Take up what a frame saw that is tracked and placed. Returns whether the frame became a
-        keyframe."""
+    def update_map(self, frame: Frame, found: Found) -> bool:
+        """Count the landmarks that a tracked frame saw, and insert it as a keyframe if the policy
+        asks for one; returns whether it did."""
         ...
 
     def state(self) -> PolicyState | None:
-        """What ``restore`` needs, None if that is more than can be kept now."""
+        """What ``restore`` needs; None if no checkpoint is possible now."""
         ...
 
     def restore(self, state: PolicyState) -> None:
@@ -66,10 +66,10 @@ class Localising:
     def begin_after_loss(self, frame: Frame) -> bool:
         return False
 
-    def see_farther(self) -> bool:
+    def map_far_points(self) -> bool:
         return False
 
-    def extend(self, frame: Frame, found: Found) -> bool:
+    def update_map(self, frame: Frame, found: Found) -> bool:
         self._mapper.refer_to_nearest(frame)
         return False
 
@@ -120,13 +120,13 @@ class MapBuilding:
             patience = config.monocular_lost_frames
         return self._tracker.lost_frames >= patience and self.begin(frame)
 
-    def see_farther(self) -> bool:
+    def map_far_points(self) -> bool:
         last = self._tracker.last
         if last is None or last.twist is not None or self._monocular:
             return False
         return self._mapper.map_far_points(last)
 
-    def extend(self, frame: Frame, found: Found) -> bool:
+    def update_map(self, frame: Frame, found: Found) -> bool:
         self.starter.reset()
         self._mapper.count(found.visible, frame.landmark[frame.landmark >= 0])
         if not frame.can_become_keyframe:
@@ -139,11 +139,11 @@ class MapBuilding:
         )
         if not self.policy.wants_keyframe(evidence):
             return False
-        place = self._mapper.old_place(frame)
+        place = self._mapper.find_old_place(frame)
         if place is not None:
             n_inliers = int(np.count_nonzero(frame.landmark >= 0))
             if self.policy.is_known(PlaceEvidence(n_inliers, place.n_shared, place.n_place)):
-                self._mapper.follow(place, frame)
+                self._mapper.use_existing_keyframe(place, frame)
                 return False
         self._mapper.insert(frame)
         self.policy.keyframe_made()

@@ -48,7 +48,8 @@ def open_map(
     localize: bool,
     resume: bool,
 ) -> Start:
-    """Let loop closing and its detector remember what belongs to a map; None is a new map.
+    """Restore detector, images and closed loops from a stored map, and begin a new drive in it
+    unless the last one is resumed or the map is only localised in. None begins a new map.
 
     Args:
         localize: the map is to stay as it is.
@@ -77,7 +78,7 @@ def open_map(
     if resume:
         return Start(map_, stored.frames, stored.checkpoint, drives[:-1], stored.world)
     if map_.n_keyframes and not localize:
-        map_.session += 1
+        map_.begin_drive()
     return Start(map_, drives=drives, world=stored.world)
 
 
@@ -138,7 +139,7 @@ class Session:
         landmark = state.tracker.landmark
         xyz = np.full((len(landmark), 3), np.nan)
         xyz[landmark >= 0] = self.mapper.map.arrays.xyz[landmark[landmark >= 0]]
-        self.rig.adopt(self.tracker.restore(state.tracker, xyz))
+        self.rig.mark_corrected(self.tracker.restore(state.tracker, xyz))
 
     def resume(self) -> None:
         """Expect the next frame after the last one of the drive that is continued, if one is: to

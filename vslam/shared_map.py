@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import wait as wait_for
 from contextlib import contextmanager
 
 from vslam.map import Map
@@ -22,7 +24,9 @@ class SharedMap:
         self._map = map_
         self._executor = executor
         self._job: Callable[[], None] | None = None
+        self._future: Future[None] | None = None
         self._failure = ""
+        self._process = os.getpid()
 
     @property
     def is_busy(self) -> bool:
@@ -34,8 +38,9 @@ class SharedMap:
         """The map.
 
         Raises:
-            RuntimeError: a job may be writing it, or one failed.
+            RuntimeError: a job may be writing it, or one failed, or this process is a fork.
         """
+        self._refuse_fork()
         if self._failure:
             raise RuntimeError(self._failure)
         if self._job is not None:
@@ -48,18 +53,22 @@ class SharedMap:
         if self._executor is None:
             self._job = lambda: job(map_)
         else:
-            future: Future[None] = self._executor.submit(job, map_)
-            self._job = future.result
+            self._future = self._executor.submit(job, map_)
+            self._job = self._future.result
 
     def wait(self) -> Map:
         """The map, once the job is done.
 
         Raises:
-            RuntimeError: an earlier job failed. This one's own error is raised as it is.
+            RuntimeError: an earlier job failed, or this process is a fork. This job's own error is
+                raised as it is.
         """
+        self._refuse_fork()
         if self._job is not None:
+            if self._future is not None:
+                wait_for([self._future])  # Ctrl-C here leaves the job to be waited for again
             job, self._job = self._job, None
-            with self._whole():
+            with self._invalidated_on_error():
                 job()
         return self.map
 
@@ -71,12 +80,12 @@ class SharedMap:
             RuntimeError: as ``wait``.
         """
         map_ = self.wait()
-        with self._whole():
+        with self._invalidated_on_error():
             yield map_
 
     @contextmanager
-    def _whole(self) -> Iterator[None]:
-        """Give the map to nobody any more if what changes it fails half way."""
+    def _invalidated_on_error(self) -> Iterator[None]:
+        """After an exception, the map is incomplete: every later access raises."""
         try:
             yield
         except BaseException as error:
@@ -85,3 +94,11 @@ class SharedMap:
                 "from a map that was saved before"
             )
             raise
+
+    def _refuse_fork(self) -> None:
+        """A fork has no copy of the thread that does the jobs: it would wait for ever."""
+        if self._executor is not None and os.getpid() != self._process:
+            raise RuntimeError(
+                "this Slam was made by another process, whose threads a fork does not copy; make "
+                "one after the fork, or use threads=1"
+            )

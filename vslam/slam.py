@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -173,7 +174,8 @@ class Slam:
             timestamp: seconds, later than that of the last call.
 
         Raises:
-            ValueError: images of another size or type, or a timestamp that goes back.
+            ValueError: images of another size or type, or a timestamp that goes back or is
+                not finite.
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         check_images(left, second, self.context.camera)
@@ -205,29 +207,30 @@ class Slam:
         self.rig.prepare(frame, tracker.twist)
         clock.lap("wait_for_mapping")
         if not mapper.n_keyframes:
-            mapper.place(frame, tracked=False)
+            mapper.append_pose(frame, tracked=False)
             found = Found.at_start(frame, begun=self._mode.begin(frame))
             clock.lap("keyframe")
             return result_of(frame, found, not found.is_lost, clock.ms)
 
         T_predicted = tracker.predict(timestamp, mapper.frames, mapper.view)
         tracked = tracker.track(frame, T_predicted, mapper.view, mapper.frames)
-        if tracked.is_lost and self._mode.see_farther():
+        if tracked.is_lost and self._mode.map_far_points():
+            T_predicted = tracker.predict(timestamp, mapper.frames, mapper.view)
             tracked = tracker.track(frame, T_predicted, mapper.view, mapper.frames)
         clock.lap("track")
-        found = self._relocaliser.check(frame, tracked, mapper)
+        found = self._relocaliser.relocalise_if_needed(frame, tracked, mapper)
         if found is not tracked:
             clock.lap("relocalise")
         if found.is_lost:
             frame.T_cw = T_predicted
-            mapper.place(frame, tracked=False)
+            mapper.append_pose(frame, tracked=False)
             tracker.lose()
             is_keyframe = self._mode.begin_after_loss(frame)
         else:
             tracker.accept(frame, found, mapper.frames)
-            mapper.place(frame, tracked=True, near=found.keyframe)
+            mapper.append_pose(frame, tracked=True, near=found.keyframe)
             self.rig.observe(frame, frame.twist)
-            is_keyframe = self._mode.extend(frame, found)
+            is_keyframe = self._mode.update_map(frame, found)
         clock.lap("keyframe")
         return result_of(frame, found, is_keyframe, clock.ms)
 
@@ -236,7 +239,7 @@ class Slam:
         there was only no time for it."""
         frame = self._next_frame(Extracted.nothing(), timestamp, None)
         frame.T_cw = self._tracker.predict(timestamp, self._mapper.frames, self._mapper.view)
-        self._mapper.place(frame, tracked=False)
+        self._mapper.append_pose(frame, tracked=False)
         if self._mapper.n_keyframes and not dropped:
             self._tracker.lose()
         found = Found(TrackingState.DROPPED if dropped else TrackingState.LOST)
@@ -248,6 +251,8 @@ class Slam:
 
     def _next_frame(self, extracted: Extracted, timestamp: float, image: Image | None) -> Frame:
         frames = self._mapper.frames
+        if not math.isfinite(timestamp):
+            raise ValueError(f"timestamp {timestamp} s must be a finite number")
         if len(frames) and not timestamp > (last := frames.timestamp(-1)):
             raise ValueError(f"timestamp {timestamp} s is not later than the last one, {last} s")
         return Frame.of(extracted, self.context.camera, len(frames), timestamp, image)

@@ -6,6 +6,7 @@ unpacks to 100 GB. What is promised is compared with what is there before memory
 
 from __future__ import annotations
 
+import json
 import os
 import zipfile
 import zlib
@@ -21,8 +22,10 @@ MOST_PIXELS = 2**27
 """Of an image file: 11,585 x 11,585; OpenCV itself allows eight times as many."""
 
 _OPENCV_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
+_ANY_SIZE = 2**27  # bytes that every archive may unpack to
+_MOST_PACKED = 20  # beyond that, so many times its own size
 ARCHIVE_ERRORS = (
-    EOFError, ValueError, KeyError, RuntimeError, zlib.error,
+    EOFError, ValueError, KeyError, RuntimeError, OverflowError, zlib.error,
     zipfile.BadZipFile, zipfile.LargeZipFile,
 )  # fmt: skip
 """What NumPy, zipfile and zlib raise for an archive of arrays that is damaged, encrypted, packed in
@@ -32,6 +35,19 @@ an unknown way, or none."""
 def limit_images() -> None:
     """Let OpenCV refuse larger images by their header; it asks once, when it is first imported."""
     os.environ.setdefault(_OPENCV_LIMIT, str(MOST_PIXELS))
+
+
+def require_utf8(path: Path) -> None:
+    """Refuse a name that reports, which are text, cannot hold.
+
+    Raises:
+        InputError: it is not UTF-8.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        shown = os.fsencode(path).decode(errors="replace")
+        raise InputError(f"{shown}: this name is not UTF-8; rename it.") from None
 
 
 def read_npz(path: Path, what: str, fix: str = "name another file") -> dict[str, NDArray[Any]]:
@@ -46,7 +62,7 @@ def read_npz(path: Path, what: str, fix: str = "name another file") -> dict[str,
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            _check_memory(path, archive, what)
+            _check_size(path, archive, what)
             return {
                 member.filename.removesuffix(".npy"): _read_member(archive, member)
                 for member in archive.infolist()
@@ -60,21 +76,39 @@ def read_npz(path: Path, what: str, fix: str = "name another file") -> dict[str,
         ) from error
 
 
+def read_json(array: NDArray[Any]) -> Any:
+    """The JSON in an array of bytes.
+
+    Raises:
+        ValueError: it is no such array, or no JSON.
+    """
+    if array.dtype != "uint8" or array.ndim != 1:  # bytes() of a number is as many zeros
+        raise ValueError("the header is no text")
+    return json.loads(array.tobytes())
+
+
 def require_memory(path: Path, what: str) -> None:
-    """Refuse an archive that unpacks to more than the free memory; other files pass.
+    """Refuse an archive that unpacks to far more than its size, or to more than the free memory;
+    other files pass.
 
     Raises:
         InputError: it does.
     """
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
-            _check_memory(path, archive, what)
+            _check_size(path, archive, what)
 
 
-def _check_memory(path: Path, archive: zipfile.ZipFile, what: str) -> None:
+def _check_size(path: Path, archive: zipfile.ZipFile, what: str) -> None:
     import psutil
 
     needed = sum(member.file_size for member in archive.infolist())
+    packed = path.stat().st_size
+    if needed > max(_ANY_SIZE, _MOST_PACKED * packed):
+        raise InputError(
+            f"{path}: {packed / 2**20:.1f} MB unpack to {needed / 2**20:.0f} MB; this is hardly "
+            f"{what}."
+        )
     there = psutil.virtual_memory().available
     if needed > there:
         raise InputError(

@@ -1,1 +1,1 @@
-"""Siamese networks that tell whether two images show one place. Only here is torch imported."""
+"""Siamese networks that tell whether two images show one place; runs ask them without torch."""

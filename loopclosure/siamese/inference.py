@@ -15,12 +15,16 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.images import Size
-from vslam.loopclosure.siamese.weights import find_weights
+from vslam.loopclosure.siamese.weights import SHIPPED, find_weights
 
 # Keys of the metadata.
 FORMAT, NAME, ABOUT, COMPARISON = "vslam", "name", "about", "comparison"
 VERSION = "1"  # of the format
 _NO_RUNTIME = "learned loop detectors need ONNX Runtime: pip install onnxruntime."
+
+
+_FOREIGN = "not a network of this version of vslam"
+_FIX = "write one with 'vslam export onnx', or name another file"
 
 
 class OnnxNetwork:
@@ -42,21 +46,28 @@ class OnnxNetwork:
         """
         self._embedding = open_session(path, path, "image")
         metadata = self._embedding.get_modelmeta().custom_metadata_map
-        if metadata.get(FORMAT) != VERSION or COMPARISON not in metadata:
-            raise InputError(
-                f"{path}: not a network of this version of vslam; write one with "
-                "'vslam export onnx', or name another file."
-            )
-        self._comparison = open_session(path, base64.b64decode(metadata[COMPARISON]), "query")
-        compared = self._comparison.get_inputs()
-        self._views = tuple(compared[0].shape)
-        self._compared = [one.name for one in compared]
-        self.name: str = metadata[NAME]
+        if metadata.get(FORMAT) != VERSION:
+            raise InputError(f"{path}: {_FOREIGN}; {_FIX}.")
         self.fingerprint = fingerprint_of(path)
-        self.about: dict[str, Any] = json.loads(metadata[ABOUT])
-        height, width = self._embedding.get_inputs()[0].shape
-        self.size: Size = (height, width)
-        self.dimensions: int = self._embedding.get_outputs()[0].shape[0]
+        try:
+            comparison = base64.b64decode(metadata[COMPARISON])
+            self._comparison = open_session(path, comparison, "query")
+            compared = self._comparison.get_inputs()
+            self._views = tuple(compared[0].shape)
+            self._compared = [one.name for one in compared]
+            self.name: str = metadata[NAME]
+            self.about: dict[str, Any] = json.loads(metadata[ABOUT])
+            height, width = self._embedding.get_inputs()[0].shape
+            self.size: Size = (height, width)
+            self.dimensions: int = self._embedding.get_outputs()[0].shape[0]
+            if path.parent != SHIPPED:
+                blank = self.embed(np.zeros(self.size, np.uint8))
+                self.compare(blank, blank[None])
+                self.about["parameters"] + 0
+        except InputError:
+            raise
+        except Exception as error:  # what a file may lack, and a dozen kinds of onnxruntime
+            raise InputError(f"{path}: {_FOREIGN}; {_FIX}.") from error
 
     def embed(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Descriptor ``(D,)`` of norm 1 of a grey image ``(H, W)`` of the network's size."""
@@ -157,22 +168,35 @@ def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
         import onnxruntime
     except ImportError as error:
         raise InputError(_NO_RUNTIME) from error
+    try:
+        given = model if isinstance(model, bytes) else model.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: the weights cannot be read ({error.strerror}).") from error
+    if path.parent != SHIPPED:
+        _refuse_beyond_limits(path, given)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4  # what it says of damaged files is in the exception, too
     options.enable_mem_pattern = False  # it saves no time here, and takes 10 MB
     options.enable_cpu_mem_arena = False  # activations are given back after each image
     try:
-        given = model if isinstance(model, bytes) else model.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: the weights cannot be read ({error.strerror}).") from error
-    try:
         session = onnxruntime.InferenceSession(given, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises a dozen kinds
         raise InputError(f"{path}: not a readable ONNX file; name another file.") from error
-    if session.get_inputs()[0].name != first_input:
-        raise InputError(
-            f"{path}: not a network of vslam; write one with 'vslam export onnx', or name another "
-            "file."
-        )
+    if [one.name for one in session.get_inputs()][:1] != [first_input]:
+        raise InputError(f"{path}: {_FOREIGN}; {_FIX}.")
     return session
+
+
+def _refuse_beyond_limits(path: Path, file: bytes) -> None:
+    try:
+        from vslam.loopclosure.siamese.onnx_limits import check_graph
+    except ImportError as error:
+        raise InputError(
+            f"{path}: weights that vslam does not ship are checked by the package onnx, which is "
+            "not installed; pip install 'vslam[train]'."
+        ) from error
+    try:
+        check_graph(file)
+    except ValueError as error:
+        raise InputError(f"{path}: {_FOREIGN} ({error}); {_FIX}.") from error

@@ -1,9 +1,8 @@
-"""Where the weights of the networks are; imports no torch, so that a mistake is told at once."""
+"""The networks by name, and where the weights that a run reads are."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from vslam.errors import InputError
 
@@ -45,20 +44,3 @@ def find_weights(name: str, weights: Path | None = None) -> Path:
             "and name the .onnx file with --weights."
         )
     raise InputError(f"--weights {path}: not there; name the .onnx file of a training.")
-
-
-def read_pth(path: Path, fix: str) -> Any:
-    """What a weight file of torch holds; nothing in it is executed.
-
-    Args:
-        fix: what to do if it cannot be read, for the message.
-
-    Raises:
-        InputError: no such file, or not a weight file.
-    """
-    import torch
-
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises half a dozen kinds
-        raise InputError(f"{path}: not a readable weight file; {fix}.") from error

@@ -33,7 +33,7 @@ from typing import Any
 import torch
 
 from vslam.errors import InputError
-from vslam.loopbench.kept import keep_conditions
+from vslam.lab.loopbench.kept import keep_conditions
 from vslam.loopclosure.siamese.component_training import learn_components
 from vslam.loopclosure.siamese.data import Collection, load, refuse_test_data
 from vslam.loopclosure.siamese.export import export_onnx

@@ -18,6 +18,7 @@ from vslam.calibration.models import Array
 from vslam.errors import InputError
 
 _HEADER = re.compile(r"\A\ufeff?%YAML[: ]1\.\d.*\n?")
+_MOST_BYTES = 100_000  # parsed in a second or two; a calibration has 5,000
 _MOST_STEPS = 10_000  # lists and numbers at one key
 _NO_SPACE = re.compile(r"^(\s*[\w.]+):(?=\[)", re.MULTILINE)
 
@@ -93,7 +94,8 @@ def read_document(path: Path) -> Document:
     import yaml
 
     try:
-        text = path.read_text("utf-8")
+        too_large = path.stat().st_size > _MOST_BYTES
+        text = "" if too_large else path.read_text("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: the calibration is no text; name the file with the cameras' numbers."
@@ -104,6 +106,10 @@ def read_document(path: Path) -> Document:
         raise InputError(
             f"{path}: the calibration cannot be read ({error.strerror}); name another."
         ) from error
+    if too_large:
+        raise InputError(
+            f"{path}: larger than {_MOST_BYTES // 1000} kB, which no calibration is; name another."
+        )
     if not text.strip():
         raise InputError(f"{path}: the calibration is empty; name another.")
     if text.lstrip("\ufeff \n").startswith("<?xml"):

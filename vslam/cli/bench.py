@@ -33,9 +33,9 @@ from vslam.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Generator
 
-    from vslam.bench.execute import CellOutcome, RunOptions
-    from vslam.bench.grid import Cell
     from vslam.datasets.sources import SourceOptions
+    from vslam.lab.bench.execute import CellOutcome, RunOptions
+    from vslam.lab.bench.grid import Cell
 
 _UNKNOWN_LENGTH = 1000  # frames of a stream that does not say, for the estimate of time
 _FIRST_SEQUENCES = "00-05"
@@ -113,11 +113,11 @@ def bench(
 ) -> None:
     """Run sequences under perturbations with loop detectors, and show which detector wins."""
     chosen = names_in(detectors)
-    from vslam.bench import execute
-    from vslam.bench.estimate import check_disk, duration, estimate, size
-    from vslam.bench.grid import make_grid, parse_perturbations
-    from vslam.bench.table import GridProgress, shown_live
     from vslam.cli.console import console
+    from vslam.lab.bench import execute
+    from vslam.lab.bench.estimate import check_disk, duration, estimate, size
+    from vslam.lab.bench.grid import make_grid, parse_perturbations
+    from vslam.lab.bench.table import GridProgress, shown_live
     from vslam.loopclosure.registry import parse_weights, require_detector
 
     files = parse_weights(weights or [], chosen)
@@ -192,8 +192,8 @@ def cell_options(
     out: Path,
 ) -> RunOptions:
     """What is the same for all cells of a data set below ``root``, by the options of a command."""
-    from vslam.bench.execute import RunOptions, scratch_folder
     from vslam.config import Config, load_config
+    from vslam.lab.bench.execute import RunOptions, scratch_folder
     from vslam.machine import available_cores
 
     thresholds = Config() if config is None else load_config(config)
@@ -233,10 +233,10 @@ def open_all(
 
     Rendered ones are rendered here: two runs cannot render one sequence at a time.
     """
-    from vslam.bench.grid import parse_sequences
     from vslam.cli.console import console
     from vslam.datasets.sources import open_source
     from vslam.datasets.stream import count_expected
+    from vslam.lab.bench.grid import parse_sequences
 
     if seqs is None and kind in ("kitti", "synthetic"):
         seqs = _FIRST_SEQUENCES
@@ -266,11 +266,11 @@ def outcomes_of(
 ) -> Generator[CellOutcome, None, None]:
     """Run cells here or on a cluster and publish them."""
     if scheduler is not None:
-        from vslam.bench.cluster import run_on_cluster
+        from vslam.lab.bench.cluster import run_on_cluster
 
         return run_on_cluster(cells, options, scheduler, out)
-    from vslam.bench.execute import run_here
     from vslam.cli.console import console
+    from vslam.lab.bench.execute import run_here
     from vslam.machine import available_cores
     from vslam.run.warmup import compile_kernels, is_cold
 

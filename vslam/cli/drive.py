@@ -32,6 +32,7 @@ class Output:
     view: Literal["native", "web"] | None
     pages: bool
     ply: bool
+    save_map: Path | None
     quiet: bool
 
 
@@ -48,6 +49,8 @@ def drive(
         out: where to make the folder of the run.
         resume: the folder of the run to go on with instead.
     """
+    if options.localize and output.save_map is not None:
+        raise InputError("--save-map: localising changes no map; leave it out.")
     told = console(shown=not output.quiet)
     kind, source, perturbation = _open(options, told)
     _refuse_camera(source, resume)
@@ -80,7 +83,7 @@ def drive(
             )  # fmt: skip
         report = write_results(
             folder, outcome, moments.moments, pictures.pictures,
-            pages=output.pages, ply=output.ply, map_file=options.save_map,
+            pages=output.pages, ply=output.ply, map_file=output.save_map,
         )  # fmt: skip
         if not outcome.interrupted:
             remove_autosave(folder)

@@ -143,7 +143,7 @@ def g2o(
     graph, map_ = _graph(run)
     ids = graph.keyframes  # frames of several drives are not unique
     if len(set(map_.sessions)) == 1:
-        ids = np.array(map_.frames)[ids]
+        ids = map_.frames[ids]
     target = out or _beside(run, "pose_graph.g2o")
     with new_file(target) as file:
         save_g2o(file, ids, inverses(graph.T_cw), graph.edges, graph.T_i_j, graph.sigmas)

@@ -15,10 +15,10 @@ from vslam.cli.options import Weights, names_in
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
-    from vslam.loopbench.conditions import Condition
-    from vslam.loopbench.online import Window
-    from vslam.loopbench.schema import Gain, OnlineScore, Score
-    from vslam.loopbench.sets import ProgressBar
+    from vslam.lab.loopbench.conditions import Condition
+    from vslam.lab.loopbench.online import Window
+    from vslam.lab.loopbench.schema import Gain, OnlineScore, Score
+    from vslam.lab.loopbench.sets import ProgressBar
     from vslam.loopclosure.vocabulary import Vocabulary
 
 _EXAMPLES = """
@@ -95,9 +95,9 @@ def bench(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
     """Precision and recall of loop detectors, on places under changes or on drives."""
-    from vslam.loopbench.conditions import parse_conditions
-    from vslam.loopbench.online import parse_window
-    from vslam.loopbench.registry import require_comparable
+    from vslam.lab.loopbench.conditions import parse_conditions
+    from vslam.lab.loopbench.online import parse_window
+    from vslam.lab.loopbench.registry import require_comparable
     from vslam.loopclosure.registry import parse_weights
 
     names = names_in(detectors)
@@ -152,9 +152,9 @@ def _on_drives(
 ) -> str:
     """Measure in the protocol of the literature; says on what."""
     from vslam.datasets.synthetic import store
-    from vslam.loopbench.drives import open_drives
-    from vslam.loopbench.measure_online import measure_drive
-    from vslam.loopbench.registry import online_detector
+    from vslam.lab.loopbench.drives import open_drives
+    from vslam.lab.loopbench.measure_online import measure_drive
+    from vslam.lab.loopbench.registry import online_detector
 
     starts = [online_detector(one, asked.files.get(one), asked.vocabulary) for one in asked.names]
     threads, bar = asked.threads, asked.progress_bar
@@ -184,11 +184,11 @@ def _on_sets(
     """Measure queries against galleries; says on what."""
     from vslam.cli.console import console
     from vslam.datasets.synthetic import store
-    from vslam.loopbench.cost import cost
-    from vslam.loopbench.detectors import DetectorSet
-    from vslam.loopbench.measure import measure
-    from vslam.loopbench.registry import comparable_scorer
-    from vslam.loopbench.sets import open_set
+    from vslam.lab.loopbench.cost import cost
+    from vslam.lab.loopbench.detectors import DetectorSet
+    from vslam.lab.loopbench.measure import measure
+    from vslam.lab.loopbench.registry import comparable_scorer
+    from vslam.lab.loopbench.sets import open_set
 
     scorers = [
         comparable_scorer(one, asked.files.get(one), asked.vocabulary) for one in asked.names
@@ -228,8 +228,8 @@ def _require_writable(out: Path) -> None:
 
 def _write(out: Path, seed: int, **found: object) -> None:
     """Write the report of what was found so far."""
-    from vslam.loopbench.report import write_report
-    from vslam.loopbench.schema import LoopsJson
+    from vslam.lab.loopbench.report import write_report
+    from vslam.lab.loopbench.schema import LoopsJson
     from vslam.machine import versions
     from vslam.report.summary import this_machine
 

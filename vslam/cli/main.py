@@ -5,9 +5,12 @@ from __future__ import annotations
 import atexit
 import gc
 import os
+import signal
 import sys
 from collections.abc import Collection
-from types import ModuleType
+from contextlib import suppress
+from pathlib import Path
+from types import FrameType, ModuleType
 from typing import Annotated
 
 import typer
@@ -30,6 +33,7 @@ from vslam.cli import (
 from vslam.cli import map as map_
 from vslam.errors import InputError, ResultsError
 from vslam.machine import keep_memory
+from vslam.untrusted import require_utf8
 
 _GROUPS: tuple[ModuleType, ...] = (
     run, evaluate, perturb, info, doctor, bench, stress, report, synth, train, export, map_,
@@ -65,6 +69,14 @@ def version(
 app = application(_GROUPS)
 
 
+def _treat_as_ctrl_c(signal_number: int, stack: FrameType | None) -> None:
+    """What a machine that shuts down sends (SIGTERM) ends a run as Ctrl-C does."""
+    handler = signal.getsignal(signal.SIGINT)
+    if not callable(handler):  # a shell's background jobs ignore Ctrl-C
+        raise KeyboardInterrupt
+    handler(signal.SIGINT, stack)
+
+
 def main() -> None:
     """Entry point: bad input becomes one line on stderr and exit code 2."""
     # Imports and kernels from the cache make a million objects that stay. To look through them for
@@ -75,7 +87,12 @@ def main() -> None:
     keep_memory()
     # OpenBLAS's threads spin while they wait, and no product of a run is large enough to share.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    signal.signal(signal.SIGTERM, _treat_as_ctrl_c)
     try:
+        for word in sys.argv[1:]:
+            require_utf8(Path(word))
+        with suppress(FileNotFoundError):  # the folder was removed
+            require_utf8(Path.cwd())
         # typer prepares every option of every command that it knows: 30 ms.
         (application((run,)) if sys.argv[1:2] == ["run"] else app)()
     except InputError as error:

@@ -67,7 +67,7 @@ def report(
 
 def serve_runs(folders: list[Path], port: int) -> None:
     """Serve a page of the runs in some folders until Ctrl-C."""
-    from vslam.overview.serve import make_server
+    from vslam.lab.overview.serve import make_server
 
     with make_server(folders, port) as server:
         typer.echo(f"http://127.0.0.1:{server.server_port}/ shows the runs; Ctrl-C ends it")
@@ -88,8 +88,8 @@ def write_overview_of(
     """Write the report of finished runs; unless ``quiet``, show its first tables and say where it
     is."""
     from vslam.cli.tables import show_tables
-    from vslam.overview import write_overview
-    from vslam.overview.versus import versus
+    from vslam.lab.overview import write_overview
+    from vslam.lab.overview.versus import versus
 
     written = write_overview(runs, trajectories, out, baseline)
     if not quiet:

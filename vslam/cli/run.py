@@ -138,7 +138,8 @@ def run(
     resume: Annotated[
         Path | None,
         typer.Option(
-            metavar="FOLDER", help="Go on at the next frame of a run that was cut off; alone."
+            metavar="FOLDER",
+            help="Go on at the next frame of a run that was cut off.",
         ),
     ] = None,
     realtime: Annotated[
@@ -164,7 +165,11 @@ def run(
     """Run SLAM on a sequence and write trajectory, map, recording and report to a folder."""
     from vslam.loopclosure.registry import DEFAULT_DETECTOR, require_detector
 
-    output = Output(record=record, view=view, pages=pages, ply=ply, quiet=quiet)
+    if save_map is not None:
+        from vslam.maps.new_output import require_place
+
+        require_place(save_map, "--save-map")
+    output = Output(record=record, view=view, pages=pages, ply=ply, save_map=save_map, quiet=quiet)
     if resume is not None:
         _refuse_beside_resume(context)
         from vslam.run.options import read_options
@@ -180,12 +185,6 @@ def run(
         raise InputError(f"--local-weights {local_weights}: no such file; name an .onnx file.")
     if localize and map_file is None:
         raise InputError("--localize: name the map to localise in with --map.")
-    if localize and save_map is not None:
-        raise InputError("--save-map: localising changes no map; leave it out.")
-    if save_map is not None:
-        from vslam.maps.new_output import require_place
-
-        require_place(save_map, "--save-map")
     if map_file is not None:
         if compare:
             raise InputError(
@@ -230,14 +229,13 @@ def run(
         map_file=map_file,
         localize=localize,
         compare=beside,
-        save_map=save_map,
         realtime=realtime,
         autosave=autosave,
     )
     drive(options, output, out=out)
 
 
-_BESIDE_RESUME = {"resume", "record", "view", "pages", "ply", "quiet"}
+_BESIDE_RESUME = {"resume", "record", "view", "pages", "ply", "save_map", "quiet"}
 
 
 def _refuse_beside_resume(context: typer.Context) -> None:

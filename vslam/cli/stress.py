@@ -16,9 +16,9 @@ from vslam.cli.options import KITTI_ROOT, Data, Dataset, MaxFrames, Sensor, Thre
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
-    from vslam.bench.execute import CellOutcome
-    from vslam.bench.grid import Cell
     from vslam.datasets.sequence import Sequence
+    from vslam.lab.bench.execute import CellOutcome
+    from vslam.lab.bench.grid import Cell
 
 _EXAMPLES = """
 [b]Examples[/b]
@@ -105,17 +105,17 @@ def stress(
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing while it runs.")] = False,
 ) -> None:
     """Find the strength of each perturbation at which a run fails, and report on it."""
-    from vslam.bench import execute
-    from vslam.bench.grid import parse_sequences
     from vslam.cli.console import console
     from vslam.datasets import open_sequence
     from vslam.datasets.sources import SourceOptions
+    from vslam.lab.bench import execute
+    from vslam.lab.bench.grid import parse_sequences
+    from vslam.lab.stress.criterion import Criterion
+    from vslam.lab.stress.plan import Plan, parse_laws
+    from vslam.lab.stress.report import render_boundaries, write_report
+    from vslam.lab.stress.run import Results, run_all
+    from vslam.lab.stress.summary import summarise
     from vslam.loopclosure.registry import require_detector
-    from vslam.stress.criterion import Criterion
-    from vslam.stress.plan import Plan, parse_laws
-    from vslam.stress.report import render_boundaries, write_report
-    from vslam.stress.run import Results, run_all
-    from vslam.stress.summary import summarise
 
     others = _others(names_in(systems), system or [], orbslam3_python, vocabulary)
     chosen = names_in(detectors) if "vslam" in names_in(systems) else []
@@ -199,9 +199,9 @@ def foreign(
     from vslam.config import load_config
     from vslam.datasets import open_sequence
     from vslam.datasets.perturbation import parse_perturbation
+    from vslam.lab.stress.external import run_external
     from vslam.report.folder import create_run_folder
     from vslam.run.options import RunOptions, settings_of
-    from vslam.stress.external import run_external
 
     options = RunOptions(
         data=str(data), dataset=dataset, seq=seq, perturb=perturb, seed=seed, threads=threads,
@@ -218,8 +218,8 @@ def _others(
     systems: list[str], given: list[str], python: Path | None, vocabulary: Path | None
 ) -> dict[str, str]:
     """Command templates of the systems that are not vslam."""
-    from vslam.stress import orbslam3
-    from vslam.stress.external import check_template
+    from vslam.lab.stress import orbslam3
+    from vslam.lab.stress.external import check_template
 
     templates: dict[str, str] = {}
     for text in given:

@@ -1,8 +1,13 @@
-"""The commands ``vslam train`` and ``vslam export`` of networks. torch is imported inside them."""
+"""The commands ``vslam train`` and ``vslam export`` of networks.
+
+The libraries of the extra ``train`` are imported inside the commands, since ``vslam`` has to start
+without them.
+"""
 
 from __future__ import annotations
 
 import time
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -116,6 +121,7 @@ def train(
 ) -> None:
     """Train a loop detector; writes weights (.safetensors to go on from, .onnx for runs), log,
     pairs, checkpoints and a model card."""
+    _require_libraries("train")
     from vslam.loopclosure.siamese.branches import CapsuleBranch
     from vslam.loopclosure.siamese.data import load, refuse_test_data
     from vslam.loopclosure.siamese.images import parse_size
@@ -164,6 +170,24 @@ def train(
     for name, value in outcome.figures.items():
         typer.echo(f"{name:<28}{value:.4f}")
     typer.echo(f"{'weights':<28}{outcome.weights}")
+
+
+def _require_libraries(command: str) -> None:
+    """Refuse a command that the installed packages cannot carry out.
+
+    All of them are looked for before the command starts: the export that follows a training imports
+    onnxscript hours later.
+
+    Raises:
+        InputError: one of the packages of the extra ``train`` is not installed.
+    """
+    from vslam.errors import InputError
+
+    for name in ("torch", "safetensors", "onnx", "onnxscript"):
+        if find_spec(name) is None:
+            raise InputError(
+                f"vslam {command}: {name} is not installed; pip install 'vslam[train]'."
+            )
 
 
 def _refuse_of_pcanet(given: dict[str, object]) -> None:
@@ -228,6 +252,7 @@ def onnx(
     ] = None,
 ) -> None:
     """Write the ONNX file that runs use, and check it against torch."""
+    _require_libraries("export onnx")
     from vslam.loopclosure.siamese.export import export_onnx
     from vslam.loopclosure.siamese.siamese import load_network
 
@@ -247,6 +272,7 @@ def weights_(
     out: Annotated[Path, typer.Option(help="File to write, .safetensors.")],
 ) -> None:
     """Write weights in half precision, with model card and ONNX file, as vslam ships them."""
+    _require_libraries("export weights")
     import shutil
 
     from vslam.errors import ResultsError

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vslam.camera import ImageMap
 from vslam.datasets.sequence import Image
 from vslam.errors import InputError, UnreadableImageError
-from vslam.untrusted import MOST_PIXELS
+from vslam.untrusted import MOST_PIXELS, require_utf8
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
 
@@ -80,10 +80,17 @@ def checked_files(
 
 
 def list_images(folder: Path) -> dict[str, Path]:
-    """Image files of a folder by stem, in the order of their names; empty without the folder."""
+    """Image files of a folder by stem, in the order of their names; empty without the folder.
+
+    Raises:
+        InputError: the name of one is not UTF-8.
+    """
     if not folder.is_dir():
         return {}
-    return {path.stem: path for path in sorted(folder.iterdir()) if is_image(path)}
+    images = [path for path in sorted(folder.iterdir()) if is_image(path)]
+    for path in images:
+        require_utf8(path)
+    return {path.stem: path for path in images}
 
 
 def is_image(path: Path) -> bool:

@@ -286,6 +286,6 @@ def _time_of_exif(path: Path) -> float | None:
             tags = image.getexif().get_ifd(_EXIF)
         day = datetime.strptime(str(tags[_DATE_TIME_ORIGINAL]), "%Y:%m:%d %H:%M:%S")
         fraction = float(f"0.{str(tags.get(_SUB_SEC_TIME_ORIGINAL, 0)).strip()}")
-    except (OSError, KeyError, ValueError):
+    except Exception:  # Pillow raises a dozen kinds, for huge images one of its own
         return None
     return day.replace(tzinfo=UTC).timestamp() + fraction

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -11,43 +11,52 @@ from numpy.typing import NDArray
 from vslam.camera import Camera
 from vslam.frame_poses import FrameTable
 from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe
-from vslam.map import NONE, Arrays, Map
+from vslam.map import (
+    KEYFRAME_FIELDS,
+    LANDMARK_FIELDS,
+    NONE,
+    ROW_FIELDS,
+    UNPREDICTED,
+    Arrays,
+    KeyframeTable,
+    Map,
+    Scalars,
+)
 from vslam.maps.checkpoint import ARRAYS as CHECKPOINT_ARRAYS
 from vslam.maps.checkpoint import checked_checkpoint
 from vslam.maps.stored_map import StoredMap, World, observations
+
+# These follow from the list of observations by landmark that the file has instead, and from
+# keyframe_first_row.
+_NOT_IN_FILE = ("head", "n_observations", "keyframe", "landmark", "next_row")
+# The columns of the map, and what they are called in the file.
+FILE_NAMES = {
+    name: f"{prefix}_{name.removeprefix(f'{prefix}_')}"
+    for prefix, fields in (
+        ("keyframe", KEYFRAME_FIELDS + KeyframeTable._fields),
+        ("landmark", LANDMARK_FIELDS),
+        ("row", ROW_FIELDS),
+    )
+    for name in fields
+    if name not in _NOT_IN_FILE
+}
+_SIZES = {"keyframe": "K", "landmark": "L", "row": "R"}
+
+
+def _kind(name: str, in_file: str) -> tuple[type, tuple[str | int, ...]]:
+    """Type and shape that a column of the map must have in the file."""
+    empty = (Arrays()._asdict() | KeyframeTable()._asdict())[name]
+    size = "K+1" if name == "first_row" else _SIZES[in_file.partition("_")[0]]
+    return empty.dtype.type, (size, *empty.shape[1:])
+
 
 # K keyframes, L landmarks, R keypoints, O observations, E loops, F frames of the last drive.
 # A number more than one of them: where each begins, and where the last one ends.
 ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "scales": (np.float64, ("levels",)),
-    "keyframe_T_cw": (np.float64, ("K", 4, 4)),
-    "keyframe_first_row": (np.int64, ("K+1",)),
-    "keyframe_alive": (np.bool_, ("K",)),
-    "keyframe_T_c_parent": (np.float64, ("K", 4, 4)),
-    "keyframe_timestamp": (np.float64, ("K",)),
-    "keyframe_frame": (np.int64, ("K",)),
-    "keyframe_parent": (np.int64, ("K",)),
-    "keyframe_session": (np.int64, ("K",)),
-    "keyframe_unit_scale": (np.float64, ("K",)),
-    "restarts": (np.int64, ("restarts",)),
-    "unpredicted_restarts": (np.int64, ("unpredicted",)),
-    "landmark_xyz": (np.float64, ("L", 3)),
-    "landmark_normal": (np.float64, ("L", 3)),
-    "landmark_distance_range": (np.float64, ("L", 2)),
-    "landmark_descriptor": (np.uint64, ("L", 4)),
-    "landmark_first_keyframe": (np.int32, ("L",)),
-    "landmark_visible": (np.int32, ("L",)),
-    "landmark_found": (np.int32, ("L",)),
-    "landmark_alive": (np.bool_, ("L",)),
-    "landmark_merged_into": (np.int32, ("L",)),
+    **{in_file: _kind(name, in_file) for name, in_file in FILE_NAMES.items()},
     "landmark_first_observation": (np.int64, ("L+1",)),
     "observation_row": (np.int64, ("O",)),
-    "row_xy": (np.float32, ("R", 2)),
-    "row_u_right": (np.float32, ("R",)),
-    "row_octave": (np.uint8, ("R",)),
-    "row_angle": (np.float32, ("R",)),
-    "row_descriptor": (np.uint64, ("R", 4)),
-    "row_certainty": (np.uint8, ("R",)),
     "loop_ends": (np.int64, ("E", 2)),
     "loop_T_query_match": (np.float64, ("E", 4, 4)),
     "loop_scale": (np.float64, ("E",)),
@@ -61,20 +70,24 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "frame_unit_scale": (np.float64, ("F",)),
 }
 _MAY_BE_NAN = {"row_u_right"}
+_MOST = 1e12  # metres, pixels, seconds: products of a few of them are finite, too
 _ROTATION_TOLERANCE = 1e-6
+_MOST_PIXELS = 1e6  # of a side of an image, and of a focal length
 _MAX_OFFSET = 100.0  # pixels
+_MAX_SESSION = 2**31  # it must fit into a column of the map
 
 
 class DamagedMapError(Exception):
     """What is wrong with the arrays of a file."""
 
 
-def _set_offset(map_: Map, header: dict[str, Any]) -> None:
-    """The disparity offset, and what measured it."""
-    offset, information, until = header["disparity_offset"]
-    _require(abs(offset) < _MAX_OFFSET and 0.0 <= information < np.inf, "the disparity offset")
-    map_.disparity_offset, map_.offset_information = float(offset), float(information)
-    map_.calibrated_until = int(until)
+def _scalars(entry: dict[str, Any]) -> Scalars:
+    names = asdict(Scalars())
+    found = Scalars(**{name: type(default)(entry[name]) for name, default in names.items()})
+    sound = abs(found.disparity_offset) < _MAX_OFFSET and 0.0 <= found.offset_information < np.inf
+    _require(sound, "the disparity offset")
+    _require(0 <= found.session < _MAX_SESSION, "the number of the drive")
+    return found
 
 
 def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
@@ -85,13 +98,13 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
             wrong with them.
     """
     sizes = _check_shapes(data)
-    map_ = _build_map(data, sizes, int(header["session"]))
-    _set_offset(map_, header)
+    map_ = _build_map(data, sizes)
+    map_.scalars = _scalars(header["scalars"])
     checkpoint = None
     if header["checkpoint"] is not None:
         arrays = {name: data[f"checkpoint_{name}"] for name in CHECKPOINT_ARRAYS}
         checkpoint = checked_checkpoint(
-            arrays, header["checkpoint"], data["keyframe_first_row"], sizes["L"]
+            arrays, header["checkpoint"], map_, sizes["F"] if header["frames"] else 0
         )
     else:
         a = map_.arrays
@@ -131,8 +144,9 @@ def _check_shapes(data: dict[str, NDArray]) -> dict[str, int]:
                 wanted = sizes.setdefault(key, size)
             if size != wanted:
                 raise DamagedMapError(f"{name} has shape {array.shape}")
-        if dtype in (np.float32, np.float64) and name not in _MAY_BE_NAN:
-            _require(bool(np.isfinite(array).all()), f"{name} is not finite")
+        if dtype in (np.float32, np.float64):
+            nan = np.isnan(array) & (name in _MAY_BE_NAN)
+            _require(bool((nan | (np.abs(array) < _MOST)).all()), f"{name} is out of range")
     return sizes
 
 
@@ -145,7 +159,7 @@ def _require(holds: bool, otherwise: str) -> None:
         raise DamagedMapError(otherwise)
 
 
-def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) -> Map:
+def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
     n, n_landmarks, n_rows = sizes["K"], sizes["L"], sizes["R"]
     scales, parent = data["scales"], data["keyframe_parent"]
     _require(len(scales) > 1 and bool((np.diff(scales) > 0).all()), "scales do not grow")
@@ -156,11 +170,10 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) ->
         _check_rigid(name, data[name])
     _require(bool((parent[1:] >= 0).all() and (parent < np.arange(n)).all()), "keyframe_parent")
     _check_ids("keyframe_parent", parent, n, least=NONE)
-    _require(bool((data["keyframe_unit_scale"] > 0).all()), "keyframe_unit_scale")
-    for name in ("restarts", "unpredicted_restarts"):
-        _check_ids(name, data[name], n, least=1)
+    _require(bool((data["keyframe_unit_scale"] > 1 / _MOST).all()), "keyframe_unit_scale")
+    _check_ids("keyframe_restart", data["keyframe_restart"], UNPREDICTED + 1)
+    _require(not data["keyframe_restart"][:1].any(), "keyframe_restart of the first keyframe")
     _check_ids("row_octave", data["row_octave"], len(scales))
-    _require(not np.isinf(data["row_u_right"]).any(), "row_u_right is infinite")
     _require(bool((data["row_certainty"] > 0).all()), "row_certainty")
 
     first, rows = data["landmark_first_observation"], data["observation_row"]
@@ -178,40 +191,9 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int], session: int) ->
     living = data["keyframe_alive"]
     _require(bool(living[keyframe[rows]].all()), "a keyframe that was culled observes something")
     _require(bool(living[parent[parent >= 0]].all() and living[parent < 0].all()), "family tree")
-    map_ = Map(scales)
-    map_.n_keyframes, map_.n_landmarks, map_.n_rows = n, n_landmarks, n_rows
-    map_.arrays = Arrays(
-        T_cw=data["keyframe_T_cw"],
-        first_row=first_row,
-        keyframe_alive=living,
-        xyz=data["landmark_xyz"],
-        normal=data["landmark_normal"],
-        distance_range=data["landmark_distance_range"],
-        landmark_descriptor=data["landmark_descriptor"],
-        first_keyframe=data["landmark_first_keyframe"],
-        visible=data["landmark_visible"],
-        found=data["landmark_found"],
-        landmark_alive=alive,
-        merged_into=data["landmark_merged_into"],
-        xy=data["row_xy"],
-        u_right=data["row_u_right"],
-        octave=data["row_octave"],
-        angle=data["row_angle"],
-        descriptor=data["row_descriptor"],
-        certainty=data["row_certainty"],
-        keyframe=keyframe,
-        **observations(rows, first, data["row_u_right"]),
-    )
-    map_.timestamps = data["keyframe_timestamp"].tolist()
-    map_.frames = data["keyframe_frame"].tolist()
-    map_.parents = parent.tolist()
-    map_.T_c_parent = {int(k): data["keyframe_T_c_parent"][k] for k in np.flatnonzero(~living)}
-    map_.sessions = data["keyframe_session"].tolist()
-    map_.session = session
-    map_.unit_scale = data["keyframe_unit_scale"].tolist()
-    map_.restarts = data["restarts"].tolist()
-    map_.unpredicted_restarts = data["unpredicted_restarts"].tolist()
-    return map_
+    columns = {name: data[in_file] for name, in_file in FILE_NAMES.items()}
+    columns |= observations(rows, first, data["row_u_right"]) | {"keyframe": keyframe}
+    return Map(scales).with_columns(columns)
 
 
 def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> None:
@@ -229,7 +211,7 @@ def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> N
 def _loops(data: dict[str, NDArray], n: int) -> tuple[LoopEdge, ...]:
     _check_ids("loop_ends", data["loop_ends"], n)
     _check_rigid("loop_T_query_match", data["loop_T_query_match"])
-    _require(bool((data["loop_scale"] > 0).all()), "loop_scale")
+    _require(bool((data["loop_scale"] > 1 / _MOST).all()), "loop_scale")
     return tuple(
         LoopEdge(
             query=query,
@@ -260,7 +242,7 @@ def _frames(data: dict[str, NDArray], n: int) -> FrameTable:
     _check_ids("frame_reference", frames.reference, max(n, 1))
     _check_rigid("frame_T_c_reference", frames.T_c_reference)
     _require(bool((np.diff(frames.timestamp) > 0).all()), "frame_timestamp")
-    _require(bool((frames.unit_scale > 0).all()), "frame_unit_scale")
+    _require(bool((frames.unit_scale > 1 / _MOST).all()), "frame_unit_scale")
     return frames
 
 
@@ -278,18 +260,17 @@ def camera_of(header: dict[str, Any]) -> Camera:
         DamagedMapError, KeyError, TypeError, ValueError: as ``checked_map``.
     """
     camera = Camera(**header["camera"])
-    numbers = [camera.fx, camera.fy, camera.width, camera.height]
-    sound = all(isinstance(x, int | float) and 0 < x < 1e6 for x in numbers)
-    sound = sound and bool(
-        np.isfinite([camera.cx, camera.cy, camera.baseline, camera.right_delay]).all()
-    )
-    _require(sound and camera.baseline >= 0, "camera")
+    sizes = [camera.fx, camera.fy, camera.width, camera.height]
+    places = [camera.cx, camera.cy, camera.baseline, camera.right_delay]
+    sound = all(isinstance(x, int | float) and 1 <= x < _MOST_PIXELS for x in sizes)
+    sound = sound and all(isinstance(x, int | float) and abs(x) < _MOST for x in places)
+    _require(sound and camera.baseline >= 0 and isinstance(camera.depth, bool), "camera")
     return replace(camera, width=int(camera.width), height=int(camera.height))
 
 
 def _world(fields: dict[str, Any]) -> World:
     S = np.array(fields["S_truth_world"], np.float64)
-    _require(S.shape == (4, 4) and bool(np.isfinite(S).all()), "world")
+    _require(S.shape == (4, 4) and bool((np.abs(S) < _MOST).all()), "world")
     return World(str(fields["name"]), S)
 
 

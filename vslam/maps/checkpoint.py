@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from vslam.features import PATCH_PIXELS, Features, KeyframePatches
 from vslam.loops import ResembledPlace, loop_entry, loop_of
+from vslam.map import Map
 from vslam.states import (
     Checkpoint,
     ClosingState,
@@ -34,6 +35,8 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
 }
 FEATURES = ("xy", "octave", "angle", "descriptors", "u_right")
 _OF_TRACKER = ("index", "timestamp", "lost_frames", "n_tracked")
+_MOST = 1e12  # metres, pixels, seconds
+_MOST_FRAMES = 2**31
 _OF_MAPPER = ("reference", "last_frame", "last_timestamp")
 
 
@@ -74,20 +77,17 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
 
 
 def checked_checkpoint(
-    arrays: dict[str, NDArray],
-    entry: dict[str, Any],
-    first_row: NDArray[np.int64],
-    n_landmarks: int,
+    arrays: dict[str, NDArray], entry: dict[str, Any], map_: Map, n_frames: int
 ) -> Checkpoint:
     """The checkpoint of a file, which may hold anything.
 
     Args:
-        first_row: ``(K + 1,)`` of the map's keyframes.
+        map_: of the same file, checked.
+        n_frames: of the drive so far.
 
     Raises:
-        KeyError, TypeError, ValueError: in a few words what is wrong with it.
+        KeyError, TypeError, ValueError, OverflowError: in a few words what is wrong with it.
     """
-    n_keyframes = len(first_row) - 1
     sizes = {
         "N": len(arrays["landmark"]),
         "M": len(arrays["patch_keyframe"]),
@@ -98,33 +98,74 @@ def checked_checkpoint(
         wanted = tuple(sizes[size] if isinstance(size, str) else size for size in shape)
         if array.dtype != dtype or array.shape != wanted or not array.flags.c_contiguous:
             raise ValueError(f"checkpoint_{name} is {array.dtype} {array.shape}")
-    tracker, mapper = dict(entry["tracker"]), dict(entry["mapper"])
-    policy, landmark = PolicyState(**entry["policy"]), arrays["landmark"]
-    T_cw, twist = np.array(tracker.pop("T_cw"), np.float64), tracker.pop("twist")
-    twist = None if twist is None else np.array(twist, np.float64)
-    numbers = [*(tracker[name] for name in _OF_TRACKER), *(mapper[name] for name in _OF_MAPPER)]
+        nan = np.isnan(array) & (name == "u_right")
+        if dtype == np.float32 and not (nan | (np.abs(array) < _MOST)).all():
+            raise ValueError(f"checkpoint_{name} is out of range")
+    tracker, mapper, policy = (dict(entry[name]) for name in ("tracker", "mapper", "policy"))
+    T_cw, twist = tracker.pop("T_cw"), tracker.pop("twist")
+    landmark, reference = arrays["landmark"], _count(mapper["reference"])
+    # A drive that has begun in the map of another one, and made no keyframe yet, has -1 and -inf.
+    last_frame, last_timestamp = _count(mapper["last_frame"], -1), mapper["last_timestamp"]
     sound = (
-        T_cw.shape == (4, 4)
-        and (twist is None or twist.shape == (6,))
-        and all(np.isfinite(x).all() for x in (T_cw, 0.0 if twist is None else twist))
-        and np.isfinite(arrays["xy"]).all()
-        and all(isinstance(x, int | float) for x in (*numbers, *vars(policy).values()))
-        and np.isfinite(np.array(entry["rig"], np.float64)).all()
-        and 0 <= mapper["reference"] < n_keyframes
-        and ((landmark >= -1) & (landmark < n_landmarks)).all()
+        ((landmark >= -1) & (landmark < map_.n_landmarks)).all()
+        and (arrays["octave"] < len(map_.scales)).all()
+        and reference < map_.n_keyframes
+        and map_.arrays.keyframe_alive[reference]
+        and _count(tracker["index"]) < n_frames
+        and last_frame < n_frames
+        and isinstance(policy["gain_awaited"], bool)
     )
     if not sound:
         raise ValueError("the last frame is out of range")
     features = Features(**{name: arrays[name] for name in FEATURES})
     return Checkpoint(
         tracker=TrackerState(
-            **tracker, features=features, landmark=landmark, T_cw=T_cw, twist=twist
+            index=tracker.pop("index"),
+            timestamp=_number(tracker.pop("timestamp")),
+            lost_frames=_count(tracker.pop("lost_frames")),
+            n_tracked=_count(tracker.pop("n_tracked")),
+            features=features,
+            landmark=landmark,
+            T_cw=_pose(T_cw),
+            twist=None if twist is None else _numbers(twist, 6),
+            **tracker,
         ),
-        mapper=MapperState(**mapper, patches=_patches_of(arrays, first_row)),
-        policy=policy,
-        closing=_closing_of(entry["closing"], n_keyframes),
-        rig=tuple(map(float, entry["rig"])),
+        mapper=MapperState(
+            reference=reference,
+            last_frame=last_frame,
+            last_timestamp=-np.inf if last_timestamp == -np.inf else _number(last_timestamp),
+            patches=_patches_of(arrays, map_.arrays.first_row[: map_.n_keyframes + 1]),
+        ),
+        policy=PolicyState(_number(policy["gained_close"]), policy["gain_awaited"]),
+        closing=_closing_of(entry["closing"], map_.n_keyframes),
+        rig=tuple(_numbers(entry["rig"]).tolist()),
     )
+
+
+def _count(value: Any, least: int = 0) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value < _MOST_FRAMES:
+        raise ValueError(f"{value!r:.40} is no count")
+    return value
+
+
+def _number(value: Any) -> float:
+    if not isinstance(value, int | float) or not abs(value) < _MOST:
+        raise ValueError(f"{value!r:.40} is out of range")
+    return float(value)
+
+
+def _numbers(values: Any, count: int | None = None) -> NDArray[np.float64]:
+    found = np.array(values, np.float64)
+    if found.ndim != 1 or len(found) != (count or len(found)) or not (np.abs(found) < _MOST).all():
+        raise ValueError("numbers are out of range")
+    return found
+
+
+def _pose(values: Any) -> NDArray[np.float64]:
+    T = np.array(values, np.float64)
+    if T.shape != (4, 4) or not (np.abs(T) < _MOST).all():
+        raise ValueError("a pose is out of range")
+    return T
 
 
 def _patches_of(
@@ -141,18 +182,22 @@ def _patches_of(
 
 
 def _closing_of(entry: dict[str, Any], n_keyframes: int) -> ClosingState:
-    verified = tuple((int(turn), loop_of(edge)) for turn, edge in entry["verified"])
+    verified = tuple((_count(turn), loop_of(edge)) for turn, edge in entry["verified"])
     for _, edge in verified:
-        T = edge.T_query_match
-        known = min(edge.query, edge.match) >= 0 and max(edge.query, edge.match) < n_keyframes
-        if not known or T is None or not np.isfinite(T).all() or not edge.scale > 0:
+        if max(_count(edge.query), _count(edge.match)) >= n_keyframes:
             raise ValueError("a loop that waits is out of range")
+        _pose(edge.T_query_match)
+        if _number(edge.scale) <= 1 / _MOST:
+            raise ValueError("a loop that waits has no scale")
+        _number(edge.score), _count(edge.n_matches), _count(edge.n_inliers)
     places = tuple(
-        ResembledPlace(frozenset(map(int, keyframes)), int(length), int(age))
+        ResembledPlace(frozenset(map(_count, keyframes)), _count(length), _count(age))
         for keyframes, length, age in entry["places"]
     )
+    if max((k for place in places for k in place.keyframes), default=-1) >= n_keyframes:
+        raise ValueError("a place that was resembled is out of range")
     return ClosingState(
-        ConsistencyState(places, verified, int(entry["turn"])),
-        VerifierState(int(entry["resting_until"]), float(entry["in_vain"])),
-        int(entry["followed"]),
+        ConsistencyState(places, verified, _count(entry["turn"])),
+        VerifierState(_count(entry["resting_until"]), _number(entry["in_vain"])),
+        _count(entry["followed"]),
     )

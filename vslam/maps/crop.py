@@ -32,7 +32,7 @@ def near_frames(
     from scipy.spatial import cKDTree
 
     keyframes, xz = _places(map_)
-    frame, session = (np.array(values)[keyframes] for values in (map_.frames, map_.sessions))
+    frame, session = map_.frames[keyframes], map_.sessions[keyframes]
     named = (session == drive) & (frame >= first) & (frame <= last)
     if not named.any():
         return keyframes[:0]

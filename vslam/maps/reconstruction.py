@@ -65,8 +65,8 @@ def reconstruction_of(map_: Map, camera: Camera) -> Reconstruction:
     landmarks, landmark = np.unique(a.landmark[rows], return_inverse=True)
     return Reconstruction(
         camera=camera,
-        frames=np.array(map_.frames, np.int64)[keyframes],
-        timestamps=np.array(map_.timestamps, np.float64)[keyframes],
+        frames=map_.frames[keyframes],
+        timestamps=map_.timestamps[keyframes],
         T_cw=a.T_cw[keyframes],
         xyz=a.xyz[landmarks],
         keyframe=np.searchsorted(keyframes, a.keyframe[rows]).astype(np.int64),

@@ -21,15 +21,14 @@ from vslam.camera import Camera
 from vslam.errors import InputError
 from vslam.frame_poses import FrameTable
 from vslam.machine import versions
-from vslam.map import LANDMARK_FIELDS, ROW_FIELDS
 from vslam.map_kernels import gather_observations
-from vslam.maps.checked_map import ARRAYS, DamagedMapError, camera_of, checked_map
+from vslam.maps.checked_map import FILE_NAMES, DamagedMapError, camera_of, checked_map
 from vslam.maps.checkpoint import checkpoint_arrays, checkpoint_entry
 from vslam.maps.new_output import replaced_file
 from vslam.maps.stored_map import StoredMap
-from vslam.untrusted import ARCHIVE_ERRORS, require_memory
+from vslam.untrusted import ARCHIVE_ERRORS, read_json, require_memory
 
-SCHEMA = 5
+SCHEMA = 6
 _FOREIGN = "not a map of vslam; name a map.npz, or the folder of a run"
 
 
@@ -76,16 +75,16 @@ def load_checkpoint(path: Path) -> StoredMap:
 def _as_damage(path: Path) -> Iterator[None]:
     try:
         yield
-    except (DamagedMapError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (*ARCHIVE_ERRORS, DamagedMapError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: the map is damaged ({error}); save it again.") from error
 
 
 def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
-    map_, a, checkpoint = stored.map, stored.map.arrays, stored.checkpoint
-    n, n_landmarks, n_rows = map_.n_keyframes, map_.n_landmarks, map_.n_rows
-    landmarks = np.arange(n_landmarks, dtype=np.int32)
-    index = np.arange(n, dtype=np.int64)
-    first, rows = gather_observations(a, landmarks, index)
+    map_, checkpoint = stored.map, stored.checkpoint
+    index = np.arange(map_.n_keyframes, dtype=np.int64)
+    landmarks = np.arange(map_.n_landmarks, dtype=np.int32)
+    first, rows = gather_observations(map_.arrays, landmarks, index)
+    columns = map_.columns()
     loops = stored.loops
     T = [loop.T_query_match for loop in loops]
     frames = stored.frames or FrameTable(
@@ -104,13 +103,8 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
         },
         "images": stored.images is not None,
         "frames": stored.frames is not None,
-        "session": map_.session,
+        "scalars": asdict(map_.scalars),
         "checkpoint": None if checkpoint is None else checkpoint_entry(checkpoint),
-        "disparity_offset": [
-            map_.disparity_offset,
-            map_.offset_information,
-            map_.calibrated_until,
-        ],
         "world": None
         if stored.world is None
         else {
@@ -121,19 +115,7 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
     arrays = {
         "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
         "scales": map_.scales,
-        "keyframe_T_cw": a.T_cw[: map_.n_keyframes],
-        "keyframe_first_row": a.first_row[: map_.n_keyframes + 1],
-        "keyframe_alive": a.keyframe_alive[:n],
-        "keyframe_T_c_parent": np.array(
-            [map_.T_c_parent.get(k, np.eye(4)) for k in range(n)], np.float64
-        ).reshape(-1, 4, 4),
-        "keyframe_timestamp": np.array(map_.timestamps, np.float64),
-        "keyframe_frame": np.array(map_.frames, np.int64),
-        "keyframe_parent": np.array(map_.parents, np.int64),
-        "keyframe_session": np.array(map_.sessions, np.int64),
-        "keyframe_unit_scale": np.array(map_.unit_scale, np.float64),
-        "restarts": np.array(map_.restarts, np.int64),
-        "unpredicted_restarts": np.array(map_.unpredicted_restarts, np.int64),
+        **{in_file: columns[name] for name, in_file in FILE_NAMES.items()},
         "landmark_first_observation": first,
         "observation_row": rows,
         "loop_ends": np.array([(one.query, one.match) for one in loops], np.int64).reshape(-1, 2),
@@ -145,13 +127,6 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
         ).reshape(-1, 2),
         "loop_learned": np.array([loop.matched_by == "learned" for loop in loops], np.bool_),
     }
-    for prefix, fields, size in (
-        ("landmark", LANDMARK_FIELDS, n_landmarks),
-        ("row", ROW_FIELDS, n_rows),
-    ):
-        for name in fields:
-            if f"{prefix}_{name.removeprefix('landmark_')}" in ARRAYS:
-                arrays[f"{prefix}_{name.removeprefix('landmark_')}"] = getattr(a, name)[:size]
     for name in FrameTable._fields:
         arrays[f"frame_{name}"] = getattr(frames, name)
     if checkpoint is not None:
@@ -198,7 +173,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
                     f"{path}: a map of schema {int(file['schema'])}, this version reads {SCHEMA}; "
                     "run again with it."
                 )
-            header = json.loads(bytes(file["header"]))
+            header = read_json(file["header"])
             if not isinstance(header, dict) or header.get("kind") != "vslam map":
                 raise InputError(f"{path}: {_FOREIGN}.")
             if header.get("schema") != SCHEMA:

@@ -16,7 +16,8 @@ from vslam.map import (
     LANDMARK_FIELDS,
     NONE,
     ROW_FIELDS,
-    Arrays,
+    UNPREDICTED,
+    KeyframeTable,
     Map,
     loop_of_living,
 )
@@ -140,39 +141,26 @@ def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> M
         a.u_right[kept_rows],
     )
     all_kept = len(kept_rows) == map_.n_rows
-    of_rows = slice(map_.n_rows) if all_kept and not copy else kept_rows
-    found = Map(map_.scales)
-    found.n_keyframes, found.n_landmarks, found.n_rows = n, len(landmarks), len(kept_rows)
-    found.disparity_offset = map_.disparity_offset
-    found.offset_information, found.calibrated_until = map_.offset_information, n - 1
-    found.arrays = Arrays(
-        T_cw=a.T_cw[keyframes],
-        first_row=first_row,
-        keyframe_alive=np.ones(n, np.bool_),
-        xyz=a.xyz[landmarks],
-        normal=a.normal[landmarks],
-        distance_range=a.distance_range[landmarks],
-        landmark_descriptor=a.landmark_descriptor[landmarks],
-        first_keyframe=anchor[kept].astype(np.int32),
-        visible=a.visible[landmarks],
-        found=a.found[landmarks],
-        landmark_alive=np.ones(len(landmarks), np.bool_),
-        merged_into=np.full(len(landmarks), NONE, np.int32),
-        xy=a.xy[of_rows],
-        u_right=a.u_right[of_rows],
-        octave=a.octave[of_rows],
-        angle=a.angle[of_rows],
-        descriptor=a.descriptor[of_rows],
-        certainty=a.certainty[of_rows],
-        keyframe=np.repeat(np.arange(n, dtype=np.int32), np.diff(first_row)),
+    of_rows = slice(None) if all_kept and not copy else kept_rows
+    parent, restart = _family(map_, keyframes, new_id)
+    renumbered: dict[str, NDArray] = {
+        "first_row": first_row,
+        "first_keyframe": anchor[kept].astype(np.int32),
+        "keyframe": np.repeat(np.arange(n, dtype=np.int32), np.diff(first_row)),
+        "parent": parent,
+        "restart": restart,
         **links,
-    )
-    for name in ("timestamps", "frames", "sessions", "unit_scale"):
-        values = getattr(map_, name)
-        setattr(found, name, [values[k] for k in keyframes.tolist()])
-    found.session = map_.session
-    found.parents = [_ancestor(map_, k, new_id) for k in keyframes.tolist()]
-    _begin_submaps(map_, found, new_id)
+    }
+    columns = map_.columns()
+    for fields, chosen in (
+        (KEYFRAME_FIELDS + KeyframeTable._fields, keyframes),
+        (LANDMARK_FIELDS, landmarks),
+        (ROW_FIELDS, of_rows),
+    ):
+        for name in fields:
+            columns[name] = renumbered[name] if name in renumbered else columns[name][chosen]
+    found = map_.with_columns(columns)
+    found.scalars = replace(map_.scalars, calibrated_until=n - 1)
     return found
 
 
@@ -210,43 +198,25 @@ def observations(
 def appended(one: StoredMap, other: StoredMap) -> StoredMap:
     """Two compact maps as one, the second a sub-map of which nobody knows where it lies."""
     a, b = one.map, other.map
-    n, n_landmarks, n_rows = a.n_keyframes, a.n_landmarks, a.n_rows
-    found = Map(a.scales)
-    found.n_keyframes = n + b.n_keyframes
-    found.disparity_offset = a.disparity_offset
-    found.offset_information = a.offset_information
-    found.calibrated_until = found.n_keyframes - 1
-    found.n_landmarks, found.n_rows = n_landmarks + b.n_landmarks, n_rows + b.n_rows
+    n, drives = a.n_keyframes, a.scalars.session + 1
     shift = {
-        "first_keyframe": n, "keyframe": n, "merged_into": 0, "landmark": n_landmarks,
-        "head": n_rows, "next_row": n_rows,
+        "first_row": a.n_rows, "first_keyframe": n, "keyframe": n, "landmark": a.n_landmarks,
+        "merged_into": a.n_landmarks, "head": a.n_rows, "next_row": a.n_rows, "parent": n,
+        "session": drives,
     }  # fmt: skip
-    arrays = {}
-    for fields, sizes in (
-        (KEYFRAME_FIELDS, (n, b.n_keyframes)),
-        (LANDMARK_FIELDS, (n_landmarks, b.n_landmarks)),
-        (ROW_FIELDS, (n_rows, b.n_rows)),
-    ):
-        for name in fields:
-            first, second = (
-                getattr(map_.arrays, name)[:size] for map_, size in zip((a, b), sizes, strict=True)
-            )
-            if name in shift:
-                second = np.where(second >= 0, second + shift[name], NONE).astype(second.dtype)
-            arrays[name] = np.concatenate([first, second])
-    ends = n_rows + b.arrays.first_row[: b.n_keyframes + 1]
-    arrays["first_row"] = np.concatenate([a.arrays.first_row[:n], ends])
-    found.arrays = Arrays(**arrays)
-    found.timestamps = [*a.timestamps, *b.timestamps]
-    found.frames = [*a.frames, *b.frames]
-    found.unit_scale = [*a.unit_scale, *b.unit_scale]
-    drives = a.session + 1
-    found.sessions = [*a.sessions, *(drives + session for session in b.sessions)]
-    found.session = drives + b.session
-    found.parents = [*a.parents, *(n + parent if parent >= 0 else 0 for parent in b.parents)]
-    found.restarts = [*a.restarts, n, *(n + k for k in b.restarts)]
-    unpredicted = [*a.unpredicted_restarts, n, *(n + k for k in b.unpredicted_restarts)]
-    found.unpredicted_restarts = unpredicted
+
+    first, second = a.columns(), b.columns()
+    for name, by in shift.items():
+        column = second[name]
+        second[name] = np.where(column >= 0, column + by, NONE).astype(column.dtype)
+    first["first_row"] = first["first_row"][:-1]  # its last entry is the first of the second map
+    columns = {name: np.concatenate([column, second[name]]) for name, column in first.items()}
+    columns["parent"][n + np.flatnonzero(b.parents < 0)] = 0
+    columns["restart"][n : n + 1] = UNPREDICTED
+    found = a.with_columns(columns)
+    found.scalars = replace(
+        a.scalars, session=drives + b.scalars.session, calibrated_until=found.n_keyframes - 1
+    )
     loops = tuple(replace(loop, query=n + loop.query, match=n + loop.match) for loop in other.loops)
     tables = {
         name: table.followed_by(other.detector.tables[name])
@@ -266,46 +236,46 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
     )
 
 
-def _ancestor(map_: Map, keyframe: int, new_id: NDArray[np.int64]) -> int:
-    """New id of the nearest ancestor that is kept, or -1."""
-    parent = map_.parents[keyframe]
-    while parent >= 0 and new_id[parent] < 0:
-        parent = map_.parents[parent]
-    return int(new_id[parent]) if parent >= 0 else NONE
+def _family(
+    map_: Map, keyframes: NDArray[np.int64], new_id: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """``parent`` and ``restart`` of the keyframes that are kept."""
+    n, parents = len(keyframes), map_.parents.tolist()
+    parent = np.full(n, NONE, np.int64)
+    for k, keyframe in enumerate(keyframes.tolist()):
+        ancestor = parents[keyframe]
+        while ancestor >= 0 and new_id[ancestor] < 0:
+            ancestor = parents[ancestor]
+        if ancestor >= 0:
+            parent[k] = new_id[ancestor]
 
+    # A sub-map begins at the first keyframe that is kept from its beginning on: edges of the
+    # spanning tree that lead past it are weak.
+    restart = np.zeros(n, np.uint8)
+    begins = np.array(map_.restarts, np.int64)
+    position = np.searchsorted(keyframes, begins)
+    inside = (position > 0) & (position < n)
+    np.maximum.at(restart, position[inside], map_.keyframes.restart[begins[inside]])
 
-def _begin_submaps(map_: Map, found: Map, new_id: NDArray[np.int64]) -> None:
-    """Where the sub-maps of a map begin in one that holds a part of it."""
-    restarts, unpredicted = set(), set()
-    # The first keyframe kept from there on: edges of the spanning tree that lead past it are weak.
-    kept = np.flatnonzero(new_id >= 0)
-    for restart in map_.restarts:
-        position = int(np.searchsorted(kept, restart))
-        if 0 < position < len(kept):
-            restarts.add(position)
-            if restart in map_.unpredicted_restarts:
-                unpredicted.add(position)
-    submap = map_.submaps()
-    for keyframe, parent in enumerate(found.parents):
-        if parent < 0 and keyframe > 0:
-            found.parents[keyframe] = 0
-            if submap[kept[keyframe]] != submap[kept[0]]:
-                restarts.add(keyframe)
-                unpredicted.add(keyframe)
-    found.restarts, found.unpredicted_restarts = sorted(restarts), sorted(unpredicted)
+    orphans = 1 + np.flatnonzero(parent[1:] < 0)
+    parent[orphans] = 0
+    submap = map_.submaps()[keyframes]
+    restart[orphans[submap[orphans] != submap[:1]]] = UNPREDICTED
+    return parent, restart
 
 
 def _moved(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> FrameTable:
     """Frames placed by living keyframes, numbered anew."""
     reference = frames.reference.copy()
     T_c_reference, unit = frames.T_c_reference.copy(), frames.unit_scale.copy()
+    table = map_.keyframes
     for i, keyframe in enumerate(frames.reference.tolist()):
         if not map_.n_keyframes or map_.arrays.keyframe_alive[keyframe]:
             continue
         # As FramePoses.pose places it today.
-        T_c_reference[i, :3, 3] *= map_.unit_scale[keyframe] / unit[i]
-        T_c_reference[i] = orthonormalised(T_c_reference[i] @ map_.T_c_parent[keyframe])
-        reference[i] = map_.parents[keyframe]
-        unit[i] = map_.unit_scale[map_.parents[keyframe]]
+        T_c_reference[i, :3, 3] *= table.unit_scale[keyframe] / unit[i]
+        T_c_reference[i] = orthonormalised(T_c_reference[i] @ table.T_c_parent[keyframe])
+        reference[i] = table.parent[keyframe]
+        unit[i] = table.unit_scale[reference[i]]
     reference = new_id[reference] if map_.n_keyframes else reference
     return frames._replace(reference=reference, T_c_reference=T_c_reference, unit_scale=unit)

@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 
 from vslam.features import TrackingState
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
 
 BLUE, GREEN, AMBER, RED, GREY = "#3b82f6", "#10b981", "#f59e0b", "#ef4444", "#94a3b8"
 VIOLET = "#8b5cf6"
@@ -49,6 +51,7 @@ STYLE = {
     "legend.labelcolor": INK,
     "lines.linewidth": 1.6,
     "svg.fonttype": "none",  # text stays text and takes the font of the page
+    "text.parse_math": False,  # a name with dollars is no formula
     "xtick.color": LINE,
     "xtick.labelcolor": MUTED,
     "ytick.color": LINE,
@@ -85,6 +88,13 @@ def add_legend(figure: Figure, axes: Axes) -> None:
     count = len(axes.get_legend_handles_labels()[0])
     columns = count if count <= 5 else min(-(-count // 2), 4)
     figure.legend(loc="outside lower center", ncols=columns, columnspacing=1.2)
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Label a logarithmic axis with plain numbers: 1, 2, 5, 10, ..."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter("{x:g}")
 
 
 def save(name: str, caption: str, figure: Figure) -> ReportFigure:

@@ -84,7 +84,7 @@ def open_images(
         InputError: the images are not there, not those of the run, or of no data set.
     """
     report = run.report
-    if set(run.map.sessions) != {run.map.session}:  # the report is of the last drive
+    if set(run.map.sessions) != {run.map.scalars.session}:  # the report is of the last drive
         raise InputError(
             f"{run.folder}: the map is of several drives, whose images cannot be opened together; "
             "export g2o, euroc or ply --no-colours, which need none."
@@ -101,12 +101,12 @@ def open_images(
         report.sequence,
         start=report.start,
         every=report.every,
-        max_frames=max(run.map.frames) + 1,
+        max_frames=int(run.map.frames.max()) + 1,
         monocular=report.sensor == "mono",
         calib=report.calib,
         on_render=on_render,
     )
-    same = len(sequence) > max(run.map.frames) and np.allclose(
+    same = len(sequence) > run.map.frames.max() and np.allclose(
         sequence.timestamps[run.map.frames], run.map.timestamps, rtol=0.0, atol=1e-6
     )
     if not same or not same_camera(run.camera, sequence.camera):

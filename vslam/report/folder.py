@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vslam.errors import InputError, ResultsError
-from vslam.evaluation.loops import evaluate_loops
+from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
 from vslam.evaluation.trajectories import Evaluation, evo_command
 from vslam.evaluation.worlds import world_of
-from vslam.maps.new_output import replaced_file
 from vslam.maps.ply import save_ply
 from vslam.maps.storage import save_map
 from vslam.report.frame_table import write_frames
@@ -26,6 +25,8 @@ from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_trut
 from vslam.trajectory import write_kitti, write_tum
 
 if TYPE_CHECKING:
+    from vslam.report.figures import ReportFigure
+    from vslam.report.seen_loops import SeenLoop
     from vslam.run.loop_pictures import LoopPicture
     from vslam.run.moments import Moment
 
@@ -78,12 +79,13 @@ def write_results(
 ) -> ReportJson:
     """Evaluate a run, in any state of completion, and write all that is known of it.
 
-    Files: ``trajectory_kitti.txt``, ``trajectory.tum``, ``trajectory_causal.tum`` (poses as they
-    were given at the time), ``trajectory_<detector>.tum`` (of each one compared),
-    ``ground_truth_kitti.txt``, ``config.json`` (read by ``--config``),
-    ``keyframes.tum``, ``frames.csv``, ``report.json``,
-    ``report.md``, ``report.html`` (one file, no network request), ``figures/*.png``, ``map.npz``,
-    ``map.ply``; what matters most comes first.
+    What is worth most comes first, and what fails costs itself alone: trajectories
+    (``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``, ``keyframes.tum``,
+    ``trajectory_causal.tum`` with poses as they were given at the time,
+    ``trajectory_<detector>.tum`` of each detector compared), maps (``map.npz``, ``map.ply``),
+    numbers (``frames.csv``, ``config.json``, read by ``--config``, and ``report.json``), and what
+    people read (``figures/*.png``, ``report.md`` and ``report.html``, one file that makes no
+    network request).
 
     Args:
         folder: an existing folder; what is written replaces files of an earlier report.
@@ -95,58 +97,49 @@ def write_results(
         map_file: where to write the map, too.
 
     Raises:
-        ResultsError: files could not be written; none is incomplete, and all others are there.
+        ResultsError: some could not be written; none is incomplete, and all others are there.
     """
     written = Results(folder)
-    write_trajectories(written, outcome)
-    with written.file("trajectory_causal.tum") as file:
-        write_tum(file, causal_trajectory(outcome))
-    for other in outcome.compared:
-        with written.file(f"trajectory_{_safe(other.settings.detector)}.tum") as file:
-            write_tum(file, other.trajectory)
-    with written.file("keyframes.tum") as file:
-        write_tum(file, outcome.keyframes)
-    with written.file("frames.csv") as file:
-        write_frames(file, outcome.tracks)
-    config = outcome.settings.config.model_dump_json(indent=2) + "\n"
-    with written.file("config.json") as file:
-        file.write_text(config)
-    evaluation, remark = evaluate_run(outcome)
-    report = _write_report(
-        written, outcome, config, evaluation, remark, moments, pictures, pages=pages
-    )
-    if outcome.map is not None and ply:
-        landmarks = outcome.map.living_landmarks()
-        with written.file("map.ply") as file:
-            save_ply(file, outcome.map.arrays.xyz[landmarks])
-    if (stored := outcome.stored) is not None:
-        if outcome.settings.map is None and evaluation is not None:
-            stored = replace(stored, world=world_of(outcome, evaluation))
-        with written.file("map.npz") as file:
-            save_map(file, stored)
+    evaluation, remark = _write_data(written, outcome, ply=ply, map_file=map_file)
+    verdict, report = None, None
+    with written.file("report.json") as file:
+        verdict = evaluate_loops(outcome)
+        command = _evo_command(folder, outcome, evaluation)
+        report = summarize(outcome, evaluation, verdict, command, remark)
+        file.write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    if pages and report is not None:
+        _write_pages(written, report, outcome, evaluation, verdict, moments, pictures)
     written.require_all()
-    if map_file is not None and outcome.stored is not None:
-        _copy_map(folder / "map.npz", map_file)
+    assert report is not None
     return report
 
 
 class Results:
-    """The files of a run: each is tried, and what cannot be written whole is removed."""
+    """The results of a run: each is tried, and what cannot be written whole is removed."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._failed: dict[str, OSError] = {}
+        self._failed: dict[str, Exception] = {}
+
+    @contextlib.contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Something that may fail without harm to the other results, whatever it raises."""
+        try:
+            yield
+        except Exception as error:
+            self._failed[name] = error
 
     @contextlib.contextmanager
     def file(self, name: str) -> Iterator[Path]:
         """Where to write a file, or a folder of files."""
         path = self.folder / name
-        try:
-            yield path
-        except OSError as error:
-            self._failed[name] = error
-            with contextlib.suppress(OSError):
-                shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        with self.part(name):
+            try:
+                yield path
+            except Exception:
+                with contextlib.suppress(OSError):
+                    shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+                raise
 
     def require_all(self) -> None:
         """
@@ -155,24 +148,64 @@ class Results:
         """
         if not self._failed:
             return
-        error = next(iter(self._failed.values()))
-        remedy = "free some space or name another folder with --out"
-        if all((self.folder / name).exists() for name in ("autosave.npz", "run.json")):
+        by_reason: dict[str, list[str]] = {}
+        for name, error in self._failed.items():
+            by_reason.setdefault(_reason(error), []).append(name)
+        failed = ", ".join(f"{', '.join(names)} {why}" for why, names in by_reason.items())
+        first = next(iter(self._failed.values()))
+        if not any(isinstance(error, OSError) for error in self._failed.values()):
+            remedy = "this is a fault of vslam, please report it"
+        elif all((self.folder / name).exists() for name in ("autosave.npz", "run.json")):
             remedy = f"free some space, then vslam run --resume {self.folder}"
+        else:
+            remedy = "free some space or name another folder with --out"
         raise ResultsError(
-            f"{self.folder}: {', '.join(self._failed)} could not be written "
-            f"({error.strerror or error}), all other results are there; {remedy}."
-        ) from error
+            f"{self.folder}: {failed}, all other results are there; {remedy}."
+        ) from first
 
 
-def _copy_map(file: Path, to: Path) -> None:
-    try:
-        with replaced_file(to) as copy:
-            copy.write(file.read_bytes())
-    except OSError as error:
-        raise ResultsError(
-            f"{to}: cannot be written ({error.strerror or error}); the map is in {file}."
-        ) from error
+def _reason(error: Exception) -> str:
+    if isinstance(error, OSError):
+        return f"could not be written ({error.strerror or ' '.join(str(error).split())})"
+    return f"failed ({' '.join(f'{type(error).__name__}: {error}'.split()).rstrip(':.')})"
+
+
+def _write_data(
+    written: Results, outcome: RunOutcome, *, ply: bool, map_file: Path | None
+) -> tuple[Evaluation | None, str | None]:
+    """Trajectories, maps and tables; returns ``evaluate_run``, which tells where the map lies."""
+    write_trajectories(written, outcome)
+    with written.file("keyframes.tum") as file:
+        write_tum(file, outcome.keyframes)
+    with written.file("trajectory_causal.tum") as file:
+        write_tum(file, causal_trajectory(outcome))
+    for other in outcome.compared:
+        with written.file(f"trajectory_{_safe(other.settings.detector)}.tum") as file:
+            write_tum(file, other.trajectory)
+    evaluation, remark = None, None
+    with written.part("the evaluation"):
+        evaluation, remark = evaluate_run(outcome)
+    if (stored := outcome.stored) is not None:
+        if outcome.settings.map is None and evaluation is not None:
+            with written.part("the map's place in the ground truth"):
+                stored = replace(stored, world=world_of(outcome, evaluation))
+        with written.file("map.npz") as file:
+            save_map(file, stored)
+        if map_file is not None:
+            with written.part(str(map_file)):
+                save_map(map_file, stored)
+    if outcome.map is not None and ply:
+        with written.file("map.ply") as file:
+            save_ply(file, outcome.map.arrays.xyz[outcome.map.living_landmarks()])
+    with written.file("frames.csv") as file:
+        write_frames(file, outcome.tracks)
+    with written.file("config.json") as file:
+        file.write_text(_config_text(outcome))
+    return evaluation, remark
+
+
+def _config_text(outcome: RunOutcome) -> str:
+    return outcome.settings.config.model_dump_json(indent=2) + "\n"
 
 
 def write_trajectories(written: Results, outcome: RunOutcome) -> None:
@@ -182,7 +215,9 @@ def write_trajectories(written: Results, outcome: RunOutcome) -> None:
         write_kitti(file, outcome.trajectory.T_wc)
     with written.file("trajectory.tum") as file:
         write_tum(file, outcome.trajectory)
-    ground_truth = matched_ground_truth(outcome)
+    ground_truth = None
+    with written.part("the ground truth"):
+        ground_truth = matched_ground_truth(outcome)
     if ground_truth is None:
         return
     if len(ground_truth) == len(outcome.trajectory):
@@ -193,48 +228,45 @@ def write_trajectories(written: Results, outcome: RunOutcome) -> None:
             write_tum(file, ground_truth)
 
 
-def _write_report(
+def _evo_command(folder: Path, outcome: RunOutcome, evaluation: Evaluation | None) -> str | None:
+    """What repeats the evaluation with evo."""
+    if evaluation is None:
+        return None
+    if evaluation.frames == len(outcome.trajectory):
+        estimate, truth = folder / "trajectory_kitti.txt", folder / "ground_truth_kitti.txt"
+        return evo_command(estimate, truth, evaluation.alignment, "kitti")
+    estimate, truth = folder / "trajectory.tum", folder / "ground_truth.tum"
+    return evo_command(estimate, truth, evaluation.alignment, "tum")
+
+
+def _write_pages(
     written: Results,
+    report: ReportJson,
     outcome: RunOutcome,
-    config: str,
     evaluation: Evaluation | None,
-    remark: str | None,
+    verdict: LoopEvaluation | None,
     moments: Collection[Moment],
     pictures: Collection[LoopPicture],
-    *,
-    pages: bool,
-) -> ReportJson:
-    """``report.json``, and with ``pages`` what people read."""
-    folder, verdict = written.folder, evaluate_loops(outcome)
-    command = None
-    if evaluation is not None:
-        estimate, truth = folder / "trajectory_kitti.txt", folder / "ground_truth_kitti.txt"
-        if evaluation.frames == len(outcome.trajectory):
-            command = evo_command(estimate, truth, evaluation.alignment, "kitti")
-        else:
-            estimate, truth = folder / "trajectory.tum", folder / "ground_truth.tum"
-            command = evo_command(estimate, truth, evaluation.alignment, "tum")
-    report = summarize(outcome, evaluation, verdict, command, remark)
-    with written.file("report.json") as file:
-        file.write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
-    if pages:
-        from vslam.report.explorer import explorer_data
-        from vslam.report.figures import draw_figures
-        from vslam.report.render import render_html, render_markdown
-        from vslam.report.seen_loops import seen_loops
+) -> None:
+    """Figures, and the pages that show them, without those that could not be drawn."""
+    from vslam.report.explorer import explorer_data
+    from vslam.report.figures import draw_figures
+    from vslam.report.render import render_html, render_markdown
+    from vslam.report.seen_loops import seen_loops
 
-        seen = seen_loops(report, pictures)
-        with written.file("report.md") as file:
-            file.write_text(render_markdown(report, seen), encoding="utf-8")
+    figures: list[ReportFigure] = []
+    seen: list[SeenLoop] = []
+    with written.file("figures") as file:
         figures = draw_figures(outcome, evaluation, matched_ground_truth(outcome), verdict)
-        with written.file("figures") as file:
-            file.mkdir(exist_ok=True)
-            for figure in figures:
-                (file / f"{figure.name}.png").write_bytes(figure.png)
-            for loop in seen:
-                (file / loop.name).write_bytes(loop.jpeg)
+        seen = seen_loops(report, pictures)
+        file.mkdir(exist_ok=True)
+        for figure in figures:
+            (file / f"{figure.name}.png").write_bytes(figure.png)
+        for loop in seen:
+            (file / loop.name).write_bytes(loop.jpeg)
+    with written.file("report.md") as file:
+        file.write_text(render_markdown(report, seen), encoding="utf-8")
+    with written.file("report.html") as file:
         explorer = explorer_data(outcome, evaluation, matched_ground_truth(outcome), moments)
-        page = render_html(report, config, figures, explorer, seen)
-        with written.file("report.html") as file:
-            file.write_text(page, encoding="utf-8")
-    return report
+        page = render_html(report, _config_text(outcome), figures, explorer, seen)
+        file.write_text(page, encoding="utf-8")

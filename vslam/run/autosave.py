@@ -1,10 +1,11 @@
 """What a run leaves on the disk while it goes on, so that a killed one costs a minute at most.
 
 ``trajectory_online.tum`` has the pose of each frame as it was tracked, a line when it comes. Every
-so often the map is copied where no keyframe is being mapped, and a thread writes it with all that
-the report tells of the frames so far: ``autosave_progress.npz``, then ``autosave.npz``, a map file
-as any other. Each takes the place of the one before in one step. A run killed between the two finds
-the progress of a few frames more than the map has, and passes over them.
+so often the map is copied between two frames, if possible while no keyframe is being mapped, and a
+thread writes it with all that the report tells of the frames so far: ``autosave_progress.npz``,
+then ``autosave.npz``, a map file as any other. Each takes the place of the one before in one step.
+A run killed between the two finds the progress of a few frames more than the map has, and passes
+over them.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from typing import Protocol, TextIO
 from vslam.errors import InputError
 from vslam.features import TrackResult
 from vslam.lock_file import locked
-from vslam.map import Map
 from vslam.maps.new_output import replaced_file
 from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap
@@ -204,15 +204,8 @@ def remove_autosave(folder: Path) -> None:
 
 def _copy(stored: StoredMap) -> StoredMap:
     """A copy of the map as it is, for another thread to make compact."""
-    map_ = stored.map
-    copy = Map(map_.scales)
-    vars(copy).update(
-        {name: value.copy() if isinstance(value, (list, dict)) else value
-         for name, value in vars(map_).items()}
-    )  # fmt: skip
-    copy.arrays = map_.used_arrays()
     tables = {
         name: replace(table, first=table.first.copy(), values=table.values.copy())
         for name, table in stored.detector.tables.items()
     }
-    return replace(stored, map=copy, detector=replace(stored.detector, tables=tables))
+    return replace(stored, map=stored.map.copy(), detector=replace(stored.detector, tables=tables))

@@ -126,9 +126,9 @@ class LoopPictureRecorder(NullRecorder):
         """See `vslam.run.recorder.Recorder.loops`."""
         assert self._camera is not None
         for edge in edges:
-            if not edge.accepted or map_.sessions[edge.match] != map_.session:
+            if not edge.accepted or map_.sessions[edge.match] != map_.scalars.session:
                 continue
-            query_frame, match_frame = map_.frames[edge.query], map_.frames[edge.match]
+            query_frame, match_frame = map_.frames[[edge.query, edge.match]].tolist()
             query, match = self._jpegs.get(query_frame), self._jpegs.get(match_frame)
             if query is None or match is None:
                 continue

@@ -45,7 +45,6 @@ class RunOptions(BaseModel):
     map_file: Path | None = None
     localize: bool = False
     compare: tuple[str, ...] = ()
-    save_map: Path | None = None
     realtime: bool = False
     autosave: float = 60.0
 
@@ -90,7 +89,7 @@ def write_options(folder: Path, options: RunOptions) -> None:
     data = Path(options.data)
     absolute: dict[str, object] = {
         name: path.resolve()
-        for name in ("right", "depth", "weights", "local_weights", "map_file", "save_map")
+        for name in ("right", "depth", "weights", "local_weights", "map_file")
         if (path := getattr(options, name)) is not None
     }
     absolute["data"] = str(data.resolve()) if data.exists() else options.data
@@ -106,11 +105,18 @@ def write_options(folder: Path, options: RunOptions) -> None:
 
 
 def read_options(folder: Path) -> RunOptions:
-    """Read ``run.json`` of the folder of a run.
+    """Read ``run.json`` of the folder of a run that is to be resumed.
 
     Raises:
-        InputError: there is none, or it is damaged.
+        InputError: there is none, or it is damaged, or the folder holds a link: the run would write
+            to wherever it leads.
     """
+    for path in folder.rglob("*"):
+        if path.is_symlink():
+            raise InputError(
+                f"{path}: this is a link, and a resumed run writes into its own folder only; put "
+                "the file itself there."
+            )
     path = folder / OPTIONS
     try:
         return RunOptions.model_validate_json(path.read_bytes())

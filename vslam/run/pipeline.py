@@ -340,8 +340,7 @@ def require_camera(map_file: Path, camera: Camera) -> None:
 
 
 def _frames_of_this_run(map_: Map) -> NDArray[np.int64]:
-    of_this = np.array(map_.sessions, np.int64) == map_.session
-    return np.where(of_this, np.array(map_.frames, np.int64), -1)
+    return np.where(map_.sessions == map_.scalars.session, map_.frames, -1)
 
 
 def _until_broken(frames: Iterator[TimedFrame], broken: list[str]) -> Iterator[TimedFrame]:

@@ -10,6 +10,7 @@ import json
 from array import array
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from vslam.features import TrackingState, TrackResult
 from vslam.frontend.sides import Sides
 from vslam.loops import LoopCorrection, LoopEdge, loop_entry, loop_of
 from vslam.maps.new_output import replaced_file
-from vslam.untrusted import ARCHIVE_ERRORS
+from vslam.untrusted import ARCHIVE_ERRORS, read_json, read_npz
 
 SCHEMA = 2
 _STATES = tuple(TrackingState)
@@ -202,36 +203,32 @@ def read_progress(path: Path) -> Progress:
     Raises:
         InputError: no such file, a damaged one, or of another version.
     """
+    arrays = read_npz(path, "the progress of a run", "there is nothing to resume")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            header = json.loads(bytes(file["header"]))
-            if header["kind"] != "vslam progress" or header["schema"] != SCHEMA:
-                raise InputError(f"{path}: of another version of vslam; resume with that.")
-            tracks = _checked_table(file["frames"], header["stages"], file["stage_ms"])
-            wall_s, cpu_s = file["seconds"].tolist()
-            corrections = []
-            for number, entry in enumerate(header["corrections"]):
-                before, after = file[f"correction_{number}_T_cw"]
-                keyframes = file[f"correction_{number}_keyframes"]
-                edge = loop_of(entry["edge"])
-                corrections.append(
-                    LoopCorrection(edge, keyframes, before, after, float(entry["seconds"]))
-                )
-            return Progress(
-                tracks=tracks,
-                skipped=[str(line) for line in header["skipped"]],
-                latency_ms=file["latency_ms"].tolist(),
-                wall_s=wall_s,
-                cpu_s=cpu_s,
-                loops=[loop_of(entry) for entry in header["loops"]],
-                corrections=corrections,
-            )
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror or error}); there is nothing to resume."
-        ) from error
-    except (*ARCHIVE_ERRORS, TypeError, IndexError, MemoryError) as error:
+        header = read_json(arrays["header"])
+        if header["kind"] != "vslam progress" or header["schema"] != SCHEMA:
+            raise InputError(f"{path}: of another version of vslam; resume with that.")
+        wall_s, cpu_s = arrays["seconds"].tolist()
+        return Progress(
+            tracks=_checked_table(arrays["frames"], header["stages"], arrays["stage_ms"]),
+            skipped=[str(line) for line in header["skipped"]],
+            latency_ms=arrays["latency_ms"].tolist(),
+            wall_s=wall_s,
+            cpu_s=cpu_s,
+            loops=[loop_of(entry) for entry in header["loops"]],
+            corrections=[
+                _correction(entry, arrays, number)
+                for number, entry in enumerate(header["corrections"])
+            ],
+        )
+    except (*ARCHIVE_ERRORS, TypeError, IndexError) as error:
         raise InputError(f"{path}: damaged ({error}); there is nothing to resume.") from error
+
+
+def _correction(entry: dict[str, Any], arrays: dict[str, NDArray], number: int) -> LoopCorrection:
+    before, after = arrays[f"correction_{number}_T_cw"]
+    keyframes = arrays[f"correction_{number}_keyframes"]
+    return LoopCorrection(loop_of(entry["edge"]), keyframes, before, after, float(entry["seconds"]))
 
 
 def _checked_table(rows: NDArray, stages: list[str], stage_ms: NDArray) -> TrackTable:

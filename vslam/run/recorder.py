@@ -7,12 +7,14 @@ thread.
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import functools
 import logging
 import os
 import shutil
 import socket
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -194,40 +196,49 @@ def open_viewer(kind: str) -> Viewer:
     """
     import rerun as rr
 
+    shown, page, words = _has_display(), 0, []
+    if kind == "native" and not shown:
+        raise InputError("--view native: there is no display here; use --view web.")
     try:
-        if kind == "web":
-            sink = rr.GrpcServerSink("127.0.0.1", _free_port(_VIEWER_PORT))
-            page = _free_port(_WEB_PORT)
-            shown = _has_display()
-            rr.serve_web_viewer(web_port=page, open_browser=shown, connect_to=sink.uri)
-            return Viewer(f"http://localhost:{page}?url={sink.uri}", sink)
-        if not _has_display():
-            raise InputError("--view native: there is no display here; use --view web.")
         port = _free_port(_VIEWER_PORT)
-        rr.spawn(
-            port=port, connect=False, executable_path=_executable(), hide_welcome_screen=True,
-            recording=rr.RecordingStream("vslam"),  # without one, rerun only logs a warning
-        )  # fmt: skip
-    except (OSError, RuntimeError) as error:
+        if kind == "web":
+            page = _free_port(_WEB_PORT)
+            # Both serve the page; the first opens the browser, too.
+            words = ["--web-viewer" if shown else "--serve-web", f"--web-viewer-port={page}"]
+        viewer = _start_viewer(port, words)
+    except OSError as error:
         raise InputError(f"--view {kind}: no viewer can be started ({error}).") from error
+    if kind == "web":
+        atexit.register(viewer.kill)  # a window stays open, a page nobody can close
     until = time.monotonic() + _VIEWER_STARTS_S
-    while not _listens(port):
-        if time.monotonic() > until:
-            raise InputError("--view native: the viewer does not start here; use --view web.")
+    while not (_listens(port) and (not page or _listens(page))):
+        if viewer.poll() is not None or time.monotonic() > until:
+            raise InputError(f"--view {kind}: the viewer does not start here; leave it out.")
         time.sleep(0.05)
-    return Viewer("", rr.GrpcSink(f"rerun+http://127.0.0.1:{port}/proxy"))
+    uri = f"rerun+http://127.0.0.1:{port}/proxy"
+    return Viewer(f"http://localhost:{page}?url={uri}" if page else "", rr.GrpcSink(uri))
+
+
+def _start_viewer(port: int, words: list[str]) -> subprocess.Popen[bytes]:
+    """A viewer that this machine alone can reach; rerun's own functions let it listen on every
+    interface. It has a session of its own: Ctrl-C is for the run."""
+    command = [_executable(), "--bind=127.0.0.1", f"--port={port}", "--hide-welcome-screen", *words]
+    nothing = subprocess.DEVNULL
+    return subprocess.Popen(
+        command, stdin=nothing, stdout=nothing, stderr=nothing, start_new_session=True
+    )
 
 
 def _has_display() -> bool:
     return sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
 
 
-def _executable() -> str | None:
+def _executable() -> str:
     """The viewer of the package that is installed, not another one on the path."""
     spec = find_spec("rerun_cli")
     folder = Path(spec.origin).parent if spec and spec.origin else Path()
     found = [path for name in ("rerun", "rerun.exe") if (path := folder / name).is_file()]
-    return str(found[0]) if found else None
+    return str(found[0]) if found else "rerun"
 
 
 def _listens(port: int) -> bool:

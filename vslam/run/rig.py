@@ -89,7 +89,7 @@ def _twists(map_: Map) -> NDArray[np.float64]:
     T_cw, times = map_.arrays.T_cw, map_.timestamps
     twists = np.full((map_.n_keyframes, 6), np.nan)
     living = map_.living_keyframes()
-    sessions = np.array(map_.sessions)[living]
+    sessions = map_.sessions[living]
     for session in np.unique(sessions):
         drive = living[sessions == session]
         for k, keyframe in enumerate(drive):

@@ -1,0 +1,292 @@
+"""The two modes alone: one builds the map, the other leaves it alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from parts import CAMERA, Points
+from test_mapper import Drive, at, begin_with_two_views, bytes_of_map, see_points, see_without_depth
+
+from vslam.camera import Camera
+from vslam.features import Side, TrackingState
+from vslam.frontend.frame import Frame
+from vslam.frontend.tracker import Found, Tracker
+from vslam.map_frames import OldPlace
+from vslam.modes import Localising, MapBuilding
+from vslam.states import PolicyState
+
+POINTS = Points.create()
+TWIST = np.array([0.0, 0.0, -2.0, 0.0, 0.0, 0.0])
+
+
+class Building(Drive):
+    """A mapper with the mode that builds its map, and the tracker that this mode works with."""
+
+    def __init__(self, camera: Camera = CAMERA, **options) -> None:
+        see = see_without_depth if camera.monocular else see_points
+        super().__init__(camera=camera, see=see, **options)
+        self.tracker = Tracker(self.context)
+        self.mode = MapBuilding(self.context, self.mapper, self.tracker)
+
+    @classmethod
+    def with_a_map(cls, **options) -> Building:
+        """With keyframes at frames 0 and 3, and two frames after the last one."""
+        drive = cls(**options)
+        drive.steps([0, 3], 6)
+        drive.mapper.merge()
+        return drive
+
+    def placed_frame(self, *, tracked: bool = True) -> Frame:
+        """The next frame, placed; one that is not tracked has no landmarks."""
+        frame = self.next_frame()
+        if not tracked:
+            frame.landmark[:], frame.xyz[:] = -1, np.nan
+        self.mapper.hold(frame)
+        self.mapper.append_pose(frame, tracked=tracked)
+        return frame
+
+    def lost_frame(self, n: int) -> Frame:
+        """The last one of n frames that were lost."""
+        for _ in range(n):
+            self.tracker.lose()
+        return self.placed_frame(tracked=False)
+
+
+def found(frame: Frame) -> Found:
+    """That a frame was tracked by the landmarks that it has, and should see all of these."""
+    landmarks = frame.landmark[frame.landmark >= 0]
+    return Found(TrackingState.OK, len(landmarks), len(landmarks), landmarks)
+
+
+# -- localising -----------------------------------------------------------------------------------
+
+
+def test_localising_leaves_the_map_alone():
+    """To the byte, the counts of what frames saw included."""
+    drive = Building.with_a_map()
+    mapper, mode = drive.mapper, Localising(drive.mapper)
+    lost, tracked = drive.lost_frame(10), drive.placed_frame()
+    before = bytes_of_map(mapper.complete())
+    assert not mode.begin(lost)
+    assert not mode.begin_after_loss(lost)
+    assert not mode.map_far_points()
+    assert not mode.update_map(tracked, found(tracked))
+    mode.restore(PolicyState(1.0, True))
+    mapper.finish()
+    assert bytes_of_map(mapper.map) == before
+    assert mapper.n_keyframes == 2
+    assert mode.state() is None
+    assert not mode.changes_map
+
+
+def test_localising_tracks_by_the_keyframe_that_shares_the_most_with_a_frame():
+    drive = Drive(see=lambda k: POINTS.see(at(k), slice(20 * k, 20 * k + 100)))
+    drive.steps([0, 3], 6)
+    drive.mapper.merge()
+    frame = drive.next_frame()
+    drive.mapper.refer_to(0)
+    Localising(drive.mapper).update_map(frame, found(frame))
+    assert drive.mapper.reference == 1
+
+
+# -- the beginning of a map -----------------------------------------------------------------------
+
+
+def test_a_stereo_frame_begins_a_map():
+    drive = Building()
+    frame = drive.placed_frame()
+    assert drive.mode.begin(frame)
+    assert drive.mapper.n_keyframes == 1
+    assert np.count_nonzero(frame.landmark >= 0) > 50
+    assert drive.tracker.last is frame
+    assert drive.mode.state().gain_awaited
+    assert drive.mode.changes_map
+
+
+def test_a_frame_with_too_few_depths_begins_none():
+    drive = Building()
+    frame = drive.placed_frame()
+    frame.features.u_right[99:] = np.nan
+    before = drive.mode.state()
+    assert not drive.mode.begin(frame)
+    assert drive.mapper.n_keyframes == 0
+    assert drive.tracker.last is None
+    assert drive.mode.state() == before
+
+
+def test_a_monocular_map_begins_with_the_second_view():
+    drive = Building(CAMERA.left_camera())
+    assert not drive.mode.begin(drive.placed_frame())
+    assert drive.mode.state() is None  # the first view is not kept in a file
+    for _ in range(20):
+        second = drive.placed_frame(tracked=False)
+        if drive.mode.begin(second):
+            break
+    assert drive.mapper.n_keyframes == 2
+    assert drive.mapper.map.frames.tolist() == [0, second.index]
+    assert drive.tracker.last is second
+    assert drive.mode.state() is not None
+    assert drive.mode.state().gain_awaited is False
+
+
+@pytest.mark.parametrize("twist", [TWIST, None])
+def test_a_sub_map_is_placed_by_the_prediction_if_the_speed_is_known(twist):
+    """The frame tracks nothing of the map before, even if it did when it was lost."""
+    drive = Building.with_a_map()
+    drive.tracker.resume(twist)
+    frame = drive.placed_frame()
+    assert (frame.landmark >= 0).any()
+    assert drive.mode.begin(frame)
+    map_ = drive.mapper.complete()
+    assert map_.restarts == [2]
+    assert map_.unpredicted_restarts == ([] if twist is not None else [2])
+    assert map_.parents[2] == 1
+
+
+@pytest.mark.parametrize(("young_keyframes", "patience"), [(2, 1), (1, 3)])
+def test_a_lost_stereo_camera_begins_a_sub_map_sooner_in_a_young_map(young_keyframes, patience):
+    """Of two keyframes: after one frame where that is young, else after three."""
+    drive = Building.with_a_map(tracking={"young_keyframes": young_keyframes})
+    for n in range(1, patience + 1):
+        begun = drive.mode.begin_after_loss(drive.lost_frame(1))
+        assert begun == (n == patience)
+    assert drive.mapper.n_keyframes == 3
+    assert drive.tracker.lost_frames == 0
+
+
+def test_a_lost_monocular_camera_looks_for_a_first_view_after_four_frames():
+    drive = Building(CAMERA.left_camera())
+    begin_with_two_views(drive)
+    for _ in range(3):
+        assert not drive.mode.begin_after_loss(drive.lost_frame(1))
+        assert drive.mode.state() is not None
+    assert not drive.mode.begin_after_loss(drive.lost_frame(1))
+    assert drive.mode.state() is None  # a view waits
+
+
+# -- more of a young map --------------------------------------------------------------------------
+
+
+def test_a_frame_that_is_lost_right_after_a_map_began_may_see_more_of_it():
+    drive = Building()
+    assert not drive.mode.map_far_points()  # of what?
+    first = drive.placed_frame()
+    drive.mode.begin(first)
+    shown = len(drive.mapper.view.local_landmarks.ids)
+    first.twist = TWIST
+    assert not drive.mode.map_far_points()  # the camera was tracked since then
+    assert len(drive.mapper.view.local_landmarks.ids) == shown
+    first.twist = None
+    assert drive.mode.map_far_points()
+    assert len(drive.mapper.view.local_landmarks.ids) == 240 > shown
+    assert not drive.mode.map_far_points()  # there is no more
+
+
+def test_a_monocular_map_has_no_far_points_to_show():
+    drive = Building(CAMERA.left_camera())
+    begin_with_two_views(drive)
+    drive.tracker.start_from(drive.last)
+    drive.last.twist = None
+    drive.mapper.map_far_points = lambda frame: pytest.fail("a map without depths was asked")
+    assert not drive.mode.map_far_points()
+
+
+# -- a tracked frame ------------------------------------------------------------------------------
+
+
+def test_a_frame_that_shows_nothing_new_is_only_counted():
+    drive = Building.with_a_map(min_tracked_close=0)
+    frame = drive.placed_frame()
+    before = drive.mapper.complete().copy().arrays
+    lost = np.flatnonzero(frame.landmark >= 0)[:5]
+    gone = frame.landmark[lost].copy()
+    says = found(frame)
+    frame.landmark[lost] = -1
+    assert not drive.mode.update_map(frame, says)
+    assert drive.mapper.n_keyframes == 2
+    after = drive.mapper.complete().copy().arrays
+    seen = np.zeros(len(before.visible), int)
+    seen[says.visible] = 1
+    np.testing.assert_array_equal(after.visible - before.visible, seen)
+    seen[gone] = 0
+    np.testing.assert_array_equal(after.found - before.found, seen)
+
+
+def test_a_frame_becomes_a_keyframe_when_it_is_time():
+    drive = Building.with_a_map(max_interval_s=0.5, min_tracked_close=0)
+    made = []
+    for _ in range(3):
+        frame = drive.placed_frame()
+        made.append(drive.mode.update_map(frame, found(frame)))
+    assert made == [False, False, True]  # frames 6, 7 and 8; the keyframe before is 3
+    assert drive.mapper.last_frame == 8
+    assert drive.mode.state().gain_awaited
+    assert not drive.mapper.is_merged
+
+
+def test_a_frame_of_the_right_camera_becomes_no_keyframe():
+    drive = Building.with_a_map(max_interval_s=0.05)
+    frame = drive.placed_frame()
+    frame.side = Side.RIGHT
+    assert not drive.mode.update_map(frame, found(frame))
+    frame.side = Side.LEFT
+    assert drive.mode.update_map(frame, found(frame))
+
+
+@pytest.mark.parametrize(("idle", "made"), [(True, True), (False, False)])
+def test_a_frame_that_is_not_urgent_waits_for_mapping(idle, made):
+    """It tracks seven tenths of what the reference keyframe sees."""
+    drive = Building.with_a_map(min_tracked_close=0, merge_after_frames=50, max_interval_s=50.0)
+    if not idle:
+        drive.mapper.insert(drive.placed_frame())
+    assert drive.mapper.is_merged == idle
+    frame = drive.next_frame()
+    frame.landmark[int(0.7 * drive.mapper.view.n_reference) :] = -1
+    drive.mapper.append_pose(frame, tracked=True)
+    assert drive.mode.update_map(frame, found(frame)) == made
+
+
+@pytest.mark.parametrize(("known_after_s", "known"), [(0.5, True), (5.0, False)])
+def test_at_an_old_place_no_keyframe_is_made(known_after_s, known):
+    drive = Building.with_a_map(max_interval_s=0.05, known_after_s=known_after_s)
+    frame = drive.placed_frame()
+    before = drive.mode.state()
+    assert drive.mode.update_map(frame, found(frame)) != known
+    assert drive.mapper.n_keyframes == (2 if known else 3)
+    assert drive.mapper.reference == (0 if known else 2)
+    assert drive.mapper.last_timestamp == frame.timestamp
+    assert (drive.mode.state() == before) == known
+
+
+@pytest.mark.parametrize(("n_tracked", "n_shared", "n_place", "known"), [
+    (150, 100, 200, True),
+    (149, 100, 200, False),
+    (150, 99, 200, False),
+    (150, 100, 201, False),
+    (49, 49, 10, False),
+])  # fmt: skip
+def test_an_old_place_must_be_tracked_as_well_as_its_keyframe_was(
+    n_tracked, n_shared, n_place, known
+):
+    drive = Building.with_a_map(max_interval_s=0.05)
+    frame = drive.placed_frame()
+    frame.landmark[np.flatnonzero(frame.landmark >= 0)[n_tracked:]] = -1
+    drive.mapper.find_old_place = lambda frame: OldPlace(0, n_shared, n_place)
+    assert drive.mode.update_map(frame, found(frame)) != known
+
+
+def test_a_frame_that_is_tracked_ends_the_wait_for_a_second_view():
+    drive = Building(CAMERA.left_camera())
+    begin_with_two_views(drive)
+    drive.mode.begin_after_loss(drive.lost_frame(4))
+    assert drive.mode.state() is None
+    frame = drive.placed_frame()
+    drive.mode.update_map(frame, found(frame))
+    assert drive.mode.state() is not None
+
+
+def test_a_mode_that_is_restored_remembers_what_the_other_did():
+    drive, other = Building(), Building()
+    drive.mode.begin(drive.placed_frame())
+    other.mode.restore(drive.mode.state())
+    assert other.mode.state() == drive.mode.state() == PolicyState(200.0, True)

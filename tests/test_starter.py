@@ -1,0 +1,179 @@
+"""The starter alone: with which frames a map, or a sub-map, begins."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from parts import ALL, CAMERA, Points, frame_of
+
+from vslam.config import Config
+from vslam.frontend.frame import Frame
+from vslam.frontend.tracking import TrackingContext
+from vslam.geometry import se3_exp, se3_log, transform
+from vslam.starter import OneViewStart, Starter, TwoViewStart
+
+POINTS = Points.create()
+LEFT_CAMERA = CAMERA.left_camera()
+ASIDE = np.array([-1.0, 0.0, 0.1, 0.0, 0.01, 0.0])  # twist to a view from which points are mapped
+
+
+def starter(camera=LEFT_CAMERA, **thresholds: float) -> Starter:
+    config = Config.model_validate({"initialization": thresholds})
+    return Starter(TrackingContext.create(camera, config))
+
+
+def frame(
+    index: int, seconds: float, moved: float = 0.0, among: slice = ALL, camera=LEFT_CAMERA
+) -> Frame:
+    """A frame that is ``moved`` times as far aside as two views should be, and not tracked."""
+    features = POINTS.see(se3_exp(moved * ASIDE), among)
+    if camera.monocular:
+        features.u_right[:] = np.nan
+    return frame_of(features, index, seconds, camera=camera)
+
+
+# -- one view -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("camera", [CAMERA, replace(CAMERA, depth=True)], ids=["stereo", "depth"])
+@pytest.mark.parametrize(("n_stereo", "enough"), [(100, True), (99, False)])
+def test_a_frame_with_enough_depths_begins_a_map_alone(camera, n_stereo, enough):
+    one, seen = starter(camera), frame(0, 0.0, camera=camera)
+    seen.features.u_right[n_stereo:] = np.nan
+    start = one.offer(seen)
+    assert (start is not None) == enough
+    if start is not None:
+        assert isinstance(start, OneViewStart)
+        assert start.frame is seen
+    assert not one.is_waiting
+
+
+# -- two views ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n_features", "enough"), [(200, True), (199, False)])
+def test_a_frame_with_enough_features_waits_for_a_second_view(n_features, enough):
+    one = starter()
+    assert one.offer(frame(0, 0.0, among=slice(0, n_features))) is None
+    assert one.is_waiting == enough
+
+
+def test_two_views_from_different_places_begin_a_map():
+    one, first, second = starter(), frame(0, 0.0), frame(1, 0.5, 1.0)
+    assert one.offer(first) is None
+    start = one.offer(second)
+    assert isinstance(start, TwoViewStart)
+    assert start.first is first
+    assert start.second is second
+    assert not start.predicted
+    np.testing.assert_array_equal(start.features[0], start.features[1])  # the same points
+    seen = POINTS.xyz[start.features[0]]
+    assert len(seen) == 240
+    unit = np.median(start.points[:, 2]) / np.median(seen[:, 2])
+    assert np.median(start.points[:, 2]) == pytest.approx(15.0)
+    np.testing.assert_allclose(start.points, unit * seen, rtol=1e-3, atol=1e-3)
+    truth = se3_exp(ASIDE)
+    truth[:3, 3] *= unit
+    np.testing.assert_allclose(start.T_2_1, truth, atol=1e-3)
+    np.testing.assert_allclose(start.twist, se3_log(start.T_2_1) / 0.5)
+    assert one.is_waiting  # until it is told that the map has begun
+    one.reset()
+    assert not one.is_waiting
+
+
+def test_a_camera_that_stands_begins_no_map_and_the_first_view_keeps_waiting():
+    one, first = starter(), frame(0, 0.0)
+    assert one.offer(first) is None
+    assert one.offer(frame(1, 0.1, 1e-4)) is None
+    start = one.offer(frame(2, 0.2, 1.0))
+    assert isinstance(start, TwoViewStart)
+    assert start.first is first
+
+
+@pytest.mark.parametrize(("seconds", "together"), [(1.5, True), (1.501, False)])
+def test_a_view_that_has_waited_too_long_is_replaced(seconds, together):
+    one, second = starter(), frame(1, seconds, 1.0)
+    one.offer(frame(0, 0.0))
+    start = one.offer(second)
+    assert (start is not None) == together
+    if not together:
+        start = one.offer(frame(2, seconds + 0.1, 2.0))
+        assert isinstance(start, TwoViewStart)
+        assert start.first is second
+
+
+@pytest.mark.parametrize(("n_common", "together"), [(100, True), (99, False)])
+def test_a_view_that_shows_too_little_of_the_first_one_replaces_it(n_common, together):
+    """Of 240 points each shows 200 at least; what it shows besides looks like none of the first."""
+    one, second = starter(min_landmarks=50, min_points=20), frame(1, 0.1, 1.0)
+    strange = np.random.default_rng(1).integers(0, 256, (240 - n_common, 32), dtype=np.uint8)
+    second.features.descriptors[:] = np.vstack([POINTS.descriptors[:n_common], strange])
+    one.offer(frame(0, 0.0))
+    start = one.offer(second)
+    assert (start is not None) == together
+    if start is None:
+        third = frame(2, 0.2, 2.0)
+        third.features.descriptors[:] = second.features.descriptors
+        start = one.offer(third)
+        assert isinstance(start, TwoViewStart)
+        assert start.first is second
+
+
+def test_a_view_that_shows_too_little_of_the_first_one_and_too_little_at_all_is_not_kept():
+    one = starter()
+    one.offer(frame(0, 0.0))
+    assert one.offer(frame(1, 0.1, 1.0, slice(0, 99))) is None
+    assert not one.is_waiting
+
+
+@pytest.mark.parametrize(("min_landmarks", "enough"), [(240, True), (241, False)])
+def test_a_map_needs_enough_points_to_begin_with(min_landmarks, enough):
+    one = starter(min_landmarks=min_landmarks)
+    one.offer(frame(0, 0.0))
+    assert (one.offer(frame(1, 0.1, 1.0)) is not None) == enough
+    assert one.is_waiting
+
+
+# -- the unit of a sub-map ------------------------------------------------------------------------
+
+
+def two_views() -> TwoViewStart:
+    """A start in which the camera moves by 0.5 units in 0.25 s."""
+    T_2_1 = se3_exp(np.array([0.3, 0.0, 0.4, 0.0, 0.02, 0.0]))
+    T_2_1[:3, 3] *= 0.5 / np.linalg.norm(T_2_1[:3, 3])
+    features = np.arange(240), np.arange(240)
+    return TwoViewStart(frame(4, 1.0), frame(6, 1.25), T_2_1, features, POINTS.xyz)
+
+
+def test_a_sub_map_takes_its_unit_from_the_speed_before():
+    """At 6 units a second the camera moves by 1.5 in 0.25 s: three times as far."""
+    start = two_views()
+    rescaled = start.at_speed(np.array([0.0, 3.6, 4.8, 0.1, 0.0, 0.0]), 10.0)
+    assert rescaled.predicted
+    np.testing.assert_allclose(rescaled.points, 3.0 * POINTS.xyz)
+    np.testing.assert_allclose(rescaled.T_2_1[:3, 3], 3.0 * start.T_2_1[:3, 3])
+    np.testing.assert_array_equal(rescaled.T_2_1[:3, :3], start.T_2_1[:3, :3])
+    in_second = transform(rescaled.T_2_1, rescaled.points)
+    np.testing.assert_allclose(in_second, 3.0 * transform(start.T_2_1, POINTS.xyz))
+    assert rescaled.first is start.first
+    assert rescaled.second is start.second
+    np.testing.assert_allclose(se3_exp(0.25 * rescaled.twist), rescaled.T_2_1, atol=1e-12)
+    assert np.linalg.norm(start.T_2_1[:3, 3]) == pytest.approx(0.5)  # as it was
+
+
+@pytest.mark.parametrize(("speed", "believed"), [
+    (19.9, True), (20.1, False), (0.201, True), (0.199, False), (0.0, False),
+])  # fmt: skip
+def test_a_speed_that_asks_for_too_much_rescaling_tells_nothing(speed, believed):
+    """The start has 2 units a second; ten times as much or as little is the limit."""
+    start = two_views()
+    rescaled = start.at_speed(np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0]), 10.0)
+    assert rescaled.predicted == believed
+    assert (rescaled is start) != believed
+
+
+def test_without_a_speed_a_sub_map_keeps_its_own_unit():
+    start = two_views()
+    assert start.at_speed(None, 10.0) is start

@@ -1,0 +1,117 @@
+"""How sure the rows, columns and disparities of features are, told by finished stereo maps.
+
+    python tools/experiments/motorway/noise_model.py runs/one runs/two
+
+Adjusts the map of each run and prints the standard deviations of the errors of u, v and the
+disparity, in pixels of the feature's octave, that explain its residuals: variance components
+(W. Foerstner, "Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten", 1979). The
+squared residuals of a kind are divided by its redundancy, which is the number of its observations
+less what landmarks could follow, so that a kind is not called sure because it is trusted. The
+weights are then those found, and it begins again until they stay. Poses take a share of the
+redundancy that is left out: six numbers for hundreds of observations. u and v are those of aligned
+matches and of what was first seen; of others the variance is taken to be four times theirs.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scale_probe import in_cameras
+
+from vslam.backend.bundle_adjustment import BundleProblem
+from vslam.backend.global_bundle_adjustment import adjust_globally
+from vslam.backend.global_mapping import take_snapshot
+from vslam.camera import DISPARITY_WEIGHT
+from vslam.maps.storage import load_map
+
+ROUNDS = 8
+START = (0.5, 0.5, 0.2)  # pixels, of u, v, disparity
+GATE = 4.0  # standard deviations beyond which a residual is an outlier, in any of the three
+
+
+def variance_components(
+    problem: BundleProblem, sigma: NDArray[np.float64]
+) -> tuple[BundleProblem, NDArray[np.float64], int]:
+    """The adjusted problem under ``(3,)`` sigma of u, v, disparity; the ``(3,)`` sigma that its
+    residuals show; the number of stereo observations that count.
+
+    The program trusts u and v alike, monocular ones, too: so does the adjustment.
+    """
+    pixel = float(np.sqrt(np.mean(sigma[:2] ** 2)))
+    certainty = (DISPARITY_WEIGHT / problem.disparity_weights()) ** 2
+    octave = (problem.inverse_sigma2 / certainty) ** -0.5
+    pixels = pixel * np.sqrt(certainty.max() / certainty)
+    scaled = replace(
+        problem,
+        inverse_sigma2=(octave * pixels) ** -2.0,
+        disparity_weight=pixels / sigma[2],
+    )
+    solution = adjust_globally(scaled, iterations=10)
+    owner = np.repeat(np.arange(len(problem.points)), np.diff(problem.first))
+    adjusted = replace(problem, T_cw=solution.T_cw, points=solution.points)
+    q = in_cameras(adjusted)
+    fx, fy, cx, cy, bf, _ = problem.intrinsics
+    x, y, z = q.T
+    u, v, disparity = fx * x / z + cx, fy * y / z + cy, bf / z
+    error = np.stack(
+        [
+            problem.uvr[:, 0] - u,
+            problem.uvr[:, 1] - v,
+            problem.uvr[:, 0] - problem.uvr[:, 2] - disparity,
+        ],
+        axis=1,
+    )
+    error /= octave[:, None]
+    stereo = np.isfinite(error[:, 2])
+    with np.errstate(invalid="ignore"):
+        gate = GATE * np.stack([pixels, pixels, np.full_like(pixels, sigma[2])], axis=1)
+        good = (z > 0) & (np.abs(np.nan_to_num(error)) < gate).all(axis=1)
+    # Rows of d(u, v, disparity)/d(point) in units of sigma.
+    R = solution.T_cw[problem.camera, :3, :3]
+    nil = np.zeros_like(z)
+    P = np.stack(
+        [
+            np.stack([fx / z, nil, -fx * x / z**2], axis=1),
+            np.stack([nil, fy / z, -fy * y / z**2], axis=1),
+            np.stack([nil, nil, -bf / z**2], axis=1),
+        ],
+        axis=1,
+    )
+    spread = octave[:, None] * gate / GATE
+    J = np.einsum("oij,ojk->oik", P, R) / spread[:, :, None]
+    J[~stereo, 2] = 0.0
+    J[~good] = 0.0
+    V = np.zeros((len(problem.points), 3, 3))
+    np.add.at(V, owner, np.einsum("oki,okj->oij", J, J))
+    lever = np.einsum("oki,oij,okj->ok", J, np.linalg.pinv(V, hermitian=True)[owner], J)
+    counted = good & stereo & (certainty == certainty.max())
+    redundancy = (1.0 - lever[counted]).sum(axis=0)
+    found = np.sqrt((error[counted] ** 2).sum(axis=0) / redundancy)
+    return adjusted, found, int(counted.sum())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("runs", nargs="+", type=Path, help="folders of stereo runs")
+    print("| run | observations | u | v | disparity | times surer |")
+    print("|---|---|---|---|---|---|")
+    for folder in parser.parse_args().runs:
+        stored = load_map(folder / "map.npz")
+        problem = take_snapshot(stored.map, stored.camera).problem
+        sigma = np.array(START)
+        for _ in range(ROUNDS):
+            problem, sigma, count = variance_components(problem, sigma)
+        u, v, disparity = sigma
+        print(
+            f"| {folder.parent.name} | {count} | {u:.2f} | {v:.2f} | {disparity:.2f} "
+            f"| {np.hypot(u, v) / np.sqrt(2.0) / disparity:.1f} |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,51 @@
+"""Print boundaries of two systems side by side, from the ``boundaries.csv`` of ``vslam stress``.
+
+python tools/experiments/stress/boundary_table.py docs/stress/kitti00.csv bow orbslam3
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from pathlib import Path
+
+from vslam.datasets.perturbation import LAWS
+
+NAMES = {"bow": "vslam", "orbslam3": "ORB-SLAM3"}
+
+
+def table(path: Path, ours: str, theirs: str) -> str:
+    """Markdown, a line for each law that one of both was run under."""
+    with path.open(newline="") as file:
+        rows = {(row["law"], row["system"]): row for row in csv.DictReader(file)}
+    # Two detectors are told by their names, two systems by theirs.
+    known = NAMES if theirs in NAMES else {}
+    names = [known.get(system, f"`{system}`") for system in (ours, theirs)]
+    columns = [f"{name} {what}" for name in names for what in ("holds to", "fails at")]
+    lines = [f"| law | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
+    for law, kind in LAWS.items():
+        found = [rows.get((law, system)) for system in (ours, theirs)]
+        if any(found):
+            name = f"`{law}`" + (f", {kind.unit}" if kind.unit != "x" else "")
+            lines.append(f"| {name} | {' | '.join(map(_cells, found))} |")
+    return "\n".join(lines)
+
+
+def _cells(row: dict[str, str] | None) -> str:
+    if row is None:
+        return "- | -"
+    held = f"{float(row['holds_to']):g}" if row["holds_to"] else "nothing"
+    failed = f"{float(row['fails_at']):g}: {row['reason']}" if row["fails_at"] else "never"
+    return f"{held} | {failed}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("csv", type=Path)
+    parser.add_argument("systems", nargs=2)
+    args = parser.parse_args()
+    print(table(args.csv, *args.systems))
+
+
+if __name__ == "__main__":
+    main()

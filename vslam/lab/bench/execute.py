@@ -1,0 +1,253 @@
+"""Cells become folders: each runs in a process of its own, and its results appear all at once.
+
+A cell is finished when its folder is there, whole: what kills the benchmark in between costs the
+cells at work and no other. Runs come back as files in memory (a few MB), so that it does not matter
+which machine made them; only this module writes to the folder of the benchmark.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Collection, Generator, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from vslam.errors import InputError, ResultsError
+from vslam.lab.bench.grid import Cell, is_finished
+
+_POLL_S = 0.1
+_NOT_KEPT = {"map.npz"}  # hundreds of MB on a long sequence, and no figure needs it
+_PARTS, _FAILED = ".parts", "failed"
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What is the same for all cells.
+
+    Attributes:
+        data: root of the data set on the machine that runs the cell; None for rendered towns.
+        config: thresholds, the text of a ``config.json``.
+        threads: of each run; its result does not depend on it.
+        command: program that takes the words of ``vslam``; None for vslam itself.
+        others: programs as ``command`` for the cells whose detector has such a name: other systems.
+        scratch: where runs write; None for the temporary folder of the machine.
+        source: words of ``vslam run`` on how the data is to be read.
+    """
+
+    data: Path | None
+    config: str
+    threads: int
+    command: tuple[str, ...] | None = None
+    scratch: Path | None = None
+    others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    source: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A run that is complete: its files by path relative to ``folder``, where it was written."""
+
+    cell: Cell
+    folder: str
+    files: dict[str, bytes]
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A run without results: ``message`` in one line, ``log`` all that it said."""
+
+    cell: Cell
+    message: str
+    log: str = ""
+
+
+CellOutcome = Finished | Failed
+
+
+def run_cell(
+    cell: Cell, options: RunOptions, stopped: Callable[[], bool] = lambda: False
+) -> CellOutcome:
+    """Run one cell and bring back its files; nothing stays on this machine.
+
+    Args:
+        stopped: asked again and again; the run is killed once it says yes.
+    """
+    if options.scratch is not None:
+        options.scratch.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f"{cell.name}.", dir=options.scratch) as name:
+        work = Path(name)
+        (work / "config.json").write_text(options.config)
+        program = options.others.get(cell.detector) or options.command
+        command = list(program or (sys.executable, "-m", "vslam.cli.child"))
+        command += ["run", *cell.arguments(), "--threads", str(options.threads)]
+        command += ["--data", str(options.data)] if options.data else []
+        command += options.source
+        command += ["--config", str(work / "config.json"), "--no-record", "--no-report", "--quiet"]
+        code = _call([*command, "--out", str(work / "runs")], work / "log.txt", stopped)
+        log = (work / "log.txt").read_text(errors="replace")
+        if code:
+            return Failed(cell, _reason(code, log), log)
+        for folder in (path.parent for path in work.glob("runs/*/report.json")):
+            if is_finished(cell, folder, options.config):
+                return Finished(cell, str(folder), _read(folder) | {"log.txt": log.encode()})
+        return Failed(cell, "no report of this run (another version of vslam?)", log)
+
+
+def run_here(
+    cells: Collection[Cell], options: RunOptions, jobs: int, out: Path
+) -> Generator[CellOutcome, None, None]:
+    """Run cells on this machine, ``jobs`` at a time, publish each and yield it as it ends.
+
+    Threads are enough: each only waits for a process. They publish, too, so that a cell that ends
+    while the caller is interrupted is not lost. Leaving the iteration kills what runs.
+
+    Raises:
+        ResultsError: as :func:`publish`.
+    """
+    stop = threading.Event()
+
+    def run_and_publish(cell: Cell) -> CellOutcome:
+        try:
+            outcome = run_cell(cell, options, stop.is_set)
+        except OSError as error:  # it could not be started, or its files not read
+            outcome = Failed(cell, error.strerror or str(error))
+        if not stop.is_set() or isinstance(outcome, Finished):
+            publish(outcome, out)
+        return outcome
+
+    with ThreadPoolExecutor(jobs, "cell") as pool:
+        try:
+            futures = [pool.submit(run_and_publish, cell) for cell in cells]
+            for future in as_completed(futures):
+                yield future.result()
+        finally:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+
+
+def finished_cells(cells: Collection[Cell], out: Path, config: str) -> list[Cell]:
+    """Those whose results are in ``out`` already."""
+    return [cell for cell in cells if is_finished(cell, out / cell.name, config)]
+
+
+def publish(outcome: CellOutcome, out: Path) -> None:
+    """Write a finished cell into ``out``, whole or not at all; of a failed one what it said.
+
+    Raises:
+        ResultsError: the folder cannot be written.
+    """
+    cell = outcome.cell
+    failed = out / _FAILED / f"{cell.name}.txt"
+    try:
+        if isinstance(outcome, Failed):
+            failed.parent.mkdir(parents=True, exist_ok=True)
+            failed.write_text(f"{outcome.message}\n\n{outcome.log}")
+            return
+        target = out / cell.name
+        part = out / _PARTS / str(os.getpid()) / cell.name
+        shutil.rmtree(part, ignore_errors=True)
+        for name, data in outcome.files.items():
+            path = part / name
+            if not path.resolve().is_relative_to(part.resolve()):
+                raise ResultsError(f"{name}: a worker sent a file outside its folder.")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if path.suffix in (".json", ".md", ".html"):  # the command that reproduces the ATE
+                data = data.replace(outcome.folder.encode(), shlex.quote(str(target)).encode())
+            path.write_bytes(data)
+        shutil.rmtree(target, ignore_errors=True)  # of other thresholds, or damaged
+        part.rename(target)
+        failed.unlink(missing_ok=True)
+    except OSError as error:
+        raise ResultsError(
+            f"{out}: the results of {cell.name} cannot be written ({error.strerror}); free some "
+            "space and give the same command again: finished cells are kept."
+        ) from error
+
+
+def prepare(out: Path, data: str) -> None:
+    """Make the folder of a benchmark, clear what killed ones left, and hold it to one data set.
+
+    Args:
+        data: what tells this data from other data under the same names.
+
+    Raises:
+        InputError: the folder cannot be written, or holds runs on other data.
+    """
+    import psutil
+
+    note = out / "data.txt"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if not note.exists():
+            note.write_text(f"{data}\n")
+        if (known := note.read_text().strip()) != data:
+            raise InputError(
+                f"{out}: holds runs on {known}, not on {data}; name another folder with --out."
+            )
+        for left in (out / _PARTS).glob("*"):
+            if not (left.name.isdecimal() and psutil.pid_exists(int(left.name))):
+                shutil.rmtree(left, ignore_errors=True)
+    except OSError as error:
+        raise InputError(
+            f"{out}: cannot be written ({error.strerror}); name another folder with --out."
+        ) from error
+
+
+def scratch_folder(out: Path) -> Path:
+    """Where this process keeps what is not finished."""
+    return out / _PARTS / str(os.getpid())
+
+
+def tidy(out: Path) -> None:
+    """Remove what this process kept there."""
+    shutil.rmtree(scratch_folder(out), ignore_errors=True)
+    with suppress(OSError):  # another benchmark has its own in it
+        (out / _PARTS).rmdir()
+
+
+def _call(command: list[str], log: Path, stopped: Callable[[], bool]) -> int:
+    """Run a command to its end, or kill it; the exit code. It gets a session of its own, so that
+    Ctrl-C reaches it through us only, and a pipe that tells it when we are gone."""
+    with log.open("wb") as output:
+        child = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        try:
+            while not stopped():
+                with suppress(subprocess.TimeoutExpired):
+                    return child.wait(_POLL_S)
+            return -1
+        finally:
+            if child.poll() is None:
+                child.kill()
+                child.wait()
+            if child.stdin is not None:
+                child.stdin.close()
+
+
+def _reason(code: int, log: str) -> str:
+    if code < 0:
+        return f"killed by signal {-code}" + (" (out of memory?)" if code == -9 else "")
+    lines = [line.strip() for line in log.splitlines() if line.strip()]
+    said = next((line for line in reversed(lines) if line.startswith("error: ")), None)
+    return (said or (lines[-1] if lines else f"exit code {code}")).removeprefix("error: ")
+
+
+def _read(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name not in _NOT_KEPT
+    }

@@ -1,0 +1,106 @@
+"""The table that is on the screen while a grid runs."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from vslam.lab.bench.estimate import duration, estimate
+from vslam.lab.bench.execute import CellOutcome, Failed
+from vslam.lab.bench.grid import Cell, read_report
+from vslam.report.schema import ReportJson
+
+
+class GridProgress:
+    """Which cells are finished, failed or missing, and what the finished ones say.
+
+    Attributes:
+        cells: the whole grid.
+        reports: of the finished cells, in the order in which they ended.
+        failed: why, in one line each.
+    """
+
+    def __init__(
+        self,
+        cells: Collection[Cell],
+        finished: Collection[Cell],
+        frames: Mapping[str, int],
+        out: Path,
+        jobs: int,
+    ) -> None:
+        self.cells = cells
+        self.reports: dict[Cell, ReportJson] = {}
+        self.failed: dict[Cell, str] = {}
+        self._frames, self._out, self._jobs = frames, out, jobs
+        for cell in finished:
+            self._note(cell)
+
+    @property
+    def missing(self) -> list[Cell]:
+        """Neither finished nor failed."""
+        return [c for c in self.cells if c not in self.reports and c not in self.failed]
+
+    def add(self, outcome: CellOutcome) -> str:
+        """Take note of a cell that has been published; returns a line that says so."""
+        cell = outcome.cell
+        if isinstance(outcome, Failed):
+            self.failed[cell] = outcome.message
+            said = f"failed: {outcome.message}"
+        else:
+            self._note(cell)
+            ate = self.reports[cell].ate_rmse_m
+            said = "finished" if ate is None else f"ATE {ate:.3f} m"
+        return f"{len(self.reports) + len(self.failed)}/{len(self.cells)} {cell.name}: {said}"
+
+    def table(self) -> Table:
+        """A row for each sequence and perturbation, a column for each detector: cells finished of
+        all, and the median of their ATE."""
+        detectors = list(dict.fromkeys(cell.detector for cell in self.cells))
+        caption = f"{len(self.reports)} of {len(self.cells)} cells finished"
+        caption += f", {len(self.failed)} failed" if self.failed else ""
+        if self.missing:
+            left = estimate(self.missing, self.reports, self._frames, self._jobs).seconds
+            caption += f", about {duration(left)} left"
+        table = Table("sequence", "perturbation", *detectors, caption=caption)
+        for group in dict.fromkeys((cell.sequence, cell.perturb) for cell in self.cells):
+            cells = [cell for cell in self.cells if (cell.sequence, cell.perturb) == group]
+            texts = (self._text([c for c in cells if c.detector == d]) for d in detectors)
+            table.add_row(*group, *texts)
+        return table
+
+    def _text(self, cells: list[Cell]) -> str:
+        done = [self.reports[cell] for cell in cells if cell in self.reports]
+        failed = sum(cell in self.failed for cell in cells)
+        ates = [report.ate_rmse_m for report in done if report.ate_rmse_m is not None]
+        text = f"{len(done)}/{len(cells)}" + (f"  {statistics.median(ates):.3f} m" if ates else "")
+        return text + (f"  [red]{failed} failed[/red]" if failed else "")
+
+    def _note(self, cell: Cell) -> None:
+        report = read_report(self._out / cell.name)
+        if report is not None:
+            self.reports[cell] = report
+
+
+@contextmanager
+def shown_live(progress: GridProgress, *, shown: bool) -> Iterator[Callable[[str], None]]:
+    """Show the table on stderr and keep it up to date; where that is no terminal, print the lines
+    given to what this yields. At the end the table stays only if cells are missing or failed: a
+    finished grid is followed by its results."""
+    console = Console(stderr=True, quiet=not shown, highlight=False, soft_wrap=True)
+    live = (
+        Live(get_renderable=progress.table, console=console, refresh_per_second=1, transient=True)
+        if console.is_terminal
+        else nullcontext()
+    )
+    try:
+        with live:
+            yield lambda line: None if console.is_terminal else console.print(line, markup=False)
+    finally:
+        if progress.missing or progress.failed:
+            console.print(progress.table())

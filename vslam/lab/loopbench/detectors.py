@@ -1,0 +1,203 @@
+"""Loop detectors as functions of images: how alike each query and each image of a gallery are."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.config import OrbConfig
+from vslam.frontend.orb import extract
+from vslam.lab.loopbench.conditions import Image
+from vslam.lab.loopbench.node_matching import NodeIndex, index_nodes
+from vslam.loopclosure.bow_index import InvertedIndex
+from vslam.loopclosure.local_matching import DescriptorMaps
+from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
+
+if TYPE_CHECKING:
+    from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
+    from vslam.loopclosure.siamese.scoring import NetworkScorer
+
+
+_MATCHING_LEVEL = 2  # of the vocabulary: features of a node there, of about 100, are matched
+_KEPT_GALLERIES = 3  # the unchanged one survives two strengths of a condition with its own
+
+
+@dataclass(frozen=True)
+class DescribedImage:
+    """An image with its ORB features.
+
+    Attributes:
+        image: ``(H, W)`` uint8.
+        xy: ``(N, 2)`` float32 pixels.
+        descriptors: ``(N, 32)`` uint8.
+        words: ``(N,)`` int32 of the vocabulary.
+        nodes: direct index.
+    """
+
+    image: Image
+    xy: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    words: NDArray[np.int32]
+    nodes: NodeIndex
+
+
+def describe(images: list[Image], vocabulary: Vocabulary, threads: int) -> list[DescribedImage]:
+    """Extract the features of all images, as a run does."""
+    node_of_word = vocabulary.ancestors(_MATCHING_LEVEL)
+
+    def one(image: Image) -> DescribedImage:
+        found = extract(image, OrbConfig())
+        words = vocabulary.words(found.descriptors)
+        return DescribedImage(
+            image, found.xy, found.descriptors, words, index_nodes(node_of_word[words])
+        )
+
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(one, images))
+
+
+class Scorer(Protocol):
+    """A loop detector without a map."""
+
+    name: str
+    probability: bool
+    """Whether scores are probabilities, with thresholds at 0.5 and 0.9."""
+
+    def store(self, gallery: list[DescribedImage]) -> Any:
+        """What it keeps of the gallery."""
+
+    def scores(self, queries: list[DescribedImage], stored: Any) -> NDArray[np.float64]:
+        """``(Q, G)``, greater is more alike."""
+
+
+class BowScorer:
+    """tf-idf and the L1 score, as :class:`vslam.loopclosure.bow.BowDetector` has them."""
+
+    name = "bow"
+    probability = False
+
+    def __init__(self, vocabulary: Vocabulary) -> None:
+        self._vocabulary = vocabulary
+
+    def store(self, gallery: list[DescribedImage]) -> InvertedIndex:
+        """See :class:`Scorer`."""
+        index = InvertedIndex(self._vocabulary.n_words)
+        for number, one in enumerate(gallery):
+            index.add(number, bow_vector(self._vocabulary, one.words))
+        return index
+
+    def scores(self, queries: list[DescribedImage], stored: InvertedIndex) -> NDArray[np.float64]:
+        """See :class:`Scorer`."""
+        return np.stack(
+            [stored.compare(bow_vector(self._vocabulary, one.words)).score for one in queries]
+        ).astype(np.float64)
+
+
+def open_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scorer:
+    """``bow``, or one of the networks.
+
+    Raises:
+        InputError: no weights for it, or those of another network.
+    """
+    if name == "bow":
+        return BowScorer(vocabulary)
+    from vslam.config import SiameseConfig
+    from vslam.loopclosure.siamese.scoring import NetworkScorer
+
+    return _ImageScorer(NetworkScorer(name, weights, SiameseConfig().fit))
+
+
+class _ImageScorer:
+    """Hands the images themselves to a network."""
+
+    probability = True
+
+    def __init__(self, network: NetworkScorer) -> None:
+        self.name = network.name
+        self._network = network
+
+    def store(self, gallery: list[DescribedImage]) -> NDArray[np.float32]:
+        """Descriptors ``(G, D)``."""
+        return self._network.embed([one.image for one in gallery])
+
+    def scores(
+        self, queries: list[DescribedImage], stored: NDArray[np.float32]
+    ) -> NDArray[np.float64]:
+        return self._network.scores(self.store(queries), stored)
+
+
+class LocalDescriptorCache:
+    """Coarse local descriptors of images, computed once for each."""
+
+    def __init__(self, network: LocalDescriptors | None = None) -> None:
+        self._network = network
+        self._kept: dict[bytes, DescriptorMaps] = {}
+
+    def of(self, image: Image) -> DescriptorMaps:
+        """Those of a grey image ``(H, W)``; the fine ones are left out.
+
+        Raises:
+            InputError: the network cannot be read.
+        """
+        digest = hashlib.blake2b(image.tobytes()).digest()
+        if digest not in self._kept:
+            if self._network is None:
+                from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
+
+                self._network = LocalDescriptors()
+            self._kept[digest] = self._network.describe(image).coarse_alone()
+        return self._kept[digest]
+
+
+class DetectorSet:
+    """The detectors of a benchmark, the first of which the others are compared with.
+
+    Most conditions have the same gallery: what was made of the last few galleries is kept.
+    """
+
+    def __init__(self, scorers: list[Scorer], vocabulary: Vocabulary | None, threads: int) -> None:
+        """Keep nothing yet.
+
+        Args:
+            vocabulary: None where all scorers look at images alone: no features are extracted.
+            threads: that extract them.
+        """
+        self.scorers = tuple(scorers)
+        self._vocabulary, self._threads = vocabulary, threads
+        self.local = LocalDescriptorCache()
+        self._kept: OrderedDict[bytes, tuple[list[DescribedImage], dict[str, Any]]] = OrderedDict()
+
+    def gallery(self, images: list[Image]) -> tuple[list[DescribedImage], dict[str, Any]]:
+        """Features of the images, and what each detector keeps of them."""
+        hashed = hashlib.blake2b()
+        for image in images:
+            hashed.update(f"{image.shape}".encode())
+            hashed.update(image.tobytes())
+        digest = hashed.digest()
+        if digest not in self._kept:
+            described = self.describe(images)
+            self._kept[digest] = described, {one.name: one.store(described) for one in self.scorers}
+            while len(self._kept) > _KEPT_GALLERIES:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(digest)
+        return self._kept[digest]
+
+    def describe(self, images: list[Image]) -> list[DescribedImage]:
+        """See :func:`describe`."""
+        if self._vocabulary is None:
+            return [_without_features(image) for image in images]
+        return describe(images, self._vocabulary, self._threads)
+
+
+def _without_features(image: Image) -> DescribedImage:
+    words = np.empty(0, np.int32)
+    return DescribedImage(
+        image, np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8), words, index_nodes(words)
+    )

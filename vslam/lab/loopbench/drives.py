@@ -1,0 +1,89 @@
+"""Drives to test loop detectors on: images in the order in which they were taken."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vslam.errors import InputError
+from vslam.lab.loopbench.sets import ProgressBar
+from vslam.loopclosure.siamese.image_source import ImageSource
+from vslam.loopclosure.siamese.kitti_source import read_kitti
+from vslam.loopclosure.siamese.source_registry import open_source, split_spec
+
+if TYPE_CHECKING:
+    from vslam.datasets.synthetic import Variation
+
+_ORDERED = ("kitti", "fabmap")  # of the kinds of sources, those whose images are in order
+_OPTIONS = {"seed": "101", "aliased": "0", "change": "0", "every": "10"}
+
+
+def open_drives(
+    spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar
+) -> list[ImageSource]:
+    """Open ``drive:ROUTE[seed=101,aliased=1,change=0.5,every=10]``, ``kitti:`` or ``fabmap:``.
+
+    Of a built-in route every so many frames are rendered on first use, the left camera alone.
+
+    Args:
+        cache: folder of rendered towns.
+        progress_bar: opened while a drive is rendered.
+
+    Raises:
+        InputError: what is no drive, an unknown route or option, or data that is missing or
+            malformed.
+    """
+    kind, route, given = split_spec(spec)
+    if kind in _ORDERED:
+        return open_source(spec)
+    if kind != "drive":
+        raise InputError(
+            f"--data {spec}: --protocol online takes drives; name drive:ROUTE, kitti:DIR or "
+            "fabmap:DIR."
+        )
+    from vslam.datasets.synthetic import ROUTES, Variation
+
+    options = {**_OPTIONS, **given}
+    if route not in ROUTES or set(options) != set(_OPTIONS):
+        raise InputError(
+            f"--data {spec}: must be drive:ROUTE with a route of {', '.join(ROUTES)} and options "
+            f"{', '.join(_OPTIONS)}."
+        )
+    try:
+        seed, aliased, every = (int(options[key]) for key in ("seed", "aliased", "every"))
+        change = float(options["change"])
+    except ValueError as error:
+        raise InputError(f"--data {spec}: an option is not a number.") from error
+    if seed < 0 or every < 1 or not 0.0 <= change <= 1.0:
+        raise InputError(
+            f"--data {spec}: seed must be at least 0, every at least 1 and change from 0 to 1."
+        )
+    town = Variation(seed, bool(aliased), change)
+    return [_rendered(route, town, every, cache, threads=threads, progress_bar=progress_bar)]
+
+
+def _rendered(
+    name: str,
+    town: Variation,
+    every: int,
+    cache: Path,
+    *,
+    threads: int,
+    progress_bar: ProgressBar,
+) -> ImageSource:
+    from vslam.datasets.synthetic import built_in_route, store
+    from vslam.datasets.synthetic.views import render_views
+
+    route = built_in_route(name)
+    frames = range(0, len(route.T_wc), every)
+    root = store.place_folder(cache) / f"drive-{store.folder_name(town)}-every{every}"
+    if not (root / "poses" / f"{name}.txt").exists():
+        with progress_bar(f"rendering {root.name} {name}", len(frames)) as advance:
+            render_views(
+                route, town, root, frames, threads=threads, on_frame=lambda done, of: advance()
+            )
+    (source,) = read_kitti(root, name, every=str(every))
+    kind = "aliased town" if town.aliased else "town"
+    changed = f", change {town.change:g}" if town.change else ""
+    return replace(source, name=f"{name} in {kind} {town.seed}{changed}")

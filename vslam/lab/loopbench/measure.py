@@ -1,0 +1,229 @@
+"""Measure loop detectors on test sets: descriptors alone, and after geometric verification."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.config import LearnedMatchingConfig, VerificationConfig
+from vslam.geometry import Matrix
+from vslam.lab.loopbench.conditions import Condition
+from vslam.lab.loopbench.detectors import (
+    DescribedImage,
+    DetectorSet,
+    LocalDescriptorCache,
+    Scorer,
+)
+from vslam.lab.loopbench.node_matching import match_by_node
+from vslam.lab.loopbench.schema import Curve, Gain, Score, Verified
+from vslam.lab.loopbench.sequences import log_odds, sequence_scores
+from vslam.lab.loopbench.sets import QuerySet, TestSet
+from vslam.loopclosure.local_matching import homography_share, match_coarse
+from vslam.loopclosure.precision_recall import (
+    PrecisionRecall,
+    accepted_at,
+    average_precision,
+    balanced_accuracy,
+    precision_recall,
+    summary,
+)
+from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
+
+MIN_SHARE = 0.18  # of the coarse cells; KITTI 00: 99.7 % of wrong best images have less
+MIN_MATCHES = 20  # that obey one epipolar geometry (ORB-SLAM, VII-B, asks for 20 in 3D)
+_EPIPOLAR_PIXELS = 2.0
+_CURVE_POINTS = 200
+_RESAMPLES = 200  # of the queries, for the interval of a difference
+
+
+def measure(
+    test_set: TestSet,
+    condition: Condition,
+    detectors: DetectorSet,
+    seed: int,
+    *,
+    descriptors_only: bool = False,
+) -> tuple[list[Score], list[Gain]]:
+    """All detectors on one set under one condition; nothing where that is not to be had.
+
+    Args:
+        descriptors_only: nothing is verified, and there are no intervals of differences.
+    """
+    query_set = test_set.query_set(condition, seed)
+    if query_set is None:
+        return [], []
+    queries = detectors.describe(query_set.queries)
+    gallery, stored = detectors.gallery(query_set.gallery)
+    verify = None if descriptors_only else Verification(queries, gallery, detectors.local)
+    found = {one.name: one.scores(queries, stored[one.name]) for one in detectors.scorers}
+    scores = [
+        _score(test_set.title, condition, scorer, found[scorer.name], query_set, verify)
+        for scorer in detectors.scorers
+    ]
+    if descriptors_only:
+        return scores, []
+    first, *others = found
+    gains = [
+        _gain(test_set.title, condition, first, other, found, query_set.relation)
+        for other in others
+    ]
+    return scores, gains
+
+
+def _score(
+    title: str,
+    condition: Condition,
+    scorer: Scorer,
+    scores: Matrix,
+    query_set: QuerySet,
+    verify: Verification | None,
+) -> Score:
+    known = query_set.relation != UNKNOWN
+    same, score = query_set.relation[known] == SAME, scores[known]
+    accuracy: dict[str, float | None] = {
+        str(threshold): balanced_accuracy(same, score, threshold) if scorer.probability else None
+        for threshold in (0.5, 0.9)
+    }
+    curve = precision_recall(same, score)
+    answerable = (query_set.relation == SAME).any(1)
+    best, truth = _best_images(scores, query_set.relation)
+    sequence_right = None
+    if query_set.in_order:
+        over_sequences = sequence_scores(log_odds(scores) if scorer.probability else scores)
+        _, found = _best_images(over_sequences, query_set.relation)
+        sequence_right = float((found == SAME)[answerable].mean())
+    right, wrong = (truth == SAME)[answerable], truth == DIFFERENT
+    verified = {}
+    if verify is not None:
+        orb = np.array([verify.by_orb(q, int(g)) for q, g in enumerate(best)])
+        learned = np.array([verify.by_learned(q, int(g)) for q, g in enumerate(best)])
+        verified = {
+            name: Verified(
+                right=float((accepted[answerable] & right).mean()),
+                wrong=int((accepted & wrong).sum()),
+            )
+            for name, accepted in (("orb", orb), ("learned", learned), ("both", orb | learned))
+        }
+    return Score(
+        data=title,
+        condition=condition.name,
+        detector=scorer.name,
+        figures=summary(same, score),
+        accuracy=accuracy,
+        accepted=accepted_at(curve, 0.9) if scorer.probability else None,
+        queries=int(answerable.sum()),
+        first_right=float(right.mean()),
+        sequence_right=sequence_right,
+        verified=verified,
+        curve=thinned(curve),
+    )
+
+
+def _best_images(
+    scores: Matrix, relation: NDArray[np.int8]
+) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
+    """The best image of each query of which the truth is known, and its relation."""
+    best = np.where(relation != UNKNOWN, scores, -np.inf).argmax(1)
+    return best, relation[np.arange(len(best)), best]
+
+
+def thinned(curve: PrecisionRecall) -> Curve:
+    """The best precision at equal steps of recall, and the end where every pair is accepted.
+
+    Equal steps of the pairs would have a good detector's curve in the first of them: of thousands
+    of pairs it finds all true ones among the first few.
+    """
+    points = drawn_points(curve)
+    return Curve(
+        precision=curve.precision[points].round(5).tolist(),
+        recall=curve.recall[points].round(5).tolist(),
+    )
+
+
+def drawn_points(curve: PrecisionRecall) -> NDArray[np.int64]:
+    """Points of a curve that are nearest to equal steps of recall, and the first."""
+    wanted = np.linspace(0.0, curve.recall[0], _CURVE_POINTS)
+    reached = len(curve.recall) - 1 - np.searchsorted(curve.recall[::-1], wanted)
+    return np.unique(np.append(reached, 0))
+
+
+def _gain(
+    title: str,
+    condition: Condition,
+    first: str,
+    second: str,
+    found: dict[str, Matrix],
+    relation: NDArray[np.int8],
+) -> Gain:
+    """Difference in AP with a bootstrap interval: queries are drawn again, with their galleries."""
+    known, rng = relation != UNKNOWN, np.random.default_rng(0)
+
+    def gain(rows: NDArray[np.integer]) -> float:
+        mask = known[rows]
+        same = relation[rows][mask] == SAME
+        if not same.any():
+            return 0.0
+        ap = [average_precision(precision_recall(same, found[name][rows][mask]))
+              for name in (first, second)]  # fmt: skip
+        return ap[1] - ap[0]
+
+    n = len(relation)
+    drawn = [gain(rng.integers(n, size=n)) for _ in range(_RESAMPLES)]
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return Gain(
+        data=title, condition=condition.name, first=first, second=second,
+        difference=gain(np.arange(n)), low=float(low), high=float(high),
+    )  # fmt: skip
+
+
+class Verification:
+    """Whether two images show one place by their local descriptors; each pair is matched once."""
+
+    def __init__(
+        self,
+        queries: list[DescribedImage],
+        gallery: list[DescribedImage],
+        local: LocalDescriptorCache,
+    ) -> None:
+        self._queries, self._gallery, self._local = queries, gallery, local
+        self._by_orb: dict[tuple[int, int], bool] = {}
+        self._by_learned: dict[tuple[int, int], bool] = {}
+
+    def by_orb(self, query: int, image: int) -> bool:
+        """Whether enough ORB matches obey one epipolar geometry."""
+        key = query, image
+        if key not in self._by_orb:
+            inliers = epipolar_inliers(self._queries[query], self._gallery[image])
+            self._by_orb[key] = inliers >= MIN_MATCHES
+        return self._by_orb[key]
+
+    def by_learned(self, query: int, image: int) -> bool:
+        """Whether enough cells of the coarse grid obey one homography, roughly."""
+        key = query, image
+        if key not in self._by_learned:
+            a = self._local.of(self._queries[query].image)
+            b = self._local.of(self._gallery[image].image)
+            coarse = match_coarse(a, b, LearnedMatchingConfig().coarse_alike)
+            self._by_learned[key] = homography_share(coarse, a, b) >= MIN_SHARE
+        return self._by_learned[key]
+
+
+def epipolar_inliers(
+    a: DescribedImage, b: DescribedImage, config: VerificationConfig | None = None
+) -> int:
+    """Matches of two images that obey the best fundamental matrix found."""
+    import cv2
+
+    config = config or VerificationConfig()
+    match = match_by_node(
+        *a.nodes, a.descriptors.view(np.uint64), np.ones(len(a.xy), np.bool_),
+        *b.nodes, b.descriptors.view(np.uint64), np.ones(len(b.xy), np.bool_),
+        config.match_distance, config.match_ratio,
+    )  # fmt: skip
+    rows = np.flatnonzero(match >= 0)
+    if len(rows) < MIN_MATCHES:
+        return 0
+    _, inlier = cv2.findFundamentalMat(
+        a.xy[rows], b.xy[match[rows]], cv2.USAC_DEFAULT, _EPIPOLAR_PIXELS, 0.999, 2000
+    )
+    return 0 if inlier is None else int(inlier.sum())

@@ -1,0 +1,98 @@
+"""Measure loop detectors on drives: one decision an image, before and after verification."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.lab.loopbench.detectors import LocalDescriptorCache, describe
+from vslam.lab.loopbench.measure import Verification, drawn_points
+from vslam.lab.loopbench.online import Decisions, Window, decide, decision_curve, judge
+from vslam.lab.loopbench.registry import Start
+from vslam.lab.loopbench.schema import DecisionCurve, OnlineScore
+from vslam.lab.loopbench.sets import ProgressBar
+from vslam.loopclosure.precision_recall import PrecisionRecall, max_f1, recall_at_full_precision
+from vslam.loopclosure.siamese.image_source import ImageSource
+from vslam.loopclosure.vocabulary import Vocabulary
+
+
+def measure_drive(
+    drive: ImageSource,
+    starts: Sequence[Start],
+    window: Window,
+    vocabulary: Vocabulary,
+    *,
+    threads: int,
+    progress_bar: ProgressBar,
+) -> list[OnlineScore]:
+    """All detectors on one drive.
+
+    Args:
+        drive: images in order.
+        starts: of the detectors.
+        window: the youngest images, which are not searched.
+        vocabulary: of the features that verification matches, and of ``bow``.
+        progress_bar: opened for each detector.
+
+    Raises:
+        InputError: no image has a true match before the window.
+        UnreadableImageError: an image is missing or damaged.
+    """
+    searchable = window.searchable(len(drive), drive.times)
+    judge(_nothing(len(drive)), drive.relation, searchable)
+    images = describe([drive.grey(k) for k in range(len(drive))], vocabulary, threads)
+    verify = Verification(images, images, LocalDescriptorCache())
+    scores = []
+    for start in starts:
+        detector = start(images)
+        with progress_bar(f"{drive.name}: {detector.name}", len(images)) as advance:
+            found = decide(detector, images, searchable, advance)
+        by_orb, by_learned = np.zeros((2, len(images)), np.bool_)
+        for k in np.flatnonzero(found.match >= 0):
+            pair = int(k), int(found.match[k])
+            by_orb[k], by_learned[k] = verify.by_orb(*pair), verify.by_learned(*pair)
+        kept = {"nothing": found, "orb": found.only(by_orb), "learned": found.only(by_learned),
+                "both": found.only(by_orb | by_learned)}  # fmt: skip
+        scores += [
+            _score(drive, detector.name, window, by, decisions, searchable)
+            for by, decisions in kept.items()
+        ]
+    return scores
+
+
+def _nothing(n: int) -> Decisions:
+    return Decisions(np.full(n, -1), np.full(n, -np.inf))
+
+
+def _score(
+    drive: ImageSource,
+    detector: str,
+    window: Window,
+    verified_by: str,
+    decisions: Decisions,
+    searchable: NDArray[np.int64],
+) -> OnlineScore:
+    judged = judge(decisions, drive.relation, searchable)
+    strict, lenient = (decision_curve(judged, near_is_wrong=near) for near in (True, False))
+    f1, threshold = _max_f1(strict)
+    points = drawn_points(strict)
+    return OnlineScore.model_validate({
+        "data": drive.name, "detector": detector, "window": str(window),
+        "verified_by": verified_by, "images": len(drive),
+        "answerable": judged.answerable.sum(), "right": judged.right.sum(),
+        "near": judged.near.sum(), "far": judged.far.sum(),
+        "recall_at_100_precision": recall_at_full_precision(strict),
+        "recall_at_100_precision_far": recall_at_full_precision(lenient),
+        "max_f1": f1, "max_f1_far": _max_f1(lenient)[0], "max_f1_threshold": threshold,
+        "curve": DecisionCurve(
+            threshold=strict.thresholds[points[points < len(strict.thresholds)]].tolist(),
+            precision=strict.precision[points].round(5).tolist(),
+            recall=strict.recall[points].round(5).tolist(),
+        ),
+    })  # fmt: skip
+
+
+def _max_f1(curve: PrecisionRecall) -> tuple[float, float | None]:
+    return max_f1(curve) if len(curve.thresholds) else (0.0, None)

@@ -1,0 +1,229 @@
+"""The protocol of the literature: images in order, one decision for each against those before.
+
+An image is compared with the images that are older by a window in time. The best of them is its
+match, and its score is compared with a threshold. With a ground truth that marks which images show
+one place:
+
+- the match is *right* if it is marked, else *wrong*;
+- precision is right / (right + wrong) of the images whose score reaches the threshold;
+- recall is right / (images that have a marked image before the window).
+
+Recall at 100 % precision is the highest recall of all thresholds that let no wrong match through
+(Cummins and Newman, IJRR 2008; Galvez-Lopez and Tardos, T-RO 2012; Garcia-Fidalgo and Ortiz, RA-L
+2018; An et al., IROS 2019). A detection that verification refuses is none at any threshold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError
+from vslam.lab.loopbench.detectors import DescribedImage, Scorer
+from vslam.loopclosure.precision_recall import PrecisionRecall
+from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME
+
+
+class Detection(NamedTuple):
+    """``match``, number of an image added before; ``score``, greater is more alike."""
+
+    match: int
+    score: float
+
+
+class OnlineDetector(Protocol):
+    """What a detector remembers of one drive. Images come in order, and twice: ``find`` asks for
+    each at once, ``add`` has it searched from the moment that it is older than the window."""
+
+    name: str
+
+    def add(self, image: DescribedImage) -> None:
+        """Remember an image; the first is number 0."""
+
+    def find(self, image: DescribedImage) -> Detection | None:
+        """The image added that is most alike; None if there is none."""
+
+
+class ScoredDetector:
+    """A scorer without state as an online detector: all scores of a drive at once, then row by row
+    the greatest of the images added."""
+
+    def __init__(self, scorer: Scorer, images: list[DescribedImage]) -> None:
+        self.name = scorer.name
+        self._scores = scorer.scores(images, scorer.store(images))
+        self._added = self._asked = 0
+
+    def add(self, image: DescribedImage) -> None:
+        """See :class:`OnlineDetector`."""
+        self._added += 1
+
+    def find(self, image: DescribedImage) -> Detection | None:
+        """See :class:`OnlineDetector`."""
+        row = self._scores[self._asked, : self._added]
+        self._asked += 1
+        if not len(row):
+            return None
+        best = int(row.argmax())
+        return Detection(best, float(row[best]))
+
+
+@dataclass(frozen=True)
+class Window:
+    """The youngest images that a query is not compared with.
+
+    ``amount`` images, or seconds if ``timed``.
+    """
+
+    amount: float
+    timed: bool
+
+    def __str__(self) -> str:
+        return f"{self.amount:g} {'s' if self.timed else 'images'}"
+
+    def searchable(self, n: int, times: NDArray[np.float64] | None) -> NDArray[np.int64]:
+        """``(n,)`` how many images, from the first on, each may be compared with.
+
+        Args:
+            n: images of the drive.
+            times: ``(n,)`` seconds, ascending; None counts one image a second, DLoopDetector's
+                default.
+        """
+        clock = np.arange(n, dtype=np.float64) if times is None or not self.timed else times
+        # Times are multiples of an interval that binary fractions do not hold.
+        return np.searchsorted(clock, clock - self.amount + 1e-6, side="right")
+
+
+def parse_window(text: str) -> Window:
+    """``20s`` or ``200``, seconds or images.
+
+    Raises:
+        InputError: neither.
+    """
+    timed = text.endswith("s")
+    try:
+        amount = float(text.removesuffix("s")) if timed else float(int(text))
+        if not 0.0 < amount < float("inf"):
+            raise ValueError
+    except ValueError as error:
+        raise InputError(
+            f"--window {text}: must be above 0, seconds (20s) or a number of images (200)."
+        ) from error
+    return Window(amount, timed)
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """One of each of N images.
+
+    Attributes:
+        match: ``(N,)`` int64 image found, -1 for none.
+        score: ``(N,)`` float64, -inf for none.
+    """
+
+    match: NDArray[np.int64]
+    score: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if np.isnan(self.score).any():
+            raise InputError("loops bench: a score is NaN; look at the weights of the detector.")
+
+    def only(self, accepted: NDArray[np.bool_]) -> Decisions:
+        """Those accepted ``(N,)``; the others find nothing."""
+        return Decisions(
+            np.where(accepted, self.match, -1), np.where(accepted, self.score, -np.inf)
+        )
+
+
+def decide(
+    detector: OnlineDetector,
+    images: list[DescribedImage],
+    searchable: NDArray[np.int64],
+    on_image: Callable[[], None] = lambda: None,
+) -> Decisions:
+    """Run a detector that remembers nothing yet over a drive.
+
+    Args:
+        searchable: ``(N,)`` as of :meth:`Window.searchable`.
+        on_image: called after each image.
+    """
+    match, score = np.full(len(images), -1, np.int64), np.full(len(images), -np.inf)
+    added = 0
+    for k, image in enumerate(images):
+        for old in images[added : searchable[k]]:
+            detector.add(old)
+        added = int(searchable[k])
+        found = detector.find(image)
+        if found is not None:
+            match[k], score[k] = found
+        on_image()
+    return Decisions(match, score)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Decisions held against the truth.
+
+    Attributes:
+        score: ``(N,)`` float64, -inf for no decision.
+        right: ``(N,)`` bool, the match is marked as the same place.
+        far: ``(N,)`` bool, the match is known to be another place. A match that is neither lies
+            near the place, but not near enough to be marked.
+        answerable: ``(N,)`` bool, images with a marked one before the window.
+    """
+
+    score: NDArray[np.float64]
+    right: NDArray[np.bool_]
+    far: NDArray[np.bool_]
+    answerable: NDArray[np.bool_]
+
+    @property
+    def near(self) -> NDArray[np.bool_]:
+        """``(N,)`` bool, decisions that are neither right nor far."""
+        return np.isfinite(self.score) & ~self.right & ~self.far
+
+
+def judge(
+    decisions: Decisions, relation: NDArray[np.int8], searchable: NDArray[np.int64]
+) -> Judged:
+    """Hold decisions against the relation ``(N, N)`` int8 of the images of a drive.
+
+    Raises:
+        InputError: no image has a marked one before the window.
+    """
+    n = len(relation)
+    before = np.arange(n)[None] < searchable[:, None]
+    answerable = ((relation == SAME) & before).any(1)
+    if not answerable.any():
+        raise InputError(
+            "--protocol online: no image has a true match before the window; give a longer drive "
+            "or a shorter --window."
+        )
+    found = decisions.match >= 0
+    truth = np.where(found, relation[np.arange(n), decisions.match], 0)
+    return Judged(
+        decisions.score, found & (truth == SAME), found & (truth == DIFFERENT), answerable
+    )
+
+
+def decision_curve(judged: Judged, *, near_is_wrong: bool = True) -> PrecisionRecall:
+    """Precision and recall over images, at each distinct score from the lowest on.
+
+    Args:
+        near_is_wrong: as in the literature, whatever is not marked; False leaves out matches that
+            are near the place.
+    """
+    wrong = judged.far | (judged.near & near_is_wrong)
+    counted = judged.right | wrong
+    score, right = judged.score[counted], judged.right[counted]
+    order = np.argsort(-score, kind="stable")
+    ranked = score[order]
+    last = np.flatnonzero(np.append(np.diff(ranked) != 0, len(ranked) > 0))
+    n_right = np.cumsum(right[order])[last]
+    precision, recall = n_right / (last + 1), n_right / judged.answerable.sum()
+    return PrecisionRecall(
+        np.append(precision[::-1], 1.0), np.append(recall[::-1], 0.0), ranked[last][::-1]
+    )

@@ -1,0 +1,143 @@
+"""Images to test loop detectors on: rendered towns, drives and collections with ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError
+from vslam.lab.loopbench.conditions import Condition, Image, apply
+from vslam.loopclosure.siamese.image_source import UNKNOWN, ImageSource
+from vslam.loopclosure.siamese.source_registry import open_source, split_spec
+
+ProgressBar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
+"""``(what, how many)`` opens a bar; what it yields is called after each of them."""
+
+_GAP = 50  # images of a drive before a query that are not searched: it was just there
+_OPTIONS = {"seed": "0", "aliased": "0", "places": "150"}
+
+
+@dataclass(frozen=True)
+class QuerySet:
+    """Query images, the gallery that is searched for their places, and what is true.
+
+    Attributes:
+        queries: Q images ``(H, W)`` uint8, under the condition.
+        gallery: G images as they were taken.
+        relation: ``(Q, G)`` int8, 1 same place, -1 another, 0 not known: left out.
+        in_order: whether queries and gallery were taken one after the other on a way.
+    """
+
+    queries: list[Image]
+    gallery: list[Image]
+    relation: NDArray[np.int8]
+    in_order: bool = False
+
+
+@dataclass(frozen=True)
+class TestSet:
+    """One set of images.
+
+    Attributes:
+        title: of the report.
+        query_set: ``(condition, seed)`` to the images under it, None where the set has no such.
+    """
+
+    __test__ = False  # no test, whatever pytest thinks of its name
+
+    title: str
+    query_set: Callable[[Condition, int], QuerySet | None]
+
+
+def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar) -> list[TestSet]:
+    """Open ``town:ROUTE[seed=101,aliased=1,places=150]`` or a source as of ``vslam train``.
+
+    A town is rendered on first use, anew for each viewpoint and change, into ``cache``.
+
+    Args:
+        cache: folder of rendered towns.
+        progress_bar: opened while a town is rendered.
+
+    Raises:
+        InputError: unknown kind, route or option, or data that is missing or malformed.
+    """
+    kind, route, given = split_spec(spec)
+    if kind != "town":
+        return [_images(source) for source in open_source(spec)]
+    from vslam.datasets.synthetic import ROUTES
+
+    options = {**_OPTIONS, **given}
+    if route not in ROUTES or set(options) != set(_OPTIONS):
+        raise InputError(
+            f"--data {spec}: must be town:ROUTE with a route of {', '.join(ROUTES)} and options "
+            f"{', '.join(_OPTIONS)}."
+        )
+    try:
+        seed, aliased, places = (int(options[key]) for key in _OPTIONS)
+    except ValueError as error:
+        raise InputError(f"--data {spec}: an option is not a number.") from error
+    return [
+        _town(route, seed, bool(aliased), places, cache, threads=threads, progress_bar=progress_bar)
+    ]
+
+
+def _images(source: ImageSource) -> TestSet:
+    is_query = source.is_query
+    index = np.arange(len(source))
+    queries = index if is_query is None else np.flatnonzero(is_query)
+    gallery = index if is_query is None else np.flatnonzero(~is_query)
+    relation = source.relation[np.ix_(queries, gallery)].copy()
+    if is_query is None:
+        relation[index[:, None] - index[None] < _GAP] = UNKNOWN
+        queries, gallery = queries[_GAP:], gallery[:-_GAP]
+        relation = relation[_GAP:, :-_GAP]
+
+    def query_set(condition: Condition, seed: int) -> QuerySet | None:
+        if condition.kind == "change":
+            return None
+        as_taken = [source.grey(int(i)) for i in gallery]
+        changed = apply(condition, [source.grey(int(i)) for i in queries], seed, rendered=False)
+        return QuerySet(changed, as_taken, relation, in_order=is_query is None)
+
+    return TestSet(source.name, query_set)
+
+
+def _town(
+    name: str,
+    seed: int,
+    aliased: bool,
+    places: int,
+    cache: Path,
+    *,
+    threads: int,
+    progress_bar: ProgressBar,
+) -> TestSet:
+    from vslam.datasets.synthetic import built_in_route, store
+    from vslam.datasets.synthetic.pairs import Moves, render_pairs
+    from vslam.datasets.synthetic.site import Variation
+
+    def query_set(condition: Condition, draw: int) -> QuerySet | None:
+        change, view = condition.change, condition.view
+        town = f"{name}-seed{seed}{'-aliased' if aliased else ''}-{places}"
+        folder = store.place_folder(cache) / f"{town}-view{view:g}-change{change:g}"
+        if not (folder / "pairs.csv").exists():
+            variation = Variation(seed, aliased, change)
+            moves = Moves(condition.lateral, condition.heading)
+            with progress_bar(f"rendering {folder.name}", places) as advance:
+                render_pairs(
+                    built_in_route(name), variation, folder, places, moves,
+                    kinds=("shift",), threads=threads, on_frame=lambda done, of: advance(),
+                )  # fmt: skip
+        (source,) = open_source(f"pairs:{folder}")
+        assert source.is_query is not None
+        queries, gallery = np.flatnonzero(source.is_query), np.flatnonzero(~source.is_query)
+        changed = apply(condition, [source.grey(int(i)) for i in queries], draw, rendered=True)
+        relation = source.relation[np.ix_(queries, gallery)]
+        return QuerySet(changed, [source.grey(int(i)) for i in gallery], relation)
+
+    return TestSet(f"{name} {'aliased ' if aliased else ''}town {seed}", query_set)

@@ -1,0 +1,100 @@
+"""Images reduced to thumbnails and correlated: a detector that was never trained on anything.
+
+As the simple mode of cuVSLAM (libs/slam/vpr, version 17): a grey image about eight times smaller,
+compared by zero-mean normalised cross-correlation, so that gain and offset do not matter. cuVSLAM
+compares thumbnails in place; here, as in OpenRatSLAM (Ball et al., Autonomous Robots 2013), the
+view may be shifted by a few pixels, and the score is the highest correlation.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.lab.loopbench.conditions import Image
+from vslam.lab.loopbench.detectors import DescribedImage
+
+Float = NDArray[np.float32]
+
+_WIDTH, _HEIGHT = 128, 48  # pixels
+_ASIDE, _UP, _STEP = 8, 2, 2  # pixels of shift, and between the shifts tried
+_FLAT = 1.0  # grey levels: length below which a part shows nothing
+_TOGETHER = 16  # queries compared at a time, for memory
+# The parts of a thumbnail that the middle of another one is compared with; the middle is the 14th.
+_PARTS = tuple(
+    (slice(_UP + up, _HEIGHT - _UP + up), slice(_ASIDE + aside, _WIDTH - _ASIDE + aside))
+    for up in range(-_UP, _UP + 1, _STEP)
+    for aside in range(-_ASIDE, _ASIDE + 1, _STEP)
+)
+_MIDDLE = _PARTS[len(_PARTS) // 2]
+
+
+class Gallery(NamedTuple):
+    """``rows`` (G, 6144) f4 thumbnails less their means; ``length`` (27, G) f4 of each part less
+    its own."""
+
+    rows: Float
+    length: Float
+
+
+class ThumbnailScorer:
+    """See :class:`vslam.lab.loopbench.detectors.Scorer`."""
+
+    name = "thumbnail"
+    probability = False
+
+    def store(self, gallery: list[DescribedImage]) -> Gallery:
+        """See :func:`remember`."""
+        return remember(np.stack([thumbnail(one.image) for one in gallery]))
+
+    def scores(self, queries: list[DescribedImage], stored: Gallery) -> NDArray[np.float64]:
+        """See :func:`correlations`."""
+        return correlations(np.stack([thumbnail(one.image) for one in queries]), stored)
+
+
+def thumbnail(image: Image) -> Float:
+    """The image ``(H, W)`` in ``(48, 128)`` float32."""
+    import cv2
+
+    small = cv2.resize(image, (_WIDTH, _HEIGHT), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.float32)
+
+
+def remember(thumbnails: Float) -> Gallery:
+    """What correlation needs of thumbnails ``(G, 48, 128)``."""
+    rows = _centred(thumbnails)
+    length = [np.linalg.norm(_centred(thumbnails[:, y, x]), axis=1) for y, x in _PARTS]
+    return Gallery(rows, np.maximum(np.stack(length), _FLAT))
+
+
+def correlations(queries: Float, gallery: Gallery) -> NDArray[np.float64]:
+    """``(Q, G)`` highest correlation of a query's middle with a part of that size, -1 to 1.
+
+    Args:
+        queries: thumbnails ``(Q, 48, 128)``.
+        gallery: of :func:`remember`.
+    """
+    middle = _centred(queries[:, *_MIDDLE])
+    middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), _FLAT)
+    middle = middle.reshape(queries[:, *_MIDDLE].shape)
+    best = [_best(middle[k : k + _TOGETHER], gallery) for k in range(0, len(middle), _TOGETHER)]
+    return np.concatenate(best).astype(np.float64)
+
+
+def _best(middle: Float, gallery: Gallery) -> Float:
+    # The middle has mean 0: the mean of the part that it is laid on does not matter.
+    laid = np.zeros((len(middle), len(_PARTS), _HEIGHT, _WIDTH), np.float32)
+    for k, (y, x) in enumerate(_PARTS):
+        laid[:, k, y, x] = middle
+    product = laid.reshape(-1, _HEIGHT * _WIDTH) @ gallery.rows.T
+    best: Float = (product.reshape(len(middle), len(_PARTS), -1) / gallery.length).max(1)
+    return best
+
+
+def _centred(images: Float) -> Float:
+    """``(N, D)`` with mean 0 each."""
+    rows = images.reshape(len(images), -1)
+    centred: Float = rows - rows.mean(1, keepdims=True)
+    return centred

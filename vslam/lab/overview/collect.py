@@ -1,0 +1,230 @@
+"""Finished runs found on disk, of vslam and of other systems, reduced to what is compared."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from vslam.errors import InputError
+from vslam.evaluation.trajectories import evaluate_trajectory
+from vslam.lab.overview.schema import MEASURES, Drive, RunEntry
+from vslam.report.schema import ReportJson
+from vslam.run.outcome import alignment_of
+from vslam.trajectory import Trajectory, read_trajectory
+from vslam.untrusted import require_utf8
+
+MONOCULAR = ", mono"  # ends the name of a monocular system
+
+
+@dataclass(frozen=True)
+class Found:
+    """Runs in the order found, notes about what was left out, and files of trajectories.
+
+    Attributes:
+        estimate: the trajectory of each run by its ``source``.
+        truth: the folder of a run with the ground truth of each (dataset, place).
+    """
+
+    runs: list[RunEntry]
+    notes: list[str]
+    estimate: dict[str, Path] = field(default_factory=dict)
+    truth: dict[tuple[str, str], Path] = field(default_factory=dict)
+
+
+def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
+    """Read every run below ``folders`` and evaluate ``trajectories`` on the same sequences.
+
+    Interrupted runs and reports that this version cannot read are left out, with a note.
+
+    Raises:
+        InputError: a folder is not there, none holds a finished run, or a trajectory cannot be
+            read or placed.
+    """
+    found = Found([], [])
+    configs: dict[str, Path] = {}
+    for folder in _run_folders(folders):
+        report = _read(folder, found.notes)
+        if report is None:
+            continue
+        try:
+            entry = _entry(report, folder)
+        except InputError as error:
+            found.notes.append(f"{folder} is left out: {error}")
+            continue
+        found.runs.append(entry)
+        found.estimate[entry.source] = folder / "trajectory.tum"
+        if (folder / "ground_truth_kitti.txt").is_file():
+            found.truth.setdefault((entry.drive.dataset, entry.drive.place), folder)
+        if (folder / "config.json").is_file():
+            configs.setdefault((folder / "config.json").read_text(errors="replace"), folder)
+    if not found.runs:
+        raise InputError(
+            f"{', '.join(map(str, folders))}: no finished run here; name folders that 'vslam run' "
+            "or 'vslam bench' wrote."
+        )
+    if len(configs) > 1:
+        found.notes.append(
+            f"runs with {len(configs)} different sets of thresholds are in one table: "
+            + ", ".join(str(folder / "config.json") for folder in configs.values())
+        )
+    for text in trajectories:
+        _add_external(text, found)
+    return found
+
+
+def read_aligned(found: Found, run: RunEntry) -> tuple[Trajectory, Trajectory | None]:
+    """The trajectory of a run, aligned where there is a ground truth, and that ground truth.
+
+    Raises:
+        InputError: a file is missing or malformed.
+    """
+    truth = _truth(found, run.drive)
+    times = truth.timestamps if truth is not None else None
+    estimate = read_trajectory(found.estimate[run.source], times)
+    if truth is None:
+        return estimate, None
+    try:
+        evaluation = evaluate_trajectory(estimate, truth, run.alignment)
+    except InputError:  # too short to align
+        return estimate, None
+    # Matched by time, an estimate may have fewer poses than the truth; only places are drawn.
+    return Trajectory(estimate.timestamps[: evaluation.frames], evaluation.T_wc_aligned), truth
+
+
+def _run_folders(folders: Collection[Path]) -> list[Path]:
+    found: dict[Path, Path] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"{folder}: no such folder; name folders of runs.")
+        for path in sorted(folder.rglob("report.json")):
+            require_utf8(path)
+            if not any(part.startswith(".") for part in path.relative_to(folder).parts):
+                found.setdefault(path.parent.resolve(), path.parent)
+    return list(found.values())
+
+
+def _read(folder: Path, notes: list[str]) -> ReportJson | None:
+    path = folder / "report.json"
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        notes.append(f"{path} is damaged and left out")
+        return None
+    if isinstance(content, dict) and content.get("kind") == "overview":
+        return None
+    try:
+        report = ReportJson.model_validate(content)
+    except ValidationError:
+        version = content.get("schema_version") if isinstance(content, dict) else None
+        notes.append(f"{path} is of another version of vslam (schema {version}) and left out")
+        return None
+    if report.interrupted:
+        notes.append(f"{folder} was interrupted ({report.interrupted}) and left out")
+        return None
+    return report
+
+
+def _entry(report: ReportJson, folder: Path) -> RunEntry:
+    parts = [f"frames from {report.start}"] if report.start else []
+    parts += [f"every {report.every}"] if report.every > 1 else []
+    parts += [f"{report.max_frames} frames"] if report.max_frames else []
+    detector = report.detector + (MONOCULAR if report.sensor == "mono" else "")
+    sequence, town = report.sequence, None
+    laws: list[str] = []
+    if report.dataset == "synthetic":
+        from vslam.datasets.synthetic import parse_drive  # and with it the renderer
+
+        # What changes a rendered town is a perturbation, too: 05+change:0.5 is the route 05.
+        town = parse_drive(sequence)[1].seed
+        sequence, *parts_of_town = sequence.split("+")
+        laws = [part for part in parts_of_town if not part.startswith("seed:")]
+    if report.perturb != "none":
+        laws.append(report.perturb)
+    return RunEntry(
+        drive=Drive(
+            dataset=report.dataset,
+            sequence=sequence,
+            excerpt=", ".join(parts),
+            perturb=",".join(laws) or "none",
+        ),
+        system=detector,
+        seed=report.seed,
+        town=town,
+        alignment=alignment_of(report.sensor),
+        frames=report.frames,
+        measures={name: getattr(report, name) for name, *_ in MEASURES},
+        source=str(folder),
+        machine=f"{report.machine.cpu}, {report.machine.cores} cores, {report.threads} threads",
+    )
+
+
+def _add_external(text: str, found: Found) -> None:
+    name, separator, file = text.partition("=")
+    system, *where = name.split("@")
+    if not (separator and system and file) or len(where) > 2:
+        raise InputError(
+            f"--trajectory {text}: write NAME=FILE, or NAME@SEQUENCE@PERTURB=FILE to say of what."
+        )
+    perturb = where[1] if len(where) == 2 else "none"
+    places = {
+        (run.drive.dataset, run.drive.sequence, run.drive.excerpt): None
+        for run in found.runs
+        if not where or run.drive.sequence == where[0]
+    }
+    if len(places) != 1:
+        known = ", ".join(dict.fromkeys(run.drive.sequence for run in found.runs))
+        fix = "two excerpts of it are there" if places and where else f"one of {known}"
+        raise InputError(
+            f"--trajectory {text}: of which sequence? name it, {system}@SEQUENCE=FILE ({fix})."
+        )
+    dataset, sequence, excerpt = next(iter(places))
+    drive = Drive(dataset=dataset, sequence=sequence, excerpt=excerpt, perturb=perturb)
+    truth = _truth(found, drive)
+    if truth is None:
+        raise InputError(f"--trajectory {text}: none of the runs of {sequence} has a ground truth.")
+    path = Path(file)
+    alignment = _alignment_of_external(system, drive, found)
+    evaluation = evaluate_trajectory(read_trajectory(path, truth.timestamps), truth, alignment)
+    if evaluation.frames < len(truth):
+        found.notes.append(
+            f"{system} has a pose for {evaluation.frames} of {len(truth)} frames of {drive.place}, "
+            f"{perturb}: its errors are of those, where vslam's are of all"
+        )
+    measures: dict[str, float | None] = {
+        measure: getattr(evaluation, measure, None) for measure, *_ in MEASURES
+    }
+    source = f"{system}: {path}"
+    found.runs.append(
+        RunEntry(
+            drive=drive,
+            system=system,
+            seed=None,
+            alignment=alignment,
+            frames=evaluation.frames,
+            measures=measures,
+            source=source,
+            machine=None,
+        )
+    )
+    found.estimate[source] = path
+
+
+def _alignment_of_external(system: str, drive: Drive, found: Found) -> str:
+    """That of vslam's runs of the same place. Where some of them are monocular and some are not,
+    a name that ends as those of monocular runs do decides."""
+    there = {run.alignment for run in found.runs if run.drive.place == drive.place}
+    if len(there) == 1:
+        return there.pop()
+    return alignment_of("mono" if system.endswith(MONOCULAR) else "stereo")
+
+
+def _truth(found: Found, drive: Drive) -> Trajectory | None:
+    folder = found.truth.get((drive.dataset, drive.place))
+    if folder is None:
+        return None
+    times = read_trajectory(folder / "trajectory.tum").timestamps
+    return read_trajectory(folder / "ground_truth_kitti.txt", times)

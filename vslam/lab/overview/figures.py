@@ -1,0 +1,218 @@
+"""The figures of many runs: errors by sequence, strength curves, trajectories from above."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib import style
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from vslam.errors import InputError
+from vslam.lab.overview.collect import Found, read_aligned
+from vslam.lab.overview.schema import Drive, OverviewJson, Row, RunEntry
+from vslam.lab.overview.summary import strengths, systems
+from vslam.report.drawing import (
+    AMBER,
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    LOW,
+    RED,
+    SQUARE,
+    STYLE,
+    VIOLET,
+    ReportFigure,
+    add_legend,
+    new_figure,
+    plain_ticks,
+    save,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_COLORS = [AMBER, BLUE, GREEN, VIOLET, RED, "#06b6d4", "#ec4899", "#84cc16"]
+_MIN_STRENGTHS = 2  # not counting none
+_DASHES = ["-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1))]  # where lines cover each other
+
+Drawing = tuple[str, str, Figure]
+Looks = Mapping[str, tuple[str, Any]]  # colour and dashes of each system
+
+
+def draw_overview(report: OverviewJson, found: Found) -> list[ReportFigure]:
+    """Draw all that there is data for, in the order of the report."""
+    looks = {
+        name: (_COLORS[k % len(_COLORS)], _DASHES[k % len(_DASHES)])
+        for k, name in enumerate(systems(report.rows))
+    }
+    with style.context(STYLE, after_reset=True):
+        return [
+            save(_identifier(name), caption, figure)
+            for drawings in (
+                _errors(report.rows, looks),
+                _curves(report.rows, looks),
+                _paths(report, found, looks),
+            )
+            for name, caption, figure in drawings
+        ]
+
+
+def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
+    """ATE by sequence: one figure for each perturbation."""
+    for perturb in dict.fromkeys(row.drive.perturb for row in rows):
+        known = [r for r in rows if r.drive.perturb == perturb and r.measures["ate_rmse_m"]]
+        places = list(dict.fromkeys((row.drive.dataset, row.drive.place) for row in known))
+        if not places:
+            continue
+        figure, axes = new_figure(f"ATE, {_light(perturb)}", "sequence", "ATE RMSE (m)", LOW)
+        names = systems(known)
+        for k, name in enumerate(names):
+            mine = [row for row in known if row.system == name]
+            at = np.array([places.index((r.drive.dataset, r.drive.place)) for r in mine], float)
+            at += 0.6 * ((k + 0.5) / len(names) - 0.5)
+            median, least, greatest = _spreads(mine, "ate_rmse_m")
+            axes.vlines(at, least, greatest, color=looks[name][0], linewidth=2.2, alpha=0.5)
+            axes.plot(at, median, "o", color=looks[name][0], markersize=5, label=name)
+        _logarithmic(axes)
+        axes.set_xticks(range(len(places)), [place for _, place in places])
+        axes.set_xlim(-0.5, len(places) - 0.5)
+        axes.grid(visible=False, axis="x")
+        add_legend(figure, axes)
+        yield (
+            f"ate-{perturb}",
+            "Medians over runs; lines from the least to the greatest. Logarithmic.",
+            figure,
+        )
+
+
+def _curves(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
+    """ATE and loops against the strength of a law, one figure for each law and sequence."""
+    laws = {
+        law.partition(":")[0]: None
+        for row in rows
+        for law in row.drive.perturb.split(",")
+        if law != "none"
+    }
+    for law in laws:
+        strength = strengths((row.drive for row in rows), law)
+        places = {(d.dataset, d.sequence, d.excerpt): d for d, s in strength.items() if s > 0}
+        for key, place in places.items():
+            mine = [
+                row
+                for row in rows
+                if row.drive in strength
+                and (row.drive.dataset, row.drive.sequence, row.drive.excerpt) == key
+            ]
+            if len({strength[row.drive] for row in mine} - {0.0}) < _MIN_STRENGTHS:
+                continue
+            yield (
+                f"strength-{law}-{place.dataset}-{place.place}",
+                "Medians over runs, shaded from the least to the greatest. Strength 0: the images "
+                "as they are.",
+                _curve(f"{place.place}: {law}", mine, strength, looks),
+            )
+
+
+def _curve(
+    title: str,
+    rows: list[Row],
+    strength: dict[Drive, float],
+    looks: Looks,
+) -> Figure:
+    figure, axes = new_figure(title, "", "ATE RMSE (m)", 1.7 * LOW)
+    axes.remove()
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
+    for name in systems(rows):
+        mine = sorted((r for r in rows if r.system == name), key=lambda r: strength[r.drive])
+        color, dashes = looks[name]
+        for axes, measure in ((upper, "ate_rmse_m"), (lower, "loops_found")):
+            some = [row for row in mine if row.measures[measure]]
+            if not some or (measure == "loops_found" and name == "none"):
+                continue
+            at = [strength[row.drive] for row in some]
+            median, least, greatest = _spreads(some, measure)
+            axes.fill_between(at, least, greatest, color=color, alpha=0.16, linewidth=0)
+            label = name if axes is upper else "_again"  # one entry of the legend for both
+            axes.plot(at, median, "o", linestyle=dashes, color=color, markersize=4, label=label)
+    upper.set_ylabel("ATE RMSE (m)")
+    lower.set(xlabel="strength", ylabel="loops found")
+    lower.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+    for axes in (upper, lower):
+        axes.set_ylim(bottom=0)
+        axes.tick_params(length=3)
+    add_legend(figure, upper)
+    return figure
+
+
+def _paths(report: OverviewJson, found: Found, looks: Looks) -> Iterator[Drawing]:
+    """The run with the median ATE of each system, one figure for each drive."""
+    for drive in dict.fromkeys(row.drive for row in report.rows):
+        figure, axes = new_figure(
+            f"{drive.place}, {_light(drive.perturb)}", "x (m)", "z (m)", SQUARE
+        )
+        rows = [row for row in report.rows if row.drive == drive]
+        if not _draw_paths(axes, rows, found, looks):
+            continue
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.margins(0.06)
+        add_legend(figure, axes)
+        yield (
+            f"path-{drive.dataset}-{drive.place}-{drive.perturb}",
+            "From above, aligned to the ground truth; of each system the run with the median ATE.",
+            figure,
+        )
+
+
+def _draw_paths(axes: Axes, rows: list[Row], found: Found, looks: Looks) -> int:
+    drawn = 0
+    for row in rows:
+        runs = [r for r in found.runs if r.drive == row.drive and r.system == row.system]
+        try:
+            estimate, truth = read_aligned(found, _median_run(runs))
+        except InputError as error:
+            found.notes.append(f"no path of {row.system} on {row.drive.place}: {error}")
+            continue
+        if truth is not None and not drawn:
+            x, z = truth.T_wc[:, 0, 3], truth.T_wc[:, 2, 3]
+            axes.plot(x, z, color=GREY, linewidth=3.4, alpha=0.65, label="truth")
+            axes.plot(x[:1], z[:1], "o", color=INK, markersize=5, zorder=4, label="start")
+        color, dashes = looks[row.system]
+        x, z = estimate.T_wc[:, 0, 3], estimate.T_wc[:, 2, 3]
+        axes.plot(x, z, color=color, linestyle=dashes, label=row.system)
+        drawn += 1
+    return drawn
+
+
+def _median_run(runs: Iterable[RunEntry]) -> RunEntry:
+    def ate(run: RunEntry) -> float:
+        value = run.measures["ate_rmse_m"]
+        return float("inf") if value is None else value
+
+    ordered = sorted(runs, key=ate)
+    return ordered[(len(ordered) - 1) // 2]
+
+
+def _spreads(rows: list[Row], measure: str) -> np.ndarray:
+    spreads = [s for row in rows if (s := row.measures[measure]) is not None]
+    return np.array([(s.median, s.least, s.greatest) for s in spreads]).T
+
+
+def _logarithmic(axes: Axes) -> None:
+    """A logarithmic axis from at least a third to three times the data, in plain numbers."""
+    low, high = axes.dataLim.intervaly
+    axes.set_yscale("log")
+    axes.set_ylim(max(low, 1e-4) / 3.0, max(high, 1e-4) * 3.0)
+    plain_ticks(axes.yaxis)
+
+
+def _light(perturb: str) -> str:
+    return "images as they are" if perturb == "none" else perturb
+
+
+def _identifier(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")

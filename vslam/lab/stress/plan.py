@@ -1,0 +1,150 @@
+"""Searches in progress: which cells they want next, and what they have found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from vslam.datasets.perturbation import all_laws, law_kind, parse_perturbation
+from vslam.errors import InputError
+from vslam.lab.bench.grid import Cell, draws
+from vslam.lab.stress.criterion import Criterion
+from vslam.lab.stress.kitti_c import CORRUPTIONS
+from vslam.lab.stress.search import Boundary, boundary, next_position, strength_at
+from vslam.report.schema import ReportJson
+
+Reports = Callable[[Cell], ReportJson | str | None]
+"""The report of a finished cell, why it failed, or None if it has not run."""
+
+
+@dataclass
+class Search:
+    """One law, sequence, system and seed.
+
+    Attributes:
+        clean: the cell on the images as they are.
+        seed: of the perturbation.
+        law: by name.
+        verdicts: by position, of what was tested.
+        tested: its cells, by position.
+    """
+
+    clean: Cell
+    law: str
+    seed: int
+    steps: int
+    verdicts: dict[float, str] = field(default_factory=dict)
+    tested: dict[float, Cell] = field(default_factory=dict)
+
+    def cell(self, position: float) -> Cell:
+        """The run at a position from 0, weakest, to 1, strongest."""
+        strength = strength_at(law_kind(self.law), position)
+        name = parse_perturbation(f"{self.law}:{strength:g}", self.seed).name
+        return replace(self.clean, perturb=name, seed=self.seed)
+
+    def wants(self) -> Cell | None:
+        """The next cell to run, None at the end."""
+        position = next_position({p: bool(v) for p, v in self.verdicts.items()}, self.steps)
+        return None if position is None else self.cell(position)
+
+    def advance(self, reports: Reports, criterion: Criterion) -> bool:
+        """Judge what has run; whether anything had."""
+        moved = False
+        clean = reports(self.clean)
+        while isinstance(clean, ReportJson):
+            states = {p: bool(v) for p, v in self.verdicts.items()}
+            position = next_position(states, self.steps)
+            if position is None:
+                break
+            cell = self.cell(position)
+            found = reports(cell)
+            if found is None:
+                break
+            verdict = found if isinstance(found, str) else criterion.verdict(found, clean)
+            self.verdicts[position], self.tested[position] = verdict, cell
+            moved = True
+        return moved
+
+    @property
+    def boundary(self) -> Boundary:
+        """What was found, when the search has ended."""
+        return boundary(self.verdicts, law_kind(self.law), self.steps)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be found out.
+
+    Attributes:
+        laws: to search boundaries of, by name.
+        systems: loop detectors of vslam, and names of other systems.
+        repeated: those systems that differ from run to run: they get all seeds under every law.
+        preset: ``kitti-c`` for fixed severities, or None.
+        sensor: ``mono`` for the left camera alone, None for all that the data has.
+        baseline: the system that errors of a preset are set against.
+    """
+
+    dataset: str
+    sequences: tuple[str, ...]
+    laws: tuple[str, ...]
+    systems: tuple[str, ...]
+    seeds: int
+    steps: int
+    max_frames: int | None
+    baseline: str
+    criterion: Criterion
+    repeated: tuple[str, ...] = ()
+    preset: str | None = None
+    sensor: str | None = None
+
+    def clean_cells(self) -> list[Cell]:
+        """Each system on the images as they are."""
+        return [
+            Cell(self.dataset, sequence, "none", system, 0, self.max_frames, sensor=self.sensor)
+            for sequence in self.sequences
+            for system in self.systems
+        ]
+
+    def searches(self) -> list[Search]:
+        """All searches. A law that draws nothing is searched once, save for systems that differ
+        from run to run."""
+        return [
+            Search(clean, law, seed, self.steps)
+            for seed in range(self.seeds)
+            for law in self.laws
+            for clean in self.clean_cells()
+            if seed == 0 or law_kind(law).drawn or clean.detector in self.repeated
+        ]
+
+    def preset_cells(self) -> list[Cell]:
+        """The runs of the preset, none without one."""
+        if self.preset is None:
+            return []
+        specs = [spec for corruption in CORRUPTIONS.values() for spec in corruption.perturbations]
+        return [
+            replace(clean, perturb=spec, seed=seed)
+            for seed in range(self.seeds)
+            for spec in specs
+            for clean in self.clean_cells()
+            if seed == 0 or draws(spec) or clean.detector in self.repeated
+        ]
+
+
+def parse_laws(text: str) -> list[str]:
+    """``fog,rain`` or ``all``.
+
+    Raises:
+        InputError: an unknown law, or none.
+    """
+    names = list(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+    if names == ["all"]:
+        return list(all_laws())
+    for name in names:
+        if name not in all_laws():
+            raise InputError(
+                f"--laws {text}: unknown law '{name}'; choose from all, {', '.join(all_laws())}; "
+                "their strengths are searched for."
+            )
+    if not names:
+        raise InputError("--laws: no law; name some, fog,rain for example, or all.")
+    return names

@@ -1,0 +1,91 @@
+"""Runs searches to their end, all that are open at a time: each round runs what they want next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Generator, Iterable
+from contextlib import closing
+from pathlib import Path
+
+from vslam.lab.bench.execute import CellOutcome, Failed
+from vslam.lab.bench.grid import Cell, is_finished, read_report
+from vslam.lab.stress.criterion import Criterion
+from vslam.lab.stress.plan import Search
+from vslam.report.schema import ReportJson
+
+RunCells = Callable[[Collection[Cell]], Generator[CellOutcome, None, None]]
+
+
+class Results:
+    """Reports of cells by cell: those in the folder, and failures of this session."""
+
+    def __init__(self, out: Path, config: str) -> None:
+        self._out, self._config = out, config
+        self._known: dict[Cell, ReportJson | str] = {}
+
+    def __call__(self, cell: Cell) -> ReportJson | str | None:
+        """The report of a cell, why it failed, or None if it has not run."""
+        if cell not in self._known:
+            folder = self._out / cell.name
+            if not is_finished(cell, folder, self._config):
+                return None
+            report = read_report(folder)
+            assert report is not None
+            self._known[cell] = report
+        return self._known[cell]
+
+    def add(self, outcome: CellOutcome) -> None:
+        """Take note of a cell that has ended."""
+        if isinstance(outcome, Failed):
+            self._known[outcome.cell] = outcome.message
+        else:
+            self._known.pop(outcome.cell, None)
+
+
+def run_all(
+    clean: Collection[Cell],
+    searches: Collection[Search],
+    others: Iterable[Cell],
+    results: Results,
+    criterion: Criterion,
+    run: RunCells,
+    say: Callable[[str], None] = lambda line: None,
+) -> None:
+    """Run the clean cells, then round after round what searches want, then ``others``.
+
+    What is finished already is not run again, whichever command made it.
+    """
+    _run(clean, results, run, say)
+    while True:
+        for search in searches:
+            search.advance(results, criterion)
+        wanted = list(dict.fromkeys(cell for s in searches if (cell := _wanted(s, results))))
+        if not wanted:
+            break
+        _run(wanted, results, run, say)
+    _run(list(dict.fromkeys(others)), results, run, say)
+
+
+def _wanted(search: Search, results: Results) -> Cell | None:
+    """A search without a clean run has nothing to compare with, and ends."""
+    return search.wants() if isinstance(results(search.clean), ReportJson) else None
+
+
+def _run(
+    cells: Collection[Cell], results: Results, run: RunCells, say: Callable[[str], None]
+) -> None:
+    missing = [cell for cell in cells if results(cell) is None]
+    if not missing:
+        return
+    with closing(run(missing)) as outcomes:
+        for k, outcome in enumerate(outcomes, start=1):
+            results.add(outcome)
+            failed = f"failed: {outcome.message}" if isinstance(outcome, Failed) else None
+            said = failed or _said(results(outcome.cell))
+            say(f"{k}/{len(missing)} {outcome.cell.name}: {said}")
+
+
+def _said(report: ReportJson | str | None) -> str:
+    if not isinstance(report, ReportJson):
+        return "finished"
+    ate = "no ATE" if report.ate_rmse_m is None else f"ATE {report.ate_rmse_m:.3f} m"
+    return f"{ate}, {report.lost_frames} lost"

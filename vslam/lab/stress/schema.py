@@ -1,0 +1,79 @@
+"""The schema of ``stress.json``: no times, no machine; equal runs give equal bytes."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Tested(_Model):
+    """One run at one strength; ``verdict`` says why it failed, empty if it held."""
+
+    strength: float
+    verdict: str
+    lost_percent: float | None = None
+    ate_rmse_m: float | None = None
+    causal_ate_rmse_m: float | None = None
+    loops_closed: int | None = None
+
+
+class BoundaryEntry(_Model):
+    """One search: see :class:`vslam.lab.stress.search.Boundary`."""
+
+    dataset: str
+    sequence: str
+    law: str
+    unit: str
+    system: str
+    seed: int
+    holds_to: float | None
+    fails_at: float | None
+    reason: str
+    also_failed: tuple[float, ...]
+    tested: list[Tested]
+
+
+class CleanEntry(_Model):
+    """The run of a system on the images as they are, which limits are taken from."""
+
+    dataset: str
+    sequence: str
+    system: str
+    frames: int
+    lost_frames: int
+    ate_rmse_m: float | None
+    causal_ate_rmse_m: float | None
+    ate_limit_m: float | None
+    loops_found: int | None
+
+
+class CorruptionEntry(_Model):
+    """One corruption of a preset: ATE summed over severities, medians over seeds, by system, and
+    that in percent of the baseline's; None without a law, or without an ATE."""
+
+    sequence: str
+    corruption: str
+    specs: tuple[str, ...]
+    note: str
+    ate_sum_m: dict[str, float | None]
+    error_percent: dict[str, float | None]
+    lost_percent: dict[str, float | None]
+
+
+class StressJson(_Model):
+    """A stress test."""
+
+    kind: str = "stress"
+    schema_version: int = 1
+    criterion: str
+    steps: int
+    max_frames: int | None
+    notes: list[str]
+    clean: list[CleanEntry]
+    boundaries: list[BoundaryEntry]
+    preset: str | None = None
+    baseline: str | None = None
+    corruptions: list[CorruptionEntry] = []

@@ -1,0 +1,165 @@
+"""From finished searches to the numbers of the report."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Collection, Mapping
+
+from vslam.datasets.perturbation import law_kind
+from vslam.lab.bench.grid import Cell
+from vslam.lab.stress.criterion import Criterion
+from vslam.lab.stress.kitti_c import CORRUPTIONS, Corruption
+from vslam.lab.stress.plan import Plan, Reports, Search
+from vslam.lab.stress.schema import BoundaryEntry, CleanEntry, CorruptionEntry, StressJson, Tested
+from vslam.lab.stress.search import strength_at
+from vslam.report.schema import ReportJson
+
+
+def summarise(
+    plan: Plan, searches: Collection[Search], reports: Reports, notes: list[str]
+) -> StressJson:
+    """All that is known, of searches that have ended; ``notes`` are added to."""
+    clean = plan.clean_cells()
+    failed = [(cell, found) for cell in clean if isinstance(found := reports(cell), str)]
+    notes = [*notes, *(f"{cell.name} is left out, it fails on clean images: {why}"
+                       for cell, why in failed)]  # fmt: skip
+    ended = [s for s in searches if isinstance(reports(s.clean), ReportJson) and s.wants() is None]
+    return StressJson(
+        criterion=plan.criterion.words,
+        steps=plan.steps,
+        max_frames=plan.max_frames,
+        notes=notes,
+        clean=clean_entries(clean, reports, plan.criterion),
+        boundaries=[boundary_entry(search, reports) for search in ended],
+        preset=plan.preset,
+        baseline=plan.baseline if plan.preset else None,
+        corruptions=corruption_entries(plan.preset_cells(), reports, plan.baseline)
+        if plan.preset
+        else [],
+    )
+
+
+def clean_entries(
+    cells: Collection[Cell], reports: Reports, criterion: Criterion
+) -> list[CleanEntry]:
+    """The clean runs that there are."""
+    return [
+        CleanEntry(
+            dataset=cell.dataset,
+            sequence=cell.sequence,
+            system=cell.detector,
+            frames=report.frames,
+            lost_frames=report.lost_frames,
+            ate_rmse_m=report.ate_rmse_m,
+            causal_ate_rmse_m=report.causal_ate_rmse_m,
+            ate_limit_m=criterion.ate_limit(report),
+            loops_found=report.loops_found,
+        )
+        for cell in cells
+        if isinstance(report := reports(cell), ReportJson)
+    ]
+
+
+def boundary_entry(search: Search, reports: Reports) -> BoundaryEntry:
+    """What a search that has ended has found."""
+    found, kind = search.boundary, law_kind(search.law)
+    return BoundaryEntry(
+        dataset=search.clean.dataset,
+        sequence=search.clean.sequence,
+        law=search.law,
+        unit=kind.unit,
+        system=search.clean.detector,
+        seed=search.seed,
+        holds_to=found.holds_to,
+        fails_at=found.fails_at,
+        reason=found.reason,
+        also_failed=found.also_failed,
+        tested=[
+            _tested(strength_at(kind, position), search.verdicts[position], reports(cell))
+            for position, cell in sorted(search.tested.items())
+        ],
+    )
+
+
+def _tested(strength: float, verdict: str, report: ReportJson | str | None) -> Tested:
+    if not isinstance(report, ReportJson):
+        return Tested(strength=strength, verdict=verdict)
+    return Tested(
+        strength=strength,
+        verdict=verdict,
+        lost_percent=lost_percent(report),
+        ate_rmse_m=report.ate_rmse_m,
+        causal_ate_rmse_m=report.causal_ate_rmse_m,
+        loops_closed=report.loops_closed if report.loops_missed is not None else None,
+    )
+
+
+def lost_percent(report: ReportJson) -> float:
+    """Of the frames that came."""
+    return 100.0 * report.lost_frames / max(1, report.frames - report.dropped_frames)
+
+
+def corruption_entries(
+    cells: Collection[Cell], reports: Reports, baseline: str
+) -> list[CorruptionEntry]:
+    """Errors by corruption against a baseline (mCE, Hendrycks and Dietterich, ICLR 2019)."""
+    systems = list(dict.fromkeys(cell.detector for cell in cells))
+    return [
+        _corruption(sequence, name, corruption, cells, reports, systems, baseline)
+        for sequence in dict.fromkeys(cell.sequence for cell in cells)
+        for name, corruption in CORRUPTIONS.items()
+    ]
+
+
+def _corruption(
+    sequence: str,
+    name: str,
+    corruption: Corruption,
+    cells: Collection[Cell],
+    reports: Reports,
+    systems: list[str],
+    baseline: str,
+) -> CorruptionEntry:
+    sums: dict[str, float | None] = {}
+    lost: dict[str, float | None] = {}
+    for system in systems:
+        ates, losses = [], []
+        for spec in corruption.perturbations:
+            found = [
+                report
+                for cell in cells
+                if (cell.sequence, cell.detector, cell.perturb) == (sequence, system, spec)
+                and isinstance(report := reports(cell), ReportJson)
+            ]
+            known = [report.ate_rmse_m for report in found if report.ate_rmse_m is not None]
+            # Without its failed seeds a system that breaks would look better than one that holds.
+            all_known = bool(known) and len(known) == len(found)
+            ates.append(statistics.median(known) if all_known else None)
+            losses += [lost_percent(report) for report in found]
+        complete = bool(ates) and None not in ates
+        sums[system] = sum(a for a in ates if a is not None) if complete else None
+        lost[system] = statistics.fmean(losses) if losses else None
+    base = sums.get(baseline)
+    return CorruptionEntry(
+        sequence=sequence,
+        corruption=name,
+        specs=corruption.specs,
+        note=corruption.note,
+        ate_sum_m=sums,
+        error_percent={
+            system: 100.0 * value / base if value is not None and base else None
+            for system, value in sums.items()
+        },
+        lost_percent=lost,
+    )
+
+
+def mean_error(entries: Collection[CorruptionEntry], system: str) -> float | None:
+    """mCE in percent: the mean over corruptions that every system has an error for."""
+    known = [e.error_percent[system] for e in entries if _complete(e.error_percent)]
+    values = [value for value in known if value is not None]
+    return statistics.fmean(values) if values else None
+
+
+def _complete(errors: Mapping[str, float | None]) -> bool:
+    return bool(errors) and all(value is not None for value in errors.values())

@@ -1,4 +1,4 @@
-"""Where the camera may be again, as far as odometry tells: what lies beyond is not compared."""
+"""Which keyframes the camera may see again, as far as odometry tells: no others are compared."""
 
 from __future__ import annotations
 
@@ -17,11 +17,16 @@ def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.
     are always within reach: where the camera was lost between them, their relative pose is unknown,
     and in a monocular map so is the ratio of their units.
 
+    Within a sub-map, a keyframe that looks another way than the camera is out of reach wherever it
+    lies: odometry knows directions to a few degrees, and nothing here recognises a place from
+    behind or from the side.
+
     Args:
         keyframe: where the camera is.
 
     Returns:
-        ``(n_keyframes,)`` in the unit of the map; 0 or less for those where the camera may be.
+        ``(n_keyframes,)`` in the unit of the map; 0 or less for those that the camera may see
+        again, infinite for those that look another way.
     """
     n, a = map_.n_keyframes, map_.arrays
     T = a.T_cw[:n]
@@ -36,6 +41,8 @@ def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.
         beyond = apart - config.reach - config.reach_share * way
     else:
         beyond = apart - config.monocular_reach_share * way
+    ahead = T[:, 2, :3]  # where each keyframe looks, in the world
+    beyond[ahead @ ahead[keyframe] < np.cos(np.radians(config.reach_angle))] = np.inf
     if map_.restarts:
         submap = map_.submaps()
         beyond[submap != submap[keyframe]] = 0.0

@@ -246,6 +246,19 @@ def test_reach_grows_with_the_way_and_knows_nothing_of_lost_cameras_and_units():
     assert beyond_reach(lost, 4, config)[3] == pytest.approx(70 - 20 - 7)
 
 
+def test_a_keyframe_that_looks_another_way_is_out_of_reach_if_the_way_between_is_known():
+    map_ = driven([0.0, 1.0, 2.0, 3.0])
+    for keyframe, degrees in enumerate([-70.0, 50.0, 180.0]):
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        map_.arrays.T_cw[keyframe, :3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    map_.arrays.T_cw[:3, :3, 3] = 0.0  # all at one place
+    beyond = beyond_reach(map_, 3, SiameseConfig(reach_angle=60.0))
+    assert (beyond > 0).tolist() == [True, False, True, False]
+    map_.restarts = [3]
+    map_.parents[:] = [0, 0, 1, 2]
+    assert (beyond_reach(map_, 3, SiameseConfig())[:3] == 0).all()
+
+
 def test_the_network_sees_nothing_until_the_camera_may_be_back():
     network = CountingNetwork()
     images = KeyframeImages(LocalDescriptors())

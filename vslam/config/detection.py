@@ -56,6 +56,9 @@ class SiameseConfig(Section):
     """Replaces `reach` and `reach_share` in monocular maps, which have no metres and whose unit
     drifts: only keyframes within this share of the way driven since are compared. It is twice what
     KITTI 00 needs, where the unit drifts by a factor of 2.3. [own]"""
+    reach_angle: float = Field(60.0, gt=0, le=180)
+    """Only keyframes are compared whose camera looks within this angle of where the query's does,
+    in degrees: no place is recognised from behind or from the side. [own]"""
     embedded_at_once: int = Field(8, ge=1)
     """Upper bound of the keyframes that the network processes for one query; the nearest ones are
     taken. [own]"""

@@ -9,19 +9,19 @@ from siamese_worlds import SMALL, small_network, views
 from torch.nn import functional
 
 from vslam.errors import InputError
-from vslam.loopclosure.siamese import capsules
-from vslam.loopclosure.siamese.branches import (
+from vslam.loopclosure.siamese.images import to_size
+from vslam.loopclosure.training import capsules
+from vslam.loopclosure.training.branches import (
     CapsuleBranch,
     CapsuleShape,
     standardised,
     textured,
 )
-from vslam.loopclosure.siamese.convolutional import alexnet
-from vslam.loopclosure.siamese.extractors import LIGHT_BLOCKS, grid_side
-from vslam.loopclosure.siamese.images import to_size
-from vslam.loopclosure.siamese.preprocessing import to_tensor
-from vslam.loopclosure.siamese.pruning import lowest, masked, mean_couplings, pruned
-from vslam.loopclosure.siamese.siamese import (
+from vslam.loopclosure.training.convolutional import alexnet
+from vslam.loopclosure.training.extractors import LIGHT_BLOCKS, grid_side
+from vslam.loopclosure.training.preprocessing import to_tensor
+from vslam.loopclosure.training.pruning import lowest, masked, mean_couplings, pruned
+from vslam.loopclosure.training.siamese import (
     build_network,
     for_inference,
     load_network,

@@ -205,7 +205,7 @@ def test_the_choices_of_detectors_are_those_of_the_registry():
 
 
 def test_the_choices_of_presets_are_those_of_the_settings():
-    from vslam.loopclosure.siamese.settings import PRESETS
+    from vslam.loopclosure.training.settings import PRESETS
 
     assert set(get_args(train.PresetName)) == set(PRESETS)
 

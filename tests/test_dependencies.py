@@ -71,10 +71,10 @@ STARTED = {
     ("vslam.run.warmup", "vslam.run.warmup"),
 }
 ONLY_IN = {
-    "torch": "vslam.loopclosure.siamese",
-    "torchvision": "vslam.loopclosure.siamese",
-    "onnx": ("vslam.loopclosure.siamese.export", "vslam.loopclosure.siamese.onnx_limits"),
-    "safetensors": "vslam.loopclosure.siamese.siamese",
+    "torch": "vslam.loopclosure.training",
+    "torchvision": "vslam.loopclosure.training",
+    "onnx": ("vslam.loopclosure.training.export", "vslam.loopclosure.siamese.onnx_limits"),
+    "safetensors": "vslam.loopclosure.training.siamese",
     "onnxruntime": "vslam.loopclosure.siamese.inference",
     "gtsam": "vslam.backend",
     "rerun": "vslam.run.recorder",
@@ -87,6 +87,7 @@ ONLY_IN = {
     "typer": "vslam.cli",
 }
 
+TRAINING = "vslam.loopclosure.training"
 # Imports torch inside its functions, and only after it has looked for it.
 TRAINING_COMMANDS = "vslam.cli.train"
 
@@ -252,8 +253,13 @@ def test_only_training_reaches_the_libraries_of_the_extra_train():
     while need - found:
         found |= need
         need = {m for m, targets in ARROWS.items() if targets & (found - {TRAINING_COMMANDS})}
-    outside = {m for m in found if not within(m, "vslam.loopclosure.siamese")}
+    outside = {m for m in found if not within(m, TRAINING)}
     assert outside == {TRAINING_COMMANDS}
+
+
+def test_only_its_commands_import_the_training():
+    users = {m for m, names in ARROWS.items() if any(within(name, TRAINING) for name in names)}
+    assert {m for m in users if not within(m, TRAINING)} == {TRAINING_COMMANDS}
 
 
 def test_the_library_does_not_print():

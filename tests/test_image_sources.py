@@ -10,7 +10,11 @@ from siamese_worlds import views
 
 from vslam.errors import InputError, UnreadableImageError
 from vslam.geometry import se3_exp
-from vslam.loopclosure.siamese.data import (
+from vslam.loopclosure.siamese.image_source import read_loop_matrix, undistorted
+from vslam.loopclosure.siamese.kitti_source import relation_of_poses
+from vslam.loopclosure.siamese.pack import write_pack
+from vslam.loopclosure.siamese.source_registry import open_source
+from vslam.loopclosure.training.data import (
     Collection,
     divide,
     draw_pairs,
@@ -19,10 +23,6 @@ from vslam.loopclosure.siamese.data import (
     refuse_test_data,
     write_pairs,
 )
-from vslam.loopclosure.siamese.image_source import read_loop_matrix, undistorted
-from vslam.loopclosure.siamese.kitti_source import relation_of_poses
-from vslam.loopclosure.siamese.pack import write_pack
-from vslam.loopclosure.siamese.source_registry import open_source
 from vslam.trajectory import write_kitti
 
 

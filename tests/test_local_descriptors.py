@@ -11,11 +11,11 @@ from safetensors.torch import load_file
 from vslam.errors import InputError
 from vslam.loopclosure.local_matching import positions
 from vslam.loopclosure.siamese import local_descriptors
-from vslam.loopclosure.siamese.export import export_local
-from vslam.loopclosure.siamese.local import LocalHead, LocalNetwork, doubled
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors, resized
-from vslam.loopclosure.siamese.siamese import build_network, load_network
 from vslam.loopclosure.siamese.weights import SHIPPED
+from vslam.loopclosure.training.export import export_local
+from vslam.loopclosure.training.local import LocalHead, LocalNetwork, doubled
+from vslam.loopclosure.training.siamese import build_network, load_network
 
 
 @pytest.fixture(scope="module")

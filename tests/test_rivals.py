@@ -22,30 +22,30 @@ from vslam.cli.train import NetworkName, PresetName
 from vslam.errors import InputError
 from vslam.lab.loopbench.schema import Cost, Curve, LoopsJson, Score
 from vslam.loopclosure.registry import DETECTORS
-from vslam.loopclosure.siamese.branches import CapsuleShape
-from vslam.loopclosure.siamese.component_training import learn_components
-from vslam.loopclosure.siamese.convolutional import (
+from vslam.loopclosure.siamese.inference import open_network
+from vslam.loopclosure.siamese.weights import NETWORKS
+from vslam.loopclosure.training.branches import CapsuleShape
+from vslam.loopclosure.training.component_training import learn_components
+from vslam.loopclosure.training.convolutional import (
     CONVOLUTIONAL,
     INCEPTIONS,
     Inception,
     alexnet,
     googlenet,
 )
-from vslam.loopclosure.siamese.export import HASHED_TOLERANCE, TOLERANCE, export_onnx
-from vslam.loopclosure.siamese.inference import open_network
-from vslam.loopclosure.siamese.initial_network import starting_network
-from vslam.loopclosure.siamese.pcanet import COMPONENTS, FILTERS, KERNEL, PcaNetBranch
-from vslam.loopclosure.siamese.pcanet import principal_filters as principal_filters_of
-from vslam.loopclosure.siamese.preprocessing import standardised, to_tensor
-from vslam.loopclosure.siamese.settings import PRESETS
-from vslam.loopclosure.siamese.siamese import (
+from vslam.loopclosure.training.export import HASHED_TOLERANCE, TOLERANCE, export_onnx
+from vslam.loopclosure.training.initial_network import starting_network
+from vslam.loopclosure.training.pcanet import COMPONENTS, FILTERS, KERNEL, PcaNetBranch
+from vslam.loopclosure.training.pcanet import principal_filters as principal_filters_of
+from vslam.loopclosure.training.preprocessing import standardised, to_tensor
+from vslam.loopclosure.training.settings import PRESETS
+from vslam.loopclosure.training.siamese import (
     ConcatenationHead,
     DistanceHead,
     build_network,
     load_network,
     save_network,
 )
-from vslam.loopclosure.siamese.weights import NETWORKS
 
 ROOT = Path(__file__).parents[1]
 

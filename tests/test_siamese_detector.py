@@ -28,19 +28,19 @@ from vslam.features import Features
 from vslam.loopclosure.reach import beyond_reach
 from vslam.loopclosure.registry import detector_with_images
 from vslam.loopclosure.siamese.detector import SiameseDetector, open_detector
-from vslam.loopclosure.siamese.export import (
+from vslam.loopclosure.siamese.inference import LateNetwork, OnnxNetwork, open_network
+from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
+from vslam.loopclosure.siamese.scoring import NetworkScorer
+from vslam.loopclosure.siamese.weights import SHIPPED
+from vslam.loopclosure.training.export import (
     SIMILARITY_TOLERANCE,
     TOLERANCE,
     export_onnx,
     to_onnx,
     write_onnx,
 )
-from vslam.loopclosure.siamese.inference import LateNetwork, OnnxNetwork, open_network
-from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
-from vslam.loopclosure.siamese.preprocessing import to_tensor
-from vslam.loopclosure.siamese.scoring import NetworkScorer
-from vslam.loopclosure.siamese.siamese import build_network, for_inference, load_network
-from vslam.loopclosure.siamese.weights import SHIPPED
+from vslam.loopclosure.training.preprocessing import to_tensor
+from vslam.loopclosure.training.siamese import build_network, for_inference, load_network
 from vslam.loopclosure.verifier import verifier_for
 from vslam.map import PREDICTED, Map
 from vslam.map_kernels import link

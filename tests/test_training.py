@@ -13,25 +13,25 @@ from siamese_worlds import SMALL, small_network, small_settings, views
 
 from vslam.errors import InputError, ResultsError
 from vslam.loopclosure.precision_recall import average_precision, precision_recall
-from vslam.loopclosure.siamese import training
-from vslam.loopclosure.siamese.augmentation import STRONG, Augmentation, augment
-from vslam.loopclosure.siamese.branches import Layout
-from vslam.loopclosure.siamese.checkpoint import CHECKPOINT
-from vslam.loopclosure.siamese.data import draw_pairs
-from vslam.loopclosure.siamese.initial_network import resized, starting_network
-from vslam.loopclosure.siamese.model_card import describe, write_card
-from vslam.loopclosure.siamese.objective import (
+from vslam.loopclosure.training import training
+from vslam.loopclosure.training.augmentation import STRONG, Augmentation, augment
+from vslam.loopclosure.training.branches import Layout
+from vslam.loopclosure.training.checkpoint import CHECKPOINT
+from vslam.loopclosure.training.data import draw_pairs
+from vslam.loopclosure.training.initial_network import resized, starting_network
+from vslam.loopclosure.training.model_card import describe, write_card
+from vslam.loopclosure.training.objective import (
     calibrate,
     contrast,
     cross_entropy,
     embed_all,
     score_matrix,
 )
-from vslam.loopclosure.siamese.preprocessing import to_tensor
-from vslam.loopclosure.siamese.pruning import lowest, pruned
-from vslam.loopclosure.siamese.settings import PRESETS, load_settings
-from vslam.loopclosure.siamese.siamese import load_network, save_network
-from vslam.loopclosure.siamese.training import train
+from vslam.loopclosure.training.preprocessing import to_tensor
+from vslam.loopclosure.training.pruning import lowest, pruned
+from vslam.loopclosure.training.settings import PRESETS, load_settings
+from vslam.loopclosure.training.siamese import load_network, save_network
+from vslam.loopclosure.training.training import train
 
 
 @pytest.fixture(autouse=True)

@@ -12,15 +12,15 @@ from pydantic import ValidationError
 from siamese_worlds import SMALL, small_network, small_settings, views
 
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.augmentation import STRONG, augment
-from vslam.loopclosure.siamese.branches import CapsuleShape, Layout
-from vslam.loopclosure.siamese.export import export_onnx
 from vslam.loopclosure.siamese.images import parse_size, to_size
-from vslam.loopclosure.siamese.initial_network import resized, starting_network
-from vslam.loopclosure.siamese.lite import LiteExtractor
-from vslam.loopclosure.siamese.preprocessing import Unrolling
-from vslam.loopclosure.siamese.pruning import lowest, masked, mean_couplings, pruned
-from vslam.loopclosure.siamese.siamese import (
+from vslam.loopclosure.training.augmentation import STRONG, augment
+from vslam.loopclosure.training.branches import CapsuleShape, Layout
+from vslam.loopclosure.training.export import export_onnx
+from vslam.loopclosure.training.initial_network import resized, starting_network
+from vslam.loopclosure.training.lite import LiteExtractor
+from vslam.loopclosure.training.preprocessing import Unrolling
+from vslam.loopclosure.training.pruning import lowest, masked, mean_couplings, pruned
+from vslam.loopclosure.training.siamese import (
     SiameseNetwork,
     aligned,
     build_network,
@@ -28,7 +28,7 @@ from vslam.loopclosure.siamese.siamese import (
     load_network,
     save_network,
 )
-from vslam.loopclosure.siamese.training import train
+from vslam.loopclosure.training.training import train
 
 WIDE = {"pixels": 48, "width": 81, "views": 2, "view_width": 65}
 SHIFT = 16  # columns between the two views of 81

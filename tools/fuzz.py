@@ -360,7 +360,7 @@ def _write_weights(folder: Path) -> None:
     if found:
         shutil.copy(found[0], folder / "net.safetensors")
         return
-    from vslam.loopclosure.siamese.siamese import build_network, save_network
+    from vslam.loopclosure.training.siamese import build_network, save_network
 
     save_network(build_network("squeezenet", None), folder / "net.safetensors", {})
 
@@ -530,7 +530,7 @@ def _read_onnx(folder: Path) -> None:
 
 
 def _read_weights(folder: Path) -> None:
-    from vslam.loopclosure.siamese.siamese import load_network
+    from vslam.loopclosure.training.siamese import load_network
 
     load_network(folder / "net.safetensors")
 

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError, UnreadableImageError
 
+_FIELD_OF_VIEW = 80.0  # degrees, of the camera that turn_homography turns
+
 Fit = Literal["squash", "crop"]
 
 
@@ -74,3 +76,16 @@ def read_grey(source: Path | NDArray[np.uint8], name: str = "") -> NDArray[np.ui
         path = source if isinstance(source, Path) else Path(name)
         raise UnreadableImageError(path, "cannot be decoded; get the file again or remove it.")
     return np.asarray(image, np.uint8)
+
+
+def turn_homography(width: int, height: int, degrees: float) -> NDArray[np.float64]:
+    """Pixels before to pixels after a camera turned to the right where it stands, ``(3, 3)``.
+
+    Of a camera that sees 80 degrees across, as those on cars do. Heights only scale, so it holds
+    for images that were squashed, too.
+    """
+    focal = width / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    R = np.array([[c, 0, -s], [0, 1.0, 0], [s, 0, c]])
+    return np.asarray(K @ R @ np.linalg.inv(K))

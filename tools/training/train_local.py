@@ -31,13 +31,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from vslam.loopclosure.local_matching import COARSE_STRIDE, FINE_STRIDE
-from vslam.loopclosure.siamese.branches import CapsuleBranch
-from vslam.loopclosure.siamese.export import export_local
 from vslam.loopclosure.siamese.images import read_grey
-from vslam.loopclosure.siamese.lite import LiteExtractor
-from vslam.loopclosure.siamese.local import LocalHead, LocalNetwork
-from vslam.loopclosure.siamese.siamese import load_network
 from vslam.loopclosure.siamese.weights import SHIPPED
+from vslam.loopclosure.training.branches import CapsuleBranch
+from vslam.loopclosure.training.export import export_local
+from vslam.loopclosure.training.lite import LiteExtractor
+from vslam.loopclosure.training.local import LocalHead, LocalNetwork
+from vslam.loopclosure.training.siamese import load_network
 
 SIZE = (192, 640)  # rows and columns of a training image
 COARSE = ((SIZE[0] - 1) // COARSE_STRIDE + 1, (SIZE[1] - 1) // COARSE_STRIDE + 1)

@@ -34,16 +34,16 @@ import torch
 
 from vslam.errors import InputError
 from vslam.lab.loopbench.kept import keep_conditions
-from vslam.loopclosure.siamese.component_training import learn_components
-from vslam.loopclosure.siamese.data import Collection, load, refuse_test_data
-from vslam.loopclosure.siamese.export import export_onnx
 from vslam.loopclosure.siamese.images import parse_size
-from vslam.loopclosure.siamese.initial_network import starting_network
-from vslam.loopclosure.siamese.runtime import set_threads
-from vslam.loopclosure.siamese.settings import PRESETS, TrainSettings
-from vslam.loopclosure.siamese.siamese import build_network, load_network
 from vslam.loopclosure.siamese.source_registry import open_source
-from vslam.loopclosure.siamese.training import TrainingOutcome, train
+from vslam.loopclosure.training.component_training import learn_components
+from vslam.loopclosure.training.data import Collection, load, refuse_test_data
+from vslam.loopclosure.training.export import export_onnx
+from vslam.loopclosure.training.initial_network import starting_network
+from vslam.loopclosure.training.runtime import set_threads
+from vslam.loopclosure.training.settings import PRESETS, TrainSettings
+from vslam.loopclosure.training.siamese import build_network, load_network
+from vslam.loopclosure.training.training import TrainingOutcome, train
 
 TRAINED = (
     "capsule", "capsule-pruned", "squeezenet", "mobilenet", "alexnet", "googlenet", "darknet19",

@@ -16,9 +16,9 @@ import typer
 from vslam.cli.export import commands as export
 
 if TYPE_CHECKING:
-    from vslam.loopclosure.siamese.data import Collection
-    from vslam.loopclosure.siamese.settings import TrainSettings
-    from vslam.loopclosure.siamese.training import TrainingOutcome
+    from vslam.loopclosure.training.data import Collection
+    from vslam.loopclosure.training.settings import TrainSettings
+    from vslam.loopclosure.training.training import TrainingOutcome
 
 _TRAIN_EXAMPLES = """
 [b]Examples[/b]
@@ -122,13 +122,13 @@ def train(
     """Train a loop detector; writes weights (.safetensors to go on from, .onnx for runs), log,
     pairs, checkpoints and a model card."""
     _require_libraries("train")
-    from vslam.loopclosure.siamese.branches import CapsuleBranch
-    from vslam.loopclosure.siamese.data import load, refuse_test_data
     from vslam.loopclosure.siamese.images import parse_size
-    from vslam.loopclosure.siamese.runtime import set_threads
-    from vslam.loopclosure.siamese.settings import PRESETS, load_settings
-    from vslam.loopclosure.siamese.siamese import load_network
     from vslam.loopclosure.siamese.source_registry import open_source
+    from vslam.loopclosure.training.branches import CapsuleBranch
+    from vslam.loopclosure.training.data import load, refuse_test_data
+    from vslam.loopclosure.training.runtime import set_threads
+    from vslam.loopclosure.training.settings import PRESETS, load_settings
+    from vslam.loopclosure.training.siamese import load_network
     from vslam.machine import available_cores
 
     if network == "pcanet":
@@ -212,13 +212,13 @@ def _train(
     quiet: bool,
 ) -> TrainingOutcome:
     from vslam.cli.console import console
-    from vslam.loopclosure.siamese.checkpoint import CHECKPOINT
-    from vslam.loopclosure.siamese.component_training import learn_components
-    from vslam.loopclosure.siamese.export import export_onnx
-    from vslam.loopclosure.siamese.initial_network import starting_network
-    from vslam.loopclosure.siamese.model_card import describe, write_card
-    from vslam.loopclosure.siamese.siamese import load_network
-    from vslam.loopclosure.siamese.training import train as run
+    from vslam.loopclosure.training.checkpoint import CHECKPOINT
+    from vslam.loopclosure.training.component_training import learn_components
+    from vslam.loopclosure.training.export import export_onnx
+    from vslam.loopclosure.training.initial_network import starting_network
+    from vslam.loopclosure.training.model_card import describe, write_card
+    from vslam.loopclosure.training.siamese import load_network
+    from vslam.loopclosure.training.training import train as run
 
     start, settings, report = starting_network(
         settings, collection, weights, device, resuming=resume and (folder / CHECKPOINT).exists()
@@ -253,8 +253,8 @@ def onnx(
 ) -> None:
     """Write the ONNX file that runs use, and check it against torch."""
     _require_libraries("export onnx")
-    from vslam.loopclosure.siamese.export import export_onnx
-    from vslam.loopclosure.siamese.siamese import load_network
+    from vslam.loopclosure.training.export import export_onnx
+    from vslam.loopclosure.training.siamese import load_network
 
     network, about = load_network(weights)
     path = out or weights.with_suffix(".onnx")
@@ -276,8 +276,8 @@ def weights_(
     import shutil
 
     from vslam.errors import ResultsError
-    from vslam.loopclosure.siamese.export import export_onnx
-    from vslam.loopclosure.siamese.siamese import load_network, save_network
+    from vslam.loopclosure.training.export import export_onnx
+    from vslam.loopclosure.training.siamese import load_network, save_network
 
     network, about = load_network(weights)
     save_network(network, out, about, half=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.augmentation import turn_homography
+from vslam.loopclosure.siamese.images import turn_homography
 
 Image = NDArray[np.uint8]
 

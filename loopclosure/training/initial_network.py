@@ -10,27 +10,27 @@ import torch
 from torch.nn import functional
 
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.branches import CapsuleBranch, Layout
-from vslam.loopclosure.siamese.convolutional import ConvolutionalBranch
-from vslam.loopclosure.siamese.data import Collection, divide, validation_images
-from vslam.loopclosure.siamese.lite import LiteExtractor
-from vslam.loopclosure.siamese.objective import validate
-from vslam.loopclosure.siamese.preprocessing import to_tensor
-from vslam.loopclosure.siamese.pruning import (
+from vslam.loopclosure.siamese.weights import PRUNED
+from vslam.loopclosure.training.branches import CapsuleBranch, Layout
+from vslam.loopclosure.training.convolutional import ConvolutionalBranch
+from vslam.loopclosure.training.data import Collection, divide, validation_images
+from vslam.loopclosure.training.lite import LiteExtractor
+from vslam.loopclosure.training.objective import validate
+from vslam.loopclosure.training.preprocessing import to_tensor
+from vslam.loopclosure.training.pruning import (
     lowest,
     mean_couplings,
     pruned,
     with_iterations,
 )
-from vslam.loopclosure.siamese.runtime import milliseconds_per_image
-from vslam.loopclosure.siamese.settings import TrainSettings
-from vslam.loopclosure.siamese.siamese import (
+from vslam.loopclosure.training.runtime import milliseconds_per_image
+from vslam.loopclosure.training.settings import TrainSettings
+from vslam.loopclosure.training.siamese import (
     SiameseNetwork,
     build_network,
     for_inference,
     load_network,
 )
-from vslam.loopclosure.siamese.weights import PRUNED
 
 _RANKED_IMAGES = 1000
 

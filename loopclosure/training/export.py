@@ -25,9 +25,9 @@ from vslam.loopclosure.siamese.inference import (
     VERSION,
     OnnxNetwork,
 )
-from vslam.loopclosure.siamese.local import LocalNetwork
-from vslam.loopclosure.siamese.pcanet import PcaNetBranch
-from vslam.loopclosure.siamese.siamese import SiameseNetwork, for_inference
+from vslam.loopclosure.training.local import LocalNetwork
+from vslam.loopclosure.training.pcanet import PcaNetBranch
+from vslam.loopclosure.training.siamese import SiameseNetwork, for_inference
 
 TOLERANCE = 1e-4  # of a descriptor of length 1
 HASHED_TOLERANCE = 0.01  # of PCANet: a bit of a code flips where a response is 0 but for rounding

@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.augmentation import STRONG, Augmentation
-from vslam.loopclosure.siamese.branches import CapsuleShape
-from vslam.loopclosure.siamese.siamese import Head
+from vslam.loopclosure.training.augmentation import STRONG, Augmentation
+from vslam.loopclosure.training.branches import CapsuleShape
+from vslam.loopclosure.training.siamese import Head
 
 
 class TrainSettings(BaseModel):

@@ -16,21 +16,21 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.capsules import CapsuleLayer
-from vslam.loopclosure.siamese.extractors import (
+from vslam.loopclosure.siamese.images import Size
+from vslam.loopclosure.training.capsules import CapsuleLayer
+from vslam.loopclosure.training.extractors import (
     LIGHT_BLOCKS,
     LightExtractor,
     OriginalExtractor,
     PrimaryCapsules,
     grid_side,
 )
-from vslam.loopclosure.siamese.images import Size
-from vslam.loopclosure.siamese.lite import (
+from vslam.loopclosure.training.lite import (
     EARLY_STRIDE,
     LiteExtractor,
     lite_grid_side,
 )
-from vslam.loopclosure.siamese.preprocessing import Unrolling, standardised, textured
+from vslam.loopclosure.training.preprocessing import Unrolling, standardised, textured
 
 _LEAST_SHARE = 0.02  # of texture in a view: where no view shows any, all still count alike
 

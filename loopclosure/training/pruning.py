@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.branches import CapsuleBranch
-from vslam.loopclosure.siamese.siamese import SiameseNetwork
+from vslam.loopclosure.training.branches import CapsuleBranch
+from vslam.loopclosure.training.siamese import SiameseNetwork
 
 
 @torch.no_grad()

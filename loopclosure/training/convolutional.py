@@ -14,10 +14,10 @@ import torch
 from torch import Tensor, nn
 
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.branches import Layout
 from vslam.loopclosure.siamese.images import Size
-from vslam.loopclosure.siamese.preprocessing import standardised
-from vslam.loopclosure.siamese.torch_files import read_pth
+from vslam.loopclosure.training.branches import Layout
+from vslam.loopclosure.training.preprocessing import standardised
+from vslam.loopclosure.training.torch_files import read_pth
 
 DIMENSIONS = 1024  # of the descriptor, as many as the capsule network's
 _LEAST_SIDE = 64  # of an image: AlexNet's last pooling needs 63

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import torch
 
-from vslam.loopclosure.siamese.siamese import SiameseNetwork
+from vslam.loopclosure.training.siamese import SiameseNetwork
 
 
 def set_threads(threads: int) -> None:

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vslam.loopclosure.siamese.lite import LiteExtractor
-from vslam.loopclosure.siamese.preprocessing import standardised, textured
+from vslam.loopclosure.training.lite import LiteExtractor
+from vslam.loopclosure.training.preprocessing import standardised, textured
 
 COARSE_SIZE, FINE_SIZE = 64, 32  # numbers of a descriptor
 _QUARTER = 3  # blocks of the extractor to stride 4: 24 channels

@@ -9,9 +9,9 @@ import torch
 from pydantic import ValidationError
 
 from vslam.errors import InputError, ResultsError
-from vslam.loopclosure.siamese.data import Pairs
-from vslam.loopclosure.siamese.settings import TrainSettings
-from vslam.loopclosure.siamese.siamese import SiameseNetwork
+from vslam.loopclosure.training.data import Pairs
+from vslam.loopclosure.training.settings import TrainSettings
+from vslam.loopclosure.training.siamese import SiameseNetwork
 
 CHECKPOINT = "checkpoint.pt"
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from vslam.loopclosure.siamese.capsules import squash
+from vslam.loopclosure.training.capsules import squash
 
 Block = tuple[int, int, int]
 """Channels, stride and dilation of a separable convolution; the first is the stem."""

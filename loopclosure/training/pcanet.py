@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vslam.loopclosure.siamese.branches import Layout
 from vslam.loopclosure.siamese.images import Size
-from vslam.loopclosure.siamese.preprocessing import standardised, to_tensor
+from vslam.loopclosure.training.branches import Layout
+from vslam.loopclosure.training.preprocessing import standardised, to_tensor
 
 FILTERS, KERNEL = 8, 7  # of each of two stages
 _BLOCKS = 4  # along a side of the image

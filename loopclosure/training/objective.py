@@ -10,11 +10,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from vslam.loopclosure.precision_recall import balanced_accuracy, summary
-from vslam.loopclosure.siamese.augmentation import Augmentation, augment
-from vslam.loopclosure.siamese.data import Collection
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
-from vslam.loopclosure.siamese.preprocessing import to_tensor
-from vslam.loopclosure.siamese.siamese import DistanceHead, SiameseNetwork
+from vslam.loopclosure.training.augmentation import Augmentation, augment
+from vslam.loopclosure.training.data import Collection
+from vslam.loopclosure.training.preprocessing import to_tensor
+from vslam.loopclosure.training.siamese import DistanceHead, SiameseNetwork
 
 _MOST_SAME = 5  # images of its place that a validation image is to find
 

@@ -23,14 +23,14 @@ import torch
 from numpy.typing import NDArray
 
 from vslam.errors import InputError, ResultsError
-from vslam.loopclosure.siamese.augmentation import augment
-from vslam.loopclosure.siamese.checkpoint import (
+from vslam.loopclosure.training.augmentation import augment
+from vslam.loopclosure.training.checkpoint import (
     CHECKPOINT,
     TrainingProgress,
     load_checkpoint,
     save_checkpoint,
 )
-from vslam.loopclosure.siamese.data import (
+from vslam.loopclosure.training.data import (
     Collection,
     Pairs,
     check_emphasis,
@@ -40,8 +40,8 @@ from vslam.loopclosure.siamese.data import (
     validation_images,
     write_pairs,
 )
-from vslam.loopclosure.siamese.lite import LiteExtractor
-from vslam.loopclosure.siamese.objective import (
+from vslam.loopclosure.training.lite import LiteExtractor
+from vslam.loopclosure.training.objective import (
     blend,
     calibrate,
     contrast,
@@ -49,9 +49,9 @@ from vslam.loopclosure.siamese.objective import (
     embed_all,
     validate,
 )
-from vslam.loopclosure.siamese.preprocessing import to_tensor
-from vslam.loopclosure.siamese.settings import TrainSettings
-from vslam.loopclosure.siamese.siamese import (
+from vslam.loopclosure.training.preprocessing import to_tensor
+from vslam.loopclosure.training.settings import TrainSettings
+from vslam.loopclosure.training.siamese import (
     SiameseNetwork,
     build_network,
     load_network,

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vslam.errors import InputError
-from vslam.loopclosure.siamese.torch_files import read_pth
+from vslam.loopclosure.training.torch_files import read_pth
 
 # Expansion, channels, stride and kernel of the blocks of the first five stages.
 _BLOCKS = (

@@ -6,12 +6,12 @@ import math
 import time
 from pathlib import Path
 
-from vslam.loopclosure.siamese.checkpoint import TrainingProgress
-from vslam.loopclosure.siamese.data import Collection, divide, validation_images
-from vslam.loopclosure.siamese.pcanet import PcaNetBranch
-from vslam.loopclosure.siamese.settings import TrainSettings
-from vslam.loopclosure.siamese.siamese import build_network
-from vslam.loopclosure.siamese.training import (
+from vslam.loopclosure.training.checkpoint import TrainingProgress
+from vslam.loopclosure.training.data import Collection, divide, validation_images
+from vslam.loopclosure.training.pcanet import PcaNetBranch
+from vslam.loopclosure.training.settings import TrainSettings
+from vslam.loopclosure.training.siamese import build_network
+from vslam.loopclosure.training.training import (
     TrainingOutcome,
     calibrated,
     open_device,

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from vslam.loopclosure.siamese.images import turn_homography
+
 _TURNED = 0.5  # share of the images that turn, where any do
 _ZOOMED = 0.5  # likewise
-_FIELD_OF_VIEW = 80.0  # degrees
 
 
 class Augmentation(BaseModel):
@@ -82,19 +83,6 @@ def augment(
         grain = rng.standard_normal(out.shape, dtype=np.float32)
         out = np.clip(np.rint(out + np.float32(noise) * grain), 0, 255).astype(np.uint8)
     return out
-
-
-def turn_homography(width: int, height: int, degrees: float) -> NDArray[np.float64]:
-    """Pixels before to pixels after a camera turned to the right where it stands, ``(3, 3)``.
-
-    Of a camera that sees 80 degrees across, as those on cars do. Heights only scale, so it holds
-    for images that were squashed, too.
-    """
-    focal = width / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    R = np.array([[c, 0, -s], [0, 1.0, 0], [s, 0, c]])
-    return np.asarray(K @ R @ np.linalg.inv(K))
 
 
 def _cover(image: NDArray[np.uint8], largest: float, rng: np.random.Generator) -> None:

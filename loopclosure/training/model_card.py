@@ -12,10 +12,10 @@ from typing import Any
 import torch
 
 from vslam.errors import ResultsError
-from vslam.loopclosure.siamese.data import Collection
-from vslam.loopclosure.siamese.settings import TrainSettings
-from vslam.loopclosure.siamese.siamese import SiameseNetwork
-from vslam.loopclosure.siamese.training import TrainingOutcome
+from vslam.loopclosure.training.data import Collection
+from vslam.loopclosure.training.settings import TrainSettings
+from vslam.loopclosure.training.siamese import SiameseNetwork
+from vslam.loopclosure.training.training import TrainingOutcome
 
 
 def describe(

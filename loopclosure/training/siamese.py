@@ -14,12 +14,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vslam.errors import InputError, ResultsError
-from vslam.loopclosure.siamese.branches import CapsuleBranch, CapsuleShape, Layout
-from vslam.loopclosure.siamese.capsules import TINY
-from vslam.loopclosure.siamese.convolutional import CONVOLUTIONAL, ConvolutionalBranch
-from vslam.loopclosure.siamese.extractors import fold_batch_norms
-from vslam.loopclosure.siamese.pcanet import PcaNetBranch
 from vslam.loopclosure.siamese.weights import NETWORKS, PRUNED
+from vslam.loopclosure.training.branches import CapsuleBranch, CapsuleShape, Layout
+from vslam.loopclosure.training.capsules import TINY
+from vslam.loopclosure.training.convolutional import CONVOLUTIONAL, ConvolutionalBranch
+from vslam.loopclosure.training.extractors import fold_batch_norms
+from vslam.loopclosure.training.pcanet import PcaNetBranch
 
 Head = Literal["distance", "concatenation"]
 """What compares two descriptors: :class:`DistanceHead` or :class:`ConcatenationHead`."""

@@ -254,7 +254,7 @@ def test_a_keyframe_that_looks_another_way_is_out_of_reach_if_the_way_between_is
     map_.arrays.T_cw[:3, :3, 3] = 0.0  # all at one place
     beyond = beyond_reach(map_, 3, SiameseConfig(reach_angle=60.0))
     assert (beyond > 0).tolist() == [True, False, True, False]
-    map_.restarts = [3]
+    map_.keyframes.restart[3] = PREDICTED
     map_.parents[:] = [0, 0, 1, 2]
     assert (beyond_reach(map_, 3, SiameseConfig())[:3] == 0).all()
 

@@ -17,14 +17,14 @@ DATASETS = ("kitti", "euroc", "tum", "synthetic")  # those that `open_sequence` 
 
 def open_sequence(
     dataset: str,
-    root: Path,
+    root: Path | str,
     name: str | None = None,
     *,
     start: int = 0,
     every: int = 1,
     max_frames: int | None = None,
     monocular: bool = False,
-    calib: Several[Path] = (),
+    calib: Several[Path | str] = (),
     depth_scale: float | None = None,
     on_render: Callable[[int, int], None] | None = None,
 ) -> Sequence:
@@ -112,14 +112,14 @@ def open_sequence(
 
 def open_plugin_source(
     dataset: str,
-    root: Path,
+    root: Path | str,
     name: str | None,
     *,
     start: int,
     every: int,
     max_frames: int | None,
     monocular: bool,
-    calib: Several[Path],
+    calib: Several[Path | str],
 ) -> Sequence | Stream:
     """What a reader of another package opens.
 
@@ -136,7 +136,7 @@ def open_plugin_source(
 
     return open_plugin(
         others[dataset],
-        root,
+        Path(root),
         name,
         start=start,
         every=every,

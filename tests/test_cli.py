@@ -251,7 +251,7 @@ def fake_result(index: int, T_wc: np.ndarray) -> TrackResult:
 @pytest.fixture
 def pipeline(monkeypatch) -> SimpleNamespace:
     """In place of SLAM: returns the ground truth, shifted; notes what it was called with."""
-    calls = SimpleNamespace(interrupted=None, loops=[])
+    calls = SimpleNamespace(interrupted=None, loops=[], lost=False)
 
     def run_sequence(
         sequence, perturbation, settings, recorder, on_frame, autosave=None, resume=None, slam=None
@@ -259,6 +259,8 @@ def pipeline(monkeypatch) -> SimpleNamespace:
         T_wc = circle(len(sequence))  # the ground truth, if it has one
         T_wc[:, 1, 3] += 2.0
         tracks = [fake_result(k, T_wc[k]) for k in range(len(sequence))]
+        if calls.lost:
+            tracks = [replace(track, state=TrackingState.LOST) for track in tracks]
         for track in tracks:
             on_frame(track)
         trajectory = Trajectory(sequence.timestamps, T_wc)
@@ -426,6 +428,27 @@ def test_interrupted_run_keeps_its_results(call, root, pipeline):
     assert code == 1
     assert "Ctrl-C" in out
     assert Path("runs/latest/trajectory.tum").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("", "vslam doctor says what is wrong"),
+        ("--perturb night:9", "under --perturb night:9; a weaker one"),
+        ("--sensor mono", "one camera must move sideways"),
+    ],
+)
+def test_a_run_that_tracked_nothing_exits_with_1_and_says_why(call, root, pipeline, words, why):
+    pipeline.lost = True
+    command = ("run", "--data", root, "--max-frames", 10, *words.split())
+    code, out, err = call(*command)
+    assert (code, "error" in err) == (1, False)
+    assert "nothing was tracked in 10 frames" in out
+    assert why in out
+    code, out, err = call(*command, "--quiet")
+    assert (code, out) == (1, "")
+    assert err.startswith("error: nothing was tracked in 10 frames")
+    assert why in err
 
 
 def test_eval(call, tmp_path):

@@ -199,6 +199,35 @@ def test_choices_are_checked_by_the_parser(call, words, parts):
         assert part in err
 
 
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        ("run --perturb brigthness:1", "brightness"),
+        ("run --perturb Fog", "fog"),
+        ("run --detector capsul", "capsule"),
+        ("run --dataset kiti", "kitti"),
+        ("run --dataset synthetic --seq dmo", "demo"),
+        ("perturb --dataset eurok", "euroc"),
+        ("train capsul --data photos:x", "capsule"),
+        ("stress --laws rian", "rain"),
+        ("loops bench --detectors thumbnai", "thumbnail"),
+        ("loops bench --perturb blurr:0.5", "blur"),
+    ],
+)
+def test_a_misspelt_name_is_told_which_one_may_be_meant(call, root, words, meant):
+    command, *rest = words.split()
+    data = ["--data", root] if "--dataset" not in words and command in ("run", "stress") else []
+    more = ["--max-frames", 5] if data else []
+    code, _, err = call(command, *rest, *data, *more)
+    assert code == 2
+    assert f"(did you mean {meant}?)" in " ".join(err.replace("│", " ").split())
+    assert "Value error" not in err
+
+
+def test_a_name_like_no_other_is_told_of_none(call):
+    assert "did you mean" not in call("run", "--dataset", "synthetic", "--seq", "77")[2]
+
+
 def test_the_choices_of_detectors_are_those_of_the_registry():
     assert get_args(options.DetectorName) == DETECTORS
     assert get_args(train.NetworkName) == NETWORKS

@@ -9,7 +9,7 @@ from pathlib import Path
 from vslam import plugins
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import Stream
-from vslam.errors import InputError
+from vslam.errors import InputError, did_you_mean
 
 _FIRST = "00"  # KITTI's, and the town rendered after it
 DATASETS = ("kitti", "euroc", "tum", "synthetic")  # those that `open_sequence` knows
@@ -128,8 +128,11 @@ def open_plugin_source(
     """
     others = plugins.find_plugins(plugins.READERS)
     if dataset not in others:
-        known = ", ".join((*DATASETS, *others))
-        raise InputError(f"--dataset {dataset}: unknown data set; this version reads {known}.")
+        known = (*DATASETS, *others)
+        raise InputError(
+            f"--dataset {dataset}: unknown data set{did_you_mean(dataset, known)}; this version "
+            f"reads {', '.join(known)}."
+        )
     if calib:
         raise InputError(f"--calib: {others[dataset]} brings its own; leave it out.")
     from vslam.datasets.plugin_reader import open_plugin

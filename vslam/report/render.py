@@ -129,9 +129,11 @@ def _loops(report: ReportJson) -> Headline:
     return Headline("Loops", f"{report.loops_closed} closed", ", ".join(notes), tone)
 
 
-def render_markdown(report: ReportJson, seen: Collection[SeenLoop] = ()) -> str:
+def render_markdown(
+    report: ReportJson, seen: Collection[SeenLoop] = (), recordings: Collection[str] = ()
+) -> str:
     """Markdown whose tables are aligned, to be read in a terminal; the pictures of the loops
-    ``seen`` are files in the folder ``figures``."""
+    ``seen`` are files in the folder ``figures``, ``recordings`` are files in its own."""
     lines = [f"# vslam: {report.dataset} {report.sequence}", ""]
     if report.interrupted:
         lines += [f"**Interrupted: {report.interrupted}.** Numbers are of the frames done.", ""]
@@ -155,8 +157,9 @@ def render_markdown(report: ReportJson, seen: Collection[SeenLoop] = ()) -> str:
         lines += _table(table)
     lines += ["", "## Run", "", *markdown_table(("", ""), option_rows(report))]
     lines += ["", "## Machine", "", *markdown_table(("", ""), machine_rows(report))]
-    lines += ["", "## Recording", "", "    rerun recording.rrd", ""]
-    return "\n".join(lines)
+    if recordings:
+        lines += ["", "## Recording", "", *(f"    rerun {name}" for name in recordings)]
+    return "\n".join([*lines, ""])
 
 
 def _table(table: Table) -> list[str]:
@@ -172,6 +175,7 @@ def render_html(
     figures: Collection[ReportFigure],
     explorer: dict[str, Any] | None = None,
     seen: Collection[SeenLoop] = (),
+    recordings: Collection[str] = (),
 ) -> str:
     """One self-contained page: style, figures and numbers are inside, nothing is loaded.
 
@@ -181,6 +185,7 @@ def render_html(
         figures: drawn by :func:`vslam.report.figures.draw_figures`.
         explorer: made by :func:`vslam.report.explorer.explorer_data`.
         seen: drawn by :func:`vslam.report.seen_loops.seen_loops`.
+        recordings: names of those beside the page.
     """
     return render_page(
         "report.html.jinja",
@@ -190,6 +195,7 @@ def render_html(
         stages=stage_rows(report),
         seen=seen,
         seen_note=seen_note(report, seen),
+        recordings=recordings,
         detector_table=detector_table(report),
         about_detector=about(report.detector),
         loop_tables=loop_tables(report),

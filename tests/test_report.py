@@ -550,6 +550,21 @@ def test_interrupted_run_is_not_blamed_for_revisits_to_come() -> None:
     assert (report.revisit_stretches, report.loops_missed) == (0, 0)
 
 
+def test_a_right_loop_on_a_revisit_too_short_to_count_is_explained() -> None:
+    outcome = two_laps()
+    done = np.arange(266)
+    outcome = replace(
+        outcome,
+        trajectory=outcome.trajectory.select(done),
+        loops=outcome.loops[:1],
+        corrections=[],
+    )
+    report = summarize(outcome, None, evaluate_loops(outcome), None)
+    assert (report.revisit_stretches, report.loops_closed, report.loops[0].right) == (0, 1, True)
+    note = headlines(report)[-1].note
+    assert note.startswith("no revisit of 20 m or more to be found (1 right on shorter ones), ")
+
+
 def test_before_is_drawn_in_the_frame_of_the_ground_truth() -> None:
     """An estimate in a world of its own, aligned: the keyframes before follow the alignment."""
     outcome = two_laps()

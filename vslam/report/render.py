@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
+from vslam.evaluation.loops import LoopLimits
 from vslam.loopclosure.registry import about
 from vslam.report.detector_table import detector_table
 from vslam.report.loop_tables import loop_tables
@@ -118,7 +119,7 @@ def _loops(report: ReportJson) -> Headline:
     notes = []
     if report.revisit_stretches is not None:
         notes += [
-            f"{report.loops_found} of {report.revisit_stretches} revisits found",
+            _revisits(report),
             f"{report.loops_missed} missed",
             f"{report.loops_wrong} wrong",
         ]
@@ -127,6 +128,16 @@ def _loops(report: ReportJson) -> Headline:
     notes.append(f"{report.loops_rejected} candidates rejected")
     tone = "bad" if report.loops_wrong else ""
     return Headline("Loops", f"{report.loops_closed} closed", ", ".join(notes), tone)
+
+
+def _revisits(report: ReportJson) -> str:
+    """How many stretches were found again; a right loop on one that is too short to count is not
+    left without a word."""
+    if report.revisit_stretches:
+        return f"{report.loops_found} of {report.revisit_stretches} revisits found"
+    none = f"no revisit of {LoopLimits().min_length_m:.0f} m or more to be found"
+    right = sum(loop.accepted and loop.right is True for loop in report.loops)
+    return f"{none} ({right} right on shorter ones)" if right else none
 
 
 def render_markdown(

@@ -156,7 +156,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--detector capsule --weights no.safetensors", ["no.safetensors", "not there"]),
         ("--detector bow --weights no.safetensors", ["--weights", "bow has none"]),
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
-        ("", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
+        ("--dataset kitti", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
         ("--config nothing.json", ["nothing.json", "configuration"]),
         ("--compare none --detector none", ["--compare none", "name another"]),
         ("--compare both,bow --detector bow", ["--compare bow", "name another"]),
@@ -169,11 +169,24 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--data ..", ["no data set that is known", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
-        ("--topics /a,/b", ["--topics", "only for --dataset bag"]),
+        ("--dataset kitti --topics /a,/b", ["--topics", "only for --dataset bag"]),
     ],
 )
 def test_run_refuses_without_data(call, words, parts):
     refused(call("run", *words.split()), *parts)
+    assert not Path("runs").exists()
+
+
+def test_a_bare_run_without_data_says_what_to_do(call):
+    code, out, err = call("run")
+    assert (code, out) == (2, "")
+    assert err.startswith("error: there is nothing to run on; ")
+    commands = [line.split("  ")[1] for line in err.splitlines()[1:]]
+    assert commands == [
+        "vslam run --dataset synthetic --seq demo",
+        "vslam run DATA --calib FILE",
+        "vslam run --data FOLDER --seq 00",
+    ]
     assert not Path("runs").exists()
 
 

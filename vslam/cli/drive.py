@@ -58,10 +58,10 @@ def drive(
     # Bad input has been refused by now; what follows takes a second to import.
     from vslam.cli.summary import print_summary
     from vslam.datasets.stream import count_expected
+    from vslam.doctor.nothing_tracked import why_nothing_was_tracked
     from vslam.report.folder import write_results
     from vslam.run.autosave import FolderAutosave, remove_autosave
     from vslam.run.moments import LoopPictureRecorder, MomentRecorder
-    from vslam.run.nothing_tracked import why_nothing_was_tracked
     from vslam.run.options import settings_of
     from vslam.run.pipeline import begin, run_sequence
 

@@ -1,8 +1,9 @@
 """In place of ``vslam run``: writes the folder of a run in a moment, with figures made up.
 
 Files in ``$STUB_FOLDER`` change what a run does, NAME being sequence, perturbation, detector and
-seed joined by ``-``: ``fail-NAME``, ``interrupt-NAME``, ``hold-NAME`` (it waits while that is
-there). Each start adds a line, NAME and the parent's process number, to the file ``started``.
+seed joined by ``-``: ``fail-NAME``, ``interrupt-NAME``, ``lost-NAME`` (in all frames),
+``unwritten-NAME`` (exit code 1 after the report), ``hold-NAME`` (it waits while that is there).
+Each start adds a line, NAME and the parent's process number, to the file ``started``.
 """
 
 from __future__ import annotations
@@ -58,6 +59,9 @@ def main() -> None:
         "ate_rmse_m": 1.0 + 0.1 * index,
         "interrupted": "Ctrl-C" if (folder / f"interrupt-{name}").exists() else None,
     }
+    lost = (folder / f"lost-{name}").exists()
+    if lost:
+        report["lost_frames"] = report["frames"]
     out = Path(options["--out"]) / "20261121-120000"
     out.mkdir(parents=True)
     report["evo_command"] = f"evo_ape kitti {out}/ground_truth_kitti.txt --align"
@@ -66,6 +70,8 @@ def main() -> None:
     (out / "map.npz").write_bytes(b"large")
     for file in ("trajectory.tum", "ground_truth_kitti.txt"):
         (out / file).write_bytes((folder / file).read_bytes())
+    if lost or (folder / f"unwritten-{name}").exists():
+        sys.exit(1)
 
 
 if __name__ == "__main__":

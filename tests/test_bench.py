@@ -174,6 +174,13 @@ def test_failing_cells_are_told_and_done_again(stub: Path, tmp_path: Path):
     assert not (out / "failed" / f"{cells[1].name}.txt").exists()
 
 
+def test_a_run_that_tracked_nothing_is_a_result_and_one_not_written_is_none(stub: Path, tmp_path):
+    (stub / "lost-00-none-none-0").touch()
+    (stub / "unwritten-00-none-bow-0").touch()
+    outcomes = execute.run_here(CELLS[:2], options_for(tmp_path), 1, tmp_path)
+    assert [type(outcome) for outcome in outcomes] == [execute.Finished, execute.Failed]
+
+
 def test_a_runner_that_does_not_start_is_a_failed_cell(tmp_path: Path):
     options = execute.RunOptions(None, CONFIG, 1, command=("/no/such/program",))
     (outcome,) = execute.run_here(CELLS[:1], options, 1, tmp_path)

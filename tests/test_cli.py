@@ -156,7 +156,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--detector capsule --weights no.safetensors", ["no.safetensors", "not there"]),
         ("--detector bow --weights no.safetensors", ["--weights", "bow has none"]),
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
-        ("", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
+        ("--dataset kitti", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
         ("--config nothing.json", ["nothing.json", "configuration"]),
         ("--compare none --detector none", ["--compare none", "name another"]),
         ("--compare both,bow --detector bow", ["--compare bow", "name another"]),
@@ -169,11 +169,24 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--data ..", ["no data set that is known", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
-        ("--topics /a,/b", ["--topics", "only for --dataset bag"]),
+        ("--dataset kitti --topics /a,/b", ["--topics", "only for --dataset bag"]),
     ],
 )
 def test_run_refuses_without_data(call, words, parts):
     refused(call("run", *words.split()), *parts)
+    assert not Path("runs").exists()
+
+
+def test_a_bare_run_without_data_says_what_to_do(call):
+    code, out, err = call("run")
+    assert (code, out) == (2, "")
+    assert err.startswith("error: there is nothing to run on; ")
+    commands = [line.split("  ")[1] for line in err.splitlines()[1:]]
+    assert commands == [
+        "vslam run --dataset synthetic --seq demo",
+        "vslam run DATA --calib FILE",
+        "vslam run --data FOLDER --seq 00",
+    ]
     assert not Path("runs").exists()
 
 
@@ -197,6 +210,35 @@ def test_choices_are_checked_by_the_parser(call, words, parts):
     assert (code, out) == (2, "")
     for part in parts:
         assert part in err
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        ("run --perturb brigthness:1", "brightness"),
+        ("run --perturb Fog", "fog"),
+        ("run --detector capsul", "capsule"),
+        ("run --dataset kiti", "kitti"),
+        ("run --dataset synthetic --seq dmo", "demo"),
+        ("perturb --dataset eurok", "euroc"),
+        ("train capsul --data photos:x", "capsule"),
+        ("stress --laws rian", "rain"),
+        ("loops bench --detectors thumbnai", "thumbnail"),
+        ("loops bench --perturb blurr:0.5", "blur"),
+    ],
+)
+def test_a_misspelt_name_is_told_which_one_may_be_meant(call, root, words, meant):
+    command, *rest = words.split()
+    data = ["--data", root] if "--dataset" not in words and command in ("run", "stress") else []
+    more = ["--max-frames", 5] if data else []
+    code, _, err = call(command, *rest, *data, *more)
+    assert code == 2
+    assert f"(did you mean {meant}?)" in " ".join(err.replace("│", " ").split())
+    assert "Value error" not in err
+
+
+def test_a_name_like_no_other_is_told_of_none(call):
+    assert "did you mean" not in call("run", "--dataset", "synthetic", "--seq", "77")[2]
 
 
 def test_the_choices_of_detectors_are_those_of_the_registry():
@@ -251,7 +293,7 @@ def fake_result(index: int, T_wc: np.ndarray) -> TrackResult:
 @pytest.fixture
 def pipeline(monkeypatch) -> SimpleNamespace:
     """In place of SLAM: returns the ground truth, shifted; notes what it was called with."""
-    calls = SimpleNamespace(interrupted=None, loops=[])
+    calls = SimpleNamespace(interrupted=None, loops=[], lost=False)
 
     def run_sequence(
         sequence, perturbation, settings, recorder, on_frame, autosave=None, resume=None, slam=None
@@ -259,6 +301,8 @@ def pipeline(monkeypatch) -> SimpleNamespace:
         T_wc = circle(len(sequence))  # the ground truth, if it has one
         T_wc[:, 1, 3] += 2.0
         tracks = [fake_result(k, T_wc[k]) for k in range(len(sequence))]
+        if calls.lost:
+            tracks = [replace(track, state=TrackingState.LOST) for track in tracks]
         for track in tracks:
             on_frame(track)
         trajectory = Trajectory(sequence.timestamps, T_wc)
@@ -426,6 +470,27 @@ def test_interrupted_run_keeps_its_results(call, root, pipeline):
     assert code == 1
     assert "Ctrl-C" in out
     assert Path("runs/latest/trajectory.tum").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("", "vslam doctor says what is wrong"),
+        ("--perturb night:9", "under --perturb night:9; a weaker one"),
+        ("--sensor mono", "one camera must move sideways"),
+    ],
+)
+def test_a_run_that_tracked_nothing_exits_with_1_and_says_why(call, root, pipeline, words, why):
+    pipeline.lost = True
+    command = ("run", "--data", root, "--max-frames", 10, *words.split())
+    code, out, err = call(*command)
+    assert (code, "error" in err) == (1, False)
+    assert "nothing was tracked in 10 frames" in out
+    assert why in out
+    code, out, err = call(*command, "--quiet")
+    assert (code, out) == (1, "")
+    assert err.startswith("error: nothing was tracked in 10 frames")
+    assert why in err
 
 
 def test_eval(call, tmp_path):

@@ -499,6 +499,19 @@ def test_a_report_shows_a_few_loops(tmp_path: Path) -> None:
     assert "6 of the 20 closed loops are shown." in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.parametrize("recordings", [[], ["recording.rrd"], ["recording-from-9.rrd"]])
+def test_the_pages_name_the_recordings_that_there_are(
+    tmp_path: Path, recordings: list[str]
+) -> None:
+    for name in recordings:
+        (tmp_path / name).touch()
+    report_of(make_outcome(40), tmp_path)
+    for page in ("report.md", "report.html"):
+        text = (tmp_path / page).read_text()
+        assert re.findall(r"rerun (\S+\.rrd)", text) == recordings
+        assert ("Replay" in text or "## Recording" in text) is bool(recordings)
+
+
 def test_missed_revisit_is_named(tmp_path: Path) -> None:
     outcome = two_laps()
     report = report_of(replace(outcome, loops=outcome.loops[1:3], corrections=[]), tmp_path)
@@ -535,6 +548,21 @@ def test_interrupted_run_is_not_blamed_for_revisits_to_come() -> None:
     outcome = replace(outcome, trajectory=outcome.trajectory.select(done), loops=[], corrections=[])
     report = summarize(outcome, None, evaluate_loops(outcome), None)
     assert (report.revisit_stretches, report.loops_missed) == (0, 0)
+
+
+def test_a_right_loop_on_a_revisit_too_short_to_count_is_explained() -> None:
+    outcome = two_laps()
+    done = np.arange(266)
+    outcome = replace(
+        outcome,
+        trajectory=outcome.trajectory.select(done),
+        loops=outcome.loops[:1],
+        corrections=[],
+    )
+    report = summarize(outcome, None, evaluate_loops(outcome), None)
+    assert (report.revisit_stretches, report.loops_closed, report.loops[0].right) == (0, 1, True)
+    note = headlines(report)[-1].note
+    assert note.startswith("no revisit of 20 m or more to be found (1 right on shorter ones), ")
 
 
 def test_before_is_drawn_in_the_frame_of_the_ground_truth() -> None:

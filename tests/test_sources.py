@@ -383,3 +383,32 @@ def test_a_run_of_a_url_has_a_folder_with_a_plain_name(tmp_path):
     assert folder.parent == tmp_path
     assert "camera-camera.local_live_stream" in folder.name
     assert len(folder.name) < 120
+
+
+@pytest.mark.parametrize("quiet", [[], ["--quiet"]])
+def test_swapped_sides_end_a_run_with_1_and_the_way_to_swap_them(folder, tmp_path, quiet):
+    left, right = (folder / "images" / side for side in ("left", "right"))
+    words = [
+        "run", str(right), "--right", str(left), "--calib", str(folder / "stereo.yaml"),
+        "--fps", "10", "--detector", "none", "--no-record", *quiet,
+    ]  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "vslam", *words],
+        cwd=tmp_path, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    said = done.stderr if quiet else done.stdout
+    assert done.returncode == 1
+    assert f"nothing was tracked in {FRAMES} frames: disparities are negative" in said
+    assert f"--data {left} --right {right}" in said
+    report = json.loads((tmp_path / "runs" / "latest" / "report.json").read_text())
+    assert "disparities are negative" in report["warnings"][0]
+
+
+def test_swapped_topics_of_a_bag_are_named(corridor, tmp_path):
+    pair = {"/a/image_rect": corridor.left[:2], "/b/image_rect": corridor.right[:2]}
+    write_bag(tmp_path / "b.bag", "ros1", pair, STAMPS[:2], camera=corridor.camera)
+    with pytest.raises(InputError, match=r"the sides seem swapped.*--topics"):
+        open_source(
+            "bag", str(tmp_path / "b.bag"), "",
+            SourceOptions(topics=("/b/image_rect", "/a/image_rect")),
+        )  # fmt: skip

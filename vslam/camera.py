@@ -5,6 +5,7 @@ Camera frame: x right, y down, z forward. Units: metres and pixels.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol, TypeVar
@@ -37,6 +38,10 @@ class Camera:
             one's pixels.
         right_delay: seconds by which the right image of a pair is taken later than the left one,
             negative if it is taken earlier; 0 for cameras that share a trigger.
+
+    Raises:
+        ValueError: a size or focal length that is not positive, a negative baseline, or a principal
+            point further from the image than the image is wide or high.
     """
 
     fx: float
@@ -48,6 +53,29 @@ class Camera:
     height: int
     depth: bool = False
     right_delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that no camera has.
+
+        Raises:
+            ValueError: in one sentence which number is wrong.
+        """
+        size = f"{self.width}x{self.height}"
+        if not (self.width > 0 and self.height > 0):
+            raise ValueError(f"the image size {size} must be positive")
+        if not (0 < self.fx < math.inf and 0 < self.fy < math.inf):
+            raise ValueError(f"the focal lengths ({self.fx}, {self.fy}) must be positive")
+        if not 0 <= self.baseline < math.inf:
+            raise ValueError(
+                f"the baseline of {self.baseline} m must not be negative; "
+                "it is 0 for a single camera"
+            )
+        # A rectified view may well have its principal point beside the image, but not far from it.
+        near = -self.width <= self.cx <= 2 * self.width
+        if not (near and -self.height <= self.cy <= 2 * self.height):
+            raise ValueError(
+                f"the principal point ({self.cx}, {self.cy}) lies far outside the {size} image"
+            )
 
     @property
     def sensor(self) -> Sensor:
@@ -130,6 +158,12 @@ def check_images(left: Image, second: Image | DepthImage | None, camera: Camera)
         raise ValueError(f"a {what} image belongs to a camera of {camera.sensor}")
     expected = (camera.height, camera.width)
     images = [left] if second is None else [left, second]
+    if any(image.shape[:2] == expected and image.ndim == 3 for image in images):
+        raise ValueError(
+            f"an image is in colour, {' and '.join(str(image.shape) for image in images)}, where "
+            f"grey is wanted, {expected}; convert it with "
+            "cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)"
+        )
     if any(image.shape != expected for image in images):
         shapes = " and ".join(str(image.shape) for image in images)
         raise ValueError(f"images are {shapes}, the camera's {expected}")

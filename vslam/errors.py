@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 
@@ -36,3 +37,12 @@ class BrokenSourceError(InputError):
 
 class ResultsError(Exception):
     """Results cannot be written, on a full disk for example. The CLI exits with 1."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """`` (did you mean NAME?)`` with the known name that a misspelt word is most like; empty if it
+    is like none."""
+    from difflib import get_close_matches  # only a mistake needs it
+
+    near = get_close_matches(word.lower(), list(known), n=1)
+    return f" (did you mean {near[0]}?)" if near else ""

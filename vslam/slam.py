@@ -111,7 +111,7 @@ class Slam:
     @classmethod
     def load(
         cls,
-        path: Path,
+        path: Path | str,
         config: Config | None = None,
         detector: LoopDetector | str | None = None,
         *,
@@ -135,7 +135,7 @@ class Slam:
         except (ValueError, KeyError) as error:
             raise InputError(f"{path}: {error}; go on with the options of its run.") from error
 
-    def save(self, path: Path, drive: str = "", *, resumable: bool = False) -> None:
+    def save(self, path: Path | str, drive: str = "", *, resumable: bool = False) -> None:
         """Write the map to a file, in place of what is there: all that ``load`` needs.
 
         Args:

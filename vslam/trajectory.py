@@ -58,7 +58,7 @@ def bridge_gaps(trajectory: Trajectory, known: NDArray[np.bool_]) -> Trajectory:
 
 
 def read_table(
-    path: Path, columns: tuple[int, ...], what: str, max_rows: int | None = None
+    path: Path | str, columns: tuple[int, ...], what: str, max_rows: int | None = None
 ) -> NDArray[np.float64]:
     """Read a text file of numbers; blank lines and lines that begin with ``#`` are passed over.
 
@@ -75,7 +75,7 @@ def read_table(
         InputError: missing, empty or malformed file, NaN or infinity in it.
     """
     try:
-        lines = path.read_text().splitlines()
+        lines = Path(path).read_text().splitlines()
     except OSError as error:
         raise InputError(f"{path}: cannot read the file ({error.strerror}).") from error
     except UnicodeDecodeError as error:
@@ -111,7 +111,7 @@ def read_table(
     return np.array(rows)
 
 
-def trajectory_format(path: Path) -> Literal["kitti", "tum"]:
+def trajectory_format(path: Path | str) -> Literal["kitti", "tum"]:
     """Tell the two formats apart by the number of columns of the first pose.
 
     Raises:
@@ -120,7 +120,7 @@ def trajectory_format(path: Path) -> Literal["kitti", "tum"]:
     return _FORMAT_OF_COLUMNS[read_table(path, (12, 8), "a pose", max_rows=1).shape[1]]
 
 
-def read_kitti_poses(path: Path) -> NDArray[np.float64]:
+def read_kitti_poses(path: Path | str) -> NDArray[np.float64]:
     """Read a KITTI pose file into ``(N, 4, 4)`` float64 ``T_wc``.
 
     Raises:
@@ -129,7 +129,7 @@ def read_kitti_poses(path: Path) -> NDArray[np.float64]:
     return _poses_of_rows(path, read_table(path, (12,), "a KITTI pose"))
 
 
-def read_trajectory(path: Path, timestamps: NDArray[np.float64] | None = None) -> Trajectory:
+def read_trajectory(path: Path | str, timestamps: NDArray[np.float64] | None = None) -> Trajectory:
     """Read a KITTI (12 columns) or TUM (8 columns) trajectory.
 
     Args:
@@ -167,11 +167,11 @@ def read_trajectory(path: Path, timestamps: NDArray[np.float64] | None = None) -
     return Trajectory(rows[:, 0], T_wc)
 
 
-def write_kitti(path: Path, T_wc: NDArray[np.float64]) -> None:
+def write_kitti(path: Path | str, T_wc: NDArray[np.float64]) -> None:
     """Write ``(N, 4, 4)`` poses in KITTI's format with 13 significant digits."""
     rows = T_wc[:, :3, :].reshape(-1, 12) + 0.0  # no "-0": equal poses give equal bytes
     lines = (" ".join([f"{x:.12e}" for x in row]) + "\n" for row in rows.tolist())
-    path.write_text("".join(lines))
+    Path(path).write_text("".join(lines))
 
 
 def tum_line(timestamp: float, T_wc: NDArray[np.float64]) -> str:
@@ -182,11 +182,11 @@ def tum_line(timestamp: float, T_wc: NDArray[np.float64]) -> str:
     return " ".join([f"{timestamp:.9f}", *numbers]) + "\n"
 
 
-def write_tum(path: Path, trajectory: Trajectory) -> None:
+def write_tum(path: Path | str, trajectory: Trajectory) -> None:
     """Write a trajectory in TUM's format: nanoseconds, nanometres, quaternions with qw >= 0."""
     T_wc = trajectory.T_wc
     rows = np.column_stack([T_wc[:, :3, 3], quaternions(T_wc[:, :3, :3])]).tolist()
-    path.write_text(
+    Path(path).write_text(
         "".join(
             f"{t:.9f} "
             + " ".join(f"{x:.9f}" for x in row[:3])
@@ -199,7 +199,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     )
 
 
-def write_euroc(path: Path, trajectory: Trajectory) -> None:
+def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
     """Write a trajectory as EuRoC's ground truth is written, without velocities and biases.
 
     Times are whole nanoseconds, but no better than float64 seconds: 0.2 us in Unix time.
@@ -211,7 +211,7 @@ def write_euroc(path: Path, trajectory: Trajectory) -> None:
     rows = np.column_stack([trajectory.T_wc[:, :3, 3], q[:, 3], q[:, :3]])
     for seconds, row in zip(trajectory.timestamps.tolist(), rows.tolist(), strict=True):
         lines.append(",".join([str(round(seconds * 1e9)), *(f"{x:.12f}" for x in row)]) + "\n")
-    path.write_text("".join(lines))
+    Path(path).write_text("".join(lines))
 
 
 def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -250,7 +250,7 @@ def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(((q[:, 3] < 0) | ((q[:, 3] == 0) & (first < 0)))[:, None], -q, q)
 
 
-def _poses_of_rows(path: Path, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+def _poses_of_rows(path: Path | str, rows: NDArray[np.float64]) -> NDArray[np.float64]:
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
     T_wc[:, :3, :] = rows.reshape(-1, 3, 4)
     R_wc = T_wc[:, :3, :3]

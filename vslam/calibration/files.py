@@ -43,7 +43,7 @@ _PAIRS = (  # in a folder
 )
 
 
-def read_calibration(files: Sequence[Path], size: Size | None = None) -> Calibration:
+def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> Calibration:
     """Read a calibration in any of the formats of docs/cameras.md.
 
     Args:
@@ -55,7 +55,9 @@ def read_calibration(files: Sequence[Path], size: Size | None = None) -> Calibra
             can have.
     """
     paths = [
-        found for given in files for found in (_in_folder(given) if given.is_dir() else [given])
+        found
+        for given in map(Path, files)
+        for found in (_in_folder(given) if given.is_dir() else [given])
     ]
     documents = [read_document(path) for path in paths]
     for keys, reader, most in _FORMATS:

@@ -141,6 +141,12 @@ def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
         return Calibration(models[0], source=documents[0].source)
     left, right = found
     P = right.matrix("P", 3, 4)
+    if P[0, 3] == 0 and "P" in left and left.matrix("P", 3, 4)[0, 3] != 0:
+        raise InputError(
+            f"{_sources(documents)}: the sides seem swapped, since the baseline is in the first "
+            "camera's projection matrix and belongs into the right one's; name the left camera "
+            "first, with --topics or --calib."
+        )
     T_left_right = _unrectified(left.matrix("R", 3, 3), right.matrix("R", 3, 3), P, right.source)
     return _pair(_sources(documents), models[0], models[1], T_left_right)
 

@@ -75,7 +75,7 @@ def unchanged(image: Pixels) -> Pixels:
 def _rectify_one(calibration: Calibration) -> Rectification:
     model = calibration.left
     if model.undistorted:
-        return _as_it_is(model, 0.0)
+        return _as_it_is(calibration.source, model, 0.0)
     camera = _common_view(calibration.source, [(model, np.eye(3))], 0.0)
     left = _maps(model, np.eye(3), camera)
     return Rectification(camera, np.eye(3), _linear(left), unchanged, _nearest(left), False)
@@ -89,7 +89,7 @@ def _rectify_pair(
     baseline = float(np.linalg.norm(centre))
     R_left_rectified = _between(R_left_right, centre, source)
     if _is_rectified(left, right, R_left_right, centre):
-        return _as_it_is(left, baseline)
+        return _as_it_is(source, left, baseline)
     R_right_rectified = R_left_right.T @ R_left_rectified
     pair = [(left, R_left_rectified), (right, R_right_rectified)]
     camera = _common_view(source, pair, baseline)
@@ -104,9 +104,23 @@ def _rectify_pair(
     )
 
 
-def _as_it_is(model: CameraModel, baseline: float) -> Rectification:
-    camera = Camera(model.fx, model.fy, model.cx, model.cy, baseline, model.width, model.height)
+def _as_it_is(source: str, model: CameraModel, baseline: float) -> Rectification:
+    centre = model.cx, model.cy
+    camera = _camera(source, (model.fx, model.fy), centre, baseline, (model.width, model.height))
     return Rectification(camera, np.eye(3), unchanged, unchanged, unchanged, True)
+
+
+def _camera(
+    source: str,
+    focal: tuple[float, float],
+    centre: tuple[float, float],
+    baseline: float,
+    size: tuple[int, int],
+) -> Camera:
+    try:
+        return Camera(*focal, *centre, baseline, *size)
+    except ValueError as error:
+        raise InputError(f"{source}: {error}; correct the calibration.") from error
 
 
 def _is_rectified(
@@ -171,7 +185,7 @@ def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline
     cx = (width - 1) / 2 - focal * (x0 + x1) / 2
     cy = (height - 1) / 2 - focal * (y0 + y1) / 2
     focal, cx, cy = float(focal), float(cx), float(cy)
-    camera = Camera(focal, focal, cx, cy, baseline, width, height)
+    camera = _camera(source, (focal, focal), (cx, cy), baseline, (width, height))
     for model, R_own_rectified in cameras:
         _check_view(model, R_own_rectified, camera, source)
     return camera

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
 import typer
 
 from vslam.cli.console import console
-from vslam.errors import InputError
+from vslam.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
     from vslam.cli.console import Console
@@ -58,6 +58,7 @@ def drive(
     # Bad input has been refused by now; what follows takes a second to import.
     from vslam.cli.summary import print_summary
     from vslam.datasets.stream import count_expected
+    from vslam.doctor.nothing_tracked import why_nothing_was_tracked
     from vslam.report.folder import write_results
     from vslam.run.autosave import FolderAutosave, remove_autosave
     from vslam.run.moments import LoopPictureRecorder, MomentRecorder
@@ -81,6 +82,8 @@ def drive(
                 source, perturbation, settings, recorder,
                 on_frame=on_frame, autosave=autosave, resume=unfinished, slam=slam,
             )  # fmt: skip
+        if why := why_nothing_was_tracked(outcome, options):
+            outcome = replace(outcome, warnings=[why, *outcome.warnings])
         report = write_results(
             folder, outcome, moments.moments, pictures.pictures,
             pages=output.pages, ply=output.ply, map_file=output.save_map,
@@ -89,7 +92,9 @@ def drive(
             remove_autosave(folder)
     if not output.quiet:
         print_summary(report, folder)
-    if outcome.interrupted:
+    if why and output.quiet:  # else the summary has said it
+        raise ResultsError(f"{why}.")
+    if why or outcome.interrupted:
         raise typer.Exit(1)
 
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import atexit
 import gc
 import os
+import re
 import signal
 import sys
 from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType, ModuleType
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from vslam.cli import (
     bench,
@@ -31,7 +33,7 @@ from vslam.cli import (
     vocabulary,
 )
 from vslam.cli import map as map_
-from vslam.errors import InputError, ResultsError
+from vslam.errors import InputError, ResultsError, did_you_mean
 from vslam.machine import keep_memory
 from vslam.untrusted import require_utf8
 
@@ -39,6 +41,29 @@ _GROUPS: tuple[ModuleType, ...] = (
     run, evaluate, perturb, info, doctor, bench, stress, report, synth, train, export, map_,
     vocabulary, loops,
 )  # fmt: skip
+
+
+class _Command(TyperCommand):
+    """A command that says of a misspelt choice which one may be meant."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """See ``TyperCommand.parse_args``."""
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            error.message = _plain(error.message)
+            raise
+
+
+def _plain(message: str) -> str:
+    """What the parser says of a value, without the name of the library that it has it from."""
+    message = message.removeprefix("Value error, ")
+    word, found, choices = message.partition(" is not one of ")
+    if not found:
+        return message
+    known = re.findall("'([^']*)'", choices)
+    meant = did_you_mean(word.strip("'"), known)
+    return f"{word}{found}{choices.rstrip('.')}{meant}."
 
 
 def application(groups: Collection[ModuleType]) -> typer.Typer:
@@ -52,6 +77,9 @@ def application(groups: Collection[ModuleType]) -> typer.Typer:
     )
     for group in groups:
         group.register(made)
+    for commands in (made, *(group.typer_instance for group in made.registered_groups)):
+        for command in commands.registered_commands if commands else ():
+            command.cls = _Command
     made.callback(invoke_without_command=True)(version)
     return made
 

@@ -55,6 +55,12 @@ _EXAMPLES = """
 """
 
 
+_WITHOUT_DATA = """there is nothing to run on; name some images, or take rendered ones:
+  vslam run --dataset synthetic --seq demo          a drive that needs no download
+  vslam run DATA --calib FILE                       images, video, bag or camera (docs/sources.md)
+  vslam run --data FOLDER --seq 00                  KITTI, also by $KITTI_ROOT (datasets.md)"""
+
+
 def register(app: typer.Typer) -> None:
     """Add the command to the application."""
     app.command(epilog=_EXAMPLES)(run)
@@ -232,6 +238,8 @@ def run(
         realtime=realtime,
         autosave=autosave,
     )
+    if dataset is None and data == str(KITTI_ROOT) and not KITTI_ROOT.exists():
+        raise InputError(_WITHOUT_DATA)
     drive(options, output, out=out)
 
 

@@ -71,14 +71,14 @@ class Config(Section):
     siamese: SiameseConfig = SiameseConfig()
 
 
-def load_config(path: Path) -> Config:
+def load_config(path: Path | str) -> Config:
     """Read a configuration in JSON; keys left out keep their defaults.
 
     Raises:
         InputError: missing file, no JSON, unknown key or value out of range.
     """
     try:
-        return Config.model_validate_json(path.read_bytes())
+        return Config.model_validate_json(Path(path).read_bytes())
     except OSError as error:
         raise InputError(f"{path}: cannot read the configuration ({error.strerror}).") from error
     except ValidationError as error:

@@ -9,7 +9,7 @@ from pathlib import Path
 from vslam import plugins
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import Stream
-from vslam.errors import InputError
+from vslam.errors import InputError, did_you_mean
 
 _FIRST = "00"  # KITTI's, and the town rendered after it
 DATASETS = ("kitti", "euroc", "tum", "synthetic")  # those that `open_sequence` knows
@@ -17,14 +17,14 @@ DATASETS = ("kitti", "euroc", "tum", "synthetic")  # those that `open_sequence` 
 
 def open_sequence(
     dataset: str,
-    root: Path,
+    root: Path | str,
     name: str | None = None,
     *,
     start: int = 0,
     every: int = 1,
     max_frames: int | None = None,
     monocular: bool = False,
-    calib: Several[Path] = (),
+    calib: Several[Path | str] = (),
     depth_scale: float | None = None,
     on_render: Callable[[int, int], None] | None = None,
 ) -> Sequence:
@@ -112,14 +112,14 @@ def open_sequence(
 
 def open_plugin_source(
     dataset: str,
-    root: Path,
+    root: Path | str,
     name: str | None,
     *,
     start: int,
     every: int,
     max_frames: int | None,
     monocular: bool,
-    calib: Several[Path],
+    calib: Several[Path | str],
 ) -> Sequence | Stream:
     """What a reader of another package opens.
 
@@ -128,15 +128,18 @@ def open_plugin_source(
     """
     others = plugins.find_plugins(plugins.READERS)
     if dataset not in others:
-        known = ", ".join((*DATASETS, *others))
-        raise InputError(f"--dataset {dataset}: unknown data set; this version reads {known}.")
+        known = (*DATASETS, *others)
+        raise InputError(
+            f"--dataset {dataset}: unknown data set{did_you_mean(dataset, known)}; this version "
+            f"reads {', '.join(known)}."
+        )
     if calib:
         raise InputError(f"--calib: {others[dataset]} brings its own; leave it out.")
     from vslam.datasets.plugin_reader import open_plugin
 
     return open_plugin(
         others[dataset],
-        root,
+        Path(root),
         name,
         start=start,
         every=every,

@@ -109,7 +109,7 @@ class BagStream:
 
 
 def open_bag(
-    path: Path,
+    path: Path | str,
     *,
     topics: tuple[str, ...] = (),
     sensor: str | None = None,
@@ -129,6 +129,7 @@ def open_bag(
         InputError: rosbags is not installed, no bag, cut off, topics missing, or images that have
             no stamps, cannot be decoded or do not belong together.
     """
+    path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such file; name a bag with --data.")
     with _opened(path) as bag:

@@ -28,14 +28,14 @@ _POSE_COLUMNS = 8  # time, position, quaternion; velocities and biases may follo
 
 
 def open_euroc(
-    root: Path,
+    root: Path | str,
     name: str | None = None,
     *,
     start: int = 0,
     every: int = 1,
     max_frames: int | None = None,
     monocular: bool = False,
-    calib: Several[Path] = (),
+    calib: Several[Path | str] = (),
 ) -> Sequence:
     """Open a sequence; its images are rectified as they are read.
 
@@ -56,7 +56,7 @@ def open_euroc(
         InputError: data missing or malformed, no pairs, calibration unusable.
         UnreadableImageError: the first pair cannot be decoded.
     """
-    base, found = _find(root, name)
+    base, found = _find(Path(root), name)
     cameras = [base / f"cam{side}" for side in range(1 if monocular else 2)]
     listed = [_read_list(camera) for camera in cameras]
     frames = _pair(cameras, listed)

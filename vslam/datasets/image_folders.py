@@ -98,10 +98,10 @@ class ImageFolders:
 
 
 def open_images(
-    folder: Path,
-    right: Path | None = None,
+    folder: Path | str,
+    right: Path | str | None = None,
     *,
-    depth: Path | None = None,
+    depth: Path | str | None = None,
     fps: float | None = None,
     start: int = 0,
     every: int = 1,
@@ -121,6 +121,9 @@ def open_images(
         InputError: no images, no second ones, sides that do not match, or no usable times.
         UnreadableImageError: the first image cannot be decoded.
     """
+    folder = Path(folder)
+    right = None if right is None else Path(right)
+    depth = None if depth is None else Path(depth)
     places, is_depth = _find_sides(folder, right, depth, sensor)
     files = _matched([_sorted_images(place) for place in places], places, by_time=is_depth)
     n = len(files[0])

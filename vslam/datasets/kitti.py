@@ -80,7 +80,7 @@ class KittiSequence(KittiImages):
 
 
 def open_kitti(
-    root: Path,
+    root: Path | str,
     name: str,
     *,
     start: int = 0,
@@ -104,7 +104,7 @@ def open_kitti(
 
 
 def open_kitti_images(
-    root: Path,
+    root: Path | str,
     name: str,
     *,
     start: int = 0,
@@ -164,7 +164,7 @@ def open_kitti_images(
     )
 
 
-def list_kitti(root: Path) -> list[tuple[str, int, int]]:
+def list_kitti(root: Path | str) -> list[tuple[str, int, int]]:
     """Name and numbers of left and right images of each sequence below ``root``.
 
     Raises:
@@ -176,7 +176,7 @@ def list_kitti(root: Path) -> list[tuple[str, int, int]]:
     ]
 
 
-def read_calibration(path: Path, *, width: int, height: int) -> Camera:
+def read_calibration(path: Path | str, *, width: int, height: int) -> Camera:
     """Read P0 and P1 of ``calib.txt``, with or without the ``P0:`` at the beginning of the line.
 
     Args:
@@ -188,7 +188,7 @@ def read_calibration(path: Path, *, width: int, height: int) -> Camera:
     """
     fix = "take calib.txt of this sequence from KITTI's calibration files"
     try:
-        lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
+        lines = [line.split() for line in Path(path).read_text().splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: the calibration is missing or unreadable; {fix}.") from error
     keyed = {words[0].rstrip(":"): words[1:] for words in lines if words[0].endswith(":")}
@@ -218,7 +218,8 @@ def read_calibration(path: Path, *, width: int, height: int) -> Camera:
     return Camera(float(fx), float(fy), float(cx), float(cy), float(baseline), width, height)
 
 
-def _find_root(root: Path) -> Path:
+def _find_root(root: Path | str) -> Path:
+    root = Path(root)
     for base in (root, root / "dataset"):
         if (base / "sequences").is_dir():
             return base

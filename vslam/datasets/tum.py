@@ -42,14 +42,14 @@ _CAMERAS = {
 
 
 def open_tum(
-    root: Path,
+    root: Path | str,
     name: str | None = None,
     *,
     start: int = 0,
     every: int = 1,
     max_frames: int | None = None,
     monocular: bool = False,
-    calib: Several[Path] = (),
+    calib: Several[Path | str] = (),
     depth_scale: float | None = None,
 ) -> Sequence:
     """Open a sequence; its images are undistorted as they are read.
@@ -72,6 +72,7 @@ def open_tum(
         InputError: data missing or malformed, no pairs, calibration or ground truth unusable.
         UnreadableImageError: a file is empty, the first pair cannot be decoded or does not fit.
     """
+    root = Path(root)
     folder = find_sequence(root, name, is_tum)
     if folder is None:
         raise InputError(
@@ -148,7 +149,7 @@ def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
     return np.array(times), files
 
 
-def _calibration(folder: Path, calib: Several[Path], size: tuple[int, int]) -> Calibration:
+def _calibration(folder: Path, calib: Several[Path | str], size: tuple[int, int]) -> Calibration:
     own = folder / CALIBRATION
     if calib or own.is_file():
         return read_calibration(calib or [own], size)

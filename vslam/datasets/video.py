@@ -63,7 +63,11 @@ class VideoStream:
 
 
 def open_video(
-    path: Path, *, fps: float | None = None, side_by_side: bool = False, monocular: bool = False
+    path: Path | str,
+    *,
+    fps: float | None = None,
+    side_by_side: bool = False,
+    monocular: bool = False,
 ) -> VideoStream:
     """Open a video and decode its first frames.
 
@@ -76,6 +80,7 @@ def open_video(
             f"{path}: a video has one image a frame; say --side-by-side if it holds both of a "
             "stereo pair, or run with --sensor mono."
         )
+    path = Path(path)
     capture = _open(path)
     _check_size(path, capture)
     n = _count(capture)

@@ -161,7 +161,7 @@ def kitti_drift(
 
 
 def read_pair(
-    estimate: Path, ground_truth: Path, times: Path | None = None
+    estimate: Path | str, ground_truth: Path | str, times: Path | str | None = None
 ) -> tuple[Trajectory, Trajectory]:
     """Read an estimate and its ground truth, each in either format.
 
@@ -189,7 +189,7 @@ def read_pair(
 
 
 def evo_command(
-    estimate: Path, ground_truth: Path, alignment: str, format_: Literal["kitti", "tum"]
+    estimate: Path | str, ground_truth: Path | str, alignment: str, format_: Literal["kitti", "tum"]
 ) -> str:
     """The ``evo_ape`` command line that reproduces the ATE of two files of one format."""
     files = shlex.join([str(ground_truth), str(estimate)])

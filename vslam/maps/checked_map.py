@@ -259,7 +259,10 @@ def camera_of(header: dict[str, Any]) -> Camera:
     Raises:
         DamagedMapError, KeyError, TypeError, ValueError: as ``checked_map``.
     """
-    camera = Camera(**header["camera"])
+    try:
+        camera = Camera(**header["camera"])
+    except ValueError as error:
+        raise DamagedMapError(f"the camera: {error}") from error
     sizes = [camera.fx, camera.fy, camera.width, camera.height]
     places = [camera.cx, camera.cy, camera.baseline, camera.right_delay]
     sound = all(isinstance(x, int | float) and 1 <= x < _MOST_PIXELS for x in sizes)

@@ -44,7 +44,7 @@ class _Point(NamedTuple):
 
 
 def save_colmap(
-    folder: Path,
+    folder: Path | str,
     reconstruction: Reconstruction,
     names: list[str],
     colours: NDArray[np.uint8],
@@ -65,7 +65,7 @@ def save_colmap(
     """
     write = _write_text if text else _write_binary
     images = list(_images(reconstruction, names))
-    write(folder, reconstruction.camera, images, list(_points(reconstruction, colours)))
+    write(Path(folder), reconstruction.camera, images, list(_points(reconstruction, colours)))
 
 
 def _images(reconstruction: Reconstruction, names: list[str]) -> Iterator[_Image]:

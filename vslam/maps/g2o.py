@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def save_g2o(
-    path: Path,
+    path: Path | str,
     ids: NDArray[np.int64],
     T_wc: NDArray[np.float64],
     edges: NDArray[np.int64],
@@ -44,7 +44,7 @@ def save_g2o(
     ):
         triangle = np.diag(diagonal)[upper].tolist()
         lines.append(f"EDGE_SE3:QUAT {ends[0]} {ends[1]} {_words(values)} {_words(triangle)}\n")
-    path.write_text("".join(lines))
+    Path(path).write_text("".join(lines))
 
 
 def _poses(T: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -25,7 +25,10 @@ T_CAMERA_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def save_nerfstudio(
-    folder: Path, reconstruction: Reconstruction, names: list[str], colours: NDArray[np.uint8]
+    folder: Path | str,
+    reconstruction: Reconstruction,
+    names: list[str],
+    colours: NDArray[np.uint8],
 ) -> None:
     """Write ``transforms.json`` and the landmarks as ``sparse_pc.ply``.
 
@@ -57,5 +60,6 @@ def save_nerfstudio(
             for name, pose in zip(names, poses, strict=True)
         ],
     }
+    folder = Path(folder)
     (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n")
     save_ply(folder / POINTS, reconstruction.xyz @ T_SAVED_WORLD[:3, :3].T, colours)

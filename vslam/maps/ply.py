@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def save_ply(
-    path: Path, xyz: NDArray[np.float64], colours: NDArray[np.uint8] | None = None
+    path: Path | str, xyz: NDArray[np.float64], colours: NDArray[np.uint8] | None = None
 ) -> None:
     """Write ``(N, 3)`` points (world, metres) as binary PLY, with ``(N, 3)`` RGB ``colours``."""
     fields = [("xyz", "<f4", 3)]
@@ -25,6 +25,6 @@ def save_ply(
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(xyz)}\n{''.join(properties)}end_header\n"
     )
-    with path.open("wb") as file:
+    with Path(path).open("wb") as file:
         file.write(header.encode())
         file.write(vertices.tobytes())

@@ -32,7 +32,7 @@ SCHEMA = 6
 _FOREIGN = "not a map of vslam; name a map.npz, or the folder of a run"
 
 
-def save_map(path: Path, stored: StoredMap, *, resumable: bool = False) -> None:
+def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) -> None:
     """Write a map, in place of what is there: what lives of it; all, if it has a checkpoint and is
     to be ``resumable``.
 
@@ -46,11 +46,11 @@ def save_map(path: Path, stored: StoredMap, *, resumable: bool = False) -> None:
     """
     whole = resumable and stored.checkpoint is not None
     arrays = _as_arrays(stored if whole else stored.compact(copy=False))
-    with replaced_file(path) as file:
+    with replaced_file(Path(path)) as file:
         np.savez(file, allow_pickle=False, **arrays)
 
 
-def load_map(path: Path) -> StoredMap:
+def load_map(path: Path | str) -> StoredMap:
     """Read a map, and check all that kernels rely on. It is compact.
 
     Raises:
@@ -60,12 +60,13 @@ def load_map(path: Path) -> StoredMap:
     return stored if stored.checkpoint is None else stored.compact()
 
 
-def load_checkpoint(path: Path) -> StoredMap:
+def load_checkpoint(path: Path | str) -> StoredMap:
     """``load_map``, but one that was written with a checkpoint comes as it was then.
 
     Raises:
         InputError: as ``load_map``.
     """
+    path = Path(path)
     data, header = _read(path)
     with _as_damage(path):
         return checked_map(data, header)
@@ -141,17 +142,19 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
     return arrays
 
 
-def map_file_of(path: Path) -> Path:
+def map_file_of(path: Path | str) -> Path:
     """The map of the folder of a run; a file as it is."""
+    path = Path(path)
     return path / "map.npz" if path.is_dir() else path
 
 
-def made_with(path: Path) -> tuple[Camera, str]:
+def made_with(path: Path | str) -> tuple[Camera, str]:
     """The camera and the name of the detector that a map was made with, its arrays unread.
 
     Raises:
         InputError: as ``load_map``.
     """
+    path = Path(path)
     with _opened(path) as (_, header), _as_damage(path):
         return camera_of(header), str(header["detector"]["name"])
 

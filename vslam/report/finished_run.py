@@ -36,12 +36,13 @@ class FinishedRun:
     loops: tuple[LoopEdge, ...] = ()
 
 
-def read_run(folder: Path) -> FinishedRun:
+def read_run(folder: Path | str) -> FinishedRun:
     """Read the report and the map of a run.
 
     Raises:
         InputError: no folder of a run, a run without a map, or of another version of vslam.
     """
+    folder = Path(folder)
     if not (folder / "map.npz").is_file():
         raise InputError(f"{folder}: no map.npz here; name the folder of a run, like runs/latest.")
     stored = load_map(folder / "map.npz")
@@ -50,13 +51,13 @@ def read_run(folder: Path) -> FinishedRun:
     return FinishedRun(folder, read_report(folder), stored.map, stored.camera, stored.loops)
 
 
-def read_report(folder: Path) -> ReportJson:
+def read_report(folder: Path | str) -> ReportJson:
     """Read ``report.json`` of a run.
 
     Raises:
         InputError: it is missing, damaged or of another version.
     """
-    path = folder / "report.json"
+    path = Path(folder) / "report.json"
     try:
         content = json.loads(path.read_bytes())
         return ReportJson.model_validate(content)

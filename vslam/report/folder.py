@@ -264,9 +264,11 @@ def _write_pages(
             (file / f"{figure.name}.png").write_bytes(figure.png)
         for loop in seen:
             (file / loop.name).write_bytes(loop.jpeg)
+    recordings = sorted(path.name for path in written.folder.glob("recording*.rrd"))
     with written.file("report.md") as file:
-        file.write_text(render_markdown(report, seen), encoding="utf-8")
+        file.write_text(render_markdown(report, seen, recordings), encoding="utf-8")
     with written.file("report.html") as file:
         explorer = explorer_data(outcome, evaluation, matched_ground_truth(outcome), moments)
-        page = render_html(report, _config_text(outcome), figures, explorer, seen)
+        config = _config_text(outcome)
+        page = render_html(report, config, figures, explorer, seen, recordings)
         file.write_text(page, encoding="utf-8")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
+from vslam.evaluation.loops import LoopLimits
 from vslam.loopclosure.registry import about
 from vslam.report.detector_table import detector_table
 from vslam.report.loop_tables import loop_tables
@@ -118,7 +119,7 @@ def _loops(report: ReportJson) -> Headline:
     notes = []
     if report.revisit_stretches is not None:
         notes += [
-            f"{report.loops_found} of {report.revisit_stretches} revisits found",
+            _revisits(report),
             f"{report.loops_missed} missed",
             f"{report.loops_wrong} wrong",
         ]
@@ -129,9 +130,21 @@ def _loops(report: ReportJson) -> Headline:
     return Headline("Loops", f"{report.loops_closed} closed", ", ".join(notes), tone)
 
 
-def render_markdown(report: ReportJson, seen: Collection[SeenLoop] = ()) -> str:
+def _revisits(report: ReportJson) -> str:
+    """How many stretches were found again; a right loop on one that is too short to count is not
+    left without a word."""
+    if report.revisit_stretches:
+        return f"{report.loops_found} of {report.revisit_stretches} revisits found"
+    none = f"no revisit of {LoopLimits().min_length_m:.0f} m or more to be found"
+    right = sum(loop.accepted and loop.right is True for loop in report.loops)
+    return f"{none} ({right} right on shorter ones)" if right else none
+
+
+def render_markdown(
+    report: ReportJson, seen: Collection[SeenLoop] = (), recordings: Collection[str] = ()
+) -> str:
     """Markdown whose tables are aligned, to be read in a terminal; the pictures of the loops
-    ``seen`` are files in the folder ``figures``."""
+    ``seen`` are files in the folder ``figures``, ``recordings`` are files in its own."""
     lines = [f"# vslam: {report.dataset} {report.sequence}", ""]
     if report.interrupted:
         lines += [f"**Interrupted: {report.interrupted}.** Numbers are of the frames done.", ""]
@@ -155,8 +168,9 @@ def render_markdown(report: ReportJson, seen: Collection[SeenLoop] = ()) -> str:
         lines += _table(table)
     lines += ["", "## Run", "", *markdown_table(("", ""), option_rows(report))]
     lines += ["", "## Machine", "", *markdown_table(("", ""), machine_rows(report))]
-    lines += ["", "## Recording", "", "    rerun recording.rrd", ""]
-    return "\n".join(lines)
+    if recordings:
+        lines += ["", "## Recording", "", *(f"    rerun {name}" for name in recordings)]
+    return "\n".join([*lines, ""])
 
 
 def _table(table: Table) -> list[str]:
@@ -172,6 +186,7 @@ def render_html(
     figures: Collection[ReportFigure],
     explorer: dict[str, Any] | None = None,
     seen: Collection[SeenLoop] = (),
+    recordings: Collection[str] = (),
 ) -> str:
     """One self-contained page: style, figures and numbers are inside, nothing is loaded.
 
@@ -181,6 +196,7 @@ def render_html(
         figures: drawn by :func:`vslam.report.figures.draw_figures`.
         explorer: made by :func:`vslam.report.explorer.explorer_data`.
         seen: drawn by :func:`vslam.report.seen_loops.seen_loops`.
+        recordings: names of those beside the page.
     """
     return render_page(
         "report.html.jinja",
@@ -190,6 +206,7 @@ def render_html(
         stages=stage_rows(report),
         seen=seen,
         seen_note=seen_note(report, seen),
+        recordings=recordings,
         detector_table=detector_table(report),
         about_detector=about(report.detector),
         loop_tables=loop_tables(report),

@@ -15,7 +15,7 @@ from vslam.datasets.perturbation.kinds import LawKind, Pair, PairLaw, Scene, Sce
 from vslam.datasets.perturbation.registry import LAWS, all_laws
 from vslam.datasets.sequence import Sequence
 from vslam.datasets.stream import Stream, TimedFrame
-from vslam.errors import DroppedFrameError, InputError
+from vslam.errors import DroppedFrameError, InputError, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,8 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
         law, _, strength = item.strip().partition(":")
         if law not in known:
             raise InputError(
-                f"--perturb {spec}: unknown law '{law}'; choose from none, {', '.join(known)}."
+                f"--perturb {spec}: unknown law '{law}'{did_you_mean(law, known)}; choose from "
+                f"none, {', '.join(known)}."
             )
         if law in strengths:
             raise InputError(f"--perturb {spec}: {law} is given twice; add up its strengths.")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.datasets.synthetic.terrain import Roads, Terrain, roads_of
-from vslam.errors import InputError
+from vslam.errors import InputError, did_you_mean
 
 Float = NDArray[np.float64]
 
@@ -143,8 +143,11 @@ def built_in_route(name: str) -> Route:
         InputError: unknown name.
     """
     if name not in _BUILT_IN:
-        known = ", ".join((*ROUTES, *DRIVES))
-        raise InputError(f"synthetic route {name}: unknown; choose one of {known}.")
+        known = (*ROUTES, *DRIVES)
+        raise InputError(
+            f"synthetic route {name}: unknown{did_you_mean(name, known)}; choose one of "
+            f"{', '.join(known)}."
+        )
     plan = _BUILT_IN[name]
     leg = plan.leg
     middle, lane = _round_corners(leg)

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vslam.errors import InputError, ResultsError
-from vslam.lab.bench.grid import Cell, is_finished
+from vslam.lab.bench.grid import Cell, is_finished, tracked_nothing
 
 _POLL_S = 0.1
 _NOT_KEPT = {"map.npz"}  # hundreds of MB on a long sequence, and no figure needs it
@@ -93,11 +93,13 @@ def run_cell(
         command += ["--config", str(work / "config.json"), "--no-record", "--no-report", "--quiet"]
         code = _call([*command, "--out", str(work / "runs")], work / "log.txt", stopped)
         log = (work / "log.txt").read_text(errors="replace")
+        for folder in (path.parent for path in work.glob("runs/*/report.json")):
+            # A run in which nothing was tracked exits with 1, and is a result like any other.
+            done = code == 0 or (code == 1 and tracked_nothing(folder))
+            if done and is_finished(cell, folder, options.config):
+                return Finished(cell, str(folder), _read(folder) | {"log.txt": log.encode()})
         if code:
             return Failed(cell, _reason(code, log), log)
-        for folder in (path.parent for path in work.glob("runs/*/report.json")):
-            if is_finished(cell, folder, options.config):
-                return Finished(cell, str(folder), _read(folder) | {"log.txt": log.encode()})
         return Failed(cell, "no report of this run (another version of vslam?)", log)
 
 

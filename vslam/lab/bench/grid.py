@@ -164,6 +164,12 @@ def read_report(folder: Path) -> ReportJson | None:
     )
 
 
+def tracked_nothing(folder: Path) -> bool:
+    """Whether a run folder holds the report of a run that was lost in every frame."""
+    report = read_report(folder)
+    return report is not None and report.lost_frames + report.dropped_frames == report.frames
+
+
 def is_finished(cell: Cell, folder: Path, config: str) -> bool:
     """Whether ``folder`` holds a complete run of just this cell.
 

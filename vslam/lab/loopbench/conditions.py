@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.perturbation import parse_perturbation
-from vslam.errors import InputError
+from vslam.errors import InputError, did_you_mean
 from vslam.loopclosure.siamese.images import turn_homography
 
 Image = NDArray[np.uint8]
@@ -76,7 +76,10 @@ def parse_conditions(kinds: str, strengths: str) -> list[Condition]:
     """
     names = [name.strip() for name in kinds.split(",") if name.strip()]
     if wrong := [name for name in names if name not in KINDS]:
-        raise InputError(f"--perturb {wrong[0]}: unknown; choose from {', '.join(KINDS)}.")
+        raise InputError(
+            f"--perturb {wrong[0]}: unknown{did_you_mean(wrong[0], KINDS)}; choose from "
+            f"{', '.join(KINDS)}."
+        )
     try:
         levels = [float(text) for text in strengths.split(",") if text.strip()]
     except ValueError as error:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
-from vslam.errors import InputError
+from vslam.errors import InputError, did_you_mean
 from vslam.lab.loopbench.detectors import DescribedImage, Scorer, open_scorer
 from vslam.lab.loopbench.incremental_bow import IncrementalBow
 from vslam.lab.loopbench.lsgd import LsgdScorer
@@ -44,8 +44,11 @@ def require_comparable(name: str, weights: Path | None, protocol: ProtocolName) 
     if name == IncrementalBow.name and protocol != "online":
         raise InputError(f"--detectors {name}: its words grow with a drive; add --protocol online.")
     if name not in (*DETECTORS, *_BASELINES):
-        known = ", ".join((*DETECTORS[1:], *_BASELINES))
-        raise InputError(f"--detectors {name}: unknown; choose from {known}.")
+        known = (*DETECTORS[1:], *_BASELINES)
+        raise InputError(
+            f"--detectors {name}: unknown{did_you_mean(name, known)}; choose from "
+            f"{', '.join(known)}."
+        )
     if name not in _BASELINES:
         require_detector(name, weights, "--detectors")
     elif weights is not None:

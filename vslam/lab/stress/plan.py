@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from vslam.datasets.perturbation import all_laws, law_kind, parse_perturbation
-from vslam.errors import InputError
+from vslam.errors import InputError, did_you_mean
 from vslam.lab.bench.grid import Cell, draws
 from vslam.lab.stress.criterion import Criterion
 from vslam.lab.stress.kitti_c import CORRUPTIONS
@@ -142,8 +142,8 @@ def parse_laws(text: str) -> list[str]:
     for name in names:
         if name not in all_laws():
             raise InputError(
-                f"--laws {text}: unknown law '{name}'; choose from all, {', '.join(all_laws())}; "
-                "their strengths are searched for."
+                f"--laws {text}: unknown law '{name}'{did_you_mean(name, all_laws())}; choose from "
+                f"all, {', '.join(all_laws())}; their strengths are searched for."
             )
     if not names:
         raise InputError("--laws: no law; name some, fog,rain for example, or all.")

@@ -1,0 +1,137 @@
+"""What a program meets that uses vslam as a library: paths as strings, cameras and images that
+cannot be."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from parts import CAMERA
+
+from vslam.calibration.files import read_calibration
+from vslam.calibration.models import Calibration, CameraModel
+from vslam.calibration.rectification import rectify
+from vslam.camera import check_images
+from vslam.config import Config, load_config
+from vslam.datasets import open_sequence
+from vslam.datasets.image_folders import open_images
+from vslam.datasets.kitti import list_kitti
+from vslam.errors import InputError
+from vslam.evaluation.trajectories import read_pair
+from vslam.maps.ply import save_ply
+from vslam.maps.storage import load_map, made_with, map_file_of
+from vslam.report.finished_run import read_report, read_run
+from vslam.slam import Slam
+from vslam.trajectory import (
+    Trajectory,
+    read_kitti_poses,
+    read_trajectory,
+    trajectory_format,
+    write_euroc,
+    write_kitti,
+    write_tum,
+)
+
+
+def test_a_map_is_saved_and_loaded_by_a_string(tmp_path):
+    file = str(tmp_path / "map.npz")
+    Slam(CAMERA, detector="none", threads=1).save(file)
+    assert load_map(file).camera == made_with(file)[0] == CAMERA
+    assert Slam.load(file, threads=1).context.camera == CAMERA
+    assert map_file_of(str(tmp_path)) == Path(file)
+
+
+def test_a_map_is_saved_into_the_working_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Slam(CAMERA, detector="none", threads=1).save("map.npz")
+    assert load_map("map.npz").camera == CAMERA
+
+
+def test_trajectories_are_written_and_read_by_strings(tmp_path):
+    kitti, tum, euroc = (str(tmp_path / name) for name in ("kitti.txt", "tum.txt", "euroc.csv"))
+    drive = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
+    write_kitti(kitti, drive.T_wc)
+    write_tum(tum, drive)
+    write_euroc(euroc, drive)
+    assert (trajectory_format(kitti), trajectory_format(tum)) == ("kitti", "tum")
+    assert len(read_kitti_poses(kitti)) == len(read_trajectory(tum)) == 3
+    assert len(Path(euroc).read_text().splitlines()) == 4
+    assert [len(one) for one in read_pair(kitti, kitti)] == [3, 3]
+
+
+def test_data_and_settings_are_read_by_strings(tmp_path, kitti_tree):
+    root = str(kitti_tree)
+    name, n, _ = list_kitti(root)[0]
+    assert len(open_sequence("kitti", root, name)) == n
+    left, right = (str(kitti_tree / "sequences" / name / f"image_{k}") for k in (0, 1))
+    assert len(open_images(left, right, fps=10.0).timestamps) == n
+    config = tmp_path / "config.json"
+    config.write_text("{}")
+    assert load_config(str(config)) == Config()
+    calib = tmp_path / "one.yaml"
+    calib.write_text("left: {lens: pinhole, size: [640, 240], focal: [9, 9], centre: [320, 120]}")
+    assert read_calibration([str(calib)]).left.width == 640
+    save_ply(str(tmp_path / "map.ply"), np.zeros((1, 3)))
+    assert (tmp_path / "map.ply").stat().st_size
+
+
+@pytest.mark.parametrize("dataset", ["kitti", "euroc", "tum"])
+def test_a_folder_without_data_is_refused_by_its_string(tmp_path, dataset):
+    with pytest.raises(InputError, match=str(tmp_path)):
+        open_sequence(dataset, str(tmp_path))
+
+
+@pytest.mark.parametrize("read", [read_run, read_report])
+def test_a_folder_that_is_no_run_is_refused_by_its_string(tmp_path, read):
+    with pytest.raises(InputError, match=str(tmp_path)):
+        read(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"cx": 6000.0}, r"principal point \(6000.0, 120.0\) lies far outside the 640x240 image"),
+        ({"cy": float("nan")}, "principal point"),
+        ({"baseline": -0.5}, "baseline of -0.5 m must not be negative"),
+        ({"fx": 0.0}, "focal lengths .* must be positive"),
+        ({"fy": -400.0}, "focal lengths"),
+        ({"width": 0}, "size 0x240 must be positive"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused(wrong, words):
+    with pytest.raises(ValueError, match=words):
+        replace(CAMERA, **wrong)
+
+
+def test_a_principal_point_beside_the_image_is_a_camera():
+    assert replace(CAMERA, cx=-10.0, cy=250.0).cx == -10.0
+
+
+def test_a_calibration_of_a_camera_that_cannot_be_is_named():
+    model = CameraModel(400.0, 400.0, 6000.0, 120.0, 640, 240)
+    with pytest.raises(InputError, match=r"^mine.yaml: the principal point .* far outside"):
+        rectify(Calibration(model, source="mine.yaml"))
+
+
+def test_the_camera_of_a_map_file_is_checked(tmp_path):
+    file = tmp_path / "map.npz"
+    Slam(CAMERA, detector="none", threads=1).save(file)
+    with np.load(file) as saved:
+        arrays = dict(saved)
+    header = json.loads(arrays["header"].tobytes())
+    header["camera"]["cx"] = 6000.0
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    np.savez(file, **arrays)
+    with pytest.raises(InputError, match=r"map.npz: .*principal point \(6000.0, 120.0\)"):
+        load_map(file)
+
+
+def test_images_in_colour_are_refused_with_the_way_to_grey():
+    colour = np.zeros((240, 640, 3), np.uint8)
+    with pytest.raises(ValueError, match=r"colour.*cv2\.cvtColor\(image, cv2\.COLOR_BGR2GRAY\)"):
+        check_images(colour, colour, CAMERA)
+    with pytest.raises(ValueError, match="colour"):
+        check_images(colour, None, CAMERA.left_camera())

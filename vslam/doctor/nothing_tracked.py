@@ -1,0 +1,77 @@
+"""Why a run tracked nothing: what can be seen in a few of its frames."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import numpy as np
+
+from vslam.datasets.sequence import Sequence
+from vslam.datasets.stream import Stream, is_live, timed_frames
+from vslam.doctor.checks import check_sides
+from vslam.doctor.matching import joined, match_images
+from vslam.errors import InputError
+from vslam.features import TrackingState
+from vslam.run.options import RunOptions
+from vslam.run.outcome import RunOutcome
+
+_FRAMES = 3  # that are looked at: each shows the sign of hundreds of disparities
+
+
+def why_nothing_was_tracked(outcome: RunOutcome, options: RunOptions) -> str | None:
+    """In one sentence why no frame of a run was tracked, and what to do; None if one was."""
+    tracked = {TrackingState.OK, TrackingState.WEAK}
+    n = len(outcome.tracks)
+    if n == 0 or any(track.state in tracked for track in outcome.tracks):
+        return None
+    said = f"nothing was tracked in {n} frame{'' if n == 1 else 's'}"
+    if len(outcome.skipped) == n:
+        return f"{said}: no image could be read ({outcome.skipped[0].rstrip('.')})"
+    if options.localize:
+        return f"{said}: the map of {options.map_file} shows no place that was seen in them"
+    if outcome.sequence.camera.sensor == "stereo" and not is_live(outcome.sequence):
+        middle = _median_disparity_behind_infinity(outcome.sequence)
+        if middle is not None:
+            how = how_to_swap(outcome.settings.dataset, options)
+            return (
+                f"{said}: disparities are negative (median {middle:.1f} px), as if left and right "
+                f"were swapped; {how}"
+            )
+    if outcome.settings.perturb != "none":
+        return f"{said} under --perturb {outcome.settings.perturb}; a weaker one leaves more to see"
+    if outcome.sequence.camera.monocular:
+        return f"{said}: one camera must move sideways past what it sees; vslam doctor looks closer"
+    return f"{said}: vslam doctor says what is wrong with images, calibration or times"
+
+
+def _median_disparity_behind_infinity(source: Sequence | Stream) -> float | None:
+    """Median disparity of a few frames, in pixels; None where it is not that of swapped sides."""
+    found = []
+    try:
+        for frame in islice(timed_frames(source), _FRAMES):
+            left, right = frame.read(map)
+            found.append(match_images(left, np.asarray(right, np.uint8)))
+    except InputError:  # a damaged image; those before it will do
+        pass
+    if not any(map(len, found)):
+        return None
+    matches = joined(found)
+    middle = float(np.median(matches.left[:, 0] - matches.right[:, 0]))
+    swapped = middle < 0 and check_sides(matches).verdict == "fault"
+    return middle if swapped else None
+
+
+def how_to_swap(dataset: str, options: RunOptions) -> str:
+    """What to type for the sides the other way round, or what to exchange where no option does."""
+    if dataset == "images" and options.right is not None:
+        return f"exchange them: --data {options.right} --right {options.data}"
+    if dataset == "images":
+        return "name the folders the other way round with --data and --right"
+    if dataset == "bag" and options.topics:
+        return f"exchange them: --topics {','.join(reversed(options.topics.split(',')))}"
+    if dataset == "bag":
+        return "name the topics the other way round with --topics"
+    if dataset == "video":
+        return "exchange the halves of the images: the left camera's must be on the left"
+    folders = {"kitti": "image_0 and image_1", "euroc": "cam0 and cam1"}
+    return f"exchange {folders.get(dataset, 'the images of both cameras')}"

@@ -148,8 +148,8 @@ def test_drives_have_clocks_of_their_own():
     two = driven(delay_s=5e-3)
     n = two.n_keyframes
     alone = measure_rig(two, CAMERA)
-    two.sessions = [k % 2 for k in range(n)]
-    two.timestamps = [t - 3.0 * (k % 2) for k, t in enumerate(two.timestamps)]
+    two.sessions = np.arange(n) % 2
+    two.timestamps = two.timestamps - 3.0 * two.sessions
     both = measure_rig(two, CAMERA)
     assert alone is not None
     assert both is not None
@@ -191,7 +191,7 @@ def driven(delay_s: float = 0.0, turned_px: float = 0.0, n: int = 5000) -> Simpl
         xy=np.stack([u, u], axis=1), u_right=u_right + rng.normal(0.0, 0.2, n),
     )  # fmt: skip
     return SimpleNamespace(
-        arrays=arrays, n_rows=n, n_keyframes=10, timestamps=times.tolist(), sessions=[0] * 10,
+        arrays=arrays, n_rows=n, n_keyframes=10, timestamps=times, sessions=np.zeros(10, int),
         living_keyframes=lambda: np.arange(10),
     )  # fmt: skip
 
@@ -211,7 +211,7 @@ def test_a_map_that_cannot_tell_says_nothing():
     assert measure_rig(driven(n=1000), CAMERA) is None
     assert measure_rig(driven(), CAMERA.left_camera()) is None
     still = driven()
-    still.timestamps = (100.0 * np.arange(10)).tolist()
+    still.timestamps = 100.0 * np.arange(10)
     assert measure_rig(still, CAMERA) is None  # gaps: nobody knows how it moved
     assert residual_warnings(None, CAMERA) == []
 

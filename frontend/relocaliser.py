@@ -5,35 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from vslam.camera import Image
 from vslam.features import Features, TrackingState
 from vslam.frontend.frame import Frame
 from vslam.frontend.relocalization import relocalise
 from vslam.frontend.tracker import Found, judge
 from vslam.frontend.tracking import TrackingContext
-from vslam.geometry import Matrix
-from vslam.loops import LoopCandidate
+from vslam.loops import LoopCandidate, Sighting
 from vslam.map import Map
 from vslam.map_view import local_map
 
 Locate = Callable[[Image | None, Features, Map], list[LoopCandidate]]
-
-
-class Sighting(Protocol):
-    """Where a frame was recognised: near ``keyframe``, at ``T_cw``; feature ``feature[i]`` of the
-    frame observes landmark ``landmark[i]``."""
-
-    @property
-    def keyframe(self) -> int: ...
-    @property
-    def T_cw(self) -> Matrix: ...
-    @property
-    def feature(self) -> NDArray[np.int64]: ...
-    @property
-    def landmark(self) -> NDArray[np.int32]: ...
 
 
 class Recognise(Protocol):

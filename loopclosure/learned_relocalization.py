@@ -2,29 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
-
 from vslam.camera import Camera, Image
 from vslam.config import Config
 from vslam.features import Features
-from vslam.geometry import Matrix
 from vslam.loopclosure.learned_verification import rated, recognise
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
-from vslam.loops import LoopCandidate
+from vslam.loops import LoopCandidate, Sighting
 from vslam.map import Map
-
-
-class Sighting(NamedTuple):
-    """Where a frame was recognised: near ``keyframe``, at ``T_cw`` (4, 4); feature ``feature[i]``
-    of the frame observes landmark ``landmark[i]``."""
-
-    keyframe: int
-    T_cw: Matrix
-    feature: NDArray[np.int64]
-    landmark: NDArray[np.int32]
 
 
 class LearnedRelocalisation:
@@ -51,5 +35,5 @@ class LearnedRelocalisation:
         for candidate in alike[: config.learned.max_candidates]:
             found = recognise(map_, maps, features, candidate.match, images, self._camera, config)
             if found is not None:
-                return Sighting(candidate.match, *found)
+                return found
         return None

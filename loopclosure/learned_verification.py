@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,21 +25,12 @@ from vslam.loopclosure.verification import (
     relative_scale,
     spread_reason,
 )
-from vslam.loops import LoopCandidate, LoopEdge
+from vslam.loops import LoopCandidate, LoopEdge, Sighting
 from vslam.map import Map
 from vslam.map_kernels import collect_landmarks
 from vslam.states import VerifierState
 
 _DEPTHS_AGREE = 0.15  # a keypoint that observes a landmark has its depth, to this share
-
-
-class Recognised(NamedTuple):
-    """Pose ``T_cw`` ``(4, 4)`` of a frame, and ``(N,)`` of its features with the landmark that
-    each observes."""
-
-    T_cw: Matrix
-    feature: NDArray[np.int64]
-    landmark: NDArray[np.int32]
 
 
 class LearnedTrials:
@@ -181,7 +171,7 @@ def recognise(
     images: KeyframeImages,
     camera: Camera,
     config: Config,
-) -> Recognised | None:
+) -> Sighting | None:
     """Find the camera of a frame outside the map at the place of a keyframe.
 
     Args:
@@ -204,7 +194,7 @@ def recognise(
     )
     if len(feature) < config.tracking.min_inliers:
         return None
-    return Recognised(sight.T_cw, feature, sight.landmarks[index[near]])
+    return Sighting(match, sight.T_cw, feature, sight.landmarks[index[near]])
 
 
 def observed_features(

@@ -17,21 +17,11 @@ from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.tracker import Found
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp, se3_log
-from vslam.loops import LoopCandidate
+from vslam.loops import LoopCandidate, Sighting
 from vslam.map import Map
 
 HERE, NOT_HERE = 1, KEYFRAMES  # keyframes: one near the frame, and one without landmarks
 T_TRUE = forward(1.2, 0.3)
-
-
-@dataclass(frozen=True)
-class Sighting:
-    """A frame that was recognised without ORB descriptors."""
-
-    keyframe: int
-    T_cw: np.ndarray
-    feature: np.ndarray
-    landmark: np.ndarray
 
 
 class Recognise:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,17 @@ class LoopCandidate:
     alike: float | None = None
     proposed_by: str = ""
     promising: bool = False
+
+
+class Sighting(NamedTuple):
+    """Where a frame outside the map was recognised: near ``keyframe``, at the pose ``T_cw``
+    ``(4, 4)``. Feature ``feature[i]`` of the frame observes landmark ``landmark[i]``; ``(N,)``
+    each."""
+
+    keyframe: int
+    T_cw: NDArray[np.float64]
+    feature: NDArray[np.int64]
+    landmark: NDArray[np.int32]
 
 
 @dataclass(frozen=True)

@@ -231,10 +231,10 @@ class Mapper:
         ORB-SLAM2 (III-B) begins with all of them. Far points bend the first poses by the error of
         the pair's calibration; but at speed close points leave the view within a frame.
         """
-        keyframe = self.reference
-        if not has_more_points(self.merge(), keyframe, frame):
-            return False
         with self._changing() as map_:
+            keyframe = self.reference
+            if not has_more_points(map_, keyframe, frame):
+                return False
             new = map_stereo_points(map_, keyframe, self._camera, self._config, far=True)
             refresh_keyframe(map_, keyframe)
             self.refer_to(keyframe)

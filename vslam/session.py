@@ -22,8 +22,8 @@ from vslam.states import Checkpoint
 
 
 @dataclass(frozen=True)
-class Start:
-    """What a drive begins with.
+class OpenedMap:
+    """A map, new or stored, that a drive begins in.
 
     Attributes:
         map: None for a new one.
@@ -47,7 +47,7 @@ def open_map(
     *,
     localize: bool,
     resume: bool,
-) -> Start:
+) -> OpenedMap:
     """Restore detector, images and closed loops from a stored map, and begin a new drive in it
     unless the last one is resumed or the map is only localised in. None begins a new map.
 
@@ -61,7 +61,7 @@ def open_map(
     if localize and (stored is None or not stored.map.n_keyframes):
         raise ValueError("there is no map to localise in")
     if stored is None:
-        return Start()
+        return OpenedMap()
     map_, images = stored.map, closing.verifier.images
     if not np.array_equal(map_.scales, context.scales):
         raise ValueError(
@@ -76,15 +76,15 @@ def open_map(
     closing.closed = list(stored.loops)
     drives = stored.drives if map_.n_keyframes else ()
     if resume:
-        return Start(map_, stored.frames, stored.checkpoint, drives[:-1], stored.world)
+        return OpenedMap(map_, stored.frames, stored.checkpoint, drives[:-1], stored.world)
     if map_.n_keyframes and not localize:
         map_.begin_drive()
-    return Start(map_, drives=drives, world=stored.world)
+    return OpenedMap(map_, drives=drives, world=stored.world)
 
 
 @dataclass(frozen=True)
 class Session:
-    """The parts of SLAM, as far as they remember anything, and what the drive began with."""
+    """The parts of SLAM, as far as they remember anything, and the map that the drive began in."""
 
     context: TrackingContext
     closing: LoopClosing
@@ -92,7 +92,7 @@ class Session:
     tracker: Tracker
     rig: RigCalibration
     mode: Mode
-    start: Start
+    opened: OpenedMap
 
     def stored_map(self, drive: str) -> StoredMap:
         """The map, with a checkpoint if there can be one now. Its arrays are those of the map.
@@ -100,7 +100,7 @@ class Session:
         Args:
             drive: what the images since the start were.
         """
-        map_, images, start = self.mapper.complete(), self.closing.verifier.images, self.start
+        map_, images, opened = self.mapper.complete(), self.closing.verifier.images, self.opened
         return StoredMap(
             map=map_,
             camera=self.context.camera,
@@ -108,8 +108,8 @@ class Session:
             detector=self.closing.detector.memory(),
             images=None if images is None else images.files(map_.n_keyframes),
             frames=self.mapper.frames.table(),
-            drives=(*start.drives, drive) if self.mode.changes_map else start.drives,
-            world=start.world,
+            drives=(*opened.drives, drive) if self.mode.changes_map else opened.drives,
+            world=opened.world,
             checkpoint=self.state(),
         )
 
@@ -144,14 +144,14 @@ class Session:
     def resume(self) -> None:
         """Expect the next frame after the last one of the drive that is continued, if one is: to
         the byte with a checkpoint, else as far as the poses of the last frames tell."""
-        frames = self.start.frames
+        frames = self.opened.frames
         if frames is None:
             return
         if len(frames.timestamp):
             self.mapper.continue_drive()
             self.tracker.resume()
-        if self.start.checkpoint is not None:
-            self.restore(self.start.checkpoint)
+        if self.opened.checkpoint is not None:
+            self.restore(self.opened.checkpoint)
         elif len(frames.tracked) > 1 and frames.tracked[-2:].all():
             self.mapper.refer_to(int(frames.reference[-1]))
             poses = self.mapper.frames

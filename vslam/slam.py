@@ -98,14 +98,14 @@ class Slam:
         self.rig = rig = RigCalibration(camera, config.stereo, context.scales)
         verifier = verifier_for(config, camera, images)
         self._closing = closing = LoopClosing(detector, verifier, camera, config, threads=threads)
-        begin = open_map(start, context, closing, localize=localize, resume=resume)
+        opened = open_map(start, context, closing, localize=localize, resume=resume)
         executor = mapping_executor(threads)
-        self._mapper = mapper = Mapper(context, closing, rig, executor, begin.map, begin.frames)
+        self._mapper = mapper = Mapper(context, closing, rig, executor, opened.map, opened.frames)
         self._tracker = tracker = Tracker(context)
         recognise = LearnedRelocalisation(images, camera, config)
         self._relocaliser = Relocaliser(context, detector.locate, recognise)
         self._mode = Localising(mapper) if localize else MapBuilding(context, mapper, tracker)
-        self._session = Session(context, closing, mapper, tracker, rig, self._mode, begin)
+        self._session = Session(context, closing, mapper, tracker, rig, self._mode, opened)
         self._session.resume()
 
     @classmethod
@@ -274,7 +274,7 @@ class Slam:
     @property
     def world(self) -> World | None:
         """Where the map that was loaded lies in that of a ground truth, None if unknown."""
-        return self._session.start.world
+        return self._session.opened.world
 
     @property
     def is_mapping(self) -> bool:

@@ -441,8 +441,8 @@ def _read_map(folder: Path) -> None:
 
 
 def _use_map(folder: Path) -> None:
-    """All that is done with maps: exports, a run that goes on in it, one that begins anew in it
-    and one that is only localised, and a merge with another map."""
+    """Use a map in every way there is: export it, resume its drive, start a new drive in it,
+    localise in it, and merge it with another map."""
     with tempfile.TemporaryDirectory(dir=folder) as out:
         _use_map_in(folder / "map.npz", folder / "other.npz", Path(out))
 

@@ -1,8 +1,9 @@
 """Loop closing: from a keyframe that looks familiar to a corrected map (ORB-SLAM, section VII).
 
-Everything here happens in the mapping job of a keyframe, which owns the map. Only the global
-bundle adjustment after a loop works beside it, on a snapshot; it is merged a number of keyframes
-later that depends on the size of the problem alone, so that a run has one result.
+Whoever calls these methods is the only one to change the map at that moment, usually the mapping
+job of a keyframe. Only the global bundle adjustment after a loop runs in parallel, on a snapshot.
+It is merged after a number of keyframes that depends on the size of the problem alone, so that a
+run has one result.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class LoopClosing:
         verifier: what decides which candidates are loops.
         edges: every candidate and what became of it, in order.
         corrections: the loops that were closed.
-        closed: their edges in the units of today, after those that the map came with.
+        closed: all closed edges, those of a loaded map first, in the current units of the map.
     """
 
     def __init__(

@@ -93,7 +93,7 @@ class Extracted:
     """What the images of one frame give.
 
     Attributes:
-        features: N features of one of the images.
+        features: the N features that were extracted from the image of ``side``.
         pyramid: of that image; None if matches are not to be aligned in it.
         row_offset: ``(N,)`` float32, by how many pixels a stereo match is lower in the right image
             than in the left one; NaN for features of which this was not measured. None if it was

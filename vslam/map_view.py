@@ -86,9 +86,9 @@ def view_of(
     """The view of the map from a reference keyframe.
 
     Args:
-        local: the landmarks around it.
-        patches: those of these landmarks.
-        monocular: whether the camera is.
+        local: the landmarks of the keyframe and of its covisible keyframes.
+        patches: image patches of these landmarks, where the newest keyframes observe them.
+        monocular: whether the camera is monocular.
     """
     living = map_.living_keyframes()
     if monocular and map_.restarts:

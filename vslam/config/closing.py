@@ -20,10 +20,11 @@ class LoopConfig(Section):
 class PoseGraphConfig(Section):
     """The pose graph of a loop closure: how far each edge is trusted, and when a loop is refused.
 
-    Drift is modelled as a random walk, whose standard deviation grows with the square root of the
-    path. At these values 400 m of odometry may be off by 1.2 % (one standard deviation), nearly all
-    of it by rotation. A gap is an edge past a restart that only a prediction of the motion led to;
-    nothing is known of a weak edge.
+    Drift is modelled as a random walk: its standard deviation grows with the square root of the
+    distance travelled. With the default values it is 1.2 % after 400 m, nearly all of it caused by
+    errors of rotation. A gap is an edge over frames in which tracking was lost and the motion was
+    only predicted. Such an edge is weak if there was no prediction, or if the camera is taken to
+    have been carried meanwhile.
     """
 
     min_shared: int = Field(100, ge=1)

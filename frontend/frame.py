@@ -55,6 +55,8 @@ class Frame:
     delay_removed: bool = False
     shift: NDArray[np.float32] | None = None
     twist: Matrix | None = None
+    coarse: object = None
+    by_patches: bool = False
 
     @classmethod
     def of(
@@ -87,6 +89,14 @@ class Frame:
         """``(4, 4)`` pose of the camera, by which landmarks are projected to the features."""
         T: Matrix = self.T_camera_left @ self.T_cw
         return T
+
+    def extract(self, extracted: Extracted, camera: Camera) -> None:
+        new = Frame.of(extracted, camera, self.index, self.timestamp, self.image)
+        self.features, self.grid, self.row_offset = new.features, new.grid, new.row_offset
+        self.landmark, self.xyz, self.shift = new.landmark, new.xyz, None
+        self.pyramid, self.side, self.T_camera_left = new.pyramid, new.side, new.T_camera_left
+        self.disparity_offset, self.delay_removed = 0.0, False
+        self.by_patches = False
 
     def snapshot(self) -> Frame:
         """A copy that keeps what the frame tracks now."""

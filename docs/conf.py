@@ -39,10 +39,10 @@ myst_links_external_new_tab = False
 
 # Pages that lie elsewhere in the repository, by their path there.
 _PAGES = {
-    "datasets.md": "about/datasets.md",
+    "datasets.md": "reference/datasets.md",
     "CONTRIBUTING.md": "about/contributing.md",
     "CHANGELOG.md": "about/changelog.md",
-    "loopclosure/vocabulary.md": "about/vocabulary.md",
+    "loopclosure/vocabulary.md": "explanation/vocabulary.md",
 }
 _LINK = re.compile(r"\[([^]]*)\]\((?!https?:|#|mailto:)([^)#\s]+)(#[^)\s]*)?\)")
 

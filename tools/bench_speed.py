@@ -3,7 +3,7 @@
     python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" \
         [--flat "town 00=/data/towns:kitti00:4541"] [--ours-only] [--also capsule] [--repeats 3] \
         [--orbslam3-python PY --orbslam3-script run_orbslam3.py --vocabulary voc.txt] \
-        [--write docs/performance.md]
+        [--write docs/research/performance.md]
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run in
 turn, one at a time, after one round that is not counted; vslam with its report, with

@@ -82,8 +82,8 @@ def page(config: Config) -> str:
     """The page for a configuration: one table for each section, its docstring above."""
     lines = [HEAD]
     for section in type(config).model_fields:
-        title, _, rest = (type(getattr(config, section)).__doc__ or "").partition("\n")
-        title = title.removesuffix(".")
+        title, _, rest = (type(getattr(config, section)).__doc__ or "").partition("\n\n")
+        title = " ".join(title.split()).removesuffix(".")
         lines += [f"## `{section}`: {title}\n"]
         lines += [f"{' '.join(rest.split())}\n"] if rest.strip() else []
         lines += ["| name | default | what it is | source |", "|---|---|---|---|"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import cv2
@@ -282,26 +281,6 @@ def test_matching_by_node_is_matching_within_nodes():
 
 
 # -- speed and real images ------------------------------------------------------------------------
-
-
-def test_a_query_among_many_keyframes_is_fast():
-    """1,000 keyframes of 2,000 features; tools/experiments/design/bow_speed.py takes 5,000."""
-    rng = np.random.default_rng(4)
-    tree = load()
-    leaves = tree.descriptors[tree.word >= 0]
-    popular = np.cumsum(np.exp(-tree.weight.astype(float)))  # seen in so many training images
-    detector, map_ = BowDetector(tree), Map(np.ones(8))
-    for k in range(1000):
-        words = np.searchsorted(popular, rng.random(2000) * popular[-1])
-        image = features_of(leaves[words].view(np.uint8))
-        detector.add(k, None, image)
-        map_.add_keyframe(image_of(tree, []), np.eye(4), float(k), k)
-    elapsed = []
-    for k in range(990, 1000):
-        start = time.process_time()
-        detector.query(k, map_)
-        elapsed.append(time.process_time() - start)
-    assert min(elapsed) < 0.01
 
 
 def demo_images(every: int) -> tuple[list[np.ndarray], np.ndarray]:

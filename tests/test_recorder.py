@@ -250,10 +250,6 @@ def test_a_run_without_frames(tmp_path: Path) -> None:
     assert rows(tmp_path / "recording.rrd", "world")
 
 
-def test_null_recorder_takes_every_call() -> None:
-    record(NullRecorder(), frames=4)
-
-
 def test_unwritable_path_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING, "vslam.run.recorder"):
         record(RerunRecorder(tmp_path / "missing" / "recording.rrd"), frames=4)

@@ -71,6 +71,7 @@ while entered < 100:
 """
 
 
+@pytest.mark.slow
 def test_processes_that_race_get_in_one_at_a_time(tmp_path):
     """The one that leaves removes the file that others may just have opened."""
     command = [sys.executable, "-c", RACER, str(tmp_path)]

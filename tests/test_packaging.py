@@ -52,10 +52,12 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return made[0], made[1]
 
 
+@pytest.mark.slow
 def test_the_same_bytes_twice(wheels):
     assert wheels[0].read_bytes() == wheels[1].read_bytes()
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_every_source_and_the_files_beside_them(wheels):
     with zipfile.ZipFile(wheels[0]) as archive:
         inside = set(archive.namelist())
@@ -79,6 +81,7 @@ def test_the_wheel_holds_every_source_and_the_files_beside_them(wheels):
     assert not {name for name in inside if "tests/" in name or name.endswith(".pyc")}
 
 
+@pytest.mark.slow
 def test_its_metadata_are_complete(wheels):
     with zipfile.ZipFile(wheels[0]) as archive:
         (name,) = (n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
@@ -111,6 +114,7 @@ def readme_for(source: str, tmp_path: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_the_readme_of_a_registry_has_no_link_that_leads_nowhere(wheels, tmp_path: Path):
     with zipfile.ZipFile(wheels[0]) as archive:
         (name,) = (n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))

@@ -193,6 +193,7 @@ def test_a_compared_detector_drops_the_frames_that_the_main_one_drops(kitti_tree
         assert (own.timestamp, own.n_features) == (compared.timestamp, compared.n_features)
 
 
+@pytest.mark.slow
 def test_command_line_in_real_time(kitti_tree, tmp_path):
     command = [sys.executable, "-m", "vslam", "run", "--data", str(kitti_tree), "--realtime"]
     done = subprocess.run(

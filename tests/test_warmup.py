@@ -61,6 +61,7 @@ for name, known in signatures().items():
 """
 
 
+@pytest.mark.slow
 def test_the_two_shares_compile_all_that_slam_calls() -> None:
     done = subprocess.run(
         [sys.executable, "-c", SHARES], capture_output=True, text=True, cwd=Path(__file__).parent

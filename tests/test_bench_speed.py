@@ -37,7 +37,7 @@ def test_a_case_is_a_title_and_a_place(speed, kitti_tree):
 def test_reading_is_measured(speed, kitti_tree):
     case = speed.Case("", kitti_tree, "00", 5)
     for system in (speed.FULL, speed.ORBSLAM3):
-        assert 0.0 < speed.reading_ms(case, system) < 1000.0
+        assert speed.reading_ms(case, system) > 0.0
 
 
 def test_comparison_has_medians_and_ratios(speed):

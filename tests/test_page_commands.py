@@ -552,6 +552,7 @@ def dask(desk: Path) -> Iterator[Callable[[str], str]]:
         process.wait()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", RULES)
 def test_commands_of_the_page_run(page: str, desk: Path, corridor, request):
     rules, text = RULES[page], (ROOT / page).read_text()

@@ -86,7 +86,7 @@ _DASHES = ("-", "--")  # of the first six networks, of the rest
 Row = tuple[str, ...]
 
 
-def main() -> None:
+def main(words: list[str] | None = None) -> None:
     """Parse the command line, run what is missing and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--trained", type=Path, required=True, help="folder with rivals.csv")
@@ -95,7 +95,7 @@ def main() -> None:
     parser.add_argument("--section", default="tables", help="of the page, to be written")
     parser.add_argument("--ways", default=",".join(WAYS), help="what the section shows")
     parser.add_argument("--retime", action="store_true", help="measure all times again")
-    args = parser.parse_args()
+    args = parser.parse_args(words)
 
     training, bench = read_training(args.trained / "rivals.csv"), args.trained / "bench"
     ways = args.ways.split(",")

@@ -89,6 +89,6 @@ def test_frames_are_averaged_by_blocks(speed):
 
 def test_what_people_wrote_stays_on_the_page(speed, tmp_path):
     page = tmp_path / "performance.md"
-    assert speed.written(page) == ""
-    page.write_text("# Performance\n\nTables.\n\n## Limits\n\nBy hand.\n")
-    assert speed.written(page) == "\n## Limits\n\nBy hand.\n"
+    assert speed.written(page) == ("# Performance\n\n", "")
+    page.write_text(f"# Speed\n\nFast.\n\n{speed.BEGIN}\nTables.\n\n## Limits\n\nBy hand.\n")
+    assert speed.written(page) == ("# Speed\n\nFast.\n\n", "\n## Limits\n\nBy hand.\n")

@@ -1,4 +1,4 @@
-"""Who may import whom (docs/design.md, section 2), read from the source.
+"""Who may import whom (docs/explanation/design.md, section 2), read from the source.
 
 Every folder and module has a level; an import may lead down or stay on its level, and no modules
 import each other in a circle. Beside that a few libraries belong to one place each.

@@ -124,7 +124,7 @@ def test_the_readme_of_a_registry_has_no_link_that_leads_nowhere(wheels, tmp_pat
     assert link.search((ROOT / "README.md").read_text())
     for text in (shown, readme_for("", tmp_path), readme_for("https://example.org/v/", tmp_path)):
         assert not link.search(text)
-    assert "](https://example.org/v/blob/main/docs/cameras.md)" in text
+    assert "](https://example.org/v/blob/main/docs/howto/cameras.md)" in text
     assert "![" not in readme_for("", tmp_path)
     assert "![The same street" in text
     assert "](https://example.org/v/raw/main/docs/images/night.jpg)" in text

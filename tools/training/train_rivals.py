@@ -1,4 +1,4 @@
-"""Train every architecture of docs/rivals.md under equal conditions, in both of its ways.
+"""Train every architecture of docs/research/rivals.md under equal conditions, in both of its ways.
 
 python tools/training/train_rivals.py --data SOURCE [--data SOURCE ...] --out DIR
         [--networks NAMES] [--pixels N] [--images N] [--core-minutes M] [--epochs N]

@@ -40,7 +40,7 @@ class SyntheticSequence(KittiSequence):
 
 
 def parse_drive(name: str) -> tuple[str, Variation]:
-    """Split ``05+change:0.5+moving:6+aliased+seed:1`` into the route's name and the town's variation.
+    """Split ``05+change:0.5+moving:6+aliased+seed:1`` into the route's name and the variation.
 
     A name in `DRIVES` stands for its route and variation, to which further parts may be added.
 

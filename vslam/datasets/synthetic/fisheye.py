@@ -66,7 +66,7 @@ def fisheye_rig(camera: Camera) -> FisheyeRig:
 
 
 def wide_camera(camera: Camera) -> Camera:
-    """The rectified pair of the same focal length that sees everything that the fisheye pair does."""
+    """The smallest rectified pair of the same focal length that covers the fisheye pair's view."""
     rig = fisheye_rig(camera)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for model, R_own_rectified in zip(rig.models, rig.R_own_rectified, strict=True):

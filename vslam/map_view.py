@@ -32,7 +32,7 @@ def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
     """Copy the landmarks of a keyframe and of its covisible keyframes (ORB-SLAM, V-D).
 
     ORB-SLAM also takes the neighbours of neighbours, which made no difference here
-    (docs/design.md).
+    (docs/explanation/design.md).
 
     Args:
         limit: greatest number of keyframes; those that share the most landmarks are taken.

@@ -1,7 +1,7 @@
 """Detectors, readers and perturbations of other packages, found by their entry points.
 
-docs/plugins.md explains how to write one. Plug-ins are found in the metadata of packages. A package
-is imported only when its plug-in is used, so a broken one does not affect other runs.
+docs/howto/plugins.md explains how to write one. Plug-ins are found in the metadata of packages. A
+package is imported only when its plug-in is used, so a broken one does not affect other runs.
 """
 
 from __future__ import annotations

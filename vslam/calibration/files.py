@@ -45,7 +45,7 @@ _PAIRS = (  # searched for in a folder, in this order
 
 
 def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> Calibration:
-    """Read a calibration in any of the formats of docs/cameras.md.
+    """Read a calibration in any of the formats of docs/howto/cameras.md.
 
     Args:
         files: one file, or one for each camera, left first, or a folder that holds them.
@@ -72,7 +72,7 @@ def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> C
     there = ", ".join(" ".join(key.split())[:20] for key in sorted(documents[0].values)[:6])
     raise InputError(
         f"{paths[0]}: no known calibration (it has the keys {there}); give one in vslam's own "
-        "format (docs/cameras.md), Kalibr's camchain, OpenCV's YAML, EuRoC's sensor.yaml, "
+        "format (docs/howto/cameras.md), Kalibr's camchain, OpenCV's YAML, EuRoC's sensor.yaml, "
         "ROS's camera_info or the settings of ORB-SLAM."
     )
 

@@ -1,4 +1,4 @@
-"""Readers of the calibration formats, which docs/cameras.md describes.
+"""Readers of the calibration formats, which docs/howto/cameras.md describes.
 
 They share one file because each is a few lines on the same helpers. The formats are documented in
 Kalibr's wiki (yaml formats), OpenCV's samples ``stereo_calib.cpp`` and ``camera_calibration.cpp``,

@@ -1,4 +1,7 @@
-"""All thresholds of the pipeline, one module for each stage; docs/thresholds.md lists them."""
+"""All thresholds of the pipeline, with one module for each stage.
+
+docs/reference/thresholds.md is generated from these modules.
+"""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ class KeyframeConfig(Section):
     [OS2 III-E, printed]"""
     min_kept_close: float = Field(0.2, ge=0, le=1)
     """Where a keyframe adds fewer close points than `min_tracked_close` on average, this share of
-    that average replaces `min_tracked_close` (docs/motorway.md). [own]"""
+    that average replaces `min_tracked_close` (docs/research/motorway.md). [own]"""
     first_gain: float = Field(2.0, ge=0)
     """Number of close points that a keyframe is assumed to add before this has been observed, as a
     multiple of `min_tracked_close`. [own]"""

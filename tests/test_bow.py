@@ -285,7 +285,7 @@ def test_matching_by_node_is_matching_within_nodes():
 
 
 def test_a_query_among_many_keyframes_is_fast():
-    """1,000 keyframes of 2,000 features; tools/experiments/design/bow_speed.py takes 5,000."""
+    """1,000 keyframes of 2,000 features."""
     rng = np.random.default_rng(4)
     tree = load()
     leaves = tree.descriptors[tree.word >= 0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -112,9 +113,8 @@ def _rows(values: Float, n: int) -> Float:
     return rows
 
 
-@dataclass(frozen=True)
-class Atlas:
-    """T textures with their mipmaps, flat, so that a kernel takes them as four arrays.
+class Atlas(NamedTuple):
+    """T textures with L levels each, flat, as kernels take them.
 
     Attributes:
         texels: uint8 grey of all levels of all textures.

@@ -85,7 +85,7 @@ def verify(
     T_query_match, scale, n_inliers = _consensus(map_, query, match, rows_q, rows_m, camera, config)
     if T_query_match is None:
         return replace(
-            edge, reason=f"no motion that {config.min_consensus} of the matches agree on"
+            edge, reason=f"no motion has {config.min_consensus} inliers among the matches"
         )
     edge = replace(edge, n_inliers=n_inliers, T_query_match=T_query_match, scale=scale)
     return verify_near(map_, edge, camera, config)
@@ -270,7 +270,7 @@ def _rejection_reason(
         return f"only {edge.n_inliers} of {edge.n_matches} matches fit"
     distance = float(np.linalg.norm(inverse(T_query_match)[:3, 3]))
     if distance > config.max_distance:
-        return f"{distance:.0f} m from the place"
+        return f"the pose is {distance:.0f} m from the place"
     if reason := spread_reason(guided.uv, guided.seen, camera, config, config.min_elsewhere):
         return reason
     seen, total = seen_of(map_, edge.match, guided)
@@ -295,7 +295,7 @@ def spread_reason(
     and some are ``seen``: that these lie together; "" if they do not."""
     expected, occupied = occupied_cells(uv, camera), occupied_cells(uv[seen], camera)
     if occupied < max(config.min_cells, config.min_cell_ratio * expected):
-        return f"inliers in {occupied} of {expected} cells of the image only"
+        return f"inliers in only {occupied} of {expected} cells of the image"
     elsewhere = count_elsewhere(uv[seen, 0], camera.width)
     if elsewhere < min_elsewhere:
         return f"only {elsewhere} inliers outside one third of the image"

@@ -2,10 +2,11 @@
 
 FAST finds a corner at whole pixels of one pyramid level, typically half a pixel off. When the
 camera approaches the scene, this error is biased towards the focus of expansion
-(docs/motorway.md). So the patch of a keyframe that saw the landmark is warped into the view of the
-frame and shifted until it agrees with the image. This is the "feature alignment" of SVO (Forster et
-al., ICRA 2014, III-B), solved by inverse compositional Lucas-Kanade (Baker and Matthews, IJCV 2004,
-section 3.2). Brightness and contrast of a patch may change: both are estimated with the shift.
+(docs/research/motorway.md). So the patch of a keyframe that saw the landmark is warped into the
+view of the frame and shifted until it agrees with the image. This is the "feature alignment" of SVO
+(Forster et al., ICRA 2014, III-B), solved by inverse compositional Lucas-Kanade (Baker and
+Matthews, IJCV 2004, section 3.2). Brightness and contrast of a patch may change: both are estimated
+with the shift.
 """
 
 from __future__ import annotations

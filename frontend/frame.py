@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NewType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,3 +128,8 @@ class Frame:
     def n_stereo(self) -> int:
         """Number of features with a stereo match (or a depth)."""
         return int(np.count_nonzero(np.isfinite(self.features.u_right)))
+
+
+PlacedFrame = NewType("PlacedFrame", Frame)
+"""A frame whose pose has been recorded (``Mapper.append_pose``). Only such a frame can become a
+keyframe."""

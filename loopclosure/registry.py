@@ -1,4 +1,4 @@
-"""Creates loop detectors by name: those of vslam and those of other packages (docs/plugins.md)."""
+"""Creates loop detectors by name: those of vslam and of other packages (docs/howto/plugins.md)."""
 
 from __future__ import annotations
 

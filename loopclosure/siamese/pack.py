@@ -16,7 +16,7 @@ from vslam.untrusted import read_npz
 
 def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> None:
     """Write sources as one file: images at the input size of a network, encoded as JPEG, and their
-    relations (docs/training.md).
+    relations (docs/research/training.md).
 
     Raises:
         UnreadableImageError: an image is missing or damaged.

@@ -38,7 +38,7 @@ def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[Image
     """
     files = images_in(folder)
     if not files:
-        raise InputError(f"{folder}: no images; see datasets.md.")
+        raise InputError(f"{folder}: no images; see docs/reference/datasets.md.")
     named = Path(truth).expanduser() if truth else None
     path = named or next(iter(sorted(folder.glob("*.mat"))), None)
     if path is None:

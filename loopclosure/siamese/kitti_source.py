@@ -58,7 +58,7 @@ def read_kitti(
     files = [f for f in files if any(int(f.stem) in span for span in wanted)]
     if len(files) < 2:
         numbers = frames or f"{first} to {last}"
-        raise InputError(f"{folder}: no images numbered {numbers}; see datasets.md.")
+        raise InputError(f"{folder}: no images numbered {numbers}; see docs/reference/datasets.md.")
     poses = read_kitti_poses(base / "poses" / f"{seq}.txt")
     number = np.array([int(f.stem) for f in files])
     if number[-1] >= len(poses):

@@ -79,7 +79,9 @@ def read_photos(folder: Path) -> list[ImageSource]:
     """
     notes = sorted(folder.glob("*/NOTES.txt")) or sorted(folder.glob("NOTES.txt"))
     if not notes:
-        raise InputError(f"{folder}: no set of photographs (SET/NOTES.txt); see datasets.md.")
+        raise InputError(
+            f"{folder}: no set of photographs (SET/NOTES.txt); see docs/reference/datasets.md."
+        )
     return [_read_photo_set(path.parent) for path in notes]
 
 

@@ -160,7 +160,7 @@ def held_by(map_: Map) -> NDArray[np.int64]:
     living = map_.living_keyframes()
     pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, 1)
     held = np.zeros(map_.n_keyframes, np.int64)
-    order = np.argsort(shared, kind="stable")  # greater numbers are written last
+    order = np.argsort(shared, kind="stable")  # so that greater numbers overwrite smaller ones
     for (one, other), n in zip(pairs[order].tolist(), shared[order].tolist(), strict=True):
         held[one + 1 : other + 1] = n
     return held

@@ -53,7 +53,7 @@ def _cut(pixels, offsets, shapes, xy, octave):
 
 
 class RecentPatches:
-    """The patches of the newest keyframes."""
+    """Stores the patches of the newest keyframes."""
 
     def __init__(self, capacity: int) -> None:
         """``capacity`` is the number of keyframes whose patches are remembered."""

@@ -28,7 +28,7 @@ class Recognise(Protocol):
 
 
 class MapAccess(Protocol):
-    """Access to the map, while it may be read."""
+    """Access to the map when it may be read."""
 
     @property
     def is_merged(self) -> bool:

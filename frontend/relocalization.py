@@ -1,4 +1,4 @@
-"""Finding a lost camera in the map (ORB-SLAM, T-RO 2015, V-C)."""
+"""Finds the pose of a lost camera in the map (ORB-SLAM, T-RO 2015, V-C)."""
 
 from __future__ import annotations
 

@@ -202,7 +202,7 @@ def add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs):
     flat_l, flat_r = image_l.reshape(image_l.size), image_r.reshape(image_r.size)
     side = 2 * half + 1
     one, two, three = np.uintp(1), np.uintp(2), np.uintp(3)
-    total = np.empty(LANES, np.uint16)  # of a row
+    total = np.empty(LANES, np.uint16)  # sums over one row of the patch
     for first in range(0, len(costs), LANES):
         for dy in range(-half, half + 1):
             row = (y_l + dy) * width

@@ -109,8 +109,8 @@ class Tracker:
 
     def predict(self, timestamp: float, frames: FramePoses, view: MapView) -> Matrix:
         """Predict the ``(4, 4)`` pose ``T_cw`` at a time in seconds. The velocity is constant per
-        second, not per frame, so that dropped frames do not disturb it. In a loaded map, the pose
-        of the reference keyframe is the prediction for the first frame.
+        second, not per frame, so that dropped frames do not disturb it. In a loaded map, the camera
+        is predicted to be at the reference keyframe until it is found.
 
         Args:
             frames: poses of all earlier frames, including lost ones.

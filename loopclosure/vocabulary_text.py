@@ -182,7 +182,7 @@ def _breadth_first(parent: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArra
     """Nodes in breadth-first order, siblings in the order of their lines, and the level of each."""
     by_parent = np.argsort(parent, kind="stable")
     n_children = np.bincount(parent[1:], minlength=len(parent))
-    first = 1 + np.cumsum(n_children) - n_children  # in by_parent, behind the root
+    first = 1 + np.cumsum(n_children) - n_children  # first child of each node in by_parent
     generations = [np.zeros(1, np.int64)]
     while True:
         parents = generations[-1][n_children[generations[-1]] > 0]

@@ -154,7 +154,7 @@ def essential_graph(
     )
 
 
-def held_by(map_: Map) -> NDArray[np.int64]:
+def connectivity(map_: Map) -> NDArray[np.int64]:
     """``(n_keyframes,)`` int64, how well the map is connected at each keyframe: the largest number
     of landmarks that an earlier keyframe shares with this or a later one; 0 for the first."""
     living = map_.living_keyframes()

@@ -21,7 +21,7 @@ Grey = NDArray[np.uint8]
 
 _STRIDE = 8  # a few thousand pixels suffice to know quantiles to a grey level
 _LOW, _HIGH = 0.05, 0.95
-_WITHIN = 0.98  # share of the pixels that are not overexposed, below their upper end
+_WITHIN = 0.98  # upper quantile as a fraction of the share of pixels that are not overexposed
 _LEAST_SHARE = 0.25  # least share of the pixels from which a gain is estimated
 _LEAST_RANGE = 4.0  # grey levels; over a smaller range, rounding dominates the gain
 _SEES = 16.0  # least range of the grey values of an image that is not black
@@ -90,8 +90,8 @@ def _is_black(side: NDArray[np.float64], other: NDArray[np.float64], config: Ste
 
 def _stops(ours: NDArray[np.float64], theirs: NDArray[np.float64], config: StereoConfig) -> float:
     """Binary logarithm of the gain from ``theirs`` to ``ours``; 0 if it is below the threshold, or
-    if dark and bright pixels do not agree on a gain. The quantiles of both images exclude the
-    largest share that is overexposed in either of them."""
+    if dark and bright pixels do not agree on a gain. Both images are compared below an upper
+    quantile that excludes the pixels that are overexposed in either of them."""
     below = config.clipped_from - 1
     top, dull = _HIGH, float(min(ours[below], theirs[below]))
     if dull <= top:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from ring import CAMERA, LAP, Oracle, Ring
 
-from vslam.backend.pose_graph import GAP, WEAK, held_by
+from vslam.backend.pose_graph import GAP, WEAK, connectivity
 from vslam.closing import LoopClosing
 from vslam.config import Config, ConsistencyConfig, KeyframeConfig, PoseGraphConfig
 from vslam.features import Extracted, Features, TrackingState
@@ -392,7 +392,7 @@ def test_a_wrong_keyframe_bends_the_map_and_the_loops_that_tell_are_refused():
     assert sum("contradicted" in edge.reason for edge in slam.loops) > 4
     assert not slam.corrections
     wrong = slam.map.frames.tolist().index(60)
-    held = held_by(slam.map)
+    held = connectivity(slam.map)
     assert int(held[1:].argmin()) + 1 == wrong
     expected = max(
         len(set(slam.map.landmarks_of(i).tolist()) & set(slam.map.landmarks_of(j).tolist()))

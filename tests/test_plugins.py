@@ -301,13 +301,13 @@ def test_a_compared_detector_that_fails_ends_alone(broken, kitti_tree, tmp_path,
 @pytest.mark.parametrize(
     ("answer", "says"),
     [
-        ("None", "query gave NoneType, no list"),
-        ("[7]", "query gave int in its list, no LoopCandidate"),
-        ("[LoopCandidate(0, 5, 1.0)]", "gave keyframe 5, which the map does not have"),
+        ("None", "query returned NoneType, not a list"),
+        ("[7]", "query returned a list with int, not LoopCandidate"),
+        ("[LoopCandidate(0, 5, 1.0)]", "returned keyframe 5, which is not in the map"),
         ("[LoopCandidate(0, 0, float('nan'))]", "with score nan"),
-        ("[LoopCandidate(4, 0, 1.0)]", "gave query 4"),
-        ("[LoopCandidate(0, 0.5, 1.0)]", "gave a LoopCandidate of int, float, float"),
-        ("[LoopCandidate(0, 0, '1')]", "gave a LoopCandidate of int, int, str"),
+        ("[LoopCandidate(4, 0, 1.0)]", "returned query 4"),
+        ("[LoopCandidate(0, 0.5, 1.0)]", "returned a LoopCandidate of int, float, float"),
+        ("[LoopCandidate(0, 0, '1')]", "returned a LoopCandidate of int, int, str"),
     ],
 )
 def test_candidates_that_are_none_are_caught_before_kernels_see_them(broken, answer, says):

@@ -151,9 +151,9 @@ def _between(R_left_right: Array, centre: Array, source: str) -> Array:
         )
     if baseline > _FARTHEST_M:
         raise InputError(
-            f"{source}: the cameras stand {baseline:.4g} m apart, as if the file had millimetres "
-            "or centimetres; write the translation between them in metres (a checkerboard "
-            "calibration has the unit of the squares)."
+            f"{source}: the cameras stand {baseline:.4g} m apart, as if a length in millimetres or "
+            "centimetres was taken for metres; write the translation between them in metres (a "
+            "checkerboard calibration has the unit of the squares)."
         )
     x = centre / baseline
     across = float(half[:, 0] @ x)

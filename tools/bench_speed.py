@@ -297,7 +297,7 @@ def draw(everything: list[float], in_turn: list[float], path: Path) -> None:
         axes.set_ylim(bottom=0)
         add_legend(figure, axes)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(save("along", "", figure).png)
+        path.write_bytes(save("along", "", figure).image)
 
 
 def section(case: Case, runs: dict[str, list[Run]]) -> str:

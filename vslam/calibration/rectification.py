@@ -41,7 +41,7 @@ class Rectification:
             original one; both have the same centre.
         left, right: map ``(H, W)`` uint8 images of the calibrated size to rectified ones of the
             left camera's size, bilinearly. Images that need no rectification are returned
-            unchanged; so does ``right`` if there is no right camera.
+            unchanged; without a right camera, ``right`` returns every image unchanged.
         left_depth: the same for depth images of any type, by nearest neighbour. It is valid only
             for a camera that is not turned, since depth is measured along the camera's own axis.
         identity: whether images are returned unchanged.

@@ -193,7 +193,7 @@ def check_features(images: Sequence[Image], config: OrbConfig) -> Finding:
     return judge(
         "features",
         middle < FEATURES * config.n_features,
-        f"median {middle}, least {min(counts)} of {config.n_features} asked for",
+        f"median {middle}, least {min(counts)} of {config.n_features} requested features",
         "too little texture or light: more light, longer exposure, or a lower threshold "
         "(docs/reference/thresholds.md)",
     )

@@ -55,7 +55,7 @@ class LearnedTrials:
         config = self._config
         least = config.min_alike
         if keyframe < self.state.resting_until:
-            least = max(least, config.more_alike * self.state.in_vain)
+            least = max(least, config.more_alike * self.state.failed_alike)
         alike = [(one.alike, one.match) for one in candidates if one.alike is not None]
         best = sorted(alike, reverse=True)[: config.max_candidates]
         return {match for likeness, match in best if likeness >= least}

@@ -167,6 +167,7 @@ def test_landmarks_lie_on_the_walls_and_the_ground(corridor):
     assert np.mean(distance < 0.3) > 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
 def test_same_bytes_with_one_thread_and_two_and_again(corridor, config):
     runs = [bytes_of(*run(corridor, config, threads=threads)) for threads in (1, 2, 2, 1)]

@@ -174,6 +174,7 @@ def test_same_bytes_with_one_thread_and_two_and_again(corridor, config):
     assert len(set(runs)) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
 def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, monkeypatch):
     """Mapping as late as can be (when it is merged) and as early as can be: a race would show."""

@@ -43,7 +43,7 @@ from vslam.run.options import RunOptions, read_options, write_options
 from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
 from vslam.run.pipeline import _with_earlier, run_sequence
 from vslam.run.progress import Progress, TrackLog, TrackTable, read_progress, write_progress
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 from vslam.slam import Slam
 from vslam.trajectory import read_trajectory
 
@@ -84,7 +84,7 @@ def drive(
         sequence,
         parse_perturbation(law, 0),
         settings,
-        NullRecorder(),
+        Recorder(),
         resume=resume,
         **autosave,
         **options,

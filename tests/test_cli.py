@@ -333,7 +333,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
 
     monkeypatch.setattr(run_pipeline, "run_sequence", run_sequence)
     monkeypatch.setattr(run_pipeline, "begin", lambda camera, settings, saved=None: None)
-    monkeypatch.setattr(recorder, "NullRecorder", lambda: "null")
+    monkeypatch.setattr(recorder, "Recorder", lambda: "null")
     monkeypatch.setattr(recorder, "RerunRecorder", lambda target, pictures: str(target))
     monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[1])
     monkeypatch.setattr(figures, "draw_figures", draw_figures)

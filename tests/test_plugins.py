@@ -25,7 +25,7 @@ from vslam.map import Map
 from vslam.report.folder import create_run_folder, write_results
 from vslam.run.outcome import RunSettings
 from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "howto" / "plugins.md"
@@ -269,7 +269,7 @@ def test_a_detector_that_fails_ends_the_run_with_what_it_has(broken, kitti_tree,
     settings = RunSettings(
         "kitti", "00", "none", "mine", "stereo", 0, threads, 0, 1, None, Config()
     )
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     assert outcome.interrupted is not None
     assert outcome.interrupted.startswith("the detector mine of the package broken 2.0 failed")
     assert "RuntimeError: out of memory" in outcome.interrupted
@@ -287,7 +287,7 @@ def test_a_compared_detector_that_fails_ends_alone(broken, kitti_tree, tmp_path,
     settings = RunSettings(
         "kitti", "00", "none", "none", "stereo", 0, threads, 0, 1, None, Config(), compare=("mine",)
     )
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     assert outcome.interrupted is None
     assert len(outcome.trajectory) == len(sequence)
     assert 3 <= len(outcome.compared[0].trajectory) <= len(sequence)
@@ -389,7 +389,7 @@ def test_a_run_on_a_reader_that_streams(broken, kitti_tree):
     broken(STREAM.replace("LIVE", "False"), "[vslam.readers]\nmine = broken:Reader\n")
     source = open_source("mine", str(kitti_tree), "00", SourceOptions(), max_frames=6)
     settings = RunSettings("mine", "x", "none", "none", "stereo", 0, 1, 0, 1, 6, Config())
-    outcome = run_sequence(source, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(source, Perturbation("none"), settings, Recorder())
     assert len(outcome.trajectory) == 6
 
 

@@ -125,7 +125,7 @@ PARTS = {  # what fails: where it is looked up, the name of the result that it c
     "write_frames": (folder, "frames.csv"),
     "summarize": (folder, "report.json"),
     "draw_figures": (figures, "figures"),
-    "render_markdown": (render, "report.md"),
+    "markdown": (render, "report.md"),
     "explorer_data": (explorer, "report.html"),
 }
 ALL = {

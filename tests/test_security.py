@@ -25,7 +25,8 @@ from vslam.datasets.image_files import read_grey
 from vslam.errors import InputError, UnreadableImageError
 from vslam.loopclosure.vocabulary import load
 from vslam.maps.storage import load_map
-from vslam.report.render import render_html
+from vslam.report.render import html
+from vslam.report.run_page import run_page
 from vslam.run.progress import read_progress
 from vslam.untrusted import MOST_PIXELS, read_npz
 
@@ -191,7 +192,7 @@ def test_what_people_write_is_escaped_in_pages(tmp_path: Path):
             "skipped_messages": (evil,),
         }
     )
-    page = render_html(report, evil, [])
+    page = html(run_page(report, config=evil))
     assert "alert(1)" in page
     assert "<script>alert" not in page
 

@@ -46,7 +46,7 @@ from vslam.features import TrackingState
 from vslam.report.folder import create_run_folder
 from vslam.run.outcome import RunOutcome, RunSettings
 from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 
 FRAMES = 12
 STAMPS = [k * 10**8 for k in range(FRAMES)]
@@ -297,7 +297,7 @@ def test_ctrl_c_is_the_regular_end_of_a_camera(folder, corridor, monkeypatch):
             signal.raise_signal(signal.SIGINT)
 
     law = parse_perturbation("brightness", 0)
-    outcome = run_sequence(source, law, settings, NullRecorder(), on_frame=on_frame)
+    outcome = run_sequence(source, law, settings, Recorder(), on_frame=on_frame)
     assert outcome.interrupted is None
     assert len(outcome.trajectory) == len(outcome.tracks) >= 31
     assert TrackingState.DROPPED in {track.state for track in outcome.tracks}

@@ -222,6 +222,7 @@ def test_a_map_is_saved_where_every_frame_becomes_a_keyframe(kitti_tree, tmp_pat
     assert outcome.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
 
 
+@pytest.mark.slow
 def test_a_resumed_run_goes_on_without_the_detectors_compared(kitti_tree, tmp_path):
     def interrupt(result: TrackResult) -> None:
         if result.index == 12:
@@ -245,6 +246,7 @@ def test_half_written_files_of_killed_runs_go_with_the_rest(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["map.npz"]
 
 
+@pytest.mark.slow
 def test_images_of_another_camera_do_not_resume_a_run(kitti_tree, tmp_path):
     drive_until(kitti_tree, tmp_path, 5)
     write_options(tmp_path, RunOptions(data=str(kitti_tree), seq="00", sensor="mono"))

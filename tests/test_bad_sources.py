@@ -22,8 +22,8 @@ from source_files import (
 )
 
 from vslam.datasets import live_camera, video
+from vslam.datasets.frames import selected
 from vslam.datasets.sources import SourceOptions, open_source
-from vslam.datasets.stream import Selection, timed_frames
 from vslam.errors import InputError
 
 FRAMES = 12
@@ -88,8 +88,7 @@ def test_a_useless_camera_info_is_not_read_where_there_is_a_calibration(
 @pytest.mark.parametrize("realtime", [False, True])
 def test_a_stream_that_ends_before_its_first_frame(folder, side_by_side, realtime):
     whole = open_source("video", str(folder / "pair.mkv"), "", side_by_side)
-    raw = replace(whole.raw, n_expected=None)
-    source = replace(whole, raw=raw, selection=Selection(start=FRAMES))
+    source = selected(replace(whole, n_expected=None), start=FRAMES)
     with pytest.raises(InputError, match=f"--start {FRAMES}: pair has no frame there"):
         run_source(source, realtime=realtime)
 
@@ -187,7 +186,7 @@ def test_a_video_without_time_stamps(folder, monkeypatch, side_by_side):
     path = folder / "pair.mkv"
     refused("no time stamps; give --fps", "video", path, side_by_side)
     options = SourceOptions(side_by_side.calibration, side_by_side=True, fps=10.0)
-    assert len(list(timed_frames(open_source("video", str(path), "", options)))) == FRAMES
+    assert len(list(open_source("video", str(path), "", options).frames())) == FRAMES
 
 
 def test_folders_of_images(folder, corridor, tmp_path):

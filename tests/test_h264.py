@@ -10,7 +10,6 @@ import pytest
 from source_files import run_source, write_calibration
 
 from vslam.datasets.sources import SourceOptions, open_source
-from vslam.datasets.stream import count_expected, timed_frames
 from vslam.errors import InputError
 
 av = pytest.importorskip("av")
@@ -55,8 +54,8 @@ def test_a_video_as_encoders_write_it(corridor, beside, options, tmp_path):
     times = np.arange(FRAMES) / 10
     path = write_h264(tmp_path / "a.mp4", beside, times, options={"bf": "3"})
     source = opened(path, options)
-    assert count_expected(source) == FRAMES
-    frames = list(timed_frames(source))
+    assert source.n_expected == FRAMES
+    frames = list(source.frames())
     np.testing.assert_allclose([frame.timestamp for frame in frames], times, atol=1e-5)
     for k, frame in enumerate(frames):
         for image, true in zip(frame.read(map), (corridor.left[k], corridor.right[k]), strict=True):
@@ -69,7 +68,7 @@ def test_a_rate_that_varies(beside, options, tmp_path):
     steps = np.resize([0.033, 0.041, 0.1, 0.02], FRAMES - 1)
     times = np.concatenate([[0.0], np.cumsum(steps)])
     path = write_h264(tmp_path / "vfr.mp4", beside, times)
-    found = [frame.timestamp for frame in timed_frames(opened(path, options))]
+    found = [frame.timestamp for frame in opened(path, options).frames()]
     np.testing.assert_allclose(found, times, atol=1e-4)
 
 
@@ -87,7 +86,7 @@ def test_a_file_in_fragments_keeps_the_frames_before_the_cut(beside, options, tm
     )
     data = path.read_bytes()
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) * 3 // 5])
-    found = list(timed_frames(opened(path, options)))
+    found = list(opened(path, options).frames())
     assert len(found) == FRAMES
     source = opened(tmp_path / "cut.mp4", options)
     outcome = run_source(source)

@@ -36,10 +36,10 @@ from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.bag_messages import grey_of
 from vslam.datasets.detection import detect_dataset
+from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.image_folders import open_images
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.sources import SourceOptions, open_source
-from vslam.datasets.stream import TimedFrame, count_expected, timed_frames
 from vslam.datasets.synthetic.video import write_side_by_side
 from vslam.errors import InputError
 from vslam.features import TrackingState
@@ -79,8 +79,8 @@ def expected(kitti_tree) -> RunOutcome:
 def test_the_same_pixels_give_the_same_trajectory(folder, corridor, expected, kind):
     source = opened(folder, kind)
     assert source.camera == expected.sequence.camera
-    assert count_expected(source) == FRAMES
-    for k, frame in enumerate(timed_frames(source)):
+    assert source.n_expected == FRAMES
+    for k, frame in enumerate(source.frames()):
         left, right = frame.read(map)
         assert np.array_equal(left, corridor.left[k])
         assert np.array_equal(right, corridor.right[k])
@@ -95,8 +95,8 @@ def test_the_same_pixels_give_the_same_trajectory(folder, corridor, expected, ki
 @pytest.mark.parametrize("kind", ["images", "video", "ros1"])
 def test_selected_frames(folder, corridor, kind):
     source = opened(folder, kind, start=2, every=3, max_frames=3)
-    assert count_expected(source) == 3
-    frames = list(timed_frames(source))
+    assert source.n_expected == 3
+    frames = list(source.frames())
     np.testing.assert_allclose([frame.timestamp for frame in frames], [0.2, 0.5, 0.8])
     for frame, k in zip(frames, (2, 5, 8), strict=True):
         assert np.array_equal(frame.read(map)[0], corridor.left[k])
@@ -108,7 +108,7 @@ def test_selected_frames(folder, corridor, kind):
 def test_the_left_camera_alone(folder, corridor, kind):
     source = opened(folder, kind, sensor="mono")
     assert source.camera.monocular
-    left, right = next(timed_frames(source)).read(map)
+    left, right = next(source.frames()).read(map)
     assert np.array_equal(left, corridor.left[0])
     assert right is None
 
@@ -119,7 +119,7 @@ def test_a_video_that_loses_stays_close(corridor, tmp_path):
     calib = write_calibration(tmp_path / "calib.yaml", corridor.camera)
     options = SourceOptions((calib,), side_by_side=True)
     source = open_source("video", str(tmp_path / "pair.avi"), "", options)
-    for k, frame in enumerate(timed_frames(source)):
+    for k, frame in enumerate(source.frames()):
         error = np.subtract(frame.read(map)[1], corridor.right[k], dtype=float)
         assert np.abs(error).mean() < 4.0
 
@@ -228,7 +228,7 @@ def test_frames_a_second_come_before_all_other_times(folder):
     np.testing.assert_allclose(source.timestamps, np.arange(FRAMES) / 4)
     options = SourceOptions((folder / "stereo.yaml",), fps=4.0, side_by_side=True)
     source = open_source("video", str(folder / "pair.mkv"), "", options)
-    times = [frame.timestamp for frame in timed_frames(source)]
+    times = [frame.timestamp for frame in source.frames()]
     np.testing.assert_allclose(times, np.arange(FRAMES) / 4)
 
 
@@ -255,7 +255,7 @@ def test_a_camera_at_a_url(folder, served):
     source = open_source("camera", served, "", options)
     assert (source.dataset, source.name) == ("camera", "127.0.0.1/pair.mkv")
     assert source.live
-    assert count_expected(source) is None
+    assert source.n_expected is None
     outcome = run_source(source, realtime=True)
     assert len(outcome.tracks) == FRAMES - 1  # the first image has told the size
     assert "no image came after 11" in outcome.interrupted
@@ -326,7 +326,7 @@ def test_a_sequence_written_side_by_side_comes_back(kitti_tree, tmp_path):
     options = SourceOptions((calib,), side_by_side=True)
     source = open_source("video", str(tmp_path / "new" / "town.mkv"), "", options)
     assert source.camera == sequence.camera
-    frames = list(timed_frames(source))
+    frames = list(source.frames())
     assert [frame.timestamp for frame in frames] == sequence.timestamps.tolist()
     for index, frame in enumerate(frames):
         assert all(map(np.array_equal, frame.read(map), sequence.read(index)))
@@ -337,10 +337,8 @@ def test_a_sequence_written_side_by_side_comes_back(kitti_tree, tmp_path):
 class There:
     """The corridor there and back as a stream; counts the images that somebody holds."""
 
-    dataset, name, live, n_expected = "video", "there", False, None
-
     def __init__(self, corridor):
-        self.corridor, self.camera = corridor, corridor.camera
+        self.corridor = corridor
         self.alive, self.most = 0, 0
 
     def frames(self):
@@ -357,10 +355,11 @@ class There:
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_images_of_a_stream_are_let_go(corridor, threads):
-    stream = There(corridor)
-    outcome = run_source(stream, threads=threads)
+    there = There(corridor)
+    source = Source(dataset="video", name="there", camera=corridor.camera, play=there.frames)
+    outcome = run_source(source, threads=threads)
     assert len(outcome.tracks) == 108
-    assert stream.most <= 2 * threads + 4
+    assert there.most <= 2 * threads + 4
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")

@@ -370,11 +370,10 @@ def _write_weights(folder: Path) -> None:
 
 def _use(source) -> None:
     """Every frame of it; a frame may be refused, alone."""
-    from vslam.datasets.stream import timed_frames
     from vslam.errors import InputError, UnreadableImageError
 
     try:
-        for frame in timed_frames(source):
+        for frame in source.frames():
             try:
                 frame.read(map)
             except UnreadableImageError:

@@ -235,7 +235,6 @@ def open_all(
     """
     from vslam.cli.console import console
     from vslam.datasets.sources import open_source
-    from vslam.datasets.stream import count_expected
     from vslam.lab.bench.grid import parse_sequences
 
     if seqs is None and kind in ("kitti", "synthetic"):
@@ -247,7 +246,7 @@ def open_all(
                 kind, str(root), name, options,
                 max_frames=max_frames, sensor=sensor, on_render=on_render,
             )  # fmt: skip
-        frames[name or found.name] = count_expected(found) or _UNKNOWN_LENGTH
+        frames[name or found.name] = found.n_expected or _UNKNOWN_LENGTH
     if kind != "synthetic":
         return frames, " ".join([str(root), *_words_of(options), *map(str, options.calibration)])
     from vslam.datasets.synthetic import Variation, store

@@ -63,11 +63,10 @@ def doctor(
 ) -> None:
     """Check images, calibration and times before a run; exit code 1 if there is a fault."""
     from vslam.config import Config, load_config
+    from vslam.datasets.frames import first_frames
     from vslam.datasets.sources import open_source
-    from vslam.datasets.stream import Stream
     from vslam.doctor.examine import Diagnosis, examine
     from vslam.doctor.findings import Finding
-    from vslam.doctor.first_frames import first_frames
     from vslam.doctor.page import write_page
 
     thresholds = Config() if config is None else load_config(config)
@@ -77,8 +76,7 @@ def doctor(
             kind_of_source(dataset, source), source, seq, options,
             start=start, every=every, max_frames=max_frames, sensor=sensor,
         )  # fmt: skip
-        sequence = first_frames(found) if isinstance(found, Stream) else found
-        diagnosis = examine(sequence, thresholds.orb)
+        diagnosis = examine(first_frames(found), thresholds.orb)
     except InputError as error:
         measured, _, fix = str(error).rstrip(".").rpartition("; ")
         diagnosis = Diagnosis([Finding("input", "fault", measured or fix, fix if measured else "")])

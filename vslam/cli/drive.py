@@ -14,9 +14,8 @@ from vslam.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
     from vslam.cli.console import Console
+    from vslam.datasets.frames import Source
     from vslam.datasets.perturbation import Perturbation
-    from vslam.datasets.sequence import Sequence
-    from vslam.datasets.stream import Stream
     from vslam.run.autosave import Unfinished
     from vslam.run.moments import LoopPictureRecorder
     from vslam.run.options import RunOptions
@@ -57,7 +56,6 @@ def drive(
 
     # Bad input has been refused by now; what follows takes a second to import.
     from vslam.cli.summary import print_summary
-    from vslam.datasets.stream import count_expected
     from vslam.doctor.nothing_tracked import why_nothing_was_tracked
     from vslam.report.folder import write_results
     from vslam.run.autosave import FolderAutosave, remove_autosave
@@ -77,7 +75,7 @@ def drive(
         # When only localising there is nothing to save but the poses.
         period = 0.0 if options.localize else options.autosave
         autosave = FolderAutosave(folder, period, f"{settings.dataset} {source.name}")
-        with told.progress_bar(count_expected(source)) as on_frame:
+        with told.progress_bar(source.n_expected) as on_frame:
             outcome = run_sequence(
                 source, perturbation, settings, recorder,
                 on_frame=on_frame, autosave=autosave, resume=unfinished, slam=slam,
@@ -98,7 +96,7 @@ def drive(
         raise typer.Exit(1)
 
 
-def _open(options: RunOptions, told: Console) -> tuple[str, Sequence | Stream, Perturbation]:
+def _open(options: RunOptions, told: Console) -> tuple[str, Source, Perturbation]:
     """The images and what is done to them. Refuses laws that the data cannot serve."""
     from vslam.cli.options import SourceName, kind_of_source, source_options
     from vslam.datasets.perturbation import parse_perturbation
@@ -120,11 +118,9 @@ def _open(options: RunOptions, told: Console) -> tuple[str, Sequence | Stream, P
     return kind, source, perturbation
 
 
-def _refuse_camera(source: Sequence | Stream, resume: Path | None) -> None:
+def _refuse_camera(source: Source, resume: Path | None) -> None:
     """What a camera has shown is gone."""
-    from vslam.datasets.stream import is_live
-
-    if is_live(source) and resume is not None:
+    if source.live and resume is not None:
         raise InputError(
             f"--resume {resume}: what a camera has shown is gone; go on in its map with "
             "--map FOLDER/autosave.npz."
@@ -132,7 +128,7 @@ def _refuse_camera(source: Sequence | Stream, resume: Path | None) -> None:
 
 
 def _unfinished(
-    options: RunOptions, source: Sequence | Stream, resume: Path | None, lock: ExitStack
+    options: RunOptions, source: Source, resume: Path | None, lock: ExitStack
 ) -> Unfinished | None:
     """What to go on from, of a run that is resumed. Refuses images of another camera than that of
     the map to go on in."""

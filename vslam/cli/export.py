@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vslam.backend.pose_graph import PoseGraph
-    from vslam.datasets.sequence import Sequence
+    from vslam.datasets.frames import Source
     from vslam.map import Map
     from vslam.maps.reconstruction import Reconstruction
     from vslam.report.finished_run import FinishedRun
@@ -204,7 +204,7 @@ def _read(run: Path) -> tuple[FinishedRun, Reconstruction]:
     return finished, reconstruction_of(finished.map, finished.camera)
 
 
-def _open(finished: FinishedRun, data: Path, *, quiet: bool) -> Sequence:
+def _open(finished: FinishedRun, data: Path, *, quiet: bool) -> Source:
     from vslam.cli.console import console
     from vslam.report.finished_run import open_images
 
@@ -213,7 +213,7 @@ def _open(finished: FinishedRun, data: Path, *, quiet: bool) -> Sequence:
 
 
 def _left_images(
-    sequence: Sequence, frames: list[int], *, quiet: bool
+    sequence: Source, frames: list[int], *, quiet: bool
 ) -> Iterator[NDArray[np.uint8]]:
     from vslam.cli.console import console
 
@@ -224,10 +224,9 @@ def _left_images(
 
 
 def _write_images(
-    folder: Path, sequence: Sequence, reconstruction: Reconstruction, *, link: bool, quiet: bool
+    folder: Path, sequence: Source, reconstruction: Reconstruction, *, link: bool, quiet: bool
 ) -> tuple[list[str], NDArray[np.uint8]]:
     """Write the keyframe images; returns their names, and the colours of the landmarks."""
-    from vslam.datasets.kitti import KittiSequence
     from vslam.maps.keyframe_images import landmark_colours, saved_images
 
     folder.mkdir()
@@ -236,15 +235,17 @@ def _write_images(
     if not link:
         names = [f"{frame:06d}.png" for frame in frames]
         images = saved_images(images, [folder / name for name in names])
-    elif isinstance(sequence, KittiSequence):
-        files = [sequence.left[frame] for frame in frames]
-        names = [f"{frame:06d}{file.suffix}" for frame, file in zip(frames, files, strict=True)]
-        for name, file in zip(names, files, strict=True):
-            (folder / name).symlink_to(file.resolve())
     else:
-        raise InputError(
-            f"--link: images of {sequence.dataset} are not used as they lie there; leave it out."
-        )
+        names = []
+        for frame in frames:
+            file = sequence.stored[frame].file
+            if file is None:
+                raise InputError(
+                    f"--link: images of {sequence.dataset} are not used as they lie there; leave "
+                    "it out."
+                )
+            names.append(f"{frame:06d}{file.suffix}")
+            (folder / names[-1]).symlink_to(file.resolve())
     return names, landmark_colours(reconstruction, images)
 
 

@@ -16,7 +16,7 @@ from vslam.cli.options import KITTI_ROOT, Data, Dataset, MaxFrames, Sensor, Thre
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
-    from vslam.datasets.sequence import Sequence
+    from vslam.datasets.frames import Source
     from vslam.lab.bench.execute import CellOutcome
     from vslam.lab.bench.grid import Cell
 
@@ -250,7 +250,7 @@ def _program(name: str, template: str) -> tuple[str, ...]:
     return (sys.executable, "-m", "vslam.cli.child", "foreign", name, template)
 
 
-def _fitting(laws: list[str], opened: Mapping[str, Sequence]) -> tuple[list[str], list[str]]:
+def _fitting(laws: list[str], opened: Mapping[str, Source]) -> tuple[list[str], list[str]]:
     """The laws that every sequence has the data for, and a note of each other one."""
     from vslam.datasets.perturbation import laws_for
 

@@ -7,8 +7,7 @@ from collections.abc import Sequence as Several
 from pathlib import Path
 
 from vslam import plugins
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import Stream
+from vslam.datasets.frames import Source
 from vslam.errors import InputError, did_you_mean
 
 _FIRST = "00"  # KITTI's, and the town rendered after it
@@ -27,7 +26,7 @@ def open_sequence(
     calib: Several[Path | str] = (),
     depth_scale: float | None = None,
     on_render: Callable[[int, int], None] | None = None,
-) -> Sequence:
+) -> Source:
     """Open a sequence and check the frames that ``start``, ``every``, ``max_frames`` select.
 
     Without a ``name`` it is 00 of KITTI and of the rendered towns, and of EuRoC and TUM the one at
@@ -59,7 +58,7 @@ def open_sequence(
         images = open_kitti_images(
             root, name, start=start, every=every, max_frames=max_frames, monocular=monocular
         )
-        return rectified(images, read_calibration(calib, images.size))
+        return rectified(images, read_calibration(calib, images.sizes[0]))
     if dataset == "euroc":
         from vslam.datasets.euroc import open_euroc
 
@@ -102,7 +101,7 @@ def open_sequence(
         dataset, root, name, start=start, every=every, max_frames=max_frames, monocular=monocular,
         calib=calib,
     )  # fmt: skip
-    if isinstance(source, Stream):
+    if not source.seekable:
         raise InputError(
             f"--dataset {dataset}: a stream, whose length nobody knows, which only 'vslam run', "
             "'vslam doctor' and 'vslam bench' read."
@@ -120,7 +119,7 @@ def open_plugin_source(
     max_frames: int | None,
     monocular: bool,
     calib: Several[Path | str],
-) -> Sequence | Stream:
+) -> Source:
     """What a reader of another package opens.
 
     Raises:

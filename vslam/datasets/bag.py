@@ -23,7 +23,7 @@ import numpy as np
 
 from vslam.calibration.formats import read_ros
 from vslam.calibration.models import Calibration
-from vslam.camera import ImageMap
+from vslam.camera import DepthImage, Image, ImageMap
 from vslam.datasets.bag_messages import (
     CAMERA_INFO_TYPE,
     IMAGE_TYPES,
@@ -34,9 +34,8 @@ from vslam.datasets.bag_messages import (
     is_depth,
     stamp_of,
 )
+from vslam.datasets.frames import Images, RawSource, Size, TimedFrame
 from vslam.datasets.image_files import size_text
-from vslam.datasets.sequence import DepthImage, Image
-from vslam.datasets.stream import TimedFrame
 from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 
 Bag = Any  # rosbags.highlevel.AnyReader
@@ -52,60 +51,17 @@ _NEEDED = {
 _MOST_WAITING = 32  # images of one side that wait for a partner
 
 
-@dataclass(frozen=True)
-class BagStream:
-    """See `vslam.datasets.stream.RawStream`.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BagSource(RawSource):
+    """The images of a bag.
 
     Attributes:
+        path: of the bag.
         topics: of the left images, and of the right ones or the depth.
-        depth: whether the second topic has the depth of the first one's pixels.
-        depth_scale: what depth counts in a metre, None as its encoding says.
     """
 
     path: Path
     topics: tuple[str, ...]
-    sizes: tuple[tuple[int, int], ...]
-    n_expected: int | None
-    depth: bool = False
-    depth_scale: float | None = None
-
-    @property
-    def dataset(self) -> str:
-        return "bag"
-
-    @property
-    def name(self) -> str:
-        return self.path.stem
-
-    @property
-    def live(self) -> bool:
-        return False
-
-    def frames(self) -> Iterator[TimedFrame]:
-        """See `vslam.datasets.stream.RawStream.frames`."""
-        with _opened(self.path) as bag:
-            messages = _messages(bag, self.path, self.topics)
-            for together in _together(messages, self.topics, _tolerance(self.depth)):
-                yield TimedFrame(stamp_of(together[0]) / 10**9, partial(self._read, together))
-
-    def _read(
-        self, messages: tuple[Message, ...], image_map: ImageMap
-    ) -> tuple[Image, Image | DepthImage | None]:
-        kinds = (False, self.depth)
-        sides = zip(messages, self.topics, self.sizes, kinds, strict=False)
-        left, *second = image_map(self._of_size, list(sides))
-        return np.asarray(left, np.uint8), second[0] if second else None
-
-    def _of_size(self, side: tuple[Message, str, tuple[int, int], bool]) -> Image | DepthImage:
-        message, topic, size, depth = side
-        image = _decoded(self.path, topic, message, depth, self.depth_scale)
-        if image.shape[::-1] != size:
-            raise UnreadableImageError(
-                self.path,
-                f"{topic}: {size_text(image.shape)} pixels where the first image has "
-                f"{size_text(size[::-1])}.",
-            )
-        return image
 
 
 def open_bag(
@@ -114,7 +70,7 @@ def open_bag(
     topics: tuple[str, ...] = (),
     sensor: str | None = None,
     depth_scale: float | None = None,
-) -> BagStream:
+) -> BagSource:
     """Open a bag and read its first frame.
 
     Args:
@@ -156,17 +112,45 @@ def open_bag(
                 f"of {size_text(images[0].shape)} in {chosen[0]}; name a topic of depth that is "
                 "registered to the images."
             )
-        return BagStream(
+        sizes = tuple((image.shape[1], image.shape[0]) for image in images)
+        return BagSource(
+            dataset="bag",
+            name=path.stem,
             path=path,
             topics=chosen,
-            sizes=tuple((image.shape[1], image.shape[0]) for image in images),
+            sizes=sizes[:1] if depth else sizes,
+            play=partial(_play, path, chosen, sizes, depth, depth_scale),
             n_expected=_count(bag, chosen),
             depth=depth,
-            depth_scale=depth_scale,
         )
 
 
-def find_calibration(stream: BagStream) -> Calibration | None:
+def _play(
+    path: Path, topics: tuple[str, ...], sizes: tuple[Size, ...], depth: bool, scale: float | None
+) -> Iterator[TimedFrame]:
+    def read(messages: tuple[Message, ...], image_map: ImageMap) -> Images:
+        sides = zip(messages, topics, sizes, (False, depth), strict=False)
+        left, *second = image_map(of_size, list(sides))
+        return np.asarray(left, np.uint8), second[0] if second else None
+
+    def of_size(side: tuple[Message, str, Size, bool]) -> Image | DepthImage:
+        message, topic, size, is_depth = side
+        image = _decoded(path, topic, message, is_depth, scale)
+        if image.shape[::-1] != size:
+            raise UnreadableImageError(
+                path,
+                f"{topic}: {size_text(image.shape)} pixels where the first image has "
+                f"{size_text(size[::-1])}.",
+            )
+        return image
+
+    with _opened(path) as bag:
+        messages = _messages(bag, path, topics)
+        for together in _together(messages, topics, _tolerance(depth)):
+            yield TimedFrame(stamp_of(together[0]) / 10**9, partial(read, together))
+
+
+def find_calibration(source: BagSource) -> Calibration | None:
     """By the ``camera_info`` beside the image topics, as ROS's drivers name it.
 
     None where one is missing or has no focal length, as drivers of uncalibrated cameras fill it.
@@ -174,10 +158,10 @@ def find_calibration(stream: BagStream) -> Calibration | None:
     Raises:
         InputError: a ``camera_info`` cannot be read, or is no calibration.
     """
-    path = stream.path
+    path = source.path
     documents = []
     with _opened(path) as bag:
-        for topic in stream.topics[: 1 if stream.depth else None]:
+        for topic in source.topics[: 1 if source.depth else None]:
             namespace, _, image = topic.removesuffix("/compressed").rpartition("/")
             info = f"{namespace}/camera_info"
             if not any(c.topic == info and c.msgtype == CAMERA_INFO_TYPE for c in bag.connections):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.calibration.documents import Document
-from vslam.datasets.sequence import DepthImage, Image
+from vslam.camera import DepthImage, Image
 
 Message = Any  # classes that rosbags makes out of the bag's definitions
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vslam.camera import ImageMap
-from vslam.datasets.sequence import Image
+from vslam.camera import Image, ImageMap
+from vslam.datasets.frames import Size
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,9 +36,7 @@ def open_capture(source: str | int, *parameters: int) -> Capture | None:
     return capture if capture.isOpened() else None
 
 
-def sizes_of(
-    image: NDArray[np.uint8], side_by_side: bool, monocular: bool
-) -> tuple[tuple[int, int], ...]:
+def sizes_of(image: NDArray[np.uint8], side_by_side: bool, monocular: bool) -> tuple[Size, ...]:
     """Width and height of each image that `read_sides` makes of a frame."""
     height, width = image.shape[:2]
     if not side_by_side:

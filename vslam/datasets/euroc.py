@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
+from vslam.datasets.frames import Source
 from vslam.datasets.ground_truth import poses_at
 from vslam.datasets.image_files import checked_files, find_sequence, select_frames
 from vslam.datasets.rectified import rectified
-from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError
 from vslam.trajectory import Trajectory
 
@@ -36,7 +36,7 @@ def open_euroc(
     max_frames: int | None = None,
     monocular: bool = False,
     calib: Several[Path | str] = (),
-) -> Sequence:
+) -> Source:
     """Open a sequence; its images are rectified as they are read.
 
     A frame is a left image with the right one of the same time, or the nearest within 5 ms; left

@@ -4,53 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from collections.abc import Sequence as Several
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import ImageMap
-from vslam.datasets.sequence import Image
+from vslam.camera import Image, ImageMap
+from vslam.datasets.frames import Images, RawSource, Size, stored_frames
 from vslam.errors import InputError, UnreadableImageError
 from vslam.untrusted import MOST_PIXELS, require_utf8
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
-
-
-@dataclass(frozen=True)
-class ImageFiles:
-    """The selected frames as the cameras took them; see `vslam.datasets.rectified.RawSequence`.
-
-    Attributes:
-        dataset: kind of source, ``euroc`` for example.
-        name: of the folder.
-        timestamps: ``(N,)`` float64 seconds.
-        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera, or None.
-        left, right: N image files each; right is empty for the left camera alone.
-        sizes: width and height of the images of each side.
-    """
-
-    dataset: str
-    name: str
-    timestamps: NDArray[np.float64]
-    ground_truth: NDArray[np.float64] | None
-    left: tuple[Path, ...]
-    right: tuple[Path, ...]
-    sizes: tuple[tuple[int, int], ...]
-
-    def __len__(self) -> int:
-        return len(self.left)
-
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
-        """Left and right image; see `vslam.datasets.sequence.Sequence.read`."""
-        files = [side[index] for side in (self.left, self.right) if side]
-        left, *right = image_map(self._read, list(zip(files, self.sizes, strict=True)))
-        return left, right[0] if right else None
-
-    def _read(self, file: tuple[Path, tuple[int, int]]) -> Image:
-        path, (width, height) = file
-        return read_grey_of_size(path, width, height)
 
 
 def checked_files(
@@ -59,24 +23,58 @@ def checked_files(
     timestamps: NDArray[np.float64],
     ground_truth: NDArray[np.float64] | None,
     sides: Several[tuple[Path, ...]],
-) -> ImageFiles:
-    """`ImageFiles` of one side or two, after a look at every file and the first images.
+) -> RawSource:
+    """A source of image files, after a look at every file and the first images.
+
+    Args:
+        timestamps: ``(N,)`` float64 seconds.
+        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera, or None.
+        sides: N files each of the left and the right camera, or of the left one alone.
 
     Raises:
         UnreadableImageError: a file is empty, or the first frame cannot be decoded.
     """
     for path in (path for side in sides for path in side):
         check_not_empty(path)
-    shapes = [read_grey(side[0]).shape for side in sides]
-    return ImageFiles(
+    sizes = tuple(image_size(side[0]) for side in sides)
+
+    def read(index: int, image_map: ImageMap) -> Images:
+        return read_files([side[index] for side in sides], sizes, image_map)
+
+    return RawSource(
         dataset=dataset,
         name=name,
-        timestamps=timestamps,
+        sizes=sizes,
+        stored=stored_frames(timestamps, read, sides[0]),
         ground_truth=ground_truth,
-        left=sides[0],
-        right=sides[1] if len(sides) == 2 else (),
-        sizes=tuple((width, height) for height, width in shapes),
     )
+
+
+def read_files(
+    files: Several[Path], sizes: Several[Size], image_map: ImageMap
+) -> tuple[Image, Image | None]:
+    """Left and right image, None for the right one if there is a single file.
+
+    Raises:
+        UnreadableImageError: a file is missing, damaged or not of its size.
+    """
+    left, *right = image_map(_read_file, list(zip(files, sizes, strict=True)))
+    return left, right[0] if right else None
+
+
+def _read_file(file: tuple[Path, Size]) -> Image:
+    path, (width, height) = file
+    return read_grey_of_size(path, width, height)
+
+
+def image_size(path: Path) -> Size:
+    """Width and height.
+
+    Raises:
+        UnreadableImageError: missing or damaged.
+    """
+    height, width = read_grey(path).shape
+    return width, height
 
 
 def list_images(folder: Path) -> dict[str, Path]:

@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.association import associate
-from vslam.datasets.depth_images import DepthFiles, checked_depth_files, image_size
-from vslam.datasets.image_files import ImageFiles, checked_files, list_images, select_frames
+from vslam.datasets.depth_images import depth_files
+from vslam.datasets.frames import RawSource
+from vslam.datasets.image_files import checked_files, image_size, list_images, select_frames
 from vslam.errors import InputError
 from vslam.trajectory import read_table
 
@@ -71,30 +72,25 @@ class ImageFolders:
     depth: bool
     size: tuple[int, int]
 
-    def images(self) -> ImageFiles:
-        """As a sequence of one camera or of a stereo pair.
+    def source(self, depth_scale: float | None) -> RawSource:
+        """The images as a source.
+
+        Args:
+            depth_scale: what depth images count in a metre; needed only for these.
 
         Raises:
+            InputError: there are depth images and no scale.
             UnreadableImageError: a file is empty, or the first frame cannot be decoded.
         """
-        return checked_files("images", self.name, self.timestamps, None, self.sides)
-
-    def with_depth(self, scale: float | None) -> DepthFiles:
-        """As a sequence of images with depth, which counts ``scale`` in a metre.
-
-        Raises:
-            InputError: there is no scale.
-            UnreadableImageError: a file is empty, or the first frame cannot be decoded.
-        """
+        if not self.depth:
+            return checked_files("images", self.name, self.timestamps, None, self.sides)
         colour, depth = self.sides
-        if scale is None:
+        if depth_scale is None:
             raise InputError(
                 f"{depth[0].parent}: what depth images count in a metre is not known; give "
                 "--depth-scale, 1000 for millimetres, or depth_scale in the calibration."
             )
-        return checked_depth_files(
-            DepthFiles("images", self.name, self.timestamps, None, colour, depth, self.size, scale)
-        )
+        return depth_files("images", self.name, self.timestamps, None, colour, depth, depth_scale)
 
 
 def open_images(

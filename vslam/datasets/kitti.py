@@ -7,76 +7,18 @@ root/poses/NN.txt                                ground truth, for 00 to 10
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, ImageMap
-from vslam.datasets.image_files import (
-    check_not_empty,
-    list_images,
-    read_grey,
-    read_grey_of_size,
-    select_frames,
-    size_text,
-)
-from vslam.datasets.sequence import Image
+from vslam.camera import Camera
+from vslam.datasets.frames import RawSource, Source
+from vslam.datasets.image_files import checked_files, list_images, select_frames
 from vslam.errors import InputError, UnreadableImageError
 from vslam.trajectory import read_kitti_poses, read_table
 
 _HOME = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php"
-
-
-@dataclass(frozen=True)
-class KittiImages:
-    """The selected frames of one sequence; see `vslam.datasets.rectified.RawSequence`.
-
-    Attributes:
-        name: ``00`` for example.
-        size: width and height of the images.
-        timestamps: ``(N,)`` float64 seconds since the first frame of the whole sequence.
-        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` or None; the world is the first left camera
-            of the whole sequence.
-        left, right: N image files each, of equal stems; right is empty for the left camera alone.
-    """
-
-    name: str
-    size: tuple[int, int]
-    timestamps: NDArray[np.float64]
-    ground_truth: NDArray[np.float64] | None
-    left: tuple[Path, ...]
-    right: tuple[Path, ...]
-
-    @property
-    def dataset(self) -> str:
-        return "kitti"
-
-    def __len__(self) -> int:
-        return len(self.left)
-
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
-        """Left and right image ``(H, W)`` uint8 of one frame, None for the right one where the left
-        camera is read alone. Safe to call from several threads.
-
-        Raises:
-            UnreadableImageError: a file is missing, damaged or not of the size of the others.
-        """
-        files = [side[index] for side in (self.left, self.right) if side]
-        left, *right = image_map(self._read, files)
-        return left, right[0] if right else None
-
-    def _read(self, path: Path) -> Image:
-        return read_grey_of_size(path, *self.size)
-
-
-@dataclass(frozen=True)
-class KittiSequence(KittiImages):
-    """See :class:`vslam.datasets.sequence.Sequence`; ``camera`` is from P0 and P1 of the sequence's
-    own ``calib.txt``."""
-
-    camera: Camera
 
 
 def open_kitti(
@@ -87,7 +29,7 @@ def open_kitti(
     every: int = 1,
     max_frames: int | None = None,
     monocular: bool = False,
-) -> KittiSequence:
+) -> Source:
     """Open a sequence with its own calibration; see `open_kitti_images`.
 
     Raises:
@@ -98,9 +40,15 @@ def open_kitti(
         root, name, start=start, every=every, max_frames=max_frames, monocular=monocular
     )
     folder = _find_sequence(_find_root(root), name)
-    width, height = images.size
+    width, height = images.sizes[0]
     camera = read_calibration(folder / "calib.txt", width=width, height=height)
-    return KittiSequence(**vars(images), camera=camera.left_camera() if monocular else camera)
+    return Source(
+        dataset=images.dataset,
+        name=name,
+        camera=camera.left_camera() if monocular else camera,
+        stored=images.stored,
+        ground_truth=images.ground_truth,
+    )
 
 
 def open_kitti_images(
@@ -111,7 +59,7 @@ def open_kitti_images(
     every: int = 1,
     max_frames: int | None = None,
     monocular: bool = False,
-) -> KittiImages:
+) -> RawSource:
     """Open the images of a sequence, not its calibration; only the selected frames must be
     complete.
 
@@ -134,34 +82,27 @@ def open_kitti_images(
     """
     base = _find_root(root)
     folder = _find_sequence(base, name)
-    sides = [list_images(folder / f"image_{side}") for side in range(1 if monocular else 2)]
-    stems = sorted(set().union(*sides), key=_by_number)
+    listed = [list_images(folder / f"image_{side}") for side in range(1 if monocular else 2)]
+    stems = sorted(set().union(*listed), key=_by_number)
     if not stems:
         raise InputError(
             f"{folder}: no images in image_0 and image_1; "
             f"download the grayscale images (22 GB) from {_HOME}."
         )
     chosen = select_frames(folder, len(stems), start, every, max_frames)
-    rows = _check_frames(folder, sides, [stems[k] for k in chosen])
-    left, *right = zip(*rows, strict=True)
-
-    sizes = [read_grey(path).shape for path in rows[0]]
-    if not monocular and sizes[0] != sizes[1]:
-        raise UnreadableImageError(
-            rows[0][1],
-            f"{size_text(sizes[1])} pixels but the left image has {size_text(sizes[0])}; "
-            "use the rectified images of both cameras.",
-        )
+    sides = _check_frames(folder, listed, [stems[k] for k in chosen])
     times = _read_times(folder / "times.txt")
     frames = _row_numbers(folder / "times.txt", stems, len(times))[chosen]
-    return KittiImages(
-        name=name,
-        size=(sizes[0][1], sizes[0][0]),
-        timestamps=times[frames],
-        ground_truth=_read_ground_truth(base / "poses" / f"{name}.txt", stems, len(times), chosen),
-        left=left,
-        right=() if monocular else right[0],
-    )
+    truth = _read_ground_truth(base / "poses" / f"{name}.txt", stems, len(times), chosen)
+    images = checked_files("kitti", name, times[frames], truth, sides)
+    left, *right = (f"{width}x{height}" for width, height in images.sizes)
+    if right and right[0] != left:
+        raise UnreadableImageError(
+            sides[1][0],
+            f"{right[0]} pixels but the left image has {left}; use the rectified images of both "
+            "cameras.",
+        )
+    return images
 
 
 def list_kitti(root: Path | str) -> list[tuple[str, int, int]]:
@@ -246,6 +187,7 @@ def _by_number(stem: str) -> tuple[int, str]:
 def _check_frames(
     folder: Path, sides: list[dict[str, Path]], stems: list[str]
 ) -> list[tuple[Path, ...]]:
+    """The files of these stems on each side."""
     for side, images in enumerate(sides):
         if not images:
             instead = ", or run on the left camera alone with --sensor mono" if side else ""
@@ -264,10 +206,7 @@ def _check_frames(
             f"{folder}: unequal counts, {len(sides[0])} left and {len(sides[1])} right images of "
             f"which {len(sides[0].keys() & sides[1].keys())} frames have both; {fix}."
         )
-    frames = [tuple(side[stem] for side in sides) for stem in stems]
-    for path in (path for frame in frames for path in frame):
-        check_not_empty(path)
-    return frames
+    return [tuple(side[stem] for stem in stems) for side in sides]
 
 
 def _read_times(path: Path) -> NDArray[np.float64]:

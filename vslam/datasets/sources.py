@@ -10,10 +10,8 @@ from pathlib import Path
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration
 from vslam.datasets import DATASETS, open_plugin_source, open_sequence
+from vslam.datasets.frames import RawSource, Source, selected
 from vslam.datasets.rectified import rectified
-from vslam.datasets.rectified_stream import rectified_stream
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import RawStream, Stream
 from vslam.errors import InputError
 
 SOURCES = ("images", "video", "bag", "camera")
@@ -64,7 +62,7 @@ def open_source(
     max_frames: int | None = None,
     sensor: str | None = None,
     on_render: Callable[[int, int], None] | None = None,
-) -> Sequence | Stream:
+) -> Source:
     """Open a data set, or images of any camera, which are rectified by the user's calibration.
 
     Args:
@@ -80,7 +78,7 @@ def open_source(
     """
     monocular = sensor == "mono"
     _check_options(dataset, name, options, monocular)
-    source: Sequence | Stream
+    source: Source
     if dataset in SOURCES:
         source = _open_images(dataset, data, options, start, every, max_frames, sensor)
     elif dataset not in DATASETS:
@@ -110,7 +108,7 @@ def _open_images(
     every: int,
     max_frames: int | None,
     sensor: str | None,
-) -> Sequence | Stream:
+) -> Source:
     if dataset == "images":
         from vslam.datasets.image_folders import open_images
 
@@ -119,38 +117,29 @@ def _open_images(
             every=every, max_frames=max_frames, sensor=sensor,
         )  # fmt: skip
         calibration = _calibration(dataset, data, options, found.size)
-        if not found.depth:
-            return rectified(found.images(), calibration)
-        raw = found.with_depth(options.depth_scale or calibration.depth_scale)
-        return rectified(raw, calibration, depth=True)
-    stream: RawStream
+        return rectified(found.source(options.depth_scale or calibration.depth_scale), calibration)
+    raw: RawSource
     own: Calibration | None = None
-    monocular, depth = sensor == "mono", False
+    monocular = sensor == "mono"
     if dataset == "video":
         from vslam.datasets.video import open_video
 
-        stream = open_video(
+        raw = open_video(
             Path(data), fps=options.fps, side_by_side=options.side_by_side, monocular=monocular
         )
     elif dataset == "bag":
         from vslam.datasets.bag import find_calibration, open_bag
 
-        stream = bag = open_bag(
+        raw = bag = open_bag(
             Path(data), topics=options.topics, sensor=sensor, depth_scale=options.depth_scale
         )
-        own, depth = None if options.calibration else find_calibration(bag), bag.depth
+        own = None if options.calibration else find_calibration(bag)
     else:
         from vslam.datasets.live_camera import open_camera
 
-        stream = open_camera(data, side_by_side=options.side_by_side, monocular=monocular)
-    return rectified_stream(
-        stream,
-        _calibration(dataset, data, options, stream.sizes[0], own),
-        start=start,
-        every=every,
-        max_frames=max_frames,
-        depth=depth,
-    )
+        raw = open_camera(data, side_by_side=options.side_by_side, monocular=monocular)
+    raw = selected(raw, start=start, every=every, max_frames=max_frames)
+    return rectified(raw, _calibration(dataset, data, options, raw.sizes[0], own))
 
 
 def _check_options(

@@ -14,7 +14,7 @@ from vslam.backend.pose_graph import PoseGraph, essential_graph
 from vslam.camera import Camera, same_camera
 from vslam.config import Config, load_config
 from vslam.datasets import known_datasets, open_sequence
-from vslam.datasets.sequence import Sequence
+from vslam.datasets.frames import Source
 from vslam.errors import InputError
 from vslam.loops import LoopEdge
 from vslam.map import Map
@@ -73,7 +73,7 @@ def read_report(folder: Path | str) -> ReportJson:
 
 def open_images(
     run: FinishedRun, root: Path, on_render: Callable[[int, int], None] | None = None
-) -> Sequence:
+) -> Source:
     """Open the sequence of a run as far as its last keyframe; ``map.frames`` count its frames.
 
     Args:

@@ -7,8 +7,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from vslam.config import Config
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import Stream, is_live
+from vslam.datasets.frames import Source
 from vslam.errors import InputError
 from vslam.loopclosure.registry import DEFAULT_DETECTOR
 from vslam.run.outcome import RunSettings
@@ -49,9 +48,7 @@ class RunOptions(BaseModel):
     autosave: float = 60.0
 
 
-def settings_of(
-    options: RunOptions, dataset: str, source: Sequence | Stream, perturb: str
-) -> RunSettings:
+def settings_of(options: RunOptions, dataset: str, source: Source, perturb: str) -> RunSettings:
     """What a run of a source with these options tells of itself.
 
     Args:
@@ -72,7 +69,7 @@ def settings_of(
         config=options.thresholds,
         weights=options.weights,
         local_weights=options.local_weights,
-        realtime=options.realtime or is_live(source),
+        realtime=options.realtime or source.live,
         calib=options.calib,
         map=options.map_file,
         localize=options.localize,

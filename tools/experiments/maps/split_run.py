@@ -17,8 +17,7 @@ import numpy as np
 
 from vslam.config import Config
 from vslam.datasets import open_sequence
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import timed_frames
+from vslam.datasets.frames import Source
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.run.outcome import alignment_of
 from vslam.run.preparation import prepared_frames
@@ -48,7 +47,7 @@ def main() -> None:
         compare(sequence, options.detector, options.at, options.threads, Path(folder))
 
 
-def compare(sequence: Sequence, detector: str, at: float, threads: int, folder: Path) -> None:
+def compare(sequence: Source, detector: str, at: float, threads: int, folder: Path) -> None:
     n, half = len(sequence), round(at * len(sequence))
     whole = begin(sequence, detector, threads)
     drive(whole, sequence, range(n), threads)
@@ -72,14 +71,14 @@ def compare(sequence: Sequence, detector: str, at: float, threads: int, folder: 
     )
 
 
-def begin(sequence: Sequence, detector: str, threads: int) -> Slam:
+def begin(sequence: Source, detector: str, threads: int) -> Slam:
     return Slam(sequence.camera, Config(), detector, threads=threads)
 
 
-def drive(slam: Slam, sequence: Sequence, frames: range, threads: int) -> int:
+def drive(slam: Slam, sequence: Source, frames: range, threads: int) -> int:
     """Returns how many frames were lost."""
     lost = 0
-    chosen = (frame for k, frame in enumerate(timed_frames(sequence)) if k in frames)
+    chosen = (frame for k, frame in enumerate(sequence.frames()) if k in frames)
     for timestamp, prepared in prepared_frames(chosen, slam.context, threads):
         result = slam.step_features(prepared.extracted, timestamp, prepared.image)
         lost += result.state == "LOST"
@@ -87,7 +86,7 @@ def drive(slam: Slam, sequence: Sequence, frames: range, threads: int) -> int:
     return lost
 
 
-def error(trajectory: Trajectory, sequence: Sequence) -> float:
+def error(trajectory: Trajectory, sequence: Source) -> float:
     truth = Trajectory(sequence.timestamps, sequence.ground_truth)
     alignment = alignment_of("mono" if sequence.camera.monocular else "stereo")
     return evaluate_trajectory(trajectory, truth, alignment).ate_rmse_m

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, DepthImage, Image
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import Stream
+from vslam.datasets.frames import Source
 from vslam.errors import InputError
 
 RandomStream = tuple[int, int]
@@ -70,11 +69,11 @@ class Scene:
     read: Callable[[int], tuple[Image, Image | DepthImage | None]] | None = None
 
     @classmethod
-    def of(cls, source: Sequence | Stream) -> Scene:
+    def of(cls, source: Source) -> Scene:
         """What a source knows."""
-        if isinstance(source, Stream):
+        if not source.seekable:
             return cls(source.camera)
-        times = np.asarray(source.timestamps, np.float64)
+        times = source.timestamps
         return cls(source.camera, times - times[:1], source.ground_truth, source.read)
 
 

@@ -11,10 +11,9 @@ from zlib import crc32
 import numpy as np
 
 from vslam.camera import DepthImage, Image, ImageMap
+from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation.kinds import LawKind, Pair, PairLaw, Scene, SceneLaw
 from vslam.datasets.perturbation.registry import LAWS, all_laws
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import Stream, TimedFrame
 from vslam.errors import DroppedFrameError, InputError, did_you_mean
 
 
@@ -30,7 +29,7 @@ class Perturbation:
     name: str
     laws: tuple[PairLaw | SceneLaw, ...] = ()
 
-    def bound_to(self, source: Sequence | Stream) -> Perturbation:
+    def bound_to(self, source: Source) -> Perturbation:
         """The same for the frames of one source: laws that look at depth, poses or other frames
         find them there.
 
@@ -115,9 +114,7 @@ def _read_perturbed(
     return perturbation.apply(index, t, *frame.read(image_map))
 
 
-def contact_sheet(
-    sequence: Sequence, perturbation: Perturbation, indices: Collection[int]
-) -> Image:
+def contact_sheet(sequence: Source, perturbation: Perturbation, indices: Collection[int]) -> Image:
     """A grey image with a row for each frame: left image as it is, both images perturbed.
 
     Raises:
@@ -132,7 +129,7 @@ def contact_sheet(
     return np.vstack(rows)
 
 
-def sheet_of_laws(sequence: Sequence, specs: Collection[str], index: int, seed: int) -> Image:
+def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: int) -> Image:
     """A grey image with a row for each perturbation: a frame as it is, both its images perturbed.
     The rows stand in two columns where there are several.
 
@@ -152,7 +149,7 @@ def sheet_of_laws(sequence: Sequence, specs: Collection[str], index: int, seed: 
     return np.hstack([np.vstack(rows[:half]), np.vstack(rows[half:])])
 
 
-def laws_for(sequence: Sequence | Stream) -> tuple[list[str], dict[str, str]]:
+def laws_for(sequence: Source) -> tuple[list[str], dict[str, str]]:
     """Names of the laws that a source has the data for, and of the others why they do not apply."""
     fit, unfit = [], {}
     for name in all_laws():
@@ -165,9 +162,7 @@ def laws_for(sequence: Sequence | Stream) -> tuple[list[str], dict[str, str]]:
     return fit, unfit
 
 
-def _row(
-    sequence: Sequence, perturbation: Perturbation, index: int, label: str, width: int
-) -> Image:
+def _row(sequence: Source, perturbation: Perturbation, index: int, label: str, width: int) -> Image:
     import cv2
 
     t = float(sequence.timestamps[index] - sequence.timestamps[0])

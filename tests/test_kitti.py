@@ -76,7 +76,7 @@ def test_selection(root):
     sequence = open_kitti(root, "00", start=1, every=2, max_frames=2)
     np.testing.assert_allclose(sequence.timestamps, [0.1, 0.3])
     np.testing.assert_array_equal(sequence.ground_truth[:, 2, 3], [1, 3])
-    assert [path.stem for path in sequence.left] == ["000001", "000003"]
+    assert [frame.file.stem for frame in sequence.stored] == ["000001", "000003"]
 
 
 def test_only_selected_frames_are_checked(root):

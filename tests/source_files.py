@@ -10,12 +10,23 @@ import numpy as np
 
 from vslam.camera import Camera
 from vslam.config import Config
+from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import parse_perturbation
+from vslam.datasets.sources import SourceOptions, open_source
 from vslam.run.outcome import RunOutcome, RunSettings
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import NullRecorder
 
+NO_OPTIONS = SourceOptions()
 LEFT, RIGHT = "/cam0/image_raw", "/cam1/image_raw"
+
+
+def open_from(
+    dataset: str, data: Path | str, options: SourceOptions = NO_OPTIONS, **more: object
+) -> Source:
+    """Open a source as a command does that is given these options."""
+    given = {"dataset": dataset, "data": str(data), **more}
+    return open_source(options.model_copy(update=given))
 
 
 def write_calibration(

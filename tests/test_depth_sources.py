@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 from conftest import StereoSequence, corridor_depth
-from source_files import run_source, write_bag, write_calibration, write_images
+from source_files import open_from, run_source, write_bag, write_calibration, write_images
 
 from vslam.camera import Camera
 from vslam.datasets.detection import detect_dataset
-from vslam.datasets.sources import SourceOptions, open_source
+from vslam.datasets.sources import SourceOptions
 from vslam.errors import InputError
 
 FRAMES = 8
@@ -50,8 +50,8 @@ def folders(corridor, depths, tmp_path_factory) -> Path:
 
 def opened(data: Path, calib: Path | None = None, **options):
     sensor = options.pop("sensor", None)
-    given = SourceOptions(() if calib is None else (calib,), **options)
-    return open_source(detect_dataset(str(data)), str(data), None, given, sensor=sensor)
+    given = SourceOptions(calib=() if calib is None else (calib,), **options)
+    return open_from(detect_dataset(str(data)), data, given, sensor=sensor)
 
 
 def refused(match: str, data: Path, calib: Path, **options):

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from source_files import run_source, write_calibration
+from source_files import open_from, run_source, write_calibration
 
-from vslam.datasets.sources import SourceOptions, open_source
+from vslam.datasets.sources import SourceOptions
 from vslam.errors import InputError
 
 av = pytest.importorskip("av")
@@ -36,7 +36,7 @@ def write_h264(path: Path, images, times, *, options=None, container=None) -> Pa
 @pytest.fixture(scope="module")
 def options(corridor, tmp_path_factory) -> SourceOptions:
     path = tmp_path_factory.mktemp("calib") / "c.yaml"
-    return SourceOptions((write_calibration(path, corridor.camera),), side_by_side=True)
+    return SourceOptions(calib=(write_calibration(path, corridor.camera),), side_by_side=True)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def beside(corridor) -> list[np.ndarray]:
 
 
 def opened(path: Path, options: SourceOptions):
-    return open_source("video", str(path), None, options)
+    return open_from("video", path, options)
 
 
 def test_a_video_as_encoders_write_it(corridor, beside, options, tmp_path):

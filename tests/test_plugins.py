@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from source_files import open_from
 
 from vslam import plugins
 from vslam.cli import main as cli
 from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import Perturbation, parse_perturbation
-from vslam.datasets.sources import SourceOptions, open_source
 from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 from vslam.features import Features
 from vslam.loopclosure.registry import create_detector, problem_of, require_detector
@@ -360,9 +360,7 @@ def test_a_reader_that_streams(broken, kitti_tree):
     broken(STREAM.replace("LIVE", "True"), "[vslam.readers]\nmine = broken:reader\n")
     with pytest.raises(InputError, match="a stream, whose length nobody knows"):
         open_sequence("mine", kitti_tree, "00")
-    source = open_source(
-        "mine", str(kitti_tree), "00", SourceOptions(), start=1, every=2, sensor="mono"
-    )
+    source = open_from("mine", kitti_tree, start=1, every=2, sensor="mono")
     assert not source.seekable
     assert (source.live, source.n_expected, source.camera.monocular) == (True, None, True)
     inner = open_sequence("kitti", kitti_tree, "00")
@@ -375,13 +373,13 @@ def test_a_reader_that_streams(broken, kitti_tree):
     assert times == inner.timestamps[1:8:2].tolist()
     assert all(right is None for _, right in images)
     assert np.array_equal(images[1][0], inner.read(3)[0])
-    few = open_source("mine", str(kitti_tree), "00", SourceOptions(), max_frames=3)
+    few = open_from("mine", kitti_tree, max_frames=3)
     assert few.n_expected == len(list(few.frames())) == 3
 
 
 def test_a_run_on_a_reader_that_streams(broken, kitti_tree):
     broken(STREAM.replace("LIVE", "False"), "[vslam.readers]\nmine = broken:reader\n")
-    source = open_source("mine", str(kitti_tree), "00", SourceOptions(), max_frames=6)
+    source = open_from("mine", kitti_tree, max_frames=6)
     settings = RunSettings("mine", "x", "none", "none", "stereo", 0, 1, 0, 1, 6, Config())
     outcome = run_sequence(source, Perturbation("none"), settings, NullRecorder())
     assert len(outcome.trajectory) == 6
@@ -399,7 +397,7 @@ def test_a_run_on_a_reader_that_streams(broken, kitti_tree):
 def test_what_is_no_stream_is_refused(broken, kitti_tree, change, says):
     broken(STREAM.replace(*change).replace("LIVE", "True"), "[vslam.readers]\nmine = broken:reader")
     with pytest.raises(InputError, match=says):
-        open_source("mine", str(kitti_tree), "00", SourceOptions())
+        open_from("mine", kitti_tree)
 
 
 def test_a_perturbation_that_fails_costs_one_frame(broken):

@@ -22,6 +22,7 @@ from source_files import (
     LEFT,
     RIGHT,
     all_sources,
+    open_from,
     run_source,
     source_path,
     write_bag,
@@ -39,7 +40,7 @@ from vslam.datasets.detection import detect_dataset
 from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.image_folders import open_images
 from vslam.datasets.perturbation import parse_perturbation
-from vslam.datasets.sources import SourceOptions, open_source
+from vslam.datasets.sources import SourceOptions
 from vslam.datasets.synthetic.video import write_side_by_side
 from vslam.errors import InputError
 from vslam.features import TrackingState
@@ -63,9 +64,9 @@ def opened(folder: Path, kind: str, **options):
     dataset = detect_dataset(path)
     assert dataset == (kind if kind in ("images", "video") else "bag")
     given = () if kind == "folder" else (folder / "stereo.yaml",)
-    topics = (LEFT, RIGHT) if kind == "ros1" else ()
-    chosen = SourceOptions(given, side_by_side=dataset == "video", topics=topics)
-    return open_source(dataset, path, None, chosen, **options)
+    topics = f"{LEFT},{RIGHT}" if kind == "ros1" else ""
+    chosen = SourceOptions(calib=given, side_by_side=dataset == "video", topics=topics)
+    return open_from(dataset, path, chosen, **options)
 
 
 @pytest.fixture(scope="module")
@@ -117,8 +118,8 @@ def test_a_video_that_loses_stays_close(corridor, tmp_path):
     beside = [np.hstack(pair) for pair in zip(corridor.left, corridor.right, strict=True)][:3]
     write_video(tmp_path / "pair.avi", beside, codec="MJPG")
     calib = write_calibration(tmp_path / "calib.yaml", corridor.camera)
-    options = SourceOptions((calib,), side_by_side=True)
-    source = open_source("video", str(tmp_path / "pair.avi"), "", options)
+    options = SourceOptions(calib=(calib,), side_by_side=True)
+    source = open_from("video", tmp_path / "pair.avi", options)
     for k, frame in enumerate(source.frames()):
         error = np.subtract(frame.read(map)[1], corridor.right[k], dtype=float)
         assert np.abs(error).mean() < 4.0
@@ -134,15 +135,13 @@ def test_images_without_a_partner_in_time_are_left_out(corridor, tmp_path):
     pair = {LEFT: corridor.left[:4], RIGHT: corridor.right[:4]}
     write_bag(tmp_path / "lag.bag", "ros1", pair, STAMPS[:4], lag=6_000_000, camera=corridor.camera)
     with pytest.raises(InputError, match="no images of one time"):
-        open_source("bag", str(tmp_path / "lag.bag"), "", SourceOptions())
+        open_from("bag", tmp_path / "lag.bag")
 
 
 def test_a_bag_with_a_rectified_topic_uses_its_projection_matrix(corridor, tmp_path):
     pair = {"/a/image_rect": corridor.left[:2], "/b/image_rect": corridor.right[:2]}
     write_bag(tmp_path / "b.bag", "ros1", pair, STAMPS[:2], camera=corridor.camera)
-    assert (
-        open_source("bag", str(tmp_path / "b.bag"), "", SourceOptions()).camera == corridor.camera
-    )
+    assert open_from("bag", tmp_path / "b.bag").camera == corridor.camera
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
@@ -173,7 +172,7 @@ def test_bayer_patterns_are_told_apart(pattern):
 def test_times_in_names(corridor, tmp_path, names, times):
     write_images(tmp_path, {"cam0": corridor.left[:2]}, names)
     calib = write_calibration(tmp_path / "c.yaml", corridor.camera)
-    found = open_source("images", str(tmp_path), "", SourceOptions((calib,)), sensor="mono")
+    found = open_from("images", tmp_path, SourceOptions(calib=(calib,)), sensor="mono")
     assert found.timestamps[0] == pytest.approx(times[0], abs=1e-6)
     assert np.diff(found.timestamps)[0] == pytest.approx(times[1], abs=1e-6)
 
@@ -209,7 +208,7 @@ def test_times_in_exif(corridor, tmp_path):
         exif.get_ifd(0x8769).update({0x9003: "2024:05:17 10:20:30", 0x9291: subsec})
         Image.fromarray(corridor.left[k]).save(tmp_path / f"IMG_{k}.jpg", exif=exif)
     calib = write_calibration(tmp_path / "c.yaml", corridor.camera)
-    found = open_source("images", str(tmp_path), "", SourceOptions((calib,)), sensor="mono")
+    found = open_from("images", tmp_path, SourceOptions(calib=(calib,)), sensor="mono")
     assert np.diff(found.timestamps)[0] == pytest.approx(0.5, abs=1e-6)
 
 
@@ -219,15 +218,15 @@ def test_an_image_too_large_for_pillow_has_no_time_in_exif(tmp_path):
         (tmp_path / f"IMG_{k}.png").write_bytes(png(20_000, 20_000))
     calib = write_calibration(tmp_path / "c.yaml", Camera(60.0, 60.0, 31.5, 23.5, 0.2, 64, 48))
     with pytest.raises(InputError, match="no time stamps"):
-        open_source("images", str(tmp_path), "", SourceOptions((calib,)), sensor="mono")
+        open_from("images", tmp_path, SourceOptions(calib=(calib,)), sensor="mono")
 
 
 def test_frames_a_second_come_before_all_other_times(folder):
-    options = SourceOptions((folder / "stereo.yaml",), fps=4.0)
-    source = open_source("images", str(folder / "images"), "", options)
+    options = SourceOptions(calib=(folder / "stereo.yaml",), fps=4.0)
+    source = open_from("images", folder / "images", options)
     np.testing.assert_allclose(source.timestamps, np.arange(FRAMES) / 4)
-    options = SourceOptions((folder / "stereo.yaml",), fps=4.0, side_by_side=True)
-    source = open_source("video", str(folder / "pair.mkv"), "", options)
+    options = SourceOptions(calib=(folder / "stereo.yaml",), fps=4.0, side_by_side=True)
+    source = open_from("video", folder / "pair.mkv", options)
     times = [frame.timestamp for frame in source.frames()]
     np.testing.assert_allclose(times, np.arange(FRAMES) / 4)
 
@@ -251,8 +250,8 @@ def served(folder):
 
 
 def test_a_camera_at_a_url(folder, served):
-    options = SourceOptions((folder / "stereo.yaml",), side_by_side=True)
-    source = open_source("camera", served, "", options)
+    options = SourceOptions(calib=(folder / "stereo.yaml",), side_by_side=True)
+    source = open_from("camera", served, options)
     assert (source.dataset, source.name) == ("camera", "127.0.0.1/pair.mkv")
     assert source.live
     assert source.n_expected is None
@@ -286,8 +285,8 @@ class FakeCamera:
 def test_ctrl_c_is_the_regular_end_of_a_camera(folder, corridor, monkeypatch):
     FakeCamera.images = [np.hstack(p) for p in zip(corridor.left, corridor.right, strict=True)]
     monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
-    options = SourceOptions((folder / "stereo.yaml",), side_by_side=True)
-    source = open_source("camera", "0", "", options)
+    options = SourceOptions(calib=(folder / "stereo.yaml",), side_by_side=True)
+    source = open_from("camera", "0", options)
     settings = RunSettings(
         "camera", "0", "none", "none", "stereo", 0, 2, 0, 1, None, Config(), realtime=True
     )
@@ -323,8 +322,8 @@ def test_a_sequence_written_side_by_side_comes_back(kitti_tree, tmp_path):
     sequence = open_sequence("kitti", kitti_tree, "00", max_frames=5)
     calib = write_side_by_side(sequence, tmp_path / "new" / "town.mkv")
     assert calib == tmp_path / "new" / "town.yaml"
-    options = SourceOptions((calib,), side_by_side=True)
-    source = open_source("video", str(tmp_path / "new" / "town.mkv"), "", options)
+    options = SourceOptions(calib=(calib,), side_by_side=True)
+    source = open_from("video", tmp_path / "new" / "town.mkv", options)
     assert source.camera == sequence.camera
     frames = list(source.frames())
     assert [frame.timestamp for frame in frames] == sequence.timestamps.tolist()
@@ -407,7 +406,5 @@ def test_swapped_topics_of_a_bag_are_named(corridor, tmp_path):
     pair = {"/a/image_rect": corridor.left[:2], "/b/image_rect": corridor.right[:2]}
     write_bag(tmp_path / "b.bag", "ros1", pair, STAMPS[:2], camera=corridor.camera)
     with pytest.raises(InputError, match=r"the sides seem swapped.*--topics"):
-        open_source(
-            "bag", str(tmp_path / "b.bag"), "",
-            SourceOptions(topics=("/b/image_rect", "/a/image_rect")),
+        open_from("bag", tmp_path / "b.bag", SourceOptions(topics="/b/image_rect,/a/image_rect"),
         )  # fmt: skip

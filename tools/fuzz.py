@@ -399,11 +399,9 @@ def _each(read: Callable[[str], object], names: Iterable[str]) -> None:
 def _read_source(dataset: str, data: str, folder: Path, **options) -> None:
     from vslam.datasets.sources import SourceOptions, open_source
 
-    more = {key: options.pop(key) for key in ("sensor",) if key in options}
-    calibration = options.pop("calib", None)
-    if calibration:
-        options["calibration"] = (folder / calibration,)
-    _use(open_source(dataset, str(folder / data), None, SourceOptions(**options), **more))
+    if "calib" in options:
+        options["calib"] = (folder / options["calib"],)
+    _use(open_source(SourceOptions(dataset=dataset, data=str(folder / data), **options)))
 
 
 def _read_video(folder: Path) -> None:

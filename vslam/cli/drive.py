@@ -5,11 +5,12 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
 from vslam.cli.console import console
+from vslam.cli.options import open_given
 from vslam.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ def drive(
     if options.localize and output.save_map is not None:
         raise InputError("--save-map: localising changes no map; leave it out.")
     told = console(shown=not output.quiet)
-    kind, source, perturbation = _open(options, told)
+    source, perturbation = _open(options, told)
     _refuse_camera(source, resume)
 
     # Bad input has been refused by now; what follows takes a second to import.
@@ -63,7 +64,7 @@ def drive(
     from vslam.run.options import settings_of
     from vslam.run.pipeline import begin, run_sequence
 
-    settings = settings_of(options, kind, source, perturbation.name)
+    settings = settings_of(options, source, perturbation.name)
     with ExitStack() as lock:
         unfinished = _unfinished(options, source, resume, lock)
         _compile(settings, told)
@@ -96,26 +97,14 @@ def drive(
         raise typer.Exit(1)
 
 
-def _open(options: RunOptions, told: Console) -> tuple[str, Source, Perturbation]:
+def _open(options: RunOptions, told: Console) -> tuple[Source, Perturbation]:
     """The images and what is done to them. Refuses laws that the data cannot serve."""
-    from vslam.cli.options import SourceName, kind_of_source, source_options
     from vslam.datasets.perturbation import parse_perturbation
-    from vslam.datasets.sources import open_source
 
-    o = options
-    kind = kind_of_source(cast("SourceName | None", o.dataset), o.data)
-    perturbation = parse_perturbation(o.perturb, o.seed)
-    of_source = source_options(
-        list(o.calib), o.right, o.depth, o.fps, o.side_by_side, o.topics, o.depth_scale
-    )
-    with told.render_bar() as on_render:
-        source = open_source(
-            kind, o.data, o.seq, of_source,
-            start=o.start, every=o.every, max_frames=o.max_frames, sensor=o.sensor,
-            on_render=on_render,
-        )  # fmt: skip
+    perturbation = parse_perturbation(options.perturb, options.seed)
+    source = open_given(options, told)
     perturbation.bound_to(source)
-    return kind, source, perturbation
+    return source, perturbation
 
 
 def _refuse_camera(source: Source, resume: Path | None) -> None:

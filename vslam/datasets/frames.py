@@ -223,6 +223,22 @@ def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]
         yield frame
 
 
+def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:
+    """Some frames of a source; a stream is played as far as the last of them.
+
+    Fewer frames come from a source that ends before.
+
+    Args:
+        indices: of the frames, increasing.
+    """
+    if source.seekable:
+        yield from (source.stored[k] for k in indices if k < len(source))
+        return
+    wanted = set(indices)
+    played = islice(source.frames(), max(wanted, default=-1) + 1)
+    yield from (frame for k, frame in enumerate(played) if k in wanted)
+
+
 def first_frames(source: Source) -> Source:
     """The first frames of a stream in memory, where they can be read in any order; a source that
     can seek is returned as it is.

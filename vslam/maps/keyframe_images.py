@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -11,20 +11,16 @@ from numpy.typing import NDArray
 from vslam.maps.reconstruction import Reconstruction
 
 
-def saved_images(
-    images: Iterable[NDArray[np.uint8]], paths: Iterable[Path]
-) -> Iterator[NDArray[np.uint8]]:
-    """Write each image to its path as PNG, and yield it.
+def save_image(image: NDArray[np.uint8], path: Path) -> None:
+    """Write an image as PNG.
 
     Raises:
-        OSError: a file cannot be written.
+        OSError: the file cannot be written.
     """
     import cv2
 
-    for image, path in zip(images, paths, strict=True):
-        _, encoded = cv2.imencode(".png", image)
-        path.write_bytes(encoded.tobytes())
-        yield image
+    _, encoded = cv2.imencode(".png", image)
+    path.write_bytes(encoded.tobytes())
 
 
 def landmark_colours(

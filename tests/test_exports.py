@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from source_files import write_calibration
+from source_files import write_calibration, write_video
 from test_pipeline import KITTI, needs_kitti
 from test_pipeline import run as run_pipeline
 from typer.testing import CliRunner
@@ -542,6 +542,28 @@ def test_images_are_opened_as_the_run_opened_them(corridor_run, kitti_tree, tmp_
         for name in names:
             image = cv2.imread(str(folder / "images" / name), cv2.IMREAD_GRAYSCALE)
             np.testing.assert_array_equal(image, sequence.read(int(name[:6]))[0])
+
+
+def test_a_phone_video_in_two_commands(corridor, tmp_path, monkeypatch):
+    """Keyframes and landmarks come in colour, though the run itself was grey."""
+    monkeypatch.chdir(tmp_path)
+    tinted = [np.dstack([image // 2, image, 255 - image]) for image in corridor.left]
+    write_video(Path("phone.mkv"), tinted)
+    write_calibration(Path("phone.yaml"), corridor.camera, mono=True)
+    words = ("--sensor", "mono", "--calib", "phone.yaml", "--no-record", "--no-report", "--quiet")
+    vslam("run", "phone.mkv", *words)
+    for what in ("colmap", "nerfstudio"):
+        vslam("export", what, "runs/latest")
+    images = sorted(Path("runs/latest/colmap/images").iterdir())
+    assert len(images) > 3
+    for path in images:
+        np.testing.assert_array_equal(cv2.imread(str(path)), tinted[int(path.stem)])
+    points = read_binary(Path("runs/latest/colmap/sparse/0")).points.values()
+    red, green, blue = np.array([point[1] for point in points], int).T
+    assert np.array_equal(red, 255 - green)
+    assert np.array_equal(blue, green // 2)
+    _, colours = read_ply(Path("runs/latest/nerfstudio/sparse_pc.ply"))
+    assert len(np.unique(colours, axis=0)) > 10
 
 
 @needs_kitti

@@ -131,6 +131,31 @@ def test_a_bag_in_real_time_has_every_frame(folder):
     np.testing.assert_allclose(outcome.trajectory.timestamps, np.array(STAMPS) / 1e9)
 
 
+@pytest.mark.parametrize("kind", ["images", "video", "bgr8", "rgb8", "png"])
+def test_colours(corridor, tmp_path, kind):
+    """Read as they were taken beside the grey image, which stays what it is."""
+    tinted = [np.dstack([image, image // 2, 255 - image]) for image in corridor.left[:3]]
+    calib = write_calibration(tmp_path / "left.yaml", corridor.camera, mono=True)
+    options = SourceOptions(calib=(calib,), sensor="mono")
+    if kind == "images":
+        data = write_images(tmp_path, {"left": tinted}, ["0.1.png", "0.2.png", "0.3.png"]) / "left"
+    elif kind == "video":
+        data = write_video(tmp_path / "a.mkv", tinted)
+    else:
+        stamps = [k * 10**8 for k in range(1, 4)]
+        data = write_bag(tmp_path / "a.bag", "ros1", {LEFT: tinted}, stamps, encoding=kind)
+    source = open_from({"images": "images", "video": "video"}.get(kind, "bag"), data, options)
+    for frame, image in zip(source.frames(), tinted, strict=True):
+        assert np.array_equal(frame.colour(), image[..., ::-1])
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        assert np.abs(frame.read(map)[0].astype(int) - grey).max() <= 1
+
+
+def test_a_grey_video_has_no_colours(folder, corridor):
+    frame = next(opened(folder, "video").frames())
+    assert np.array_equal(frame.colour(), corridor.left[0])
+
+
 def test_images_without_a_partner_in_time_are_left_out(corridor, tmp_path):
     pair = {LEFT: corridor.left[:4], RIGHT: corridor.right[:4]}
     write_bag(tmp_path / "lag.bag", "ros1", pair, STAMPS[:4], lag=6_000_000, camera=corridor.camera)

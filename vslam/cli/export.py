@@ -123,7 +123,7 @@ def ply(
         seen = None
         if colours:
             frames = _keyframes(finished, data, quiet=quiet)
-            seen = landmark_colours(reconstruction, (frame.read(map)[0] for frame in frames))
+            seen = landmark_colours(reconstruction, map(_image_of, frames))
         save_ply(file, reconstruction.xyz, seen)
     _say(target, reconstruction, quiet=quiet)
 
@@ -237,7 +237,7 @@ def _write_images(
     def saved() -> Iterator[NDArray[np.uint8]]:
         frames = _keyframes(finished, data, quiet=quiet)
         for index, frame in zip(reconstruction.frames.tolist(), frames, strict=True):
-            image = frame.read(map)[0]
+            image = _image_of(frame)
             if link:
                 file = _own_file(frame, finished)
                 names.append(f"{index:06d}{file.suffix}")
@@ -249,6 +249,11 @@ def _write_images(
 
     colours = landmark_colours(reconstruction, saved())
     return names, colours
+
+
+def _image_of(frame: TimedFrame) -> NDArray[np.uint8]:
+    """The left image, in colour if the source has it."""
+    return frame.read(map)[0] if frame.colour is None else frame.colour()
 
 
 def _own_file(frame: TimedFrame, finished: FinishedRun) -> Path:

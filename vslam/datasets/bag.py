@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.calibration.formats import read_ros
 from vslam.calibration.models import Calibration
@@ -29,6 +30,7 @@ from vslam.datasets.bag_messages import (
     IMAGE_TYPES,
     Message,
     camera_info,
+    colour_of,
     depth_of,
     grey_of,
     is_depth,
@@ -147,7 +149,18 @@ def _play(
     with _opened(path) as bag:
         messages = _messages(bag, path, topics)
         for together in _together(messages, topics, _tolerance(depth)):
-            yield TimedFrame(stamp_of(together[0]) / 10**9, partial(read, together))
+            yield TimedFrame(
+                stamp_of(together[0]) / 10**9,
+                partial(read, together),
+                colour=partial(_in_colour, path, topics[0], together[0]),
+            )
+
+
+def _in_colour(path: Path, topic: str, message: Message) -> NDArray[np.uint8]:
+    try:
+        return colour_of(message)
+    except ValueError as error:
+        raise UnreadableImageError(path, f"{topic}: {error}.") from error
 
 
 def find_calibration(source: BagSource) -> Calibration | None:

@@ -22,17 +22,17 @@ _DEPTH_ENCODINGS = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
-# Channels, and the OpenCV conversion to grey by name.
+# Channels, and what OpenCV calls their colours.
 _ENCODINGS: dict[str, tuple[int, str | None]] = {
     "mono": (1, None),
-    "bgr": (3, "COLOR_BGR2GRAY"),
-    "rgb": (3, "COLOR_RGB2GRAY"),
-    "bgra": (4, "COLOR_BGRA2GRAY"),
-    "rgba": (4, "COLOR_RGBA2GRAY"),
-    "bayer_rggb": (1, "COLOR_BayerRGGB2GRAY"),
-    "bayer_bggr": (1, "COLOR_BayerBGGR2GRAY"),
-    "bayer_gbrg": (1, "COLOR_BayerGBRG2GRAY"),
-    "bayer_grbg": (1, "COLOR_BayerGRBG2GRAY"),
+    "bgr": (3, "BGR"),
+    "rgb": (3, "RGB"),
+    "bgra": (4, "BGRA"),
+    "rgba": (4, "RGBA"),
+    "bayer_rggb": (1, "BayerRGGB"),
+    "bayer_bggr": (1, "BayerBGGR"),
+    "bayer_gbrg": (1, "BayerGBRG"),
+    "bayer_grbg": (1, "BayerGRBG"),
 }
 _SAME = {"8UC1": "mono8", "16UC1": "mono16", "8UC3": "bgr8", "8UC4": "bgra8"}
 
@@ -49,6 +49,27 @@ def grey_of(message: Message) -> Image:
     Raises:
         ValueError: with the reason why it cannot be decoded.
     """
+    return _decoded(message, "GRAY")
+
+
+def colour_of(message: Message) -> NDArray[np.uint8]:
+    """As `grey_of`; ``(H, W, 3)`` red, green, blue if the message has colours.
+
+    Raises:
+        ValueError: as `grey_of`.
+    """
+    return _decoded(message, "RGB")
+
+
+def _decoded(message: Message, wanted: str) -> NDArray[np.uint8]:
+    """An image of a message.
+
+    Args:
+        wanted: ``GRAY``, or ``RGB`` for what has colours.
+
+    Raises:
+        ValueError: with the reason why it cannot be decoded.
+    """
     import cv2
 
     from vslam.datasets.png import decode_with_opencv
@@ -56,23 +77,24 @@ def grey_of(message: Message) -> Image:
     if not hasattr(message, "encoding"):
         try:
             data = np.asarray(message.data, np.uint8).tobytes()
-            image = decode_with_opencv(data, cv2.IMREAD_GRAYSCALE)
+            grey = wanted == "GRAY"
+            image = decode_with_opencv(data, cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_ANYCOLOR)
         except cv2.error:
             image = None
         if image is None:
             raise ValueError(f"a compressed image of format '{message.format}' cannot be decoded")
-        return np.asarray(image, np.uint8)
+        return np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
     encoding = _SAME.get(message.encoding, message.encoding)
     name, bits = (encoding[:-2], 16) if encoding.endswith("16") else (encoding[:-1], 8)
     if name not in _ENCODINGS or not encoding.endswith(str(bits)):
         known = ", ".join(f"{known}8" for known in _ENCODINGS)
         raise ValueError(f"encoding '{message.encoding}' is unknown; known are {known}")
-    channels, conversion = _ENCODINGS[name]
+    channels, colours = _ENCODINGS[name]
     image = _pixels(message, channels, bits)
     if bits == 16:
         image = (image.astype(np.uint16) >> 8).astype(np.uint8)
-    if conversion is not None:
-        image = cv2.cvtColor(image, getattr(cv2, conversion))
+    if colours not in (None, wanted):
+        image = cv2.cvtColor(image, getattr(cv2, f"COLOR_{colours}2{wanted}"))
     return np.ascontiguousarray(image, np.uint8)
 
 

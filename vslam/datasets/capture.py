@@ -59,6 +59,21 @@ def read_sides(
     return left, rest[0] if rest else None
 
 
+def left_in_colour(image: NDArray[np.uint8], side_by_side: bool) -> NDArray[np.uint8]:
+    """The left image out of a frame: ``(H, W, 3)`` uint8 red, green, blue, or ``(H, W)`` grey.
+
+    Args:
+        image: as `read_sides` takes it.
+    """
+    import cv2
+
+    left = image[:, : image.shape[1] // 2] if side_by_side else image
+    # Decoders return grey videos in three equal channels.
+    if left.ndim == 2 or (left == left[..., :1]).all():
+        return np.ascontiguousarray(left if left.ndim == 2 else left[..., 0])
+    return np.asarray(cv2.cvtColor(left, cv2.COLOR_BGR2RGB), np.uint8)
+
+
 def _grey(image: NDArray[np.uint8]) -> Image:
     import cv2
 

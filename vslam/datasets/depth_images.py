@@ -15,6 +15,7 @@ from vslam.datasets.frames import Images, RawSource, stored_frames
 from vslam.datasets.image_files import (
     check_not_empty,
     image_size,
+    read_colour,
     read_grey_of_size,
     size_text,
 )
@@ -59,7 +60,7 @@ def depth_files(
         name=name,
         sizes=(size,),
         depth=True,
-        stored=stored_frames(timestamps, read, colour),
+        stored=stored_frames(timestamps, read, colour, read_colour),
         ground_truth=ground_truth,
     )
     source.read(0)

@@ -42,11 +42,14 @@ class TimedFrame:
             argument decides how the images are decoded, both at once for example. Raises
             UnreadableImageError if a file is damaged or not of the calibration's size.
         file: the left image's file, if its pixels need no rectification; else None.
+        colour: decodes the left image as it was taken, ``(H, W, 3)`` uint8 red, green, blue, or
+            ``(H, W)`` if it is grey; None for a source without colours. Raises as ``read``.
     """
 
     timestamp: float
     read: Callable[[ImageMap], Images]
     file: Path | None = None
+    colour: Callable[[], NDArray[np.uint8]] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -158,17 +161,23 @@ def stored_frames(
     timestamps: NDArray[np.float64],
     read: Callable[[int, ImageMap], Images],
     files: Several[Path] | None = None,
+    colour: Callable[[Path], NDArray[np.uint8]] | None = None,
 ) -> tuple[TimedFrame, ...]:
     """Frames that one function reads by their index.
 
     Args:
         timestamps: ``(N,)`` float64 seconds, increasing.
-        read, files: see `TimedFrame`.
+        read: decodes the frame of an index, see `TimedFrame`.
+        files: of the left images.
+        colour: decodes one of these, see `TimedFrame`.
     """
-    times = timestamps.tolist()
-    several = [None] * len(times) if files is None else files
-    timed = zip(times, several, strict=True)
-    return tuple(TimedFrame(time, partial(read, k), file) for k, (time, file) in enumerate(timed))
+    frames = [TimedFrame(time, partial(read, k)) for k, time in enumerate(timestamps.tolist())]
+    if files is None:
+        return tuple(frames)
+    return tuple(
+        replace(frame, file=file, colour=None if colour is None else partial(colour, file))
+        for frame, file in zip(frames, files, strict=True)
+    )
 
 
 def selected(

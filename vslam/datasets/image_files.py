@@ -45,7 +45,7 @@ def checked_files(
         dataset=dataset,
         name=name,
         sizes=sizes,
-        stored=stored_frames(timestamps, read, sides[0]),
+        stored=stored_frames(timestamps, read, sides[0], read_colour),
         ground_truth=ground_truth,
     )
 
@@ -180,6 +180,23 @@ def read_grey(path: Path) -> Image:
     if decoded is None:
         raise UnreadableImageError(path, "cannot be decoded; download the file again.")
     return np.asarray(decoded, np.uint8)
+
+
+def read_colour(path: Path) -> NDArray[np.uint8]:
+    """Decode an image file: ``(H, W, 3)`` uint8 red, green, blue, or ``(H, W)`` if it is grey.
+
+    Raises:
+        UnreadableImageError: as `read_grey`.
+    """
+    import cv2
+
+    from vslam.datasets.png import decode_with_opencv
+
+    grey = read_grey(path)  # refuses what cannot be decoded
+    decoded = decode_with_opencv(path.read_bytes(), cv2.IMREAD_ANYCOLOR)
+    if decoded is None or decoded.ndim == 2:
+        return grey
+    return np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def read_grey_of_size(path: Path, width: int, height: int) -> Image:

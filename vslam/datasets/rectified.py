@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.calibration.models import Calibration
 from vslam.calibration.rectification import Rectification, rectify
@@ -71,7 +72,8 @@ def _rectification_for(calibration: Calibration, sizes: Several[Size]) -> Rectif
 
 def _rectified_frame(rectification: Rectification, frame: TimedFrame) -> TimedFrame:
     file = frame.file if rectification.identity else None
-    return replace(frame, read=partial(_read, rectification, frame), file=file)
+    colour = None if frame.colour is None else partial(_read_colour, rectification, frame.colour)
+    return replace(frame, read=partial(_read, rectification, frame), file=file, colour=colour)
 
 
 def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) -> Images:
@@ -88,6 +90,12 @@ def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) 
         second_side = partial(rectification.right, np.asarray(second, np.uint8))
     first, other = image_map(_call, [left_side, second_side])
     return np.asarray(first, np.uint8), other
+
+
+def _read_colour(
+    rectification: Rectification, colour: Callable[[], NDArray[np.uint8]]
+) -> NDArray[np.uint8]:
+    return np.asarray(rectification.left(colour()), np.uint8)
 
 
 def _call(function: Callable[[], Image | DepthImage]) -> Image | DepthImage:

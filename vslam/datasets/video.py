@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 
 from vslam.camera import Image
-from vslam.datasets.capture import Capture, open_capture, read_sides, sizes_of
+from vslam.datasets.capture import Capture, left_in_colour, open_capture, read_sides, sizes_of
 from vslam.datasets.frames import RawSource, TimedFrame
 from vslam.errors import BrokenSourceError, InputError
 from vslam.untrusted import MOST_PIXELS
@@ -65,7 +65,11 @@ def _play(
     n = 0
     for timestamp, image in _images(_open(path)):
         timestamp = timestamp if fps is None else n / fps
-        yield TimedFrame(timestamp, partial(read_sides, image, side_by_side, monocular))
+        yield TimedFrame(
+            timestamp,
+            partial(read_sides, image, side_by_side, monocular),
+            colour=partial(left_in_colour, image, side_by_side),
+        )
         n += 1
     if n_expected is not None and n + 1 < (1.0 - _MISSING_SHARE) * n_expected:
         raise BrokenSourceError(

@@ -29,6 +29,7 @@ def test_medians_are_compared_with_the_first_detector_of_the_case(tool):
     assert lines[4] == "| b | `bow` | 1.00 | 1.00 | 200 | 0 / 0 / 0 |"
 
 
+@pytest.mark.slow
 def test_the_command_runs_the_detectors_in_turn(tool, kitti_tree, monkeypatch, capsys):
     words = ["detector_cost.py", "--case", f"ring={kitti_tree}:00:8", "--repeats", "1"]
     monkeypatch.setattr(sys, "argv", [*words, "--detectors", "none,bow"])

@@ -566,6 +566,7 @@ def test_a_phone_video_in_two_commands(corridor, tmp_path, monkeypatch):
     assert len(np.unique(colours, axis=0)) > 10
 
 
+@pytest.mark.slow
 @needs_kitti
 def test_real_keyframes_reproject_within_a_pixel(tmp_path):
     write_results(tmp_path, run_pipeline(KITTI, "06", max_frames=51), pages=False)

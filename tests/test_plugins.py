@@ -1,4 +1,4 @@
-"""Plug-ins: the package of docs/plugins.md, installed and used, and packages that are broken."""
+"""Plug-ins: the package of docs/howto/plugins.md, installed and used, and broken packages."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import NullRecorder
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "plugins.md"
+PAGE = ROOT / "docs" / "howto" / "plugins.md"
 MODULES = ("vslam_example", "broken")
 NO_FEATURES = Features(
     np.zeros((0, 2), np.float32),
@@ -113,6 +113,7 @@ def test_the_package_of_the_page_is_found(installed):
     assert "vslam_example" not in sys.modules  # found, not imported
 
 
+@pytest.mark.slow
 def test_a_run_with_reader_perturbation_and_detector(target: Path, corridor, tmp_path: Path):
     """In a process of its own, as a user types it; the help lists all three."""
     data = write_frames(tmp_path / "data", corridor, 12)
@@ -277,6 +278,7 @@ def test_a_detector_that_fails_ends_the_run_with_what_it_has(broken, kitti_tree,
     assert (folder / "trajectory.tum").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_compared_detector_that_fails_ends_alone(broken, kitti_tree, tmp_path, threads):
     broken(FAILING, "[vslam.detectors]\nmine = broken:Detector\n")

@@ -3,7 +3,7 @@
     python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" \
         [--flat "town 00=/data/towns:kitti00:4541"] [--ours-only] [--also capsule] [--repeats 3] \
         [--orbslam3-python PY --orbslam3-script run_orbslam3.py --vocabulary voc.txt] \
-        [--write docs/performance.md]
+        [--write docs/research/performance.md]
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run in
 turn, one at a time, after one round that is not counted; vslam with its report, with
@@ -37,7 +37,7 @@ FULL, LEAN, LIVE, ORBSLAM3 = "vslam", "vslam --no-report", "vslam --realtime", "
 SHOWN = {
     "process_fps", "loop_fps", "process_cpu_ms", "loop_cpu_ms", "memory_mb", "lost", "ate_m"
 }  # fmt: skip
-HEAD = """# Performance
+HEAD = """## How it was measured
 
 The command at the end of this page writes it. It runs one process at a time. *Load* is the load \
 of the machine when the command began. *Whole process* is the time from the start of Python to \
@@ -51,7 +51,7 @@ images of a frame takes, measured in separate processes: vslam's own reader for 
 run along a drive are done once per case, and so is the profile, in one thread, by \
 `tools/profile_frame.py`.
 """
-BY_HAND = "\n## Limits\n"
+BEGIN, END = "## How it was measured\n", "\n## Limits\n"  # what is outside was written by hand
 READING = """
 import sys, time, cv2
 from pathlib import Path
@@ -297,7 +297,7 @@ def draw(everything: list[float], in_turn: list[float], path: Path) -> None:
         axes.set_ylim(bottom=0)
         add_legend(figure, axes)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(save("along", "", figure).png)
+        path.write_bytes(save("along", "", figure).image)
 
 
 def section(case: Case, runs: dict[str, list[Run]]) -> str:
@@ -361,10 +361,12 @@ def anonymous(command: str) -> str:
     return command
 
 
-def written(page: Path) -> str:
-    """What is on a page from ``BY_HAND`` on."""
+def written(page: Path) -> tuple[str, str]:
+    """What people wrote on a page: before ``BEGIN``, and from ``END`` on."""
     text = page.read_text(encoding="utf-8") if page.exists() else ""
-    return text[text.index(BY_HAND) :] if BY_HAND in text else ""
+    above, begin, rest = text.partition(BEGIN)
+    _, end, below = rest.partition(END)
+    return (above, end + below) if begin else ("# Performance\n\n", "")
 
 
 def main() -> None:
@@ -383,7 +385,8 @@ def main() -> None:
     parts.append(f"```sh\npython {anonymous(shlex.join(sys.argv))}\n```\n")
     text = "\n".join(parts)
     if options.write:
-        options.write.write_text(f"{text}{written(options.write)}", encoding="utf-8")
+        above, below = written(options.write)
+        options.write.write_text(f"{above}{text}{below}", encoding="utf-8")
     else:
         print(text)
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from vslam.cli.options import kitti_root
-from vslam.cli.summary import print_rows
+from vslam.cli.tables import print_rows
 from vslam.errors import InputError
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from vslam.maps.stored_map import StoredMap
 
 commands = typer.Typer(
-    help="Look at the maps of runs, make several one, cut parts out (docs/maps.md).",
+    help="Look at the maps of runs, make several one, cut parts out (docs/howto/maps.md).",
     no_args_is_help=True,
 )
 
@@ -42,7 +42,7 @@ def info(
     run: Annotated[Path, typer.Argument(metavar="RUN|FILE", help="Folder of a run, or a map.npz.")],
 ) -> None:
     """Show what a map holds: keyframes, landmarks, observations, length, sub-maps, sizes."""
-    from vslam.cli.summary import print_rows
+    from vslam.cli.tables import print_rows
     from vslam.maps.reconstruction import reconstruction_of
     from vslam.maps.storage import load_map, map_file_of
 

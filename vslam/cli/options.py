@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
-    """vslam's own names, then those of other packages (docs/plugins.md)."""
+    """vslam's own names, then those of other packages (docs/howto/plugins.md)."""
     return (*names, *(name for name in plugins.find_plugins(group) if name not in names))
 
 
@@ -53,7 +53,7 @@ Perturb = Annotated[
     str,
     typer.Option(
         help="Laws of light, weather, glass, sensor and stereo rig, each with a strength in its "
-        f"unit (docs/stress.md), joined by commas: {', '.join(_LAWS)}. Example: "
+        f"unit (docs/howto/stress.md), joined by commas: {', '.join(_LAWS)}. Example: "
         "[b]brightness:1.5,fog:60[/b]"
     ),
 ]
@@ -74,7 +74,7 @@ KITTI_ROOT = "data/kitti"  # where $KITTI_ROOT names no other folder
 
 _WITHOUT_DATA = """there is nothing to read; name some images, or take rendered ones:
   --dataset synthetic    rendered drives, which need no download
-  DATA --calib FILE      images, video, bag or camera (docs/sources.md)
+  DATA --calib FILE      images, video, bag or camera (docs/howto/sources.md)
   --data FOLDER          KITTI, also by $KITTI_ROOT (datasets.md)"""
 
 
@@ -97,7 +97,7 @@ def _source_options(
         str | None,
         typer.Option(
             help="Data set, folder of images, video, bag, number of a camera or URL, see "
-            "docs/sources.md.",
+            "docs/howto/sources.md.",
             show_default="$KITTI_ROOT or data/kitti, for KITTI alone",
         ),
     ] = None,
@@ -115,8 +115,8 @@ def _source_options(
     calib: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Calibration to rectify images with, see docs/cameras.md; twice for a file of "
-            "each camera, left first.",
+            help="Calibration to rectify images with, see docs/howto/cameras.md; twice for a file "
+            "of each camera, left first.",
         ),
     ] = None,
     right: Annotated[

@@ -69,7 +69,8 @@ def run(
     local_weights: Annotated[
         Path | None,
         typer.Option(
-            help="ONNX file of the local descriptors that verify loops (docs/local_descriptors.md)."
+            help="ONNX file of the local descriptors that verify loops "
+            "(docs/research/local_descriptors.md)."
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Where the folders of the runs go.")] = Path("runs"),

@@ -33,7 +33,7 @@ _EXAMPLES = """
 
   vslam stress --seqs 00 --preset kitti-c --baseline bow
 
-The same command again goes on where it was stopped. docs/stress.md tells more.
+The same command again goes on where it was stopped. docs/howto/stress.md tells more.
 """
 _ORBSLAM3 = "orbslam3"
 
@@ -66,7 +66,7 @@ def stress(
         typer.Option(
             metavar="NAME=COMMAND",
             help="Another system: a command with {folder}, in KITTI's format, and {out}, see "
-            "docs/stress.md.",
+            "docs/howto/stress.md.",
         ),
     ] = None,
     orbslam3_python: Annotated[
@@ -111,11 +111,12 @@ def stress(
 ) -> None:
     """Find the strength of each perturbation at which a run fails, and report on it."""
     from vslam.cli.console import console
+    from vslam.cli.tables import show_sections
     from vslam.datasets.frames import first_frames
     from vslam.lab.bench import execute
     from vslam.lab.stress.criterion import Criterion
     from vslam.lab.stress.plan import Plan, parse_laws
-    from vslam.lab.stress.report import render_boundaries, write_report
+    from vslam.lab.stress.report import boundary_sections, write_report
     from vslam.lab.stress.run import Results, run_all
     from vslam.lab.stress.summary import summarise
     from vslam.loopclosure.registry import require_detector
@@ -173,7 +174,7 @@ def stress(
     report = summarise(plan, searches, results, notes)
     write_report(out, report, {name: first_frames(source) for name, source in opened.items()})
     if not quiet:
-        typer.echo(render_boundaries(report))
+        show_sections(boundary_sections(report))
         ended = f"{len(report.boundaries)} of {len(searches)} searches ended"
         typer.echo(f"{out / 'report.html'}: {ended}")
     if stopped or len(report.boundaries) < len(searches):

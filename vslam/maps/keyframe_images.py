@@ -1,4 +1,4 @@
-"""The images of keyframes as files, and the colours that landmarks have in them."""
+"""The images of keyframes as files, and the colours of landmarks in these images."""
 
 from __future__ import annotations
 
@@ -33,8 +33,7 @@ def save_image(image: NDArray[np.uint8], path: Path) -> None:
 def landmark_colours(
     reconstruction: Reconstruction, images: Iterable[NDArray[np.uint8]]
 ) -> NDArray[np.uint8]:
-    """``(L, 3)`` RGB of each landmark: that of the pixel observed, of the observation whose
-    brightness is the median.
+    """``(L, 3)`` uint8 RGB of each landmark, from the observation of median brightness.
 
     Args:
         images: ``(H, W)`` grey or ``(H, W, 3)`` red, green, blue image of each keyframe, in order.
@@ -48,6 +47,6 @@ def landmark_colours(
         colours[seen] = pixels.reshape(len(pixels), -1)
     order = np.lexsort((colours @ _LUMA, r.landmark))
     counts = np.bincount(r.landmark, minlength=len(r.xyz))
-    # Of an even number the lower one of both in the middle: a colour that was seen.
+    # The lower median, which is a colour that was observed.
     middle = order[np.cumsum(counts) - counts + (counts - 1) // 2]
     return colours[middle]

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
+import numpy as np
 import pytest
 from source_files import (
     LEFT,
@@ -20,6 +21,7 @@ from source_files import (
     write_bag,
     write_calibration,
     write_images,
+    write_video,
 )
 
 from vslam.datasets import live_camera, video
@@ -147,6 +149,29 @@ def test_calibrations(folder):
     refused("right camera is missing", "video", path, options("mono.yaml"))
     refused(
         "no calibration; .*docs/howto/cameras.md", "video", path, SourceOptions(side_by_side=True)
+    )
+
+
+@pytest.mark.parametrize(("rows", "what"), [(0, "column"), (1, "column and row")])
+def test_an_encoder_that_cuts_off_a_column_is_named(corridor, tmp_path, rows, what):
+    """OpenCV's does so with images of odd sizes."""
+    images = [np.pad(image, ((0, rows), (0, 1))) for image in corridor.left[:3]]
+    path = write_video(tmp_path / "a.mkv", images)
+    camera = replace(corridor.camera, width=481, height=160 + rows)
+    options = SourceOptions(calib=(write_calibration(tmp_path / "c.yaml", camera),))
+    said = f"images have 480x160; an encoder seems to have cut off the last {what}; write this size"
+    refused(said, "video", path, options, sensor="mono")
+
+
+def test_a_rate_that_contradicts_the_video_is_said(folder, side_by_side, caplog):
+    given = {"data": folder / "pair.mkv", "options": side_by_side}
+    open_from("video", **given, fps=10.0)
+    assert not caplog.messages
+    open_from("video", **given, fps=25.0)
+    (said,) = caplog.messages
+    assert said == (
+        f"{folder / 'pair.mkv'}: --fps 25 contradicts the 10 frames per second of the video itself;"
+        " leave it out unless those are wrong."
     )
 
 

@@ -475,7 +475,7 @@ def test_interrupted_run_keeps_its_results(call, root, pipeline):
     ("words", "why"),
     [
         ("", "vslam doctor says what is wrong"),
-        ("--perturb night:9", "under --perturb night:9; a weaker one"),
+        ("--perturb night:9", "under --perturb night:9; use a weaker"),
         ("--sensor mono", "one camera must move sideways"),
     ],
 )
@@ -527,6 +527,8 @@ def test_perturb_writes_a_contact_sheet(call, root):
     code, out, _ = call(*words, "--out", "sheet.png")
     assert code == 0
     assert "frames 0, 4, 9" in out
+    _, later, _ = call(*words[:-4], "--start", 5, "--every", 2, "--max-frames", 2, "--frames", 2)
+    assert "frames 5, 7" in later
     assert cv2.imread("sheet.png").shape[0] == 3 * 240
     refused(call(*words, "--out", "no/folder/sheet.png"), "no/folder/sheet.png", "--out")
 

@@ -107,6 +107,15 @@ def test_calibration_without_prefixes(root):
     assert open_kitti(root, "00").camera.baseline == 0.5
 
 
+@pytest.mark.parametrize("text", [f"P0: {row(P0)}\nP1: {row(P0)}\n", f"P0: {row(P0)}\n"])
+def test_one_camera_needs_no_baseline(root, text):
+    (root / "sequences/00/calib.txt").write_text(text)
+    camera = open_kitti(root, "00", monocular=True).camera
+    assert (camera.sensor, camera.fx, camera.cx, camera.cy) == ("mono", 50, 30, 16)
+    with pytest.raises(InputError):
+        open_kitti(root, "00")
+
+
 def test_excerpt_is_matched_by_number_to_longer_times_and_poses(root):
     for side in "01":
         for k in (0, 1):

@@ -64,7 +64,9 @@ def preview(
         image = sheet_of_laws(sequence, specs, shown[0], seed)
     else:
         shown = np.unique(np.linspace(0, len(sequence) - 1, frames).round().astype(int)).tolist()
-        image = contact_sheet(sequence, parse_perturbation(perturb, seed), shown)
+        image = contact_sheet(
+            sequence, parse_perturbation(perturb, seed), shown, given.start, given.every
+        )
     sheet = cv2.imencode(".png", image)[1]
     try:
         out.write_bytes(sheet.tobytes())
@@ -72,4 +74,5 @@ def preview(
         raise InputError(
             f"{out}: cannot be written ({error.strerror}); name another file with --out."
         ) from error
-    typer.echo(f"{out}: {name}, seed {seed}, frames {', '.join(map(str, shown))}")
+    frames_shown = ", ".join(str(given.start + given.every * frame) for frame in shown)
+    typer.echo(f"{out}: {name}, seed {seed}, frames {frames_shown}")

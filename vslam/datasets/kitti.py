@@ -41,11 +41,11 @@ def open_kitti(
     )
     folder = _find_sequence(_find_root(root), name)
     width, height = images.sizes[0]
-    camera = read_calibration(folder / "calib.txt", width=width, height=height)
+    camera = read_calibration(folder / "calib.txt", width=width, height=height, monocular=monocular)
     return Source(
         dataset=images.dataset,
         name=name,
-        camera=camera.left_camera() if monocular else camera,
+        camera=camera,
         stored=images.stored,
         ground_truth=images.ground_truth,
     )
@@ -117,12 +117,15 @@ def list_kitti(root: Path | str) -> list[tuple[str, int, int]]:
     ]
 
 
-def read_calibration(path: Path | str, *, width: int, height: int) -> Camera:
+def read_calibration(
+    path: Path | str, *, width: int, height: int, monocular: bool = False
+) -> Camera:
     """Read P0 and P1 of ``calib.txt``, with or without the ``P0:`` at the beginning of the line.
 
     Args:
         path: file to read.
         width, height: image size in pixels, which the file does not say.
+        monocular: read P0 alone; P1 need not be there.
 
     Raises:
         InputError: missing or malformed file, NaN, or numbers that no rectified pair can have.
@@ -133,23 +136,26 @@ def read_calibration(path: Path | str, *, width: int, height: int) -> Camera:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: the calibration is missing or unreadable; {fix}.") from error
     keyed = {words[0].rstrip(":"): words[1:] for words in lines if words[0].endswith(":")}
+    names = ["P0"] if monocular else ["P0", "P1"]
     try:
-        pair = [keyed["P0"], keyed["P1"]] if keyed else lines[:2]
-        P0, P1 = np.array(pair, dtype=np.float64).reshape(2, 3, 4)
+        rows = [keyed[name] for name in names] if keyed else lines[: len(names)]
+        P = np.array(rows, dtype=np.float64).reshape(len(names), 3, 4)
     except (KeyError, ValueError) as error:
-        raise InputError(f"{path}: P0 and P1 are not two rows of 12 numbers; {fix}.") from error
-    if not np.isfinite([P0, P1]).all():
-        raise InputError(f"{path}: P0 or P1 holds NaN or infinity; {fix}.")
-    fx, fy, cx, cy = P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2]
-    if not np.allclose(P0[:, :3], P1[:, :3]) or fx <= 0 or fy <= 0:
+        wanted = "P0 is not a row" if monocular else "P0 and P1 are not two rows"
+        raise InputError(f"{path}: {wanted} of 12 numbers; {fix}.") from error
+    if not np.isfinite(P).all():
+        raise InputError(f"{path}: {' or '.join(names)} holds NaN or infinity; {fix}.")
+    fx, fy, cx, cy = P[0, 0, 0], P[0, 1, 1], P[0, 0, 2], P[0, 1, 2]
+    if fx <= 0 or fy <= 0 or not np.allclose(P[0, :, :3], P[-1, :, :3]):
         raise InputError(
             f"{path}: P0 and P1 do not share one positive focal length and centre, so the pair is "
             f"not rectified; {fix}."
         )
-    baseline = (P0[0, 3] - P1[0, 3]) / fx
-    if baseline <= 0:
+    baseline = (P[0, 0, 3] - P[-1, 0, 3]) / fx
+    if baseline <= 0 and not monocular:
         raise InputError(
-            f"{path}: the baseline of P0 and P1 is {baseline:.3f} m but must be positive; {fix}."
+            f"{path}: the baseline of P0 and P1 is {baseline:.3f} m but must be positive; {fix}, "
+            "or run on the left camera alone with --sensor mono."
         )
     if not (0 < cx < width and 0 < cy < height):
         raise InputError(

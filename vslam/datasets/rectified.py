@@ -17,6 +17,8 @@ from vslam.datasets.depth_images import with_depth
 from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame
 from vslam.errors import InputError
 
+_CUT = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}  # columns and rows cut off
+
 
 def rectified(raw: RawSource, calibration: Calibration) -> Source:
     """A source whose images are rectified as they are read; the maps are computed once.
@@ -60,8 +62,14 @@ def _rectification_for(calibration: Calibration, sizes: Several[Size]) -> Rectif
     models = [model for model in (calibration.left, calibration.right) if model is not None]
     for model, (width, height) in zip(models, sizes, strict=True):
         if (model.width, model.height) != (width, height):
+            cut = model.width - width, model.height - height
             fix = "take the calibration of these images"
-            if (2 * model.width, model.height) == (width, height):
+            if max(cut) == 1 and min(cut) >= 0:
+                fix = (
+                    f"an encoder seems to have cut off the last {_CUT[cut]}; write this size into "
+                    "the calibration, whose other numbers stay the same"
+                )
+            elif (2 * model.width, model.height) == (width, height):
                 fix = "say --side-by-side if each holds both of a stereo pair"
             raise InputError(
                 f"{calibration.source}: made for {model.width}x{model.height} pixels but the "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from functools import partial
 from itertools import islice
@@ -13,7 +14,10 @@ from vslam.datasets.frames import RawSource, TimedFrame
 from vslam.errors import BrokenSourceError, InputError
 from vslam.untrusted import MOST_PIXELS
 
+_log = logging.getLogger(__name__)
+
 _CONVERT = "convert the video, with ffmpeg -i VIDEO -c:v libx264 -crf 12 NEW.mp4 for example"
+_SAME_RATE = 0.02  # 30 and 29.97 frames per second are the same
 _MISSING_SHARE = 0.05  # what the end may lack of the frames that the file speaks of: it estimates
 
 
@@ -43,13 +47,15 @@ def open_video(
     path = Path(path)
     capture = _open(path)
     _check_size(path, capture)
-    n = _count(capture)
+    n, own = _count(capture), _own_rate(capture)
     first = list(islice(_images(capture), 2))
     if not first:
         raise InputError(f"{path}: holds no image that can be decoded; {_CONVERT}.")
     times = [timestamp for timestamp, _ in first]
     if fps is None and len(times) == 2 and times[1] <= times[0]:
         raise InputError(f"{path}: the video has no time stamps; give --fps.")
+    if fps is not None and len(times) == 2 and times[1] > times[0]:
+        _compare_rates(path, fps, own)
     return RawSource(
         dataset="video",
         name=path.stem,
@@ -107,6 +113,24 @@ def _count(capture: Capture) -> int | None:
 
     n = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     return n if n > 0 else None
+
+
+def _own_rate(capture: Capture) -> float:
+    """Frames per second by the file, 0 if it does not say."""
+    import cv2
+
+    return float(capture.get(cv2.CAP_PROP_FPS))
+
+
+def _compare_rates(path: Path, fps: float, own: float) -> None:
+    if own > 0 and abs(fps - own) > _SAME_RATE * own:
+        _log.warning(
+            "%s: --fps %g contradicts the %.4g frames per second of the video itself; leave it "
+            "out unless those are wrong.",
+            path,
+            fps,
+            own,
+        )
 
 
 def _images(capture: Capture) -> Iterator[tuple[float, Image]]:

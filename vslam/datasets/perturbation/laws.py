@@ -114,8 +114,19 @@ def _read_perturbed(
     return perturbation.apply(index, t, *frame.read(image_map))
 
 
-def contact_sheet(sequence: Source, perturbation: Perturbation, indices: Collection[int]) -> Image:
+def contact_sheet(
+    sequence: Source,
+    perturbation: Perturbation,
+    indices: Collection[int],
+    start: int = 0,
+    every: int = 1,
+) -> Image:
     """A grey image with a row for each frame: left image as it is, both images perturbed.
+
+    Args:
+        indices: frames of the sequence.
+        start, every: how the sequence was selected; rows are labelled by the numbers that its
+            frames had before.
 
     Raises:
         InputError: the sequence lacks what a law needs.
@@ -124,7 +135,7 @@ def contact_sheet(sequence: Source, perturbation: Perturbation, indices: Collect
     perturbation = perturbation.bound_to(sequence)
     rows = []
     for index in indices:
-        label = f"frame {index}, {sequence.timestamps[index]:.1f} s"
+        label = f"frame {start + every * index}, {sequence.timestamps[index]:.1f} s"
         rows.append(_row(sequence, perturbation, index, label, width=480))
     return np.vstack(rows)
 

@@ -360,7 +360,7 @@ STREAM = (
 def test_a_reader_that_streams(broken, kitti_tree):
     """Frames are selected, a failure ends the stream, and what takes all frames refuses it."""
     broken(STREAM.replace("LIVE", "True"), "[vslam.readers]\nmine = broken:reader\n")
-    with pytest.raises(InputError, match="a stream, whose length nobody knows"):
+    with pytest.raises(InputError, match="a stream, which cannot seek"):
         open_sequence("mine", kitti_tree, "00")
     source = open_from("mine", kitti_tree, start=1, every=2, sensor="mono")
     assert not source.seekable

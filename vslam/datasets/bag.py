@@ -44,7 +44,7 @@ Bag = Any  # rosbags.highlevel.AnyReader
 
 _MOST_METADATA = 1_000_000  # bytes; a hundred topics make 100,000
 _TOLERANCE_NS = 5_000_000
-_DEPTH_TOLERANCE_NS = 20_000_000  # Kinects take them in turn; as TUM's associate.py
+_DEPTH_TOLERANCE_NS = 20_000_000  # Kinects take image and depth in turn; as TUM's associate.py
 _NEEDED = {
     "mono": "an image topic",
     "stereo": "two image topics",
@@ -58,8 +58,8 @@ class BagSource(RawSource):
     """The images of a bag.
 
     Attributes:
-        path: of the bag.
-        topics: of the left images, and of the right ones or the depth.
+        path: the bag's file or folder.
+        topics: the topic of the left images, and that of the right images or the depth.
     """
 
     path: Path
@@ -77,11 +77,12 @@ def open_bag(
 
     Args:
         path: ``.bag``, ``.mcap`` or ``.db3``, or the folder of a ROS 2 bag.
-        topics: of the left images and of the right ones or the depth; without any, the only image
-            topics there are, a right one in the order of their names.
-        sensor: ``stereo`` or ``rgbd``; ``mono``, and of two topics given the first one is taken;
-            None for what the topics hold.
-        depth_scale: what depth counts in a metre, None as its encoding says.
+        topics: the topic of the left images and that of the right images or the depth. If empty,
+            the bag must have just the image topics that are needed; left and right are told by the
+            order of their names.
+        sensor: ``stereo``, ``rgbd`` or ``mono``, which reads the first of two topics; None decides
+            by what the topics hold.
+        depth_scale: how many units of the depth images make a metre; None follows their encoding.
 
     Raises:
         InputError: rosbags is not installed, no bag, cut off, topics missing, or images that have
@@ -164,9 +165,9 @@ def _in_colour(path: Path, topic: str, message: Message) -> NDArray[np.uint8]:
 
 
 def find_calibration(source: BagSource) -> Calibration | None:
-    """By the ``camera_info`` beside the image topics, as ROS's drivers name it.
+    """Read the calibration from the ``camera_info`` topics beside the image topics.
 
-    None where one is missing or has no focal length, as drivers of uncalibrated cameras fill it.
+    None if a topic is missing or has no focal length, as drivers of uncalibrated cameras write it.
 
     Raises:
         InputError: a ``camera_info`` cannot be read, or is no calibration.
@@ -206,7 +207,7 @@ def _opened(path: Path) -> Iterator[Bag]:
         _check_metadata(path / "metadata.yaml")
         bag = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
         bag.open()
-    except Exception as error:  # of a damaged file rosbags and its parsers raise all sorts
+    except Exception as error:  # rosbags and its parsers raise many kinds for a damaged file
         raise InputError(
             f"{path}: cannot be read as a bag ({_reason(error)}); if its recording was cut off, "
             "repair it with 'rosbag reindex', 'ros2 bag reindex' or 'mcap recover'."
@@ -218,7 +219,7 @@ def _opened(path: Path) -> Iterator[Bag]:
 
 
 def _check_metadata(file: Path) -> None:
-    """rosbags needs 30 microseconds and 300 bytes of memory for a byte of this file.
+    """Refuse a large file: rosbags needs 30 microseconds and 300 bytes of memory for each byte.
 
     Raises:
         ValueError: it is too large.
@@ -228,10 +229,10 @@ def _check_metadata(file: Path) -> None:
 
 
 def _messages(bag: Bag, path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, Message]]:
-    """Messages of these topics with the name of theirs, in the order of their recording.
+    """Messages of these topics, each with its topic, in the order of their recording.
 
     Raises:
-        BrokenSourceError: behind the last good one of a damaged bag.
+        BrokenSourceError: after the last good message of a damaged bag.
     """
     connections = [c for c in bag.connections if c.topic in topics]
     try:
@@ -254,8 +255,8 @@ def _tolerance(depth: bool) -> int:
 def _together(
     messages: Iterator[tuple[str, Message]], topics: tuple[str, ...], tolerance: int
 ) -> Iterator[tuple[Message, ...]]:
-    """Messages of one time, one of each topic: the first two there are, unless one of them has a
-    nearer one coming."""
+    """Tuples of one message from each topic whose stamps agree; a message waits if a later one of
+    the other topic is nearer in time."""
     if len(topics) == 1:
         yield from ((message,) for _, message in messages)
         return
@@ -313,7 +314,7 @@ def _choose_topics(
 
 
 def _count(bag: Bag, topics: tuple[str, ...]) -> int | None:
-    """About how many frames there are, None where ``metadata.yaml`` says no number."""
+    """The approximate number of frames; None if ``metadata.yaml`` does not state it."""
     try:
         n = min(bag.topics[topic].msgcount for topic in topics)
     except TypeError:

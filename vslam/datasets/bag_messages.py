@@ -1,4 +1,4 @@
-"""Images and calibrations out of ROS messages.
+"""Images and calibrations from ROS messages.
 
 Fields and encodings: ``sensor_msgs/Image``, ``CompressedImage``, ``CameraInfo`` and
 ``sensor_msgs/image_encodings.hpp`` of ROS.
@@ -38,13 +38,13 @@ _SAME = {"8UC1": "mono8", "16UC1": "mono16", "8UC3": "bgr8", "8UC4": "bgra8"}
 
 
 def stamp_of(message: Message) -> int:
-    """Nanoseconds of the header's stamp, 0 where nobody has set it."""
+    """Nanoseconds of the header's stamp, 0 if it was not set."""
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 def grey_of(message: Message) -> Image:
-    """``(H, W)`` uint8 image of an ``Image`` or ``CompressedImage``, of 16 bits the upper eight.
+    """``(H, W)`` uint8 image of an ``Image`` or ``CompressedImage``; the upper eight of 16 bits.
 
     Raises:
         ValueError: with the reason why it cannot be decoded.
@@ -65,7 +65,7 @@ def _decoded(message: Message, wanted: str) -> NDArray[np.uint8]:
     """An image of a message.
 
     Args:
-        wanted: ``GRAY``, or ``RGB`` for what has colours.
+        wanted: ``GRAY``, or ``RGB``, which a grey message ignores.
 
     Raises:
         ValueError: with the reason why it cannot be decoded.
@@ -99,7 +99,8 @@ def _decoded(message: Message, wanted: str) -> NDArray[np.uint8]:
 
 
 def is_depth(message: Message, topic: str) -> bool:
-    """Whether an image message holds depth: 16 bits are grey values but in topics named so."""
+    """Whether an image message holds depth. 16-bit images are grey values unless the topic's name
+    contains ``depth``."""
     if not hasattr(message, "encoding"):
         return _COMPRESSED_DEPTH in message.format
     steps = message.encoding == "16UC1" and "depth" in topic.lower()
@@ -111,8 +112,8 @@ def depth_of(message: Message, scale: float | None) -> DepthImage:
     image_transport's plugin ``compressed_depth``.
 
     Args:
-        scale: what the image counts in a metre; None: as REP 118 says, 1000 with 16 bits and 1
-            with 32.
+        scale: how many units of the image make a metre; None follows REP 118: 1000 for 16 bits, 1
+            for 32 bits.
 
     Raises:
         ValueError: with the reason why it cannot be decoded.
@@ -128,8 +129,8 @@ def depth_of(message: Message, scale: float | None) -> DepthImage:
 
 
 def _compressed_depth(message: Message, scale: float | None) -> DepthImage:
-    """Of 16 bits the PNG holds the steps; of 32 bits their inverse, by two numbers of the header
-    (``compressed_depth_image_transport``, ``ConfigHeader``)."""
+    """With 16 bits the PNG holds the depth; with 32 bits it holds the inverse depth, scaled by two
+    numbers of the header (``compressed_depth_image_transport``, ``ConfigHeader``)."""
     import cv2
 
     from vslam.datasets.png import decode_with_opencv
@@ -170,15 +171,15 @@ def _pixels(message: Message, channels: int, bits: int, kind: str = "u") -> NDAr
 
 
 def camera_info(message: Message, source: str, rectified: bool) -> Document | None:
-    """A ``CameraInfo`` as `vslam.calibration.formats.read_ros` takes it.
+    """A ``CameraInfo`` as input of `vslam.calibration.formats.read_ros`.
 
-    None of an uncalibrated camera: its K is all zero, as the definition of ``CameraInfo`` says.
+    None for an uncalibrated camera, whose K is all zero by the definition of ``CameraInfo``.
 
     Args:
-        source: bag and topic, for messages.
-        rectified: the images are those that the projection matrix is of.
+        source: bag and topic, named in error messages.
+        rectified: whether the images are rectified, so that the projection matrix applies.
     """
-    # ROS 1 has K, D, R and P, ROS 2 small letters.
+    # ROS 1 writes K, D, R and P, ROS 2 uses small letters.
     K, D, R, P = (
         np.asarray(getattr(message, name, getattr(message, name.lower(), None)), np.float64)
         for name in "KDRP"

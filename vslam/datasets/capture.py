@@ -1,4 +1,4 @@
-"""What videos and cameras share: OpenCV's captures, and frames that hold both sides of a pair."""
+"""Code that videos and cameras share: OpenCV's captures, and frames with both sides of a pair."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Capture = Any  # cv2.VideoCapture, which has no types
 
 
 def open_capture(source: str | int, *parameters: int) -> Capture | None:
-    """A capture of a file, URL or device; None where OpenCV cannot open it.
+    """A capture of a file, URL or device; None if OpenCV cannot open it.
 
     Args:
-        parameters: properties and their values in turn.
+        parameters: properties, each followed by its value.
     """
     import cv2
 
-    # FFmpeg and OpenCV would write to the terminal in the midst of the progress bar.
+    # FFmpeg and OpenCV would write to the terminal in the middle of the progress bar.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -37,7 +37,7 @@ def open_capture(source: str | int, *parameters: int) -> Capture | None:
 
 
 def sizes_of(image: NDArray[np.uint8], side_by_side: bool, monocular: bool) -> tuple[Size, ...]:
-    """Width and height of each image that `read_sides` makes of a frame."""
+    """Width and height of each image that `read_sides` returns."""
     height, width = image.shape[:2]
     if not side_by_side:
         return ((width, height),)
@@ -47,11 +47,11 @@ def sizes_of(image: NDArray[np.uint8], side_by_side: bool, monocular: bool) -> t
 def read_sides(
     image: NDArray[np.uint8], side_by_side: bool, monocular: bool, image_map: ImageMap
 ) -> tuple[Image, Image | None]:
-    """Grey images out of a frame, the left and the right half of it with ``side_by_side``.
+    """Grey images of a frame: the frame itself, or with ``side_by_side`` its left and right half.
 
     Args:
         image: ``(H, W, 3)`` uint8 blue, green, red, or ``(H, W)`` grey.
-        monocular: of both halves the left one alone.
+        monocular: return only the left half.
     """
     width = image.shape[1] // 2
     halves = [image[:, :width], image[:, width : 2 * width]] if side_by_side else [image]
@@ -60,10 +60,10 @@ def read_sides(
 
 
 def left_in_colour(image: NDArray[np.uint8], side_by_side: bool) -> NDArray[np.uint8]:
-    """The left image out of a frame: ``(H, W, 3)`` uint8 red, green, blue, or ``(H, W)`` grey.
+    """The left image of a frame: ``(H, W, 3)`` uint8 red, green, blue, or ``(H, W)`` grey.
 
     Args:
-        image: as `read_sides` takes it.
+        image: as for `read_sides`.
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""Images with the depth of their pixels, as files, and how depth is counted."""
+"""Files of images with the depth of their pixels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from vslam.datasets.image_files import (
 )
 from vslam.errors import UnreadableImageError
 
-# Of a Kinect: its projector stands so far from its camera (ORB-SLAM2, section III-A).
+# Distance in metres from a Kinect's projector to its camera (ORB-SLAM2, section III-A).
 _VIRTUAL_BASELINE = 0.08
 
 
@@ -41,7 +41,7 @@ def depth_files(
         timestamps: ``(N,)`` float64 seconds of the colour images.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, or None.
         colour, depth: N image files each.
-        depth_scale: what depth images count in a metre.
+        depth_scale: how many units of the depth images make a metre.
 
     Raises:
         UnreadableImageError: a file is empty, or the first frame cannot be decoded, has two sizes,

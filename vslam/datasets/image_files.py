@@ -1,4 +1,4 @@
-"""What readers of image files share: which folder, which files and frames, and grey images."""
+"""Code that readers of image files share: finding folders and files, and decoding them."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def image_size(path: Path) -> Size:
 
 
 def list_images(folder: Path) -> dict[str, Path]:
-    """Image files of a folder by stem, in the order of their names; empty without the folder.
+    """Image files of a folder by stem, in the order of their names; empty if there is no folder.
 
     Raises:
         InputError: the name of one is not UTF-8.
@@ -92,15 +92,15 @@ def list_images(folder: Path) -> dict[str, Path]:
 
 
 def is_image(path: Path) -> bool:
-    """Whether a file is named as an image."""
+    """Whether a file has the name of an image."""
     return path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
 
 
 def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bool]) -> Path | None:
-    """Folder of a sequence: one in ``root``, or ``root`` itself; None where there is none at all.
+    """Folder of a sequence: one in ``root``, or ``root`` itself; None if there is no sequence.
 
     Args:
-        name: of the folder; None for ``root`` itself, or the only one in it.
+        name: name of the folder; None for ``root`` itself, or the only sequence in it.
 
     Raises:
         InputError: no sequence of this name, or several and no name.
@@ -127,7 +127,7 @@ def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bo
 def select_frames(
     source: Path, n: int, start: int, every: int, max_frames: int | None
 ) -> NDArray[np.int64]:
-    """Numbers of the frames that ``start``, ``every`` and ``max_frames`` select of n > 0.
+    """Numbers of the frames that ``start``, ``every`` and ``max_frames`` select from n > 0 frames.
 
     Raises:
         InputError: options out of range, or a start beyond the last frame of ``source``.
@@ -154,8 +154,8 @@ def check_not_empty(path: Path) -> None:
 
 
 def read_grey(path: Path) -> Image:
-    """Decode an image file: ``(H, W)`` uint8, colour weighed to grey (ITU-R BT.601), of 16 bits
-    the upper eight.
+    """Decode an image file: ``(H, W)`` uint8. Colours become grey by ITU-R BT.601; of 16 bits, the
+    upper eight are used.
 
     Raises:
         UnreadableImageError: missing, damaged or larger than `MOST_PIXELS`.
@@ -175,7 +175,7 @@ def read_grey(path: Path) -> Image:
                 path, f"larger than {MOST_PIXELS / 1e6:.0f} million pixels; scale it down."
             ) from error
         decoded = None
-    except (OSError, ValueError):  # ValueError: a time file may name a path that none can be
+    except (OSError, ValueError):  # ValueError: a list of images may name an impossible path
         decoded = None
     if decoded is None:
         raise UnreadableImageError(path, "cannot be decoded; download the file again.")

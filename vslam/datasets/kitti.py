@@ -60,7 +60,7 @@ def open_kitti_images(
     max_frames: int | None = None,
     monocular: bool = False,
 ) -> RawSource:
-    """Open the images of a sequence, not its calibration; only the selected frames must be
+    """Open the images of a sequence without its calibration; only the selected frames must be
     complete.
 
     Frame k belongs to row k of ``times.txt`` and of the poses. Where those files have more rows
@@ -70,11 +70,11 @@ def open_kitti_images(
     Args:
         root: folder that holds ``sequences`` (or ``dataset/sequences``, as KITTI's archives unpack)
             and, optionally, ``poses``.
-        name: ``00`` for example.
+        name: name of the sequence, for example ``00``.
         start: first frame, counted over the images present.
         every: take every N-th frame.
-        max_frames: at most so many, None for all.
-        monocular: read the left camera alone; the right one's images need not be there.
+        max_frames: largest number of frames, None for all.
+        monocular: read the left camera alone; the right camera's images need not exist.
 
     Raises:
         InputError: data missing, images unequal or empty, times or poses unusable.
@@ -106,7 +106,7 @@ def open_kitti_images(
 
 
 def list_kitti(root: Path | str) -> list[tuple[str, int, int]]:
-    """Name and numbers of left and right images of each sequence below ``root``.
+    """The name of each sequence in ``root``, and its numbers of left and right images.
 
     Raises:
         InputError: no KITTI data there.
@@ -124,7 +124,7 @@ def read_calibration(
 
     Args:
         path: file to read.
-        width, height: image size in pixels, which the file does not say.
+        width, height: image size in pixels, which the file does not state.
         monocular: read P0 alone; P1 need not be there.
 
     Raises:
@@ -226,7 +226,7 @@ def _read_times(path: Path) -> NDArray[np.float64]:
 
 
 def _row_numbers(path: Path, stems: list[str], n_rows: int) -> NDArray[np.int64]:
-    """Row of ``times.txt`` or of the poses for every image."""
+    """The row of ``times.txt`` or of the poses that belongs to each image."""
     fix = "take the file of this sequence from KITTI's archives"
     if n_rows < len(stems):
         raise InputError(f"{path}: only {n_rows} rows for {len(stems)} images; {fix}.")

@@ -1,6 +1,6 @@
-"""Cameras that film now: a device of this machine, or a URL, of one camera or a pair side by side.
+"""Live cameras: a device of this machine, or a URL, of one camera or a pair side by side.
 
-Time stamps are those of the machine's monotonic clock at the arrival of the image.
+Time stamps are those of the machine's monotonic clock when an image arrives.
 """
 
 from __future__ import annotations

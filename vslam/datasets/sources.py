@@ -1,4 +1,4 @@
-"""All that a run can be given: data sets, and folders, videos, bags and live cameras."""
+"""Opening of any source: data sets, folders of images, videos, bags and live cameras."""
 
 from __future__ import annotations
 
@@ -23,17 +23,20 @@ class SourceOptions(BaseModel):
 
     Attributes:
         data: folder or file, number of a device, or URL; rendered towns need none.
-        dataset: one of `known_datasets` or `SOURCES`; None finds it out from what is at ``data``.
-        seq: name of the sequence of a data set; None as for `open_sequence`.
+        dataset: one of `vslam.datasets.known_datasets` or of `SOURCES`; None detects it from
+            ``data``.
+        seq: name of the sequence of a data set; None as for `vslam.datasets.open_sequence`.
         calib: calibration files, see `vslam.calibration.files.read_calibration`.
         right: folder of the right images.
         depth: folder of the depth images.
         fps: frames per second, instead of time stamps.
         side_by_side: each frame holds the left image and, right of it, the right one.
-        topics: of the left images in a bag, and of the right ones or the depth, with a comma.
-        depth_scale: what depth images count in a metre.
-        sensor: that the source must be of; ``mono`` reads left images alone, None all there are.
-        start, every, max_frames: every N-th frame from a first one on, at most so many.
+        topics: topics of the left images of a bag and of the right images or the depth, separated
+            by a comma.
+        depth_scale: how many units of the depth images make a metre.
+        sensor: ``stereo``, ``rgbd`` or ``mono``, which reads the left images alone; None takes all
+            that the source has.
+        start, every, max_frames: selection of every N-th frame from a first one on.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -74,8 +77,8 @@ def open_source(
         on_render: see `vslam.datasets.open_sequence`.
 
     Raises:
-        InputError: an option that this source has no use for, another sensor, no calibration or
-            one of other images, or as the reader says.
+        InputError: an option does not apply to this source, its sensor is another, the calibration
+            is missing or of other images, or as the reader says.
     """
     o = options
     dataset = o.dataset or detect_dataset(o.data)

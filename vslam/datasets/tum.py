@@ -60,13 +60,14 @@ def open_tum(
 
     Args:
         root: the sequence's folder, or one with several.
-        name: of the sequence in it; None for the folder itself, or the only one in it.
+        name: name of the sequence in it; None for the folder itself, or the only one in it.
         start: first frame, counted over the pairs.
         every: take every N-th frame.
-        max_frames: at most so many, None for all.
-        monocular: read the colour images alone; there need be no depth.
-        calib: file to be used instead of the folder's, or of TUM's cameras.
-        depth_scale: what depth images count in a metre; None: as the calibration says, or 5000.
+        max_frames: largest number of frames, None for all.
+        monocular: read the colour images alone; depth images need not exist.
+        calib: calibration file, which replaces the folder's own and those of TUM's cameras.
+        depth_scale: how many units of the depth images make a metre; None takes the calibration's
+            value, or 5000.
 
     Raises:
         InputError: data missing or malformed, no pairs, calibration or ground truth unusable.

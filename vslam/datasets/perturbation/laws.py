@@ -1,4 +1,4 @@
-"""Perturbations: what ``--perturb`` says, applied to the frames of a source."""
+"""Parsing of ``--perturb``, and its application to the frames of a source."""
 
 from __future__ import annotations
 
@@ -19,19 +19,18 @@ from vslam.errors import DroppedFrameError, InputError, did_you_mean
 
 @dataclass(frozen=True)
 class Perturbation:
-    """Laws applied one after the other; without any, the images pass unchanged.
+    """Laws that are applied one after the other; without laws, the images pass unchanged.
 
     Attributes:
         name: canonical spelling, ``none`` or ``brightness:1.5,blur:0.5`` for example.
-        laws: see the package.
+        laws: see the package's docstring.
     """
 
     name: str
     laws: tuple[PairLaw | SceneLaw, ...] = ()
 
     def bound_to(self, source: Source) -> Perturbation:
-        """The same for the frames of one source: laws that look at depth, poses or other frames
-        find them there.
+        """The same perturbation for one source: some laws need its depth, poses or other frames.
 
         Raises:
             InputError: the source lacks what a law needs.
@@ -46,7 +45,7 @@ class Perturbation:
         self, index: int, t: float, left: Image, second: Image | DepthImage | None
     ) -> tuple[Image, Image | DepthImage | None]:
         """Perturb both ``(H, W)`` uint8 images of frame ``index``, ``t`` seconds after the first
-        one; safe in several threads. A depth image stays as it is: it has its own light.
+        one; safe in several threads. A depth image stays as it is, since its sensor has its own light.
 
         The left one becomes the same whatever the second one is, save under fog, whose depth comes
         from both.
@@ -65,7 +64,7 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
 
     Args:
         spec: ``law[:strength]``, several joined by commas, applied in this order; ``none`` or
-            nothing for the identity.
+            the empty string for no perturbation.
         seed: not negative; equal seeds give equal images.
 
     Raises:
@@ -100,7 +99,7 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
 
 
 def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Iterator[TimedFrame]:
-    """The same frames, perturbed as they are read; the first one's time is 0 to the laws."""
+    """The same frames, perturbed as they are read; the laws count time from the first frame."""
     begin = None
     for index, frame in enumerate(frames):
         begin = frame.timestamp if begin is None else begin

@@ -45,7 +45,7 @@ class Perturbation:
         self, index: int, t: float, left: Image, second: Image | DepthImage | None
     ) -> tuple[Image, Image | DepthImage | None]:
         """Perturb both ``(H, W)`` uint8 images of frame ``index``, ``t`` seconds after the first
-        one; safe in several threads. A depth image stays as it is, since its sensor has its own light.
+        one; safe in several threads. A depth image stays as it is: its sensor has its own light.
 
         The left one becomes the same whatever the second one is, save under fog, whose depth comes
         from both.

@@ -31,8 +31,10 @@ from source_files import (
     write_video,
 )
 from test_security import png
+from typer.testing import CliRunner
 
 from vslam.camera import Camera
+from vslam.cli.main import app
 from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.bag_messages import grey_of
@@ -341,6 +343,21 @@ def test_command_line_finds_out_what_it_is_given(folder, tmp_path):
     report = json.loads((run_folder / "report.json").read_text())
     assert (report["dataset"], report["sequence"], report["frames"]) == ("video", "pair", FRAMES)
     assert (run_folder / "report.html").exists()
+
+
+def test_a_contact_sheet_of_a_video(folder, tmp_path):
+    words = ["perturb", folder / "pair.mkv", "--side-by-side", "--calib", folder / "stereo.yaml"]
+    words += ["--perturb", "blur", "--frames", "2", "--start", "3", "--out", tmp_path / "a.png"]
+    done = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
+    assert f"frames 3, {FRAMES - 1}" in done.output
+    assert cv2.imread(str(tmp_path / "a.png")).shape == (2 * 160, 3 * 480, 3)
+
+
+def test_other_systems_are_not_tested_on_videos(folder, tmp_path):
+    words = ["stress", folder / "pair.mkv", "--side-by-side", "--calib", folder / "stereo.yaml"]
+    words += ["--systems", "mine", "--system", "mine=mine {folder} {out}", "--out", tmp_path / "a"]
+    done = CliRunner().invoke(app, list(map(str, words)))
+    assert "--systems mine: other systems read KITTI's format" in str(done.exception)
 
 
 def test_a_sequence_written_side_by_side_comes_back(kitti_tree, tmp_path):

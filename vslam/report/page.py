@@ -54,6 +54,11 @@ class Tiles:
 
     tiles: Sequence[Tile]
 
+    @property
+    def rows(self) -> list[tuple[str, str, str]]:
+        """Label, value and note of each."""
+        return [(tile.label, tile.value, tile.note) for tile in self.tiles]
+
 
 @dataclass(frozen=True)
 class Bullets:

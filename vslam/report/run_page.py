@@ -29,7 +29,7 @@ from vslam.report.seen_loops import seen_note
 
 _ALIGNMENTS = {
     "se3": "SE3 alignment, no scale",
-    "sim3": "Sim3 alignment, since the scale is arbitrary",
+    "sim3": "Sim3 alignment",
     "none": "not aligned",
 }
 _MANY_LOST = 0.1  # share of the frames
@@ -37,10 +37,14 @@ _MANY_LOST = 0.1  # share of the frames
 
 def headlines(report: ReportJson) -> list[Tile]:
     """The summary. Lost frames come first: an ATE says little of a run that was lost for half."""
-    lost = report.lost_frames
+    lost, mono = report.lost_frames, report.sensor == "mono"
     share = f"{100.0 * lost / report.frames:.1f} % of" if lost else "of"
     alignment = _ALIGNMENTS[report.alignment] if report.alignment else ""
-    evaluated = "; ".join(filter(None, (alignment, report.evaluation_remark)))
+    spread = ""
+    if report.ate_mean_m is not None:
+        largest = _number(report.ate_max_m, "m")
+        spread = f"mean {_number(report.ate_mean_m, 'm')}, maximum {largest}"
+    evaluated = "; ".join(filter(None, (alignment, spread, report.evaluation_remark)))
     rotation = _number(report.rpe_deg, "°")
     return [
         Tile(
@@ -50,6 +54,7 @@ def headlines(report: ReportJson) -> list[Tile]:
             "bad" if lost else "good",
         ),
         *_in_map(report),
+        *([Tile("Scale", "arbitrary", "as of any single camera")] if mono else []),
         Tile("ATE RMSE", _number(report.ate_rmse_m, "m"), evaluated),
         Tile("Causal ATE", _number(report.causal_ate_rmse_m, "m"), "poses as given at the time"),
         Tile("RPE", _number(report.rpe_m, "m"), f"a frame; rotation {rotation}"),

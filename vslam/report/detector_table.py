@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vslam.loopclosure.registry import about
-from vslam.report.page import Row, Section, Table
+from vslam.report.page import Row, Section, Table, number
 from vslam.report.schema import ReportJson
 
 _FIGURES = (
@@ -45,7 +45,7 @@ def detector_section(report: ReportJson) -> Section:
     rows: list[Row] = [
         (
             one.detector,
-            *(_cell(getattr(one, name), form) for _, name, form in figures),
+            *(number(getattr(one, name), form) for _, name, form in figures),
             *(one.interrupted or "no" for _ in ended),
         )
         for one in detectors
@@ -62,7 +62,3 @@ def left_out(report: ReportJson) -> str:
         f"The comparison with {', '.join(report.compare)} was left out, since the run was resumed: "
         "only the map of its own detector had been saved."
     )
-
-
-def _cell(value: float | None, form: str) -> str:
-    return "n/a" if value is None else form.format(value)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 
-from vslam.report.page import Row, Section, Table
+from vslam.report.page import Row, Section, Table, number
 from vslam.report.schema import LoopEntry, ReportJson
 
 _MAX_CLOSED = 60
@@ -40,7 +40,12 @@ def _closed(report: ReportJson) -> Table:
     closed = [loop for loop in report.loops if loop.accepted]
     closed.sort(key=lambda loop: loop.right is not False)  # wrong ones first, else as they came
     rows: list[Row] = [
-        (*_evidence(loop), _right(loop), _metres(loop.moved_m), _seconds(loop.correction_s))
+        (
+            *_evidence(loop),
+            _right(loop),
+            number(loop.moved_m, "{:.2f} m"),
+            number(loop.correction_s, "{:.2f} s"),
+        )
         for loop in closed[:_MAX_CLOSED]
     ]
     head = (*_EVIDENCE, "pose", "moved", "time")
@@ -103,11 +108,3 @@ def _right(loop: LoopEntry) -> str:
 def _share_right(loops: list[LoopEntry]) -> str:
     judged = [loop.right for loop in loops if loop.right is not None]
     return f"{sum(judged)} of {len(judged)}" if judged else "n/a"
-
-
-def _metres(value: float | None) -> str:
-    return "n/a" if value is None else f"{value:.2f} m"
-
-
-def _seconds(value: float | None) -> str:
-    return "n/a" if value is None else f"{value:.2f} s"

@@ -142,3 +142,8 @@ class Page:
     title: str
     about: Sequence[str]
     sections: Sequence[Section]
+
+
+def number(value: float | None, form: str = "{}") -> str:
+    """A number as a cell of a table; ``n/a`` for None."""
+    return "n/a" if value is None else form.format(value)

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from vslam.lab.overview.schema import DECIMALS, MEASURES, Measure, OverviewJson, RunEntry, Spread
 from vslam.lab.overview.summary import ALPHA
 from vslam.lab.overview.versus import median_text, versus
-from vslam.report.page import Bullets, Figure, Page, Pairs, Section, Table
+from vslam.report.page import Bullets, Figure, Page, Pairs, Section, Table, number
 from vslam.report.render import csv_text
 
 _OTHER = ("loops_found", "loops_missed", "loops_wrong", "fps")
@@ -130,7 +130,7 @@ def _runs(report: OverviewJson) -> Section:
             run.system,
             _seed(run),
             str(run.frames),
-            _figure(run, "ate_rmse_m", 3),
+            number(run.measures["ate_rmse_m"], "{:.3f}"),
             run.source,
         )
         for run in report.runs
@@ -160,8 +160,3 @@ def _seed(run: RunEntry) -> str:
     if run.seed is None:
         return "-"
     return f"{run.seed}, town {run.town}" if run.town else str(run.seed)
-
-
-def _figure(run: RunEntry, name: str, decimals: int) -> str:
-    value = run.measures[name]
-    return "n/a" if value is None else f"{value:.{decimals}f}"

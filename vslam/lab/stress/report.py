@@ -15,7 +15,7 @@ from vslam.errors import InputError
 from vslam.lab.stress.figures import draw_curves
 from vslam.lab.stress.schema import BoundaryEntry, StressJson
 from vslam.lab.stress.summary import mean_error
-from vslam.report.page import Bullets, Figure, Page, Row, Section, Table
+from vslam.report.page import Bullets, Figure, Page, Row, Section, Table, number
 from vslam.report.render import csv_text, html, markdown, write_files
 
 _ABOUT = (
@@ -181,9 +181,9 @@ def _clean(report: StressJson) -> Table:
             entry.sequence,
             entry.system,
             f"{entry.lost_frames} of {entry.frames}",
-            _number(entry.ate_rmse_m),
-            _number(entry.causal_ate_rmse_m),
-            _number(entry.ate_limit_m),
+            number(entry.ate_rmse_m, "{:.3f}"),
+            number(entry.causal_ate_rmse_m, "{:.3f}"),
+            number(entry.ate_limit_m, "{:.3f}"),
             "" if entry.loops_found is None else str(entry.loops_found),
         )
         for entry in report.clean
@@ -201,8 +201,8 @@ def _runs(report: StressJson) -> Table:
             str(entry.seed),
             f"{test.strength:g}",
             "" if test.lost_percent is None else f"{test.lost_percent:.1f}",
-            _number(test.ate_rmse_m),
-            _number(test.causal_ate_rmse_m),
+            number(test.ate_rmse_m, "{:.3f}"),
+            number(test.causal_ate_rmse_m, "{:.3f}"),
             test.verdict or "held",
         )
         for entry in report.boundaries
@@ -213,10 +213,6 @@ def _runs(report: StressJson) -> Table:
         "verdict",
     )  # fmt: skip
     return Table(head, rows, (*head[:3], "verdict"))
-
-
-def _number(value: float | None) -> str:
-    return "n/a" if value is None else f"{value:.3f}"
 
 
 def _sheet(report: StressJson, sequences: Mapping[str, Sequence]) -> list[Figure]:

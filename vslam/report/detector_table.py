@@ -20,8 +20,8 @@ _FIGURES = (
 )
 _NOTE = (
     "All detectors saw the same frames. The time is that of tracking and mapping: images are read "
-    "and features extracted once for all. It is wall time on cores that all of them share, and the "
-    "first one waits longest; to compare costs, time runs of their own."
+    "and features are extracted once for all detectors. It is wall time on cores that the "
+    "detectors share, and the first one waits longest; to compare costs, time separate runs."
 )
 
 
@@ -55,10 +55,10 @@ def detector_section(report: ReportJson) -> Section:
 
 
 def left_out(report: ReportJson) -> str:
-    """Why there is no comparison though one was asked for; empty otherwise."""
+    """Why there is no comparison although one was requested; empty otherwise."""
     if report.detectors or not report.compare:
         return ""
     return (
-        f"The comparison with {', '.join(report.compare)} was left out, since the run was resumed: "
+        f"The comparison with {', '.join(report.compare)} was left out: the run was resumed, and "
         "only the map of its own detector had been saved."
     )

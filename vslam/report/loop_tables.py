@@ -1,4 +1,4 @@
-"""The tables of a report that tell of loops, short even where hundreds were rejected."""
+"""The tables of loops, which stay short even where hundreds of candidates were rejected."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _revisits(report: ReportJson) -> Table:
         )
         for r in report.revisits
     ]
-    note = "By the ground truth: frames on which the camera drives along an earlier stretch again."
+    note = "According to the ground truth: frames where the camera drives an earlier stretch again."
     return Table(("frames", "again", "length", "loop"), rows, ("loop",), note)
 
 
@@ -52,7 +52,7 @@ def _closed(report: ReportJson) -> Table:
     note = (
         "Proposed by: the detectors that found the place. Verified by: the descriptors whose "
         "matches give the relative pose, ORB's or those that the network learned. Pose: compared "
-        "with the ground truth. Moved: the farthest that the correction moved a keyframe."
+        "with the ground truth. Moved: the largest distance that the correction moved a keyframe."
     )
     if len(closed) > _MAX_CLOSED:
         note += f" {len(closed) - _MAX_CLOSED} more are in report.json."
@@ -97,7 +97,7 @@ def _evidence(loop: LoopEntry) -> Row:
 
 
 def _without_numbers(reason: str) -> str:
-    """Reasons that differ in their figures only are one reason."""
+    """Reasons that differ only in their numbers count as one."""
     return re.sub(r"\d+(\.\d+)?", "N", reason)
 
 

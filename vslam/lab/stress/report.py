@@ -19,12 +19,13 @@ from vslam.report.page import Bullets, Figure, Page, Row, Section, Table, number
 from vslam.report.render import csv_text, html, markdown, write_files
 
 _ABOUT = (
-    "Weakest strength that fails by bisection, median over seeds, in brackets the least and the "
-    "greatest; > where the strongest strength holds. Behind it the reason of one seed."
+    "The weakest strength at which a run fails, found by bisection: the median over seeds, with "
+    "the smallest and the largest in brackets; > means that even the strongest one holds. It is "
+    "followed by the reason of one seed."
 )
 _NOT_MONOTONE = (
-    "Bisection believes that what holds at one strength holds at all weaker ones. These failed "
-    "although a stronger one held."
+    "Bisection assumes that a system that holds at one strength holds at all weaker ones. These "
+    "runs failed although a stronger one held."
 )
 
 
@@ -66,7 +67,7 @@ def render_csv(report: StressJson) -> str:
 
 
 def title(report: StressJson) -> str:
-    """What the report is of, in one line."""
+    """The systems and sequences, in one line."""
     systems = list(dict.fromkeys(entry.system for entry in report.clean))
     places = list(dict.fromkeys(f"{entry.dataset} {entry.sequence}" for entry in report.clean))
     excerpt = f", {report.max_frames} frames" if report.max_frames else ""
@@ -154,8 +155,9 @@ def _preset(report: StressJson) -> list[Section]:
         ("sequence", "corruption", *systems, "law"),
         rows,
         ("sequence", "corruption", "law"),
-        "ATE summed over the five severities, in percent of the baseline's; in brackets the mean "
-        "share of lost frames. The mean is over corruptions that have a law and an ATE of each.",
+        "ATE summed over the five severities, in percent of the baseline's, with the mean share of "
+        "lost frames in brackets. The mean is over the corruptions that have a law and an ATE for "
+        "each system.",
     )
     title = f"Corruption error against {report.baseline}, preset {report.preset}"
     return [Section(title, [table])]

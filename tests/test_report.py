@@ -486,6 +486,7 @@ def test_a_report_shows_a_few_loops(tmp_path: Path) -> None:
     assert "6 of the 20 closed loops are shown." in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recordings", [[], ["recording.rrd"], ["recording-from-9.rrd"]])
 def test_the_pages_name_the_recordings_that_there_are(
     tmp_path: Path, recordings: list[str]

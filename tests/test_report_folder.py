@@ -135,6 +135,7 @@ ALL = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PARTS)
 def test_a_result_that_fails_costs_itself_alone(tmp_path, monkeypatch, name):
     """Whatever it raises: a fault of the figures once took the map with it."""

@@ -202,6 +202,7 @@ FORBIDDEN = {"eval", "exec", "system", "popen", "extractall", "extract", "unpack
 FORBIDDEN_MODULES = {"pickle", "dill", "shelve", "marshal", "tarfile", "joblib"}
 
 
+@pytest.mark.slow
 def test_no_source_executes_what_it_reads():
     found = []
     for path in SOURCES:
@@ -254,6 +255,7 @@ def test_a_header_that_is_a_number_is_not_that_many_bytes(tmp_path: Path, read):
     tracemalloc.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("read", [lambda p: read_npz(p, "a map"), load_map, read_progress])
 def test_an_archive_may_not_unpack_to_far_more_than_its_size(tmp_path: Path, read):
     """There may be memory for it, but not for a small file."""

@@ -1,4 +1,4 @@
-"""The page of an examination: a table of findings, and pictures."""
+"""The page of a diagnosis: a table of findings, and pictures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HEAD = ("check", "verdict", "measured", "fix")
 
 
 def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
-    """Write the page, self-contained HTML.
+    """Write the page as self-contained HTML.
 
     Raises:
         ResultsError: the file cannot be written.

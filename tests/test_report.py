@@ -339,19 +339,6 @@ def test_html_is_self_contained(fixture: str, figures: int, request: pytest.Fixt
         assert "20 needed | &lt;b&gt;" in html
 
 
-def test_svg_ids_do_not_clash_in_the_page(looped: tuple[RunOutcome, Path]) -> None:
-    html = (looped[1] / "report.html").read_text()
-    clips = re.findall(r"<clipPath id=\"(\w+)\"", html)
-    assert clips
-    assert len(clips) == len(set(clips))
-
-
-def test_markdown_tables_are_aligned(looped: tuple[RunOutcome, Path]) -> None:
-    tables = (looped[1] / "report.md").read_text().split("\n\n")
-    for table in (block for block in tables if block.startswith("|")):
-        assert len({len(line) for line in table.splitlines()}) == 1
-
-
 @pytest.mark.slow
 def test_figures_are_reproducible(written: tuple[RunOutcome, Path], tmp_path: Path) -> None:
     outcome, folder = written

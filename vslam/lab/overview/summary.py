@@ -262,7 +262,7 @@ def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
             f"Too few sequences differ ({untied}) for Wilcoxon's test, which takes {least_pairs()} "
             f"to reach p < {ALPHA:g}: no claim about others."
         )
-    chance = "unlikely by chance" if found.winner else "chance alone may do this"
+    chance = "unlikely to be chance" if found.winner else "may be chance"
     return text + f"Wilcoxon's signed-rank test on {untied}: p = {found.p_value:.3g}, {chance}."
 
 

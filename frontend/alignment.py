@@ -1,9 +1,10 @@
 """Sub-pixel alignment of matches: a landmark's patch is laid over the image around its keypoint.
 
 A corner is found at whole pixels of one of a few scales, half a pixel off as a rule, and where the
-camera comes closer, matches lie systematically too near to where it drives (docs/motorway.md). The
-patch of a keyframe that saw the landmark, drawn as the frame should see it, is moved until it
-agrees with the image: "feature alignment" of SVO (Forster et al., ICRA 2014, III-B), by the inverse
+camera comes closer, matches lie systematically too near to where it drives
+(docs/research/motorway.md). The patch of a keyframe that saw the landmark, drawn as the frame
+should see it, is moved until it agrees with the image: "feature alignment" of SVO (Forster et al.,
+ICRA 2014, III-B), by the inverse
 compositional form of Lucas-Kanade (Baker and Matthews, IJCV 2004, section 3.2). Mean and contrast
 of a patch do not matter: both are unknowns beside the shift.
 """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NewType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,3 +127,8 @@ class Frame:
     def n_stereo(self) -> int:
         """Features with a stereo match."""
         return int(np.count_nonzero(np.isfinite(self.features.u_right)))
+
+
+PlacedFrame = NewType("PlacedFrame", Frame)
+"""A frame whose pose has been recorded (``Mapper.append_pose``). Only such a frame can become a
+keyframe."""

@@ -1,4 +1,4 @@
-"""The loop detectors by name: vslam's own, and those of other packages (docs/plugins.md)."""
+"""The loop detectors by name: vslam's own, and those of other packages (docs/howto/plugins.md)."""
 
 from __future__ import annotations
 

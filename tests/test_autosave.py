@@ -111,6 +111,7 @@ def test_saving_changes_no_byte(kitti_tree, tmp_path, undisturbed):
     np.testing.assert_allclose(online.T_wc, as_tracked, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", [9, 17, 26])
 def test_a_killed_run_goes_on_at_the_next_frame(kitti_tree, tmp_path, undisturbed, frame):
     words = [sys.executable, "-c", KILLED, str(kitti_tree), str(tmp_path), str(frame)]
@@ -200,6 +201,7 @@ def test_warnings_of_the_rig_cover_both_parts(kitti_tree, tmp_path):
     ]
 
 
+@pytest.mark.slow
 def test_a_map_is_saved_where_every_frame_becomes_a_keyframe(kitti_tree, tmp_path):
     config = Config.model_validate({"keyframes": {"max_interval_s": 0.01}})
     saved: list[int] = []
@@ -355,6 +357,7 @@ def test_where_no_lock_can_be_made_a_run_goes_on(tmp_path):
         assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     brief = ("--no-record", "--no-report", "--quiet")
     words = ("--data", kitti_tree, "--max-frames", 12, "--detector", "bow")

@@ -145,7 +145,9 @@ def test_calibrations(folder):
     refused(wide, "video", path, SourceOptions((folder / "mono.yaml",)), sensor="mono")
     refused(sizes, "images", folder / "images", SourceOptions((folder / "other.yaml",)))
     refused("right camera is missing", "video", path, options("mono.yaml"))
-    refused("no calibration; .*docs/cameras.md", "video", path, SourceOptions(side_by_side=True))
+    refused(
+        "no calibration; .*docs/howto/cameras.md", "video", path, SourceOptions(side_by_side=True)
+    )
 
 
 def test_videos(folder, tmp_path, side_by_side):

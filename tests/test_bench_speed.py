@@ -37,7 +37,7 @@ def test_a_case_is_a_title_and_a_place(speed, kitti_tree):
 def test_reading_is_measured(speed, kitti_tree):
     case = speed.Case("", kitti_tree, "00", 5)
     for system in (speed.FULL, speed.ORBSLAM3):
-        assert 0.0 < speed.reading_ms(case, system) < 1000.0
+        assert speed.reading_ms(case, system) > 0.0
 
 
 def test_comparison_has_medians_and_ratios(speed):
@@ -81,9 +81,9 @@ def test_a_keyframe_costs_what_memory_grew_by(speed):
 
 def test_what_people_wrote_stays_on_the_page(speed, tmp_path):
     page = tmp_path / "performance.md"
-    assert speed.written(page) == ""
-    page.write_text("# Performance\n\nTables.\n\n## Limits\n\nBy hand.\n")
-    assert speed.written(page) == "\n## Limits\n\nBy hand.\n"
+    assert speed.written(page) == ("# Performance\n\n", "")
+    page.write_text(f"# Speed\n\nFast.\n\n{speed.BEGIN}\nTables.\n\n## Limits\n\nBy hand.\n")
+    assert speed.written(page) == ("# Speed\n\nFast.\n\n", "\n## Limits\n\nBy hand.\n")
 
 
 def test_the_command_runs_the_systems_in_turn(speed, kitti_tree, monkeypatch, capsys):

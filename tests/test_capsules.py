@@ -236,6 +236,7 @@ def test_a_pruned_network_can_be_pruned_again():
         assert torch.allclose(pruned(once, drop).embed(x), masked(once, drop).embed(x), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_folding_changes_nothing_but_the_time():
     network = small_network().train()
     with torch.no_grad():
@@ -277,6 +278,7 @@ def test_bad_weights_are_named(tmp_path, content):
         load_network(path)
 
 
+@pytest.mark.slow
 def test_a_torchvision_file_of_another_network_is_refused(tmp_path):
     torch.save({"features.0.weight": torch.zeros(1)}, tmp_path / "x.pth")
     with pytest.raises(InputError, match="another network"):
@@ -285,6 +287,7 @@ def test_a_torchvision_file_of_another_network_is_refused(tmp_path):
         alexnet((227, 227)).load_torchvision(tmp_path / "none.pth")
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_before_training_alexnet_tells_images_apart_and_has_nothing_that_blurs_that():
     torch.manual_seed(0)
@@ -296,6 +299,7 @@ def test_before_training_alexnet_tells_images_apart_and_has_nothing_that_blurs_t
     assert float(training[0] @ training[1]) < 0.97
 
 
+@pytest.mark.slow
 def test_alexnet_takes_a_torchvision_file(tmp_path):
     torch.manual_seed(0)
     network = build_network("alexnet").eval()

@@ -104,6 +104,7 @@ def test_names_that_are_not_utf8_are_refused(call, kitti_tree, tmp_path):
         assert err.endswith("this name is not UTF-8; rename it.\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [

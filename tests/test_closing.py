@@ -145,6 +145,7 @@ def test_same_bytes_with_one_thread_and_two():
     assert again.trajectory().T_wc.tobytes() == closed().trajectory().T_wc.tobytes()
 
 
+@pytest.mark.slow
 def test_two_slams_may_share_the_features_of_their_frames():
     """As those of compared detectors do: neither writes to them, one closes the loop. All that is
     corrected in features is: disparities, and a right side that is late."""

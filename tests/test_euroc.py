@@ -224,6 +224,7 @@ def test_missing_data_and_images(root):
     refused(root, images[3].name, "empty")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="EuRoC clip absent")
 def test_the_real_vehicle_stands_still():
     sequence = open_euroc(REAL, "", start=21, max_frames=25)

@@ -539,6 +539,7 @@ def test_images_are_opened_by_the_calibration_of_the_run(corridor_run, kitti_tre
     assert read_ply(run / "landmarks.ply")[1] is not None
 
 
+@pytest.mark.slow
 @needs_kitti
 def test_real_keyframes_reproject_within_a_pixel(tmp_path):
     write_results(tmp_path, run_pipeline(KITTI, "06", max_frames=51), pages=False)

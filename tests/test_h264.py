@@ -50,6 +50,7 @@ def opened(path: Path, options: SourceOptions):
     return open_source("video", str(path), None, options)
 
 
+@pytest.mark.slow
 def test_a_video_as_encoders_write_it(corridor, beside, options, tmp_path):
     """With frames that are stored in another order than they are shown in."""
     times = np.arange(FRAMES) / 10

@@ -21,6 +21,8 @@ from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def round_the_block(tmp_path_factory):

@@ -560,6 +560,7 @@ page.src = "report.html";
 </script>"""
 
 
+@pytest.mark.slow
 def test_report_in_a_browser_as_wide_as_a_phone(written, tmp_path: Path):
     """Chromium, 400 px: all figures are drawn, nothing sticks out, nothing is asked for."""
     chromium()

@@ -1,4 +1,4 @@
-"""Plug-ins: the package of docs/plugins.md, installed and used, and packages that are broken."""
+"""Plug-ins: the package of docs/howto/plugins.md, installed and used, and broken packages."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "plugins.md"
+PAGE = ROOT / "docs" / "howto" / "plugins.md"
 MODULES = ("vslam_example", "broken")
 NO_FEATURES = Features(
     np.zeros((0, 2), np.float32),

@@ -71,9 +71,10 @@ def pages(site: Path) -> dict[Path, Page]:
 
 def test_every_page_of_the_issue_is_there(pages, site):
     wanted = (
-        "index tutorial/first_run tutorial/own_camera tutorial/report plugins howto/kitti "
-        "howto/euroc howto/tum sources bench training reference/commands reference/modules "
-        "reference/generated/vslam.slam design loops results"
+        "index tutorial/first_run tutorial/own_camera tutorial/report howto/plugins howto/kitti "
+        "howto/euroc howto/tum howto/sources howto/bench howto/training reference/commands "
+        "reference/modules reference/generated/vslam.slam explanation/design research/loops "
+        "research/results"
     )
     assert {site / f"{name}.html" for name in wanted.split()} <= pages.keys()
 
@@ -206,8 +207,9 @@ next();
 def test_pages_in_a_browser_as_wide_as_a_phone(site: Path, tmp_path: Path):
     """Chromium, 400 px: nothing sticks out, letters are large enough, no other host is asked."""
     chromium()
-    shown = ["index", "tutorial/first_run", "reference/commands", "thresholds", "design", "plugins",
-             "reference/generated/vslam.slam", "results"]  # fmt: skip
+    shown = ["index", "tutorial/first_run", "reference/commands", "reference/thresholds",
+             "explanation/design", "howto/plugins", "reference/generated/vslam.slam",
+             "research/results"]  # fmt: skip
     probe = _PROBE.replace("PAGES", json.dumps([f"{name}.html" for name in shown]))
     (site / "probe.html").write_text(probe)
 

@@ -350,8 +350,7 @@ def test_settings_are_read_and_checked(tmp_path):
         load_settings(path)
 
 
-def test_cuda_is_refused_where_there_is_none(tmp_path):
-    if torch.cuda.is_available():
-        pytest.skip("there is one")
+def test_cuda_is_refused_where_there_is_none(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(InputError, match="--device cpu"):
         train(views(20), small_settings(), tmp_path, device="cuda")

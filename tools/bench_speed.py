@@ -1,7 +1,7 @@
 """Measure vslam beside ORB-SLAM3 (pyorbslam3), and write it down as Markdown.
 
     python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" [--also capsule] \
-        [--repeats 3] [--write docs/performance.md] \
+        [--repeats 3] [--write docs/research/performance.md] \
         [--orbslam3-python PY --orbslam3-script run_orbslam3.py --vocabulary voc.txt]
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run in
@@ -28,7 +28,7 @@ import systems
 from systems import Case, OrbSlam3, Run
 
 FULL, LEAN, LIVE, ORBSLAM3 = "vslam", "vslam --no-report", "vslam --realtime", "ORB-SLAM3"
-HEAD = """# Performance
+HEAD = """## How it was measured
 
 The command at the end of this page writes it. It runs one process at a time. *Load* is the load \
 of the machine when the command began. *Whole process* is the time from the start of Python to \
@@ -41,7 +41,7 @@ images of a frame takes, measured in separate processes: vslam's own reader for 
 `cv2.imread` for ORB-SLAM3; it is subtracted from each system's time. The real-time run is \
 done once per case, and so is the profile, in one thread, by `tools/profile_frame.py`.
 """
-BY_HAND = "\n## Limits\n"
+BEGIN, END = "## How it was measured\n", "\n## Limits\n"  # what is outside was written by hand
 READING = """
 import sys, time, cv2
 from pathlib import Path
@@ -277,10 +277,12 @@ def anonymous(command: str) -> str:
     return command
 
 
-def written(page: Path) -> str:
-    """What is on a page from ``BY_HAND`` on."""
+def written(page: Path) -> tuple[str, str]:
+    """What people wrote on a page: before ``BEGIN``, and from ``END`` on."""
     text = page.read_text(encoding="utf-8") if page.exists() else ""
-    return text[text.index(BY_HAND) :] if BY_HAND in text else ""
+    above, begin, rest = text.partition(BEGIN)
+    _, end, below = rest.partition(END)
+    return (above, end + below) if begin else ("# Performance\n\n", "")
 
 
 def main() -> None:
@@ -298,7 +300,8 @@ def main() -> None:
         f"```sh\npython {anonymous(shlex.join(sys.argv))}\n```\n",
     ))  # fmt: skip
     if options.write:
-        options.write.write_text(f"{text}{written(options.write)}", encoding="utf-8")
+        above, below = written(options.write)
+        options.write.write_text(f"{above}{text}{below}", encoding="utf-8")
     else:
         print(text)
 

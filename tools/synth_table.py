@@ -1,5 +1,5 @@
-"""Write docs/results/drives.csv: vslam, with and without loop closing, and ORB-SLAM3 on rendered
-drives.
+"""Write docs/research/results/drives.csv: vslam, with and without loop closing, and ORB-SLAM3 on
+rendered drives.
 
     python tools/synth_table.py --routes demo,05 --lights "clean;brightness:1.0" \
         [--kitti KITTI --along 00,07] [--aliased demo:10] [--sensor mono] \
@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument(
         "--lights", default="clean", help="clean, perturbations, kidnappings; with semicolons"
     )
-    parser.add_argument("--out", type=Path, default=Path("docs/results/drives.csv"))
+    parser.add_argument("--out", type=Path, default=Path("docs/research/results/drives.csv"))
     parser.add_argument("--sensor", default="stereo", choices=("stereo", "mono"))
     parser.add_argument("--again", default="", help="systems to measure again, with commas")
     add_orbslam3_options(parser)

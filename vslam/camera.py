@@ -18,7 +18,7 @@ DepthImage = NDArray[np.float32]  # (H, W) metres along z, 0 where unknown
 Sensor = Literal["stereo", "mono", "rgbd"]
 
 # How much surer the disparity of an observation is than its column and row: the factor on its
-# reprojection error (docs/motorway.md, tools/experiments/motorway/noise_model.py).
+# reprojection error (docs/research/motorway.md, tools/experiments/motorway/noise_model.py).
 DISPARITY_WEIGHT = 3.0
 
 

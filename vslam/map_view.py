@@ -31,7 +31,8 @@ class LocalMap(NamedTuple):
 def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
     """Copy the landmarks of a keyframe and of its covisible keyframes (ORB-SLAM, V-D).
 
-    ORB-SLAM adds neighbours of neighbours; those changed no figure here (docs/design.md).
+    ORB-SLAM adds neighbours of neighbours; those changed no figure here
+    (docs/explanation/design.md).
 
     Args:
         limit: at most this many keyframes, nearest in covisibility first.

@@ -23,7 +23,7 @@ from vslam.closing import LoopClosing
 from vslam.features import Features
 from vslam.frame_poses import FramePoses, FrameTable
 from vslam.frontend.aligner import Aligner
-from vslam.frontend.frame import Frame
+from vslam.frontend.frame import Frame, PlacedFrame
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix, inverse, orthonormalised
@@ -147,8 +147,22 @@ class Mapper:
         the map; they replace those held before."""
         self._held = tuple(frame for frame in frames if frame is not None)
 
-    def append_pose(self, frame: Frame, *, tracked: bool, near: int = -1) -> None:
-        """Record the pose of the next frame.
+    def admit(self, frame: Frame, last: Frame | None, twist: Matrix | None) -> None:
+        """Take in the next frame, which is not tracked yet: merge if a merge is due at its index,
+        and correct its columns in the right image as far as the rig is known.
+
+        Until the next frame is admitted, this frame and the last tracked one follow the map.
+
+        Args:
+            last: the frame tracked last; None before the first.
+            twist: ``(6,)`` motion of the points past the camera, per second; None if unknown.
+        """
+        self.hold(last, frame)
+        self.merge_if_due(frame.index)
+        self._rig.prepare(frame, twist)
+
+    def append_pose(self, frame: Frame, *, tracked: bool, near: int = -1) -> PlacedFrame:
+        """Record the pose of the next frame, and return the frame as one that is placed.
 
         Args:
             tracked: False for a pose that is only predicted.
@@ -158,6 +172,7 @@ class Mapper:
         if near >= 0:
             self.refer_to(near)
         self.frames.append(frame.timestamp, frame.T_cw, tracked=tracked)
+        return PlacedFrame(frame)
 
     def count(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
         """Let the map count that a frame should have seen some landmarks and did see others."""
@@ -202,7 +217,7 @@ class Mapper:
 
     # Changes of the map, each of which begins with a merge
 
-    def insert(self, frame: Frame, *, predicted: bool = True) -> None:
+    def insert(self, frame: PlacedFrame, *, predicted: bool = True) -> None:
         """Make the frame placed last a keyframe, map its stereo points and start its mapping job.
 
         The frame then tracks all landmarks that its features observe, new ones included. A frame
@@ -267,7 +282,7 @@ class Mapper:
         """The place that the frame has come back to, if it was mapped long enough ago."""
         return find_old_place(self.merge(), frame, self._config.keyframes.known_after_s)
 
-    def use_existing_keyframe(self, place: OldPlace, frame: Frame) -> None:
+    def use_existing_keyframe(self, place: OldPlace, frame: PlacedFrame) -> None:
         """Make an existing keyframe the reference instead of inserting the frame placed last as a
         new one."""
         self.merge()

@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from vslam.frontend.frame import Frame
+from vslam.frontend.frame import PlacedFrame
 from vslam.frontend.keyframes import KeyframePolicy, PlaceEvidence
 from vslam.frontend.tracker import Found, Tracker
 from vslam.frontend.tracking import TrackingContext
@@ -24,12 +24,12 @@ class Mode(Protocol):
 
     changes_map: bool
 
-    def begin(self, frame: Frame) -> bool:
+    def begin(self, frame: PlacedFrame) -> bool:
         """Begin a map, or a sub-map, with a frame that is placed but not tracked, if it can be;
         returns whether."""
         ...
 
-    def begin_after_loss(self, frame: Frame) -> bool:
+    def begin_after_loss(self, frame: PlacedFrame) -> bool:
         """``begin``, but only if the camera was lost for long enough."""
         ...
 
@@ -38,7 +38,7 @@ class Mode(Protocol):
         after it was lost; returns whether any were added, so that tracking may be tried again."""
         ...
 
-    def update_map(self, frame: Frame, found: Found) -> bool:
+    def update_map(self, frame: PlacedFrame, found: Found) -> bool:
         """Count the landmarks that a tracked frame saw, and insert it as a keyframe if the policy
         asks for one; returns whether it did."""
         ...
@@ -60,16 +60,16 @@ class Localising:
     def __init__(self, mapper: Mapper) -> None:
         self._mapper = mapper
 
-    def begin(self, frame: Frame) -> bool:
+    def begin(self, frame: PlacedFrame) -> bool:
         return False
 
-    def begin_after_loss(self, frame: Frame) -> bool:
+    def begin_after_loss(self, frame: PlacedFrame) -> bool:
         return False
 
     def map_far_points(self) -> bool:
         return False
 
-    def update_map(self, frame: Frame, found: Found) -> bool:
+    def update_map(self, frame: PlacedFrame, found: Found) -> bool:
         self._mapper.refer_to_nearest(frame)
         return False
 
@@ -98,7 +98,7 @@ class MapBuilding:
         self._mapper = mapper
         self._tracker = tracker
 
-    def begin(self, frame: Frame) -> bool:
+    def begin(self, frame: PlacedFrame) -> bool:
         start = self.starter.offer(frame)
         if start is None:
             return False
@@ -112,7 +112,7 @@ class MapBuilding:
         self._tracker.start_from(frame)
         return True
 
-    def begin_after_loss(self, frame: Frame) -> bool:
+    def begin_after_loss(self, frame: PlacedFrame) -> bool:
         config = self._config
         young = self._mapper.n_keyframes <= config.young_keyframes
         patience = 1 if young else config.lost_frames_before_restart
@@ -126,7 +126,7 @@ class MapBuilding:
             return False
         return self._mapper.map_far_points(last)
 
-    def update_map(self, frame: Frame, found: Found) -> bool:
+    def update_map(self, frame: PlacedFrame, found: Found) -> bool:
         self.starter.reset()
         self._mapper.count(found.visible, frame.landmark[frame.landmark >= 0])
         if not frame.can_become_keyframe:

@@ -1,7 +1,7 @@
 """Detectors, readers and perturbations of other packages, found by their entry points.
 
-docs/plugins.md tells how to write one. The packages' metadata name them; a package is imported when
-its plug-in is used, not before, and a broken one hurts nobody who does not use it.
+docs/howto/plugins.md tells how to write one. The packages' metadata name them; a package is
+imported when its plug-in is used, not before, and a broken one hurts nobody who does not use it.
 """
 
 from __future__ import annotations

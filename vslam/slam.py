@@ -202,13 +202,11 @@ class Slam:
         clock = StageClock(dict(stage_ms or {}))
         frame = self._next_frame(extracted, timestamp, image)
         mapper, tracker = self._mapper, self._tracker
-        mapper.hold(tracker.last, frame)
-        mapper.merge_if_due(frame.index)
-        self.rig.prepare(frame, tracker.twist)
+        mapper.admit(frame, tracker.last, tracker.twist)
         clock.lap("wait_for_mapping")
         if not mapper.n_keyframes:
-            mapper.append_pose(frame, tracked=False)
-            found = Found.at_start(frame, begun=self._mode.begin(frame))
+            begun = self._mode.begin(mapper.append_pose(frame, tracked=False))
+            found = Found.at_start(frame, begun=begun)
             clock.lap("keyframe")
             return result_of(frame, found, not found.is_lost, clock.ms)
 
@@ -223,14 +221,14 @@ class Slam:
             clock.lap("relocalise")
         if found.is_lost:
             frame.T_cw = T_predicted
-            mapper.append_pose(frame, tracked=False)
+            placed = mapper.append_pose(frame, tracked=False)
             tracker.lose()
-            is_keyframe = self._mode.begin_after_loss(frame)
+            is_keyframe = self._mode.begin_after_loss(placed)
         else:
             tracker.accept(frame, found, mapper.frames)
-            mapper.append_pose(frame, tracked=True, near=found.keyframe)
+            placed = mapper.append_pose(frame, tracked=True, near=found.keyframe)
             self.rig.observe(frame, frame.twist)
-            is_keyframe = self._mode.update_map(frame, found)
+            is_keyframe = self._mode.update_map(placed, found)
         clock.lap("keyframe")
         return result_of(frame, found, is_keyframe, clock.ms)
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.two_views import adjust_two_views
-from vslam.frontend.frame import Frame
+from vslam.frontend.frame import Frame, PlacedFrame
 from vslam.frontend.initialization import match_views, reconstruct
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix, se3_log
@@ -31,7 +31,7 @@ class TwoViewStart:
     """
 
     first: Frame
-    second: Frame
+    second: PlacedFrame
     T_2_1: Matrix
     features: tuple[NDArray[np.int64], NDArray[np.int64]]
     points: Matrix
@@ -65,7 +65,7 @@ class TwoViewStart:
 class OneViewStart:
     """A frame whose stereo points make a map."""
 
-    frame: Frame
+    frame: PlacedFrame
 
 
 Start = OneViewStart | TwoViewStart
@@ -87,14 +87,14 @@ class Starter:
         """Forget the frame that is kept."""
         self._first = None
 
-    def offer(self, frame: Frame) -> Start | None:
+    def offer(self, frame: PlacedFrame) -> Start | None:
         """Try to begin with a frame, which is untracked; None if that is not possible yet."""
         if self._context.camera.monocular:
             return self._offer_monocular(frame)
         enough = frame.n_stereo >= self._context.config.tracking.min_stereo_start
         return OneViewStart(frame) if enough else None
 
-    def _offer_monocular(self, frame: Frame) -> TwoViewStart | None:
+    def _offer_monocular(self, frame: PlacedFrame) -> TwoViewStart | None:
         """Try a frame with the one that is kept; where they have too little in common, keep this
         one instead."""
         config = self._context.config.initialization
@@ -112,7 +112,7 @@ class Starter:
         self._first = frame if enough else None
 
     def _pair(
-        self, first: Frame, second: Frame, features: tuple[NDArray, NDArray]
+        self, first: Frame, second: PlacedFrame, features: tuple[NDArray, NDArray]
     ) -> TwoViewStart | None:
         config, camera = self._context.config.initialization, self._context.camera
         of_1, of_2 = first.features, second.features

@@ -18,7 +18,7 @@ from vslam.loopclosure.siamese.weights import SHIPPED
 from vslam.loops import PerKeyframe
 
 SHIPPED_LOCAL = SHIPPED / "local.onnx"
-WIDTH = 640  # pixels of the image that the network reads; docs/loops.md has other widths
+WIDTH = 640  # pixels of the image that the network reads; docs/research/loops.md has other widths
 GLANCE_WIDTH = 320  # of a first look
 _QUALITY = 90  # of the JPEG files of keyframes in memory
 _JPEG = b"\xff\xd8"

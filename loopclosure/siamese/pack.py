@@ -16,7 +16,7 @@ from vslam.untrusted import read_npz
 def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> None:
     """Write sources as one file: images at the size of the network, JPEG, with their relations.
 
-    See docs/training.md.
+    See docs/research/training.md.
 
     Raises:
         UnreadableImageError: an image is missing or damaged.

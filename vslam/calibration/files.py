@@ -44,7 +44,7 @@ _PAIRS = (  # in a folder
 
 
 def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> Calibration:
-    """Read a calibration in any of the formats of docs/cameras.md.
+    """Read a calibration in any of the formats of docs/howto/cameras.md.
 
     Args:
         files: one file, or one of each camera, left first, or a folder that holds them.
@@ -71,7 +71,7 @@ def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> C
     there = ", ".join(" ".join(key.split())[:20] for key in sorted(documents[0].values)[:6])
     raise InputError(
         f"{paths[0]}: no known calibration (it has the keys {there}); it must be vslam's own "
-        "(docs/cameras.md), Kalibr's camchain, OpenCV's, EuRoC's sensor.yaml, "
+        "(docs/howto/cameras.md), Kalibr's camchain, OpenCV's, EuRoC's sensor.yaml, "
         "ROS's camera_info or settings of ORB-SLAM."
     )
 

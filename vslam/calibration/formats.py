@@ -1,4 +1,4 @@
-"""What each calibration format says, as a `Calibration`; docs/cameras.md describes them.
+"""What each calibration format says, as a `Calibration`; docs/howto/cameras.md describes them.
 
 One file because each format is a few lines on the same helpers. The formats' own documentation:
 Kalibr's wiki (yaml formats), OpenCV's samples ``stereo_calib.cpp`` and ``camera_calibration.cpp``,

@@ -52,7 +52,7 @@ _EXAMPLES = """
 
   vslam bench --data drive.mp4 --side-by-side --calib stereo.yaml --runs 1
 
-The same command again continues where it was stopped. docs/bench.md tells more.
+The same command again continues where it was stopped. docs/howto/bench.md tells more.
 """
 
 

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from vslam.report.finished_run import FinishedRun
 
 commands = typer.Typer(
-    help="Export the map of a run for other programs (docs/exports.md), a trained network, or "
-    "images to train on.",
+    help="Export the map of a run for other programs (docs/howto/exports.md), a trained network, "
+    "or images to train on.",
     no_args_is_help=True,
 )
 

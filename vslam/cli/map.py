@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from vslam.maps.stored_map import StoredMap
 
 commands = typer.Typer(
-    help="Look at the maps of runs, make several one, cut parts out (docs/maps.md).",
+    help="Look at the maps of runs, make several one, cut parts out (docs/howto/maps.md).",
     no_args_is_help=True,
 )
 

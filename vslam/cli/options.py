@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
-    """vslam's own names, then those of other packages (docs/plugins.md)."""
+    """vslam's own names, then those of other packages (docs/howto/plugins.md)."""
     return (*names, *(name for name in plugins.find_plugins(group) if name not in names))
 
 
@@ -57,7 +57,7 @@ Source = Annotated[
         "--data",
         envvar="KITTI_ROOT",
         help="Data set, folder of images, video, bag, number of a camera or URL, see "
-        "docs/sources.md.",
+        "docs/howto/sources.md.",
     ),
 ]
 SourceKind = Annotated[
@@ -75,8 +75,8 @@ Calib = Annotated[
     list[Path] | None,
     typer.Option(
         "--calib",
-        help="Calibration to rectify images with, see docs/cameras.md; twice for a file of each "
-        "camera, left first.",
+        help="Calibration to rectify images with, see docs/howto/cameras.md; twice for a file of "
+        "each camera, left first.",
     ),
 ]
 Right = Annotated[
@@ -110,7 +110,7 @@ Perturb = Annotated[
     str,
     typer.Option(
         help="Laws of light, weather, glass, sensor and stereo rig, each with a strength in its "
-        f"unit (docs/stress.md), joined by commas: {', '.join(_LAWS)}. Example: "
+        f"unit (docs/howto/stress.md), joined by commas: {', '.join(_LAWS)}. Example: "
         "[b]brightness:1.5,fog:60[/b]"
     ),
 ]

@@ -57,7 +57,7 @@ _EXAMPLES = """
 
 _WITHOUT_DATA = """there is nothing to run on; name some images, or take rendered ones:
   vslam run --dataset synthetic --seq demo          a drive that needs no download
-  vslam run DATA --calib FILE                       images, video, bag or camera (docs/sources.md)
+  vslam run DATA --calib FILE                       images, video, camera (docs/howto/sources.md)
   vslam run --data FOLDER --seq 00                  KITTI, also by $KITTI_ROOT (datasets.md)"""
 
 
@@ -107,7 +107,8 @@ def run(
     local_weights: Annotated[
         Path | None,
         typer.Option(
-            help="ONNX file of the local descriptors that verify loops (docs/local_descriptors.md)."
+            help="ONNX file of the local descriptors that verify loops "
+            "(docs/research/local_descriptors.md)."
         ),
     ] = None,
     sensor: Sensor = None,

@@ -32,7 +32,7 @@ _EXAMPLES = """
 
   vslam stress --seqs 00 --preset kitti-c --baseline bow
 
-The same command again goes on where it was stopped. docs/stress.md tells more.
+The same command again goes on where it was stopped. docs/howto/stress.md tells more.
 """
 _ORBSLAM3 = "orbslam3"
 
@@ -59,7 +59,7 @@ def stress(
         typer.Option(
             metavar="NAME=COMMAND",
             help="Another system: a command with {folder}, in KITTI's format, and {out}, see "
-            "docs/stress.md.",
+            "docs/howto/stress.md.",
         ),
     ] = None,
     orbslam3_python: Annotated[

@@ -1,4 +1,4 @@
-"""Every threshold of the pipeline in one tree; docs/thresholds.md is made from it.
+"""Every threshold of the pipeline in one tree; docs/reference/thresholds.md is made from it.
 
 Each module holds the thresholds of one stage.
 """

@@ -34,13 +34,13 @@ class StereoConfig(Section):
     """A point is close if its depth is below this, in baselines. [OS2 III-A, printed]"""
     offset_sigma: float = Field(0.2, ge=0)
     """Standard deviation that is assumed of the common offset of all disparities before the motion
-    of the camera reveals it, in pixels; 0 disables the estimation of the offset (docs/motorway.md).
-    [own]"""
+    of the camera reveals it, in pixels; 0 disables the estimation of the offset
+    (docs/research/motorway.md). [own]"""
     offset_keyframes: int = Field(12, ge=3)
     """Number of keyframes after which the offset is measured anew. [own]"""
     least_delay: float = Field(1.2e-3, gt=0)
     """The report warns if the measured delay of the right camera differs from the calibration's by
-    more than this, in seconds, and by more than `delay_sigmas` (docs/stress.md). [own]"""
+    more than this, in seconds, and by more than `delay_sigmas` (docs/research/stress.md). [own]"""
     delay_sigmas: float = Field(5.0, gt=0)
     """The difference must also exceed this many standard deviations of the measured delay. [own]"""
 

@@ -27,7 +27,7 @@ class OrbConfig(Section):
 
 
 class WeakImageConfig(Section):
-    """Images with much noise or little contrast (docs/stress.md)."""
+    """Images with much noise or little contrast (docs/research/stress.md)."""
 
     noise_from: float = Field(5.0, ge=0)
     """Images are blurred if the standard deviation of their noise is at least this, in grey levels.

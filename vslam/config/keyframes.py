@@ -22,7 +22,7 @@ class KeyframeConfig(Section):
     [OS2 III-E, printed]"""
     min_kept_close: float = Field(0.2, ge=0, le=1)
     """Where keyframes bring fewer close points than `min_tracked_close`, this share of what they
-    bring replaces it (docs/motorway.md). [own]"""
+    bring replaces it (docs/research/motorway.md). [own]"""
     first_gain: float = Field(2.0, ge=0)
     """Number of close points that a keyframe is assumed to bring before any has been observed, as a
     multiple of `min_tracked_close`. [own]"""

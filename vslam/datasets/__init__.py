@@ -34,10 +34,10 @@ def open_sequence(
     ``root``, which must be the only one.
 
     With ``monocular`` the left camera is read alone. ``calib`` names calibration files
-    (docs/cameras.md) to be used instead of the data set's own; images are rectified by them.
+    (docs/howto/cameras.md) to be used instead of the data set's own; images are rectified by them.
     ``depth_scale``, what depth images count in a metre, is for RGB-D data alone.
 
-    A reader of another package (docs/plugins.md) is named as a data set is.
+    A reader of another package (docs/howto/plugins.md) is named as a data set is.
 
     A synthetic sequence has no ``root``: it is rendered into the user's cache on first use, and
     ``on_render`` is told the frames done and in all.

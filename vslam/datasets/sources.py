@@ -190,6 +190,6 @@ def _calibration(
         where = " (nor camera_info in the bag)" if dataset == "bag" else ""
         raise InputError(
             f"--calib: no calibration{where}; name a file with the cameras' focal lengths, "
-            "centres, distortion and, of two cameras, baseline, as docs/cameras.md describes it."
+            "centres, distortion and, of two cameras, baseline, as docs/howto/cameras.md describes."
         )
     return own

@@ -2,8 +2,8 @@
 
 FOLDER/rgb.txt, depth.txt    a time in seconds and an image file a line
 FOLDER/groundtruth.txt       optional: t tx ty tz qx qy qz qw
-FOLDER/calibration.yaml      optional: the camera (docs/cameras.md); without it one of TUM's three,
-                             by "freiburg1", "freiburg2" or "freiburg3" in the folder's name
+FOLDER/calibration.yaml      optional: the camera (docs/howto/cameras.md); without it one of TUM's
+                             three, by "freiburg1", "freiburg2" or "freiburg3" in the folder's name
 """
 
 from __future__ import annotations

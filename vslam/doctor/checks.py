@@ -192,7 +192,7 @@ def check_features(images: Sequence[Image], config: OrbConfig) -> Finding:
         middle < FEATURES * config.n_features,
         f"median {middle}, least {min(counts)} of {config.n_features} asked for",
         "too little texture or light: more light, longer exposure, or a lower threshold "
-        "(docs/thresholds.md)",
+        "(docs/reference/thresholds.md)",
     )
 
 

@@ -6,9 +6,9 @@ ground truth go on. With ``--lights N`` lap k is driven in light k mod N, the wa
 of that seed, light 0 being as rendered. ``--incidents`` mixes in what happens to a camera: frames
 dropped, black images, and cuts to another place of the route, most of them to another light, too.
 
-    python tools/experiments/lifelong/laps.py --laps 20 --out docs/lifelong/laps.csv
+    python tools/experiments/lifelong/laps.py --laps 20 --out docs/research/lifelong/laps.csv
     python tools/experiments/lifelong/laps.py --laps 60 --lights 4 --incidents \
-        --figure docs/lifelong/soak.svg
+        --figure docs/research/lifelong/soak.svg
 
 A frame in a light is prepared once; the milliseconds are of tracking and mapping it. Ctrl-C ends
 after the lap under way, and what is done so far is written.

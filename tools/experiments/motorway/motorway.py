@@ -1,7 +1,7 @@
 r"""Where the scale of a stereo drive goes wrong: errors of disparity and motion, and an offset.
 
     python tools/experiments/motorway/motorway.py errors 01 --frames 10:200:8 \
-        --csv docs/motorway.csv
+        --csv docs/research/motorway.csv
     python tools/experiments/motorway/motorway.py offset runs/latest
 
 ``errors`` extracts features of a rendered route and compares, with its exact depth and poses, the

@@ -1,7 +1,8 @@
 """Rendered motorways that are harder than `01`: vslam and ORB-SLAM3 on the same images, in a table.
 
-    python tools/experiments/motorway/motorway_variants.py --csv docs/results/motorway.csv \
-        --orbslam3-python PY --orbslam3-script run_orbslam3.py --vocabulary voc.txt
+    python tools/experiments/motorway/motorway_variants.py \
+        --csv docs/research/results/motorway.csv --orbslam3-python PY \
+        --orbslam3-script run_orbslam3.py --vocabulary voc.txt
 
 More speed: every second or third frame, with its own time, so that the car drives 5 or 7.5 m a
 frame. Less texture: fog, contrast, blur. Far points only: a quarter of the baseline, which leaves

@@ -23,7 +23,7 @@ LAWS: dict[str, LawKind] = {
 
 
 def all_laws() -> dict[str, LawKind]:
-    """These, then those of other packages (docs/plugins.md), of strengths from 0 to 10."""
+    """These, then those of other packages (docs/howto/plugins.md), of strengths from 0 to 10."""
     others = {
         name: LawKind(make, "x", 1.0, 0.1, 10.0, "of another package", logarithmic=True)
         for name, make in plugin_laws().items()

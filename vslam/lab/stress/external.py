@@ -65,7 +65,7 @@ def check_template(name: str, template: str) -> None:
         ) from error
     if "{folder}" not in template or "{out}" not in template:
         raise InputError(
-            f"--system {name}={template}: must hold {{folder}} and {{out}}, see docs/stress.md."
+            f"--system {name}={template}: must hold {{folder}} and {{out}} (docs/howto/stress.md)."
         )
 
 

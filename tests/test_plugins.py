@@ -114,6 +114,7 @@ def test_the_package_of_the_page_is_found(installed):
     assert "vslam_example" not in sys.modules  # found, not imported
 
 
+@pytest.mark.slow
 def test_a_run_with_reader_perturbation_and_detector(target: Path, corridor, tmp_path: Path):
     """In a process of its own, as a user types it; the help lists all three."""
     data = write_frames(tmp_path / "data", corridor, 12)
@@ -278,6 +279,7 @@ def test_a_detector_that_fails_ends_the_run_with_what_it_has(broken, kitti_tree,
     assert (folder / "trajectory.tum").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_compared_detector_that_fails_ends_alone(broken, kitti_tree, tmp_path, threads):
     broken(FAILING, "[vslam.detectors]\nmine = broken:Detector\n")

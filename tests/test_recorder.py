@@ -268,6 +268,7 @@ def test_almost_full_disk_ends_the_recording_cleanly(
     assert len(rows(tmp_path / "recording.rrd", "world/camera")) == 7
 
 
+@pytest.mark.slow
 def test_failing_disk_neither_ends_nor_hangs_the_run(tmp_path: Path) -> None:
     # Rerun's writer thread dies at the limit; in a process of its own, for it must end, too.
     script = """

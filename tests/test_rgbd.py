@@ -308,6 +308,7 @@ def test_the_command_names_the_sensor(tree, tmp_path, capsys):
     assert "rgbd" in report
 
 
+@pytest.mark.slow
 def test_rendered_rgbd(tmp_path):
     small = Camera(140.0, 140.0, 119.5, 39.5, 0.5, 240, 80)
     route = replace(built_in_route("demo"), camera=small)
@@ -324,6 +325,7 @@ def test_rendered_rgbd(tmp_path):
     assert np.median(abs(depth[72:80, 110:130] / road[:, None] - 1)) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="TUM sample absent")
 def test_real_sample():
     whole = open_tum(REAL, "")

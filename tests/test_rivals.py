@@ -200,6 +200,7 @@ def test_descriptors_of_learned_images_are_white():
     assert not d[:, 19:].any()
 
 
+@pytest.mark.slow
 def test_pcanet_learns_without_gradients_and_knows_a_place_again(tmp_path):
     settings = small_settings(network="pcanet")
     outcome = learn_components(views(30), settings, tmp_path)
@@ -216,6 +217,7 @@ def test_pcanet_learns_without_gradients_and_knows_a_place_again(tmp_path):
         starting_network(settings, views(3), path, "cpu")
 
 
+@pytest.mark.slow
 def test_size_is_stored_with_the_weights_and_onnx_says_what_torch_says(tmp_path):
     """GoogLeNet: the one whose layers (paths side by side, responses normalised) others lack."""
     torch.manual_seed(0)
@@ -250,6 +252,7 @@ def test_every_network_can_be_named_on_the_command_line():
     assert "vslam train darknet19" in str(done.exception)
 
 
+@pytest.mark.slow
 def test_the_script_plans_trains_and_goes_on(tmp_path, monkeypatch):
     tool = script("tools/training/train_rivals.py")
     seconds = {"capsule": 0.5, "capsule-pruned": 0.25, "vgg16": 3.0}
@@ -329,6 +332,7 @@ def loops_report(*detectors: str) -> LoopsJson:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_tables_of_the_page(tmp_path):
     tool = script("tools/experiments/rivals/rivals_table.py")
     names = {"images": ("capsule", "capsule-pruned", "pcanet"), "minutes": ("capsule", "pcanet"),

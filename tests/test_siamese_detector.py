@@ -97,6 +97,7 @@ def detector(config: SiameseConfig | None = None, places: list[int] | None = Non
     return found
 
 
+@pytest.mark.slow
 def test_the_same_image_is_the_best_match():
     places = list(range(90))
     places[80] = 12
@@ -140,6 +141,7 @@ def test_the_threshold_holds_for_loops_and_not_for_relocalisation():
     assert one.locate(None, Features.none(), map_) == []
 
 
+@pytest.mark.slow
 def test_detectors_are_opened_by_name(tmp_path):
     path = tmp_path / "capsule.onnx"
     export_onnx(small_network(), path)
@@ -154,6 +156,7 @@ def test_detectors_are_opened_by_name(tmp_path):
         open_detector("capsule", SiameseConfig(), SHIPPED / "capsule.safetensors")
 
 
+@pytest.mark.slow
 def test_files_that_are_no_network_are_told_in_a_sentence(tmp_path):
     missing, damaged = tmp_path / "missing.onnx", tmp_path / "damaged.onnx"
     with pytest.raises(InputError, match=r"missing\.onnx: not there"):

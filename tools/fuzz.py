@@ -190,11 +190,13 @@ def _read_config(folder: Path) -> None:
 def _read_report(folder: Path) -> None:
     from vslam.lab.overview import write_overview
     from vslam.report.finished_run import read_report
-    from vslam.report.render import render_html, render_markdown
+    from vslam.report.render import html, markdown
+    from vslam.report.run_page import run_page
 
     report = read_report(folder)
-    render_html(report, "", [])
-    render_markdown(report)
+    page = run_page(report)
+    html(page)
+    markdown(page)
     write_overview([folder], [], folder / "overview")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import typer
 
 from vslam.cli.options import KITTI_ROOT, Data
-from vslam.cli.summary import print_rows
+from vslam.cli.tables import print_rows
 from vslam.errors import InputError
 
 

@@ -42,7 +42,7 @@ def info(
     run: Annotated[Path, typer.Argument(metavar="RUN|FILE", help="Folder of a run, or a map.npz.")],
 ) -> None:
     """Show what a map holds: keyframes, landmarks, observations, length, sub-maps, sizes."""
-    from vslam.cli.summary import print_rows
+    from vslam.cli.tables import print_rows
     from vslam.maps.reconstruction import reconstruction_of
     from vslam.maps.storage import load_map, map_file_of
 

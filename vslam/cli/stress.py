@@ -106,13 +106,14 @@ def stress(
 ) -> None:
     """Find the strength of each perturbation at which a run fails, and report on it."""
     from vslam.cli.console import console
+    from vslam.cli.tables import show_sections
     from vslam.datasets import open_sequence
     from vslam.datasets.sources import SourceOptions
     from vslam.lab.bench import execute
     from vslam.lab.bench.grid import parse_sequences
     from vslam.lab.stress.criterion import Criterion
     from vslam.lab.stress.plan import Plan, parse_laws
-    from vslam.lab.stress.report import render_boundaries, write_report
+    from vslam.lab.stress.report import boundary_sections, write_report
     from vslam.lab.stress.run import Results, run_all
     from vslam.lab.stress.summary import summarise
     from vslam.loopclosure.registry import require_detector
@@ -169,7 +170,7 @@ def stress(
     report = summarise(plan, searches, results, notes)
     write_report(out, report, opened)
     if not quiet:
-        typer.echo(render_boundaries(report))
+        show_sections(boundary_sections(report))
         ended = f"{len(report.boundaries)} of {len(searches)} searches ended"
         typer.echo(f"{out / 'report.html'}: {ended}")
     if stopped or len(report.boundaries) < len(searches):

@@ -1,4 +1,4 @@
-"""The first frames of a stream, to be looked at in any order."""
+"""The first frames of a stream, kept in memory for access in any order."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from vslam.datasets.sequence import DepthImage, Image
 from vslam.datasets.stream import Stream
 from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 
-_FRAMES = 120  # some seconds; a pair of 752x480 takes 0.7 MB
+_FRAMES = 120  # several seconds; a pair of 752x480 images takes 0.7 MB
 
 
 @dataclass(frozen=True)
 class FirstFrames:
-    """A :class:`vslam.datasets.sequence.Sequence` of frames in memory; of a frame that could not
-    be decoded, why."""
+    """A :class:`vslam.datasets.sequence.Sequence` of frames in memory; a frame that could not be
+    decoded is kept as its error."""
 
     dataset: str
     name: str
@@ -42,14 +42,14 @@ class FirstFrames:
 
 
 def first_frames(stream: Stream) -> FirstFrames:
-    """Take frames until there are enough or the stream ends.
+    """Read frames until there are enough or the stream ends.
 
     Raises:
         InputError: there is no frame.
     """
     times: list[float] = []
     frames: list[tuple[Image, Image | DepthImage | None] | UnreadableImageError] = []
-    problem = "there are no frames in it"
+    problem = "it has no frames"
     try:
         for frame in islice(stream.frames(), _FRAMES):
             times.append(frame.timestamp)

@@ -1,4 +1,4 @@
-"""The images of keyframes as files, and the colours that landmarks have in them."""
+"""The images of keyframes as files, and the colours of landmarks in these images."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def saved_images(
 def landmark_colours(
     reconstruction: Reconstruction, images: Iterable[NDArray[np.uint8]]
 ) -> NDArray[np.uint8]:
-    """``(L, 3)`` RGB of each landmark: the median over its observations, of the pixel observed.
+    """``(L, 3)`` uint8 RGB of each landmark: the median of the pixels at its observations.
 
     Args:
         images: ``(H, W)`` grey image of each keyframe, in order.
@@ -43,6 +43,6 @@ def landmark_colours(
         grey[seen] = image[y.clip(0, image.shape[0] - 1), x.clip(0, image.shape[1] - 1)]
     order = np.lexsort((grey, r.landmark))
     counts = np.bincount(r.landmark, minlength=len(r.xyz))
-    # Of an even number the lower one of both in the middle: a grey that was seen.
+    # The lower median, which is a grey value that was observed.
     middle = order[np.cumsum(counts) - counts + (counts - 1) // 2]
     return np.repeat(grey[middle, None], 3, axis=1)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydantic import ValidationError
 
 from vslam.backend.pose_graph import PoseGraph, essential_graph
 from vslam.camera import Camera, same_camera
@@ -57,18 +55,7 @@ def read_report(folder: Path | str) -> ReportJson:
     Raises:
         InputError: it is missing, damaged or of another version.
     """
-    path = Path(folder) / "report.json"
-    try:
-        content = json.loads(path.read_bytes())
-        return ReportJson.model_validate(content)
-    except ValidationError as error:
-        known = ReportJson.model_fields["schema_version"].default
-        schema = content.get("schema_version") if isinstance(content, dict) else None
-        raise InputError(
-            f"{path}: report schema {schema}, this version reads {known}; run again with it."
-        ) from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: missing or damaged; name the folder of a run.") from error
+    return ReportJson.read(Path(folder) / "report.json")
 
 
 def open_images(

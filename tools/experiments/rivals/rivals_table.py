@@ -58,7 +58,7 @@ from vslam.report.drawing import (
     new_figure,
     save,
 )
-from vslam.report.page import markdown_table
+from vslam.report.render import markdown_table
 from vslam.report.summary import this_machine
 
 CONDITIONS = ("light", "viewpoint", "occlusion")
@@ -127,7 +127,7 @@ def main(words: list[str] | None = None) -> None:
     images = []
     for figure in figures:
         file = folder / f"{figure.name}.png"
-        file.write_bytes(figure.png)
+        file.write_bytes(figure.image)
         images.append(f"![{figure.caption}]({file.relative_to(args.page.parent)})")
     write_csv(folder / "table6.csv", table_6(reports, digits=4))
     write_csv(folder / "conditions.csv", every_score(reports))

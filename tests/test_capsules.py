@@ -205,6 +205,7 @@ def test_texture_is_more_than_a_grey_level():
     assert at == [[0, 2], [1, 1], [1, 2]]  # what differs from the pixel on its right or below
 
 
+@pytest.mark.slow
 def test_a_pruned_network_is_the_masked_network():
     network = small_network().eval()
     branch = network.branch

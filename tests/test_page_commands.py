@@ -119,7 +119,12 @@ RULES = {
         not_run=(("python tools/experiments/design/orb_pattern.py", "it takes 20 s"),)
     ),
     "docs/howto/exports.md": Rules(
-        (("colmap RUN", "colmap RUN --out again"), ("RUN", "runs/latest"))
+        (
+            ("colmap RUN", "colmap RUN --out again"),
+            ("RUN", "runs/latest"),
+            ("nerfstudio runs/latest$", "nerfstudio runs/latest --out once_more"),
+        ),
+        not_run=(("vslam run phone.mp4", "test_exports.py runs it"),),
     ),
     "docs/index.md": Rules(not_run=(("pip", INSTALL), ("vslam run", "test_site.py runs them"))),
     "docs/howto/euroc.md": Rules(),

@@ -23,7 +23,6 @@ import pytest
 from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import parse_perturbation, perturbed
-from vslam.datasets.stream import timed_frames
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.features import TrackingState
 from vslam.frontend.tracking import TrackingContext
@@ -82,7 +81,7 @@ def test_both_cameras_at_once_are_prepared_to_the_same_bytes(kitti_tree, monocul
         return pool.map(lambda side: (met.wait(), function(side))[1], sides)
 
     with ThreadPoolExecutor(2) as pool:
-        for frame in islice(perturbed(timed_frames(sequence), law), 3):
+        for frame in islice(perturbed(sequence.frames(), law), 3):
             one = prepare_frame(frame, context)
             other = prepare_frame(frame, context, at_once)
             assert one.image.tobytes() == other.image.tobytes()

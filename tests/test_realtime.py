@@ -15,8 +15,8 @@ import pytest
 
 from vslam.config import Config, OrbConfig
 from vslam.datasets import open_sequence
+from vslam.datasets.frames import TimedFrame
 from vslam.datasets.perturbation import Perturbation
-from vslam.datasets.stream import TimedFrame
 from vslam.features import TrackingState
 from vslam.run.outcome import RunSettings
 from vslam.run.pipeline import run_sequence

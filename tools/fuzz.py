@@ -61,11 +61,10 @@ class Reader:
 
 def _use(source) -> None:
     """Every frame of it; a frame may be refused, alone."""
-    from vslam.datasets.stream import timed_frames
     from vslam.errors import InputError, UnreadableImageError
 
     try:
-        for frame in timed_frames(source):
+        for frame in source.frames():
             try:
                 frame.read(map)
             except UnreadableImageError:
@@ -91,11 +90,9 @@ def _each(read: Callable[[str], object], names: Iterable[str]) -> None:
 def _read_source(dataset: str, data: str, folder: Path, **options) -> None:
     from vslam.datasets.sources import SourceOptions, open_source
 
-    more = {key: options.pop(key) for key in ("sensor",) if key in options}
-    calibration = options.pop("calib", None)
-    if calibration:
-        options["calibration"] = (folder / calibration,)
-    _use(open_source(dataset, str(folder / data), None, SourceOptions(**options), **more))
+    if "calib" in options:
+        options["calib"] = (folder / options["calib"],)
+    _use(open_source(SourceOptions(dataset=dataset, data=str(folder / data), **options)))
 
 
 def _read_video(folder: Path) -> None:

@@ -114,7 +114,7 @@ def _rows(values: Float, n: int) -> Float:
 
 
 class Atlas(NamedTuple):
-    """T textures with their mipmaps of L levels in flat arrays for kernels.
+    """T textures with their mipmaps in flat arrays for kernels.
 
     Attributes:
         texels: uint8 grey levels of all mipmap levels of all textures.

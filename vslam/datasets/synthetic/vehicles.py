@@ -36,7 +36,8 @@ Float = NDArray[np.float64]
 
 
 def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Surfaces:
-    """A car with random shape, colour and number plate; +z is forward, the wheels are on y = 0."""
+    """A car with random shape, colour and number plate, at the origin with +z forward and wheels on
+    y = 0."""
     kind = str(rng.choice(list(_OUTLINES), p=[0.4, 0.24, 0.24, 0.12]))
     length, width, height = (float(x * rng.uniform(0.94, 1.06)) for x in _SIZES[kind])
     outline = np.array([(x, y) for x, y, _ in _OUTLINES[kind]])

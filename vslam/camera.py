@@ -102,7 +102,7 @@ class Camera:
 
     @property
     def bf(self) -> float:
-        """Baseline times focal length: disparity in pixels is ``bf / z``."""
+        """The baseline times the focal length; a disparity in pixels is ``bf / z``."""
         return self.baseline * self.fx
 
     @property

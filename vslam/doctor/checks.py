@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
+from vslam.camera import Camera, Image
 from vslam.config import OrbConfig
-from vslam.datasets.sequence import Image
 from vslam.doctor.findings import Finding, judge
 from vslam.doctor.focal_length import FocalFit
 from vslam.doctor.matching import Matches, count_views

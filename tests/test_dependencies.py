@@ -262,6 +262,7 @@ def test_only_its_commands_import_the_training():
     assert {m for m in users if not within(m, TRAINING)} == {TRAINING_COMMANDS}
 
 
+@pytest.mark.slow
 def test_the_library_does_not_print():
     printing = set()
     for module, path in SOURCES.items():
@@ -271,6 +272,7 @@ def test_the_library_does_not_print():
     assert printing == set()
 
 
+@pytest.mark.slow
 def test_tracking_and_mapping_load_no_heavy_library():
     script = (
         f"import sys, vslam.slam\nsys.stdout.write(' '.join({set(ONLY_IN)} & set(sys.modules)))"

@@ -293,6 +293,7 @@ def test_the_tools_import_what_there_is():
     assert missing == []
 
 
+@pytest.mark.slow
 def test_the_library_does_not_print():
     printing = set()
     for module, path in SOURCES.items():
@@ -302,6 +303,7 @@ def test_the_library_does_not_print():
     assert printing == set()
 
 
+@pytest.mark.slow
 def test_tracking_and_mapping_load_no_heavy_library():
     script = (
         f"import sys, vslam.slam\nsys.stdout.write(' '.join({set(ONLY_IN)} & set(sys.modules)))"

@@ -117,6 +117,7 @@ def test_a_camera_that_is_never_found_has_poses_all_the_same(file):
     assert not slam.in_map().any()
 
 
+@pytest.mark.slow
 def test_going_on_extends_the_map_and_closes_the_ring(file, ring, check_map):
     slam = Slam.load(file, threads=1)
     n = slam.map.n_keyframes

@@ -267,6 +267,7 @@ def test_interrupt_finishes_the_report_of_the_frames_done(kitti_tree, tmp_path, 
     assert len(poses) == report["frames"]
 
 
+@pytest.mark.slow
 def test_full_disk_keeps_what_was_written(kitti_tree, tmp_path, monkeypatch, capsys):
     from vslam.cli import main as cli
     from vslam.report import folder as run_folder

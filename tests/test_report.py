@@ -629,6 +629,7 @@ def test_interrupted_before_the_first_frame(tmp_path: Path) -> None:
     assert figures_of(tmp_path) == set()
 
 
+@pytest.mark.slow
 def test_interrupted_with_skipped_frames_and_no_keyframe(tmp_path: Path) -> None:
     outcome = make_outcome(60, lost=slice(0, 0))
     done = np.setdiff1d(np.arange(50), [7, 8])
@@ -659,6 +660,7 @@ def test_many_lost_frames_send_the_reader_to_the_doctor(tmp_path, lost, expected
         assert ("vslam doctor checks" in (tmp_path / name).read_text()) is expected
 
 
+@pytest.mark.slow
 def test_calibration_files_are_among_the_options(tmp_path):
     outcome = make_outcome(40)
     settings = replace(outcome.settings, calib=(Path("left.yaml"), Path("right.yaml")))

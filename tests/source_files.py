@@ -15,7 +15,7 @@ from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.sources import SourceOptions, open_source
 from vslam.run.outcome import RunOutcome, RunSettings
 from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 
 NO_OPTIONS = SourceOptions()
 LEFT, RIGHT = "/cam0/image_raw", "/cam1/image_raw"
@@ -226,4 +226,4 @@ def run_source(source, *, threads: int = 2, perturb: str = "none", **more) -> Ru
         source.dataset, source.name, perturb, "none", "stereo", 0, threads, 0, 1, None, Config(),
         **more,
     )  # fmt: skip
-    return run_sequence(source, parse_perturbation(perturb, 0), settings, NullRecorder())
+    return run_sequence(source, parse_perturbation(perturb, 0), settings, Recorder())

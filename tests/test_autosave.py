@@ -43,7 +43,7 @@ from vslam.run.options import RunOptions, read_options, write_options
 from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
 from vslam.run.pipeline import _with_earlier, run_sequence
 from vslam.run.progress import Progress, TrackLog, TrackTable, read_progress, write_progress
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 from vslam.slam import Slam
 from vslam.trajectory import read_trajectory
 
@@ -84,7 +84,7 @@ def drive(
         sequence,
         parse_perturbation(law, 0),
         settings,
-        NullRecorder(),
+        Recorder(),
         resume=resume,
         **autosave,
         **options,
@@ -220,6 +220,7 @@ def test_a_map_is_saved_where_every_frame_becomes_a_keyframe(kitti_tree, tmp_pat
     assert outcome.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
 
 
+@pytest.mark.slow
 def test_a_resumed_run_goes_on_without_the_detectors_compared(kitti_tree, tmp_path):
     def interrupt(result: TrackResult) -> None:
         if result.index == 12:
@@ -243,6 +244,7 @@ def test_half_written_files_of_killed_runs_go_with_the_rest(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["map.npz"]
 
 
+@pytest.mark.slow
 def test_images_of_another_camera_do_not_resume_a_run(kitti_tree, tmp_path):
     drive_until(kitti_tree, tmp_path, 5)
     write_options(tmp_path, RunOptions(data=str(kitti_tree), seq="00", sensor="mono"))

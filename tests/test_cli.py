@@ -154,8 +154,8 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
     ("words", "parts"),
     [
         ("--detector vgg16", ["--detector vgg16", "ships no weights", "vslam train vgg16"]),
-        ("--detector capsule --weights no.safetensors", ["no.safetensors", "not there"]),
-        ("--detector bow --weights no.safetensors", ["--weights", "bow has none"]),
+        ("--detector capsule --weights no.safetensors", ["no.safetensors", "no such file"]),
+        ("--detector bow --weights no.safetensors", ["--weights", "bow has no weights"]),
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
         ("--dataset kitti", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
         ("--config nothing.json", ["nothing.json", "configuration"]),
@@ -331,7 +331,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
 
     monkeypatch.setattr(run_pipeline, "run_sequence", run_sequence)
     monkeypatch.setattr(run_pipeline, "begin", lambda camera, settings, saved=None: None)
-    monkeypatch.setattr(recorder, "NullRecorder", lambda: "null")
+    monkeypatch.setattr(recorder, "Recorder", lambda: "null")
     monkeypatch.setattr(recorder, "RerunRecorder", lambda target, pictures: str(target))
     monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[1])
     monkeypatch.setattr(figures, "draw_figures", draw_figures)

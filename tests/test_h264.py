@@ -80,6 +80,7 @@ def test_a_file_cut_off_has_no_index(beside, options, tmp_path):
         opened(tmp_path / "cut.mp4", options)
 
 
+@pytest.mark.slow
 def test_a_file_in_fragments_keeps_the_frames_before_the_cut(beside, options, tmp_path):
     fragments = {"movflags": "frag_keyframe+empty_moov"}
     path = write_h264(

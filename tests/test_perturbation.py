@@ -21,6 +21,7 @@ def walk_of(duration, deviation, rng, jumps=()):
     return np.fromiter(islice(ou_walk(deviation, rng, jumps), int(duration / 0.01) + 1), float)
 
 
+@pytest.mark.slow
 def test_walk_has_the_stated_deviation_and_correlation_time():
     walk = walk_of(20_000.0, 0.35, np.random.default_rng(0))
     # 20,000 s hold about 5,000 independent values: the deviation is known to about 1 %.

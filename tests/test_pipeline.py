@@ -32,7 +32,7 @@ from vslam.maps.stored_map import StoredMap
 from vslam.run.outcome import RunOutcome, RunSettings
 from vslam.run.pipeline import _tell_loops, run_sequence
 from vslam.run.preparation import prepare_frame
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 from vslam.trajectory import Trajectory, read_kitti_poses
 
 KITTI = Path(__file__).parents[2] / "shared" / "data" / "kitti"
@@ -48,7 +48,7 @@ def run(root: Path, sequence: str = "00", *, threads: int = 2, perturb: str = "n
         "kitti", sequence, perturb, detector, "stereo", seed, threads, 0, 1, max_frames, Config(),
         compare=compare,
     )  # fmt: skip
-    return run_sequence(frames, perturbation, settings, NullRecorder(), **options)
+    return run_sequence(frames, perturbation, settings, Recorder(), **options)
 
 
 def vslam(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:

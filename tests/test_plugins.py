@@ -24,7 +24,7 @@ from vslam.map import Map
 from vslam.report.folder import create_run_folder, write_results
 from vslam.run.outcome import RunSettings
 from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "howto" / "plugins.md"
@@ -268,7 +268,7 @@ def test_a_detector_that_fails_ends_the_run_with_what_it_has(broken, kitti_tree,
     settings = RunSettings(
         "kitti", "00", "none", "mine", "stereo", 0, threads, 0, 1, None, Config()
     )
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     assert outcome.interrupted is not None
     assert outcome.interrupted.startswith("the detector mine of the package broken 2.0 failed")
     assert "RuntimeError: out of memory" in outcome.interrupted
@@ -286,7 +286,7 @@ def test_a_compared_detector_that_fails_ends_alone(broken, kitti_tree, tmp_path,
     settings = RunSettings(
         "kitti", "00", "none", "none", "stereo", 0, threads, 0, 1, None, Config(), compare=("mine",)
     )
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     assert outcome.interrupted is None
     assert len(outcome.trajectory) == len(sequence)
     assert 3 <= len(outcome.compared[0].trajectory) <= len(sequence)
@@ -300,13 +300,13 @@ def test_a_compared_detector_that_fails_ends_alone(broken, kitti_tree, tmp_path,
 @pytest.mark.parametrize(
     ("answer", "says"),
     [
-        ("None", "query gave NoneType, no list"),
-        ("[7]", "query gave int in its list, no LoopCandidate"),
-        ("[LoopCandidate(0, 5, 1.0)]", "gave keyframe 5, which the map does not have"),
+        ("None", "query returned NoneType, not a list"),
+        ("[7]", "query returned a list with int, not LoopCandidate"),
+        ("[LoopCandidate(0, 5, 1.0)]", "returned keyframe 5, which is not in the map"),
         ("[LoopCandidate(0, 0, float('nan'))]", "with score nan"),
-        ("[LoopCandidate(4, 0, 1.0)]", "gave query 4"),
-        ("[LoopCandidate(0, 0.5, 1.0)]", "gave a LoopCandidate of int, float, float"),
-        ("[LoopCandidate(0, 0, '1')]", "gave a LoopCandidate of int, int, str"),
+        ("[LoopCandidate(4, 0, 1.0)]", "returned query 4"),
+        ("[LoopCandidate(0, 0.5, 1.0)]", "returned a LoopCandidate of int, float, float"),
+        ("[LoopCandidate(0, 0, '1')]", "returned a LoopCandidate of int, int, str"),
     ],
 )
 def test_candidates_that_are_none_are_caught_before_kernels_see_them(broken, answer, says):
@@ -383,7 +383,7 @@ def test_a_run_on_a_reader_that_streams(broken, kitti_tree):
     broken(STREAM.replace("LIVE", "False"), "[vslam.readers]\nmine = broken:reader\n")
     source = open_from("mine", kitti_tree, max_frames=6)
     settings = RunSettings("mine", "x", "none", "none", "stereo", 0, 1, 0, 1, 6, Config())
-    outcome = run_sequence(source, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(source, Perturbation("none"), settings, Recorder())
     assert len(outcome.trajectory) == 6
 
 

@@ -49,7 +49,7 @@ from vslam.features import TrackingState
 from vslam.report.folder import create_run_folder
 from vslam.run.outcome import RunOutcome, RunSettings
 from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 
 FRAMES = 12
 STAMPS = [k * 10**8 for k in range(FRAMES)]
@@ -323,12 +323,13 @@ def test_ctrl_c_is_the_regular_end_of_a_camera(folder, corridor, monkeypatch):
             signal.raise_signal(signal.SIGINT)
 
     law = parse_perturbation("brightness", 0)
-    outcome = run_sequence(source, law, settings, NullRecorder(), on_frame=on_frame)
+    outcome = run_sequence(source, law, settings, Recorder(), on_frame=on_frame)
     assert outcome.interrupted is None
     assert len(outcome.trajectory) == len(outcome.tracks) >= 31
     assert TrackingState.DROPPED in {track.state for track in outcome.tracks}
 
 
+@pytest.mark.slow
 def test_command_line_finds_out_what_it_is_given(folder, tmp_path):
     calib = str(folder / "stereo.yaml")
     words = ["--data", str(folder / "pair.mkv"), "--side-by-side", "--calib", calib, "--no-record"]
@@ -407,6 +408,7 @@ class There:
         self.alive -= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_images_of_a_stream_are_let_go(corridor, threads):
     there = There(corridor)
@@ -416,6 +418,7 @@ def test_images_of_a_stream_are_let_go(corridor, threads):
     assert there.most <= 2 * threads + 4
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
 def test_a_viewer_is_refused_before_the_run(folder, tmp_path):
     calib = str(folder / "stereo.yaml")
@@ -438,6 +441,7 @@ def test_a_run_of_a_url_has_a_folder_with_a_plain_name(tmp_path):
     assert len(folder.name) < 120
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quiet", [[], ["--quiet"]])
 def test_swapped_sides_end_a_run_with_1_and_the_way_to_swap_them(folder, tmp_path, quiet):
     left, right = (folder / "images" / side for side in ("left", "right"))

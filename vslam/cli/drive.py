@@ -174,7 +174,7 @@ def _recorder(
     pictures: LoopPictureRecorder,
 ) -> Recorder:
     """All that is to be told of the run: a file, a viewer, and what the report shows."""
-    from vslam.run.recorder import NullRecorder, RerunRecorder, SeveralRecorders
+    from vslam.run.recorder import Recorder, RerunRecorder, SeveralRecorders
 
     recorders: list[Recorder] = []
     if output.record:
@@ -187,5 +187,5 @@ def _recorder(
     if output.pages:
         recorders.append(moments)
     if not recorders:
-        return NullRecorder()
+        return Recorder()
     return SeveralRecorders((pictures, *recorders))  # pictures first, since the others show them

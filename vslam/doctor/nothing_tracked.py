@@ -38,7 +38,7 @@ def why_nothing_was_tracked(outcome: RunOutcome, options: RunOptions) -> str | N
                 f"were swapped; {how}"
             )
     if outcome.settings.perturb != "none":
-        return f"{said} under --perturb {outcome.settings.perturb}; use a weaker perturbation"
+        return f"{said} under --perturb {outcome.settings.perturb}; a weaker one may work"
     if outcome.sequence.camera.monocular:
         return f"{said}: one camera must move sideways to begin a map; vslam doctor checks the rest"
     return f"{said}: vslam doctor says what is wrong with images, calibration or times"

@@ -23,7 +23,7 @@ from vslam.datasets.synthetic import built_in_route
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.run.outcome import RunSettings, matched_ground_truth
 from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 
 
 def twin(folder: Path, route: str) -> Source:
@@ -53,7 +53,7 @@ def ate(sequence: Source) -> float:
         dataset=sequence.dataset, sequence=sequence.name, perturb="none", detector="none",
         sensor="stereo", seed=0, threads=2, start=0, every=1, max_frames=None, config=Config(),
     )  # fmt: skip
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     truth = matched_ground_truth(outcome)
     assert truth is not None
     return evaluate_trajectory(outcome.trajectory, truth).ate_rmse_m

@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import Perturbation, perturbed
+from vslam.datasets.synthetic.store import calibration_text
 from vslam.errors import DroppedFrameError, InputError, ResultsError
 from vslam.features import TrackingState, TrackResult
 from vslam.report.folder import write_results
@@ -122,28 +122,6 @@ def export_kitti(sequence: Source, perturbation: Perturbation, folder: Path) -> 
     (folder / "times.txt").write_text("".join(f"{t:.9e}\n" for t in times))
     (folder / "calib.txt").write_text(calibration_text(sequence.camera))
     return np.array(kept, np.int64)
-
-
-def calibration_text(camera: Camera) -> str:
-    """``calib.txt`` of KITTI, for cameras that are grey."""
-    lines = []
-    for k in range(4):
-        row = [
-            camera.fx,
-            0,
-            camera.cx,
-            -camera.bf * (k % 2),
-            0,
-            camera.fy,
-            camera.cy,
-            0,
-            0,
-            0,
-            1,
-            0,
-        ]
-        lines.append(f"P{k}: " + " ".join(f"{x:.12e}" for x in row))
-    return "\n".join(lines) + "\n"
 
 
 def _call(template: str, sequence: Path, out: Path) -> None:

@@ -393,7 +393,10 @@ def test_a_run_on_a_reader_that_streams(broken, kitti_tree):
         (("return Source", "return dict"), "gave dict, not vslam.datasets.frames.Source"),
         (("camera=inner.camera", "camera=3"), "camera is int, not vslam.camera.Camera"),
         (("live=LIVE", "n_expected=-1"), "n_expected is -1, neither None nor a number"),
-        (("play=play", "stored=(*inner.stored, inner.stored[0])"), "times of stored frames must"),
+        (
+            ("play=play", "stored=(*inner.stored, inner.stored[0])"),
+            "x: the times of its frames do not increase",
+        ),
     ],
 )
 def test_what_is_no_stream_is_refused(broken, kitti_tree, change, says):

@@ -355,6 +355,19 @@ def test_a_contact_sheet_of_a_video(folder, tmp_path):
     assert cv2.imread(str(tmp_path / "a.png")).shape == (2 * 160, 3 * 480, 3)
 
 
+@pytest.mark.slow
+def test_a_stress_test_of_a_video(folder, tmp_path):
+    """Its cells read the video as the command was told to; laws that look ahead are left out."""
+    words = ["stress", folder / "pair.mkv", "--side-by-side", "--calib", folder / "stereo.yaml"]
+    words += ["--laws", "bias,desync", "--detectors", "none", "--seeds", "1", "--steps", "1"]
+    words += ["--max-frames", "8", "--out", tmp_path / "stress"]
+    done = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
+    assert "1 of 1 searches ended" in done.output
+    report = json.loads((tmp_path / "stress" / "stress.json").read_text())
+    assert [(b["sequence"], b["law"]) for b in report["boundaries"]] == [("pair", "bias")]
+    assert "desync: looks at the next frame" in report["notes"][0]
+
+
 def test_other_systems_are_not_tested_on_videos(folder, tmp_path):
     words = ["stress", folder / "pair.mkv", "--side-by-side", "--calib", folder / "stereo.yaml"]
     words += ["--systems", "mine", "--system", "mine=mine {folder} {out}", "--out", tmp_path / "a"]

@@ -103,7 +103,7 @@ def _source_options(
     ] = None,
     dataset: Annotated[
         SourceName | None,
-        typer.Option(help="What it is.", show_default="found out from what is there"),
+        typer.Option(help="What it is.", show_default="detected from the files"),
     ] = None,
     seq: Annotated[
         str | None,
@@ -149,7 +149,7 @@ def _source_options(
     depth_scale: Annotated[
         float | None,
         typer.Option(
-            help="What depth images count in a metre.",
+            help="Units of the depth images per metre.",
             show_default="the calibration's; of tum 5000, of a bag as its encoding says",
         ),
     ] = None,
@@ -184,7 +184,6 @@ def _source_options(
     )  # fmt: skip
 
 
-SOURCE_OPTIONS = tuple(inspect.signature(_source_options).parameters)
 _NAMES = {"SourceOptions": object}  # of annotations that cost an import
 
 
@@ -196,28 +195,32 @@ def reads_source(
     Args:
         without: options that the command does not take.
     """
-    names = [name for name in SOURCE_OPTIONS if name not in without]
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        source = [p for p in _parameters(_source_options) if p.name not in without]
+        own = [p for p in _parameters(command) if p.name != "given"]
+        for parameter in source:
+            parameter.annotation.__metadata__[0].rich_help_panel = "Input"
+
         def called(**values: Any) -> None:
-            given = {name: values.pop(name) for name in names}
+            given = {parameter.name: values.pop(parameter.name) for parameter in source}
             command(given=_source_options(**given), **values)
 
-        parameters: list[inspect.Parameter] = []
-        for function, own in ((command, None), (_source_options, names)):
-            hints = get_type_hints(function, localns=_NAMES, include_extras=True)
-            several = [
-                parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
-                for name, parameter in inspect.signature(function).parameters.items()
-                if name != "given" and (own is None or name in own)
-            ]
-            parameters = several + parameters
-        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        called.__annotations__ = {p.name: p.annotation for p in parameters}
+        called.__signature__ = inspect.Signature([*source, *own])  # type: ignore[attr-defined]
+        called.__annotations__ = {p.name: p.annotation for p in (*source, *own)}
         called.__name__, called.__doc__ = command.__name__, command.__doc__
         return called
 
     return decorate
+
+
+def _parameters(function: Callable[..., object]) -> list[inspect.Parameter]:
+    """The parameters of a function with their annotations evaluated."""
+    hints = get_type_hints(function, localns=_NAMES, include_extras=True)
+    return [
+        parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
+        for name, parameter in inspect.signature(function).parameters.items()
+    ]
 
 
 def require_data(options: SourceOptions) -> None:

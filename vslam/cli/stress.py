@@ -151,7 +151,7 @@ def stress(
     plan = Plan(
         kind, tuple(opened), tuple(fitting), tuple(names), seeds, steps, given.max_frames,
         baseline or names[0], Criterion(max_lost, ate_factor, ate_least), tuple(others), preset,
-        given.sensor,
+        given.sensor, tuple(map(str, given.calib)),
     )  # fmt: skip
     execute.prepare(out, identity_of(kind, given))
     searches, results = plan.searches(), Results(out, options.config)

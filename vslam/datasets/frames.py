@@ -70,7 +70,7 @@ class _Frames:
         object.__setattr__(self, "n_expected", len(self.stored))
         times = self.timestamps
         if not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-            raise ValueError("the times of stored frames must be numbers that increase")
+            raise InputError(f"{self.name}: the times of its frames do not increase; repair them.")
         if self.ground_truth is not None and self.ground_truth.shape != (len(times), 4, 4):
             raise ValueError(f"ground_truth must be of shape ({len(times)}, 4, 4)")
 
@@ -132,8 +132,8 @@ class Source(_Frames):
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose, or None.
 
     Raises:
-        ValueError: the times of stored frames do not increase, or the ground truth has another
-            shape.
+        InputError: the times of stored frames do not increase.
+        ValueError: the ground truth has another shape.
     """
 
     camera: Camera

@@ -84,6 +84,13 @@ def add_legend(figure: Figure, axes: Axes) -> None:
     figure.legend(loc="outside lower center", ncols=columns, columnspacing=1.2)
 
 
+def finish_map(figure: Figure, axes: Axes) -> None:
+    """Show both axes at equal scale, with a margin and a legend."""
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+    add_legend(figure, axes)
+
+
 def plain_ticks(axis: Axis) -> None:
     """Label a logarithmic axis with plain numbers: 1, 2, 5, 10, ..."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))

@@ -29,7 +29,7 @@ test-fast: $(DEVELOPED)  ## run the tests that are not marked slow: under two mi
 check: $(DEVELOPED)  ## check format, lint and types
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
-	$(MAKE) types
+	@$(MAKE) --no-print-directory types
 
 # mypy cannot follow the folders' mapping to vslam.* (pyproject.toml): it reads a plain installation.
 types: $(DEVELOPED)  ## check types

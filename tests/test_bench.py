@@ -340,6 +340,7 @@ def test_bench_shows_the_detectors_beside_the_first_one(bench):
     assert bench("--detectors", "both", "--quiet")[1] == ""
 
 
+@pytest.mark.slow
 def test_bench_shows_what_is_left_when_all_runs_of_the_baseline_fail(bench, stub: Path):
     for name in ("none-bow-0", "brightness:1-bow-0", "brightness:1-bow-1"):
         (stub / f"fail-00-{name}").touch()
@@ -368,6 +369,7 @@ def test_bench_counts_failures_and_ends_with_1(bench, stub: Path):
     assert len(started(stub)) == 7
 
 
+@pytest.mark.slow
 def test_bench_loses_nothing_to_an_interrupt(bench, stub: Path, monkeypatch):
     add = table.GridProgress.add
 

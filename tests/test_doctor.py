@@ -125,6 +125,7 @@ def faults(seen, config: OrbConfig = FEW) -> list[str]:
     return [finding.check for finding in found]
 
 
+@pytest.mark.slow
 def test_nothing_is_wrong_with_the_corridor(clean):
     diagnosis = examine(clean, FEW)
     assert [f for f in diagnosis.findings if f.verdict != "good"] == []
@@ -304,9 +305,10 @@ def test_the_command(kitti_tree, tmp_path):
     assert "median vertical error" in text
 
 
+@pytest.mark.slow
 def test_the_command_looks_at_the_beginning_of_a_video(corridor, tmp_path, monkeypatch):
     """Frames of a stream cannot be had again: the first ones are kept."""
-    monkeypatch.setattr("vslam.doctor.first_frames._FRAMES", 9)
+    monkeypatch.setattr("vslam.datasets.frames._FIRST_FRAMES", 9)
     pairs = [np.hstack(pair) for pair in zip(corridor.left, corridor.right, strict=True)]
     video = write_video(tmp_path / "drive.mkv", pairs)
     calibration = write_calibration(tmp_path / "stereo.yaml", corridor.camera)
@@ -383,6 +385,7 @@ def test_a_wrong_focal_length_shows_when_the_camera_turns(clean, factor):
     assert said == pytest.approx(c.fx, rel=0.03)
 
 
+@pytest.mark.slow
 def test_straight_ahead_no_focal_length_shows(clean):
     """Frames 0 to 7 go straight on."""
     straight = replace(

@@ -59,6 +59,7 @@ def test_known_streets_do_not_grow_the_map(check_map):
     check_map(slam.map)
 
 
+@pytest.mark.slow
 def test_what_is_known_is_tracked_no_worse():
     mean = [float(errors(laps(known)[0], RING, PLACES).mean()) for known in (10.0, NEVER_KNOWN)]
     assert mean[0] < 1.1 * mean[1]

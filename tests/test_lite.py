@@ -85,6 +85,7 @@ def imagenet(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_the_published_network_is_computed(imagenet):
     """Grey images of deviation 1 in, what the network makes of them at deviation 0.5 out."""

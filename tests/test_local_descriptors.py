@@ -70,7 +70,7 @@ def test_doubling_keeps_what_lies_on_the_grid():
 
 
 def test_files_that_are_not_the_local_descriptors(tmp_path):
-    with pytest.raises(InputError, match="are not there"):
+    with pytest.raises(InputError, match="are missing"):
         LocalDescriptors(tmp_path / "missing.onnx")
     with pytest.raises(InputError, match="not the local descriptors"):
         LocalDescriptors(SHIPPED / "capsule.onnx").describe(picture(0))

@@ -164,6 +164,7 @@ def test_what_was_not_joined_is_not_in_the_map(file, ring):
     assert not slam.in_map().any()
 
 
+@pytest.mark.slow
 def test_a_resumed_drive_has_all_its_frames(ring, tmp_path):
     whole, first = new(), new()
     drive(whole, ring, range(120), seed=8)

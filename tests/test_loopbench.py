@@ -219,6 +219,7 @@ def test_a_sequence_is_the_mean_along_the_best_line():
     np.testing.assert_allclose(found[2, 2], (0.3 + 0.9 + 0.3) / 3)
 
 
+@pytest.mark.slow
 def test_a_sequence_outvotes_an_image_that_looks_like_all(vocabulary):
     """The way is driven again, but one image of the gallery resembles every query most."""
     n = 30

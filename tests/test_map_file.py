@@ -224,7 +224,7 @@ def test_descriptors_and_images_of_learned_detectors_come_back(tmp_path):
 
     values = found.images.values.copy()
     values[:2] = 0
-    with pytest.raises(ValueError, match="keyframe 0 is no JPEG"):
+    with pytest.raises(ValueError, match="keyframe 0 is not a JPEG"):
         create()[1].restore(replace(found.images, values=values), 640)
     seen = again.memory()  # by the network, as a lost frame was looked for
     table = seen.tables["capsule/descriptors"]

@@ -120,6 +120,7 @@ def test_darkness_at_the_beginning_only_delays_it():
     assert len(slam.trajectory()) == 40
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_still_begins_no_map():
     slam, results = run([3.0 + 1e-6 * k for k in range(30)])
     assert slam.map.n_keyframes == 0

@@ -23,7 +23,6 @@ import pytest
 from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import parse_perturbation, perturbed
-from vslam.datasets.stream import timed_frames
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.features import TrackingState
 from vslam.frontend.tracking import TrackingContext
@@ -33,7 +32,7 @@ from vslam.maps.stored_map import StoredMap
 from vslam.run.outcome import RunOutcome, RunSettings
 from vslam.run.pipeline import _tell_loops, run_sequence
 from vslam.run.preparation import prepare_frame
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 from vslam.trajectory import Trajectory, read_kitti_poses
 
 KITTI = Path(__file__).parents[2] / "shared" / "data" / "kitti"
@@ -49,7 +48,7 @@ def run(root: Path, sequence: str = "00", *, threads: int = 2, perturb: str = "n
         "kitti", sequence, perturb, detector, "stereo", seed, threads, 0, 1, max_frames, Config(),
         compare=compare,
     )  # fmt: skip
-    return run_sequence(frames, perturbation, settings, NullRecorder(), **options)
+    return run_sequence(frames, perturbation, settings, Recorder(), **options)
 
 
 def vslam(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -82,7 +81,7 @@ def test_both_cameras_at_once_are_prepared_to_the_same_bytes(kitti_tree, monocul
         return pool.map(lambda side: (met.wait(), function(side))[1], sides)
 
     with ThreadPoolExecutor(2) as pool:
-        for frame in islice(perturbed(timed_frames(sequence), law), 3):
+        for frame in islice(perturbed(sequence.frames(), law), 3):
             one = prepare_frame(frame, context)
             other = prepare_frame(frame, context, at_once)
             assert one.image.tobytes() == other.image.tobytes()

@@ -16,13 +16,13 @@ import pytest
 
 from vslam.config import Config, OrbConfig
 from vslam.datasets import open_sequence
+from vslam.datasets.frames import TimedFrame
 from vslam.datasets.perturbation import Perturbation
-from vslam.datasets.stream import TimedFrame
 from vslam.features import TrackingState
 from vslam.run.outcome import RunSettings
 from vslam.run.pipeline import run_sequence
 from vslam.run.realtime import play
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 from vslam.slam import Slam
 
 
@@ -158,7 +158,7 @@ def test_one_camera_in_real_time(kitti_tree, threads):
     settings = RunSettings(
         "kitti", "00", "none", "none", "mono", 0, threads, 0, 1, 6, Config(), realtime=True
     )
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     assert len(outcome.tracks) == 6
     assert len(outcome.latency_ms) == sum(track.n_features > 0 for track in outcome.tracks) > 0
 
@@ -174,7 +174,7 @@ def test_an_unreadable_image_in_real_time(kitti_tree, threads, tmp_path):
     settings = RunSettings(
         "kitti", "00", "none", "none", "stereo", 0, threads, 0, 1, 6, Config(), realtime=True
     )
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     assert len(outcome.trajectory) == len(outcome.tracks) == 6
     assert outcome.tracks[5].state == TrackingState.LOST
     assert [str(image) in message for message in outcome.skipped] == [True]
@@ -187,7 +187,7 @@ def test_a_compared_detector_drops_the_frames_that_the_main_one_drops(kitti_tree
         "kitti", "00", "none", "bow", "stereo", 0, 2, 0, 1, 8, Config(),
         realtime=True, compare=("none",),
     )  # fmt: skip
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     (other,) = outcome.compared
     assert len(outcome.tracks) == len(other.tracks) == 8
     for own, compared in zip(outcome.tracks, other.tracks, strict=True):

@@ -25,7 +25,6 @@ from vslam.map import Map
 from vslam.run import recorder as recorder_module
 from vslam.run.moments import LoopPictureRecorder
 from vslam.run.recorder import (
-    NullRecorder,
     Recorder,
     RerunRecorder,
     SeveralRecorders,
@@ -333,7 +332,7 @@ def test_a_window_shows_the_run_and_the_recording_is_the_same(tmp_path, window, 
 
 
 def test_a_window_that_is_closed_does_not_end_the_recording(tmp_path, window, recording, caplog):
-    class Closing(NullRecorder):
+    class Closing(Recorder):
         def map(self, map_: Map) -> None:
             if map_.n_keyframes == 10:
                 window[0].kill()

@@ -28,7 +28,7 @@ from vslam.frontend.tracking import TrackingContext
 from vslam.maps.storage import load_map, save_map
 from vslam.run.outcome import RunOutcome, RunSettings
 from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory, write_tum
 
@@ -93,7 +93,7 @@ def run_on(tree: Path, *, threads: int = 1, **options) -> RunOutcome:
         sensor=sequence.camera.sensor, seed=0, threads=threads, start=0, every=1, max_frames=None,
         config=Config(),
     )  # fmt: skip
-    return run_sequence(sequence, parse_perturbation("none", 0), settings, NullRecorder())
+    return run_sequence(sequence, parse_perturbation("none", 0), settings, Recorder())
 
 
 def ate_of(outcome: RunOutcome) -> float:

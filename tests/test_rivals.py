@@ -189,6 +189,7 @@ def test_histograms_count_the_codes_of_each_block():
     assert histograms.sum((2, 3, 4)).unique().tolist() == [20 * 24]
 
 
+@pytest.mark.slow
 def test_descriptors_of_learned_images_are_white():
     branch = PcaNetBranch((64, 64))
     images = views(10).images

@@ -217,6 +217,7 @@ def test_a_system_that_fails_on_clean_images_is_left_out_with_a_note(tmp_path):
     assert any("other" in note and "no licence" in note for note in report.notes)
 
 
+@pytest.mark.slow
 def test_the_report_says_it_in_every_form(tmp_path):
     _, report = conducted(tmp_path)
     write_report(tmp_path, report, {})
@@ -429,6 +430,7 @@ def test_a_template_must_hold_both_places(template):
         check_template("slam", template)
 
 
+@pytest.mark.slow
 def test_from_the_command_line_with_another_system(tmp_path):
     """The clean run is perfect; darkness turns the ruler's path to a wrong one."""
     root = make_kitti(tmp_path / "data")

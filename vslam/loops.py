@@ -57,8 +57,8 @@ class LoopEdge:
             the map around the match; None if the candidate was rejected before it was computed.
         features: ``(N,)`` int32, inlier features of the query (index within the keyframe).
         landmarks: ``(N,)`` int32, the landmark of the place that each of them observes.
-        scale: length of the match's map unit in the map unit around the query: 1 in metric maps,
-            while monocular maps drift in scale.
+        scale: map units around the query per map unit around the match: 1 in metric maps; scale
+            drift changes it in monocular ones.
         matched_by: "orb" or "learned", the descriptors that were matched.
     """
 

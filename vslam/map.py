@@ -369,8 +369,8 @@ class Map:
         a.keyframe_alive[keyframe] = False
 
     def begin_submap(self, keyframe: int, parent: int, *, predicted: bool) -> None:
-        """Record that mapping restarted at a keyframe whose pose relative to the parent is a
-        prediction, or not even that."""
+        """Record that mapping restarted at a keyframe; ``predicted`` tells whether its pose
+        relative to the parent is at least a prediction."""
         self.keyframes.parent[keyframe] = parent
         self.keyframes.restart[keyframe] = PREDICTED if predicted else UNPREDICTED
 

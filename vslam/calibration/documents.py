@@ -116,8 +116,8 @@ def read_document(path: Path) -> Document:
         raise InputError(f"{path}: the calibration is empty; name another file.")
     if text.lstrip("\ufeff \n").startswith("<?xml"):
         raise InputError(
-            f"{path}: the calibration is XML, which is not supported; save it under a name that "
-            "ends in .yml, for which cv2.FileStorage writes YAML."
+            f"{path}: the calibration is XML, which is not read; save it under a name that ends in "
+            ".yml, for which cv2.FileStorage writes YAML."
         )
     text = _NO_SPACE.sub(r"\1: ", _HEADER.sub("", text))
     try:

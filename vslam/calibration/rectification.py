@@ -41,7 +41,7 @@ class Rectification:
             original one; both have the same centre.
         left, right: map ``(H, W)`` uint8 images of the calibrated size to rectified ones of the
             left camera's size, bilinearly. Images that need no rectification are returned
-            unchanged; so does ``right`` if there is no right camera.
+            unchanged; without a right camera, ``right`` returns every image unchanged.
         left_depth: the same for depth images of any type, by nearest neighbour. It is valid only
             for a camera that is not turned, since depth is measured along the camera's own axis.
         identity: whether images are returned unchanged.
@@ -151,9 +151,9 @@ def _between(R_left_right: Array, centre: Array, source: str) -> Array:
         )
     if baseline > _FARTHEST_M:
         raise InputError(
-            f"{source}: the cameras stand {baseline:.4g} m apart, as if the file had millimetres "
-            "or centimetres; write the translation between them in metres (a checkerboard "
-            "calibration has the unit of the squares)."
+            f"{source}: the cameras stand {baseline:.4g} m apart, as if a length in millimetres or "
+            "centimetres was taken for metres; write the translation between them in metres (a "
+            "checkerboard calibration has the unit of the squares)."
         )
     x = centre / baseline
     across = float(half[:, 0] @ x)

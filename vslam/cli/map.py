@@ -91,12 +91,12 @@ def _contents(map_: Map, reconstruction: Reconstruction) -> Rows:
 
 def _weakest_place(map_: Map) -> Rows:
     """Where the fewest landmarks hold the map together."""
-    from vslam.backend.pose_graph import held_by
+    from vslam.backend.pose_graph import connectivity
 
     living = map_.living_keyframes()[1:]
     if not len(living):
         return []
-    held = held_by(map_)[living]
+    held = connectivity(map_)[living]
     at = int(held.argmin())
     return [("weakest place", f"frame {map_.frames[living[at]]}, held by {held[at]} landmarks")]
 

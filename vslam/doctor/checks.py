@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
+from vslam.camera import Camera, Image
 from vslam.config import OrbConfig
-from vslam.datasets.sequence import Image
 from vslam.doctor.findings import Finding, judge
 from vslam.doctor.focal_length import FocalFit
 from vslam.doctor.matching import Matches, count_views
@@ -193,7 +192,7 @@ def check_features(images: Sequence[Image], config: OrbConfig) -> Finding:
     return judge(
         "features",
         middle < FEATURES * config.n_features,
-        f"median {middle}, least {min(counts)} of {config.n_features} asked for",
+        f"median {middle}, least {min(counts)} of {config.n_features} requested features",
         "too little texture or light: more light, longer exposure, or a lower threshold "
         "(docs/reference/thresholds.md)",
     )
@@ -297,7 +296,7 @@ def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding
     if off > DEPTH_PX and not (clear and (np.abs(best) <= reach - _BORDER).all()):
         return Finding("registration", "unknown", f"{measured}, but no shift fits clearly best")
     if off > DEPTH_PX and views() < DEPTH_VIEWS:
-        few = "but these images show a single view, which may fit there by chance"
+        few = "but these images show one view, which may fit there by chance"
         return Finding("registration", "unknown", f"{measured}, {few}")
     return judge(
         "registration",

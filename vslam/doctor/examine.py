@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
+from vslam.camera import Camera, DepthImage, Image
 from vslam.config import OrbConfig
-from vslam.datasets.sequence import DepthImage, Image, Sequence
+from vslam.datasets.frames import Source
 from vslam.doctor import checks
 from vslam.doctor.findings import Finding, judge
 from vslam.doctor.focal_length import Moved, fit_focal_length
@@ -48,7 +48,7 @@ class Diagnosis:
         return [finding for finding in self.findings if finding.verdict == "fault"]
 
 
-def examine(sequence: Sequence, config: OrbConfig) -> Diagnosis:
+def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
     """Run all checks that apply to the sequence: stereo, RGB-D or monocular.
 
     The images are rectified, as in a run.
@@ -102,7 +102,7 @@ class _Pair:
         return float(np.median(np.abs(self.matches.left[:, 1] - self.matches.right[:, 1])))
 
 
-def _pairs(sequence: Sequence, lefts: dict[int, Image], lag: int) -> list[_Pair]:
+def _pairs(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
     """Pairs of left images and the right images ``lag`` frames later, if both can be read."""
     found = []
     for frame, left in lefts.items():
@@ -117,7 +117,7 @@ def _pairs(sequence: Sequence, lefts: dict[int, Image], lag: int) -> list[_Pair]
 
 
 def _examine_stereo(
-    sequence: Sequence, lefts: dict[int, Image], *, blind: bool
+    sequence: Source, lefts: dict[int, Image], *, blind: bool
 ) -> tuple[list[Finding], list[Picture]]:
     inner = dict(list(lefts.items())[1:-1:2])  # these have frames before and after them
     by_lag = {lag: _pairs(sequence, inner if lag else lefts, lag) for lag in _LAGS}
@@ -146,7 +146,7 @@ def _examine_stereo(
     return findings, [_stereo_picture(pair) for pair in shown]
 
 
-def _examine_focal_length(sequence: Sequence, found: list[Finding]) -> list[Finding]:
+def _examine_focal_length(sequence: Source, found: list[Finding]) -> list[Finding]:
     """Check the focal length, unless another fault of the images would distort the result."""
     if any(finding.verdict == "fault" for finding in found):
         return []
@@ -157,7 +157,7 @@ def _examine_focal_length(sequence: Sequence, found: list[Finding]) -> list[Find
     return [checks.check_focal_length(fit, sequence.camera)]
 
 
-def _moved(sequence: Sequence, frame: int) -> Moved | None:
+def _moved(sequence: Source, frame: int) -> Moved | None:
     """Points of a frame with their disparities and their positions a few frames later; None if
     there are too few points or an image cannot be read."""
     try:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.sequence import Image
+from vslam.camera import Image
 
 _FEATURES = 2000
 _MAX_DISTANCE = 64  # bits of 256; ORB-SLAM2's TH_LOW is 50

@@ -6,8 +6,7 @@ from itertools import islice
 
 import numpy as np
 
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import Stream, is_live, timed_frames
+from vslam.datasets.frames import Source
 from vslam.doctor.checks import check_sides
 from vslam.doctor.matching import joined, match_images
 from vslam.errors import InputError
@@ -30,7 +29,7 @@ def why_nothing_was_tracked(outcome: RunOutcome, options: RunOptions) -> str | N
         return f"{said}: no image could be read ({outcome.skipped[0].rstrip('.')})"
     if options.localize:
         return f"{said}: none of them was recognised in the map {options.map_file}"
-    if outcome.sequence.camera.sensor == "stereo" and not is_live(outcome.sequence):
+    if outcome.sequence.camera.sensor == "stereo" and not outcome.sequence.live:
         middle = _median_disparity_behind_infinity(outcome.sequence)
         if middle is not None:
             how = how_to_swap(outcome.settings.dataset, options)
@@ -39,17 +38,17 @@ def why_nothing_was_tracked(outcome: RunOutcome, options: RunOptions) -> str | N
                 f"were swapped; {how}"
             )
     if outcome.settings.perturb != "none":
-        return f"{said} under --perturb {outcome.settings.perturb}; use a weaker perturbation"
+        return f"{said} under --perturb {outcome.settings.perturb}; a weaker one may work"
     if outcome.sequence.camera.monocular:
         return f"{said}: one camera must move sideways to begin a map; vslam doctor checks the rest"
     return f"{said}: vslam doctor says what is wrong with images, calibration or times"
 
 
-def _median_disparity_behind_infinity(source: Sequence | Stream) -> float | None:
+def _median_disparity_behind_infinity(source: Source) -> float | None:
     """Median disparity of a few frames in pixels if the sides seem to be swapped, else None."""
     found = []
     try:
-        for frame in islice(timed_frames(source), _FRAMES):
+        for frame in islice(source.frames(), _FRAMES):
             left, right = frame.read(map)
             found.append(match_images(left, np.asarray(right, np.uint8)))
     except InputError:  # a damaged image; those before it will do

@@ -70,7 +70,8 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
             "places": [[sorted(one.keyframes), one.length, one.age] for one in consistency.places],
             "verified": [[turn, loop_entry(edge)] for turn, edge in consistency.verified],
             "turn": consistency.turn,
-            **asdict(closing.verifier),
+            "resting_until": closing.verifier.resting_until,
+            "in_vain": closing.verifier.failed_alike,
             "followed": closing.followed,
         },
     }

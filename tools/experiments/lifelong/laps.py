@@ -23,7 +23,6 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,9 +30,8 @@ from numpy.typing import NDArray
 
 from vslam.config import Config, load_config
 from vslam.datasets import open_sequence
+from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import parse_perturbation, perturbed
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import TimedFrame
 from vslam.errors import InputError
 from vslam.evaluation.loops import LoopLimits
 from vslam.evaluation.trajectories import evaluate_trajectory
@@ -146,7 +144,7 @@ def plan_laps(seam: tuple[int, int], laps: int, lights: int, seed: int | None = 
 class PreparedRoute:
     """Features of the frames of a route in each light, extracted when they are first wanted."""
 
-    def __init__(self, route: Sequence, context: TrackingContext, threads: int, seed: int) -> None:
+    def __init__(self, route: Source, context: TrackingContext, threads: int, seed: int) -> None:
         self._route, self._context, self._threads, self._seed = route, context, threads, seed
         self._lights: dict[int, list[Extracted]] = {}
 
@@ -160,11 +158,7 @@ class PreparedRoute:
 
     def _prepare(self, light: int) -> Iterator[Extracted]:
         spec = LIGHT if light else "none"
-        frames = (
-            TimedFrame(float(time), partial(self._route.read, index))
-            for index, time in enumerate(self._route.timestamps)
-        )
-        changed = perturbed(frames, parse_perturbation(spec, self._seed + light))
+        changed = perturbed(self._route.frames(), parse_perturbation(spec, self._seed + light))
         for _, prepared in prepared_frames(changed, self._context, self._threads):
             assert prepared.extracted is not None, prepared.problem
             yield prepared.extracted

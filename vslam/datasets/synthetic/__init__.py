@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from vslam.datasets.kitti import KittiSequence, open_kitti
+from vslam.datasets.frames import Source
+from vslam.datasets.kitti import open_kitti
 from vslam.datasets.synthetic.routes import (
     DRIVES,
     ROUTES,
@@ -20,7 +21,6 @@ __all__ = [
     "DRIVES",
     "ROUTES",
     "Route",
-    "SyntheticSequence",
     "Variation",
     "built_in_route",
     "cache_folder",
@@ -29,14 +29,6 @@ __all__ = [
     "render_sequence",
     "route_of_poses",
 ]
-
-
-class SyntheticSequence(KittiSequence):
-    """A rendered sequence, which is read like KITTI."""
-
-    @property
-    def dataset(self) -> str:
-        return "synthetic"
 
 
 def parse_drive(name: str) -> tuple[str, Variation]:
@@ -81,7 +73,7 @@ def open_synthetic(
     monocular: bool = False,
     threads: int = 2,
     on_frame: OnFrame | None = None,
-) -> SyntheticSequence:
+) -> Source:
     """Open a built-in route; frames that are not in the cache are rendered first.
 
     Args:
@@ -107,4 +99,4 @@ def open_synthetic(
     found = open_kitti(
         root, route_name, start=start, every=every, max_frames=max_frames, monocular=monocular
     )
-    return SyntheticSequence(**vars(replace(found, name=name)))
+    return replace(found, dataset="synthetic", name=name)

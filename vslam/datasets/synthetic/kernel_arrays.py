@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.synthetic.scene import Atlas, Surfaces
+from vslam.datasets.synthetic.scene import Surfaces
 
 
 class SurfaceArrays(NamedTuple):
@@ -32,23 +32,6 @@ class SurfaceArrays(NamedTuple):
     @classmethod
     def of(cls, surfaces: Surfaces) -> SurfaceArrays:
         return cls(*(getattr(surfaces, name) for name in cls._fields))
-
-
-class AtlasArrays(NamedTuple):
-    """T textures with L levels in the form for kernels; `scene.Atlas` documents the fields.
-
-    ``texels``, ``alpha`` (N,) u1; ``offset``, ``alpha_offset`` (T, L) i8; ``log_size`` (T, 2) i8.
-    """
-
-    texels: NDArray[np.uint8]
-    alpha: NDArray[np.uint8]
-    offset: NDArray[np.int64]
-    alpha_offset: NDArray[np.int64]
-    log_size: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, atlas: Atlas) -> AtlasArrays:
-        return cls(*(getattr(atlas, name) for name in cls._fields))
 
 
 class LightValues(NamedTuple):

@@ -24,7 +24,7 @@ from vslam.datasets.synthetic.site import AFTER, BEFORE, Variation
 from vslam.datasets.synthetic.town import Town
 
 _NEAR, _LEFT = 60.0, 75.0  # m: a place is passed within the first, and left beyond the second
-_AGAIN, _STRETCH = 60, 15  # frames: least time before a place is revisited; least length of that
+_AGAIN, _STRETCH = 60, 15  # frames: least time until a revisit; least length of a revisit
 _CASTS = 8  # number of shadow maps that are kept
 _CLOUD = 12.0  # frames for which a cloud hides the sun while it moves between two passes
 _CAR_REACH = np.array([1.1, 2.7])  # half width and length of the largest car, m

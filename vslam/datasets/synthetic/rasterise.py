@@ -51,7 +51,7 @@ def find_visible(surfaces, atlas, camera, light):
     """Project the surfaces that a camera may see, nearest first.
 
     Args:
-        surfaces, atlas, camera, light: `SurfaceArrays`, `AtlasArrays`, `PosedCamera`,
+        surfaces, atlas, camera, light: `SurfaceArrays`, `scene.Atlas`, `PosedCamera`,
             `LightValues`.
 
     Returns:
@@ -207,7 +207,7 @@ def rasterise(visible, atlas, band):
 
     Args:
         visible: from `find_visible`.
-        atlas: `AtlasArrays`.
+        atlas: `scene.Atlas`.
         band: `SampleBand`; ``inverse_depth`` and ``seen`` are updated.
     """
     visible, alpha = borrowed(visible), borrowed(atlas.alpha)

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.datasets.synthetic.kernel_arrays import (
-    AtlasArrays,
     LightValues,
     PosedCamera,
     SampleBand,
@@ -81,7 +80,7 @@ class Renderer:
     def __init__(self, camera: Camera, atlas: Atlas, sky: int, threads: int = 1) -> None:
         """``sky`` is the number of the panorama texture; see `textures.sky`."""
         self._camera = camera
-        self._atlas = AtlasArrays.of(atlas)
+        self._atlas = atlas
         self._sky = sky
         self._pool = ThreadPoolExecutor(threads)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -112,8 +113,7 @@ def _rows(values: Float, n: int) -> Float:
     return rows
 
 
-@dataclass(frozen=True)
-class Atlas:
+class Atlas(NamedTuple):
     """T textures with their mipmaps in flat arrays for kernels.
 
     Attributes:

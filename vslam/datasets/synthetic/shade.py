@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.synthetic.kernel_arrays import AtlasArrays, PosedCamera
+from vslam.datasets.synthetic.kernel_arrays import PosedCamera
 from vslam.datasets.synthetic.rasterise import (
     AMBIENT,
     DETAIL,
@@ -19,6 +19,7 @@ from vslam.datasets.synthetic.rasterise import (
     SUN,
     TEXTURE,
 )
+from vslam.datasets.synthetic.scene import Atlas
 from vslam.datasets.synthetic.shadows import LampPools, ShadowMap
 from vslam.kernels import borrowed, inline, kernel
 
@@ -184,7 +185,7 @@ def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
     Args:
         visible: from `rasterise.find_visible`.
         band: `kernel_arrays.SampleBand`, from `rasterise.rasterise`.
-        atlas, light, camera: `kernel_arrays.AtlasArrays`, `LightValues`, `PosedCamera`.
+        atlas, light, camera: `scene.Atlas`, `LightValues`, `PosedCamera`.
         sky: number of the sky's panorama in the atlas.
         shadows, pools: `shadows.ShadowMap`, `shadows.LampPools`.
         view: `render.RenderedView`, output.
@@ -192,7 +193,7 @@ def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
     visible, seen = borrowed(visible), borrowed(band.seen)
     first_row, samples = band.first_row, band.samples
     image, depth = view.image, view.depth
-    atlas = AtlasArrays(
+    atlas = Atlas(
         borrowed(atlas.texels), borrowed(atlas.alpha), borrowed(atlas.offset),
         borrowed(atlas.alpha_offset), borrowed(atlas.log_size))  # fmt: skip
     shadows = ShadowMap(borrowed(shadows.height_cm), borrowed(shadows.frame))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.synthetic.kernel_arrays import AtlasArrays, SurfaceArrays
+from vslam.datasets.synthetic.kernel_arrays import SurfaceArrays
 from vslam.datasets.synthetic.scene import Atlas, Surfaces
 from vslam.kernels import kernel
 
@@ -87,7 +87,7 @@ def cast_shadows(surfaces: Surfaces, atlas: Atlas, sun: NDArray[np.float64]) -> 
     columns, rows = np.ceil((high - low) / cell).astype(int) + 1
     frame = np.array([low[0], low[1], cell, float(up.min()) - 1.0])
     shadows = ShadowMap(np.zeros((rows, columns), np.uint16), frame)
-    _cast(SurfaceArrays.of(casts), AtlasArrays.of(atlas), slope, shadows)
+    _cast(SurfaceArrays.of(casts), atlas, slope, shadows)
     return shadows
 
 
@@ -96,7 +96,7 @@ def _cast(surfaces, atlas, slope, shadows):
     """Raise the heights of a shadow map to those of the occluders.
 
     Args:
-        surfaces, atlas: `SurfaceArrays` of the occluders, `AtlasArrays`.
+        surfaces, atlas: `SurfaceArrays` of the occluders, `scene.Atlas`.
         slope: ``(2,)`` float64 metres along x and z that a sun ray travels per metre of height.
         shadows: `ShadowMap`, updated.
     """

@@ -165,7 +165,7 @@ def render_sequence(
             (folder / name).mkdir(parents=True, exist_ok=True)
         write(folder / _RECORD, json.dumps(wanted).encode())
         write(folder / "times.txt", "".join(f"{t:.6e}\n" for t in route.timestamps).encode())
-        write(folder / "calib.txt", _calibration(route.camera).encode())
+        write(folder / "calib.txt", calibration_text(route.camera).encode())
         (root / "poses").mkdir(exist_ok=True)
         write_kitti(root / "poses" / f"{route.name}.txt", route.ground_truth)
         for k in missing:
@@ -187,7 +187,7 @@ def _matching_record(folder: Path, wanted: dict[str, Any], camera: Camera) -> di
     if found is None or any(found.get(key) != value for key, value in wanted.items()):
         return None
     try:
-        same = (folder / "calib.txt").read_text() == _calibration(camera)
+        same = (folder / "calib.txt").read_text() == calibration_text(camera)
     except FileNotFoundError:
         same = True
     return found if same else None
@@ -271,7 +271,8 @@ def _read_record(folder: Path) -> dict[str, Any] | None:
         return None
 
 
-def _calibration(camera: Camera) -> str:
+def calibration_text(camera: Camera) -> str:
+    """``calib.txt`` of KITTI, for cameras that are grey."""
     lines = []
     for side in range(4):
         shift = -camera.bf if side % 2 else 0.0

@@ -115,7 +115,7 @@ def _park(site: Site, xz: Float, out: Float, style: RoadStyle) -> None:
         key = site.next_thing % ALIASES if site.variation.aliased else site.next_thing
         car = make_car(np.random.default_rng([site.variation.seed, 10, key]), site.atlas,
                        site.next_thing)  # fmt: skip
-        site.stand(car.surfaces, near, heading, when)
+        site.stand(car, near, heading, when)
 
 
 def _screen(site: Site, xz: Float, out: Float, style: RoadStyle) -> None:

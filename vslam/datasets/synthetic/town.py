@@ -77,7 +77,7 @@ def build_town(route: Route, variation: Variation, aside: tuple[float, ...] = (0
         streetside.furnish(site)
         streetside.lay_kerbs(site)
     rng = np.random.default_rng([variation.seed, 9])
-    moving = tuple(make_car(rng, atlas, 0).surfaces for _ in range(variation.moving))
+    moving = tuple(make_car(rng, atlas, 0) for _ in range(variation.moving))
     return Town(
         join([ground, *site.parts]),
         atlas.build(),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -37,17 +35,9 @@ _TAPER_AT, _TAPER = (0.0, 0.12, 0.9, 1.0), (0.84, 1.0, 1.0, 0.9)  # width along 
 Float = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Car:
-    """A car at the origin with +z forward and wheels on y = 0; ``half`` has half its length and
-    half its width in metres."""
-
-    surfaces: Surfaces
-    half: tuple[float, float]
-
-
-def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Car:
-    """A car with random shape, colour and number plate."""
+def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Surfaces:
+    """A car with random shape, colour and number plate, at the origin with +z forward and wheels on
+    y = 0."""
     kind = str(rng.choice(list(_OUTLINES), p=[0.4, 0.24, 0.24, 0.12]))
     length, width, height = (float(x * rng.uniform(0.94, 1.06)) for x in _SIZES[kind])
     outline = np.array([(x, y) for x, y, _ in _OUTLINES[kind]])
@@ -96,7 +86,7 @@ def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Car:
         gain=0.2,
         thing=thing,
     )
-    return Car(join([*parts, shade]), (length / 2, width / 2))
+    return join([*parts, shade])
 
 
 def _trapezium(

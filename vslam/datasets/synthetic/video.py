@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from vslam.camera import Camera
-from vslam.datasets.sequence import Sequence
+from vslam.datasets.frames import Source
 from vslam.errors import InputError
 
 
-def write_side_by_side(sequence: Sequence, path: Path) -> Path:
+def write_side_by_side(sequence: Source, path: Path) -> Path:
     """Write the images losslessly (codec FFV1), and vslam's calibration file beside them.
 
     Args:

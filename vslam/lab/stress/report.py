@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import law_kind, sheet_of_laws
-from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError
 from vslam.lab.stress.figures import draw_curves
 from vslam.lab.stress.schema import BoundaryEntry, StressJson
@@ -29,7 +29,7 @@ _NOT_MONOTONE = (
 )
 
 
-def write_report(out: Path, report: StressJson, sequences: Mapping[str, Sequence]) -> None:
+def write_report(out: Path, report: StressJson, sequences: Mapping[str, Source]) -> None:
     """Write all files of the report.
 
     Args:
@@ -217,7 +217,7 @@ def _runs(report: StressJson) -> Table:
     return Table(head, rows, (*head[:3], "verdict"))
 
 
-def _sheet(report: StressJson, sequences: Mapping[str, Sequence]) -> list[Figure]:
+def _sheet(report: StressJson, sequences: Mapping[str, Source]) -> list[Figure]:
     """A frame in the middle of the first sequence under each law, at the weakest strength at which
     the first system failed, or at the strongest of all."""
     specs: dict[str, str] = {}

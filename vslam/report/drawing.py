@@ -1,7 +1,7 @@
-"""How a figure of the report looks: colours, style, and its two files.
+"""The look of all figures of reports: colours, style, and their two files.
 
 Every figure is drawn once in light colours and saved twice: as PNG, and as SVG whose neutral
-colours are CSS variables, so that the HTML report follows the reader's light or dark theme.
+colours are CSS variables, so that the HTML page follows the reader's light or dark theme.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def plain_ticks(axis: Axis) -> None:
 
 
 def draw(drawings: Iterable[Drawing]) -> list[page.Figure]:
-    """Save drawings, which are made in the style of reports as they are asked for."""
+    """Save drawings; where an iterator makes them, it does so in the style of reports."""
     # after_reset shuts out a matplotlibrc of the user: equal runs give equal figures.
     with style.context(STYLE, after_reset=True):
         return [save(*drawing) for drawing in drawings]

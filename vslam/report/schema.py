@@ -24,11 +24,11 @@ class LoopEntry(Record):
     """One loop candidate, accepted or not, in frames of this run.
 
     ``query_frame`` is None for a frame that was not in the map, ``match_frame`` for one of an
-    earlier drive. ``right`` says whether the relative pose found is the ground truth's, None where
-    that cannot be said. ``moved_m`` is the farthest way that the correction moved a keyframe,
-    ``correction_s`` its time; None if rejected. ``matched_by`` names the descriptors that the
-    relative pose comes from, ``orb`` or ``learned``, ``proposed_by`` the detector that found the
-    candidate, or several joined by ``+``.
+    earlier drive. ``right`` says whether the relative pose agrees with the ground truth, None where
+    that is unknown. ``moved_m`` is the largest distance that the correction moved a keyframe,
+    ``correction_s`` the time it took; None if rejected. ``matched_by`` names the descriptors that
+    the relative pose comes from, ``orb`` or ``learned``, ``proposed_by`` the detector that found
+    the candidate, or several joined by ``+``.
     """
 
     query_frame: int | None
@@ -46,7 +46,7 @@ class LoopEntry(Record):
 
 
 class RevisitEntry(Record):
-    """A stretch of frames that leads along an earlier one, by the ground truth.
+    """Frames where the camera drives along an earlier stretch, according to the ground truth.
 
     ``loop_frame`` is the first frame with a right loop that was closed on it, None if missed.
     """

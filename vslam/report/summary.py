@@ -87,7 +87,7 @@ def summarize(
 
 
 def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
-    """Errors of a run's final trajectory, or None, and why they are not of all frames."""
+    """Errors of a run's final trajectory, or None, and why some frames are not evaluated."""
     ground_truth = matched_ground_truth(outcome)
     if ground_truth is None:
         return None, "no ground truth"
@@ -102,7 +102,7 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
 
 
 def causal_ate(outcome: RunOutcome) -> float | None:
-    """ATE of the poses as they were given at the time, None where it cannot be said."""
+    """ATE of the poses as they were given at the time, None where it cannot be computed."""
     ground_truth = matched_ground_truth(outcome)
     if ground_truth is None or not outcome.tracks:
         return None
@@ -196,7 +196,7 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
 
 
 def _frame(frames: NDArray[np.int64], keyframe: int) -> int | None:
-    """The frame of this run that a keyframe was; None for none, and for those of earlier drives."""
+    """The frame of this run that became a keyframe; None for none and for earlier drives."""
     return int(frames[keyframe]) if keyframe >= 0 and frames[keyframe] >= 0 else None
 
 

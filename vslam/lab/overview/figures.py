@@ -29,6 +29,7 @@ from vslam.report.drawing import (
     Drawing,
     add_legend,
     draw,
+    finish_map,
     new_figure,
     plain_ticks,
 )
@@ -153,9 +154,7 @@ def _paths(report: OverviewJson, found: Found, looks: Looks) -> Iterator[Drawing
         rows = [row for row in report.rows if row.drive == drive]
         if not _draw_paths(axes, rows, found, looks):
             continue
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.margins(0.06)
-        add_legend(figure, axes)
+        finish_map(figure, axes)
         yield (
             f"path-{drive.dataset}-{drive.place}-{drive.perturb}",
             "Seen from above, aligned to the ground truth; each system by its run of median ATE.",

@@ -482,7 +482,7 @@ def test_interrupted_run_keeps_its_results(call, root, pipeline):
     ("words", "why"),
     [
         ("", "vslam doctor says what is wrong"),
-        ("--perturb night:9", "under --perturb night:9; use a weaker"),
+        ("--perturb night:9", "under --perturb night:9; a weaker one"),
         ("--sensor mono", "one camera must move sideways"),
     ],
 )

@@ -102,6 +102,7 @@ def ate(outcome: RunOutcome) -> float:
     return evaluate_trajectory(outcome.trajectory, truth).ate_rmse_m
 
 
+@pytest.mark.slow
 def test_saving_changes_no_byte(kitti_tree, tmp_path, undisturbed):
     saved = drive(kitti_tree, tmp_path)
     assert saved.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()

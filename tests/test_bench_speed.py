@@ -34,6 +34,7 @@ def test_a_case_is_a_title_and_a_place(speed, kitti_tree):
             speed.parse_case(wrong)
 
 
+@pytest.mark.slow
 def test_reading_is_measured(speed, kitti_tree):
     case = speed.Case("", kitti_tree, "00", 5)
     for system in (speed.FULL, speed.ORBSLAM3):

@@ -88,6 +88,7 @@ RIGS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", RIGS)
 def test_rectified_rows_correspond_and_disparity_is_depth(rig):
     """Points in both images come from one row, at the disparity of the rectified camera."""
@@ -182,6 +183,7 @@ def test_a_distortion_that_folds_the_image():
         rectify(Calibration(replace(PINHOLE, distortion=(-2.0, 0.0, 0.0, 0.0))))
 
 
+@pytest.mark.slow
 def test_a_wide_lens_may_fold_its_corners():
     """As fits of action cameras do, whose targets never reach the corners."""
     wide = CameraModel(582.0, 582.0, 640, 360, 1280, 720, "pinhole", (-0.24, 0.05, 0, 0, -0.004))

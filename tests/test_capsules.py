@@ -161,6 +161,7 @@ def test_similarity_falls_with_distance():
     assert network.similarity(e[:1], near) > network.similarity(e[:1], e[1:2])
 
 
+@pytest.mark.slow
 def test_the_default_network_is_within_the_budget():
     network = build_network("capsule")
     assert network.n_parameters() <= 3_000_000

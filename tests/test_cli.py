@@ -345,7 +345,7 @@ def test_run_writes_its_folder_and_a_summary(call, root, pipeline):
         "run", "--data", root, "--max-frames", 10, "--perturb", "blur:0.5", "--threads", 3
     )
     assert code == 0, err
-    assert "10 done, 1 lost, 0 unreadable" in out
+    assert re.search("Lost frames +1 +10.0 % of 10; 0 weak, 0 skipped", out)
     assert "5.0 fps" in out
     assert "report.html" in out
     assert "10/10" in err
@@ -371,18 +371,25 @@ def with_detector(pipeline) -> SimpleNamespace:
 def test_summary_counts_loops(call, root, with_detector):
     code, out, err = call("run", "--data", root, "--max-frames", 10, "--detector", "bow")
     assert code == 0, err
-    assert "loops          1 closed, 0 missed, 0 wrong, 2 candidates rejected\n" in out
-    assert "99 landmarks in 2 sub-maps" in out
-    assert "detector       bow: the bag of words\n" in out
+    assert re.search("Loops +1 closed .* 0 missed, 0 wrong, 2 candidates rejected\n", out)
+    assert re.search("Map +99 +landmarks, .* 2 sub-maps", out)
+    assert "detector bow (the bag of words)" in out
     assert "detectors together" not in out
     (root / "poses" / "00.txt").unlink()
     _, out, _ = call("run", "--data", root, "--max-frames", 10, "--detector", "bow")
-    assert "1 closed, 2 candidates rejected" in out
+    assert re.search("Loops +1 closed +2 candidates rejected", out)
 
 
 def test_summary_without_a_detector(call, root, pipeline):
     _, out, _ = call("run", "--data", root, "--max-frames", 10, "--detector", "none")
-    assert "not looked for, 0 missed" in out
+    assert re.search("Loops +off +no detector; no revisit", out)
+
+
+def detectors_in(out: str) -> list[list[str]]:
+    """Cells of the table of detectors that a run prints, its head first."""
+    table = out.split("Detectors\n\n")[1].split("\n\n")[0]
+    head, _, *rows = [re.split(r"  +", line.strip()) for line in table.splitlines()]
+    return [head, *rows]
 
 
 def test_compare_prints_a_row_for_each_detector(call, root, with_detector):
@@ -390,8 +397,8 @@ def test_compare_prints_a_row_for_each_detector(call, root, with_detector):
     code, out, err = call(*words, "--compare", "both, none,none")
     assert code == 0, err
     assert with_detector.settings.compare == ("both", "none")
-    assert "5.0 fps, all 3 detectors together" in out
-    head, *rows = [re.split(r"  +", line.strip()) for line in out.splitlines()[-4:]]
+    assert re.search("5.0 fps .* all 3 detectors together", out)
+    head, *rows = detectors_in(out)
     assert head == [
         "detector", "lost", "ATE", "causal ATE", "RPE", "loops found", "missed", "wrong", "time",
     ]  # fmt: skip
@@ -409,13 +416,13 @@ def test_compare_prints_a_row_for_each_detector(call, root, with_detector):
 def test_compare_without_ground_truth_counts_the_loops_closed(call, root, with_detector):
     (root / "poses" / "00.txt").unlink()
     words = ("run", "--data", root, "--max-frames", 10, "--detector", "bow", "--compare", "none")
-    head, *rows = [re.split(r"  +", line.strip()) for line in call(*words)[1].splitlines()[-3:]]
+    head, *rows = detectors_in(call(*words)[1])
     assert head == ["detector", "lost", "loops closed", "time"]
     assert rows == [["bow", "1", "1", "1.5 s"], ["none", "1", "0", "1.5 s"]]
     with_detector.interrupted = "Ctrl-C"
     code, out, _ = call(*words)
     assert code == 1
-    assert out.splitlines()[-1].endswith("1.5 s  Ctrl-C")
+    assert detectors_in(out)[-1][-2:] == ["1.5 s", "Ctrl-C"]
 
 
 @pytest.mark.parametrize(
@@ -435,7 +442,7 @@ def test_the_last_line_says_how_to_compare(call, root, pipeline, detector, other
 def test_a_monocular_run_says_that_its_scale_is_arbitrary(call, root, pipeline):
     code, out, err = call("run", "--data", root, "--sensor", "mono")
     assert code == 0, err
-    assert "scale" in out
+    assert "Scale" in out
     assert "arbitrary" in out
     assert pipeline.settings.sensor == "mono"
     assert pipeline.evaluation.alignment == "sim3"

@@ -116,6 +116,7 @@ def test_a_drive_that_ends_before_the_next_keyframe_asks_an_earlier_one():
     assert len(slam.loops) == before
 
 
+@pytest.mark.slow
 def test_a_loop_that_no_earlier_keyframe_far_enough_away_confirms_stays_open():
     config = Config(consistency=ConsistencyConfig(min_moved=20.0))
     slam, _ = run(ZOOMING, ENDS_EARLY, Oracle(ZOOMING, ENDS_EARLY), config=config)
@@ -211,6 +212,7 @@ def test_a_camera_carried_back_is_lost_without_a_detector():
     assert slam.map.restarts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_parts_of_the_map_are_joined_by_a_loop(check_map, threads):
     frames = [*ROUND[:80], *ROUND[140:]]  # 60 frames, 90 m, cut out
@@ -276,6 +278,7 @@ def open_loop(gap):
 STIFF = Config(pose_graph=PoseGraphConfig(weak_translation=10.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gap", "unpredicted", "config", "expected"),
     [
@@ -428,6 +431,7 @@ class Confused(Oracle):
         return sorted(found, key=lambda one: -one.score)
 
 
+@pytest.mark.slow
 def test_a_sound_map_is_not_doubted_whatever_many_keyframes_resemble():
     frames = ROUND[: LAP // 2 + 60]
     slam, _ = run(twofold(), frames, Confused(twofold(), frames))

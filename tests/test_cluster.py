@@ -105,6 +105,7 @@ def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
         next(running)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("address", "said"),
     [("foo://bar", "nothing answers there"), ("tls://127.0.0.1:9", "Dask has no certificates")],

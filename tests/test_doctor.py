@@ -173,6 +173,7 @@ def test_a_camera_that_stands_still_says_nothing_of_synchronisation(clean):
     assert "fault" not in found.values()
 
 
+@pytest.mark.slow
 def test_sides_of_different_places(clean):
     noise = np.random.default_rng(0).integers(0, 256, clean.left[0].shape).astype(np.uint8)
     assert faults(right(clean, lambda i: noise)) == ["stereo"]

@@ -116,6 +116,7 @@ def test_alignment_of_position_noise():
     assert result.errors_m.shape == (2001,)
 
 
+@pytest.mark.slow
 def test_scale_error_is_drift_in_se3_and_none_in_sim3():
     truth = straight(2001, 0.5)
     drift = kitti_drift(scaled(truth, 1.01).T_wc, truth.T_wc)

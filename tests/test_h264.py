@@ -65,6 +65,7 @@ def test_a_video_as_encoders_write_it(corridor, beside, options, tmp_path):
     assert all(track.state == "OK" for track in outcome.tracks)
 
 
+@pytest.mark.slow
 def test_a_rate_that_varies(beside, options, tmp_path):
     steps = np.resize([0.033, 0.041, 0.1, 0.02], FRAMES - 1)
     times = np.concatenate([[0.0], np.cumsum(steps)])
@@ -73,6 +74,7 @@ def test_a_rate_that_varies(beside, options, tmp_path):
     np.testing.assert_allclose(found, times, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_file_cut_off_has_no_index(beside, options, tmp_path):
     data = write_h264(tmp_path / "a.mp4", beside, np.arange(FRAMES) / 10).read_bytes()
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) * 3 // 5])

@@ -117,6 +117,7 @@ def test_a_camera_that_is_never_found_has_poses_all_the_same(file):
     assert not slam.in_map().any()
 
 
+@pytest.mark.slow
 def test_going_on_extends_the_map_and_closes_the_ring(file, ring, check_map):
     slam = Slam.load(file, threads=1)
     n = slam.map.n_keyframes
@@ -274,8 +275,9 @@ def test_localise_by_the_command_line(kitti_tree, mapped, tmp_path):
     words = ("run", "--data", kitti_tree, "--no-record", "--out", tmp_path, "--start", 4)
     result = vslam(*words, "--map", mapped, "--localize")
     assert result.exit_code == 0, result.output
-    assert re.search(r"in the map +100\.0 % of the frames, 0\.0\d+ m off", result.output)
-    assert "first after 0.00 s; 1 of the 1 times" in result.output
+    assert re.search(r"In the map +100\.0 % +of the frames", result.output)
+    assert re.search(r"Error in the map +0\.0\d+ m", result.output)
+    assert "first fix after 0.00 s, found at 1 of 1 attempts" in result.output
     report = report_of(tmp_path)
     assert report["localize"]
     assert report["detector"] == "both"

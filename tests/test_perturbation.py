@@ -140,6 +140,7 @@ def test_time_of_day_does_not_matter():
     assert not np.array_equal(early[1], TEXTURE)
 
 
+@pytest.mark.slow
 def test_a_walk_is_drawn_as_far_as_needed_and_its_beginning_stays():
     far, near = (parse_perturbation("brightness,gamma", 4) for _ in range(2))
     far.apply(0, 3600.0, TEXTURE, RAMP)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -201,7 +202,7 @@ def test_command_line_in_real_time(kitti_tree, tmp_path):
         cwd=tmp_path, capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "frames dropped, latency" in done.stdout
+    assert re.search("Latency +.* dropped", done.stdout)
     folder = tmp_path / "runs" / "latest"
     report = json.loads((folder / "report.json").read_text())
     assert report["realtime"] is True

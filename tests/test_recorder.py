@@ -331,6 +331,7 @@ def test_a_window_shows_the_run_and_the_recording_is_the_same(tmp_path, window, 
         assert len(rows(tmp_path / "recording.rrd", entity)) == len(rows(recording, entity))
 
 
+@pytest.mark.slow
 def test_a_window_that_is_closed_does_not_end_the_recording(tmp_path, window, recording, caplog):
     class Closing(Recorder):
         def map(self, map_: Map) -> None:

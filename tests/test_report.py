@@ -339,19 +339,6 @@ def test_html_is_self_contained(fixture: str, figures: int, request: pytest.Fixt
         assert "20 needed | &lt;b&gt;" in html
 
 
-def test_svg_ids_do_not_clash_in_the_page(looped: tuple[RunOutcome, Path]) -> None:
-    html = (looped[1] / "report.html").read_text()
-    clips = re.findall(r"<clipPath id=\"(\w+)\"", html)
-    assert clips
-    assert len(clips) == len(set(clips))
-
-
-def test_markdown_tables_are_aligned(looped: tuple[RunOutcome, Path]) -> None:
-    tables = (looped[1] / "report.md").read_text().split("\n\n")
-    for table in (block for block in tables if block.startswith("|")):
-        assert len({len(line) for line in table.splitlines()}) == 1
-
-
 @pytest.mark.slow
 def test_figures_are_reproducible(written: tuple[RunOutcome, Path], tmp_path: Path) -> None:
     outcome, folder = written
@@ -642,6 +629,7 @@ def test_interrupted_before_the_first_frame(tmp_path: Path) -> None:
     assert figures_of(tmp_path) == set()
 
 
+@pytest.mark.slow
 def test_interrupted_with_skipped_frames_and_no_keyframe(tmp_path: Path) -> None:
     outcome = make_outcome(60, lost=slice(0, 0))
     done = np.setdiff1d(np.arange(50), [7, 8])
@@ -672,6 +660,7 @@ def test_many_lost_frames_send_the_reader_to_the_doctor(tmp_path, lost, expected
         assert ("vslam doctor checks" in (tmp_path / name).read_text()) is expected
 
 
+@pytest.mark.slow
 def test_calibration_files_are_among_the_options(tmp_path):
     outcome = make_outcome(40)
     settings = replace(outcome.settings, calib=(Path("left.yaml"), Path("right.yaml")))

@@ -294,6 +294,7 @@ def test_a_map_keeps_its_camera(outcome, tmp_path):
     assert load_map(tmp_path / "map.npz").camera == outcome.sequence.camera
 
 
+@pytest.mark.slow
 def test_the_command_names_the_sensor(tree, tmp_path, capsys):
     def call(*words: str) -> tuple[int, str]:
         with pytest.raises(SystemExit) as stopped:

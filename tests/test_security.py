@@ -180,6 +180,7 @@ def test_yaml_makes_no_objects_and_no_bombs(tmp_path: Path):
     assert read_document(path).numbers("b") == (2.0, 2.0)
 
 
+@pytest.mark.slow
 def test_what_people_write_is_escaped_in_pages(tmp_path: Path):
     evil = "<script>alert(1)</script>\"'&"
     report = report_of(make_outcome(20), tmp_path).model_copy(

@@ -179,6 +179,7 @@ def test_without_onnxruntime_a_sentence_says_what_to_install(monkeypatch):
         open_network("capsule")
 
 
+@pytest.mark.slow
 def test_a_late_network_is_loaded_by_the_first_image_and_missed_before(monkeypatch):
     script = (
         "import sys\n"
@@ -396,6 +397,7 @@ def test_shipped_weights_know_a_place_again(name):
     assert sum(path.stat().st_size for path in SHIPPED.iterdir()) < 14e6
 
 
+@pytest.mark.slow
 def test_no_run_loads_torch():
     script = (
         "import sys\nimport numpy as np\nimport vslam.cli.main, vslam.run.pipeline\n"

@@ -183,6 +183,7 @@ def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, mon
     assert bytes_of(*run(corridor, config, threads=2)) == late
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
 @pytest.mark.parametrize("dark", [(), range(9, 14)])
 def test_dropping_dead_landmarks_changes_no_byte(corridor, config, dark, monkeypatch, check_map):
@@ -209,6 +210,7 @@ def test_the_map_cannot_be_read_while_a_keyframe_is_mapped(corridor):
     assert slam.map.n_keyframes == 2
 
 
+@pytest.mark.slow
 def test_map_stays_sound_with_a_keyframe_each_frame(corridor, check_map):
     """Fusion merges landmarks that the frame in hand tracks both."""
     slam, results = run(corridor, EAGER)

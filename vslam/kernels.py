@@ -166,7 +166,7 @@ def _use_temporary_cache() -> None:
     config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = folder
     _warn(
         "There is no writable folder for compiled kernels, so each run compiles them, which takes "
-        "a minute; set NUMBA_CACHE_DIR to a writable folder."
+        "a minute. Set NUMBA_CACHE_DIR to a writable folder."
     )
 
 

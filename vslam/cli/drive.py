@@ -56,7 +56,7 @@ def drive(
     _refuse_camera(source, resume)
 
     # Bad input has been refused by now; what follows takes a second to import.
-    from vslam.cli.summary import print_summary
+    from vslam.cli.tables import print_summary
     from vslam.doctor.nothing_tracked import why_nothing_was_tracked
     from vslam.report.folder import write_results
     from vslam.run.autosave import FolderAutosave, remove_autosave

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from vslam.cli.summary import Rows
+    from vslam.cli.tables import Rows
     from vslam.map import Map
     from vslam.maps.reconstruction import Reconstruction
     from vslam.maps.stored_map import StoredMap

@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vslam.report.page import Pairs, Section
+
+if TYPE_CHECKING:
+    from vslam.report.schema import ReportJson
+
+Rows = list[tuple[str, str]]
+_LOOK_AT = (("report", "report.html"), ("recording", "recording.rrd"))
 
 
 def show_sections(sections: Iterable[Section]) -> None:
@@ -17,6 +25,28 @@ def show_sections(sections: Iterable[Section]) -> None:
     show(sections, Console(width=None if sys.stdout.isatty() else 1000))
 
 
-def print_rows(rows: Collection[tuple[str, str]]) -> None:
+def print_rows(rows: Rows) -> None:
     """Print names and values, the values one below the other."""
-    show_sections([Section("", [Pairs(tuple(rows))])])
+    show_sections([Section("", [Pairs(rows)])])
+
+
+def print_summary(report: ReportJson, folder: Path) -> None:
+    """Print the first sections of the page of a run that is over; ``folder`` holds its results."""
+    from vslam.report.run_page import run_page
+
+    page = run_page(report)
+    summary, detectors, *_ = page.sections
+    there = [(name, str(folder / file)) for name, file in _LOOK_AT if (folder / file).exists()]
+    rows = [("folder", str(folder)), *there, *_how_to_compare(report)]
+    about = Section("", [" · ".join(page.about)])
+    show_sections([about, summary, detectors, Section("", [Pairs(rows)])])
+
+
+def _how_to_compare(report: ReportJson) -> Rows:
+    """What to type for a comparison, where the ground truth could judge one."""
+    refused = report.realtime or report.map is not None  # as of the command line
+    if report.detectors or report.compare or report.alignment is None or refused:
+        return []
+    if report.detector in ("bow", "none"):
+        return [("compare", "add --compare both to set the capsule network beside it")]
+    return [("compare", "add --compare bow to set the bag of words beside it")]

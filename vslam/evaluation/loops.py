@@ -214,7 +214,7 @@ def judge_loops(
         timestamps: ``(N,)`` seconds.
     """
     found = revisits(T_wc, timestamps, limits)
-    right = tuple(_is_right(edge, frames, T_wc, limits) for edge in edges)
+    right = tuple(is_right_loop(edge, frames, T_wc, limits) for edge in edges)
     loop_frame = np.full(len(found), -1, np.int64)
     path = path_length(T_wc)
     slack = limits.max_interruption_m
@@ -235,7 +235,11 @@ def judge_loops(
     return LoopEvaluation(found, loop_frame, right, n_wrong)
 
 
-def _is_right(edge: LoopEdge, frames: Indices, T_wc: Poses, limits: LoopLimits) -> bool | None:
+def is_right_loop(
+    edge: LoopEdge, frames: Indices, T_wc: Poses, limits: LoopLimits = _DEFAULT_LIMITS
+) -> bool | None:
+    """Whether the relative pose of one loop is the true one, as :func:`judge_loops` says; None
+    where that cannot be told."""
     if edge.T_query_match is None or edge.query < 0:
         return None
     query, match = frames[edge.query], frames[edge.match]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vslam.loopclosure.registry import about
-from vslam.report.page import Row, Section, Table
+from vslam.report.page import Row, Section, Table, number
 from vslam.report.schema import ReportJson
 
 _FIGURES = (
@@ -20,8 +20,8 @@ _FIGURES = (
 )
 _NOTE = (
     "All detectors saw the same frames. The time is that of tracking and mapping: images are read "
-    "and features extracted once for all. It is wall time on cores that all of them share, and the "
-    "first one waits longest; to compare costs, time runs of their own."
+    "and features are extracted once for all detectors. It is wall time on cores that the "
+    "detectors share, and the first one waits longest; to compare costs, time separate runs."
 )
 
 
@@ -45,7 +45,7 @@ def detector_section(report: ReportJson) -> Section:
     rows: list[Row] = [
         (
             one.detector,
-            *(_cell(getattr(one, name), form) for _, name, form in figures),
+            *(number(getattr(one, name), form) for _, name, form in figures),
             *(one.interrupted or "no" for _ in ended),
         )
         for one in detectors
@@ -55,14 +55,10 @@ def detector_section(report: ReportJson) -> Section:
 
 
 def left_out(report: ReportJson) -> str:
-    """Why there is no comparison though one was asked for; empty otherwise."""
+    """Why there is no comparison although one was requested; empty otherwise."""
     if report.detectors or not report.compare:
         return ""
     return (
-        f"The comparison with {', '.join(report.compare)} was left out, since the run was resumed: "
+        f"The comparison with {', '.join(report.compare)} was left out: the run was resumed, and "
         "only the map of its own detector had been saved."
     )
-
-
-def _cell(value: float | None, form: str) -> str:
-    return "n/a" if value is None else form.format(value)

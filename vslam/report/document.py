@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Self
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from vslam.errors import InputError
 
@@ -30,21 +30,17 @@ class Document(Record):
         Raises:
             InputError: the file is missing, damaged or of another version.
         """
+        known = cls.model_fields["schema_version"].default
         try:
             content = json.loads(path.read_bytes())
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(f"{path}: missing or damaged; name the folder of a run.") from error
-        known = cls.model_fields["schema_version"].default
-        found = content.get("schema_version") if isinstance(content, dict) else None
-        cause: ValidationError | None = None
-        if found == known:
-            try:
+            found = content["schema_version"]
+            if found == known:
                 return cls.model_validate(content)
-            except ValidationError as error:
-                cause = error
+        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+            raise InputError(f"{path}: missing or damaged; name the folder of a run.") from error
         raise InputError(
-            f"{path}: report schema {found}, this version reads {known}; run again with it."
-        ) from cause
+            f"{path}: report schema {found}, this version reads {known}; repeat the run with it."
+        )
 
     def to_json(self) -> str:
         """The text of the file."""

@@ -1,7 +1,7 @@
-"""How a figure of the report looks: colours, style, and its two files.
+"""The look of all figures of reports: colours, style, and their two files.
 
 Every figure is drawn once in light colours and saved twice: as PNG, and as SVG whose neutral
-colours are CSS variables, so that the HTML report follows the reader's light or dark theme.
+colours are CSS variables, so that the HTML page follows the reader's light or dark theme.
 """
 
 from __future__ import annotations
@@ -84,6 +84,13 @@ def add_legend(figure: Figure, axes: Axes) -> None:
     figure.legend(loc="outside lower center", ncols=columns, columnspacing=1.2)
 
 
+def finish_map(figure: Figure, axes: Axes) -> None:
+    """Show both axes at equal scale, with a margin and a legend."""
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+    add_legend(figure, axes)
+
+
 def plain_ticks(axis: Axis) -> None:
     """Label a logarithmic axis with plain numbers: 1, 2, 5, 10, ..."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
@@ -92,7 +99,7 @@ def plain_ticks(axis: Axis) -> None:
 
 
 def draw(drawings: Iterable[Drawing]) -> list[page.Figure]:
-    """Save drawings, which are made in the style of reports as they are asked for."""
+    """Save drawings; where an iterator makes them, it does so in the style of reports."""
     # after_reset shuts out a matplotlibrc of the user: equal runs give equal figures.
     with style.context(STYLE, after_reset=True):
         return [save(*drawing) for drawing in drawings]

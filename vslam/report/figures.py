@@ -70,37 +70,37 @@ def _drawings(
         if evaluation is not None and evaluation.alignment != "none":
             caption += f" Estimate after {evaluation.alignment.upper()} alignment."
         if outcome.compared:
-            caption += " Dashed: the detectors compared, each after an alignment of its own."
+            caption += " Dashed: the detectors compared, each after its own alignment."
         yield "top_view", caption, top_view(outcome, evaluation, ground_truth, verdict)
     if outcome.corrections:
         caption = (
-            "Keyframes just before the first loop was closed and at the end. Dashed: each loop, "
-            "from where its keyframes stood before its own correction: what they lie apart is the "
-            "drift that it took away."
+            "Keyframes just before the first loop was closed, and at the end. Dashed: each loop, "
+            "between the positions of its two keyframes before its correction; their distance is "
+            "the drift that the correction removed."
         )
         yield "loop_closing", caption, loop_closing(outcome, evaluation, ground_truth)
     if evaluation is not None:
         yield (
             "error_along_path",
-            "Distance of each position from the ground truth, along the way travelled.",
+            "Distance of each position from the ground truth, along the path travelled.",
             _error_along_path(outcome, evaluation),
         )
-        yield "error_histogram", "How many frames have which error.", _error_histogram(evaluation)
+        yield "error_histogram", "Number of frames by error.", _error_histogram(evaluation)
     if outcome.tracks:
         yield (
             "tracked_points",
-            "Landmarks that survived pose optimisation, of those matched, of the stereo features.",
+            "Stereo features, those that were matched to landmarks, and inliers of the pose.",
             _tracked_points(outcome),
         )
     if stage_names(outcome.tracks):
         yield (
             "stage_times",
-            "Wall time of each stage, stacked; averaged over a few frames on long runs.",
+            "Wall time of each stage, stacked; long runs show averages over a few frames.",
             _stage_times(outcome),
         )
         yield (
             "stage_distribution",
-            "Box: half of the frames that go through the stage; whiskers: 90 %.",
+            "Boxes hold half of the frames that go through a stage, whiskers 90 %.",
             _stage_distribution(outcome),
         )
 

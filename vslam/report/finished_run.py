@@ -116,8 +116,8 @@ def _other_images(run: FinishedRun) -> InputError:
 
 
 def pose_graph(run: FinishedRun) -> PoseGraph:
-    """The essential graph of a run's final map with its loops as they were measured, weighed as by
-    the run.
+    """The essential graph of a run's final map with its loops as they were measured, with the
+    weights of the run.
 
     Raises:
         InputError: the run's thresholds cannot be read.

@@ -76,20 +76,21 @@ def write_results(
     ply: bool = False,
     map_file: Path | None = None,
 ) -> ReportJson:
-    """Evaluate a run, in any state of completion, and write all that is known of it.
+    """Evaluate a run, in any state of completion, and write all results.
 
-    What is worth most comes first, and what fails costs itself alone: trajectories
+    The most valuable files are written first, and one that fails does not affect the others:
+    trajectories
     (``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``, ``keyframes.tum``,
-    ``trajectory_causal.tum`` with poses as they were given at the time,
+    ``trajectory_causal.tum`` with the poses as they were given at the time,
     ``trajectory_<detector>.tum`` of each detector compared), maps (``map.npz``, ``map.ply``),
-    numbers (``frames.csv``, ``config.json``, read by ``--config``, and ``report.json``), and what
-    people read (``figures/*.png``, ``report.md`` and ``report.html``, one file that makes no
+    numbers (``frames.csv``, ``config.json``, read by ``--config``, and ``report.json``), and pages
+    for people (``figures/*.png``, ``report.md`` and ``report.html``, one file that makes no
     network request).
 
     Args:
         folder: an existing folder; what is written replaces files of an earlier report.
         outcome: the run; it may be interrupted, all lost, or without a single frame.
-        pages: write what people read, too: Markdown, HTML and figures.
+        pages: whether to write the pages for people: Markdown, HTML and figures.
         ply: write the landmarks as ``map.ply``, too.
         moments: images of keyframes for the HTML page.
         pictures: of closed loops; some are written as ``figures/loop-<frame>-<frame>.jpg``.
@@ -114,7 +115,7 @@ def write_results(
 
 
 class Results:
-    """The results of a run: each is tried, and what cannot be written whole is removed."""
+    """The results of a run: each is attempted, and an incomplete file is removed."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -122,7 +123,7 @@ class Results:
 
     @contextlib.contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Something that may fail without harm to the other results, whatever it raises."""
+        """A part that may fail, whatever it raises, without affecting the other results."""
         try:
             yield
         except Exception as error:
@@ -208,8 +209,8 @@ def _config_text(outcome: RunOutcome) -> str:
 
 
 def write_trajectories(written: Results, outcome: RunOutcome) -> None:
-    """Write the final trajectory in both formats and the ground truth of the same frames; in TUM's
-    alone, which has times, where not all of them have one."""
+    """Write the final trajectory in both formats, and the ground truth of the same frames. Where it
+    is missing for some frames, it is written in the TUM format alone, which has times."""
     with written.file("trajectory_kitti.txt") as file:
         write_kitti(file, outcome.trajectory.T_wc)
     with written.file("trajectory.tum") as file:
@@ -228,7 +229,7 @@ def write_trajectories(written: Results, outcome: RunOutcome) -> None:
 
 
 def _evo_command(folder: Path, outcome: RunOutcome, evaluation: Evaluation | None) -> str | None:
-    """What repeats the evaluation with evo."""
+    """The command that repeats the evaluation with evo."""
     if evaluation is None:
         return None
     if evaluation.frames == len(outcome.trajectory):
@@ -247,7 +248,7 @@ def _write_pages(
     moments: Collection[Moment],
     pictures: Collection[LoopPicture],
 ) -> None:
-    """Figures, and the pages that show them, without those that could not be drawn."""
+    """Write the figures, and the pages with those that could be drawn."""
     from vslam.report.explorer import explorer
     from vslam.report.figures import draw_figures
     from vslam.report.render import html, markdown

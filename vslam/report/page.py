@@ -54,6 +54,11 @@ class Tiles:
 
     tiles: Sequence[Tile]
 
+    @property
+    def rows(self) -> list[tuple[str, str, str]]:
+        """Label, value and note of each."""
+        return [(tile.label, tile.value, tile.note) for tile in self.tiles]
+
 
 @dataclass(frozen=True)
 class Bullets:
@@ -137,3 +142,8 @@ class Page:
     title: str
     about: Sequence[str]
     sections: Sequence[Section]
+
+
+def number(value: float | None, form: str = "{}") -> str:
+    """A number as a cell of a table; ``n/a`` for None."""
+    return "n/a" if value is None else form.format(value)

@@ -87,11 +87,8 @@ def _markdown_part(part: Part) -> str:
         case Table(rows=[_, *_]):
             lines = markdown_table(part.head, part.rows)
             return "\n".join([*lines, *(["", part.note] if part.note else [])])
-        case Pairs():
-            return "\n".join(markdown_table(("", ""), part.rows))
-        case Tiles():
-            rows = [(tile.label, tile.value, tile.note) for tile in part.tiles]
-            return "\n".join(markdown_table(("", "", ""), rows))
+        case Pairs(rows=[first, *_]) | Tiles(rows=[first, *_]):
+            return "\n".join(markdown_table(("",) * len(first), part.rows))
         case Bullets():
             return "\n".join(f"- {sentence}" for sentence in part.sentences)
         case Alert():
@@ -147,21 +144,24 @@ def show(sections: Iterable[Section], console: Console) -> None:
         text = textwrap.fill(text, console.width, subsequent_indent=indent)
         console.out(text, style=style, highlight=False)
 
-    for section in sections:
-        parts = [part for part in section.parts if _is_shown(part)]
-        if section.title and parts:
-            console.out(f"\n{section.title}\n", style="bold", highlight=False)
+    shown = [(one.title, list(filter(_is_shown, one.parts))) for one in sections]
+    for k, (title, parts) in enumerate(one for one in shown if one[1]):
+        if k:
+            console.out()
+        if title:
+            console.out(f"{title}\n", style="bold", highlight=False)
         for part in parts:
             match part:
                 case Table():
-                    console.print(rich_table(part), crop=False)
+                    wide = rich_table(part, gap=2)
+                    fits = (wide.width or 0) <= console.width
+                    console.print(wide if fits else rich_table(part, gap=1), crop=False)
                     console.out()
                     if part.note:
                         say(part.note)
-                case Pairs():
-                    width = max(len(name) for name, _ in part.rows)
-                    for name, value in part.rows:
-                        console.out(f"{name:<{width}}  {value}", highlight=False)
+                case Pairs() | Tiles():
+                    for line in _columns(part.rows):
+                        console.out(line, highlight=False)
                 case Bullets():
                     for sentence in part.sentences:
                         say(f"- {sentence}", indent="  ")
@@ -171,8 +171,22 @@ def show(sections: Iterable[Section], console: Console) -> None:
                     say(part)
 
 
-def rich_table(table: Table) -> RichTable:
-    """A table for rich, as wide as its cells; headings are broken at their commas and brackets."""
+def _columns(rows: Sequence[Row]) -> list[str]:
+    """Lines of cells, each column as wide as its widest cell."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+
+
+def rich_table(table: Table, gap: int) -> RichTable:
+    """A table for rich, as wide as its cells; headings are broken at their commas and brackets.
+
+    Args:
+        table: the cells.
+        gap: characters between two columns.
+    """
     from rich import box
     from rich.table import Table as RichTable
     from rich.text import Text
@@ -183,8 +197,10 @@ def rich_table(table: Table) -> RichTable:
     made = RichTable(
         box=box.SIMPLE_HEAD,
         show_edge=False,
-        padding=0,
-        width=sum(widths) + len(widths) - 1,  # or rich would shrink the columns to the terminal
+        pad_edge=False,
+        padding=(0, 0, 0, gap - 1),
+        width=sum(widths)
+        + gap * (len(widths) - 1),  # or rich would shrink the columns to the terminal
     )
     for name, head in zip(table.head, heads, strict=True):
         justify: Literal["left", "right"] = "left" if name in table.texts else "right"

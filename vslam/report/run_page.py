@@ -29,18 +29,23 @@ from vslam.report.seen_loops import seen_note
 
 _ALIGNMENTS = {
     "se3": "SE3 alignment, no scale",
-    "sim3": "Sim3 alignment, since the scale is arbitrary",
+    "sim3": "Sim3 alignment",
     "none": "not aligned",
 }
 _MANY_LOST = 0.1  # share of the frames
 
 
 def headlines(report: ReportJson) -> list[Tile]:
-    """The summary. Lost frames come first: an ATE says little of a run that was lost for half."""
-    lost = report.lost_frames
+    """The summary. Lost frames come first: the ATE of a run that was lost half of the time says
+    little."""
+    lost, mono = report.lost_frames, report.sensor == "mono"
     share = f"{100.0 * lost / report.frames:.1f} % of" if lost else "of"
     alignment = _ALIGNMENTS[report.alignment] if report.alignment else ""
-    evaluated = "; ".join(filter(None, (alignment, report.evaluation_remark)))
+    spread = ""
+    if report.ate_mean_m is not None:
+        largest = _number(report.ate_max_m, "m")
+        spread = f"mean {_number(report.ate_mean_m, 'm')}, maximum {largest}"
+    evaluated = "; ".join(filter(None, (alignment, spread, report.evaluation_remark)))
     rotation = _number(report.rpe_deg, "°")
     return [
         Tile(
@@ -50,11 +55,14 @@ def headlines(report: ReportJson) -> list[Tile]:
             "bad" if lost else "good",
         ),
         *_in_map(report),
+        *([Tile("Scale", "arbitrary", "as of any single camera")] if mono else []),
         Tile("ATE RMSE", _number(report.ate_rmse_m, "m"), evaluated),
-        Tile("Causal ATE", _number(report.causal_ate_rmse_m, "m"), "poses as given at the time"),
-        Tile("RPE", _number(report.rpe_m, "m"), f"a frame; rotation {rotation}"),
+        Tile(
+            "Causal ATE", _number(report.causal_ate_rmse_m, "m"), "poses as estimated at the time"
+        ),
+        Tile("RPE", _number(report.rpe_m, "m"), f"per frame; rotation {rotation}"),
         Tile("t_rel", _number(report.t_rel_percent, "%"), "KITTI drift over 100-800 m"),
-        Tile("r_rel", _number(report.r_rel_deg_per_100m, "°"), "every 100 m"),
+        Tile("r_rel", _number(report.r_rel_deg_per_100m, "°"), "per 100 m"),
         Tile(
             "Speed",
             f"{report.fps:.1f} fps",
@@ -64,7 +72,7 @@ def headlines(report: ReportJson) -> list[Tile]:
         Tile(
             "CPU",
             f"{report.cpu_ms_per_frame:.1f} ms",
-            f"a frame, of all threads{_together(report)}; start-up {report.startup_s:.1f} s",
+            f"per frame, of all threads{_together(report)}; start-up {report.startup_s:.1f} s",
         ),
         Tile("Memory", f"{report.peak_memory_mb:.0f} MB", f"at its peak{_together(report)}"),
         Tile("Map", f"{report.landmarks:,}", _map_note(report)),
@@ -73,12 +81,12 @@ def headlines(report: ReportJson) -> list[Tile]:
 
 
 def _together(report: ReportJson) -> str:
-    """What is said of speed and memory where several detectors were run."""
+    """A remark on speed and memory where several detectors were run."""
     return f", all {len(report.detectors)} detectors together" if report.detectors else ""
 
 
 def advice(report: ReportJson) -> str:
-    """What to look at after a run that lost many frames; empty after others."""
+    """What to do after a run that lost many frames; empty after others."""
     if report.lost_frames <= _MANY_LOST * report.frames:
         return ""
     return "Many frames were lost: vslam doctor checks images, calibration and time stamps."
@@ -88,7 +96,7 @@ def _in_map(report: ReportJson) -> list[Tile]:
     if (found := report.in_map) is None:
         return []
     fix = "no fix" if found.first_fix_s is None else f"first fix after {found.first_fix_s:.2f} s"
-    times = f"found {found.found} of the {found.sought} times it was looked for"
+    times = f"found at {found.found} of {found.sought} attempts"
     error = _number(found.error_m, "m")
     weak = f", {found.weak_percent:.1f} % by few inliers" if found.weak_percent else ""
     note = f"of the frames{weak}; {fix}, {times}"
@@ -99,7 +107,7 @@ def _in_map(report: ReportJson) -> list[Tile]:
 
 
 def _latency(report: ReportJson) -> list[Tile]:
-    """In real time the machine decides what becomes of a frame: that is said with a tone."""
+    """In a real-time run, dropped frames are a fault of the machine: they colour the tile."""
     if report.latency_ms is None:
         return []
     ms, dropped = report.latency_ms, report.dropped_frames
@@ -128,8 +136,8 @@ def _loops(report: ReportJson) -> Tile:
 
 
 def _revisits(report: ReportJson) -> str:
-    """How many stretches were found again; a right loop on one that is too short to count is not
-    left without a word."""
+    """How many stretches were found again. A right loop on a stretch that is too short to count is
+    mentioned."""
     if report.revisit_stretches:
         return f"{report.loops_found} of {report.revisit_stretches} revisits found"
     none = f"no revisit of {LoopLimits().min_length_m:.0f} m or more to be found"

@@ -17,11 +17,11 @@ _DESCRIPTORS = {"orb": "ORB descriptors", "learned": "learned descriptors"}
 
 def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Figure]:
     """Draw the closed loops that a reader should see: wrong ones first, then those that learned
-    descriptors verified, else in their order.
+    descriptors verified, otherwise in their order.
 
     Args:
         report: of the run.
-        pictures: of its closed loops, as far as both images are kept.
+        pictures: of those of its closed loops of which both images are kept.
     """
     closed = {(loop.query_frame, loop.match_frame): loop for loop in report.loops if loop.accepted}
     of_loop = [(closed.get((one.query_frame, one.match_frame)), one) for one in pictures]
@@ -39,7 +39,7 @@ def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Fi
 
 
 def seen_note(report: ReportJson, seen: Collection[Figure]) -> str:
-    """What the pictures show, and of how many loops there is none."""
+    """What the pictures show, and how many of the closed loops have one."""
     note = "Lines join what both images show; at most 60 matches are drawn."
     if len(seen) < report.loops_closed:
         note += f" {len(seen)} of the {report.loops_closed} closed loops are shown."

@@ -33,13 +33,11 @@ from vslam.datasets import open_sequence
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import parse_perturbation, perturbed
 from vslam.errors import InputError
-from vslam.evaluation.loops import LoopLimits
+from vslam.evaluation.loops import is_right_loop
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frontend.tracking import TrackingContext
-from vslam.geometry import inverse, se3_log
 from vslam.loopclosure.registry import create_detector
-from vslam.loops import LoopEdge
 from vslam.machine import available_cores
 from vslam.run.preparation import prepared_frames
 from vslam.run.warmup import compile_kernels
@@ -164,17 +162,6 @@ class PreparedRoute:
             yield prepared.extracted
 
 
-def is_right(edge: LoopEdge, frames: NDArray[np.int64], T_wc: NDArray[np.float64]) -> bool:
-    """Whether a loop's relative pose is that of the ground truth ``(N, 4, 4)`` of the frames."""
-    assert edge.T_query_match is not None
-    T_match_query = inverse(T_wc[frames[edge.match]]) @ T_wc[frames[edge.query]]
-    error, limits = se3_log(edge.T_query_match @ T_match_query), LoopLimits()
-    return bool(
-        np.linalg.norm(error[:3]) <= limits.max_translation_m
-        and np.degrees(np.linalg.norm(error[3:])) <= limits.max_rotation_deg
-    )
-
-
 def resident_mb() -> float:
     """Memory of the process (Linux), images and figures included."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
@@ -211,7 +198,7 @@ class Drive:
             len(slam.map.living_keyframes()),
             len(slam.map.living_landmarks()),
             len(loops),
-            sum(not is_right(edge, frames, truth.T_wc) for edge in loops),
+            sum(not is_right_loop(edge, frames, truth.T_wc) for edge in loops),
             int(np.count_nonzero(~tracked[first:])),
             f"{error.ate_rmse_m:.4f}",
             f"{1e3 * cpu_s / len(results):.1f}",

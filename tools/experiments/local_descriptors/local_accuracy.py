@@ -19,7 +19,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from training.render_matches import moved
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "training"))
+
+from render_matches import moved
 
 from vslam.camera import Camera
 from vslam.config import Config

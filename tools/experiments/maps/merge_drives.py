@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -21,7 +22,7 @@ from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation import parse_perturbation, perturbed
-from vslam.evaluation.loops import LoopLimits
+from vslam.evaluation.loops import LoopLimits, is_right_loop
 from vslam.evaluation.trajectories import evaluate_trajectory, path_length
 from vslam.geometry import inverses
 from vslam.loopclosure.registry import detector_with_images
@@ -132,13 +133,8 @@ def true_meetings(drives) -> set[tuple[int, int]]:
 
 
 def is_right(loop: LoopEdge, map_: Map, order: list[int], truth) -> bool:
-    T_wq, T_wm = (truth[order[map_.sessions[k]]][map_.frames[k]] for k in (loop.query, loop.match))
-    error = loop.T_query_match @ inverses(T_wm[None])[0] @ T_wq
-    angle = np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1))
-    return bool(
-        np.linalg.norm(error[:3, 3]) <= LIMITS.max_translation_m
-        and np.degrees(angle) <= LIMITS.max_rotation_deg
-    )
+    ends = [truth[order[map_.sessions[k]]][map_.frames[k]] for k in (loop.query, loop.match)]
+    return is_right_loop(replace(loop, query=0, match=1), np.arange(2), np.stack(ends)) is True
 
 
 def ate(map_: Map, T_true: np.ndarray) -> float:

@@ -34,11 +34,11 @@ from vslam.datasets.synthetic import store
 from vslam.errors import InputError
 from vslam.lab.loopbench.conditions import parse_conditions
 from vslam.lab.loopbench.cost import cost
+from vslam.lab.loopbench.curves import draw_curves
 from vslam.lab.loopbench.detectors import DetectorSet
 from vslam.lab.loopbench.kept import digest, keep_conditions
 from vslam.lab.loopbench.measure import measure
 from vslam.lab.loopbench.registry import comparable_scorer
-from vslam.lab.loopbench.report import draw
 from vslam.lab.loopbench.schema import LoopsJson, Score
 from vslam.lab.loopbench.sets import open_set
 from vslam.loopclosure.siamese.inference import OnnxNetwork, open_network
@@ -54,10 +54,10 @@ from vslam.report.drawing import (
     RED,
     STYLE,
     VIOLET,
-    ReportFigure,
     new_figure,
     save,
 )
+from vslam.report.page import Figure
 from vslam.report.render import markdown_table
 from vslam.report.summary import this_machine
 
@@ -119,7 +119,7 @@ def main(words: list[str] | None = None) -> None:
     if args.section != "tables":
         folder = folder / args.section
     folder.mkdir(parents=True, exist_ok=True)
-    figures = draw(reports["images"]) if "images" in reports else []
+    figures = draw_curves(reports["images"]) if "images" in reports else []
     if (args.trained / "progress.csv").exists():
         progress = read_training(args.trained / "progress.csv")
         figures.append(draw_progress(progress))
@@ -149,7 +149,7 @@ def table_of(rows: list[dict[str, str]]) -> list[Row]:
     return [tuple(rows[0]), *(tuple(row.values()) for row in rows)]
 
 
-def draw_progress(progress: list[dict[str, str]]) -> ReportFigure:
+def draw_progress(progress: list[dict[str, str]]) -> Figure:
     """Validation AP over the images shown, of the networks that were shown the same."""
     rows = [row for row in progress if row["way"] == "images" and row["network"] not in PAIR[1:]]
     with style.context(STYLE, after_reset=True):

@@ -17,29 +17,34 @@ from vslam.report.render import html, markdown, write_files
 
 MEAN = "mean of all"
 _ABOUT_AP = (
-    "Average precision over all pairs of a query and a gallery image whose relation is known, "
-    "descriptors alone. Last column: AP of the detector minus that of the first, with the 95 % "
-    "interval of a bootstrap over the queries; * where it does not hold 0."
+    "Average precision, by the descriptors alone, over all pairs of a query and a gallery image "
+    "whose relation is known. Last columns: AP of a detector minus that of the first, with the "
+    "95 % interval of a bootstrap over the queries; * where the interval excludes 0."
 )
-_ABOUT_RECALL = "Highest recall without one wrong pair; at a recall of 70 %, the precision."
+_ABOUT_RECALL = "The highest recall without a wrong pair, and the precision at a recall of 70 %."
 _ABOUT_VERIFIED = (
-    "Of the queries that have a place to find: share whose best image shows it, and shares where "
-    f"also at least {MIN_MATCHES} ORB matches obey one epipolar geometry, where matches of learned "
-    f"local descriptors that obey one homography cover {100 * MIN_SHARE:.0f} % of the image, and "
-    "where one of both is so."
+    "Share of the queries with a place to find whose best image shows it; then the shares where "
+    f"in addition at least {MIN_MATCHES} ORB matches obey one epipolar geometry, where matches of "
+    f"learned local descriptors that obey one homography cover {100 * MIN_SHARE:.0f} % of the "
+    "image, and where at least one of the two tests passes."
 )
 _ABOUT_SEQUENCES = (
-    "Share of queries whose best image shows their place: by its score, and by the scores of a "
+    "Share of the queries whose best image shows their place, by single scores and by scores of a "
     f"sequence of {LENGTH} queries (SeqSLAM). Images without order have no sequences."
 )
-_ABOUT_WRONG = "Queries whose best image shows another place and passes those tests, too."
-_ABOUT_ACCURACY = "Balanced: mean of the shares of true and of false pairs judged rightly by p."
+_ABOUT_WRONG = (
+    "Number of queries whose best image shows another place and still passes those tests."
+)
+_ABOUT_ACCURACY = (
+    "Balanced accuracy: the mean of the shares of true and of false pairs that p classifies "
+    "correctly."
+)
 _ABOUT_ACCEPTED = (
-    "Of the pairs with p of at least 0.9; where there are none, precision counts as 1."
+    "Over the pairs with p of at least 0.9; where there are none, precision counts as 1."
 )
 _ABOUT_COST = (
-    "Each in a process of its own, one thread, medians. An image: what is needed beyond the ORB "
-    "features that tracking has anyway. Parameters of bow: weights of its words."
+    "Medians, each detector in its own process with one thread. Image: what is needed beyond the "
+    "ORB features that tracking extracts anyway. Parameters of bow: weights of its words."
 )
 
 

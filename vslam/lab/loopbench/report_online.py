@@ -9,12 +9,12 @@ from vslam.report.page import Section, Table
 
 _VERIFIED = ("nothing", "orb", "learned", "both")
 _ABOUT = (
-    "One decision an image against the images before the window. Recall: right decisions of the "
-    "images with a true match there. In brackets: without counting as wrong the matches that lie "
-    "near the place and are not marked."
+    "One decision for each image against the images before the window. Recall: the share of the "
+    "images with a true match there that are decided correctly. In brackets: unmarked matches that "
+    "lie near the place do not count as wrong."
 )
 _ABOUT_COUNTS = (
-    "Decisions at the lowest threshold whose match is marked / lies near / is another place."
+    "Decisions at the lowest threshold, by whether the match is marked, lies near, or is elsewhere."
 )
 
 

@@ -112,7 +112,7 @@ class Cost(Record):
 
 
 class LoopsJson(Document):
-    """``kind`` tells this file from those of runs.
+    """``kind`` distinguishes this file from those of runs.
 
     ``cells``, ``gains`` and ``costs`` are of the protocol retrieval, ``online`` of the other one.
     """

@@ -24,7 +24,7 @@ def write_overview(
         runs: folders of runs, or folders that hold such at any depth.
         trajectories: ``NAME[@SEQUENCE[@PERTURB]]=FILE``, of other systems.
         out: made if it is not there.
-        baseline: system that the others are set against; None for the simplest.
+        baseline: the system that the others are compared with; None for the simplest.
 
     Raises:
         InputError: no finished run, a trajectory that cannot be read or placed, or no run of the

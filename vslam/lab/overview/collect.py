@@ -19,7 +19,7 @@ MONOCULAR = ", mono"  # ends the name of a monocular system
 
 @dataclass(frozen=True)
 class Found:
-    """Runs in the order found, notes about what was left out, and files of trajectories.
+    """Runs in the order found, notes on what was left out, and files of trajectories.
 
     Attributes:
         estimate: the trajectory of each run by its ``source``.
@@ -35,7 +35,7 @@ class Found:
 def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
     """Read every run below ``folders`` and evaluate ``trajectories`` on the same sequences.
 
-    Interrupted runs and reports that this version cannot read are left out, with a note.
+    Interrupted runs and reports that this version cannot read are left out with a note.
 
     Raises:
         InputError: a folder is not there, none holds a finished run, or a trajectory cannot be
@@ -218,8 +218,8 @@ def _add_external(text: str, found: Found) -> None:
 
 
 def _alignment_of_external(system: str, drive: Drive, found: Found) -> str:
-    """That of vslam's runs of the same place. Where some of them are monocular and some are not,
-    a name that ends as those of monocular runs do decides."""
+    """The alignment of vslam's runs of the same place. Where only some of them are monocular, the
+    ending of the name decides."""
     there = {run.alignment for run in found.runs if run.drive.place == drive.place}
     if len(there) == 1:
         return there.pop()

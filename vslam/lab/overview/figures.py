@@ -29,6 +29,7 @@ from vslam.report.drawing import (
     Drawing,
     add_legend,
     draw,
+    finish_map,
     new_figure,
     plain_ticks,
 )
@@ -80,7 +81,7 @@ def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
         add_legend(figure, axes)
         yield (
             f"ate-{perturb}",
-            "Medians over runs; lines from the least to the greatest. Logarithmic.",
+            "Medians over runs, with lines from the smallest to the largest value; logarithmic.",
             figure,
         )
 
@@ -107,8 +108,8 @@ def _curves(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
                 continue
             yield (
                 f"strength-{law}-{place.dataset}-{place.place}",
-                "Medians over runs, shaded from the least to the greatest. Strength 0: the images "
-                "as they are.",
+                "Medians over runs, shaded from the smallest to the largest value. Strength 0: the "
+                "images as they are.",
                 _curve(f"{place.place}: {law}", mine, strength, looks),
             )
 
@@ -153,12 +154,10 @@ def _paths(report: OverviewJson, found: Found, looks: Looks) -> Iterator[Drawing
         rows = [row for row in report.rows if row.drive == drive]
         if not _draw_paths(axes, rows, found, looks):
             continue
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.margins(0.06)
-        add_legend(figure, axes)
+        finish_map(figure, axes)
         yield (
             f"path-{drive.dataset}-{drive.place}-{drive.perturb}",
-            "From above, aligned to the ground truth; of each system the run with the median ATE.",
+            "Seen from above, aligned to the ground truth; each system by its run of median ATE.",
             figure,
         )
 

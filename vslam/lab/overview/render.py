@@ -7,24 +7,26 @@ from collections.abc import Collection
 from vslam.lab.overview.schema import DECIMALS, MEASURES, Measure, OverviewJson, RunEntry, Spread
 from vslam.lab.overview.summary import ALPHA
 from vslam.lab.overview.versus import median_text, versus
-from vslam.report.page import Bullets, Figure, Page, Pairs, Section, Table
+from vslam.report.page import Bullets, Figure, Page, Pairs, Section, Table, number
 from vslam.report.render import csv_text
 
 _OTHER = ("loops_found", "loops_missed", "loops_wrong", "fps")
 _ABOUT_ERRORS = (
-    "Medians over runs, in brackets the least and the greatest. ATE after the alignment named, of "
-    "every frame, lost ones included: SE3 without scale, Sim3 with scale for monocular runs, which "
-    "have none; causal ATE is of the poses as they were given at the time. Systems with different "
-    "alignments are not compared. RPE from one frame to the next."
+    "Medians over runs, with the smallest and the largest value in brackets. The ATE counts every "
+    "frame, lost ones included, after the alignment named: SE3 keeps the scale; Sim3, for "
+    "monocular runs, fits it. The causal ATE is that of the poses as they were estimated at the "
+    "time. Systems with different alignments are not compared. The RPE is from one frame to the "
+    "next."
 )
 _ABOUT_OTHERS = (
-    "Loops by the ground truth. fps of the frame loop: runs made side by side have fewer."
+    "Loops are judged by the ground truth. fps is that of the frame loop; runs that share a "
+    "machine are slower."
 )
 ALIGNMENTS = {"se3": "SE3", "sim3": "Sim3"}
 _TESTED = (
-    "Pairs are sequences, each with the median of its runs: runs of one sequence are not "
-    "independent. Over all conditions, a sequence counts once, with the mean of its medians. "
-    f"Two-sided, level {ALPHA:g}, not corrected for the number of tests."
+    "Wilcoxon's signed-rank test on sequences, each with the median of its runs, because runs of "
+    "one sequence are not independent. Over all conditions a sequence counts once, with the mean "
+    f"of its medians. Two-sided, level {ALPHA:g}, not corrected for the number of tests."
 )
 
 
@@ -46,7 +48,7 @@ def overview_page(report: OverviewJson, figures: Collection[Figure]) -> Page:
 
 
 def title(report: OverviewJson) -> str:
-    """What the report is of, in one line."""
+    """The systems and the number of runs, in one line."""
     places = len({(row.drive.dataset, row.drive.place) for row in report.rows})
     return (
         f"{', '.join(report.systems)}: {len(report.runs)} runs on {places} "
@@ -73,7 +75,7 @@ def render_csv(report: OverviewJson) -> str:
 
 
 def _results(report: OverviewJson) -> list[Section]:
-    """Two tables of the same rows: one would be too wide to read."""
+    """Two tables of the same rows, because one would be too wide to read."""
     texts = ("sequence", "perturbation", "system")
 
     def table(name: str, measures: Collection[Measure], note: str, *, aligned: bool) -> Section:
@@ -130,7 +132,7 @@ def _runs(report: OverviewJson) -> Section:
             run.system,
             _seed(run),
             str(run.frames),
-            _figure(run, "ate_rmse_m", 3),
+            number(run.measures["ate_rmse_m"], "{:.3f}"),
             run.source,
         )
         for run in report.runs
@@ -160,8 +162,3 @@ def _seed(run: RunEntry) -> str:
     if run.seed is None:
         return "-"
     return f"{run.seed}, town {run.town}" if run.town else str(run.seed)
-
-
-def _figure(run: RunEntry, name: str, decimals: int) -> str:
-    value = run.measures[name]
-    return "n/a" if value is None else f"{value:.{decimals}f}"

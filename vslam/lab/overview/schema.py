@@ -26,7 +26,7 @@ ALL = "all"  # in the place of a perturbation: over all of them
 
 
 class Drive(Record):
-    """Images that systems are compared on, but for the seeds of what was drawn.
+    """Images on which systems are compared; drives that differ only in a seed are one.
 
     ``excerpt`` is empty for a whole sequence.
     """
@@ -38,16 +38,16 @@ class Drive(Record):
 
     @property
     def place(self) -> str:
-        """The sequence, without what was done to its images."""
+        """The sequence without its perturbation."""
         return f"{self.sequence}, {self.excerpt}" if self.excerpt else self.sequence
 
 
 class RunEntry(Record):
-    """One run. ``measures`` has the names of ``MEASURES``; None where a run has no such figure.
+    """One run. ``measures`` has the names of ``MEASURES``; None where a run has no such value.
 
     ``system`` is the loop detector, or the name of another system; ``source`` the folder of the
     run or the file of the trajectory; ``seed`` is None for other systems. ``town`` is the seed of
-    a rendered town: one drive in other towns is that drive again, as with another ``seed``.
+    a rendered town: the same route in another town counts as the same drive with another seed.
     ``alignment`` is what was fitted before errors were computed: ``se3``, or ``sim3`` for a
     monocular run, whose scale is arbitrary.
     """
@@ -64,7 +64,7 @@ class RunEntry(Record):
 
 
 class Spread(Record):
-    """Of the ``n`` runs that have the figure."""
+    """Median and extremes over the ``n`` runs that have a value."""
 
     n: int
     median: float
@@ -73,8 +73,8 @@ class Spread(Record):
 
 
 class Row(Record):
-    """All runs of one system on one drive; None for a measure that no run has. ``alignment`` is
-    that of its runs."""
+    """All runs of one system on one drive, which share an ``alignment``; None for a measure that no
+    run has."""
 
     drive: Drive
     system: str
@@ -99,8 +99,8 @@ class Comparison(Record):
     ``perturb`` is ``all`` for a comparison over all perturbations: a sequence then counts once,
     with its mean over the perturbations under which both systems have run on it. ``p_value`` is
     two-sided, of Wilcoxon's signed-rank test on the differences that are not ties; None where there
-    are too few for it to say anything. ``winner`` is the system that has the smaller errors by that
-    test, None where the test does not tell.
+    are too few of them for the test. ``winner`` is the system with the smaller errors by that test,
+    None where the test does not decide.
     """
 
     measure: str
@@ -118,8 +118,8 @@ class Comparison(Record):
 
 
 class OverviewJson(Document):
-    """``kind`` tells this file from the ``report.json`` of one run. ``systems`` are in the order in
-    which they are compared, the baseline first."""
+    """``kind`` distinguishes this file from the ``report.json`` of one run. ``systems`` are in the
+    order in which they are compared, the baseline first."""
 
     kind: Literal["overview"] = "overview"
     schema_version: int = 3

@@ -10,7 +10,7 @@ from vslam.report.page import Bullets, Section, Table
 
 _TEXTS = ("sequence", "perturbation")
 _LOOPS = ("loops_found", "loops_missed", "loops_wrong")
-_NOTE = "Medians over runs. Lost: frames. Loops: found / missed / wrong."
+_NOTE = "Medians over runs. Lost: number of lost frames. Loops: found / missed / wrong."
 
 Key = tuple[Drive, str]
 
@@ -94,8 +94,8 @@ def _difference(first: Spread | None, second: Spread | None, measure: str) -> st
 def _points(
     report: OverviewJson, rows: dict[str, dict[Key, Row]], names: tuple[str, ...]
 ) -> Iterator[str]:
-    """What the runs on the drives that all of ``names`` share add up to, lost frames first, then
-    the comparisons of two systems."""
+    """Totals over the runs on the drives that all of ``names`` share, lost frames first, then the
+    comparisons of two systems."""
     shared = set.intersection(*(set(rows[name]) for name in names))
     runs = {
         name: [

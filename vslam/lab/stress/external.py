@@ -94,7 +94,7 @@ def run_external(
     report = report.model_copy(
         update={"loops_found": None, "loops_missed": None, "loops_wrong": None}
     )
-    (folder / "report.json").write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    (folder / "report.json").write_text(report.to_json(), encoding="utf-8")
     return report
 
 

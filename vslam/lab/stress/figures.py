@@ -42,7 +42,7 @@ def draw_curves(report: StressJson) -> list[page.Figure]:
     by: dict[tuple[str, str], list[BoundaryEntry]] = {}
     for entry in report.boundaries:
         by.setdefault((entry.sequence, entry.law), []).append(entry)
-    caption = "A line for each seed; crosses are runs that failed. Strongest to the right."
+    caption = "One line for each seed; crosses are runs that failed. The strongest is on the right."
     return draw(
         (f"{sequence}-{law}", caption, _curves(sequence, law, entries, colors))
         for (sequence, law), entries in by.items()

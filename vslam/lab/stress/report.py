@@ -15,16 +15,17 @@ from vslam.errors import InputError
 from vslam.lab.stress.figures import draw_curves
 from vslam.lab.stress.schema import BoundaryEntry, StressJson
 from vslam.lab.stress.summary import mean_error
-from vslam.report.page import Bullets, Figure, Page, Row, Section, Table
+from vslam.report.page import Bullets, Figure, Page, Row, Section, Table, number
 from vslam.report.render import csv_text, html, markdown, write_files
 
 _ABOUT = (
-    "Weakest strength that fails by bisection, median over seeds, in brackets the least and the "
-    "greatest; > where the strongest strength holds. Behind it the reason of one seed."
+    "The weakest strength at which a run fails, found by bisection: the median over seeds, with "
+    "the smallest and the largest in brackets; > means that even the strongest one holds. It is "
+    "followed by the reason of one seed."
 )
 _NOT_MONOTONE = (
-    "Bisection believes that what holds at one strength holds at all weaker ones. These failed "
-    "although a stronger one held."
+    "Bisection assumes that a system that holds at one strength holds at all weaker ones. These "
+    "runs failed although a stronger one held."
 )
 
 
@@ -66,7 +67,7 @@ def render_csv(report: StressJson) -> str:
 
 
 def title(report: StressJson) -> str:
-    """What the report is of, in one line."""
+    """The systems and sequences, in one line."""
     systems = list(dict.fromkeys(entry.system for entry in report.clean))
     places = list(dict.fromkeys(f"{entry.dataset} {entry.sequence}" for entry in report.clean))
     excerpt = f", {report.max_frames} frames" if report.max_frames else ""
@@ -154,8 +155,9 @@ def _preset(report: StressJson) -> list[Section]:
         ("sequence", "corruption", *systems, "law"),
         rows,
         ("sequence", "corruption", "law"),
-        "ATE summed over the five severities, in percent of the baseline's; in brackets the mean "
-        "share of lost frames. The mean is over corruptions that have a law and an ATE of each.",
+        "ATE summed over the five severities, in percent of the baseline's, with the mean share of "
+        "lost frames in brackets. The mean is over the corruptions that have a law and an ATE for "
+        "each system.",
     )
     title = f"Corruption error against {report.baseline}, preset {report.preset}"
     return [Section(title, [table])]
@@ -181,9 +183,9 @@ def _clean(report: StressJson) -> Table:
             entry.sequence,
             entry.system,
             f"{entry.lost_frames} of {entry.frames}",
-            _number(entry.ate_rmse_m),
-            _number(entry.causal_ate_rmse_m),
-            _number(entry.ate_limit_m),
+            number(entry.ate_rmse_m, "{:.3f}"),
+            number(entry.causal_ate_rmse_m, "{:.3f}"),
+            number(entry.ate_limit_m, "{:.3f}"),
             "" if entry.loops_found is None else str(entry.loops_found),
         )
         for entry in report.clean
@@ -201,8 +203,8 @@ def _runs(report: StressJson) -> Table:
             str(entry.seed),
             f"{test.strength:g}",
             "" if test.lost_percent is None else f"{test.lost_percent:.1f}",
-            _number(test.ate_rmse_m),
-            _number(test.causal_ate_rmse_m),
+            number(test.ate_rmse_m, "{:.3f}"),
+            number(test.causal_ate_rmse_m, "{:.3f}"),
             test.verdict or "held",
         )
         for entry in report.boundaries
@@ -213,10 +215,6 @@ def _runs(report: StressJson) -> Table:
         "verdict",
     )  # fmt: skip
     return Table(head, rows, (*head[:3], "verdict"))
-
-
-def _number(value: float | None) -> str:
-    return "n/a" if value is None else f"{value:.3f}"
 
 
 def _sheet(report: StressJson, sequences: Mapping[str, Source]) -> list[Figure]:

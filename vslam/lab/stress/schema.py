@@ -33,7 +33,7 @@ class BoundaryEntry(Record):
 
 
 class CleanEntry(Record):
-    """The run of a system on the images as they are, which limits are taken from."""
+    """The run of a system on unperturbed images, from which the limits are derived."""
 
     dataset: str
     sequence: str

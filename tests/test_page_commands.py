@@ -122,7 +122,7 @@ RULES = {
         (
             ("colmap RUN", "colmap RUN --out again"),
             ("RUN", "runs/latest"),
-            ("nerfstudio runs/latest$", "nerfstudio runs/latest --out once_more"),
+            (r"nerfstudio runs/latest\n", r"nerfstudio runs/latest --out twice\n"),
         ),
         not_run=(("vslam run phone.mp4", "test_exports.py runs it"),),
     ),

@@ -118,7 +118,7 @@ def causal_ate(outcome: RunOutcome) -> float | None:
     if ground_truth is None or not outcome.tracks:
         return None
     try:
-        given = causal_trajectory(outcome)
+        given = causal_trajectory(outcome.tracks)
         return evaluate_trajectory(given, ground_truth, outcome.settings.alignment).ate_rmse_m
     except InputError:
         return None

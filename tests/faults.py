@@ -115,7 +115,7 @@ POINTS = (
     Point("loop pictures", "vslam.run.moments.loop_matches", 1, ON),
     Point("closing the map", "vslam.closing.LoopClosing.conclude", 1, MAPLESS),
     Point("final trajectory", "vslam.mapping.Mapper.trajectory", 1, EARLY),
-    Point("check of the rig", "vslam.run.pipeline.measure_rig", 1, EARLY),
+    Point("check of the rig", "vslam.run.pipeline.measure_rig", 1, ON),
     Point("result: KITTI poses", "vslam.report.folder.write_kitti", 1, MISSING,
           ("trajectory_kitti.txt",)),
     Point("result: TUM poses", "vslam.report.folder.write_tum", 1, MISSING, ("trajectory.tum",)),
@@ -359,7 +359,7 @@ def inject(root: Path, work: Path, point: Point, fault: str, seed: int, whole: b
         else:
             same = (folder / "trajectory.tum").read_bytes() == whole
             found += ", resumed to the same bytes" if same else ", resumed"
-    elif point.expected == EARLY and not point.options and "autosave" not in found:
+    elif point.expected == EARLY and not found.startswith((f"{FRAMES} ", "0 ")):
         wrong.append("nothing to resume from")
     short = " | ".join(said).replace(str(folder.resolve()), "RUN").replace(str(folder), "RUN")
     return Row(point.name, fault, call, code, short, found, "; ".join(wrong))
@@ -389,9 +389,9 @@ def _look(point: Point, folder: Path, whole: bytes) -> tuple[str, list[str]]:
     wrong = [f"no {name}" for name in RESULTS if name not in costs and not (folder / name).exists()]
     wrong += [f"a useless {path.name}" for path in folder.glob(".*.part")]
     lengths = {
-        name: len(read_trajectory(folder / name).T_wc)
+        name: len(read_trajectory(path).T_wc) if path.stat().st_size else 0
         for name in ("trajectory.tum", "trajectory_causal.tum", "trajectory_online.tum")
-        if (folder / name).exists()
+        if (path := folder / name).exists()
     }
     frames = (
         len((folder / "frames.csv").read_text().splitlines()) - 1

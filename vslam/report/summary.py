@@ -102,6 +102,8 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
     ground_truth = matched_ground_truth(outcome)
     if ground_truth is None:
         return None, "no ground truth"
+    if not outcome.tracks:
+        return None, "no frames"
     try:
         alignment = outcome.settings.alignment
         found = evaluate_trajectory(outcome.trajectory, ground_truth, alignment)

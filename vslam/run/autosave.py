@@ -174,9 +174,13 @@ class FolderAutosave:
 
     def _save(self, slam: Slam, progress: Callable[[], Progress]) -> None:
         self._last, self._missed = time.monotonic(), 0
-        stored = slam.stored_map(self._drive)
+        stored, done = slam.stored_map(self._drive), progress()
+        frames, n_done = stored.frames, len(done.tracks)
+        if frames is not None and len(frames.timestamp) > n_done:
+            # A step that failed had placed its frame already: it is to be tracked once more.
+            stored = replace(stored, frames=frames.until(n_done), checkpoint=None)
         try:
-            self._writing = self._writer.submit(self._write, _copy(stored), progress())
+            self._writing = self._writer.submit(self._write, _copy(stored), done)
         except Exception as error:  # no memory for a copy, or no thread
             self._warn(MAP, error)
 

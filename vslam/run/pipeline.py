@@ -99,7 +99,7 @@ def run_sequence(
                 autosave.offer(slam, main.so_far)
                 for other in others:
                     if other.problem is None:
-                        with other.keeping_what_is_done():
+                        with other.keeping_what_is_done(f"frame {result.index}"):
                             other.step(played)
                 if main.problem:
                     break
@@ -110,23 +110,23 @@ def run_sequence(
         except Exception as error:  # whatever it is, what is done is kept
             if isinstance(error, InputError) and not main.has_begun:
                 raise
-            main.fail(error)
+            main.fail(f"frame {len(main.tracks)}", error)
         for one in (main, *others):
-            with one.keeping_what_is_done():
+            with one.keeping_what_is_done("completing the map"):
                 one.finish()
         if not broken and main.problem:
             broken.append(main.problem)
-        with main.keeping_what_is_done():
+        with main.keeping_what_is_done("saving the map"):
             autosave.close(slam, main.so_far, resumable=bool(broken) and main.has_map)
     seconds = main.seconds()
     give_back_memory()  # results need room: a map is copied before it is written
-    with main.keeping_what_is_done():
+    with main.keeping_what_is_done("the final trajectory"):
         if main.has_map:
             _tell_loops(recorder, slam, n_told)
             recorder.finish(main.trajectory(), slam.map)
         else:
             recorder.finish(causal_trajectory(main.tracks), None)
-    ended = broken[0] if broken else None
+    ended = broken[0] if broken else main.problem
     beside = [_outcome(sequence, other, seconds, other.problem or ended) for other in others]
     compared = tuple(replace(one, map=None, stored=None) for one in beside)  # maps are large
     return replace(_outcome(sequence, main, seconds, ended), compared=compared)
@@ -177,22 +177,22 @@ class _Run:
             return False
         return True
 
-    def fail(self, error: Exception) -> None:
+    def fail(self, what: str, error: Exception) -> None:
         """Note what ended the run; what follows from it is not noted."""
         if self._failure is not None:
             return
         if sys.flags.dev_mode:
             _log.warning("the run ends here", exc_info=error)
         why = str(error).rstrip(".") if isinstance(error, InputError) else reason(error)
-        self._failure = f"frame {len(self.tracks)} failed, {why}"
+        self._failure = f"{what} failed, {why}"
 
     @contextmanager
-    def keeping_what_is_done(self) -> Iterator[None]:
-        """End this run by an exception, and no other."""
+    def keeping_what_is_done(self, what: str) -> Iterator[None]:
+        """Let an exception end this run alone, so that all done before is kept."""
         try:
             yield
         except Exception as error:
-            self.fail(error)
+            self.fail(what, error)
 
     def trajectory(self) -> Trajectory:
         """Pose of each frame done, as the map is now."""
@@ -313,7 +313,7 @@ def _outcome(
         interrupted=interrupted,
     )
     if run.has_map:
-        with run.keeping_what_is_done():
+        with run.keeping_what_is_done("collecting the results"):
             return _with_map(outcome, run)
     return replace(outcome, interrupted=interrupted or run.problem)
 
@@ -322,7 +322,6 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
     """An outcome with all that only a complete map tells."""
     slam, settings, camera = run.slam, run.settings, outcome.sequence.camera
     loops, corrections, keyframe_frames = _with_earlier(run.before, slam)
-    delay = delay_warnings(slam.rig.delay, camera)
     return replace(
         outcome,
         trajectory=run.trajectory(),
@@ -330,7 +329,7 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
         warnings=[
             *slam.problems,
             *rig_warnings(run.sides),
-            *(delay or residual_warnings(measure_rig(slam.map, camera), camera)),
+            *_map_warnings(slam, camera),
         ],
         n_keyframes=len(slam.map.living_keyframes()),
         n_landmarks=len(slam.map.living_landmarks()),
@@ -344,6 +343,17 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
         keyframe_frames=keyframe_frames,
         n_submaps=len({0, *slam.map.restarts}) if slam.map.n_keyframes else 0,
     )
+
+
+def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
+    """Faults of the rig that the map shows."""
+    try:
+        residuals = measure_rig(slam.map, camera)
+        return delay_warnings(slam.rig.delay, camera) or residual_warnings(residuals, camera)
+    except Exception as error:  # a check must not cost what is checked
+        problem = f"the rig could not be checked ({reason(error)})"
+        _log.warning(problem)
+        return [problem]
 
 
 def _with_earlier(

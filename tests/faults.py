@@ -19,6 +19,7 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, partial
@@ -170,7 +171,12 @@ def on_frame() -> None:
     """Called when a frame is done."""
 
 
-def failing(point: Point, call: int, fault: Callable[[], Exception]) -> None:
+def failing(
+    point: Point,
+    call: int,
+    fault: Callable[[], Exception],
+    set_attribute: Callable[[Any, str, Any], None] = setattr,
+) -> None:
     """Let a call of a function raise, and no other, from now on."""
     owner, name = _owner(point.function)
     function = getattr(owner, name)
@@ -184,7 +190,7 @@ def failing(point: Point, call: int, fault: Callable[[], Exception]) -> None:
             raise fault()
         return function(*args, **kwargs)
 
-    setattr(owner, name, wrapped)
+    set_attribute(owner, name, wrapped)
 
 
 def _owner(path: str) -> tuple[Any, str]:
@@ -318,6 +324,9 @@ def _run(words: list[str], log: Path, fault: Callable[[], None], *, learned: boo
         main()
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else 0
+    except BaseException:
+        traceback.print_exc()
+        code = 1
     threading._shutdown()  # what Python does at its end, where it may wait for ever
     atexit._run_exitfuncs()
     sys.stderr.flush()

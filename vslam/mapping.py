@@ -366,5 +366,5 @@ class Mapper:
 
     def _start(self, job: Callable[[Map], None]) -> None:
         """Start a job that maps; tracking goes on with the view as it is."""
-        self._is_merged = False
         self._shared.start(job)
+        self._is_merged = False

@@ -346,6 +346,9 @@ def inject(root: Path, work: Path, point: Point, fault: str, seed: int, whole: b
     words = ["run", "--data", str(root), "--quiet", "--autosave", "0.3", "--out", str(out)]
     if not point.function.startswith("vslam.run.recorder"):
         words.append("--no-record")
+    pages = fault == "RuntimeError" or point.function.startswith(("vslam.report", "vslam.run"))
+    if not pages:  # to draw the figures takes longer than the run
+        words.append("--no-report")
     learned = point.function.startswith("vslam.loopclosure.verifier")
     make = FAULTS[fault]
     code = run_in_fork(
@@ -357,12 +360,13 @@ def inject(root: Path, work: Path, point: Point, fault: str, seed: int, whole: b
     found = "nothing"
     if point.expected != REFUSED:
         try:
-            found, missing = _look(point, folder, whole)
+            found, missing = _look(point, folder, whole, RESULTS if pages else RESULTS[:-3])
             wrong += missing
         except Exception as error:
             wrong.append(f"cannot be loaded: {error!r}")
-    if (folder / MAP).exists():
-        code_again = run_in_fork(["run", "--resume", str(folder), "--quiet"], log, lambda: None)
+    if (folder / MAP).exists() and point.expected != MISSING:
+        again = ["run", "--resume", str(folder), "--quiet", "--no-record", "--no-report"]
+        code_again = run_in_fork(again, log, lambda: None)
         if code_again != 0:
             wrong.append(f"--resume ends with {code_again}: {log.read_text()}")
         else:
@@ -392,10 +396,12 @@ RESULTS = (
 )  # fmt: skip
 
 
-def _look(point: Point, folder: Path, whole: bytes) -> tuple[str, list[str]]:
+def _look(
+    point: Point, folder: Path, whole: bytes, results: tuple[str, ...]
+) -> tuple[str, list[str]]:
     """Load all that a run left; returns what there is, and what is not as it should be."""
     costs = (*point.costs, *(["map.npz"] if point.expected == MAPLESS else []))
-    wrong = [f"no {name}" for name in RESULTS if name not in costs and not (folder / name).exists()]
+    wrong = [f"no {name}" for name in results if name not in costs and not (folder / name).exists()]
     wrong += [f"a useless {path.name}" for path in folder.glob(".*.part")]
     lengths = {
         name: len(read_trajectory(path).T_wc) if path.stat().st_size else 0
@@ -430,5 +436,5 @@ def _look(point: Point, folder: Path, whole: bytes) -> tuple[str, list[str]]:
         assert saved is not None
         assert len(progress.tracks) >= len(saved.timestamp)
         found.append(f"autosave of {len(saved.timestamp)} frames")
-    found.append(f"{sum((folder / name).exists() for name in RESULTS)} of {len(RESULTS)} results")
+    found.append(f"{sum((folder / name).exists() for name in results)} of {len(results)} results")
     return ", ".join(found), wrong

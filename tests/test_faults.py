@@ -19,37 +19,33 @@ from vslam.slam import Slam
 
 TOOL = Path(__file__).parents[1] / "tools" / "experiments" / "lifelong" / "inject_faults.py"
 INCOMPLETE = r"^mapping a keyframe failed .* incomplete; continue from a map that was saved before$"
-SOME = (  # of each kind; the tool takes all of them
-    ("a frame's track", "MemoryError"),
-    ("keyframe policy", "RuntimeError"),
-    ("closing job, fusion", "RuntimeError"),
-    ("global adjustment", "MemoryError"),
-    ("image source", "disk full"),
-    ("features thread", "MemoryError"),
-    ("handing thread", "RuntimeError"),
-    ("autosave, map", "disk full"),
-    ("moments", "MemoryError"),
-    ("result: figures", "MemoryError"),
-    ("warm-up of the kernels", "disk full"),
-)
+SOME = [  # of each kind; the tool takes all of them
+    "a frame's track",
+    "closing job, fusion",
+    "global adjustment",
+    "image source",
+    "handing thread",
+    "moments",
+    "result: figures",
+    "warm-up of the kernels",
+]
 CORE = ("vslam.frontend.tracker.", "vslam.modes.", "vslam.mapping.", "vslam.shared_map.",
         "vslam.closing.", "vslam.loopclosure.verification.", "ring.")  # fmt: skip
 
 
 def test_what_fails_in_a_run_costs_itself_alone(tmp_path):
     """In a process of its own, which forks: this one may have threads."""
-    for fault in FAULTS:
-        points = [name for name, which in SOME if which == fault]
-        table = tmp_path / f"{fault}.csv"
-        words = ["--points", *points, "--faults", fault, "--out", str(table)]
-        done = subprocess.run(
-            [sys.executable, str(TOOL), *words], capture_output=True, text=True, timeout=300
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-        with table.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-        assert sorted(row["point"] for row in rows) == sorted(points)
-        assert not any(row["wrong"] for row in rows)
+    table = tmp_path / "faults.csv"
+    words = ["--once", "--points", *SOME, "--out", str(table)]
+    done = subprocess.run(
+        [sys.executable, str(TOOL), *words], capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    with table.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert sorted(row["point"] for row in rows) == sorted(SOME)
+    assert len({row["fault"] for row in rows}) > 1
+    assert not any(row["wrong"] for row in rows)
 
 
 @pytest.mark.parametrize(

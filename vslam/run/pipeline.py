@@ -300,7 +300,7 @@ def _outcome(
         keyframes=causal_trajectory(keyframes),
         tracks=run.tracks,
         skipped=run.skipped,
-        warnings=["there is no map, since mapping failed; poses are those of tracking"],
+        warnings=["there is no map of this run, and its poses are those of tracking"],
         wall_s=seconds[0],
         cpu_s=seconds[1],
         step_s=run.step_s,

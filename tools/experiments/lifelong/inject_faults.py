@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import csv
 import os
+import random
 import shutil
 import sys
 import tempfile
@@ -24,12 +25,13 @@ from faults import FAULTS, POINTS, Row, inject, load_everything, run_in_fork, wr
 
 
 def inject_all(
-    work: Path, points: Collection[str], faults: Collection[str], seed: int
+    work: Path, points: Collection[str], faults: Collection[str], seed: int, *, once: bool
 ) -> list[Row]:
-    """Inject each fault at each of the points that are named, and print what became of it.
+    """Inject faults at each of the points that are named, and print what became of each.
 
     Args:
         work: an empty folder.
+        once: one of the faults at each point, drawn from the seed, instead of all.
     """
     load_everything()
     rows = []
@@ -42,7 +44,8 @@ def inject_all(
     for point in POINTS:
         if point.name not in points:
             continue
-        for fault in faults:
+        drawn = random.Random(f"{seed} {point.function}").choice(sorted(faults))
+        for fault in [drawn] if once else faults:
             folder = work / f"{len(rows)}"
             folder.mkdir()
             row = inject(root, folder, point, fault, seed, whole)
@@ -55,12 +58,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", nargs="+", default=[point.name for point in POINTS])
     parser.add_argument("--faults", nargs="+", choices=FAULTS, default=list(FAULTS))
+    parser.add_argument("--once", action="store_true", help="one fault a point, drawn by the seed")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="CSV table of all injections")
     options = parser.parse_args()
     work = Path(tempfile.mkdtemp())  # a TemporaryDirectory would go when a fork ends
     try:
-        rows = inject_all(work, options.points, options.faults, options.seed)
+        rows = inject_all(work, options.points, options.faults, options.seed, once=options.once)
     finally:
         shutil.rmtree(work)
     if options.out is not None:

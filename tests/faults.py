@@ -21,7 +21,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -32,8 +32,7 @@ from ring import CAMERA, LAP, Oracle, Ring
 
 from vslam.camera import ImageMap
 from vslam.config import Config
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import TimedFrame
+from vslam.datasets.frames import Images, Source, TimedFrame
 from vslam.features import Extracted, Features
 from vslam.geometry import inverse
 from vslam.maps.storage import load_map
@@ -241,14 +240,14 @@ def stage(*, learned: bool) -> None:
         images = create_images("both", Config()) if learned else None
         return Oracle(RING, [float(k) for k in range(FRAMES)]), images
 
-    def frames(source: Sequence) -> Iterator[TimedFrame]:
-        for index, timestamp in enumerate(source.timestamps.tolist()):
+    def frames(source: Source) -> Iterator[TimedFrame]:
+        for frame in source.stored:
             next_image()
-            yield TimedFrame(timestamp, partial(read, source, index))
+            yield replace(frame, read=partial(read, frame))
 
-    def read(source: Sequence, index: int, image_map: ImageMap) -> tuple:
+    def read(frame: TimedFrame, image_map: ImageMap) -> Images:
         read_image()
-        return source.read(index, image_map)
+        return frame.read(image_map)
 
     @contextlib.contextmanager
     def progress_bar(total: object) -> Iterator[Callable[[object], None]]:
@@ -256,7 +255,7 @@ def stage(*, learned: bool) -> None:
 
     preparation.extract_features = see
     pipeline.detector_with_images = detector
-    pipeline.timed_frames = frames
+    Source.frames = frames
     quiet.progress_bar = progress_bar
 
 

@@ -104,6 +104,7 @@ def test_names_that_are_not_utf8_are_refused(call, kitti_tree, tmp_path):
         assert err.endswith("this name is not UTF-8; rename it.\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [
@@ -153,8 +154,8 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
     ("words", "parts"),
     [
         ("--detector vgg16", ["--detector vgg16", "ships no weights", "vslam train vgg16"]),
-        ("--detector capsule --weights no.safetensors", ["no.safetensors", "not there"]),
-        ("--detector bow --weights no.safetensors", ["--weights", "bow has none"]),
+        ("--detector capsule --weights no.safetensors", ["no.safetensors", "no such file"]),
+        ("--detector bow --weights no.safetensors", ["--weights", "bow has no weights"]),
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
         ("--dataset kitti", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
         ("--config nothing.json", ["nothing.json", "configuration"]),
@@ -165,7 +166,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--data nowhere", ["nowhere", "no such file or folder", "--data"]),
         ("--data .", ["the folder is empty", "--data"]),
         ("nowhere", ["nowhere", "no such file or folder", "--data"]),
-        ("nowhere --data .", ["nowhere: --data says what to run on, too"]),
+        ("nowhere --data .", ["nowhere: --data says what to read, too"]),
         ("--data ..", ["no data set that is known", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
@@ -177,17 +178,20 @@ def test_run_refuses_without_data(call, words, parts):
     assert not Path("runs").exists()
 
 
-def test_a_bare_run_without_data_says_what_to_do(call):
-    code, out, err = call("run")
+@pytest.mark.parametrize("command", ["run", "bench", "stress", "doctor", "perturb"])
+def test_a_bare_command_without_data_says_what_to_do(call, command):
+    code, out, err = call(command)
     assert (code, out) == (2, "")
-    assert err.startswith("error: there is nothing to run on; ")
-    commands = [line.split("  ")[1] for line in err.splitlines()[1:]]
-    assert commands == [
-        "vslam run --dataset synthetic --seq demo",
-        "vslam run DATA --calib FILE",
-        "vslam run --data FOLDER --seq 00",
-    ]
-    assert not Path("runs").exists()
+    assert err.startswith("error: there is nothing to read; ")
+    ways = [line.strip().split("  ")[0] for line in err.splitlines()[1:]]
+    assert ways == ["--dataset synthetic", "DATA --calib FILE", "--data FOLDER"]
+    assert not any(Path().iterdir())
+
+
+def test_the_environment_names_kitti_alone(call, root, monkeypatch):
+    monkeypatch.setenv("KITTI_ROOT", str(root))
+    refused(call("run"), "unequal counts")
+    refused(call("doctor", "--dataset", "euroc"), "--dataset euroc: name the data with --data")
 
 
 @pytest.mark.parametrize(
@@ -267,11 +271,6 @@ def test_run_refuses_bad_input(call, root, words, parts):
     assert not Path("runs").exists()
 
 
-def test_root_from_the_environment(call, root, monkeypatch):
-    monkeypatch.setenv("KITTI_ROOT", str(root))
-    refused(call("run"), "unequal counts")
-
-
 def test_misspelt_option(call):
     code, _, err = call("run", "--frames", "5")
     assert code == 2
@@ -332,7 +331,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
 
     monkeypatch.setattr(run_pipeline, "run_sequence", run_sequence)
     monkeypatch.setattr(run_pipeline, "begin", lambda camera, settings, saved=None: None)
-    monkeypatch.setattr(recorder, "NullRecorder", lambda: "null")
+    monkeypatch.setattr(recorder, "Recorder", lambda: "null")
     monkeypatch.setattr(recorder, "RerunRecorder", lambda target, pictures: str(target))
     monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[1])
     monkeypatch.setattr(figures, "draw_figures", draw_figures)
@@ -476,7 +475,7 @@ def test_interrupted_run_keeps_its_results(call, root, pipeline):
     ("words", "why"),
     [
         ("", "vslam doctor says what is wrong"),
-        ("--perturb night:9", "under --perturb night:9; a weaker one"),
+        ("--perturb night:9", "under --perturb night:9; use a weaker"),
         ("--sensor mono", "one camera must move sideways"),
     ],
 )
@@ -528,6 +527,8 @@ def test_perturb_writes_a_contact_sheet(call, root):
     code, out, _ = call(*words, "--out", "sheet.png")
     assert code == 0
     assert "frames 0, 4, 9" in out
+    _, later, _ = call(*words[:-4], "--start", 5, "--every", 2, "--max-frames", 2, "--frames", 2)
+    assert "frames 5, 7" in later
     assert cv2.imread("sheet.png").shape[0] == 3 * 240
     refused(call(*words, "--out", "no/folder/sheet.png"), "no/folder/sheet.png", "--out")
 

@@ -1,4 +1,4 @@
-"""Who may import whom (docs/design.md, section 2), read from the source.
+"""Who may import whom (docs/explanation/design.md, section 2), read from the source.
 
 Every folder and module has a level; an import may lead down or stay on its level, and no modules
 import each other in a circle. Beside that a few libraries belong to one place each.
@@ -279,6 +279,7 @@ def test_tracking_and_mapping_load_no_heavy_library():
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
+@pytest.mark.slow
 def test_a_run_loads_what_it_needs(kitti_tree, tmp_path):
     """A third of the start are imports: without pages, recording or ground truth a run does
     without these."""

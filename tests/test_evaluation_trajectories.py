@@ -198,6 +198,7 @@ def test_unknown_alignment():
         evaluate_trajectory(drive(9), drive(9), "rigid")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alignment", ["se3", "sim3", "none"])
 @pytest.mark.parametrize("write", [lambda p, t: write_kitti(p, t.T_wc), write_tum])
 def test_evo_command_reproduces_the_ate(tmp_path, write, alignment):

@@ -193,6 +193,7 @@ fetch("report.html").then(answer => answer.text())
 </script>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [400, 1200])
 def test_the_explorer_in_a_browser(run: Path, tmp_path: Path, width: int):
     """The slider moves through time, buttons zoom, nothing is asked for."""

@@ -48,6 +48,7 @@ def laps(known_after_s: float, threads: int = 1) -> tuple[Slam, tuple[int, ...],
     return slam, tuple(keyframes), results
 
 
+@pytest.mark.slow
 def test_known_streets_do_not_grow_the_map(check_map):
     slam, keyframes, results = laps(10.0)
     _, growing, _ = laps(NEVER_KNOWN)
@@ -58,6 +59,7 @@ def test_known_streets_do_not_grow_the_map(check_map):
     check_map(slam.map)
 
 
+@pytest.mark.slow
 def test_what_is_known_is_tracked_no_worse():
     mean = [float(errors(laps(known)[0], RING, PLACES).mean()) for known in (10.0, NEVER_KNOWN)]
     assert mean[0] < 1.1 * mean[1]
@@ -65,6 +67,7 @@ def test_what_is_known_is_tracked_no_worse():
     assert sum(result.n_inliers <= 60 for result in laps(10.0)[2][2 * LAP :]) <= 1
 
 
+@pytest.mark.slow
 def test_known_streets_give_the_same_bytes_with_one_thread_and_two():
     one, two = laps(10.0)[0], laps(10.0, threads=2)[0]
     assert one.trajectory().T_wc.tobytes() == two.trajectory().T_wc.tobytes()

@@ -164,6 +164,7 @@ def test_what_was_not_joined_is_not_in_the_map(file, ring):
     assert not slam.in_map().any()
 
 
+@pytest.mark.slow
 def test_a_resumed_drive_has_all_its_frames(ring, tmp_path):
     whole, first = new(), new()
     drive(whole, ring, range(120), seed=8)
@@ -226,6 +227,7 @@ def test_the_first_frame_after_a_cut_tells_the_speed(ring, tmp_path):
     np.testing.assert_allclose(second.skip(6.1).T_wc, expected, atol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("localize", [False, True])
 def test_the_same_bytes_with_one_thread_and_two(file, ring, localize):
     places = [*range(60, 120), None, None, None, None, *range(20, 50)]
@@ -266,6 +268,7 @@ def mapped(kitti_tree, tmp_path_factory) -> Path:
     return out / "latest"
 
 
+@pytest.mark.slow
 def test_localise_by_the_command_line(kitti_tree, mapped, tmp_path):
     before = (mapped / "map.npz").read_bytes()
     words = ("run", "--data", kitti_tree, "--no-record", "--out", tmp_path, "--start", 4)

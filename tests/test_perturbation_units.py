@@ -327,6 +327,7 @@ def test_a_black_side_is_black_for_its_share_of_the_seconds(side):
     np.testing.assert_array_equal(black[::2], black[1::2])  # by the second
 
 
+@pytest.mark.slow
 def test_every_law_is_repeatable_and_keeps_the_shape():
     drive = Drive()
     for name, kind in LAWS.items():

@@ -26,7 +26,8 @@ from vslam.datasets.video import open_video
 from vslam.errors import InputError, UnreadableImageError
 from vslam.loopclosure.vocabulary import load
 from vslam.maps.storage import load_map
-from vslam.report.render import render_html
+from vslam.report.render import html
+from vslam.report.run_page import run_page
 from vslam.run.progress import read_progress
 from vslam.untrusted import MOST_PIXELS, read_npz
 
@@ -205,7 +206,7 @@ def test_what_people_write_is_escaped_in_pages(tmp_path: Path):
             "skipped_messages": (evil,),
         }
     )
-    page = render_html(report, evil, [])
+    page = html(run_page(report, config=evil))
     assert "alert(1)" in page
     assert "<script>alert" not in page
 
@@ -215,6 +216,7 @@ FORBIDDEN = {"eval", "exec", "system", "popen", "extractall", "extract", "unpack
 FORBIDDEN_MODULES = {"pickle", "dill", "shelve", "marshal", "tarfile", "joblib"}
 
 
+@pytest.mark.slow
 def test_no_source_executes_what_it_reads():
     found = []
     for path in SOURCES:
@@ -267,6 +269,7 @@ def test_a_header_that_is_a_number_is_not_that_many_bytes(tmp_path: Path, read):
     tracemalloc.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("read", [lambda p: read_npz(p, "a map"), load_map, read_progress])
 def test_an_archive_may_not_unpack_to_far_more_than_its_size(tmp_path: Path, read):
     """There may be memory for it, but not for a small file."""

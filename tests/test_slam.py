@@ -168,6 +168,7 @@ def test_landmarks_lie_on_the_walls_and_the_ground(corridor):
     assert np.mean(distance < 0.3) > 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
 def test_same_bytes_with_one_thread_and_two_and_again(corridor, config):
     runs = [bytes_of(*run(corridor, config, threads=threads)) for threads in (1, 2, 2, 1)]
@@ -181,6 +182,7 @@ def test_two_in_threads_of_their_own_have_the_bytes_of_one(corridor):
         assert [one.result() for one in both] == [expected] * 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
 def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, monkeypatch):
     """Mapping as late as can be (when it is merged) and as early as can be: a race would show."""

@@ -223,6 +223,7 @@ def clearance(surfaces, cameras):
     return tree.query(points)[0].min(initial=np.inf)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROUTES)
 def test_nothing_stands_near_a_camera_of_any_route(name, unpainted):
     route = built_in_route(name)

@@ -1,5 +1,5 @@
-"""Write docs/results/drives.csv: vslam, with and without loop closing, and ORB-SLAM3 on rendered
-drives.
+"""Write docs/research/results/drives.csv: vslam, with and without loop closing, and ORB-SLAM3 on
+rendered drives.
 
     python tools/synth_table.py --routes demo,05 --lights "clean;brightness:1.0" \
         [--kitti KITTI --along 00,07] [--aliased demo:10] [--sensor mono] \
@@ -12,7 +12,7 @@ a kidnapping: ``cut:300`` takes 300 frames out, ``black:20`` blackens 20. What i
 to a folder, and every system reads the same images. Each finished row is kept in a JSON file beside
 the table and not measured again unless the bytes of the drives changed or ``--again`` names its
 system. The table is always written whole. For what the script of ORB-SLAM3 takes and prints see
-compare_orbslam3.py.
+systems.py.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from changed_drive import changed_drive, run_over
+from systems import OrbSlam3, add_orbslam3_options, changed_drive, orbslam3_of, run_over
 
 OURS = {"vslam": "bow", "vslam without loops": "none"}
 ORBSLAM3 = "ORB-SLAM3"
@@ -67,20 +67,18 @@ def main() -> None:
     parser.add_argument(
         "--lights", default="clean", help="clean, perturbations, kidnappings; with semicolons"
     )
-    parser.add_argument("--out", type=Path, default=Path("docs/results/drives.csv"))
+    parser.add_argument("--out", type=Path, default=Path("docs/research/results/drives.csv"))
     parser.add_argument("--sensor", default="stereo", choices=("stereo", "mono"))
     parser.add_argument("--again", default="", help="systems to measure again, with commas")
-    parser.add_argument("--orbslam3-python", type=Path)
-    parser.add_argument("--orbslam3-script", type=Path)
-    parser.add_argument("--vocabulary", type=Path)
+    add_orbslam3_options(parser)
     options = parser.parse_args()
-    again = options.again.split(",")
+    again, orbslam3 = options.again.split(","), orbslam3_of(options)
     kept = {key: row for key, row in _read(options.out).items() if row["system"] not in again}
     for drive in _drives(options):
         for light in options.lights.split(";"):
             # Without loop closing vslam runs once for each drive.
             systems = [*OURS] if light == "clean" and "aliased" not in drive.title else ["vslam"]
-            systems += [ORBSLAM3] if options.orbslam3_python else []
+            systems += [ORBSLAM3] if orbslam3 else []
             sensor = ", mono" if options.sensor == "mono" else ""
             wanted = {f"{drive.title}, {light}, {system}{sensor}": system for system in systems}
             missing = {key: system for key, system in wanted.items() if key not in kept}
@@ -88,7 +86,10 @@ def main() -> None:
                 continue
             with _in_light(drive, light) as data:
                 for key, system in missing.items():
-                    kept[key] = _row(drive, light, system, data, options)
+                    kept[key] = _row(
+                        drive, light, system, data, options.sensor,
+                        orbslam3 if system == ORBSLAM3 else None,
+                    )  # fmt: skip
                     _write(options.out, kept)
     _write(options.out, kept)
 
@@ -135,7 +136,9 @@ def _in_light(drive: Drive, light: str) -> Iterator[Path]:
         yield root
 
 
-def _row(drive: Drive, light: str, system: str, data: Path, options: argparse.Namespace) -> Row:
+def _row(
+    drive: Drive, light: str, system: str, data: Path, sensor: str, orbslam3: OrbSlam3 | None
+) -> Row:
     import numpy as np
 
     from vslam.datasets.kitti import read_kitti_poses
@@ -143,12 +146,13 @@ def _row(drive: Drive, light: str, system: str, data: Path, options: argparse.Na
     from vslam.evaluation.trajectories import path_length
 
     truth = read_kitti_poses(data / "poses" / f"{drive.name}.txt")
-    _, found = run_over(data, drive.name, options, OURS.get(system), sensor=options.sensor)
+    words = ("--detector", OURS[system]) if system in OURS else ()
+    _, found = run_over(data, drive.name, orbslam3, *words, sensor=sensor)
     return {
         "drive": drive.title,
         "light": light,
         "system": system,
-        "sensor": options.sensor,
+        "sensor": sensor,
         "frames": len(truth),
         "path_m": float(path_length(truth)[-1]),
         **{key: None if np.isnan(value) else value for key, value in found.items()},

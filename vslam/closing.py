@@ -1,9 +1,9 @@
 """Loop closing: from a keyframe that looks familiar to a corrected map (ORB-SLAM, section VII).
 
-Whoever calls these methods is the only one to change the map at that moment, usually the mapping
-job of a keyframe. Only the global bundle adjustment after a loop runs in parallel, on a snapshot.
-It is merged after a number of keyframes that depends on the size of the problem alone, so that a
-run has one result.
+The caller of these methods, usually the mapping job of a keyframe, must be the map's only writer
+meanwhile. Only the global bundle adjustment after a loop runs in parallel, on a snapshot.
+Its result is merged after a number of keyframes that depends only on the size of the problem, so
+that the same input always gives the same map.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ class LoopClosing:
     """Finds, verifies and closes loops.
 
     Attributes:
-        detector: what finds candidates.
-        verifier: what decides which candidates are loops.
-        edges: every candidate and what became of it, in order.
+        detector: proposes candidates.
+        verifier: decides which candidates are loops.
+        edges: the outcome of every candidate, in order.
         corrections: the loops that were closed.
         closed: all closed edges, those of a loaded map first, in the current units of the map.
         problems: what failed without harm to the map, a sentence each.
@@ -74,7 +74,7 @@ class LoopClosing:
         self._consistency = LoopConsistency(config.consistency.model_copy(update=memory))
         self._executor = ThreadPoolExecutor(1, "global-adjustment") if threads > 1 else None
         self._global: _PendingAdjustment | None = None
-        self._followed = 0  # times that an old keyframe served instead of a new one
+        self._followed = 0  # how often an old keyframe was reused instead of a new one
 
     def process(
         self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
@@ -117,7 +117,7 @@ class LoopClosing:
         return None
 
     def state(self) -> ClosingState:
-        """What ``restore`` needs to continue from here, with the detector and images restored."""
+        """What ``restore`` needs to continue from here, apart from the detector and the images."""
         return ClosingState(self._consistency.state(), self.verifier.state(), self._followed)
 
     def restore(self, state: ClosingState) -> None:
@@ -128,12 +128,12 @@ class LoopClosing:
 
     @property
     def is_adjusting(self) -> bool:
-        """Whether a global bundle adjustment is yet to be merged."""
+        """Whether the result of a global bundle adjustment is still to be merged."""
         return self._global is not None
 
     def count_reused_keyframe(self, keyframe: int) -> bool:
-        """Count a keyframe that was not inserted after ``keyframe``, since its place is mapped
-        already; returns whether the global bundle adjustment is due to be merged."""
+        """Count a keyframe that was not inserted after ``keyframe`` because its place was mapped
+        already; returns whether the global bundle adjustment must be merged now."""
         self._followed += 1
         return self._is_due(keyframe)
 
@@ -141,8 +141,8 @@ class LoopClosing:
         return self._global is not None and keyframe + self._followed >= self._global.due
 
     def conclude(self, map_: Map) -> None:
-        """At the end of a drive, close a verified loop that still waits for a second keyframe, if
-        an earlier keyframe confirms it."""
+        """At the end of a drive, close a verified loop that no second keyframe has confirmed yet,
+        if an earlier keyframe confirms it."""
         gates, found = self._config.verification, None
         with self._sparing_the_map("Looking for loops"):
             for edge in self._consistency.confirmed_by_earlier(map_, self._camera, gates):
@@ -152,9 +152,10 @@ class LoopClosing:
             self._close(map_, found)
 
     def finish(self, map_: Map) -> None:
-        """Merge the global bundle adjustment that is under way, if there is one.
+        """Wait for the running global bundle adjustment, if there is one, and merge its result.
 
-        The map is sound without it: if it failed, a warning is logged and the map stays as it is.
+        The map is sound without it: after a failure, a warning is logged and the map stays as it
+        was.
         """
         pending, self._global = self._global, None
         if pending is None:
@@ -192,12 +193,12 @@ class LoopClosing:
     def _close(self, map_: Map, loop: _Loop) -> None:
         """Correct the map by a verified loop that agrees with the rest."""
         edge, solution = loop.edge, loop.solution
-        if self._global is not None:  # it knows nothing of this loop
+        if self._global is not None:  # it started before this loop was known
             self._global.cancel()
             self._global = None
         keyframes = solution.graph.keyframes
         before = map_.arrays.T_cw[keyframes]
-        # Before fusion: afterwards each side has the neighbours of both.
+        # Fusion makes the two sides neighbours, so their own neighbours are collected before it.
         query_side = [edge.query, *strong_neighbours(map_, edge.query, self._config)]
         match_side = [edge.match, *strong_neighbours(map_, edge.match, self._config)]
         self.closed.append(edge)
@@ -207,7 +208,7 @@ class LoopClosing:
         edge = replace(edge, reason="closed")
         seconds = time.perf_counter() - loop.start
         self.corrections.append(LoopCorrection(edge, keyframes, before, solution.T_cw, seconds))
-        self._consistency.reset()  # it compares places of the map before the correction
+        self._consistency.reset()  # its places are those of the map before the correction
         with self._sparing_the_map("Global bundle adjustment after a loop"):
             self._global = self._start_global(map_, edge.query)
 
@@ -222,7 +223,7 @@ class LoopClosing:
         )
 
     def _correct(self, map_: Map, solution: Solution) -> None:
-        """Move the keyframes, and what hangs on them, to where a solution puts them."""
+        """Move the keyframes and their landmarks to the poses of a solution."""
         keyframes = solution.graph.keyframes
         if self._camera.monocular:
             growth = move_keyframes_similarly(map_, keyframes, solution.S_wc)

@@ -34,7 +34,8 @@ def evaluate_files(
     """Compare a trajectory with the ground truth: ATE, RPE and KITTI drift."""
     import json
 
-    from vslam.cli.summary import error_rows, print_rows
+    from vslam.cli.summary import error_rows
+    from vslam.cli.tables import print_rows
     from vslam.evaluation.trajectories import evaluate_trajectory, evo_command, read_pair
     from vslam.trajectory import trajectory_format
 

@@ -5,21 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
 if TYPE_CHECKING:
     from vslam.evaluation.trajectories import Evaluation
     from vslam.report.schema import ReportJson
 
 Rows = list[tuple[str, str]]
 _LOOK_AT = (("report", "report.html"), ("recording", "recording.rrd"))
-
-
-def print_rows(rows: Rows) -> None:
-    """Print names and values, the values one below the other."""
-    width = max(len(name) for name, _ in rows)
-    for name, value in rows:
-        typer.echo(f"{name:<{width}}  {value}")
 
 
 def error_rows(errors: Evaluation | ReportJson) -> Rows:
@@ -42,36 +33,37 @@ def error_rows(errors: Evaluation | ReportJson) -> Rows:
 
 def print_summary(report: ReportJson, folder: Path) -> None:
     """Print what matters of a run that is over; ``folder`` holds its results."""
+    from vslam.cli.tables import show_sections
     from vslam.loopclosure.registry import about
-    from vslam.report.render import advice
+    from vslam.report.detector_table import detector_section
+    from vslam.report.page import Pairs, Section
+    from vslam.report.run_page import advice
 
     evaluated = report.alignment is not None
     submaps = f" in {report.submaps} sub-maps" if report.submaps > 1 else ""
-    print_rows(
-        [
-            *([("interrupted", report.interrupted)] if report.interrupted else []),
-            *_scale(report),
-            (
-                "frames",
-                f"{report.frames} done, {report.lost_frames} lost, "
-                f"{report.skipped_frames} unreadable",
-            ),
-            *in_map_rows(report),
-            *_latency(report),
-            *([("evaluation", report.evaluation_remark)] if report.evaluation_remark else []),
-            *(error_rows(report) if evaluated else []),
-            ("detector", f"{report.detector}: {about(report.detector)}"),
-            ("loops", _loops(report)),
-            ("speed", _speed(report)),
-            ("map", f"{report.keyframes} keyframes, {report.landmarks} landmarks{submaps}"),
-            *(("warning", warning) for warning in report.warnings),
-            *([("advice", advice(report))] if advice(report) else []),
-            ("folder", str(folder)),
-            *((name, str(folder / file)) for name, file in _LOOK_AT if (folder / file).exists()),
-            *_how_to_compare(report),
-        ]
-    )
-    _print_detectors(report)
+    rows = [
+        *([("interrupted", report.interrupted)] if report.interrupted else []),
+        *_scale(report),
+        (
+            "frames",
+            f"{report.frames} done, {report.lost_frames} lost, {report.skipped_frames} unreadable",
+        ),
+        *in_map_rows(report),
+        *_latency(report),
+        *([("evaluation", report.evaluation_remark)] if report.evaluation_remark else []),
+        *(error_rows(report) if evaluated else []),
+        ("detector", f"{report.detector}: {about(report.detector)}"),
+        ("loops", _loops(report)),
+        ("speed", _speed(report)),
+        ("map", f"{report.keyframes} keyframes, {report.landmarks} landmarks{submaps}"),
+        *(("warning", warning) for warning in report.warnings),
+        *([("advice", advice(report))] if advice(report) else []),
+        ("folder", str(folder)),
+        *((name, str(folder / file)) for name, file in _LOOK_AT if (folder / file).exists()),
+        *_how_to_compare(report),
+    ]
+    detectors = [detector_section(report)] if report.detectors else []
+    show_sections([Section("", [Pairs(rows)]), *detectors])
 
 
 def in_map_rows(report: ReportJson) -> Rows:
@@ -131,20 +123,3 @@ def _how_to_compare(report: ReportJson) -> Rows:
     if report.detector in ("bow", "none"):
         return [("compare", "add --compare both to set the capsule network beside it")]
     return [("compare", "add --compare bow to set the bag of words beside it")]
-
-
-def _print_detectors(report: ReportJson) -> None:
-    from vslam.report.detector_table import detector_table
-
-    table = detector_table(report)
-    if not table.rows:
-        return
-    lines = [table.head, *table.rows]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    typer.echo()
-    for line in lines:
-        cells = [
-            f"{cell:<{width}}" if title in table.texts else f"{cell:>{width}}"
-            for title, cell, width in zip(table.head, line, widths, strict=True)
-        ]
-        typer.echo("  ".join(cells).rstrip())

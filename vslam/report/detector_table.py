@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vslam.loopclosure.registry import about
-from vslam.report.page import Row, Table
+from vslam.report.page import Row, Section, Table
 from vslam.report.schema import ReportJson
 
 _FIGURES = (
@@ -25,15 +25,15 @@ _NOTE = (
 )
 
 
-def detector_table(report: ReportJson) -> Table:
-    """A row for each detector, the run's own first; no rows where there was no comparison.
+def detector_section(report: ReportJson) -> Section:
+    """A row for each detector, the run's own first; empty where there was no comparison.
 
-    Figures that none of them has are left out. The loops closed are counted only where there is no
-    ground truth to say which revisits were found.
+    Figures that no detector has are left out. The loops closed are counted only where there is no
+    ground truth that tells which revisits were found.
     """
     detectors = report.detectors
     if not detectors:
-        return Table("Detectors", ("detector",), [], note=left_out(report))
+        return Section("Detectors", [left_out(report)])
     known = {
         name for _, name, _ in _FIGURES if any(getattr(one, name) is not None for one in detectors)
     }
@@ -51,7 +51,7 @@ def detector_table(report: ReportJson) -> Table:
         for one in detectors
     ]
     names = "; ".join(f"{one.detector}: {about(one.detector)}" for one in detectors)
-    return Table("Detectors", head, rows, ("detector", *ended), f"{names}. {_NOTE}")
+    return Section("Detectors", [Table(head, rows, ("detector", *ended), f"{names}. {_NOTE}")])
 
 
 def left_out(report: ReportJson) -> str:

@@ -10,17 +10,37 @@ from __future__ import annotations
 
 from base64 import b64encode
 from collections.abc import Collection
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.evaluation.trajectories import Evaluation
+from vslam.report.page import Markup, Section
+from vslam.report.render import fill_template
 from vslam.run.outcome import RunOutcome
 from vslam.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from vslam.run.moments import Moment
+
+
+def explorer(
+    outcome: RunOutcome,
+    evaluation: Evaluation | None,
+    ground_truth: Trajectory | None,
+    moments: Collection[Moment],
+) -> list[Section]:
+    """The section of the page with the explorer; empty without two frames. See
+    :func:`explorer_data`."""
+    data = explorer_data(outcome, evaluation, ground_truth, moments)
+    if data is None:
+        return []
+    program = files("vslam.report").joinpath("explorer.js").read_text("utf-8")
+    with_error = evaluation is not None
+    markup = fill_template("explorer.html.jinja", data=data, program=program, with_error=with_error)
+    return [Section("Explorer", [Markup(markup)])]
 
 
 def explorer_data(

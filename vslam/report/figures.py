@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib import style
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from vslam.evaluation.loops import LoopEvaluation
 from vslam.evaluation.trajectories import Evaluation
 from vslam.features import TrackingState
+from vslam.report import page
 from vslam.report.drawing import (
     AMBER,
     BLUE,
@@ -24,12 +24,11 @@ from vslam.report.drawing import (
     MUTED,
     RED,
     STATE_COLORS,
-    STYLE,
     VIOLET,
-    ReportFigure,
+    Drawing,
     add_legend,
+    draw,
     new_figure,
-    save,
 )
 from vslam.report.summary import stage_names
 from vslam.report.trajectory_figures import loop_closing, top_view
@@ -48,7 +47,7 @@ def draw_figures(
     evaluation: Evaluation | None,
     ground_truth: Trajectory | None,
     verdict: LoopEvaluation | None,
-) -> list[ReportFigure]:
+) -> list[page.Figure]:
     """Draw all figures that this run has data for, in the order of the report.
 
     Args:
@@ -57,20 +56,15 @@ def draw_figures(
         ground_truth: of the same frames, or None.
         verdict: of ``outcome.loops``, or None.
     """
-    # after_reset shuts out a matplotlibrc of the user: equal runs give equal figures.
-    with style.context(STYLE, after_reset=True):
-        return [
-            save(name, caption, figure)
-            for name, caption, figure in _draw(outcome, evaluation, ground_truth, verdict)
-        ]
+    return draw(_drawings(outcome, evaluation, ground_truth, verdict))
 
 
-def _draw(
+def _drawings(
     outcome: RunOutcome,
     evaluation: Evaluation | None,
     ground_truth: Trajectory | None,
     verdict: LoopEvaluation | None,
-) -> Iterator[tuple[str, str, Figure]]:
+) -> Iterator[Drawing]:
     if len(outcome.trajectory):
         caption = "Seen from above, at equal scale; z points ahead of the first camera."
         if evaluation is not None and evaluation.alignment != "none":

@@ -25,8 +25,7 @@ from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_trut
 from vslam.trajectory import write_kitti, write_tum
 
 if TYPE_CHECKING:
-    from vslam.report.figures import ReportFigure
-    from vslam.report.seen_loops import SeenLoop
+    from vslam.report.page import Figure
     from vslam.run.loop_pictures import LoopPicture
     from vslam.run.moments import Moment
 
@@ -106,7 +105,7 @@ def write_results(
         verdict = evaluate_loops(outcome)
         command = _evo_command(folder, outcome, evaluation)
         report = summarize(outcome, evaluation, verdict, command, remark)
-        file.write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
+        file.write_text(report.to_json(), encoding="utf-8")
     if pages and report is not None:
         _write_pages(written, report, outcome, evaluation, verdict, moments, pictures)
     written.require_all()
@@ -249,26 +248,27 @@ def _write_pages(
     pictures: Collection[LoopPicture],
 ) -> None:
     """Figures, and the pages that show them, without those that could not be drawn."""
-    from vslam.report.explorer import explorer_data
+    from vslam.report.explorer import explorer
     from vslam.report.figures import draw_figures
-    from vslam.report.render import render_html, render_markdown
+    from vslam.report.render import html, markdown
+    from vslam.report.run_page import run_page
     from vslam.report.seen_loops import seen_loops
 
-    figures: list[ReportFigure] = []
-    seen: list[SeenLoop] = []
+    truth = matched_ground_truth(outcome)
+    figures: list[Figure] = []
+    seen: list[Figure] = []
     with written.file("figures") as file:
-        figures = draw_figures(outcome, evaluation, matched_ground_truth(outcome), verdict)
+        drawn = draw_figures(outcome, evaluation, truth, verdict)
+        figures = [replace(figure, file=f"figures/{figure.name}.png") for figure in drawn]
         seen = seen_loops(report, pictures)
         file.mkdir(exist_ok=True)
-        for figure in figures:
-            (file / f"{figure.name}.png").write_bytes(figure.png)
-        for loop in seen:
-            (file / loop.name).write_bytes(loop.jpeg)
+        for figure in (*figures, *seen):
+            (written.folder / figure.file).write_bytes(figure.image)
     recordings = sorted(path.name for path in written.folder.glob("recording*.rrd"))
     with written.file("report.md") as file:
-        file.write_text(render_markdown(report, seen, recordings), encoding="utf-8")
+        page = run_page(report, figures, seen, recordings)
+        file.write_text(markdown(page), encoding="utf-8")
     with written.file("report.html") as file:
-        explorer = explorer_data(outcome, evaluation, matched_ground_truth(outcome), moments)
-        config = _config_text(outcome)
-        page = render_html(report, config, figures, explorer, seen, recordings)
-        file.write_text(page, encoding="utf-8")
+        sections = explorer(outcome, evaluation, truth, moments)
+        page = run_page(report, figures, seen, recordings, sections, _config_text(outcome))
+        file.write_text(html(page), encoding="utf-8")

@@ -5,24 +5,20 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 
-from vslam.report.page import Row, Table
+from vslam.report.page import Row, Section, Table
 from vslam.report.schema import LoopEntry, ReportJson
 
 _MAX_CLOSED = 60
 _MAX_REJECTED = 12
 
 
-def loop_tables(report: ReportJson) -> list[Table]:
-    """Revisits, closed loops, why others were rejected, which came near."""
+def loop_sections(report: ReportJson) -> list[Section]:
+    """Revisits, closed loops, why candidates were rejected, and which of them came near."""
     return [
-        table
-        for table in (
-            _revisits(report),
-            _closed(report),
-            _reasons(report),
-            _nearly(report),
-        )
-        if table.rows
+        Section("Revisits", [_revisits(report)], wide=False),
+        Section("Loops closed", [_closed(report)], wide=False),
+        Section("Loops rejected", [_reasons(report)], wide=False),
+        Section("Rejected with the most inliers", [_nearly(report)], folded=True, wide=False),
     ]
 
 
@@ -37,7 +33,7 @@ def _revisits(report: ReportJson) -> Table:
         for r in report.revisits
     ]
     note = "By the ground truth: frames on which the camera drives along an earlier stretch again."
-    return Table("Revisits", ("frames", "again", "length", "loop"), rows, ("loop",), note)
+    return Table(("frames", "again", "length", "loop"), rows, ("loop",), note)
 
 
 def _closed(report: ReportJson) -> Table:
@@ -55,7 +51,7 @@ def _closed(report: ReportJson) -> Table:
     )
     if len(closed) > _MAX_CLOSED:
         note += f" {len(closed) - _MAX_CLOSED} more are in report.json."
-    return Table("Loops closed", head, rows, ("pose",), note)
+    return Table(head, rows, ("pose",), note)
 
 
 def _reasons(report: ReportJson) -> Table:
@@ -70,7 +66,7 @@ def _reasons(report: ReportJson) -> Table:
     ]
     head = ("reason", "candidates", "most inliers", "pose right")
     note = f"{report.loops_rejected} candidates; each of them is in report.json."
-    return Table("Loops rejected", head, rows, ("reason",), note)
+    return Table(head, rows, ("reason",), note)
 
 
 def _nearly(report: ReportJson) -> Table:
@@ -80,7 +76,7 @@ def _nearly(report: ReportJson) -> Table:
         (*_evidence(loop), _right(loop), loop.reason) for loop in rejected[:_MAX_REJECTED]
     ]
     head = (*_EVIDENCE, "pose", "reason")
-    return Table("Rejected with the most inliers", head, rows, ("pose", "reason"), folded=True)
+    return Table(head, rows, ("pose", "reason"))
 
 
 _EVIDENCE = ("frame", "earlier", "proposed by", "score", "verified by", "matches", "inliers")

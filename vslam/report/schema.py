@@ -6,14 +6,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, StringConstraints
+from pydantic import StringConstraints
+
+from vslam.report.document import Document, Record
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class StageTime(_Model):
+class StageTime(Record):
     """Milliseconds of one stage over the frames that went through it."""
 
     mean: float
@@ -22,7 +20,7 @@ class StageTime(_Model):
     p99: float = 0.0
 
 
-class LoopEntry(_Model):
+class LoopEntry(Record):
     """One loop candidate, accepted or not, in frames of this run.
 
     ``query_frame`` is None for a frame that was not in the map, ``match_frame`` for one of an
@@ -47,7 +45,7 @@ class LoopEntry(_Model):
     correction_s: float | None
 
 
-class RevisitEntry(_Model):
+class RevisitEntry(Record):
     """A stretch of frames that leads along an earlier one, by the ground truth.
 
     ``loop_frame`` is the first frame with a right loop that was closed on it, None if missed.
@@ -61,7 +59,7 @@ class RevisitEntry(_Model):
     loop_frame: int | None
 
 
-class DetectorFigures(_Model):
+class DetectorFigures(Record):
     """One of the detectors that were compared on the same frames; None where a figure cannot be
     given, as in ``ReportJson``.
 
@@ -86,7 +84,7 @@ class DetectorFigures(_Model):
     interrupted: str | None
 
 
-class MapFigures(_Model):
+class MapFigures(Record):
     """How a run found itself in the map that it went on in.
 
     ``in_map_percent`` of the frames are placed in it at the end, ``weak_percent`` of the frames
@@ -106,7 +104,7 @@ class MapFigures(_Model):
     error_m: float | None
 
 
-class Machine(_Model):
+class Machine(Record):
     """Where the times were measured; ``cores`` counts those that the process may use."""
 
     cpu: str
@@ -115,7 +113,7 @@ class Machine(_Model):
     platform: str
 
 
-class ReportJson(_Model):
+class ReportJson(Document):
     """One run in numbers.
 
     Errors are None without ground truth, and KITTI's drift also on paths shorter than 100 m;
@@ -175,7 +173,7 @@ class ReportJson(_Model):
     revisit_stretches: int | None
     revisits: list[RevisitEntry]
     loops: list[LoopEntry]
-    detectors: list[DetectorFigures] = []
+    detectors: tuple[DetectorFigures, ...] = ()
     in_map: MapFigures | None = None
 
     dataset: str

@@ -17,7 +17,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TextIO
+from typing import TextIO
 
 from vslam.errors import InputError
 from vslam.features import TrackResult
@@ -85,39 +85,23 @@ def _forget_poses(path: Path, frames: int) -> None:
             file.write("".join(lines).encode())
 
 
-class Autosave(Protocol):
-    """Told of every frame of a run, in order."""
+class Autosave:
+    """Told of every frame of a run, in order; this one keeps nothing."""
 
     def frame(self, result: TrackResult) -> None:
         """A frame was tracked."""
-        ...
 
     def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
         """The frame is done with: this is the moment to save, if it is time."""
-        ...
 
     def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
         """The run is over, and finished; if ``resumable``, it ended early with a complete map."""
-        ...
 
 
-class NoAutosave:
-    """Keeps nothing."""
-
-    def frame(self, result: TrackResult) -> None:
-        pass
-
-    def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
-        pass
-
-    def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
-        pass
+NO_AUTOSAVE = Autosave()
 
 
-NO_AUTOSAVE = NoAutosave()
-
-
-class FolderAutosave:
+class FolderAutosave(Autosave):
     """Saves into the folder of a run.
 
     What cannot be written, on a full disk for example, is told once; the run goes on, and the next

@@ -14,7 +14,7 @@ from vslam.features import Features, TrackResult
 from vslam.loops import LoopEdge
 from vslam.map import Map
 from vslam.run.loop_pictures import LoopPicture, loop_matches, spread
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 from vslam.trajectory import Trajectory
 
 _MOST = 96  # moments: about 1 MB of the page
@@ -47,7 +47,7 @@ class Moment:
     tracked: NDArray[np.bool_]
 
 
-class MomentRecorder(NullRecorder):
+class MomentRecorder(Recorder):
     """Keeps every keyframe at first and, whenever there are too many, every second of those kept:
     what is kept depends on the keyframes alone, and lies evenly over a run of any length."""
 
@@ -88,7 +88,7 @@ def _moment(
     return Moment(frame, jpeg, points, tracked[order])
 
 
-class LoopPictureRecorder(NullRecorder):
+class LoopPictureRecorder(Recorder):
     """Keeps a small image of each keyframe, and of each closed loop what its picture shows.
 
     There is no picture of a loop whose earlier image is not kept: that of another drive, of the

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import Config
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import Stream
+from vslam.datasets.frames import Source
 from vslam.features import TrackResult
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.map import Map
@@ -87,7 +86,7 @@ class RunOutcome:
     """
 
     settings: RunSettings
-    sequence: Sequence | Stream
+    sequence: Source
     trajectory: Trajectory
     keyframes: Trajectory
     tracks: list[TrackResult]
@@ -122,9 +121,9 @@ def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:
     return Trajectory(times, np.array(poses, np.float64).reshape(-1, 4, 4))
 
 
-def ground_truth_of(source: Sequence | Stream) -> Trajectory | None:
+def ground_truth_of(source: Source) -> Trajectory | None:
     """The ground truth of all frames that have one, None without any."""
-    if isinstance(source, Stream) or source.ground_truth is None:
+    if source.ground_truth is None:
         return None
     known = np.flatnonzero(np.isfinite(source.ground_truth).all((1, 2)))
     return Trajectory(source.timestamps, source.ground_truth).select(known)

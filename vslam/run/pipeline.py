@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, same_camera
+from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation import Perturbation, perturbed
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import Stream, TimedFrame, is_live, timed_frames
 from vslam.errors import BrokenSourceError, InputError
 from vslam.features import TrackingState, TrackResult
 from vslam.frontend.sides import Sides
@@ -43,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 
 def run_sequence(
-    sequence: Sequence | Stream,
+    sequence: Source,
     perturbation: Perturbation,
     settings: RunSettings,
     recorder: Recorder,
@@ -85,10 +84,10 @@ def run_sequence(
     n_told = 0  # loops that the recorder knows of
     broken: list[str] = []
     with _stop_on_interrupt() as interrupted:
-        frames = perturbed(_until_broken(timed_frames(sequence), broken), perturbation)
+        frames = perturbed(_until_broken(sequence.frames(), broken), perturbation)
         frames = _following(frames, main.before.tracks.timestamps)
         try:
-            for played in in_their_time(frames, slam.context, settings, live=is_live(sequence)):
+            for played in in_their_time(frames, slam.context, settings, live=sequence.live):
                 result = main.step(played)
                 if (frame := played.made) is not None and frame.problem and not frame.dropped:
                     _log.warning("frame %d skipped: %s", result.index, frame.problem)
@@ -104,7 +103,7 @@ def run_sequence(
                 if main.problem:
                     break
                 if interrupted.is_set():
-                    if not is_live(sequence):  # a camera has no other end
+                    if not sequence.live:  # a camera has no other end
                         broken.append("Ctrl-C")
                     break
         except Exception as error:  # whatever it is, what is done is kept
@@ -286,7 +285,7 @@ def _following(frames: Iterator[TimedFrame], before: NDArray[np.float64]) -> Ite
 
 
 def _outcome(
-    sequence: Sequence | Stream,
+    sequence: Source,
     run: _Run,
     seconds: tuple[float, float],
     interrupted: str | None,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import Generic, TypeVar
 
-from vslam.datasets.stream import TimedFrame
+from vslam.datasets.frames import TimedFrame
 
 T = TypeVar("T")
 

@@ -21,7 +21,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec, Protocol
+from typing import Any, Concatenate, ParamSpec
 
 import cv2
 import numpy as np
@@ -74,8 +74,11 @@ _FILE_PACE = _Pace(50, 25, 10)
 _VIEWER_PACE = _Pace(5, 5, 2)  # nothing is kept for long there
 
 
-class Recorder(Protocol):
-    """What the pipeline tells of a run. No method raises because a recording cannot be written."""
+class Recorder:
+    """What the pipeline tells of a run; this one records nothing (``--no-record``).
+
+    No method raises because a recording cannot be written.
+    """
 
     def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
         """Log what does not change; once, before the first frame.
@@ -120,24 +123,7 @@ class Recorder(Protocol):
         close the file."""
 
 
-class NullRecorder:
-    """Records nothing (``--no-record``)."""
-
-    def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None: ...
-    def frame(self, result: TrackResult, T_wc: NDArray[np.float64]) -> None: ...
-    def keyframe(
-        self,
-        result: TrackResult,
-        image: NDArray[np.uint8],
-        features: Features,
-        tracked: NDArray[np.bool_],
-    ) -> None: ...
-    def map(self, map_: Map) -> None: ...
-    def loops(self, edges: Collection[LoopEdge], map_: Map) -> None: ...
-    def finish(self, trajectory: Trajectory, map_: Map | None) -> None: ...
-
-
-class SeveralRecorders:
+class SeveralRecorders(Recorder):
     """Tells each of several recorders. One that ends does not end the others; one that raises is
     told no more, and a warning is logged."""
 
@@ -281,7 +267,7 @@ def _guarded(
     return call
 
 
-class RerunRecorder:
+class RerunRecorder(Recorder):
     """Writes a ``.rrd`` file, or shows the same live.
 
     Timelines: ``frame`` (number) and ``time`` (seconds).

@@ -237,8 +237,7 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
         frame = Frame.of(Extracted(features), CAMERA, k, 0.1 * k)
         frame.T_cw, frame.landmark = T_cw, landmark
         mapper.hold(frame)
-        mapper.append_pose(frame, tracked=True)
-        mapper.insert(frame)
+        mapper.insert(mapper.append_pose(frame, tracked=True))
         mapper.merge()
         landmark = frame.landmark
     return mapper.map, features

@@ -3,7 +3,7 @@ r"""Let every part of a run fail once, and write down what the run says and leav
 The points and the judgement are those of the tests (tests/faults.py): this tool takes all of them,
 with every fault.
 
-    python tools/experiments/lifelong/inject_faults.py --out docs/lifelong/faults.csv
+    python tools/experiments/lifelong/inject_faults.py --out docs/research/lifelong/faults.csv
 """
 
 from __future__ import annotations

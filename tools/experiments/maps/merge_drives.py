@@ -19,9 +19,8 @@ import numpy as np
 
 from vslam.config import Config
 from vslam.datasets import open_sequence
+from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation import parse_perturbation, perturbed
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import TimedFrame, timed_frames
 from vslam.evaluation.loops import LoopLimits
 from vslam.evaluation.trajectories import evaluate_trajectory, path_length
 from vslam.geometry import inverses
@@ -71,13 +70,13 @@ def memory(detector: str):
     return detector_with_images(detector, Config())
 
 
-def lit_frames(sequence: Sequence, frames: range, perturb: str, seed: int) -> Iterator[TimedFrame]:
+def lit_frames(sequence: Source, frames: range, perturb: str, seed: int) -> Iterator[TimedFrame]:
     """Some frames of a sequence, in a light of their own."""
-    some = (frame for k, frame in enumerate(timed_frames(sequence)) if k in frames)
+    some = (frame for k, frame in enumerate(sequence.frames()) if k in frames)
     return perturbed(some, parse_perturbation(perturb, seed))
 
 
-def drive(sequence: Sequence, frames: range, detector: str, perturb: str, seed: int) -> StoredMap:
+def drive(sequence: Source, frames: range, detector: str, perturb: str, seed: int) -> StoredMap:
     made, images = memory(detector)
     slam = Slam(sequence.camera, Config(), made, images=images)
     lit = lit_frames(sequence, frames, perturb, seed)

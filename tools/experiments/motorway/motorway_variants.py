@@ -1,14 +1,15 @@
 """Rendered motorways that are harder than `01`: vslam and ORB-SLAM3 on the same images, in a table.
 
-    python tools/experiments/motorway/motorway_variants.py --csv docs/results/motorway.csv \
-        --orbslam3-python PY --orbslam3-script run_orbslam3.py --vocabulary voc.txt
+    python tools/experiments/motorway/motorway_variants.py \
+        --csv docs/research/results/motorway.csv --orbslam3-python PY \
+        --orbslam3-script run_orbslam3.py --vocabulary voc.txt
 
 More speed: every second or third frame, with its own time, so that the car drives 5 or 7.5 m a
 frame. Less texture: fog, contrast, blur. Far points only: a quarter of the baseline, which leaves
 next to nothing within 40 baselines; the route is rendered anew for it. The rails of `01` and their
 posts repeat every four metres. Finished rows stay in the CSV file and are not run again, unless
 ``--again`` names their system. For what ORB-SLAM3's script takes and prints see
-compare_orbslam3.py.
+systems.py.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from typing import NamedTuple
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # tools/
 
-from changed_drive import changed_drive, run_over
+from systems import OrbSlam3, add_orbslam3_options, changed_drive, orbslam3_of, run_over
 
 ROUTE = "01"
 SHORT = 4  # times as short is the baseline that leaves far points only
@@ -59,11 +60,10 @@ def main() -> None:
     parser.add_argument("--csv", type=Path, required=True)
     parser.add_argument("--only", default="", help="titles of variants, with semicolons")
     parser.add_argument("--again", default="", help="systems to measure again, with commas")
-    parser.add_argument("--orbslam3-python", type=Path)
-    parser.add_argument("--orbslam3-script", type=Path)
-    parser.add_argument("--vocabulary", type=Path)
+    add_orbslam3_options(parser)
     options = parser.parse_args()
-    systems = [VSLAM, ORBSLAM3] if options.orbslam3_python else [VSLAM]
+    orbslam3 = orbslam3_of(options)
+    systems = [VSLAM, ORBSLAM3] if orbslam3 else [VSLAM]
     again, only = options.again.split(","), list(filter(None, options.only.split(";")))
     rows: dict[tuple[str, str], dict[str, str]] = {}
     if options.csv.exists():
@@ -80,7 +80,9 @@ def main() -> None:
             continue
         with drive_of(variant) as (data, name):
             for system in wanted:
-                rows[variant.title, system] = row_of(variant, system, data, name, options)
+                rows[variant.title, system] = row_of(
+                    variant, system, data, name, orbslam3 if system == ORBSLAM3 else None
+                )
                 write(options.csv, rows)
     print(table(rows))
 
@@ -107,11 +109,11 @@ def drive_of(variant: Variant) -> Iterator[tuple[Path, str]]:
 
 
 def row_of(
-    variant: Variant, system: str, data: Path, name: str, options: argparse.Namespace
+    variant: Variant, system: str, data: Path, name: str, orbslam3: OrbSlam3 | None
 ) -> dict[str, str]:
     """Run one system over a drive."""
-    detector = "bow" if system == VSLAM else None
-    run, found = run_over(data, name, options, detector, sensor="stereo", no_report=True)
+    words = ("--detector", "bow", "--no-report") if system == VSLAM else ()
+    run, found = run_over(data, name, orbslam3, *words)
     return {
         "variant": variant.title,
         "system": system,

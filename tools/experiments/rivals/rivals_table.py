@@ -1,7 +1,7 @@
-"""Write Table 6 of the paper and its companions, for all networks of docs/rivals.md.
+"""Write Table 6 of the paper and its companions, for all networks of docs/research/rivals.md.
 
 python tools/experiments/rivals/rivals_table.py --trained DIR --data SOURCE [--data SOURCE ...]
-        [--page docs/rivals.md] [--section NAME] [--ways NAMES] [--retime]
+        [--page docs/research/rivals.md] [--section NAME] [--ways NAMES] [--retime]
 
 DIR is what tools/training/train_rivals.py wrote, SOURCE as of ``vslam loops bench``. Measured are,
 as that command does, descriptors alone: of the networks that were shown the same images, of those
@@ -58,7 +58,7 @@ from vslam.report.drawing import (
     new_figure,
     save,
 )
-from vslam.report.page import markdown_table
+from vslam.report.render import markdown_table
 from vslam.report.summary import this_machine
 
 CONDITIONS = ("light", "viewpoint", "occlusion")
@@ -86,16 +86,16 @@ _DASHES = ("-", "--")  # of the first six networks, of the rest
 Row = tuple[str, ...]
 
 
-def main() -> None:
+def main(words: list[str] | None = None) -> None:
     """Parse the command line, run what is missing and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--trained", type=Path, required=True, help="folder with rivals.csv")
     parser.add_argument("--data", action="append", required=True, help="images to test on")
-    parser.add_argument("--page", type=Path, default=Path("docs/rivals.md"))
+    parser.add_argument("--page", type=Path, default=Path("docs/research/rivals.md"))
     parser.add_argument("--section", default="tables", help="of the page, to be written")
     parser.add_argument("--ways", default=",".join(WAYS), help="what the section shows")
     parser.add_argument("--retime", action="store_true", help="measure all times again")
-    args = parser.parse_args()
+    args = parser.parse_args(words)
 
     training, bench = read_training(args.trained / "rivals.csv"), args.trained / "bench"
     ways = args.ways.split(",")
@@ -127,7 +127,7 @@ def main() -> None:
     images = []
     for figure in figures:
         file = folder / f"{figure.name}.png"
-        file.write_bytes(figure.png)
+        file.write_bytes(figure.image)
         images.append(f"![{figure.caption}]({file.relative_to(args.page.parent)})")
     write_csv(folder / "table6.csv", table_6(reports, digits=4))
     write_csv(folder / "conditions.csv", every_score(reports))

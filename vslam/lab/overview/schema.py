@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from vslam.report.document import Document, Record
 
 Measure = tuple[str, str, str, int]
 # Name in the JSON, title, unit, decimals.
@@ -25,11 +25,7 @@ DECIMALS = {name: decimals for name, _, _, decimals in MEASURES}
 ALL = "all"  # in the place of a perturbation: over all of them
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Drive(_Model):
+class Drive(Record):
     """Images that systems are compared on, but for the seeds of what was drawn.
 
     ``excerpt`` is empty for a whole sequence.
@@ -46,7 +42,7 @@ class Drive(_Model):
         return f"{self.sequence}, {self.excerpt}" if self.excerpt else self.sequence
 
 
-class RunEntry(_Model):
+class RunEntry(Record):
     """One run. ``measures`` has the names of ``MEASURES``; None where a run has no such figure.
 
     ``system`` is the loop detector, or the name of another system; ``source`` the folder of the
@@ -67,7 +63,7 @@ class RunEntry(_Model):
     machine: str | None
 
 
-class Spread(_Model):
+class Spread(Record):
     """Of the ``n`` runs that have the figure."""
 
     n: int
@@ -76,7 +72,7 @@ class Spread(_Model):
     greatest: float
 
 
-class Row(_Model):
+class Row(Record):
     """All runs of one system on one drive; None for a measure that no run has. ``alignment`` is
     that of its runs."""
 
@@ -88,7 +84,7 @@ class Row(_Model):
     measures: dict[str, Spread | None]
 
 
-class Pair(_Model):
+class Pair(Record):
     """Medians of two systems on one drive, and ``difference``, the second minus the first."""
 
     drive: Drive
@@ -97,7 +93,7 @@ class Pair(_Model):
     difference: float
 
 
-class Comparison(_Model):
+class Comparison(Record):
     """Two systems under one perturbation, paired by sequence.
 
     ``perturb`` is ``all`` for a comparison over all perturbations: a sequence then counts once,
@@ -121,7 +117,7 @@ class Comparison(_Model):
     words: str
 
 
-class OverviewJson(_Model):
+class OverviewJson(Document):
     """``kind`` tells this file from the ``report.json`` of one run. ``systems`` are in the order in
     which they are compared, the baseline first."""
 

@@ -15,13 +15,15 @@ import http.server
 import re
 import threading
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 from vslam.errors import InputError
+from vslam.lab.overview.collect import run_folders
 from vslam.report.finished_run import read_report
-from vslam.report.page import render_page
+from vslam.report.render import fill_template
 from vslam.report.schema import ReportJson
 from vslam.untrusted import require_utf8
 
@@ -51,26 +53,18 @@ def list_runs(folders: Collection[Path]) -> list[ListedRun]:
     Raises:
         InputError: no such folder, or no run in any of them.
     """
-    found: dict[Path, ListedRun] = {}
-    for folder in folders:
-        if not folder.is_dir():
-            raise InputError(f"{folder}: no such folder; name folders of runs.")
-        for path in sorted(folder.rglob("report.json")):
-            place = path.parent.resolve()
-            parts = path.parent.relative_to(folder).parts
-            hidden = any(part.startswith(".") for part in parts)
-            if place in found or hidden or not _is_own(place / path.name):
-                continue
-            try:
-                require_utf8(place)
-                report = read_report(path.parent)
-            except InputError:
-                continue
-            page = place / "report.html"
-            found[place] = ListedRun(place.name, report, page if _is_own(page) else None)
+    found: list[ListedRun] = []
+    for folder in run_folders(folders):
+        place = folder.resolve()
+        page = place / "report.html"
+        with suppress(InputError):
+            require_utf8(place)
+            if _is_own(place / "report.json"):
+                listed = page if _is_own(page) else None
+                found.append(ListedRun(place.name, read_report(place), listed))
     if not found:
         raise InputError(f"{', '.join(map(str, folders))}: no run here; name folders of runs.")
-    return sorted(found.values(), key=lambda run: (run.report.created, run.name), reverse=True)
+    return sorted(found, key=lambda run: (run.report.created, run.name), reverse=True)
 
 
 def _is_own(path: Path) -> bool:
@@ -149,8 +143,8 @@ class _Pages:
             known = [n for n in dict.fromkeys(chosen) if n < len(self._names)][:_MOST_BESIDE]
             if len(known) > 1:
                 beside = [(n, self._names[n]) for n in known]
-                return 200, render_page("compare.html.jinja", runs=beside)
-            return 400, render_page("compare.html.jinja", runs=[])
+                return 200, fill_template("compare.html.jinja", runs=beside)
+            return 400, fill_template("compare.html.jinja", runs=[])
         return 404, "not found"
 
     def _run(self, number: int) -> tuple[int, str]:
@@ -172,7 +166,7 @@ class _Pages:
                     self._names.append(run.name)
                 number = self._numbers[run.page]
             rows.append((number, run.name, _cells(run.report)))
-        return render_page("runs.html.jinja", head=_HEAD, rows=rows, most=_MOST_BESIDE)
+        return fill_template("runs.html.jinja", head=_HEAD, rows=rows, most=_MOST_BESIDE)
 
 
 _HEAD = ("data", "perturb", "detector", "frames", "lost", "ATE (m)", "loops", "wrong", "fps")

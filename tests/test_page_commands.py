@@ -145,6 +145,10 @@ RULES = {
     "docs/research/lifelong.md": Rules(
         not_run=(
             ("python tools/experiments/lifelong/laps.py", HOURS),
+            (
+                "python tools/experiments/lifelong/inject_faults.py",
+                "test_faults.py runs a part",
+            ),
             ("python tools/kill_test.py", "it runs for minutes; test_autosave.py kills runs"),
         )
     ),

@@ -22,6 +22,7 @@ from test_report import make_outcome, report_of
 from vslam.calibration.documents import read_document
 from vslam.datasets.bag import open_bag
 from vslam.datasets.image_files import read_grey
+from vslam.datasets.video import open_video
 from vslam.errors import InputError, UnreadableImageError
 from vslam.loopclosure.vocabulary import load
 from vslam.maps.storage import load_map
@@ -155,6 +156,19 @@ def test_images_of_absurd_size_are_refused_by_their_header(tmp_path: Path, width
     said, peak = done.stdout.splitlines()
     assert f"larger than {MOST_PIXELS / 1e6:.0f} million pixels" in said
     assert int(peak) < 400  # MB
+
+
+def test_a_video_of_absurd_size_is_refused_by_its_header(tmp_path: Path, monkeypatch):
+    class Capture:
+        """A video of 144 million pixels a frame, of which no frame may be read."""
+
+        def get(self, kind: int) -> float:
+            return 12_000.0
+
+    (tmp_path / "a.mp4").write_bytes(b"a video")
+    monkeypatch.setattr("vslam.datasets.video.open_capture", lambda name: Capture())
+    with pytest.raises(InputError, match="134 million are the limit, so scale the video down"):
+        open_video(tmp_path / "a.mp4", monocular=True)
 
 
 def test_a_damaged_image_says_so(tmp_path: Path):

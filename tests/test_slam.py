@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -172,6 +173,13 @@ def test_landmarks_lie_on_the_walls_and_the_ground(corridor):
 def test_same_bytes_with_one_thread_and_two_and_again(corridor, config):
     runs = [bytes_of(*run(corridor, config, threads=threads)) for threads in (1, 2, 2, 1)]
     assert len(set(runs)) == 1
+
+
+def test_two_in_threads_of_their_own_have_the_bytes_of_one(corridor):
+    expected = bytes_of(*run(corridor))
+    with ThreadPoolExecutor(2) as pool:
+        both = [pool.submit(lambda: bytes_of(*run(corridor, threads=2))) for _ in range(2)]
+        assert [one.result() for one in both] == [expected] * 2
 
 
 @pytest.mark.slow

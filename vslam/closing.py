@@ -11,8 +11,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +35,7 @@ from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.verifier import Verifier
 from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map
+from vslam.plugins import reason
 from vslam.states import ClosingState
 
 _log = logging.getLogger(__name__)
@@ -48,6 +50,7 @@ class LoopClosing:
         edges: the outcome of every candidate, in order.
         corrections: the loops that were closed.
         closed: all closed edges, those of a loaded map first, in the current units of the map.
+        problems: what failed without harm to the map, a sentence each.
     """
 
     def __init__(
@@ -64,6 +67,7 @@ class LoopClosing:
         self.edges: list[LoopEdge] = []
         self.corrections: list[LoopCorrection] = []
         self.closed: list[LoopEdge] = []
+        self.problems: list[str] = []
         self._camera = camera
         self._config = config
         memory = {"verified_memory": verifier.verified_memory}
@@ -78,14 +82,24 @@ class LoopClosing:
         """Look for loops at a keyframe whose local mapping is done; close the first real one."""
         if self._is_due(keyframe):
             self.finish(map_)
-        if self.verifier.is_image_redundant(map_, keyframe):
-            image = None  # no network needs to see it
-        self.detector.add(keyframe, image, features)
-        self.verifier.add(map_, keyframe, image)
-        self.consider(map_, keyframe, self.detector.query(keyframe, map_))
+        found = None
+        with self._sparing_the_map("Looking for loops"):
+            if self.verifier.is_image_redundant(map_, keyframe):
+                image = None  # no network needs to see it
+            self.detector.add(keyframe, image, features)
+            self.verifier.add(map_, keyframe, image)
+            found = self._find(map_, keyframe, self.detector.query(keyframe, map_))
+        if found is not None:
+            self._close(map_, found)
 
     def consider(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> None:
         """Verify the candidates of a keyframe, best first, and close the first real loop."""
+        found = self._find(map_, keyframe, candidates)
+        if found is not None:
+            self._close(map_, found)
+
+    def _find(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> _Loop | None:
+        """The first real loop among candidates, best first. Only reads the map."""
         candidates = self.verifier.rate(map_, keyframe, candidates)
         _, refused = self._consistency.update(keyframe, candidates, map_)
         refusals = {edge.match: edge for edge in refused}
@@ -95,12 +109,12 @@ class LoopClosing:
         for number, candidate in enumerate(tried):
             edge = self.verifier.verify(map_, candidate, refusals.get(candidate.match))
             edge = self._consistency.confirm(edge, map_)
-            if edge.accepted:
-                edge = self._close(map_, edge)
-            self.edges.append(edge)
-            if edge.accepted:
+            if not edge.accepted:
+                self.edges.append(edge)
+            elif (loop := self._solve(map_, edge)) is not None:
                 self.edges += [_superseded(other) for other in tried[number + 1 :]]
-                break
+                return loop
+        return None
 
     def state(self) -> ClosingState:
         """What ``restore`` needs to continue from here, apart from the detector and the images."""
@@ -129,12 +143,13 @@ class LoopClosing:
     def conclude(self, map_: Map) -> None:
         """At the end of a drive, close a verified loop that no second keyframe has confirmed yet,
         if an earlier keyframe confirms it."""
-        gates = self._config.verification
-        for edge in self._consistency.confirmed_by_earlier(map_, self._camera, gates):
-            edge = self._close(map_, edge)
-            self.edges.append(edge)
-            if edge.accepted:
-                return
+        gates, found = self._config.verification, None
+        with self._sparing_the_map("Looking for loops"):
+            for edge in self._consistency.confirmed_by_earlier(map_, self._camera, gates):
+                if (found := self._solve(map_, edge)) is not None:
+                    break
+        if found is not None:
+            self._close(map_, found)
 
     def finish(self, map_: Map) -> None:
         """Wait for the running global bundle adjustment, if there is one, and merge its result.
@@ -145,25 +160,39 @@ class LoopClosing:
         pending, self._global = self._global, None
         if pending is None:
             return
-        try:
+        solution = None
+        with self._sparing_the_map("Global bundle adjustment after a loop"):
             solution = pending.solution()
-        except Exception as error:
-            _log.warning(
-                "Global bundle adjustment after a loop failed (%s: %s); the map stays as it was.",
-                type(error).__name__,
-                error,
-            )
-            return
-        merge_solution(map_, pending.snapshot, solution)
+        if solution is not None:
+            merge_solution(map_, pending.snapshot, solution)
 
-    def _close(self, map_: Map, edge: LoopEdge) -> LoopEdge:
-        """Correct the map by a verified loop, unless the loop contradicts the rest of the graph."""
+    @contextmanager
+    def _sparing_the_map(self, what: str) -> Iterator[None]:
+        """Report what fails without having changed the map, which is sound without it."""
+        try:
+            yield
+        except Exception as error:
+            problem = f"{what} failed ({reason(error)}); the map stays as it was."
+            if problem not in self.problems:
+                self.problems.append(problem)
+                _log.warning(problem)
+
+    def _solve(self, map_: Map, edge: LoopEdge) -> _Loop | None:
+        """How a verified loop would correct the map; None if it contradicts the rest. What became
+        of the loop is added to ``edges``."""
         start = time.perf_counter()
-        solution = self._solve(map_, edge, Hypothesis.PREDICTED)
+        solution = self._solution(map_, edge, Hypothesis.PREDICTED)
         if not solution.verdict.consistent and solution.has_gaps:
-            solution = self._solve(map_, edge, Hypothesis.KIDNAPPED)
+            solution = self._solution(map_, edge, Hypothesis.KIDNAPPED)
         if not solution.verdict.consistent:
-            return replace(edge, accepted=False, reason=solution.verdict.reason)
+            self.edges.append(replace(edge, accepted=False, reason=solution.verdict.reason))
+            return None
+        self.edges.append(replace(edge, reason="closed"))
+        return _Loop(edge, solution, start)
+
+    def _close(self, map_: Map, loop: _Loop) -> None:
+        """Correct the map by a verified loop that agrees with the rest."""
+        edge, solution = loop.edge, loop.solution
         if self._global is not None:  # it started before this loop was known
             self._global.cancel()
             self._global = None
@@ -177,13 +206,13 @@ class LoopClosing:
         fuse_loop(map_, edge, query_side, match_side, self._camera, self._config)
         adjust_locally(map_, edge.query, self._camera, self._config)
         edge = replace(edge, reason="closed")
-        seconds = time.perf_counter() - start
+        seconds = time.perf_counter() - loop.start
         self.corrections.append(LoopCorrection(edge, keyframes, before, solution.T_cw, seconds))
         self._consistency.reset()  # its places are those of the map before the correction
-        self._global = self._start_global(map_, edge.query)
-        return edge
+        with self._sparing_the_map("Global bundle adjustment after a loop"):
+            self._global = self._start_global(map_, edge.query)
 
-    def _solve(self, map_: Map, edge: LoopEdge, hypothesis: Hypothesis) -> Solution:
+    def _solution(self, map_: Map, edge: LoopEdge, hypothesis: Hypothesis) -> Solution:
         return solve(
             map_,
             self.closed,
@@ -222,6 +251,15 @@ class LoopClosing:
 
 def _superseded(candidate: LoopCandidate) -> LoopEdge:
     return LoopEdge.of(candidate, "another loop was closed at this keyframe")
+
+
+@dataclass(frozen=True)
+class _Loop:
+    """A verified loop, how it corrects the map, and when that was asked (``perf_counter``)."""
+
+    edge: LoopEdge
+    solution: Solution
+    start: float
 
 
 @dataclass(frozen=True)

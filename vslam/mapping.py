@@ -386,5 +386,5 @@ class Mapper:
 
     def _start(self, job: Callable[[Map], None]) -> None:
         """Start a mapping job; tracking continues with the present view."""
-        self._is_merged = False
         self._shared.start(job)
+        self._is_merged = False

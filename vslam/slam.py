@@ -298,6 +298,12 @@ class Slam:
         return self._closing.edges
 
     @property
+    def problems(self) -> list[str]:
+        """What failed so far without harm to the map, a sentence each: looking for loops, or a
+        global bundle adjustment."""
+        return self._closing.problems
+
+    @property
     def corrections(self) -> list[LoopCorrection]:
         """How each closed loop corrected the keyframes."""
         return self._closing.corrections

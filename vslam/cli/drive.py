@@ -59,7 +59,7 @@ def drive(
     from vslam.cli.tables import print_summary
     from vslam.doctor.nothing_tracked import why_nothing_was_tracked
     from vslam.report.folder import write_results
-    from vslam.run.autosave import FolderAutosave, remove_autosave
+    from vslam.run.autosave import MAP, FolderAutosave, remove_autosave
     from vslam.run.moments import LoopPictureRecorder, MomentRecorder
     from vslam.run.options import settings_of
     from vslam.run.pipeline import begin, run_sequence
@@ -93,6 +93,9 @@ def drive(
         print_summary(report, folder)
     if why and output.quiet:  # else the summary has said it
         raise ResultsError(f"{why}.")
+    if outcome.interrupted and outcome.interrupted != "Ctrl-C":
+        go_on = f"; vslam run --resume {folder} goes on" if (folder / MAP).exists() else ""
+        raise ResultsError(f"{folder}: ended early: {outcome.interrupted}{go_on}.")
     if why or outcome.interrupted:
         raise typer.Exit(1)
 

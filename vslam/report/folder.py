@@ -178,7 +178,7 @@ def _write_data(
     with written.file("keyframes.tum") as file:
         write_tum(file, outcome.keyframes)
     with written.file("trajectory_causal.tum") as file:
-        write_tum(file, causal_trajectory(outcome))
+        write_tum(file, causal_trajectory(outcome.tracks))
     for other in outcome.compared:
         with written.file(f"trajectory_{_safe(other.settings.detector)}.tum") as file:
             write_tum(file, other.trajectory)

@@ -91,6 +91,8 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
     ground_truth = matched_ground_truth(outcome)
     if ground_truth is None:
         return None, "no ground truth"
+    if not outcome.tracks:
+        return None, "no frames"
     try:
         alignment = outcome.settings.alignment
         found = evaluate_trajectory(outcome.trajectory, ground_truth, alignment)
@@ -107,7 +109,7 @@ def causal_ate(outcome: RunOutcome) -> float | None:
     if ground_truth is None or not outcome.tracks:
         return None
     try:
-        given = causal_trajectory(outcome)
+        given = causal_trajectory(outcome.tracks)
         return evaluate_trajectory(given, ground_truth, outcome.settings.alignment).ate_rmse_m
     except InputError:
         return None

@@ -94,8 +94,8 @@ class Autosave:
     def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
         """The frame is done with: this is the moment to save, if it is time."""
 
-    def close(self, slam: Slam, progress: Callable[[], Progress], *, whole: bool) -> None:
-        """The run is over, and finished; if not ``whole``, it may be resumed."""
+    def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
+        """The run is over, and finished; if ``resumable``, it ended early with a complete map."""
 
 
 NO_AUTOSAVE = Autosave()
@@ -132,7 +132,7 @@ class FolderAutosave(Autosave):
         try:
             self._online.write(tum_line(result.timestamp, result.T_wc))
             self._online.flush()
-        except OSError as error:
+        except Exception as error:  # nothing that is only saved may end a run
             self._warn(ONLINE, error)
             self._online = None
 
@@ -148,23 +148,31 @@ class FolderAutosave(Autosave):
         if self._writing is None or self._writing.done():
             self._save(slam, progress)
 
-    def close(self, slam: Slam, progress: Callable[[], Progress], *, whole: bool) -> None:
-        if self._seconds and not whole:
+    def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
+        if self._seconds and resumable:
             self._save(slam, progress)
         self._writer.shutdown()
         if self._online is not None:
-            self._online.close()
+            with suppress(OSError):
+                self._online.close()
 
     def _save(self, slam: Slam, progress: Callable[[], Progress]) -> None:
         self._last, self._missed = time.monotonic(), 0
-        stored, done = _copy(slam.stored_map(self._drive)), progress()
-        self._writing = self._writer.submit(self._write, stored, done)
+        stored, done = slam.stored_map(self._drive), progress()
+        frames, n_done = stored.frames, len(done.tracks)
+        if frames is not None and len(frames.timestamp) > n_done:
+            # A step that failed had placed its frame already: it is to be tracked once more.
+            stored = replace(stored, frames=frames.until(n_done), checkpoint=None)
+        try:
+            self._writing = self._writer.submit(self._write, _copy(stored), done)
+        except Exception as error:  # no memory for a copy, or no thread
+            self._warn(MAP, error)
 
     def _write(self, stored: StoredMap, progress: Progress) -> None:
         try:
             write_progress(self._folder / PROGRESS, progress)
             save_map(self._folder / MAP, stored, resumable=True)
-        except Exception as error:  # whatever it is, it must not end a run, nor be lost
+        except Exception as error:
             self._warn(MAP, error)
 
     def _warn(self, name: str, error: Exception) -> None:

@@ -56,8 +56,9 @@ class RunOutcome:
     """All that the report needs.
 
     Attributes:
-        trajectory: final pose of every frame done, lost ones included.
-        keyframes: final keyframe poses.
+        trajectory: final pose of every frame done, lost ones included; as they were tracked where
+            there is no map.
+        keyframes: final keyframe poses, likewise.
         tracks: one result a frame.
         warnings: faults of the rig that the run has shown, in sentences.
         skipped: messages of the frames whose images could not be read.
@@ -69,7 +70,7 @@ class RunOutcome:
         startup_s: seconds from the start of the process to the first frame.
         peak_memory_mb: of the process.
         n_landmarks, n_keyframes: in the final map.
-        map: the final map, None for a trajectory from elsewhere.
+        map: the final map, None for a trajectory from elsewhere or after mapping failed.
         world: where the map that the run went on in lies, as far as that is known.
         in_map: ``(N,)`` bool, frames placed in the map that the run went on in, at the end; None
             for a run that began a map.
@@ -111,12 +112,12 @@ class RunOutcome:
     compared: tuple[RunOutcome, ...] = ()
 
 
-def causal_trajectory(outcome: RunOutcome) -> Trajectory:
-    """The pose of every frame as it was given at the time, in the map as it stood then: later
+def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:
+    """The pose of each frame as it was given at the time, in the map as it stood then: later
     corrections, by bundle adjustment or a loop, are not in it. A lost or dropped frame has its
     predicted pose."""
-    times = np.array([track.timestamp for track in outcome.tracks], np.float64)
-    poses = [track.T_wc for track in outcome.tracks]
+    times = np.array([track.timestamp for track in tracks], np.float64)
+    poses = [track.T_wc for track in tracks]
     return Trajectory(times, np.array(poses, np.float64).reshape(-1, 4, 4))
 
 

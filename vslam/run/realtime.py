@@ -83,14 +83,17 @@ def play(
             mailbox.end(error)
 
     def hand_on(pool: ThreadPoolExecutor) -> None:
-        while True:
-            free.acquire()
-            dropped, newest = mailbox.take()
-            if newest is None:
-                coming.put(mailbox.error)
-                return
-            missed = [Played[T](timestamp, None, newest.came) for timestamp in dropped]
-            coming.put((missed, newest, pool.submit(prepare, newest.frame)))
+        try:
+            while True:
+                free.acquire()
+                dropped, newest = mailbox.take()
+                if newest is None:
+                    coming.put(mailbox.error)
+                    return
+                missed = [Played[T](timestamp, None, newest.came) for timestamp in dropped]
+                coming.put((missed, newest, pool.submit(prepare, newest.frame)))
+        except Exception as error:  # nobody else would end the wait for the next frame
+            coming.put(error)
 
     with ThreadPoolExecutor(min(threads, 2), "extraction") as pool:
         camera = threading.Thread(target=film, name="camera", daemon=True)

@@ -1,6 +1,6 @@
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help install dev demo test check format docs clean
+.PHONY: help install dev demo test test-fast check types format docs clean
 
 VENV ?= .venv
 BIN := $(abspath $(VENV))/bin
@@ -10,7 +10,7 @@ DEVELOPED := $(VENV)/.developed
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 help:  ## show this list
-	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
 
 install: $(INSTALLED)  ## make .venv and install what a run needs into it
 
@@ -23,10 +23,16 @@ test: $(DEVELOPED)  ## run the tests, then the built wheel in a clean environmen
 	$(BIN)/python -m pytest
 	$(BIN)/python tools/wheel_test.py
 
-# mypy cannot follow the folders' mapping to vslam.* (pyproject.toml): it reads a plain installation.
+test-fast: $(DEVELOPED)  ## run the tests that are not marked slow: under two minutes
+	$(BIN)/python -m pytest -m 'not slow'
+
 check: $(DEVELOPED)  ## check format, lint and types
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
+	@$(MAKE) --no-print-directory types
+
+# mypy cannot follow the folders' mapping to vslam.* (pyproject.toml): it reads a plain installation.
+types: $(DEVELOPED)  ## check types
 	rm -rf build
 	$(BIN)/python -m pip install --quiet --no-deps --target build/typecheck .
 	cd build/typecheck && \

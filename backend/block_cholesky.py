@@ -1,12 +1,12 @@
-"""Sparse Cholesky factorisation of symmetric systems of 6x6 blocks, one block for each keyframe.
+"""Sparse Cholesky factorisation of symmetric systems of 6x6 blocks, one block row per keyframe.
 
 The structure is analysed once for all iterations of an optimiser: an elimination order by minimum
-degree (George and Liu, "The evolution of the minimum degree ordering algorithm", SIAM Review
-1989) and the blocks that fill in. A graph of some thousand keyframes is small enough to eliminate
-it explicitly in bit sets: the degrees are exact, and the neighbours of a keyframe at the moment of
-its elimination *are* the column of the factor. The numeric part is left-looking (Davis, "Direct
-Methods for Sparse Linear Systems", section 4.8), in blocks. No step depends on anything but its
-input: results are the same bytes on every run.
+degree (George and Liu, "The evolution of the minimum degree ordering algorithm", SIAM Review 1989)
+and the fill-in. A graph of a few thousand keyframes is small enough to be eliminated explicitly on
+bit sets: the degrees are exact, and the neighbours of a keyframe when it is eliminated are the
+nonzero blocks of its column of the factor. The numeric factorisation is left-looking (Davis,
+"Direct Methods for Sparse Linear Systems", section 4.8) and works on blocks. Everything is
+deterministic: the same input gives the same bytes on every run.
 """
 
 from __future__ import annotations
@@ -22,17 +22,18 @@ BLOCK = 6
 
 
 class Structure(NamedTuple):
-    """Where the factor of a system of ``n`` block rows has blocks, in elimination order.
+    """Positions of the nonzero blocks ("slots") of the factor of a system of ``n`` block rows, in
+    elimination order.
 
     Attributes:
-        order: ``(n,)`` int64, block of the caller that is eliminated i-th.
-        first: ``(n + 1,)`` int64, slots of column c are ``first[c]:first[c + 1]``.
-        row: ``(slots,)`` int32, block row of each slot, ascending; the first of a column is its
-            diagonal. The second is the column's parent in the elimination tree.
-        row_first: ``(n + 1,)`` int64, left of the diagonal row r has
+        order: ``(n,)`` int64, the caller's index of the block that is eliminated i-th.
+        first: ``(n + 1,)`` int64, the slots of column c are ``first[c]:first[c + 1]``.
+        row: ``(slots,)`` int32, block row of each slot, ascending within a column. The first slot
+            of a column is on the diagonal, the second is its parent in the elimination tree.
+        row_first: ``(n + 1,)`` int64, the blocks of row r to the left of the diagonal are
             ``row_slot[row_first[r]:row_first[r + 1]]``.
-        row_slot, row_column: ``(slots - n,)`` int32, slot and column of each of those blocks,
-            columns ascending.
+        row_slot, row_column: ``(slots - n,)`` int32, slot and column of each block below the
+            diagonal, row by row, columns ascending.
     """
 
     order: NDArray[np.int64]
@@ -44,9 +45,12 @@ class Structure(NamedTuple):
 
 
 def analyse(n: int, pairs: NDArray[np.int64]) -> Structure:
-    """Elimination order and fill of a system in which ``(M, 2)`` pairs of ``n`` blocks couple.
+    """Elimination order and fill-in of a system of ``n`` block rows.
 
-    Pairs may come in any order, repeated or not. Memory is ``n * n / 8`` bytes while it runs.
+    Uses ``n * n / 8`` bytes of memory while it runs.
+
+    Args:
+        pairs: ``(M, 2)`` block rows that are coupled, in any order; repetitions are allowed.
     """
     return Structure(*_analyse(n, np.ascontiguousarray(pairs, np.int64).reshape(-1, 2)))
 
@@ -69,14 +73,15 @@ def _analyse(n, pairs):
     position = np.full(n, -1, np.int64)
     first = np.zeros(n + 1, np.int64)
     for step in range(n):
-        # The least degree, and of several the first: keyframes in the order of time.
+        # Minimum degree; ties are broken by index, that is, by time.
         chosen, least = -1, n
         for i in range(n):
             if position[i] < 0 and degree[i] < least:
                 chosen, least = i, degree[i]
         order[step], position[chosen] = chosen, step
         first[step + 1] = first[step] + least + 1
-        # Its neighbours become neighbours of each other. Its own set stays: column of the factor.
+        # Its neighbours become neighbours of each other. Its own set is kept as the column of the
+        # factor.
         for i in range(n):
             if not adjacent[chosen, i // 64] >> np.uint64(i % 64) & one:
                 continue
@@ -88,8 +93,8 @@ def _analyse(n, pairs):
             for word in range(words):
                 count += np.int64(popcount(adjacent[i, word]))
             degree[i] = count
-    # Filled by columns in ascending order, rows list their columns in ascending order, and the
-    # other way round: a column transposed twice is sorted.
+    # Going through the columns in ascending order sorts the columns of each row, and then going
+    # through the rows sorts the rows of each column: transposing twice sorts.
     slots = first[n]
     row_first = np.zeros(n + 1, np.int64)
     for step in range(n):
@@ -121,10 +126,11 @@ def _analyse(n, pairs):
 
 @kernel
 def panel(structure, column):
-    """Where the panel of a column begins in ``S``, and its width.
+    """Offset in ``S`` of the panel of a column, and the width of the panel.
 
     A panel holds the blocks of one column side by side and transposed: element (i, j) of the
-    k-th block is ``S[begin + j * width + 6 * k + i]``, so that rows of the panel are long.
+    k-th block is ``S[begin + j * width + 6 * k + i]``. So the rows of a panel are long, which suits
+    vector instructions.
     """
     first = structure.first[column]
     return BLOCK * BLOCK * first, BLOCK * (structure.first[column + 1] - first)
@@ -132,14 +138,14 @@ def panel(structure, column):
 
 @kernel
 def factor_solve(structure, S, x):
-    """Solve ``S x = rhs`` in place; False if S is not positive definite.
+    """Solve ``S x = rhs`` in place; returns False if S is not positive definite.
 
     Args:
-        structure: of S.
-        S: ``(36 * slots,)`` float64, the lower triangle in elimination order, one panel for each
-            column (see ``panel``); fill is zero. Overwritten with the factor. Of diagonal blocks
-            the lower triangle is read.
-        x: ``(n, 6)`` float64 right-hand side in elimination order; the solution on return.
+        structure: the ``Structure`` of S.
+        S: ``(36 * slots,)`` float64, the lower triangle in elimination order, one panel per column
+            (see ``panel``), with zeros in the fill-in; only the lower triangle of diagonal blocks
+            is read. Overwritten with the factor.
+        x: ``(n, 6)`` float64 right-hand side in elimination order; overwritten with the solution.
     """
     first, row = structure.first, structure.row
     n = len(x)
@@ -193,10 +199,11 @@ def factor_solve(structure, S, x):
 
 @inner_kernel
 def add_product(S, start, pivot, end, row, place, update):
-    """Add to a column what an earlier one, of slots ``start:end``, takes off it.
+    """Accumulate in ``update`` what an earlier column, with slots ``start:end``, subtracts from the
+    current one.
 
-    ``pivot`` is the earlier column's block in the row of the later one. Blocks that lie side by
-    side in both columns are multiplied in one go: long rows of the panels fill vector registers.
+    ``pivot`` is the slot of the earlier column in the row of the current one. Blocks that are
+    adjacent in both columns are multiplied together, because long rows fill vector registers.
     """
     width = np.uintp(BLOCK * (end - start))
     begin = np.uintp(BLOCK * BLOCK * start)
@@ -207,7 +214,8 @@ def add_product(S, start, pivot, end, row, place, update):
         after = slot + 1
         while after < end and place[row[after]] == target + BLOCK * (after - slot):
             after += 1
-        # Unsigned: a signed index may count from the end, and that test costs the vectors.
+        # A signed index could be negative and count from the end; the check for that would prevent
+        # vectorisation.
         t, length = np.uintp(target), np.uintp(BLOCK * (after - slot))
         a0 = begin + np.uintp(BLOCK * (slot - start))
         a1, a2, a3 = a0 + width, a0 + width + width, a0 + width + width + width
@@ -229,7 +237,8 @@ def add_product(S, start, pivot, end, row, place, update):
 
 @inner_kernel
 def factor_panel(S, base, width):
-    """Factor the diagonal block and divide the blocks below by it; False if it is not positive."""
+    """Factor the diagonal block of a column and divide the blocks below by it; returns False if the
+    block is not positive definite."""
     begin, columns = np.uintp(base), np.uintp(width)
     for j in range(np.uintp(BLOCK)):
         own = begin + j * columns

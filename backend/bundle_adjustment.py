@@ -1,9 +1,9 @@
 """Bundle adjustment of keyframe poses and landmarks: Levenberg-Marquardt on the Schur complement.
 
-The problem is the one of ORB-SLAM2 (section III-C): reprojection errors of mono (u, v) and stereo
-(u, v, u_right) observations under the Huber loss. Landmarks are eliminated one at a time, the
-reduced camera system is dense and solved by Cholesky (Triggs et al., "Bundle adjustment - a
-modern synthesis", section 6).
+The problem is that of ORB-SLAM2 (section III-C): reprojection errors of monocular (u, v) and stereo
+(u, v, u_right) observations with the Huber loss. Landmarks are eliminated one at a time. The
+reduced camera system is dense and solved by Cholesky factorisation (Triggs et al., "Bundle
+adjustment - a modern synthesis", section 6).
 """
 
 from __future__ import annotations
@@ -21,18 +21,19 @@ from vslam.reprojection import chi_square, residual, unpacked
 
 @dataclass(frozen=True)
 class BundleProblem:
-    """Cameras, landmarks and observations, sorted by landmark.
+    """Cameras, landmarks, and observations sorted by landmark.
 
     Attributes:
-        T_cw: ``(K, 4, 4)``; the first ``n_free`` move, the others are held.
-        points: ``(P, 3)`` world.
-        first: ``(P + 1,)`` int64, observations of point p are ``first[p]:first[p + 1]``.
-        camera: ``(O,)`` int64, camera of each observation.
-        uvr: ``(O, 3)`` float64, NaN u_right for monocular ones.
-        inverse_sigma2: ``(O,)`` float64, of u and v.
+        T_cw: ``(K, 4, 4)`` poses of the cameras (world to camera).
+        n_free: the first ``n_free`` cameras are optimised, the others are held fixed.
+        points: ``(P, 3)`` landmarks in the world frame.
+        first: ``(P + 1,)`` int64, the observations of point p are ``first[p]:first[p + 1]``.
+        camera: ``(O,)`` int64, index of the camera of each observation.
+        uvr: ``(O, 3)`` float64 observed u, v, u_right; NaN u_right for a monocular observation.
+        inverse_sigma2: ``(O,)`` float64, inverse variance of u and v.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
-        disparity_weight: ``(O,)`` float64, how many times surer a disparity is than its u and v;
-            None: as sure as the camera's intrinsics say.
+        disparity_weight: ``(O,)`` float64, standard deviation of u and v over that of the
+            disparity; None takes the weight in ``intrinsics`` for all.
     """
 
     T_cw: NDArray[np.float64]
@@ -46,15 +47,15 @@ class BundleProblem:
     disparity_weight: NDArray[np.float64] | None = None
 
     def disparity_weights(self) -> NDArray[np.float64]:
-        """``(O,)``, whether they are given or not."""
+        """``(O,)`` float64, ``disparity_weight`` or the default from ``intrinsics``."""
         if self.disparity_weight is not None:
             return self.disparity_weight
         return np.full(len(self.camera), self.intrinsics[5])
 
 
 class Observations(NamedTuple):
-    """The observations of a ``BundleProblem`` as kernels see them; ``used`` (O,) bool: those that
-    count."""
+    """The observations of a ``BundleProblem`` as arguments of kernels; ``used`` is ``(O,)`` bool,
+    the observations that take part."""
 
     first: NDArray[np.int64]
     camera: NDArray[np.int64]
@@ -66,10 +67,12 @@ class Observations(NamedTuple):
 
 
 class NormalEquations(NamedTuple):
-    """Gauss-Newton's system in blocks.
+    """The normal equations of Gauss-Newton in blocks.
 
-    ``W`` (O, 3, 6) point x camera; ``V`` (P, 3, 3), ``g`` (P, 3) of the points; ``U`` (K, 6, 6),
-    ``b`` (K, 6) of the free cameras.
+    Attributes:
+        W: ``(O, 3, 6)`` mixed blocks, point by camera, one per observation.
+        V, g: ``(P, 3, 3)`` and ``(P, 3)``, Hessian and right-hand side of the points.
+        U, b: ``(K, 6, 6)`` and ``(K, 6)``, Hessian and right-hand side of the free cameras.
     """
 
     W: NDArray[np.float64]
@@ -81,8 +84,15 @@ class NormalEquations(NamedTuple):
 
 @dataclass(frozen=True)
 class BundleSolution:
-    """``T_cw`` ``(K, 4, 4)``, ``points`` ``(P, 3)``, final robust ``cost`` (half the sum of the
-    Huber losses), ``inlier`` ``(O,)`` bool by the chi-square test, and iterations used."""
+    """The result of bundle adjustment.
+
+    Attributes:
+        T_cw: ``(K, 4, 4)`` poses of the cameras.
+        points: ``(P, 3)`` landmarks in the world frame.
+        cost: half the sum of the Huber losses.
+        inlier: ``(O,)`` bool, observations that pass the chi-square test.
+        iterations: number of iterations that were run.
+    """
 
     T_cw: NDArray[np.float64]
     points: NDArray[np.float64]
@@ -98,11 +108,12 @@ def adjust(
     use: NDArray[np.bool_] | None = None,
     tolerance: float = 1e-6,
 ) -> BundleSolution:
-    """Minimise the robust reprojection error. Stops when the cost falls by less than
-    ``tolerance`` (relative).
+    """Minimise the robust reprojection error by Levenberg-Marquardt.
 
     Args:
-        use: ``(O,)`` bool, observations that count; all by default.
+        iterations: maximum number of iterations.
+        use: ``(O,)`` bool, observations that take part; None uses all.
+        tolerance: stop when an iteration reduces the cost by a smaller fraction than this.
     """
     T_cw, points, cost, inlier, count = _adjust(
         problem.T_cw,
@@ -117,7 +128,7 @@ def adjust(
 
 
 def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Observations:
-    """The observations of a problem, all of them used where ``use`` is None."""
+    """The observations of a problem as arguments of kernels; ``use`` as in ``adjust``."""
     return Observations(
         problem.first,
         problem.camera,
@@ -130,7 +141,8 @@ def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Ob
 
 
 def empty_equations(n_free: int, n_points: int, n_observations: int) -> NormalEquations:
-    """Room for the normal equations; entries of W that no one writes are 0."""
+    """Allocate the normal equations. W starts at 0, because blocks of fixed cameras and unused
+    observations are never written."""
     return NormalEquations(
         np.zeros((n_observations, 3, 6)),
         np.empty((n_points, 3, 3)),
@@ -148,7 +160,7 @@ def _in_camera(T, p, q):
 
 @inner_kernel
 def robust_cost(T_cw, points, observations, inlier):
-    """Half the sum of Huber losses; sets ``inlier`` by the chi-square test."""
+    """Half the sum of the Huber losses; sets ``inlier`` by the chi-square test."""
     first, camera, uvr, inverse_sigma2, disparity_weight, used, intrinsics = observations
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     cost = 0.0
@@ -192,7 +204,7 @@ def _adjust(T_start, n_free, points_start, observations, equations, iterations, 
                 if trial < cost:
                     small = cost - trial < tolerance * cost
                     cost = trial
-                    # What is left behind in the trial is overwritten by the next step.
+                    # Swap instead of copying: the next step overwrites all of the trial.
                     T_cw, T_trial = T_trial, T_cw
                     points, points_trial = points_trial, points
                     damping, growth, improved = max(damping * 0.1, 1e-9), 2.0, True
@@ -208,7 +220,7 @@ def _adjust(T_start, n_free, points_start, observations, equations, iterations, 
 
 @inner_kernel
 def linearise(T_cw, n_free, points, observations, equations):
-    """Normal equations at the current estimate, in blocks."""
+    """Write the normal equations at the current estimate into ``equations``."""
     first, camera, uvr, inverse_sigma2, disparity_weight, used, intrinsics = observations
     W, V, g, U, b = equations
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
@@ -279,7 +291,8 @@ def linearise(T_cw, n_free, points, observations, equations):
 
 @inner_kernel
 def reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse):
-    """Reduced camera system ``S x = rhs`` (upper triangle) after eliminating the points."""
+    """Eliminate the points: write the reduced camera system ``S x = rhs`` (upper triangle of S) and
+    the inverses of the damped point blocks."""
     first, camera, used = observations.first, observations.camera, observations.used
     W, V, g, U, b = equations
     S[:] = 0.0
@@ -305,7 +318,7 @@ def reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse):
                 Y[2, i] = N[2, 0] * w0 + N[2, 1] * w1 + N[2, 2] * w2
                 rhs[6 * k + i] -= Y[0, i] * g[p, 0] + Y[1, i] * g[p, 1] + Y[2, i] * g[p, 2]
             for other in range(first[p], first[p + 1]):
-                # Each pair of cameras once, in the upper triangle.
+                # Visit each pair of cameras once, for the upper triangle.
                 m = camera[other]
                 if m < k or m >= n_free or not used[other]:
                     continue
@@ -319,8 +332,8 @@ def reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse):
 
 @inner_kernel
 def invert_damped(V, damping, N):
-    """Inverse of a point's ``(3, 3)`` block into ``N``, its diagonal raised by the damping; zero
-    if it is singular, so that the point stays where it is."""
+    """Write the inverse of a point's ``(3, 3)`` block, with damped diagonal, into ``N``; zeros if
+    the block is singular, so that the point does not move."""
     scale = 1.0 + damping
     v00, v11, v22 = V[0, 0] * scale, V[1, 1] * scale, V[2, 2] * scale
     v01, v02, v12 = V[0, 1], V[0, 2], V[1, 2]
@@ -336,7 +349,7 @@ def invert_damped(V, damping, N):
 
 @inner_kernel
 def step_points(n_free, observations, equations, camera_step, V_inverse, points, points_trial):
-    """Back-substitution: move each point by what the camera steps leave."""
+    """Back-substitution: compute the step of each point from the steps of the cameras."""
     first, camera, used = observations.first, observations.camera, observations.used
     W, g = equations.W, equations.g
     for p in range(len(points)):
@@ -357,8 +370,8 @@ def step_points(n_free, observations, equations, camera_step, V_inverse, points,
 
 @inner_kernel
 def step_cameras(n_free, camera_step, T_cw, T_trial):
-    """Move each free camera by its twist. Element by element: assigning a whole matrix would make
-    Numba compile the message of a broadcasting error, which takes seconds."""
+    """Move each free camera by its twist. Matrices are copied element by element, because for a
+    whole-array assignment Numba compiles a broadcasting error message, which takes seconds."""
     for k in range(n_free):
         T = orthonormalised(compose(se3_exp(camera_step[6 * k : 6 * k + 6]), T_cw[k]))
         for i in range(4):
@@ -368,7 +381,8 @@ def step_cameras(n_free, camera_step, T_cw, T_trial):
 
 @kernel
 def cholesky_solve(S, x):
-    """Solve ``S x = rhs`` in place from the upper triangle of S; False if not positive definite."""
+    """Solve ``S x = rhs`` in place from the upper triangle of S; returns False if S is not positive
+    definite."""
     n = len(x)
     for i in range(n):
         row = S[i]

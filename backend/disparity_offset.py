@@ -1,14 +1,14 @@
-"""The disparity that a stereo pair sees too little or too much, found from its own motion.
+"""Estimates a constant error of all disparities of a stereo pair from the motion of the camera.
 
-Calibrations leave the right camera turned by some hundredths of a degree against the left one, or
-a principal point off by a tenth of a pixel. Every disparity is then off by about the same, which
-makes near points a little and far points much too near or too far. From one pair nobody can tell;
-but a camera that moves sees how far a point moves in the image, too, and one motion must explain
-near and far points alike. So the offset is one more unknown of bundle adjustment, common to all
-keyframes (self-calibration: Triggs et al., "Bundle adjustment - a modern synthesis", section 10).
+A calibration may leave a rotation of some hundredths of a degree between the two cameras, or an
+error of a tenth of a pixel in a principal point. Both shift all disparities by nearly the same
+amount, so that depths are wrong by a fraction that grows with the depth. A single stereo pair does
+not reveal this. A moving camera does, because one motion must explain how both near and far points
+move in the image. So the offset is one more unknown of bundle adjustment, common to all keyframes
+(self-calibration: Triggs et al., "Bundle adjustment - a modern synthesis", section 10).
 
-It is found in windows of keyframes that no window before shares, and what they say is joined by
-their information, beginning with a prior of mean 0.
+The offset is estimated in disjoint windows of keyframes. Their estimates are combined by their
+information (inverse variance), starting from a prior of mean 0.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from vslam.features import shifted_columns
 from vslam.map import Map
 from vslam.map_kernels import collect_landmarks
 
-STEP = 0.2  # pixels between the costs through which a parabola is laid
+STEP = 0.2  # pixels between the three costs that a parabola is fitted to
 ITERATIONS = 15
-TOLERANCE = 1e-5  # relative; a step changes the cost by some thousandths
+TOLERANCE = 1e-5  # relative; a change of the offset by STEP changes the cost by some thousandths
 
 
 def map_and_calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """`map_keyframe`, and after every few keyframes a better disparity offset."""
+    """Run ``map_keyframe``; for a stereo camera, also update the disparity offset after every
+    ``stereo.offset_keyframes`` keyframes."""
     map_keyframe(map_, keyframe, camera, config)
     if config.stereo.offset_sigma > 0.0 and camera.sensor == "stereo":
         _calibrate(map_, keyframe, camera, config)
@@ -60,10 +61,11 @@ def _calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None
 
 
 def remaining_offset(problem: BundleProblem) -> tuple[float, float]:
-    """What is to be added to all disparities of a bundle problem, in pixels, and the information
-    (inverse variance) of that; 0, 0 if the problem does not tell.
+    """The offset that must be added to all disparities of a bundle problem, in pixels, and its
+    information (inverse variance); 0, 0 if the problem does not determine it.
 
-    The cost of the adjusted problem is nearly a parabola of the offset.
+    The cost after bundle adjustment is nearly quadratic in the offset, so a parabola is fitted to
+    it at three offsets.
     """
     first = adjust(problem, iterations=5)
     start = replace(problem, T_cw=first.T_cw, points=first.points)

@@ -1,4 +1,4 @@
-"""Fusion: landmarks that two keyframes hold of one point become one (ORB-SLAM, VI-C)."""
+"""Fusion: merges landmarks that are the same point in the world (ORB-SLAM, VI-C)."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from vslam.reprojection import chi_square_ratio, unpacked
 
 
 def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Project the landmarks of a keyframe into its neighbours and theirs into it.
+    """Project the landmarks of a keyframe into its neighbours, and the landmarks of the neighbours
+    into the keyframe.
 
-    A projection that meets a feature with a landmark of its own merges the two; one that meets a
-    free feature adds an observation.
+    If the projection of a landmark matches a feature that observes another landmark, the two are
+    merged; if it matches a feature without a landmark, an observation is added.
     """
     neighbours = fusion_neighbours(map_, keyframe, config)
     for neighbour in neighbours:
@@ -31,7 +32,8 @@ def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config)
 
 
 def fusion_neighbours(map_: Map, keyframe: int, config: Config) -> list[int]:
-    """Best covisible keyframes, and the best five of each of those (ORB-SLAM2)."""
+    """The best covisible keyframes, and the best five covisible keyframes of each of them
+    (ORB-SLAM2)."""
     first, _ = map_.covisible(keyframe)
     chosen = first[: config.mapping.fuse_neighbours].tolist()
     known = {keyframe, *chosen}
@@ -51,16 +53,17 @@ def fuse_loop(
     camera: Camera,
     config: Config,
 ) -> int:
-    """Make one what the two sides of a loop hold twice (ORB-SLAM, VII-D).
+    """Fuse the landmarks that both sides of a loop have of the same points (ORB-SLAM, VII-D).
 
-    First the pairs that verification matched, which need no geometry; then each side's landmarks
-    are projected into the keyframes of the other.
+    First the pairs that verification matched are fused; then the landmarks of each side are
+    projected into the keyframes of the other side.
 
     Args:
-        query_side, match_side: keyframes around the two ends, poses corrected.
+        edge: the loop, with its features and landmarks.
+        query_side, match_side: keyframes around the two ends of the loop, with corrected poses.
 
     Returns:
-        How many landmarks and features were fused.
+        Number of fusions.
     """
     assert edge.features is not None
     assert edge.landmarks is not None
@@ -78,7 +81,8 @@ def fuse_loop(
 
 @kernel
 def _fuse_pairs(a, rows, landmarks, keyframe):
-    """Let each row observe its landmark; one that observes another brings that one along."""
+    """Let each row observe its landmark. If the row already observes another landmark, the two are
+    merged. Returns the number of fusions."""
     fused = 0
     for i in range(len(rows)):
         row, landmark = rows[i], landmarks[i]
@@ -98,7 +102,8 @@ def _fuse_pairs(a, rows, landmarks, keyframe):
 def fuse_into(
     map_: Map, landmarks: NDArray[np.int32], keyframe: int, camera: Camera, config: Config
 ) -> int:
-    """Fuse ``(N,)`` landmarks with what one keyframe sees; returns how many were."""
+    """Fuse ``(N,)`` landmarks with the features and landmarks of a keyframe; returns the number of
+    fusions."""
     a, rows = map_.arrays, map_.rows(keyframe)
     grid = FeatureGrid.of_positions(a.xy[rows], camera.width, camera.height)
     return _fuse(
@@ -165,7 +170,7 @@ def _fuse(
             continue
         octave = predict_octave(distance, a.distance_range[landmark, 1], log_scale, len(scales))
         r = window * scales[octave]
-        # A bare -1 would make Numba compile ``link`` for the constant as well.
+        # With a plain -1, Numba would also compile ``link`` for a literal.
         best, best_distance = np.int64(-1), max_distance + 1
         column_first, column_last = max(0, int((u - r) / CELL)), int((u + r) / CELL)
         column_last = min(columns - 1, column_last)
@@ -192,7 +197,7 @@ def _fuse(
         other = a.landmark[best]
         if other < 0:
             link(a, best, landmark)
-            a.certainty[best] = 1  # of a keypoint, matched by its descriptor alone
+            a.certainty[best] = 1  # matched by descriptor alone, so no better than a keypoint
         elif a.n_observations[other] > a.n_observations[landmark]:
             merge_landmarks(a, landmark, other)
         else:

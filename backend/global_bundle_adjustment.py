@@ -1,9 +1,9 @@
-"""Bundle adjustment of hundreds of keyframes, loops included.
+"""Bundle adjustment of hundreds of keyframes with loops.
 
-The problem, the loss and the steps are those of ``bundle_adjustment``; what differs is the reduced
-camera system. Keyframes that share no landmark do not couple, so that it is kept in 6x6 blocks
-where they do and factored sparsely (``block_cholesky``; Triggs et al., "Bundle adjustment - a
-modern synthesis", section 6.3).
+Problem, loss and steps are those of ``bundle_adjustment``; only the reduced camera system differs.
+Keyframes that share no landmark are not coupled, so the system is stored as sparse 6x6 blocks and
+factorised by ``block_cholesky`` (Triggs et al., "Bundle adjustment - a modern synthesis", section
+6.3).
 """
 
 from __future__ import annotations
@@ -38,19 +38,20 @@ def adjust_globally(
 ) -> BundleSolution:
     """Minimise the robust reprojection error: ``bundle_adjustment.adjust`` for many keyframes.
 
-    A keyframe may observe a landmark once. Nearly all the time is spent without the GIL.
+    A keyframe must not observe a landmark more than once. The global interpreter lock is released
+    nearly all the time.
 
     Args:
-        iterations: of Levenberg-Marquardt, at most.
-        tolerance: stops when the cost falls by less than this (relative).
-        use: ``(O,)`` bool, observations that count; all by default.
-        stop: asked before each iteration; once it says so, the estimate so far is returned.
+        iterations: maximum number of Levenberg-Marquardt iterations.
+        tolerance: stop when an iteration reduces the cost by a smaller fraction than this.
+        use: ``(O,)`` bool, observations that take part; None uses all.
+        stop: called before each iteration; if it returns True, the current estimate is returned.
     """
     n_free, n_observations = problem.n_free, len(problem.camera)
     used = np.ones(n_observations, np.bool_) if use is None else use
     pairs = coupled_cameras(problem.first, problem.camera, used, n_free)
     structure = analyse(n_free, pairs)
-    # Free cameras come as they are eliminated, and held ones after them.
+    # Free cameras in elimination order, followed by the fixed ones.
     cameras = np.concatenate([structure.order, np.arange(n_free, len(problem.T_cw))])
     rank = np.argsort(cameras)
     points_order, order = working_order(problem.first, rank[problem.camera], len(cameras))
@@ -108,11 +109,18 @@ def adjust_globally(
 
 @kernel
 def working_order(first, rank, n_cameras):
-    """Points ``(P,)`` and observations ``(O,)`` in the order in which they are worked on.
+    """Sort points and observations for cache-friendly access to the reduced camera system.
 
-    Observations of a point come as their cameras, of which ``rank`` ``(O,)`` is the place in the
-    elimination: of any two the first names the column and the second the row. Points come by their
-    first camera: blocks that are written one after the other lie side by side.
+    The observations of a point are sorted by the elimination order of their cameras, so that of any
+    two the first one gives the column and the second one the row. Points are sorted by their first
+    camera, so that blocks that are written in sequence are adjacent in memory.
+
+    Args:
+        first: ``(P + 1,)`` as in ``BundleProblem``.
+        rank: ``(O,)`` position of each observation's camera in the elimination order.
+
+    Returns:
+        ``(P,)`` int64 order of the points and ``(O,)`` int64 order of the observations.
     """
     n_points = len(first) - 1
     start = np.zeros(n_cameras + 2, np.int64)
@@ -143,10 +151,10 @@ def working_order(first, rank, n_cameras):
 
 @kernel
 def coupled_cameras(first, camera, used, n_free):
-    """Pairs of free cameras that observe a common point, ``(M, 2)`` int64, each once."""
+    """``(M, 2)`` int64 pairs of free cameras that observe a common point, without repetitions."""
     start, points = points_of_cameras(first, camera, used, n_free)
     met = np.empty(n_free, np.int64)
-    last = np.full(n_free, -1)  # the camera that each was last met by
+    last = np.full(n_free, -1)  # the last camera i in whose pass each camera was counted
     count = 0
     for i in range(n_free):
         count += cameras_met(i, start, points, first, camera, used, n_free, last, met)
@@ -164,8 +172,8 @@ def coupled_cameras(first, camera, used, n_free):
 
 @inner_kernel
 def points_of_cameras(first, camera, used, n_free):
-    """Points that each free camera observes: those of ``k`` are ``points[start[k]:start[k + 1]]``;
-    ``(n_free + 1,)`` int64, ``(N,)`` int32."""
+    """Points that each free camera observes: those of camera k are
+    ``points[start[k]:start[k + 1]]``. Returns ``start`` int64 and ``points`` ``(N,)`` int32."""
     start = np.zeros(n_free + 2, np.int64)
     for o in range(len(camera)):
         if camera[o] < n_free and used[o]:
@@ -183,8 +191,8 @@ def points_of_cameras(first, camera, used, n_free):
 
 @inner_kernel
 def cameras_met(i, start, points, first, camera, used, n_free, last, met):
-    """Fill ``met`` with the free cameras after ``i`` that observe a point with it; returns how
-    many."""
+    """Write the free cameras after ``i`` that observe a common point with it into ``met``; returns
+    their number. ``last`` prevents repetitions."""
     n = 0
     for p in points[start[i] : start[i + 1]]:
         for o in range(first[p], first[p + 1]):
@@ -198,8 +206,8 @@ def cameras_met(i, start, points, first, camera, used, n_free, last, met):
 
 @kernel
 def pair_slots(structure, first, camera, used, n_free):
-    """Slot of each pair of used observations of a point, ``(N,)`` int32, in the order in which
-    ``reduce_points_sparsely`` meets them. Cameras are in elimination order."""
+    """``(N,)`` int32, the slot in the factor of each pair of used observations of a point, in the
+    order in which ``reduce_points_sparsely`` visits them. Cameras are in elimination order."""
     count = 0
     for p in range(len(first) - 1):
         seen = 0
@@ -237,7 +245,8 @@ def _linearise(T_cw, n_free, points, observations, equations):
 def reduce_points_sparsely(
     structure, slots, n_free, observations, equations, damping, S, x, V_inverse
 ):
-    """Reduced camera system ``S x = rhs``, in panels, after eliminating the points."""
+    """Eliminate the points: write the reduced camera system ``S x = rhs``, with S in panels and the
+    right-hand side in ``x``."""
     first, camera, used = observations.first, observations.camera, observations.used
     W, V, g, U, b = equations
     for i in range(len(S)):
@@ -275,7 +284,7 @@ def reduce_points_sparsely(
 
 @inner_kernel
 def subtract_coupling(Y, W, o, S, offset, width):
-    """Take ``Y' W[o]`` off the block of ``S`` that begins at ``offset``."""
+    """Subtract ``Y' W[o]`` from the block of ``S`` that starts at ``offset``."""
     start, step = np.uintp(offset), np.uintp(width)
     for i in range(np.uintp(6)):
         y0, y1, y2 = Y[0, i], Y[1, i], Y[2, i]

@@ -1,7 +1,7 @@
-"""The whole map as a bundle problem, and its solution merged into a map that has gone on since.
+"""Takes a snapshot of the map for global bundle adjustment, and merges the solution into the map.
 
-Global bundle adjustment takes seconds: it works on a snapshot while tracking and local mapping go
-on (Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017, section III-D).
+Global bundle adjustment takes seconds, so it works on a snapshot while tracking and local mapping
+continue (Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017, section III-D).
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ from vslam.map_kernels import refresh_landmarks, unlink
 
 @dataclass(frozen=True)
 class GlobalSnapshot:
-    """A copy of the map as a bundle problem, and what its numbers stand for.
+    """A copy of the map as a bundle problem, and the ids of what it contains.
 
     Attributes:
-        problem: keyframes that move first, held ones last.
+        problem: the bundle problem; free keyframes come first, fixed ones last.
         keyframes: ``(K,)`` int64, id of each camera of the problem.
-        landmarks: ``(P,)`` int32, id of each of its points.
-        rows: ``(O,)`` int64, row of the map of each of its observations.
-        n_keyframes, n_landmarks: how many the map had; greater ids are newer.
+        landmarks: ``(P,)`` int32, id of each point.
+        rows: ``(O,)`` int64, row of each observation in the map's arrays.
+        n_keyframes, n_landmarks: sizes of the map at the time of the snapshot; keyframes and
+            landmarks with these ids or greater ones are newer.
     """
 
     problem: BundleProblem
@@ -44,8 +45,8 @@ class GlobalSnapshot:
 def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
     """Copy all living keyframes and landmarks into a bundle problem.
 
-    The first keyframe is held. So is the first of every part of the map that no landmark connects
-    to it: nothing else says where that part is.
+    The first keyframe is fixed. So is the first keyframe of every part of the map that no landmark
+    connects to it, because nothing else determines the position of that part.
     """
     living = map_.living_keyframes()
     landmarks = map_.living_landmarks().astype(np.int32)
@@ -58,9 +59,9 @@ def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
 
 @kernel
 def connected_parts(a, landmarks, n_keyframes):
-    """First keyframe of the part of the map that each keyframe belongs to, ``(K,)`` int64.
+    """``(K,)`` int64, the first keyframe of the connected part of the map that each keyframe is in.
 
-    Keyframes that observe a common landmark are in one part (union-find).
+    Keyframes that observe a common landmark are connected (union-find).
     """
     part = np.arange(n_keyframes)
     for landmark in landmarks:
@@ -85,18 +86,18 @@ def connected_parts(a, landmarks, n_keyframes):
 
 
 def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution) -> None:
-    """Bring the solution of a snapshot into the map, which has gone on since.
+    """Apply the solution of a snapshot to the map, which may have changed since.
 
-    Keyframes and landmarks of the snapshot take their new places, as far as they live. Newer
-    keyframes keep their pose relative to their spanning-tree parent (Mur-Artal and Tardós,
-    ORB-SLAM2, III-D), newer landmarks move with the keyframe they are anchored in. Observations
-    that failed the chi-square test are removed if the row still observes the same landmark.
+    Keyframes and landmarks of the snapshot that are still alive take their new positions. Newer
+    keyframes keep their pose relative to their parent in the spanning tree (Mur-Artal and Tardós,
+    ORB-SLAM2, III-D), and newer landmarks move with their anchor keyframe. An observation that
+    failed the chi-square test is removed if its row still observes the same landmark.
     """
     a = map_.arrays
     T_cw_old = a.T_cw[: map_.n_keyframes].copy()
     living = a.keyframe_alive[snapshot.keyframes]
     a.T_cw[snapshot.keyframes[living]] = solution.T_cw[living]
-    # A parent is older than its children: it has moved when they ask for it.
+    # A parent is older than its children, so it has already been moved.
     for k in range(snapshot.n_keyframes, map_.n_keyframes):
         parent = map_.parents[k]
         if a.keyframe_alive[k] and parent >= 0:

@@ -1,4 +1,4 @@
-"""Local mapping: what happens to the map after each new keyframe (ORB-SLAM, section VI)."""
+"""Local mapping: updates the map after each new keyframe (ORB-SLAM, section VI)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ RECENT_KEYFRAMES = 3  # a landmark is on probation for this many keyframes (ORB-
 
 
 def map_keyframe(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Bring the map up to date with a keyframe that was just inserted and linked."""
+    """Run all steps of local mapping for a keyframe that was just inserted and linked to its
+    landmarks: culling of landmarks, triangulation, fusion, local bundle adjustment and culling of
+    keyframes."""
     cull_recent_landmarks(map_, keyframe, camera, config)
     triangulate_with_neighbours(map_, keyframe, camera, config)
     refresh_keyframe(map_, keyframe)
@@ -42,7 +44,7 @@ def refresh_keyframe(map_: Map, keyframe: int) -> None:
 
 
 def cull_recent_landmarks(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Erase landmarks on probation that tracking rarely finds or too few keyframes see."""
+    """Erase recent landmarks that tracking rarely finds, or that too few keyframes observe."""
     _cull_landmarks(
         map_.arrays,
         int(
@@ -53,7 +55,8 @@ def cull_recent_landmarks(map_: Map, keyframe: int, camera: Camera, config: Conf
         map_.n_landmarks,
         keyframe,
         config.mapping.min_found_ratio,
-        # One stereo and one monocular observation are not enough, nor are two monocular ones.
+        # A stereo observation counts twice. One stereo and one monocular observation are too few
+        # for a stereo map, and two observations are too few for a monocular map.
         2 if camera.monocular else 3,
     )
 
@@ -72,9 +75,9 @@ def _cull_landmarks(a, first, last, keyframe, min_found_ratio, too_few):
 def adjust_locally(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Local bundle adjustment (ORB-SLAM, VI-D).
 
-    The keyframe and its covisible keyframes move with all landmarks that they see; other
-    keyframes that see those hold still, and so does the first keyframe, which is the world.
-    Observations that fail the chi-square test afterwards are removed.
+    Optimises the keyframe, its covisible keyframes and all landmarks that they observe. Other
+    keyframes that observe these landmarks are fixed, and so is the first keyframe, which defines
+    the world frame. Observations that fail the chi-square test afterwards are removed.
     """
     free, fixed, landmarks = local_window(map_, keyframe, config)
     problem, rows = assemble(map_, free, fixed, landmarks, camera)
@@ -95,7 +98,7 @@ def adjust_locally(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
 def local_window(
     map_: Map, keyframe: int, config: Config
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
-    """Free keyframes, fixed keyframes and landmarks of local bundle adjustment."""
+    """Ids of the free keyframes, fixed keyframes and landmarks of local bundle adjustment."""
     strong = strong_neighbours(map_, keyframe, config)
     window = np.concatenate([[keyframe], strong])[: config.mapping.max_ba_keyframes]
     landmarks, others = window_landmarks(
@@ -106,15 +109,15 @@ def local_window(
     if 0 in window:
         fixed = np.concatenate([[0], fixed])
     if len(fixed) == 0 and len(free) > 1:
-        # A part of the map that began anew: its oldest keyframe is its world.
+        # A sub-map without a connection to the rest: its oldest keyframe defines its frame.
         free, fixed = free[1:], free[:1]
     return free.astype(np.int64), fixed.astype(np.int64), landmarks
 
 
 def strong_neighbours(map_: Map, keyframe: int, config: Config) -> NDArray[np.int64]:
-    """Keyframes joined to one in the covisibility graph, most shared landmarks first.
+    """Ids of the neighbours of a keyframe in the covisibility graph, most shared landmarks first.
 
-    A keyframe with weak neighbours only keeps its best one (ORB-SLAM, III-D).
+    If all neighbours share too few landmarks, the best one is returned (ORB-SLAM, III-D).
     """
     neighbours, shared = map_.covisible(keyframe)
     return neighbours[(shared >= config.mapping.min_shared) | (np.arange(len(shared)) == 0)]
@@ -122,7 +125,8 @@ def strong_neighbours(map_: Map, keyframe: int, config: Config) -> NDArray[np.in
 
 @kernel
 def window_landmarks(a, window, n_landmarks, n_keyframes):
-    """Landmarks seen from the window, ``(P,)`` i4, and which other keyframes see them, ``(K,)``."""
+    """``(P,)`` int32, landmarks that the keyframes of a window observe; ``(K,)`` bool, other
+    keyframes that observe them."""
     seen = np.zeros(n_landmarks, np.bool_)
     others = np.zeros(n_keyframes, np.bool_)
     for keyframe in window:
@@ -147,7 +151,15 @@ def assemble(
     landmarks: NDArray[np.int32],
     camera: Camera,
 ) -> tuple[BundleProblem, NDArray[np.int64]]:
-    """The bundle problem of some keyframes and landmarks, and the map row of each observation."""
+    """The bundle problem of some keyframes and landmarks.
+
+    Args:
+        free, fixed: ids of the keyframes to optimise and to hold fixed.
+        landmarks: ``(P,)`` ids.
+
+    Returns:
+        The problem, and ``(O,)`` int64, the row of each observation in the map's arrays.
+    """
     a = map_.arrays
     cameras = np.concatenate([free, fixed])
     index = np.full(map_.n_keyframes, -1, np.int64)
@@ -169,21 +181,22 @@ def assemble(
 
 @kernel
 def remove_observations(a, rows):
-    """Unlink each of ``(N,)`` rows that still observes something."""
+    """Unlink each of ``(N,)`` rows that still observes a landmark."""
     for row in rows:
         if a.landmark[row] >= 0:
             unlink(a, row)
 
 
 def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Remove covisible keyframes most of whose close landmarks at least three others see as well,
-    at the same or a finer scale (ORB-SLAM, VI-E). Without stereo all landmarks count."""
+    """Cull redundant covisible keyframes: those of whose close landmarks most are also observed by
+    at least three other keyframes at the same or a finer scale (ORB-SLAM, VI-E). For a monocular
+    camera all landmarks count as close."""
     neighbours, shared = map_.covisible(keyframe)
     close = config.stereo.close_depth_baselines * camera.baseline
     restarts = map_.restarts
     for neighbour in neighbours[shared >= config.mapping.min_shared]:
         if neighbour == 0 or neighbour in restarts:
-            continue  # the world of its sub-map
+            continue  # it defines the frame of its sub-map
         seen, redundant = count_redundant(map_.arrays, int(neighbour), camera.bf, close)
         if redundant > config.mapping.redundant_ratio * seen:
             map_.cull_keyframe(int(neighbour))
@@ -191,14 +204,14 @@ def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
 
 @kernel
 def count_redundant(a, keyframe, bf, close_depth):
-    """Close landmarks of a keyframe, and how many of them three others see as well; for a
-    monocular camera, whose ``bf`` is 0, all landmarks."""
+    """Number of close landmarks of a keyframe, and number of these that at least three other
+    keyframes observe. If ``bf`` is 0 (monocular camera), all landmarks count as close."""
     seen, redundant = 0, 0
     for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
         landmark = a.landmark[row]
         if landmark < 0:
             continue
-        # A comparison with NaN is false: monocular observations do not count.
+        # A comparison with NaN is false, so observations without depth do not count.
         if bf > 0.0 and not bf < close_depth * (a.xy[row, 0] - a.u_right[row]):
             continue
         seen += 1

@@ -1,4 +1,4 @@
-"""Moving keyframes, and the landmarks with them, when a loop has corrected them."""
+"""Moves keyframes and their landmarks after a loop correction."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from vslam.map import Map
 def move_keyframes(
     map_: Map, keyframes: NDArray[np.integer], T_cw_new: NDArray[np.float64]
 ) -> None:
-    """Set poses and take each landmark along, rigidly, with the keyframe it is anchored in.
+    """Set the poses of keyframes, and move each landmark rigidly with its anchor keyframe.
 
-    The anchor is the keyframe that saw the landmark first (ORB-SLAM, VII-C), or if that was
-    culled, the first of those that see it; landmarks anchored in keyframes that are not named
-    stay. Seen from its anchor nothing changes, so that the distance range is as before and the
-    normal turns with the anchor: it is exact where all observers move as one. Culled keyframes
-    follow the living ones they are placed by.
+    The anchor of a landmark is the keyframe that first observed it (ORB-SLAM, VII-C) or, if that
+    was culled, the oldest one that observes it. A landmark whose anchor is not among ``keyframes``
+    does not move. Relative to the anchor nothing changes, so the distance range is kept and the
+    normal is rotated with the anchor; both are exact if all observers move alike. Culled keyframes
+    need no update, because their poses are stored relative to living keyframes.
 
     Args:
         keyframes: ``(N,)`` ids of living keyframes.
         T_cw_new: ``(N, 4, 4)`` their new poses.
 
     Raises:
-        ValueError: a keyframe was culled: it has no pose of its own.
+        ValueError: a keyframe was culled and has no pose of its own.
     """
     a = map_.arrays
     if not a.keyframe_alive[keyframes].all():
-        raise ValueError("move_keyframes: some of the keyframes were culled.")
+        raise ValueError("move_keyframes: some of the keyframes were culled; pass living ones only")
     T_cw_old = a.T_cw[: map_.n_keyframes].copy()
     a.T_cw[keyframes] = T_cw_new
     carry_landmarks(map_, np.arange(map_.n_landmarks), T_cw_old)
 
 
 def carry_landmarks(map_: Map, landmarks: NDArray[np.int64], T_cw_old: NDArray[np.float64]) -> None:
-    """Move landmarks rigidly with their anchors, whose poses were ``T_cw_old`` and are the map's.
+    """Move landmarks rigidly with their anchors, from the poses ``T_cw_old`` to those in the map.
 
     Args:
-        landmarks: ``(N,)`` int64 ids; dead ones are passed over.
-        T_cw_old: ``(K, 4, 4)`` poses of all keyframes before.
+        landmarks: ``(N,)`` int64 ids; erased landmarks are skipped.
+        T_cw_old: ``(K, 4, 4)`` previous poses of all keyframes.
     """
     a, n = map_.arrays, map_.n_keyframes
     moved = np.any(T_cw_old != a.T_cw[:n], axis=(1, 2)) & a.keyframe_alive[:n]
@@ -52,16 +52,17 @@ def carry_landmarks_by(map_: Map, motion: NDArray[np.float64], moved: NDArray[np
     """Move all landmarks by the motions of their anchors.
 
     Args:
-        motion: ``(K, 4, 4)`` of each keyframe, world to world, similarities too: then normal and
-            distance range are to be refreshed.
-        moved: ``(K,)`` bool, keyframes that have one.
+        motion: ``(K, 4, 4)`` world-to-world motion of each keyframe. It may be a similarity; then
+            the caller must refresh the normals and distance ranges of the landmarks.
+        moved: ``(K,)`` bool, keyframes that have a motion.
     """
     _carry(map_.arrays, np.arange(map_.n_landmarks), motion, moved)
 
 
 @kernel
 def _motions(T_cw_old, T_cw_new, moved):
-    """World motion of each keyframe: what is fixed to it goes from p to ``motion p``."""
+    """``(K, 4, 4)`` world-to-world motion of each keyframe: a point fixed to the keyframe moves
+    from p to ``motion p``."""
     motion = np.zeros((len(moved), 4, 4))
     for k in range(len(moved)):
         if moved[k]:
@@ -91,7 +92,7 @@ def _carry(a, landmarks, motion, moved):
 
 @inner_kernel
 def anchor_of(a, landmark):
-    """The keyframe that a landmark moves with, or -1 if nothing living sees it."""
+    """Id of the keyframe that a landmark moves with, or -1 if no living keyframe observes it."""
     first = a.first_keyframe[landmark]
     if a.keyframe_alive[first]:
         return first

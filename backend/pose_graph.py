@@ -1,8 +1,8 @@
-"""The pose graph behind a closed loop: how its error is spread over the path, and whether it may.
+"""Pose-graph optimisation after a loop closure, and the test whether its result is plausible.
 
-The essential graph of ORB-SLAM (Mur-Artal et al., T-RO 2015, III-D and VII-C): spanning tree,
-strong covisibility edges and loop edges. Poses go in as ``T_cw`` and come out as ``T_cw``. GTSAM
-does the optimisation, from its built-in factors; it is loaded by the first loop.
+The graph is the essential graph of ORB-SLAM (Mur-Artal et al., T-RO 2015, III-D and VII-C):
+spanning tree, strong covisibility edges and loop edges. Poses are ``T_cw`` on input and output.
+GTSAM optimises the graph with its built-in factors; it is imported at the first loop.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from vslam.map import Map, loop_of_living
 from vslam.map_kernels import covisible_pairs
 
 TREE, COVISIBLE, WEAK, LOOP, GAP = range(5)  # kinds of edges
-HOLD = 1e-6  # sigma, m and rad, of the prior that holds a keyframe
+HOLD = 1e-6  # standard deviation of the prior that fixes a keyframe, m and rad
 
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Keyframes and what is known of their relative poses.
+    """Keyframes and measurements of their relative poses.
 
     Attributes:
         keyframes: ``(N,)`` int64 ids, ascending.
-        T_cw: ``(N, 4, 4)`` poses to start from.
-        edges: ``(E, 2)`` int64, positions i, j in ``keyframes``.
-        T_i_j: ``(E, 4, 4)`` measured pose of j in the camera frame of i.
+        T_cw: ``(N, 4, 4)`` initial poses.
+        edges: ``(E, 2)`` int64, indices i, j into ``keyframes``.
+        T_i_j: ``(E, 4, 4)`` measured pose of camera j in the frame of camera i.
         kind: ``(E,)`` uint8, TREE, COVISIBLE, WEAK, LOOP or GAP.
-        sigmas: ``(E, 2)`` standard deviations, translation (m) and rotation (rad), of each axis.
-        fixed: ``(N,)`` bool, keyframes that are held: one in each connected part.
-        scale: ``(E,)`` units around i for one around j; ``T_i_j`` is in the unit of i. 1 except
-            for loops of monocular maps (``similarity_graph``).
+        sigmas: ``(E, 2)`` standard deviations of translation (m) and rotation (rad), per axis.
+        fixed: ``(N,)`` bool, keyframes that are held fixed: one in each connected part.
+        scale: ``(E,)`` factor from lengths around j to lengths around i; ``T_i_j`` is in the unit
+            of i. 1 except for loops of monocular maps (``similarity_graph``).
     """
 
     keyframes: NDArray[np.int64]
@@ -52,15 +52,16 @@ class PoseGraph:
 
 @dataclass(frozen=True)
 class GraphCheck:
-    """Whether the edges of an optimised graph agree.
+    """Whether the edges of an optimised graph agree with each other.
 
     Attributes:
-        consistent: whether the correction may stand.
-        reason: "consistent", or in a few words what speaks against it.
-        strain: chi-square of the tree, covisibility and gap edges: how much drift, in the units of
-            the drift model, the correction implies.
-        closed: loop edges that were open before: what the strain is to be shared by.
-        loop_error: ``(E,)`` chi-square of the loop edges, NaN for others.
+        consistent: whether the correction is plausible.
+        reason: "consistent", or in a few words why it is not.
+        strain: total chi-square of the tree, covisibility and gap edges, that is, how much drift
+            the correction implies relative to the drift model.
+        closed: number of loop edges that were violated before; the limit on the strain is
+            proportional to it.
+        loop_error: ``(E,)`` chi-square of the loop edges, NaN for other edges.
     """
 
     consistent: bool
@@ -79,23 +80,27 @@ def essential_graph(
     unpredicted: Collection[int] = (),
     driven: bool = False,
 ) -> PoseGraph:
-    """The essential graph of a map, *before* anything of the new loop has been written to it.
+    """The essential graph of a map, to be built *before* the new loop changes the map.
 
-    Tree and covisibility edges are measured by the map's poses. Were landmarks of the new loop
-    fused already, keyframes on both sides would be covisible, and such an edge would hold the
-    drift in place: correct and fuse afterwards, when the graph was found consistent.
+    Tree and covisibility edges are measured by the poses in the map. If landmarks of the new loop
+    were already fused, keyframes on both sides of it would be covisible, and these edges would
+    preserve the drift. So correct the map and fuse landmarks only after the graph was found to be
+    consistent.
 
-    A loop edge stands for all that is known between its two keyframes: no other edge joins them.
-    The end of a loop that was culled is replaced by the living keyframe that it is placed by; of
-    two loops that so join the same keyframes the last counts.
+    A loop edge replaces any other edge between its two keyframes. If an end of a loop was culled,
+    the living keyframe that its pose is stored relative to takes its place; if several loops then
+    join the same keyframes, the last one counts.
 
     Args:
-        loops: that were closed, and last the new one; all with their pose.
-        weak: keyframes that began anew after tracking was lost, culled ones too. Tree edges that
-            lead past one of them, and whose ends share hardly a landmark, come from a prediction.
-        unpredicted: those of them that not even a prediction led to: always WEAK.
-        driven: trust such an edge as far as a car's motion can be predicted over that time (GAP);
-            otherwise the camera may have been carried anywhere (WEAK).
+        loops: all closed loops, the new one last; each has a pose.
+        weak: keyframes at which the map was restarted after tracking was lost, including culled
+            ones. A tree edge across such a restart, whose ends share hardly any landmarks, was not
+            measured but predicted.
+        unpredicted: the restarts for which there was no prediction either; tree edges across them
+            are always WEAK.
+        driven: whether the camera is on a vehicle. Then a predicted edge is trusted as far as the
+            motion of a car can be predicted over that time (GAP); otherwise the camera may have
+            been carried anywhere (WEAK).
 
     Raises:
         ValueError: a loop has no pose.
@@ -106,7 +111,7 @@ def essential_graph(
     T_cw = map_.arrays.T_cw[living]
     pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, config.min_shared_tree)
     seen = set(map(tuple, pairs.tolist()))
-    # Edge by the pair of its ends: what is written later wins.
+    # The kind of each edge by its pair of ends; later entries overwrite earlier ones.
     kind = dict.fromkeys(map(tuple, pairs[shared >= config.min_shared].tolist()), COVISIBLE)
     restarts, unpredicted_restarts = (np.array(sorted(at), np.int64) for at in (weak, unpredicted))
     for child, parent in zip(living.tolist(), map_.parents[living].tolist(), strict=True):
@@ -149,20 +154,21 @@ def essential_graph(
     )
 
 
-def held_by(map_: Map) -> NDArray[np.int64]:
-    """``(n_keyframes,)`` what holds the map together at each keyframe: the most landmarks that a
-    keyframe before it shares with one that is not; 0 at the first one."""
+def connectivity(map_: Map) -> NDArray[np.int64]:
+    """``(n_keyframes,)`` int64, how well the map is connected at each keyframe: the largest number
+    of landmarks that an earlier keyframe shares with this or a later one; 0 for the first."""
     living = map_.living_keyframes()
     pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, 1)
     held = np.zeros(map_.n_keyframes, np.int64)
-    order = np.argsort(shared, kind="stable")  # greater numbers are written last
+    order = np.argsort(shared, kind="stable")  # so that greater numbers overwrite smaller ones
     for (one, other), n in zip(pairs[order].tolist(), shared[order].tolist(), strict=True):
         held[one + 1 : other + 1] = n
     return held
 
 
 def _passes(pair: tuple[int, int], keyframes: NDArray[np.int64]) -> bool:
-    """Whether one of the sorted keyframes lies behind the first and not behind the second."""
+    """Whether any of the sorted ids is greater than the first of a pair, and not greater than the
+    second."""
     low, high = np.searchsorted(keyframes, pair, side="right")
     return bool(low < high)
 
@@ -175,16 +181,20 @@ def edge_sigmas(
     n: int,
     config: PoseGraphConfig,
 ) -> NDArray[np.float64]:
-    """Standard deviations of edges, ``(E, 2)``, m and rad; ``seconds`` ``(E, 2)`` of their ends.
+    """``(E, 2)`` standard deviations of the edges, translation (m) and rotation (rad).
 
-    Drift is a random walk: the variance of a tree or covisibility edge grows with its length.
-    These edges repeat what is one measurement, the path as it was estimated; were they independent
-    the path would be the stiffer the more of them pass over it. Therefore each variance is
-    multiplied by how many times the edges at its ends cover the path there: then all together
-    resist to being stretched as the drift model says, however many they are.
+    Drift is modelled as a random walk, so the variance of a tree or covisibility edge grows with
+    its length. All these edges are derived from one measurement, the estimated path. If they were
+    treated as independent, a path would be stiffer the more edges run along it. Therefore each
+    variance is multiplied by the number of edges that cover the path at its ends, so that all edges
+    together are as stiff as the drift model says, however many there are.
 
-    A GAP may be wrong by a share of the way predicted, or by what a slow car gathers in that time;
-    of a WEAK edge nothing is known.
+    The translation of a GAP edge may be wrong by a share of the predicted distance, or by the
+    distance that a slow car drives in that time. Nothing is known about a WEAK edge.
+
+    Args:
+        seconds: ``(E, 2)`` timestamps of the ends of the edges.
+        n: number of keyframes.
     """
     length = np.maximum(np.linalg.norm(T_i_j[:, :3, 3], axis=1), config.min_length)
     tree, path = kind == TREE, (kind == TREE) | (kind == COVISIBLE)
@@ -206,9 +216,9 @@ def edge_sigmas(
 
 
 def _first_of_parts(edges: NDArray[np.int64], n: int) -> NDArray[np.bool_]:
-    """``(n,)`` bool, the first node of each connected part."""
-    # The least node that each one is known to be joined to, which halves the way to the first one
-    # in each round.
+    """``(n,)`` bool, True for the first node of each connected part."""
+    # The smallest node that each node is known to be connected to. Each round follows these links
+    # twice as far (pointer jumping).
     least = np.arange(n)
     while True:
         ends = least[edges].min(axis=1, initial=n)
@@ -223,15 +233,16 @@ def _first_of_parts(edges: NDArray[np.int64], n: int) -> NDArray[np.bool_]:
 
 
 def load_optimiser() -> None:
-    """Import what the first loop needs: a tenth of a second that no frame of a camera can wait."""
+    """Import GTSAM ahead of the first loop; this takes a tenth of a second, too long while frames
+    of a live camera are waiting."""
     import gtsam  # noqa: F401
 
 
 def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
-    """Poses ``T_cw`` ``(N, 4, 4)`` that agree best with the edges.
+    """``(N, 4, 4)`` poses ``T_cw`` that best agree with the edges, by Levenberg-Marquardt.
 
-    Levenberg-Marquardt. Loop edges are under the Cauchy loss: one that contradicts the others
-    loses its influence, and shows in ``check_pose_graph``; all others are Gaussian.
+    Loop edges have the Cauchy loss, so that one that contradicts the others loses its influence and
+    is detected by ``check_pose_graph``. All other edges have a Gaussian loss.
     """
     import gtsam
 
@@ -264,13 +275,13 @@ def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
 def check_pose_graph(
     graph: PoseGraph, T_cw: NDArray[np.float64], config: PoseGraphConfig
 ) -> GraphCheck:
-    """Whether an optimised graph makes sense, or a loop was wrong and is to be undone.
+    """Test whether an optimised graph is plausible, or the new loop is wrong and must be rejected.
 
-    Two tests. A loop edge far from its measurement contradicts the others or more of the path than
-    the loss would give up. The strain, chi-square of what tree and covisibility edges were bent by,
-    has six degrees of freedom for each loop that was closed if drift is what the model says; beyond
-    several times that no plausible drift explains the loop. What a GAP is bent by counts as well.
-    Nothing can be said against a single loop across a weak edge: it strains nothing.
+    There are two tests. First, a loop edge whose residual is still large contradicts the other
+    loops or too much of the path. Second, the strain (the chi-square of tree, covisibility and gap
+    edges) has six degrees of freedom per closed loop if the drift follows the model; if it is
+    several times larger, no plausible drift explains the loop. A single loop across a WEAK edge
+    always passes, because it causes no strain.
 
     Args:
         T_cw: ``(N, 4, 4)`` result of ``optimise``.
@@ -286,7 +297,8 @@ def check_edge_errors(
     after: NDArray[np.float64],
     config: PoseGraphConfig,
 ) -> GraphCheck:
-    """``check_pose_graph`` from the chi-square ``(E,)`` of each edge before and after."""
+    """``check_pose_graph``, given the ``(E,)`` chi-square of each edge before and after the
+    optimisation."""
     loop = graph.kind == LOOP
     loop_error = np.where(loop, after, np.nan)
     strain = float(after[~loop & (graph.kind != WEAK)].sum())
@@ -306,7 +318,8 @@ def check_edge_errors(
 
 @kernel
 def edge_errors(T_cw, edges, T_i_j, sigmas):
-    """Chi-square of each edge, ``(E,)``: squared whitened logarithm of its residual motion."""
+    """``(E,)`` chi-square of each edge: the squared norm of the logarithm of its residual motion,
+    divided by the standard deviations."""
     chi2 = np.empty(len(edges))
     for e in range(len(edges)):
         T = compose(T_cw[edges[e, 0]], inverse(T_cw[edges[e, 1]]))

@@ -1,10 +1,10 @@
-"""The pose graph of a monocular map: scale drifts too, and a loop says by how much (ORB-SLAM, T-RO
-2015, VII-C; Strasdat et al., "Scale drift-aware large scale monocular SLAM", RSS 2010).
+"""Pose-graph optimisation of a monocular map, whose scale drifts as well (ORB-SLAM, T-RO 2015,
+VII-C; Strasdat et al., "Scale drift-aware large scale monocular SLAM", RSS 2010).
 
-Each keyframe has a similarity ``S_wc``, ``(4, 4)`` with the scale in its upper left 3x3 block, so
-that similarities are composed by ``@``. It maps points of the camera, in the unit that the map has
-around it before the correction, to the world. At the start all scales are 1; a loop alone measures
-another one. GTSAM optimises, from its built-in Similarity3 factors.
+Each keyframe has a similarity ``S_wc``, a ``(4, 4)`` matrix with the scale in its upper left 3x3
+block, so that ``@`` composes similarities. It maps points in the camera frame, in the unit that the
+map has there before the correction, to the world. Initially all scales are 1; only loop edges
+measure other scales. GTSAM optimises the graph with its built-in Similarity3 factors.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from vslam.map_kernels import refresh_landmarks
 
 
 def similarity(T_a_b: Matrix, scale: NDArray[np.float64] | float) -> Matrix:
-    """``(..., 4, 4)`` similarities of rigid motions and their scales ``(...,)``."""
+    """``(..., 4, 4)`` similarities from ``(..., 4, 4)`` rigid motions and ``(...,)`` scales."""
     S = T_a_b.copy()
     S[..., :3, :3] *= np.asarray(scale)[..., None, None]
     return S
 
 
 def scale_of(S: Matrix) -> NDArray[np.float64]:
-    """Scales ``(...,)`` of similarities ``(..., 4, 4)``."""
+    """``(...,)`` scales of ``(..., 4, 4)`` similarities."""
     return np.cbrt(np.linalg.det(S[..., :3, :3]))
 
 
 def rigid(S: Matrix) -> Matrix:
-    """Similarities ``(..., 4, 4)`` without their scale: where the cameras are."""
+    """``(..., 4, 4)`` rigid motions: similarities with their scale set to 1."""
     return similarity(S, 1.0 / scale_of(S))
 
 
 def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> Matrix:
-    """Similarities ``(N, 4, 4)`` that agree best with the edges, from ``S_wc``.
+    """``(N, 4, 4)`` similarities that best agree with the edges, starting from ``S_wc``.
 
-    Losses and method are those of ``pose_graph.optimise``; keyframes held keep their scale too.
+    Losses and method are those of ``pose_graph.optimise``; fixed keyframes also keep their scale.
     """
     import gtsam
 
@@ -84,9 +84,9 @@ def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfi
 
 
 def sigmas(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
-    """Standard deviations ``(E, 7)``: rotation, translation and the logarithm of the scale.
+    """``(E, 7)`` standard deviations of rotation, translation and the logarithm of the scale.
 
-    Scale drifts as the rest does, by a random walk over the path.
+    The scale drifts like the pose, as a random walk along the path.
     """
     scale = graph.sigmas[:, 1] * (config.scale_drift / config.rotation_drift)
     scale[graph.kind == LOOP] = config.loop_scale
@@ -98,13 +98,13 @@ def sigmas(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
 def check_similarity_graph(
     graph: PoseGraph, S_wc_before: Matrix, S_wc: Matrix, config: PoseGraphConfig
 ) -> GraphCheck:
-    """``check_pose_graph`` for similarities before and after optimisation."""
+    """``check_pose_graph`` for the similarities before and after the optimisation."""
     before, after = (edge_errors(graph, S, config) for S in (S_wc_before, S_wc))
     return check_edge_errors(graph, before, after, config)
 
 
 def edge_errors(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> NDArray[np.float64]:
-    """Chi-square of each edge, ``(E,)``: rotation, translation and scale of its residual."""
+    """``(E,)`` chi-square of the rotation, translation and scale of the residual of each edge."""
     i, j = graph.edges.T
     S_i_j = np.linalg.inv(S_wc[i]) @ S_wc[j]
     residual = np.linalg.inv(similarity(graph.T_i_j, graph.scale)) @ S_i_j
@@ -116,20 +116,22 @@ def edge_errors(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> NDAr
 def move_keyframes_similarly(
     map_: Map, keyframes: NDArray[np.integer], S_wc: Matrix
 ) -> NDArray[np.float64]:
-    """Move keyframes and take each landmark along with its anchor, growing or shrinking what is
-    around it (ORB-SLAM, VII-C).
+    """Move keyframes by similarities, and move and scale each landmark with its anchor (ORB-SLAM,
+    VII-C).
 
-    Culled keyframes follow the living ones they are placed by; ``map_.unit_scale`` keeps account.
+    The poses of culled keyframes, which are stored relative to living ones, are scaled as well.
+    ``map_.keyframes.unit_scale`` accumulates the scales.
 
     Args:
-        keyframes: ``(N,)`` ids of living keyframes; S_wc: ``(N, 4, 4)`` their similarities.
+        keyframes: ``(N,)`` ids of living keyframes.
+        S_wc: ``(N, 4, 4)`` new similarities of these keyframes.
 
     Returns:
-        ``(n_keyframes,)`` by what the unit around each keyframe was multiplied.
+        ``(n_keyframes,)`` factor by which lengths around each keyframe were multiplied.
     """
     a, n = map_.arrays, map_.n_keyframes
     motion = np.zeros((n, 4, 4))
-    motion[keyframes] = S_wc @ a.T_cw[keyframes]  # what is fixed to a keyframe, world to world
+    motion[keyframes] = S_wc @ a.T_cw[keyframes]  # old to new world coordinates
     moved = np.zeros(n, np.bool_)
     moved[keyframes] = True
     a.T_cw[keyframes] = inverses(rigid(S_wc))
@@ -145,7 +147,7 @@ def move_keyframes_similarly(
 
 
 def loop_in_new_units(edge: LoopEdge, growth: NDArray[np.float64]) -> LoopEdge:
-    """A loop in the units after a correction that multiplied those of its ends by ``growth``."""
+    """A loop edge after a correction that multiplied lengths around each keyframe by ``growth``."""
     assert edge.T_query_match is not None
     T = edge.T_query_match.copy()
     T[:3, 3] *= growth[edge.match]

@@ -1,4 +1,5 @@
-"""New landmarks: from stereo, and from two keyframes that see the same unmapped feature."""
+"""Creates landmarks from the stereo features of a keyframe, and by triangulation of features that
+two keyframes see."""
 
 from __future__ import annotations
 
@@ -14,22 +15,22 @@ from vslam.map_kernels import link_many
 from vslam.reprojection import chi_square_ratio, unpacked
 
 EPIPOLAR_CHI2 = 3.84  # 95 % quantile with 1 degree of freedom
-SECTIONS = 512  # of the directions of epipolar planes
+SECTIONS = 512  # number of bins for the direction of an epipolar plane
 
 
 def map_stereo_points(
     map_: Map, keyframe: int, camera: Camera, config: Config, *, far: bool = False
 ) -> NDArray[np.int32]:
-    """Map the close stereo features of a keyframe that observe no landmark yet.
+    """Create landmarks from the close stereo features of a keyframe that observe no landmark yet.
 
-    If fewer than ``mapping.min_stereo_points`` are close, that many of the nearest are mapped
-    (ORB-SLAM2, section III-E).
+    If fewer than ``mapping.min_stereo_points`` features are close, the nearest ones up to that
+    number are considered (ORB-SLAM2, section III-E).
 
     Args:
-        far: far ones, too.
+        far: whether to map far features as well.
 
     Returns:
-        The ids of the new landmarks.
+        ``(N,)`` ids of the new landmarks.
     """
     a, rows = map_.arrays, map_.rows(keyframe)
     xy = a.xy[rows].astype(np.float64)
@@ -50,8 +51,9 @@ def map_stereo_points(
 def triangulate_with_neighbours(
     map_: Map, keyframe: int, camera: Camera, config: Config
 ) -> NDArray[np.int32]:
-    """Match unmapped features of a keyframe with those of its covisible keyframes along epipolar
-    lines and triangulate them (ORB-SLAM, VI-C). Returns the ids of the new landmarks."""
+    """Match features of a keyframe without a landmark with those of its covisible keyframes along
+    epipolar lines, and triangulate them (ORB-SLAM, VI-C). Returns the ``(N,)`` ids of the new
+    landmarks."""
     neighbours, _ = map_.covisible(keyframe)
     created = [np.empty(0, np.int32)]
     limit, min_baseline = config.mapping.neighbours, camera.baseline
@@ -75,13 +77,14 @@ def triangulate_with_neighbours(
         ids = map_.add_landmarks(xyz, a.descriptor[rows_1], keyframe)
         link_many(map_.arrays, rows_1, ids)
         link_many(map_.arrays, rows_2, ids)
-        map_.arrays.certainty[rows_2] = 1  # of a keypoint, matched by its descriptor alone
+        # Matched by descriptor alone, so no more certain than a keypoint.
+        map_.arrays.certainty[rows_2] = 1
         created.append(ids)
     return np.concatenate(created)
 
 
 def median_depth(map_: Map, keyframe: int) -> float:
-    """Median depth of the landmarks that a keyframe observes: the scale of its view."""
+    """Median depth of the landmarks that a keyframe observes, as a measure of the scene's scale."""
     points, T_cw = map_.arrays.xyz[map_.landmarks_of(keyframe)], map_.arrays.T_cw[keyframe]
     return float(np.median(points @ T_cw[2, :3] + T_cw[2, 3]))
 
@@ -95,7 +98,21 @@ def unmapped_rows(a, keyframe):
 
 @kernel
 def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, max_cosine):
-    """New landmarks of two keyframes: ``xyz`` ``(N, 3)`` and the rows of both, ``(N,)`` int64."""
+    """Triangulate new landmarks from two keyframes.
+
+    Args:
+        a: the map's arrays.
+        k1, k2: ids of the keyframes.
+        intrinsics: ``(6,)``, see ``Camera.intrinsics``.
+        scales: ``(levels,)`` pyramid scale factors.
+        min_baseline: least distance between the cameras.
+        max_distance: largest Hamming distance of a match, bits.
+        max_cosine: greatest cosine of the parallax of a match without stereo.
+
+    Returns:
+        ``(N, 3)`` positions in the world, and ``(N,)`` int64 rows of the observations of each
+        keyframe.
+    """
     fx, fy, cx, cy, bf, _ = intrinsics
     T1, T2 = a.T_cw[k1], a.T_cw[k2]
     centre_1, centre_2, gap = np.empty(3), np.empty(3), np.empty(3)
@@ -110,7 +127,7 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
     count = 0
     if dot3(gap, gap) < min_baseline**2 or dot3(gap, gap) == 0.0 or n2 == 0:
         return xyz[:0], out_1[:0], out_2[:0]
-    # Camera 1's centre in camera 2: the epipole.
+    # Centre of camera 1 in the frame of camera 2; it projects to the epipole.
     t, d, point = np.empty(3), np.empty(3), np.empty(3)
     ray_1, ray_2, from_1, from_2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
@@ -126,7 +143,7 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
     for i in range(n1):
         row_1 = rows_1[i]
         world_ray(T1, a.xy[row_1], intrinsics, ray_1)
-        # The ray in camera 2; t x d is normal to the epipolar plane.
+        # d is the ray in the frame of camera 2; t x d is normal to the epipolar plane.
         for m in range(3):
             d[m] = T2[m, 0] * ray_1[0] + T2[m, 1] * ray_1[1] + T2[m, 2] * ray_1[2]
         n_x, n_y = t[1] * d[2] - t[2] * d[1], t[2] * d[0] - t[0] * d[2]
@@ -149,7 +166,7 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
             if distance >= best_distance:
                 continue
             if not stereo_1 and np.isnan(a.u_right[rows_2[j]]) and t[2] > 0.0:
-                # Near the epipole two monocular rays have no parallax.
+                # Near the epipole, monocular rays have no parallax.
                 e_x, e_y = fx * t[0] / t[2] + cx - x2[j], fy * t[1] / t[2] + cy - y2[j]
                 if e_x * e_x + e_y * e_y < 100.0 * scales[a.octave[rows_2[j]]]:
                     continue
@@ -178,7 +195,8 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
                 T2, point, a.xy[row_2], a.u_right[row_2], scales[a.octave[row_2]], intrinsics
             )
         ):
-            # Distances must explain the octaves, up to a factor of 1.5 beyond one level.
+            # The ratio of the distances must agree with that of the scales, up to a factor of 1.5
+            # beyond one level.
             for m in range(3):
                 from_1[m], from_2[m] = point[m] - centre_1[m], point[m] - centre_2[m]
             far = np.sqrt(dot3(from_1, from_1) / dot3(from_2, from_2))
@@ -195,7 +213,7 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
 
 @kernel
 def perpendicular(t):
-    """Two vectors at right angles to ``t`` (3,) and to each other, ``(2, 3)``."""
+    """``(2, 3)`` unit vectors that are orthogonal to ``t`` ``(3,)`` and to each other."""
     across = np.zeros((2, 3))
     least = 0
     for i in range(1, 3):
@@ -215,8 +233,8 @@ def perpendicular(t):
 
 @kernel
 def direction(u, v):
-    """Direction of a line through the origin, from 0 to 2, which are the same: grows with its
-    angle, and takes no trigonometric function."""
+    """Direction of the line through the origin and (u, v): a number in [0, 2) that grows with the
+    angle of the line over half a turn, without trigonometric functions."""
     if v < 0.0 or (v == 0.0 and u < 0.0):
         u, v = -u, -v
     if u > 0.0:
@@ -226,20 +244,20 @@ def direction(u, v):
 
 @kernel
 def sorted_about_epipole(x, y, gate, intrinsics, across):
-    """Features that an epipolar line may pass within their gate, by the direction of its plane.
+    """Index features by the epipolar planes that pass within their gate.
 
-    All epipolar planes contain the baseline. Seen along it, a plane is a line through the origin
-    and the square around a feature, as wide as its gate, a parallelogram that spans some
-    directions, or all of them where the epipole is in it.
+    All epipolar planes contain the baseline. Seen along it, a plane is a line through the origin,
+    and the square of gate size around a feature is a parallelogram. The parallelogram spans an
+    interval of directions, or all of them if the epipole is inside.
 
     Args:
         x, y: ``(n,)`` float32, pixels.
-        gate: ``(n,)`` float32, squared distance from the line.
-        across: ``(2, 3)``, the axes seen along the baseline.
+        gate: ``(n,)`` float32, greatest squared distance from the epipolar line, pixels squared.
+        across: ``(2, 3)``, axes of the view along the baseline, see ``perpendicular``.
 
     Returns:
-        start: ``(SECTIONS + 1,)``, where each section of directions begins in ``items``, the
-        indices of its features in rising order.
+        ``start`` ``(SECTIONS + 1,)`` and ``items`` int32: the features that a plane whose direction
+        is in bin s may pass are ``items[start[s]:start[s + 1]]``, ascending.
     """
     n = len(x)
     low, high = np.empty(n, np.int64), np.empty(n, np.int64)
@@ -247,14 +265,14 @@ def sorted_about_epipole(x, y, gate, intrinsics, across):
     for j in range(n):
         u, v = seen_along(x[j], y[j], intrinsics, across)
         middle = direction(u, v)
-        reach = 1.01 * np.sqrt(gate[j]) + 0.01  # no rounding may lose one
+        reach = 1.01 * np.sqrt(gate[j]) + 0.01  # a margin, so that rounding loses no feature
         least, most = 0.0, 0.0
         for corner in range(4):
             x_k = x[j] + (reach if corner % 2 else -reach)
             y_k = y[j] + (reach if corner // 2 else -reach)
             u_k, v_k = seen_along(x_k, y_k, intrinsics, across)
             if u * u_k + v * v_k <= 0.0:
-                least, most = -1.0, 1.0  # a right angle or more: the epipole may be inside
+                least, most = -1.0, 1.0  # at least a right angle: the epipole may be inside
                 break
             apart = direction(u_k, v_k) - middle
             apart += 2.0 * ((apart < -1.0) - (apart > 1.0))
@@ -277,7 +295,7 @@ def sorted_about_epipole(x, y, gate, intrinsics, across):
 
 @inner_kernel
 def seen_along(x, y, intrinsics, across):
-    """The ray of a pixel along the two axes."""
+    """Components of the ray of a pixel along the two axes of ``across``."""
     fx, fy, cx, cy, _, _ = intrinsics
     d_x, d_y = (x - cx) / fx, (y - cy) / fy
     u = d_x * across[0, 0] + d_y * across[0, 1] + across[0, 2]
@@ -292,7 +310,8 @@ def dot3(a, b):
 
 @inner_kernel
 def world_ray(T_cw, xy, intrinsics, ray):
-    """Viewing ray of a pixel in the world, of length 1 along the camera's z, into ``ray`` (3,)."""
+    """Write the viewing ray of a pixel in the world frame, with z = 1 in the camera frame, into
+    ``ray`` ``(3,)``."""
     x = (xy[0] - intrinsics[2]) / intrinsics[0]
     y = (xy[1] - intrinsics[3]) / intrinsics[1]
     for i in range(3):
@@ -301,21 +320,30 @@ def world_ray(T_cw, xy, intrinsics, ray):
 
 @inner_kernel
 def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_cosine, point):
-    """Put into ``point`` (3,) where two rays meet, or the stereo point of the camera pair that has
-    more parallax than the rays have; False if neither is sound.
+    """Write a point in the world into ``point`` ``(3,)``: the intersection of two rays or, if
+    stereo at one of the keyframes has more parallax, its stereo point.
 
-    ``depth_i`` is the stereo depth of each feature, NaN without; ``ray_i`` its ``world_ray``.
+    Args:
+        depth_1, depth_2: stereo depths of the features, NaN without one.
+        ray_1, ray_2: ``(3,)`` rays, see ``world_ray``.
+        centre_1, centre_2: ``(3,)`` positions of the cameras in the world.
+        baseline: of the stereo pair.
+        max_cosine: greatest cosine of the parallax of two rays without stereo.
+
+    Returns:
+        False if there is neither enough parallax nor a stereo depth, or the rays do not meet in
+        front of both cameras.
     """
     dot = dot3(ray_1, ray_2)
     square_1, square_2 = dot3(ray_1, ray_1), dot3(ray_2, ray_2)
     cosine = dot / np.sqrt(square_1 * square_2)
-    # Angle between the cameras, seen from the stereo point.
+    # Parallax of the stereo pair, as seen from the stereo point.
     angle_1 = 2.0 * np.arctan(0.5 * baseline / (depth_1 * np.sqrt(square_1)))
     angle_2 = 2.0 * np.arctan(0.5 * baseline / (depth_2 * np.sqrt(square_2)))
     stereo_1, stereo_2 = depth_1 > 0.0, depth_2 > 0.0  # False for NaN
     stereo_cosine = min(np.cos(angle_1) if stereo_1 else 2.0, np.cos(angle_2) if stereo_2 else 2.0)
     if 0.0 < cosine < stereo_cosine and (stereo_1 or stereo_2 or cosine < max_cosine):
-        # Midpoint of the shortest segment between the rays; bundle adjustment does the rest.
+        # Midpoint of the shortest segment between the rays; bundle adjustment will refine it.
         on_1, on_2 = 0.0, 0.0
         for i in range(3):
             on_1 += (centre_2[i] - centre_1[i]) * ray_1[i]
@@ -337,7 +365,8 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
 
 @inner_kernel
 def agrees(T, p, xy, u_right, scale, intrinsics):
-    """Whether a point in front of the camera reprojects within the chi-square limit."""
+    """Whether a point lies in front of the camera and passes the chi-square test of its
+    reprojection error."""
     z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
     if z <= 0.0:
         return False

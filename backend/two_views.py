@@ -1,9 +1,9 @@
-"""The beginning of a monocular map: two keyframes, their landmarks, and the unit of length.
+"""Starts a monocular map from two keyframes and their landmarks, and defines its unit of length.
 
-Two views tell the direction of a motion and not its length. The unit is chosen so that the median
-landmark is ``initialization.median_depth`` units away. With 15 of them a unit is roughly a metre
-in a street, which keeps what else is in metres in the configuration in proportion; nothing more
-is meant by it.
+Two views determine the direction of a translation but not its length. So the unit of length is
+chosen such that the median depth of the landmarks is ``initialization.median_depth``. With the
+value 15, a unit is roughly a metre in a street, so that thresholds of the configuration in metres
+are of the right order of magnitude; it is not a metric scale.
 """
 
 from __future__ import annotations
@@ -28,14 +28,15 @@ def adjust_two_views(
     """Bundle adjustment of two views, scaled to a median depth.
 
     Args:
-        T_2_1: ``(4, 4)`` start.
-        points: ``(N, 3)`` in camera 1, start.
+        T_2_1: ``(4, 4)`` initial transform from camera 1 to camera 2.
+        points: ``(N, 3)`` initial points in the frame of camera 1.
         uv: ``(N, 2, 2)`` pixels of each point in view 1 and in view 2.
-        sigma: ``(N,)`` their standard deviation, pixels.
-        depth: median depth in view 1 of the points that are kept.
+        sigma: ``(N,)`` standard deviation of these pixels, pixels.
+        depth: median depth that the kept points are to have in view 1.
 
     Returns:
-        ``T_2_1``, points, and ``(N,)`` bool: those that fit both views.
+        ``(4, 4)`` ``T_2_1``, ``(N, 3)`` points in the frame of camera 1, and ``(N,)`` bool, points
+        that are inliers in both views.
     """
     n = len(points)
     uvr = stack_uvr(uv.reshape(2 * n, 2), np.full(2 * n, np.nan))
@@ -69,13 +70,14 @@ def map_two_views(
     timestamps: tuple[float, float],
     frames: tuple[int, int],
 ) -> tuple[int, int]:
-    """Add two keyframes and what both of them see to the map.
+    """Add two keyframes and the landmarks that both observe to the map.
 
     Args:
-        features: of both views; matches: ``(N,)`` features of each that see the same point.
-        T_1_w: where the map puts the first view.
-        T_2_1, points: result of ``adjust_two_views``; ``(N, 3)`` in camera 1.
-        timestamps, frames: seconds and frame index of both.
+        features: the features of both views.
+        matches: ``(N,)`` indices of the matched features in each view.
+        T_1_w: ``(4, 4)`` pose of the first view.
+        T_2_1, points: results of ``adjust_two_views``; ``(N, 3)`` points in the frame of camera 1.
+        timestamps, frames: time in seconds and frame index of both views.
 
     Returns:
         The ids of both keyframes.

@@ -13,6 +13,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from docutils import nodes
 from site_reference import write_reference
 
 from vslam import __version__
@@ -24,25 +25,29 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["notebooks"]
 html_theme = "furo"
 html_title = f"vslam {__version__}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sphinx = False
 pygments_style, pygments_dark_style = "tango", "monokai"
+smartquotes = False  # two hyphens begin an option, they are no dash
 suppress_warnings = ["myst.header", "misc.highlighting_failure"]
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
-autodoc_default_options = {"members": True, "show-inheritance": False}
+autodoc_default_options = {"members": True}
 napoleon_use_ivar = True
+napoleon_attr_annotations = False  # the signature has the types
 default_role = "py:obj"
 myst_heading_anchors = 4
 myst_links_external_new_tab = False
 
 # Pages that lie elsewhere in the repository, by their path there.
 _PAGES = {
-    "datasets.md": "about/datasets.md",
+    "datasets.md": "reference/datasets.md",
     "CONTRIBUTING.md": "about/contributing.md",
     "CHANGELOG.md": "about/changelog.md",
-    "loopclosure/vocabulary.md": "about/vocabulary.md",
+    "loopclosure/vocabulary.md": "explanation/vocabulary.md",
 }
 _LINK = re.compile(r"\[([^]]*)\]\((?!https?:|#|mailto:)([^)#\s]+)(#[^)\s]*)?\)")
 
@@ -86,6 +91,36 @@ def _more(folder: Path, index: str) -> str:
     return "\n".join([*lines[:4], *sorted(lines[4:]), "```", ""]) if lines[4:] else ""
 
 
+_ARRAY = re.compile(
+    r"~?numpy\.ndarray\[tuple\[~?(?:typing\.)?Any, \.\.\.\], ~?numpy\.dtype\[(.*?)\]\]"
+)
+
+
+def _shorten_signature(app, what, name, thing, options, signature, returned):
+    """Arrays as the source writes them; a protocol is not constructed."""
+    if getattr(thing, "_is_protocol", False):
+        return "", ""
+    return tuple(text and _ARRAY.sub(r"NDArray[\1]", text) for text in (signature, returned))
+
+
+def _join_names(app, what, name, thing, options, lines):
+    """Sphinx takes the first of several names, as in ``fx, fy: focal lengths``, for a type."""
+    for k, line in enumerate(lines):
+        if line.startswith(":ivar "):
+            names, colon, text = line.removeprefix(":ivar ").partition(":")
+            lines[k] = f":ivar {names.replace(', ', ',')}{colon}{text}"
+
+
+def _draw_dashes(app, doctree, docname):
+    """The dash between a parameter and its description, which Sphinx leaves to ``smartquotes``."""
+    for text in list(doctree.findall(nodes.Text)):
+        if text == " -- ":
+            text.parent.replace(text, nodes.Text(" \N{EN DASH} "))
+
+
 def setup(app):
     write_reference(Path(app.srcdir) / "reference")
     app.connect("source-read", _read)
+    app.connect("autodoc-process-signature", _shorten_signature)
+    app.connect("autodoc-process-docstring", _join_names, priority=600)  # after napoleon
+    app.connect("doctree-resolved", _draw_dashes)

@@ -18,8 +18,7 @@ MODULES = (
     "vslam.geometry",
     "vslam.plugins",
     "vslam.datasets",
-    "vslam.datasets.sequence",
-    "vslam.datasets.stream",
+    "vslam.datasets.frames",
     "vslam.datasets.sources",
     "vslam.datasets.perturbation",
     "vslam.calibration.files",
@@ -74,9 +73,9 @@ def _commands(name, command):
 
 
 def _row(parameter) -> str:
-    names = ", ".join([*parameter.opts, *parameter.secondary_opts])
+    names = [*parameter.opts, *parameter.secondary_opts]
     if parameter.param_type_name == "argument":
-        names = (parameter.metavar or parameter.name or "").strip("{}[]").upper()
+        names = [(parameter.metavar or parameter.name or "").strip("{}[]").upper()]
     shown = getattr(parameter, "show_default", None)
     default = shown if isinstance(shown, str) else parameter.default
     if default in (None, "", False) or callable(default) or str(default) == "Sentinel.UNSET":
@@ -88,8 +87,14 @@ def _row(parameter) -> str:
     ]
     if choices:
         text += " One of " + ", ".join(f"`{choice}`" for choice in choices) + "."
-    cells = (f"`{names}`", text, f"{default}")
+    cells = (", ".join(f"`{name}`" for name in names), _marked_up(text), f"{default}")
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _marked_up(text: str) -> str:
+    """Options that a sentence names as code, pages as links."""
+    text = re.sub(r"docs/(\w+/(\w+)\.md)", r"[\2](../\1)", text)
+    return re.sub(r"(?<![`\w-])(--[a-z][a-z-]*)", r"`\1`", text)
 
 
 def _plain(text: str) -> str:

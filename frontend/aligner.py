@@ -1,4 +1,4 @@
-"""What alignment needs of the newest keyframes, and what it is worth to the map."""
+"""Keeps the image patches that matches are aligned to, and weights aligned observations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vslam.map import Map
 class Aligner:
     """Keeps the image patches of the newest keyframes, to which later frames are aligned.
 
-    Frames without an image pyramid, those of RGB-D cameras for example, are not aligned.
+    Frames without an image pyramid (those of an RGB-D camera, for example) are not aligned.
     """
 
     def __init__(self, config: AlignmentConfig) -> None:
@@ -23,11 +23,12 @@ class Aligner:
         self._recent = RecentPatches(config.keyframes)
 
     def remember(self, frame: Frame, keyframe: int, scales: NDArray[np.float64]) -> None:
-        """Keep the patches around the features of a frame that became a keyframe, and forget those
-        of the oldest one.
+        """Keep the patches around the features of a frame that became a keyframe, and forget the
+        patches of the oldest keyframe.
 
         Args:
-            scales: ``(levels,)`` full-resolution pixels for a pixel of each octave.
+            keyframe: id of the new keyframe.
+            scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
         """
         features = frame.features
         if frame.pyramid is None:
@@ -40,11 +41,12 @@ class Aligner:
         self._recent.add(KeyframePatches(keyframe, pixels, shift))
 
     def certainty(self, frame: Frame) -> NDArray[np.uint8] | int:
-        """``(N,)`` how many times smaller the variance of each feature's position is than that of
-        a keypoint (``Arrays.certainty``).
+        """``(N,)`` uint8, the factor by which the variance of each feature's position is smaller
+        than that of a keypoint (``Arrays.certainty``); 1 for all features of a frame without a
+        pyramid.
 
-        A landmark that is new with this frame is defined by where the frame saw it, so that this
-        position has no error; a match that was not aligned is half a pixel off.
+        An aligned match is certain. So is a feature without a match: the landmark that it creates
+        is defined by this very position. A match that was not aligned is about half a pixel off.
         """
         if frame.pyramid is None:
             return 1
@@ -52,15 +54,15 @@ class Aligner:
         return np.where(unaligned, 1, self._config.certainty).astype(np.uint8)
 
     def patches_of(self, map_: Map, ids: NDArray[np.int32]) -> LandmarkPatches:
-        """Those of ``(L,)`` sorted landmarks, as the newest keyframe saw each; valid until
-        ``remember`` is called."""
+        """The patches of ``(L,)`` landmarks with sorted ids, each from the newest keyframe that
+        observes it; valid until ``remember`` is called."""
         return self._recent.of(map_, ids)
 
     def state(self) -> tuple[KeyframePatches, ...]:
-        """The patches of all keyframes that are kept, oldest first."""
+        """The patches of all remembered keyframes, oldest first."""
         return self._recent.all()
 
     def restore(self, state: tuple[KeyframePatches, ...]) -> None:
-        """Keep the patches that ``state`` gave."""
+        """Keep the patches that ``state`` returned."""
         for patches in state:
             self._recent.add(patches)

@@ -1,11 +1,12 @@
-"""Sub-pixel alignment of matches: a landmark's patch is laid over the image around its keypoint.
+"""Sub-pixel alignment of matches: a landmark's patch is registered to the image at its keypoint.
 
-A corner is found at whole pixels of one of a few scales, half a pixel off as a rule, and where the
-camera comes closer, matches lie systematically too near to where it drives (docs/motorway.md). The
-patch of a keyframe that saw the landmark, drawn as the frame should see it, is moved until it
-agrees with the image: "feature alignment" of SVO (Forster et al., ICRA 2014, III-B), by the inverse
-compositional form of Lucas-Kanade (Baker and Matthews, IJCV 2004, section 3.2). Mean and contrast
-of a patch do not matter: both are unknowns beside the shift.
+FAST finds a corner at whole pixels of one pyramid level, typically half a pixel off. When the
+camera approaches the scene, this error is biased towards the focus of expansion
+(docs/research/motorway.md). So the patch of a keyframe that saw the landmark is warped into the
+view of the frame and shifted until it agrees with the image. This is the "feature alignment" of SVO
+(Forster et al., ICRA 2014, III-B), solved by inverse compositional Lucas-Kanade (Baker and
+Matthews, IJCV 2004, section 3.2). Brightness and contrast of a patch may change: both are estimated
+with the shift.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from vslam.frontend.frame import Frame
 from vslam.frontend.patches import patches_around
 from vslam.kernels import inner_kernel, kernel
 
-HALF = 4  # of the window that is compared, pixels
+HALF = 4  # half width of the window that is compared, pixels
 SIDE = 2 * HALF + 1
-WIDE = SIDE + 2  # with a pixel around it, for slopes
-MIN_VARIANCE = 1.0  # grey levels squared; a patch with less shows nothing
-MIN_CORNERNESS = 0.05  # determinant of the normal equations over that of a corner
+WIDE = SIDE + 2  # one more pixel on each side, for the gradients
+MIN_VARIANCE = 1.0  # grey levels squared; a patch with less has no texture
+MIN_CORNERNESS = 0.05  # determinant of the 2x2 normal matrix over the product of its diagonal
 STILL = 0.03  # pixels; a smaller step ends the iteration
 
 
@@ -34,10 +35,17 @@ def align_frame(
     intrinsics: NDArray[np.float64],
     config: AlignmentConfig,
 ) -> NDArray[np.float32] | None:
-    """``Frame.shift`` of the matches of a frame.
+    """Align the matches of a frame.
 
     Args:
-        scales: full-resolution pixels for a pixel of each octave.
+        known: patches of the landmarks that can be aligned.
+        scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
+        intrinsics: ``(6,)``, see ``Camera.intrinsics``.
+
+    Returns:
+        ``(N, 2)`` float32 for ``Frame.shift``: full-resolution pixels from each feature to its
+        aligned position, NaN where a match was not aligned. None if the frame has no pyramid or no
+        landmark has a patch.
     """
     features = frame.features
     if frame.pyramid is None or not len(known.ids):
@@ -75,20 +83,23 @@ def align_frame(
 
 @kernel
 def warps(T_cw, xyz, T_seen, view, size_seen, size, intrinsics):
-    """What a step in the patch of a frame is in the patch of a keyframe.
+    """Affine warps from the patches of a frame to the patches of keyframes.
 
-    Around a landmark the world is taken for a plane that faces the keyframe (SVO, III-B).
+    The surface around a landmark is approximated by a plane that faces the keyframe (SVO, III-B).
 
     Args:
-        T_cw: ``(4, 4)`` of the frame.
-        xyz: ``(N, 3)`` the landmarks.
-        T_seen: ``(K, 4, 4)`` of keyframes; view: ``(N,)`` which of them saw each.
-        size_seen, size: ``(N,)`` full-resolution pixels for one of the patch of the keyframe, of
-            the frame.
+        T_cw: ``(4, 4)`` pose of the frame's camera.
+        xyz: ``(N, 3)`` landmarks in the world frame.
+        T_seen: ``(K, 4, 4)`` poses of the keyframes.
+        view: ``(N,)`` index into ``T_seen`` of the keyframe that saw each landmark.
+        size_seen, size: ``(N,)`` full-resolution pixels per pixel of the keyframe's patch and of
+            the frame's patch.
+        intrinsics: ``(6,)``, see ``Camera.intrinsics``.
 
     Returns:
-        ``(N, 2, 2)`` float32; NaN for a landmark that does not lie in front of both, or would be
-        seen from behind.
+        ``(N, 2, 2)`` float32 matrices that take an offset in the frame's patch to the offset in the
+        keyframe's patch, both in patch pixels; NaN where the landmark is behind one of the cameras
+        or the plane is seen from behind.
     """
     fx, fy = intrinsics[0], intrinsics[1]
     steps = np.full((len(xyz), 2, 2), np.nan, np.float32)
@@ -102,7 +113,7 @@ def warps(T_cw, xyz, T_seen, view, size_seen, size, intrinsics):
         if not (depth > 0.0 and p[2] > 0.0):
             continue
         for k in range(2):
-            # A step of one pixel along u or v in the keyframe, on the plane, seen from the frame.
+            # One pixel along u or v in the keyframe, moved onto the plane and seen from the frame.
             for r in range(3):
                 column[r] = 0.0
                 for m in range(3):
@@ -119,20 +130,21 @@ def warps(T_cw, xyz, T_seen, view, size_seen, size, intrinsics):
 
 @kernel
 def align(seen, reference, centre, which, warp, iterations, max_shift, min_correlation):
-    """Where in each of N patches lies what is at the ``centre`` of its reference.
+    """Find in each of N patches the point that its reference patch is centred on.
 
     Args:
-        seen: ``(N, PATCH_PIXELS)`` uint8.
-        reference: ``(P, PATCH_PIXELS)`` uint8; centre: ``(P, 2)`` float32, from the middle of the
-            reference, pixels.
-        which: ``(N,)`` of these.
+        seen: ``(N, PATCH_PIXELS)`` uint8 patches of the frame.
+        reference: ``(P, PATCH_PIXELS)`` uint8 patches of keyframes.
+        centre: ``(P, 2)`` float32, the point in each reference patch, pixels from its middle.
+        which: ``(N,)`` index of the reference of each seen patch.
         warp: ``(N, 2, 2)`` float32, see ``warps``.
-        iterations: at most.
-        max_shift: from the middle of the seen patch, in x and in y, pixels.
-        min_correlation: least normalised cross-correlation.
+        iterations: maximum number of Gauss-Newton steps.
+        max_shift: largest shift in x and in y, pixels of the seen patch.
+        min_correlation: least normalised cross-correlation of an accepted alignment.
 
     Returns:
-        ``(N, 2)`` float32 shift from the middle of the seen patch, NaN where there is none.
+        ``(N, 2)`` float32 shift from the middle of the seen patch, in its pixels; NaN if the
+        alignment failed.
     """
     n = len(seen)
     shift = np.full((n, 2), np.nan, np.float32)
@@ -167,12 +179,14 @@ def align(seen, reference, centre, which, warp, iterations, max_shift, min_corre
 
 @inner_kernel
 def draw(patch, centre, warp, out):
-    """Draw a patch around ``centre`` with the steps of ``warp``; returns whether it reaches that
-    far.
+    """Warp a patch by bilinear interpolation around ``centre``; returns False, with ``out``
+    untouched, if the warped window would leave the patch.
 
     Args:
         patch: ``(PATCH_PIXELS,)`` uint8.
-        out: ``(WIDE * WIDE,)`` float32.
+        centre: ``(2,)`` float32, pixels from the middle of the patch.
+        warp: ``(2, 2)`` float32, see ``warps``.
+        out: ``(WIDE * WIDE,)`` float32, receives the window.
     """
     xx, xy, yx, yy = warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1]
     far = np.float32(HALF + 1)
@@ -180,7 +194,8 @@ def draw(patch, centre, warp, out):
     reach_y = far * (abs(yx) + abs(yy)) + abs(centre[1])
     if not max(reach_x, reach_y) <= np.float32(PATCH_RADIUS - 0.01):
         return False
-    # Whole numbers of 1 / 65536 pixel: a shift parts a coordinate, where a float takes far longer.
+    # Fixed-point coordinates (1 / 65536 pixel): a bit shift separates the whole and the fractional
+    # part much faster than floating-point arithmetic does.
     one, part = np.float32(65536.0), np.float32(1.0 / 65536.0)
     x_first = np.int32((np.float32(PATCH_RADIUS) + centre[0] - far * (xx + xy)) * one)
     y_first = np.int32((np.float32(PATCH_RADIUS) + centre[1] - far * (yx + yy)) * one)
@@ -202,10 +217,15 @@ def draw(patch, centre, warp, out):
 
 @inner_kernel
 def prepare(wide, template, slope_x, slope_y):
-    """Template without its mean, and its slopes without what another mean or contrast would
-    explain; returns the template's energy and the three sums of products of the slopes."""
+    """Subtract the mean from the template, and from its gradients their projections on a change of
+    brightness or contrast, so that neither affects the shift.
+
+    Returns:
+        Sum of squares of the template, and the entries xx, xy, yy of the 2x2 normal matrix.
+    """
     half, nil, count = np.float32(0.5), np.float32(0.0), np.float32(SIDE * SIDE)
-    # Sums of products of 1, the template t and the slopes x, y; near 0, so that few digits go.
+    # Sums of products of 1, the template t and its gradients x, y. Grey values are taken relative
+    # to the middle pixel, so that float32 sums lose few digits.
     middle = wide[WIDE * WIDE // 2]
     t, x, y, tt, tx, ty, xx, xy, yy = nil, nil, nil, nil, nil, nil, nil, nil, nil
     for r in range(SIDE):
@@ -237,8 +257,13 @@ def prepare(wide, template, slope_x, slope_y):
 
 @inner_kernel
 def compare(image, x, y, template, slope_x, slope_y):
-    """The image around its middle, shifted by ``x, y``: its energy without the mean, and its
-    products with the template and the slopes."""
+    """Compare the window of the image that is shifted by ``x, y`` from its middle with the
+    template.
+
+    Returns:
+        Sum of squares of the window after its mean is subtracted, and its inner products with the
+        template and with both gradients.
+    """
     one, nil = np.float32(1.0), np.float32(0.0)
     left, top = int(np.floor(x)), int(np.floor(y))
     part_x, part_y = x - np.float32(left), y - np.float32(top)
@@ -251,7 +276,7 @@ def compare(image, x, y, template, slope_x, slope_y):
         for c in range(SIDE):
             k = PATCH_RADIUS - HALF + c + left
             value = a * above[k] + b * above[k + 1] + c_ * below[k] + d * below[k + 1]
-            # Template and slopes have no mean: the value's own counts for nothing.
+            # Template and gradients have zero mean, so the mean of the window cancels.
             total += value
             square += value * value
             product += value * template[r, c]

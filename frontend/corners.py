@@ -1,8 +1,8 @@
-"""FAST corners of one image: scores, local maxima, even distribution.
+"""FAST corners of one image: scores, non-maximum suppression, even distribution.
 
-The FAST score is computed for every pixel without a branch, as the exact largest threshold at which
-the pixel is a corner: compiled to byte-wise vector minima and maxima this takes 0.3 ms for a KITTI
-image, less than a test that tries to stop early.
+The FAST score of a pixel is the largest threshold at which it is still a corner. It is computed for
+every pixel without a branch: compiled to vector minima and maxima of bytes, this takes 0.3 ms for a
+KITTI image, less than the usual test that tries to stop early.
 """
 
 from __future__ import annotations
@@ -14,11 +14,20 @@ from vslam.kernels import inline, inner_kernel, kernel, trailing_zeros
 
 @kernel
 def fast_scores(pixels, height, width):
-    """Largest t for which each pixel has 9 contiguous circle pixels > c + t or all < c - t, plus 1.
+    """FAST-9 score of each pixel.
 
-    For an arc, that is the smallest of its pixels minus c; for the pixel the largest over the 16
-    arcs. Runs of 2, 4 and 8 are shared between arcs: 31 minima and maxima for each polarity.
-    Unsigned indices let the compiler drop the wrap-around test and use bytes as lanes.
+    A pixel of value c is a corner at threshold t if 9 contiguous pixels of its circle are all
+    brighter than c + t, or all darker than c - t. The score is the largest such t plus 1, and 0 if
+    there is none. For a bright arc that is its smallest pixel minus c; for the pixel it is the
+    maximum over the 16 arcs of both polarities. Minima over runs of 2, 4 and 8 pixels are shared
+    between arcs, which leaves 31 minima and maxima per polarity. Unsigned indices let the compiler
+    drop the wrap-around test and use bytes as lanes.
+
+    Args:
+        pixels: ``(height * width,)`` uint8.
+
+    Returns:
+        ``(height, width)`` uint8; 0 within 3 pixels of the border.
     """
     scores = np.zeros(height * width, np.uint8)
     n = np.uintp(width - 6)
@@ -42,7 +51,8 @@ def fast_scores(pixels, height, width):
             a9, a11, a13, a15 = min(p9, p10), min(p11, p12), min(p13, p14), min(p15, p0)
             b1, b3, b5, b7 = min(a1, a3), min(a3, a5), min(a5, a7), min(a7, a9)
             b9, b11, b13, b15 = min(a9, a11), min(a11, a13), min(a13, a15), min(a15, a1)
-            # A run of 8 from an odd pixel makes an arc of 9 with the pixel before or behind it.
+            # A run of 8 that starts at an odd pixel becomes an arc of 9 with the pixel before it
+            # or the one after it.
             bright = max(
                 max(
                     max(min(min(b1, b5), max(p0, p9)), min(min(b3, b7), max(p2, p11))),
@@ -73,7 +83,15 @@ def fast_scores(pixels, height, width):
 
 @kernel
 def local_maxima(scores, margin, threshold, threshold_min, cell):
-    """Corners that no neighbour outscores; weak ones only in cells without a strong one.
+    """Corners that no neighbour outscores. A corner with a score of at most ``threshold`` is kept
+    only in a cell without a stronger one.
+
+    Args:
+        scores: ``(height, width)`` uint8, see ``fast_scores``.
+        margin: pixels along the border where no corner is wanted.
+        threshold, threshold_min: a score above ``threshold`` is strong, one of ``threshold_min`` or
+            less is ignored.
+        cell: side of the cells, pixels.
 
     Returns:
         x, y: ``(n,)`` int32; score: ``(n,)`` uint8; in row order.
@@ -83,11 +101,11 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
     xs, ys = np.empty(capacity, np.int32), np.empty(capacity, np.int32)
     score = np.empty(capacity, np.uint8)
     column_of = np.arange(width) // cell
-    strong = np.zeros(width // cell + 1, np.bool_)  # of one row of cells
-    n = first = 0  # corners, and where those of this row of cells begin
+    strong = np.zeros(width // cell + 1, np.bool_)  # cells of the current row that have one
+    n = first = 0  # number of corners, and index of the first one in the current row of cells
     weakest = np.uint8(threshold_min)
     length = np.uintp(width - 2 * margin)
-    # One byte for each pixel of a row, read eight at a time: most rows are mostly empty.
+    # One byte per pixel of a row, read eight at a time because most of them are 0.
     is_corner = np.zeros((width + 7) // 8 * 8, np.uint8)
     words = is_corner.view(np.uint64)
     for y in range(margin, height - margin):
@@ -96,7 +114,7 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
         below = scores[y + 1, margin - 1 : width - margin + 1]
         for x in range(length):
             s = here[x + 1]
-            # Of equal neighbours the first in row order wins.
+            # Of neighbours with equal scores, the first in row order wins.
             before = max(max(above[x], above[x + 1]), max(above[x + 2], here[x]))
             after = max(max(below[x], below[x + 1]), max(below[x + 2], here[x + 2]))
             is_corner[x] = (s > max(before, weakest)) & (s >= after)
@@ -122,10 +140,18 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
 
 @kernel
 def spread(x, y, score, width, height, quota):
-    """Choose ``quota`` corners, evenly: the best of each cell of the coarsest grid that has enough.
+    """Choose up to ``quota`` corners that are spread evenly: the best corner of each cell of the
+    coarsest grid in which at least ``quota`` cells have one.
 
     The cell size is found by bisection, as in Bailo et al. ("Efficient adaptive non-maximal
-    suppression", PRL 2018). Returns ``(n,)`` int64 indices in row order of the corners.
+    suppression", PRL 2018).
+
+    Args:
+        x, y, score: ``(n,)`` corners in row order, see ``local_maxima``.
+        width, height: of the image, pixels.
+
+    Returns:
+        ``(m,)`` int64 indices of the chosen corners, ascending.
     """
     n = len(x)
     kept = np.empty(min(n, quota), np.int64)
@@ -133,7 +159,8 @@ def spread(x, y, score, width, height, quota):
         for i in range(n):
             kept[i] = i
         return kept
-    # More cells than the quota fit only below this size; corners are at least 2 px apart.
+    # Corners are at least 2 px apart, so cells of 1 px hold one each; cells of size ``high`` are
+    # fewer than the quota.
     low, high = 1, int(np.sqrt(width * height / quota)) + 2
     is_occupied = np.empty(width * height, np.uint8)
     while high - low > 1:
@@ -154,7 +181,7 @@ def spread(x, y, score, width, height, quota):
             chosen[i] = True
             counts[score[i]] += 1
             surplus += 1
-    # Drop the weakest of the surplus; scores are bytes, so that counting ranks them.
+    # Drop the weakest corners beyond the quota. Scores are bytes, so a histogram ranks them.
     weakest = 0
     while counts[weakest] <= surplus:
         surplus -= counts[weakest]
@@ -173,15 +200,15 @@ def spread(x, y, score, width, height, quota):
 
 @inline
 def cell_of(x, y, inverse, columns):
-    """Cell of a pixel, ``inverse`` being that of its size: a product is many times faster than a
-    division."""
+    """Index of the cell of a pixel. ``inverse`` is one over the cell size, because multiplying is
+    many times faster than dividing."""
     half = np.float32(0.5)
     return int((y + half) * inverse) * columns + int((x + half) * inverse)
 
 
 @inner_kernel
 def occupies(x, y, width, height, size, quota, is_occupied):
-    """Whether the corners occupy ``quota`` cells of ``size`` pixels or more."""
+    """Whether the corners occupy at least ``quota`` cells of ``size`` x ``size`` pixels."""
     columns = (width + size - 1) // size
     rows = (height + size - 1) // size
     is_occupied[: columns * rows] = 0
@@ -189,7 +216,7 @@ def occupies(x, y, width, height, size, quota, is_occupied):
     missing = quota
     for i in range(len(x)):
         c = cell_of(x[i], y[i], inverse, columns)
-        missing -= 1 - is_occupied[c]  # without a branch: nobody could foretell it
+        missing -= 1 - is_occupied[c]  # no branch: it would often be mispredicted
         is_occupied[c] = 1
         if missing == 0:
             return True
@@ -198,7 +225,8 @@ def occupies(x, y, width, height, size, quota, is_occupied):
 
 @inner_kernel
 def occupy(x, y, score, width, size, best_of_cell):
-    """The best corner of each cell of ``size`` pixels, of equal ones the first; -1 without any."""
+    """Write the index of the best corner of each cell of ``size`` x ``size`` pixels into
+    ``best_of_cell``: the first one of equal scores, -1 for an empty cell."""
     columns = (width + size - 1) // size
     best_of_cell[:] = -1
     inverse = np.float32(1.0 / size)

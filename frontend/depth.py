@@ -1,4 +1,4 @@
-"""Depth images as the second view of a stereo pair (ORB-SLAM2, section III-A)."""
+"""Depth images as the right view of a virtual stereo pair (ORB-SLAM2, section III-A)."""
 
 from __future__ import annotations
 
@@ -19,20 +19,22 @@ def columns_of_depth(
 ) -> NDArray[np.float32]:
     """Column that each keypoint would have in the right camera of a virtual stereo pair.
 
-    With the depth d of the nearest pixel it is ``u - fx b / d``. A pixel of it then stands for an
-    error of depth that grows with its square, as that of structured light does.
+    A keypoint at column u whose nearest pixel has depth d gets ``u - fx b / d``. With this model, a
+    constant error in pixels means an error in depth that grows with the square of the depth, as it
+    does for structured light.
 
-    A corner at an edge of depth has two depths, and where the contour of something near crosses
-    what is behind it, it is no point of the scene at all but slides along as the camera moves.
-    Block matching of a stereo pair refuses most of these; here they are left without a column.
+    A corner at a depth discontinuity has two depths. Where the contour of a near object crosses the
+    background, the corner is not a point of the scene: it slides along the contour as the camera
+    moves. Block matching of a stereo pair rejects most of these corners; here they get no column.
 
     Args:
-        xy: ``(N, 2)`` keypoints of the left image.
-        scale: ``(N,)`` pixels that one of the keypoint's octave takes.
-        depth: ``(H, W)`` metres along the left camera's z, registered to it; 0 is unknown.
+        xy: ``(N, 2)`` keypoints of the left image, pixels.
+        scale: ``(N,)`` full-resolution pixels per pixel of the keypoint's octave.
+        depth: ``(H, W)`` metres along the z axis of the left camera, registered to its image;
+            0 where unknown.
 
     Returns:
-        ``(N,)`` float32, NaN where the depth is unknown, beyond its limits, or not one around the
+        ``(N,)`` float32, NaN where the depth is unknown, out of range, or discontinuous around the
         keypoint.
     """
     radius = np.rint(config.edge_radius * scale).astype(np.int64)
@@ -45,15 +47,22 @@ def columns_of_depth(
 
 @kernel
 def depth_around(xy, radius, depth, max_ratio):
-    """``(N,)`` float32 depth of each keypoint's pixel, 0 where known depths around it differ by
-    more than the ratio; ``radius`` ``(N,)`` int64 pixels to each side."""
+    """Depth at the nearest pixel of each keypoint.
+
+    Args:
+        radius: ``(N,)`` int64, half width of the neighbourhood that is checked, pixels.
+        max_ratio: largest ratio of the farthest to the nearest known depth in it.
+
+    Returns:
+        ``(N,)`` float32 metres; 0 where the depth is unknown or the ratio is exceeded.
+    """
     height, width = depth.shape
     found = np.zeros(len(xy), np.float32)
     for i in range(len(xy)):
         column = min(int(np.rint(xy[i, 0])), width - 1)
         row = min(int(np.rint(xy[i, 1])), height - 1)
         middle = depth[row, column]
-        if not middle > 0.0:  # NaN, too
+        if not middle > 0.0:  # also true for NaN
             continue
         nearest, farthest, r = middle, middle, radius[i]
         for y in range(max(row - r, 0), min(row + r + 1, height)):

@@ -1,4 +1,4 @@
-"""From the images of a frame to its features, whichever sensor took them and whatever the light."""
+"""Extracts the features of a frame from its images: stereo, RGB-D or monocular, in any light."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ def extract_features(
     image_map: ImageMap = map,
     sides: Sides | None = None,
 ) -> Extracted:
-    """ORB features of the left image with their columns in the right one. If the left image is
-    black, the features are those of the right image, without columns in the other.
+    """ORB features of the left image with their columns in the right image. If the left image is
+    black, the features are extracted from the right image and have no columns in the other one.
 
-    A pure function, whatever ``image_map`` is.
+    A pure function: the result does not depend on ``image_map``.
 
     Args:
         left: ``(H, W)`` uint8.
-        second: ``(H, W)``: the right image, uint8; with ``camera.depth`` the depth in metres,
-            float32; or None, and no feature has a column in a right image.
-        image_map: applies a function to both images, one after the other or both at once.
-        sides: the result of ``compare_sides``, if it is known.
+        second: ``(H, W)``: the right image, uint8; for an RGB-D camera the depth in metres,
+            float32; None for a single image, whose features have no column in a right image.
+        image_map: applies a function to both images, in turn or in parallel.
+        sides: the result of ``compare_sides``; None computes it.
     """
     camera, config = context.camera, context.config
     if second is None:
@@ -42,8 +42,8 @@ def extract_features(
         (found,) = extract_in_any_light([left], config)
         scale, depth = context.scales[found.octave], np.asarray(second, np.float32)
         u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
-        # No pyramid: depth cameras have a rolling shutter, which moves points by more than
-        # alignment corrects.
+        # No pyramid, so the frame is not aligned: depth cameras have a rolling shutter, which
+        # moves points by more than alignment corrects.
         return Extracted(_features(found, u_right))
     right_image = np.asarray(second, np.uint8)
     sides = sides or compare_sides(left, right_image, config.stereo)
@@ -57,7 +57,7 @@ def extract_features(
 
 
 def _extract_alone(image: NDArray[np.uint8], context: TrackingContext, side: Side) -> Extracted:
-    """Features of one image, without columns in another one."""
+    """Features of a single image, without columns in a second one."""
     (found,) = extract_in_any_light([image], context.config)
     u_right = np.full(len(found.xy), np.nan, np.float32)
     return Extracted(_features(found, u_right), found.pyramid, side=side)

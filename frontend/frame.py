@@ -1,4 +1,4 @@
-"""A frame: the features of an image, where it was taken from, and what of the map it sees."""
+"""A frame: the features of an image, its pose, and the landmarks that it tracks."""
 
 from __future__ import annotations
 
@@ -17,26 +17,27 @@ from vslam.geometry import Matrix, inverse
 class Frame:
     """A frame being tracked.
 
-    "The camera" is the one that took the image of the features: as a rule the left one, and the
-    right one if the left image is black. The pose of the frame is always that of the left camera.
+    "The camera" is the one whose image the features come from: the left one, or the right one if
+    the left image is black. ``T_cw`` is the pose of the left camera in both cases.
 
     Attributes:
         index: number of the frame in the run, from 0.
         timestamp: seconds.
-        image: ``(H, W)`` uint8 image of the camera, for loop detectors that look at it, or None.
-        features, grid: N features of that image.
+        image: ``(H, W)`` uint8 image of the camera, for loop detectors that need it, or None.
+        features, grid: the N features of that image, and a grid to search them by position.
         pyramid, row_offset, side: see ``Extracted``.
-        T_camera_left: ``(4, 4)`` the left camera in the camera: the identity, or
+        T_camera_left: ``(4, 4)`` transform from the left camera to the camera: the identity, or
             ``Camera.T_right_left``.
-        T_cw: ``(4, 4)`` pose estimate of the left camera.
-        landmark: ``(N,)`` int32, landmark that each feature tracks, or -1.
-        xyz: ``(N, 3)`` float64, its position; NaN without one.
-        disparity_offset, delay_removed: what the disparities of the features were corrected by:
-            the pixels added to each, and whether the delay of the right image was removed
-            (``RigCalibration``).
-        shift: ``(N, 2)`` float32, pixels from each feature to where its match was aligned, NaN for
-            those that were not; None if none was.
-        twist: ``(6,)`` speed of the camera when the frame was tracked, per second; None if unknown.
+        T_cw: ``(4, 4)`` estimated pose of the left camera (world to camera).
+        landmark: ``(N,)`` int32, id of the landmark that each feature tracks, or -1.
+        xyz: ``(N, 3)`` float64, position in the world of the point that each feature tracks,
+            metres; NaN if it tracks none.
+        disparity_offset: pixels that have been added to every disparity (``RigCalibration``).
+        delay_removed: whether the columns in the right image have been corrected for its delay.
+        shift: ``(N, 2)`` float32, pixels from each feature to its aligned position, NaN where the
+            match was not aligned; None if no match was.
+        twist: ``(6,)`` velocity of the camera when the frame was tracked, per second; None if
+            unknown.
     """
 
     index: int
@@ -67,7 +68,7 @@ class Frame:
         timestamp: float = 0.0,
         image: NDArray[np.uint8] | None = None,
     ) -> Frame:
-        """A frame that is not tracked yet: nothing is known but what its images gave."""
+        """A new frame that is not tracked yet: its pose is the identity and it has no matches."""
         features, n = extracted.features, len(extracted.features)
         return cls(
             index=index,
@@ -86,7 +87,7 @@ class Frame:
 
     @property
     def T_camera_w(self) -> Matrix:
-        """``(4, 4)`` pose of the camera, by which landmarks are projected to the features."""
+        """``(4, 4)`` pose of the camera, by which landmarks are projected into its image."""
         T: Matrix = self.T_camera_left @ self.T_cw
         return T
 
@@ -99,11 +100,11 @@ class Frame:
         self.by_patches = False
 
     def snapshot(self) -> Frame:
-        """A copy that keeps what the frame tracks now."""
+        """A copy of the frame that later changes of its pose and matches do not affect."""
         return replace(self, landmark=self.landmark.copy(), xyz=self.xyz.copy())
 
     def restore(self, snapshot: Frame) -> None:
-        """Track again what the frame tracked when the snapshot was taken."""
+        """Restore the pose and the matches that the frame had when the snapshot was taken."""
         self.T_cw, self.shift = snapshot.T_cw, snapshot.shift
         self.landmark, self.xyz = snapshot.landmark, snapshot.xyz
 
@@ -113,12 +114,12 @@ class Frame:
 
     @property
     def can_become_keyframe(self) -> bool:
-        """Whether the frame can join the map, which is made of left images."""
+        """Whether the frame can become a keyframe: the map consists of left images only."""
         return self.side == Side.LEFT
 
     @property
     def aligned(self) -> NDArray[np.bool_]:
-        """``(N,)`` features whose match was aligned."""
+        """``(N,)`` bool, features whose match was aligned."""
         if self.shift is None:
             return np.zeros(len(self.features), np.bool_)
         return (self.landmark >= 0) & np.isfinite(self.shift[:, 0])
@@ -135,7 +136,7 @@ class Frame:
 
     @property
     def n_stereo(self) -> int:
-        """Features with a stereo match."""
+        """Number of features with a stereo match (or a depth)."""
         return int(np.count_nonzero(np.isfinite(self.features.u_right)))
 
 

@@ -1,12 +1,12 @@
 """The first two views of a monocular map: their motion and their points (ORB-SLAM, section IV).
 
-A plane, or a camera that only turns, leaves the fundamental matrix undetermined; any other scene is
-not explained by a homography. Both are fitted to the same draws and the score says which one to
-believe. What follows is only accepted if one motion stands out: a map that began wrong cannot be
-mended.
+A planar scene or a pure rotation leaves the fundamental matrix undetermined; a homography cannot
+explain any other scene. Both models are fitted to the same random samples, and their scores select
+one. A reconstruction is accepted only if one motion explains clearly more points than any other,
+because a map with a wrong start cannot be repaired later.
 
-Draws are fitted and scored all at once, in batches: NumPy is as fast here as a kernel would be,
-and has nothing to compile.
+All samples are fitted and scored in one batch: NumPy is as fast here as a Numba kernel, and needs
+no compilation.
 """
 
 from __future__ import annotations
@@ -25,8 +25,10 @@ from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix
 from vslam.reprojection import CHI2_MONO, stack_uvr
 
-CHI2_LINE = 3.841  # 95 % quantile with 1 degree of freedom: a point's distance from a line
-SAMPLE = 8  # matches of a draw: what the eight-point algorithm needs; the homography has four over
+CHI2_LINE = 3.841  # 95 % quantile with 1 degree of freedom: distance of a point from a line
+# Matches per sample, as the eight-point algorithm needs. A homography needs only four; for it the
+# sample is overdetermined.
+SAMPLE = 8
 # Points with less parallax than this (0.36 degrees) are counted, but not mapped (ORB-SLAM).
 MAX_COSINE = 0.99998
 
@@ -36,11 +38,11 @@ class TwoViewModel:
     """The model that explains N matches of two views.
 
     Attributes:
-        kind: which one was selected.
-        matrix: ``(3, 3)``; a homography takes pixels of view 1 to view 2, a fundamental matrix
-            them to epipolar lines of view 2.
-        inlier: ``(N,)`` bool, matches that it explains.
-        homography_share: ``S_H / (S_H + S_F)``, what the selection goes by.
+        kind: the model that was selected.
+        matrix: ``(3, 3)``; a homography maps pixels of view 1 to pixels of view 2, a fundamental
+            matrix maps them to epipolar lines in view 2.
+        inlier: ``(N,)`` bool, matches that the model explains.
+        homography_share: ``S_H / (S_H + S_F)``, by which the model was selected.
     """
 
     kind: Literal["homography", "fundamental"]
@@ -51,12 +53,12 @@ class TwoViewModel:
 
 @dataclass(frozen=True)
 class TwoViews:
-    """Two views and what both of them see.
+    """The relative pose of two views and the points that were triangulated from them.
 
     Attributes:
-        T_2_1: ``(4, 4)`` motion from view 1 to view 2, its translation of length 1.
-        match: ``(M,)`` int64, the matches that were triangulated.
-        points: ``(M, 3)`` in the frame of camera 1.
+        T_2_1: ``(4, 4)`` transform from camera 1 to camera 2; its translation has length 1.
+        match: ``(M,)`` int64, indices of the matches that were triangulated.
+        points: ``(M, 3)`` in the frame of camera 1, in units of the baseline.
     """
 
     T_2_1: Matrix
@@ -67,7 +69,11 @@ class TwoViews:
 def match_views(
     one: Frame, two: Frame, context: TrackingContext
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Features of two frames ``(N,)`` each that look alike and lie not far apart."""
+    """Match two frames by descriptor, within a window around the position of each feature.
+
+    Returns:
+        ``(N,)`` indices of the matched features in ``one``, and ``(N,)`` in ``two``.
+    """
     config, before, now = context.config.initialization, one.features, two.features
     n = len(before)
     octave = before.octave.astype(np.int64)
@@ -101,12 +107,12 @@ def reconstruct(
     *,
     seed: int,
 ) -> TwoViews | None:
-    """Motion and points of two views, None where they do not tell one motion from another.
+    """Relative pose and points of two views; None if the matches do not determine the motion.
 
     Args:
         xy_1, xy_2: ``(N, 2)`` matched pixels.
-        sigma: ``(N,)`` their standard deviation, pixels.
-        seed: of the draws; the same seed gives the same result.
+        sigma: ``(N,)`` standard deviation of the matched pixels, pixels.
+        seed: seed of the random samples; the same seed gives the same result.
     """
     if len(xy_1) < SAMPLE:
         return None
@@ -126,7 +132,7 @@ def reconstruct(
     best = int(np.argmax(counts))
     rival = int(np.sort(counts)[-2])
     points, good, cosine = views[best]
-    # The angle that at least min_points have.
+    # Its last entry is the parallax that at least min_points points have.
     widest = np.sort(cosine[good])[: config.min_points]
     if (
         counts[best] < max(config.min_points, config.min_point_share * len(match))
@@ -141,10 +147,13 @@ def reconstruct(
 def select_model(
     xy_1: Matrix, xy_2: Matrix, sigma: Matrix, config: InitializationConfig, *, seed: int
 ) -> TwoViewModel:
-    """Homography or fundamental matrix, by their scores (ORB-SLAM, IV, steps 2, 3).
+    """Fit a homography and a fundamental matrix, and select one by their scores (ORB-SLAM, IV,
+    steps 2 and 3).
 
     Args:
-        xy_1, xy_2: ``(N, 2)`` matched pixels, N at least 8; sigma: ``(N,)`` pixels.
+        xy_1, xy_2: ``(N, 2)`` matched pixels, N at least 8.
+        sigma: ``(N,)`` standard deviation of the matched pixels, pixels.
+        seed: seed of the random samples.
     """
     n = len(xy_1)
     x_1, N_1 = normalised(xy_1)
@@ -165,7 +174,7 @@ def select_model(
         scores, inlier = score_all(models, xy_1, xy_2, sigma)
         best = int(np.argmax(scores))
         M, score, explained = models[best], float(scores[best]), inlier[best]
-        # Fitted to all that it explains, a model explains more.
+        # Refitting a model to all its inliers usually gains more inliers.
         while np.count_nonzero(explained) >= SAMPLE:
             refit = fit(np.flatnonzero(explained)[None])
             scores, inlier = score_all(refit, xy_1, xy_2, sigma)
@@ -182,8 +191,11 @@ def select_model(
 
 
 def normalised(xy: Matrix) -> tuple[Matrix, Matrix]:
-    """``(N, 2)`` points moved to their mean and scaled to a mean distance of root 2, and the
-    ``(3, 3)`` matrix that does it (Hartley, "In defense of the eight-point algorithm", PAMI 1997).
+    """Normalise ``(N, 2)`` points: their mean becomes 0 and their mean distance from it root 2
+    (Hartley, "In defense of the eight-point algorithm", PAMI 1997).
+
+    Returns:
+        The ``(N, 2)`` normalised points, and the ``(3, 3)`` matrix that normalises them.
     """
     centre = xy.mean(axis=0)
     spread = np.linalg.norm(xy - centre, axis=1).mean()
@@ -193,7 +205,7 @@ def normalised(xy: Matrix) -> tuple[Matrix, Matrix]:
 
 
 def fit_homographies(x_1: Matrix, x_2: Matrix) -> Matrix:
-    """``(B, 3, 3)`` homographies of B draws ``(B, M, 2)`` by DLT (Hartley and Zisserman, 4.1)."""
+    """``(B, 3, 3)`` homographies of B samples ``(B, M, 2)`` by DLT (Hartley and Zisserman, 4.1)."""
     x, y, u, v = x_1[..., 0], x_1[..., 1], x_2[..., 0], x_2[..., 1]
     zero, one = np.zeros_like(x), np.ones_like(x)
     above = np.stack([zero, zero, zero, -x, -y, -one, v * x, v * y, v], axis=-1)
@@ -202,8 +214,8 @@ def fit_homographies(x_1: Matrix, x_2: Matrix) -> Matrix:
 
 
 def fit_fundamentals(x_1: Matrix, x_2: Matrix) -> Matrix:
-    """``(B, 3, 3)`` fundamental matrices of B draws ``(B, M, 2)`` by the eight-point algorithm
-    (Hartley and Zisserman, 11.2): of rank 2, ``x_2' F x_1 = 0``."""
+    """``(B, 3, 3)`` fundamental matrices of B samples ``(B, M, 2)`` by the eight-point algorithm
+    (Hartley and Zisserman, 11.2). They have rank 2 and satisfy ``x_2' F x_1 = 0``."""
     x, y, u, v = x_1[..., 0], x_1[..., 1], x_2[..., 0], x_2[..., 1]
     A = np.stack([u * x, u * y, u, v * x, v * y, v, x, y, np.ones_like(x)], axis=-1)
     U, d, Vt = np.linalg.svd(_null_vectors(A))
@@ -212,7 +224,7 @@ def fit_fundamentals(x_1: Matrix, x_2: Matrix) -> Matrix:
 
 
 def _null_vectors(A: Matrix) -> Matrix:
-    """The unit vectors h that make ``|A h|`` least, ``(B, 3, 3)``."""
+    """The unit vectors h that minimise ``|A h|``, as ``(B, 3, 3)`` matrices."""
     _, vectors = np.linalg.eigh(A.swapaxes(1, 2) @ A)
     return vectors[:, :, 0].reshape(-1, 3, 3)
 
@@ -220,8 +232,8 @@ def _null_vectors(A: Matrix) -> Matrix:
 def score_homographies(
     H: Matrix, xy_1: Matrix, xy_2: Matrix, sigma: Matrix
 ) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Score ``(B,)`` and inliers ``(B, N)`` by the symmetric transfer error (ORB-SLAM, IV)."""
-    with np.errstate(all="ignore"):  # draws on a line: their scores are NaN, then 0
+    """Scores ``(B,)`` and inliers ``(B, N)`` by the symmetric transfer error (ORB-SLAM, IV)."""
+    with np.errstate(all="ignore"):  # collinear samples give NaN errors, which score 0
         there = _squared(_transferred(H, xy_1) - xy_2) / sigma**2
         back = _squared(_transferred(_adjugates(H), xy_2) - xy_1) / sigma**2
     return _score(there, back, CHI2_MONO)
@@ -230,10 +242,11 @@ def score_homographies(
 def score_fundamentals(
     F: Matrix, xy_1: Matrix, xy_2: Matrix, sigma: Matrix
 ) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Score ``(B,)`` and inliers ``(B, N)`` by the distances from the epipolar lines of both views.
+    """Scores ``(B,)`` and inliers ``(B, N)`` by the distances from the epipolar lines of both
+    views.
 
-    What a line leaves over is one dimension, but the score of a perfect match is that of a
-    homography, so that the two can be compared (ORB-SLAM, IV).
+    The distance from a line has one degree of freedom, hence ``CHI2_LINE``; but a perfect match
+    scores as much as with a homography, so that both models can be compared (ORB-SLAM, IV).
     """
     one = np.ones((len(xy_1), 1))
     p_1, p_2 = np.hstack([xy_1, one]), np.hstack([xy_2, one])
@@ -259,7 +272,7 @@ def _transferred(H: Matrix, xy: Matrix) -> Matrix:
 
 
 def _adjugates(H: Matrix) -> Matrix:
-    """Inverses up to scale: exist for singular matrices too."""
+    """Inverses up to scale, which exist for singular matrices as well."""
     a, b, c = H[:, 0], H[:, 1], H[:, 2]
     return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
 
@@ -269,7 +282,8 @@ def _squared(x: Matrix) -> Matrix:
 
 
 def motions_of_essential(E: Matrix) -> list[Matrix]:
-    """The four motions ``T_2_1`` of an essential matrix (Hartley and Zisserman, 9.6.2)."""
+    """The four candidate motions ``T_2_1`` of an essential matrix (Hartley and Zisserman,
+    9.6.2)."""
     U, _, Vt = np.linalg.svd(E)
     W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     s = np.linalg.det(U) * np.linalg.det(Vt)
@@ -278,8 +292,9 @@ def motions_of_essential(E: Matrix) -> list[Matrix]:
 
 
 def motions_of_homography(A: Matrix) -> list[Matrix]:
-    """The up to eight motions ``T_2_1`` of a calibrated homography (Faugeras and Lustman, "Motion
-    and structure from motion in a piecewise planar environment", 1988); none for a pure turn."""
+    """The eight candidate motions ``T_2_1`` of a calibrated homography (Faugeras and Lustman,
+    "Motion and structure from motion in a piecewise planar environment", 1988); none for a pure
+    rotation."""
     U, (d1, d2, d3), Vt = np.linalg.svd(A)
     if d1 / d2 < 1.00001 or d2 / d3 < 1.00001:
         return []
@@ -314,8 +329,12 @@ def _triangulate(
     camera: Camera,
     config: InitializationConfig,
 ) -> tuple[Matrix, NDArray[np.bool_], Matrix]:
-    """Points ``(N, 3)`` in camera 1; whether each lies in front of both cameras and reprojects
-    where it was seen; cosine of the angle between its rays."""
+    """Triangulate N matches.
+
+    Returns:
+        ``(N, 3)`` points in the frame of camera 1; ``(N,)`` bool, whether each one lies in front of
+        both cameras and its reprojection errors are small; ``(N,)`` cosine of its parallax.
+    """
     R, t = T_2_1[:3, :3], T_2_1[:3, 3]
     ray_1 = camera.backproject(xy_1, np.ones(len(xy_1)))
     ray_2 = camera.backproject(xy_2, np.ones(len(xy_2))) @ R  # in camera 1

@@ -15,18 +15,18 @@ from vslam.states import PolicyState
 
 @dataclass(frozen=True)
 class KeyframeEvidence:
-    """What the decision rests on.
+    """The quantities by which a keyframe decision is made.
 
     Attributes:
-        seconds_since_keyframe: since the last one.
-        n_inliers: landmarks tracked in this frame.
-        n_reference: landmarks of the reference keyframe that at least three keyframes see
-            (all of them in a young map).
-        tracked_close: close stereo features of this frame that track a landmark.
-        untracked_close: close stereo features that do not.
-        gained_close: how many close points the first frame after a keyframe tracks, a running
+        seconds_since_keyframe: time since the last keyframe, seconds.
+        n_inliers: number of landmarks tracked in this frame.
+        n_reference: number of landmarks of the reference keyframe that at least three keyframes
+            observe (in a young map: of all its landmarks).
+        tracked_close: number of close stereo features of this frame that track a landmark.
+        untracked_close: number of close stereo features that do not.
+        mapping_idle: whether local mapping of the last keyframe is finished and merged.
+        gained_close: number of close points that the first frame after a keyframe tracks, a running
             mean over the last keyframes; infinite if unknown.
-        mapping_idle: the last keyframe's local mapping is finished and merged.
     """
 
     seconds_since_keyframe: float
@@ -41,17 +41,21 @@ class KeyframeEvidence:
 def needs_keyframe(
     evidence: KeyframeEvidence, config: KeyframeConfig, *, depth: bool = False
 ) -> bool:
-    """Decide. Enough new must be visible, and either mapping is free or it is urgent.
+    """Whether a stereo or RGB-D frame should become a keyframe: because the last keyframe is old,
+    or because the view has changed enough or too few close points are tracked, and either local
+    mapping is idle or the need is urgent.
 
-    Few close points ask for a keyframe only if keyframes usually bring enough. On a motorway
-    they are few by nature and leave the view before they are seen twice, so that even the frame
-    after a keyframe tracks too few. There a share of what that frame tracks is all that is asked
-    for, provided that far points hold the pose: as many of them as the close points that are
-    wanted. In fog there are none.
+    Too few close points ask for a keyframe only if a keyframe would provide more. On a motorway
+    close points are scarce and leave the view before they are seen twice, so that even the first
+    frame after a keyframe tracks too few of them. There the frame only needs a share of what that
+    first frame tracked, provided that enough far points constrain the pose: at least as many as the
+    close points that would otherwise be required. In fog there are no far points, so the full
+    number of close points stays required.
 
     Args:
-        depth: of an RGB-D camera. Nearly all it sees is close and mapped at once, so that the
-            counts ask for few keyframes; a hand turns it faster than a car turns.
+        depth: whether the camera is RGB-D. Nearly all that it sees is close and mapped at once, so
+            that the counts alone would ask for too few keyframes, although a hand-held camera turns
+            faster than a car.
     """
     max_interval_s = config.depth_max_interval_s if depth else config.max_interval_s
     wanted: float = config.min_tracked_close
@@ -69,28 +73,31 @@ def needs_keyframe(
 
 
 def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig) -> bool:
-    """Decide without stereo (ORB-SLAM, V-E): early, since a point is mapped only once two keyframes
-    have seen it from different places; keyframes that prove redundant are culled.
+    """Whether a monocular frame should become a keyframe (ORB-SLAM, V-E). Keyframes are made early,
+    because a point is mapped only after two keyframes have seen it from different positions;
+    redundant keyframes are culled later.
 
-    Not by time: while the camera stands still, nothing new can be triangulated.
+    Time alone never asks for a keyframe: while the camera stands still, nothing new can be
+    triangulated.
     """
     tracked, reference = evidence.n_inliers, evidence.n_reference
     if tracked >= config.monocular_ratio * reference:
         return False
-    # In a sharp turn the view is new before it is mapped: there every frame counts.
+    # In a sharp turn the view changes faster than it is mapped, so do not wait for mapping.
     urgent = tracked < max(config.monocular_urgent_ratio * reference, config.monocular_min_tracked)
     late = evidence.seconds_since_keyframe >= config.max_interval_s
     return evidence.mapping_idle or urgent or late
 
 
 class CloseGain:
-    """What the last keyframes gained: how many close points the first frame after one tracks.
+    """How many close points a keyframe provides: a running mean of the number of close points that
+    the first frame after each keyframe tracks.
 
-    One such frame may track few by chance; that they are few by nature takes several to show. So
-    this is a mean that forgets, and it begins with plenty.
+    A single frame may track few by chance; only several in a row show that close points are scarce.
+    So this is an exponential moving average, and it starts at a high value.
 
     Attributes:
-        mean: of those frames.
+        mean: the moving average.
         awaited: whether the next frame is the first one after a keyframe.
     """
 
@@ -100,11 +107,12 @@ class CloseGain:
         self._weight = config.gain_weight
 
     def begin(self) -> None:
-        """A keyframe was made."""
+        """Note that a keyframe was made."""
         self.awaited = True
 
     def add(self, tracked_close: int) -> None:
-        """A frame was tracked."""
+        """Add the number of close points that a frame tracks, if it is the first one after a
+        keyframe."""
         if self.awaited:
             self.mean += self._weight * (tracked_close - self.mean)
             self.awaited = False
@@ -112,12 +120,12 @@ class CloseGain:
 
 @dataclass(frozen=True)
 class PlaceEvidence:
-    """How well a place is known that a frame has come back to.
+    """How well the map already covers a place that a frame has returned to.
 
     Attributes:
-        n_inliers: landmarks tracked in the frame.
-        n_shared: of these, landmarks of the old keyframe that shares the most.
-        n_place: landmarks of that keyframe that at least three keyframes see.
+        n_inliers: number of landmarks tracked in the frame.
+        n_shared: number of these that the old keyframe observes which shares the most with it.
+        n_place: number of landmarks of that keyframe that at least three keyframes observe.
     """
 
     n_inliers: int
@@ -126,12 +134,13 @@ class PlaceEvidence:
 
 
 def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
-    """Whether a keyframe here would repeat an old one: the frame tracks enough landmarks for one
-    next to the old keyframe, and shares enough of them with it.
+    """Whether a keyframe here would repeat an old one: the frame tracks as many landmarks as a
+    frame next to the old keyframe should, and shares enough of them with it.
 
-    Few close points are no reason to map the place once more, since mapping it did not make them
-    more. At the end of a map the last keyframe has few landmarks that three keyframes observe, and
-    the camera would count as being at a known place until it is lost; so a minimum is asked for.
+    A lack of close points is no reason to map a known place again, because the old keyframe did not
+    provide more of them. At the end of a map the last keyframe has few landmarks that three
+    keyframes observe, so that both ratios would hold until the camera is lost; hence the minimum
+    number of inliers.
     """
     return (
         evidence.n_inliers >= config.known_min_inliers
@@ -142,7 +151,7 @@ def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
 
 class KeyframePolicy:
     """Decides whether a tracked frame becomes a keyframe. Only ``observe``, ``keyframe_made`` and
-    ``restore`` change what it remembers."""
+    ``restore`` change its state."""
 
     def __init__(self, context: TrackingContext) -> None:
         self._context = context
@@ -152,7 +161,7 @@ class KeyframePolicy:
     def observe(
         self, frame: Frame, view: MapView, *, seconds_since_keyframe: float, mapping_idle: bool
     ) -> KeyframeEvidence:
-        """Take in a tracked frame; returns what speaks for and against making it a keyframe."""
+        """Take a tracked frame into account and return the evidence for ``wants_keyframe``."""
         depth = feature_depth(frame.features, self._context.camera)
         close, tracked = depth < self._context.close_depth, frame.landmark >= 0
         tracked_close = int(np.count_nonzero(close & tracked))
@@ -168,24 +177,24 @@ class KeyframePolicy:
         )
 
     def wants_keyframe(self, evidence: KeyframeEvidence) -> bool:
-        """Whether the frame should become a keyframe, unless its place is known."""
+        """Whether the frame should become a keyframe, unless ``is_known`` holds for its place."""
         camera = self._context.camera
         if camera.monocular:
             return needs_monocular_keyframe(evidence, self._config)
         return needs_keyframe(evidence, self._config, depth=camera.depth)
 
     def is_known(self, evidence: PlaceEvidence) -> bool:
-        """Whether an old keyframe serves in place of a new one."""
+        """Whether an old keyframe serves instead of a new one."""
         return is_known_place(evidence, self._config)
 
     def keyframe_made(self) -> None:
-        """Expect the first frame after a keyframe."""
+        """Note that a keyframe was made."""
         self._gain.begin()
 
     def state(self) -> PolicyState:
-        """What is remembered of earlier keyframes."""
+        """The state, for a saved map or a checkpoint."""
         return PolicyState(self._gain.mean, self._gain.awaited)
 
     def restore(self, state: PolicyState) -> None:
-        """Remember what ``state`` gave."""
+        """Continue from a state that ``state`` returned."""
         self._gain.mean, self._gain.awaited = state.gained_close, state.gain_awaited

@@ -1,7 +1,7 @@
-"""Matching of landmarks and descriptors to the features of a frame. No state.
+"""Stateless matching of landmarks and descriptors to the features of a frame.
 
 Search by projection follows ORB-SLAM (Mur-Artal et al., T-RO 2015, V-C and V-D): a landmark is
-looked for only near its projection and near the pyramid level at which it should appear.
+searched for only near its projection and near the pyramid level at which it should appear.
 """
 
 from __future__ import annotations
@@ -20,11 +20,21 @@ ORIENTATION_BINS = 30
 
 @kernel
 def predict_view(T, xyz, normal, distance_range, intrinsics, width, height, scales, window):
-    """Where landmarks should appear (ORB-SLAM, V-D): in the image, within their distance
-    range, seen from a direction at most 60 degrees off the mean one.
+    """Predict where landmarks appear in an image (ORB-SLAM, V-D). A landmark is visible if it
+    projects into the image, its distance is in its range, and its viewing direction is at most 60
+    degrees from the mean one.
+
+    Args:
+        T: ``(4, 4)`` pose of the camera (world to camera).
+        xyz, normal: ``(N, 3)`` positions, and mean viewing directions as unit vectors.
+        distance_range: ``(N, 2)`` least and greatest distance at which each is detected.
+        intrinsics: ``(6,)``, see ``Camera.intrinsics``.
+        scales: ``(levels,)`` pyramid scale factors.
+        window: search radius at octave 0, pixels.
 
     Returns:
-        ``uvr`` ``(N, 3)``; search radius ``(N,)``, 0 if not visible; octave ``(N,)`` int64.
+        ``uvr`` ``(N, 3)``, predicted u, v, u_right; ``(N,)`` search radius in pixels, 0 for
+        landmarks that are not visible; ``(N,)`` int64 predicted octave.
     """
     n = len(xyz)
     fx, fy, cx, cy, bf, _ = intrinsics
@@ -57,17 +67,20 @@ def predict_view(T, xyz, normal, distance_range, intrinsics, width, height, scal
             continue
         octave[i] = predict_octave(distance, distance_range[i, 1], log_scale, len(scales))
         uvr[i, 0], uvr[i, 1], uvr[i, 2] = u, v, u - bf / z
-        # Seen head-on the prediction is better.
+        # The prediction is more accurate for a landmark that is seen from its mean direction.
         radius[i] = (window if cos > 0.998 else 1.6 * window) * scales[octave[i]]
     return uvr, radius, octave
 
 
 class Projections(NamedTuple):
-    """M landmarks where they should appear.
+    """The predicted appearance of M landmarks.
 
-    ``uvr`` (M, 3) f8 predicted u, v, u_right; ``radius`` (M,) f8 half width of the window in
-    pixels, not positive: skip; ``octave_low``, ``octave_high`` (M,) int levels to accept;
-    ``descriptor`` (M, 4) u8.
+    Attributes:
+        uvr: ``(M, 3)`` predicted u, v, u_right.
+        radius: ``(M,)`` half width of the search window, pixels; a landmark whose radius is not
+            positive is skipped.
+        octave_low, octave_high: ``(M,)`` the range of octaves to accept.
+        descriptor: ``(M, 4)`` the 32 bytes of each descriptor as four integers.
     """
 
     uvr: NDArray[np.float64]
@@ -78,9 +91,14 @@ class Projections(NamedTuple):
 
 
 class Searchable(NamedTuple):
-    """N features of an image, by cell.
+    """N features of an image with a grid to search them by position.
 
-    ``xy`` (N, 2) f4; ``octave`` (N,) u1; ``u_right`` (N,) f4; ``descriptor`` (N, 4) u8; ``grid``.
+    Attributes:
+        xy: ``(N, 2)`` pixels.
+        octave: ``(N,)``.
+        u_right: ``(N,)`` columns in the right image, NaN without one.
+        descriptor: ``(N, 4)`` the 32 bytes of each descriptor as four integers.
+        grid: indices of the features in each cell of the image.
     """
 
     xy: NDArray[np.float32]
@@ -91,24 +109,26 @@ class Searchable(NamedTuple):
 
     @classmethod
     def of_features(cls, features: Features, grid: FeatureGrid) -> Searchable:
-        """Those of a frame."""
+        """View the features of a frame."""
         descriptor = features.descriptors.view(np.uint64)
         return cls(features.xy, features.octave, features.u_right, descriptor, grid)
 
 
 @kernel
 def search_windows(projections, features, free, max_distance, ratio):
-    """Best feature for each of M projected landmarks.
+    """Find the best feature for each of M projected landmarks.
 
     Args:
-        projections: ``Projections``; features: ``Searchable``.
+        projections: ``Projections`` of the landmarks.
+        features: ``Searchable`` of the image.
         free: ``(N,)`` bool, features that may be matched.
-        max_distance: of the descriptors, bits.
-        ratio: best over second best, where both are of one level (1 switches the test off).
+        max_distance: largest Hamming distance of a match, bits.
+        ratio: largest ratio of the best to the second best distance, tested if both features are of
+            one octave (1 switches the test off).
 
     Returns:
-        ``(M,)`` int32 feature or -1, no feature twice (the closest descriptor keeps it), and
-        ``(M,)`` int32 distances.
+        ``(M,)`` int32 index of the feature or -1, and ``(M,)`` int32 distances. A feature is
+        matched at most once: of several landmarks, the one with the closest descriptor keeps it.
     """
     uvr, radius, octave_low, octave_high, descriptors = projections
     xy, octave, u_right, frame_descriptors, grid = features
@@ -164,13 +184,16 @@ def search_windows(projections, features, free, max_distance, ratio):
 
 @kernel
 def search_all(a, b, max_distance, ratio):
-    """Nearest descriptor of b for each of a, both ways, with a ratio test.
+    """Exhaustive matching of two sets of descriptors: mutual nearest neighbours that pass a ratio
+    test.
 
     Args:
-        a, b: ``(M, 4)`` and ``(N, 4)`` uint64.
+        a, b: ``(M, 4)`` and ``(N, 4)`` uint64 descriptors.
+        max_distance: largest Hamming distance of a match, bits.
+        ratio: largest ratio of the best to the second best distance, for each descriptor of a.
 
     Returns:
-        ``(M,)`` int32 index into b or -1; mutual nearest neighbours only.
+        ``(M,)`` int32 index into b or -1.
     """
     m, n = len(a), len(b)
     best_of_a = np.full(m, -1, np.int32)
@@ -197,12 +220,11 @@ def search_all(a, b, max_distance, ratio):
 
 @kernel
 def consistent_orientation(angle_a, angle_b):
-    """Matches whose rotation falls in one of the three fullest of 30 bins (ORB-SLAM, V-C).
-
-    The second and third bin count only with at least a tenth of the first.
+    """Whether the rotation of each match falls in one of the three fullest of 30 bins (ORB-SLAM,
+    V-C). The second and the third bin count only if they hold at least a tenth of the first.
 
     Args:
-        angle_a, angle_b: ``(N,)`` float32 radians of the matched features.
+        angle_a, angle_b: ``(N,)`` float32 orientations of the matched features, radians.
 
     Returns:
         ``(N,)`` bool.
@@ -227,11 +249,16 @@ def consistent_orientation(angle_a, angle_b):
 
 
 def count_elsewhere(u: NDArray[np.floating], width: int) -> int:
-    """How many of ``(N,)`` columns lie outside the strip, a third of the image, with the most.
+    """Number of inliers outside the vertical strip, a third of the image wide, that holds the most.
 
-    What looks alike at two places is one object: a facade, a parked car. It may bring a hundred
-    inliers and fix a pose to a centimetre, but all of them lie together; the rest of the scene
-    does not fit. A place that is seen again has inliers all over the image.
+    Two different places may share one similar object, for example a facade or a parked car. It can
+    provide a hundred inliers and fix a pose to a centimetre, but all of them lie close together,
+    because the rest of the scene does not match. At a true revisit, inliers are spread over the
+    whole image.
+
+    Args:
+        u: ``(N,)`` columns of the inliers, pixels.
+        width: of the image, pixels.
     """
     columns = np.sort(u)
     ends = np.searchsorted(columns, columns + width / 3, side="right")

@@ -20,10 +20,10 @@ from vslam.frontend.corners import fast_scores, local_maxima, spread
 from vslam.frontend.smoothing import smoothed
 from vslam.kernels import kernel
 
-PATCH_RADIUS = 15  # of the intensity centroid (Rublee et al., section 3.2)
-LANES = 32  # pixels read of each row of the disc: its 31 columns and one that counts nothing
-SPARE = 64  # bytes at the end of a pyramid
-MARGIN = 19  # reach of a rotated test point (13 sqrt 2) from a keypoint, rounded up
+PATCH_RADIUS = 15  # of the disc of the intensity centroid, pixels (Rublee et al., section 3.2)
+LANES = 32  # pixels read per row of the disc: its 31 columns and one of weight 0
+SPARE = 64  # unused bytes at the end of a pyramid
+MARGIN = 19  # largest distance of a rotated test point from its keypoint (13 sqrt 2), rounded up
 PATTERN: NDArray[np.int8] = np.load(Path(__file__).with_name("orb_pattern.npy"))
 
 
@@ -31,8 +31,8 @@ PATTERN: NDArray[np.int8] = np.load(Path(__file__).with_name("orb_pattern.npy"))
 class Extraction:
     """Features of one image, sorted by octave: see ``vslam.features.Features`` for the fields.
 
-    Pixels are counted from the middle of the first one at every level: pixel x of a level that is
-    ``w`` times narrower lies at ``(x + 0.5) w - 0.5`` of the image.
+    At every level, coordinate 0 is the centre of the first pixel: x in a level that is ``w`` times
+    narrower than the image corresponds to ``(x + 0.5) w - 0.5`` in the image.
     """
 
     xy: NDArray[np.float32]
@@ -43,9 +43,9 @@ class Extraction:
 
 
 def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
-    """Extract up to ``config.n_features`` ORB features from ``(H, W)`` uint8.
+    """Extract up to ``config.n_features`` ORB features from an ``(H, W)`` uint8 image.
 
-    A pure function of its arguments, safe to call from several threads.
+    A pure function, safe to call from several threads.
     """
     pyramid = build_pyramid(image, config)
     xy, octave, angle, descriptors = extract_levels(
@@ -63,7 +63,7 @@ def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
 
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
-    """``(L,)`` scale of each level; level 0 is 1."""
+    """``(L,)`` float64, scale of each level: full-resolution pixels per pixel; level 0 has 1."""
     return _scales(config.n_levels, config.scale_factor)
 
 
@@ -72,7 +72,8 @@ def _scales(n_levels: int, scale_factor: float) -> NDArray[np.float64]:
 
 
 def features_per_level(config: OrbConfig) -> NDArray[np.int64]:
-    """Share ``n_features`` among the levels in proportion to 1 / scale (ORB-SLAM, V-A)."""
+    """``(L,)`` int64, ``n_features`` divided among the levels in proportion to 1 / scale (ORB-SLAM,
+    V-A)."""
     return _quota(config.n_features, config.n_levels, config.scale_factor).copy()
 
 
@@ -81,7 +82,7 @@ def _quota(n_features: int, n_levels: int, scale_factor: float) -> NDArray[np.in
     weights = 1.0 / _scales(n_levels, scale_factor)
     share = n_features * weights / weights.sum()
     quota = np.floor(share).astype(np.int64)
-    # What rounding down leaves goes to the levels that it cost most.
+    # Give the features lost by rounding down to the levels that lost the largest fractions.
     left = n_features - quota.sum()
     quota[np.argsort(quota - share, kind="stable")[:left]] += 1
     return quota
@@ -91,7 +92,7 @@ def _quota(n_features: int, n_levels: int, scale_factor: float) -> NDArray[np.in
 def _layout(
     height: int, width: int, n_levels: int, scale_factor: float
 ) -> tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Bytes of a pyramid, and its offsets, shapes and scales."""
+    """Number of bytes of a pyramid, and the offsets, shapes and scales of its levels."""
     scales = _scales(n_levels, scale_factor)
     shapes = np.round(np.array([height, width]) / scales[:, None]).astype(np.int64).clip(min=1)
     sizes = shapes.prod(axis=1)
@@ -100,7 +101,8 @@ def _layout(
 
 
 def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
-    """Shrink the image level by level, bilinearly."""
+    """Build the pyramid of an ``(H, W)`` uint8 image: each level is resized bilinearly from the
+    one before."""
     size, offsets, shapes, scales = _layout(*image.shape, config.n_levels, config.scale_factor)
     pixels = np.empty(size + SPARE, np.uint8)
     pixels[-SPARE:] = 0
@@ -116,9 +118,19 @@ def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
 
 @kernel
 def extract_levels(pixels, offsets, shapes, quota, threshold, threshold_min, cell, inside, pattern):
-    """Features of all levels: ``xy``, ``octave``, ``angle`` and ``descriptors``.
+    """Extract the features of all levels.
 
-    One kernel, so that Python, for which threads wait for each other, is called once an image.
+    A single kernel, so that an image takes the global interpreter lock only once.
+
+    Args:
+        pixels, offsets, shapes: of the ``Pyramid``.
+        quota: ``(L,)`` int64, greatest number of features per level.
+        threshold, threshold_min, cell: see ``local_maxima``.
+        inside: ``DISC``.
+        pattern: ``PATTERN``, ``(256, 4)`` int8 test points xa, ya, xb, yb.
+
+    Returns:
+        ``xy``, ``octave``, ``angle`` and ``descriptors``, see ``vslam.features.Features``.
     """
     capacity = quota.sum()
     xy, octave = np.empty((capacity, 2), np.float32), np.empty(capacity, np.uint8)
@@ -130,10 +142,10 @@ def extract_levels(pixels, offsets, shapes, quota, threshold, threshold_min, cel
         image = pixels[first : first + height * width].reshape(height, width)
         corners = detect_corners(image, quota[level], threshold, threshold_min, cell)
         if len(corners) == 0:
-            continue  # the smallest levels have none
+            continue
         turned = orientations(image, corners, inside)
         described = describe(smoothed(image), corners, turned, pattern)
-        # Sizes are whole numbers: not quite the scale apart.
+        # The sizes of levels are rounded to whole pixels, so their ratios differ from the scales.
         wide, high = shapes[0, 1] / width, shapes[0, 0] / height
         for i in range(len(corners)):
             x, y = corners[i, 0] + 0.5, corners[i, 1] + 0.5
@@ -147,7 +159,8 @@ def extract_levels(pixels, offsets, shapes, quota, threshold, threshold_min, cel
 
 @kernel
 def detect_corners(pixels, quota, threshold, threshold_min, cell):
-    """FAST-9 corners of one level, spread evenly: ``(n, 2)`` float32 x, y in level pixels."""
+    """Up to ``quota`` FAST-9 corners of one level, spread evenly: ``(n, 2)`` float32 x, y in pixels
+    of the level."""
     height, width = pixels.shape
     if min(height, width) <= 2 * MARGIN or quota == 0:
         return np.empty((0, 2), np.float32)
@@ -161,7 +174,7 @@ def detect_corners(pixels, quota, threshold, threshold_min, cell):
 
 
 def disc(radius: int) -> NDArray[np.int16]:
-    """1 inside of a disc, else 0: ``(2 radius + 1, LANES)``, its centre in column ``radius``."""
+    """``(2 radius + 1, LANES)`` mask, 1 inside a disc whose centre is in column ``radius``."""
     x = np.arange(LANES) - radius
     y = np.arange(-radius, radius + 1)[:, None]
     return (abs(x) <= np.floor(np.sqrt(radius**2 - y**2 + 0.5))).astype(np.int16)
@@ -172,15 +185,16 @@ DISC = disc(PATCH_RADIUS)
 
 @kernel
 def orientations(pixels, corners, inside):
-    """Direction of the intensity centroid of the disc around each corner, radians, ``(n,)`` f32."""
+    """``(n,)`` float32, direction of the intensity centroid of the disc around each corner, in
+    radians (Rublee et al., section 3.2)."""
     n = len(corners)
     angles = np.empty(n, np.float32)
     height, width = pixels.shape
     rows = len(inside)
     radius = rows // 2
     flat, weight = pixels.reshape(height * width), inside.reshape(rows * LANES)
-    # Of each column. 255 (1 + 2 + ... + 15) stays within 16 bits, so that a register takes many
-    # columns.
+    # Sum and first moment of each column. At most 255 (1 + 2 + ... + 15), they fit 16 bits, so a
+    # vector register holds many columns.
     total, moment = np.empty(LANES, np.int16), np.empty(LANES, np.int16)
     for i in range(n):
         corner = (int(corners[i, 1]) - radius) * width + int(corners[i, 0]) - radius
@@ -204,7 +218,8 @@ def orientations(pixels, corners, inside):
 
 @kernel
 def describe(smooth, corners, angles, pattern):
-    """Rotated BRIEF (Rublee et al., section 4) of each corner, ``(n, 32)`` uint8, bit 0 first."""
+    """``(n, 32)`` uint8, rotated BRIEF descriptor of each corner (Rublee et al., section 4); the
+    first test is bit 0 of byte 0."""
     n = len(corners)
     height, width = smooth.shape
     flat = smooth.reshape(height * width)

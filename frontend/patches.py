@@ -1,7 +1,7 @@
-"""Patches: the pixels around keypoints, and of landmarks as the newest keyframes saw them.
+"""Image patches around keypoints, and a store of the patches of the newest keyframes.
 
-Only the newest keyframes keep theirs: those see nearly all that tracking follows, and a patch takes
-more memory than the rest of an observation.
+Only the newest keyframes keep their patches: they observe nearly all landmarks that tracking
+follows, and a patch takes more memory than the rest of an observation.
 """
 
 from __future__ import annotations
@@ -25,12 +25,14 @@ from vslam.map import Map
 def patches_around(
     pyramid: Pyramid, xy: NDArray[np.float32], octave: NDArray[np.uint8]
 ) -> NDArray[np.uint8]:
-    """``(N, PATCH_PIXELS)`` the pixels around keypoints in their octaves, row by row.
+    """Cut a square patch around each keypoint out of the level of its octave.
 
     Args:
-        xy: ``(N, 2)`` full-resolution pixels, at least ``PATCH_RADIUS`` pixels of the octave from
-            its border.
+        xy: ``(N, 2)`` full-resolution pixels; the patches must lie inside their levels.
         octave: ``(N,)``.
+
+    Returns:
+        ``(N, PATCH_PIXELS)`` uint8, row by row.
     """
     return _cut(pyramid.pixels, pyramid.offsets, pyramid.shapes, xy, octave)
 
@@ -51,18 +53,19 @@ def _cut(pixels, offsets, shapes, xy, octave):
 
 
 class RecentPatches:
-    """The patches of the newest keyframes."""
+    """Stores the patches of the newest keyframes."""
 
     def __init__(self, capacity: int) -> None:
-        """``capacity``: of keyframes."""
-        self._keyframes = np.full(capacity, -1, np.int64)  # of each slot
+        """``capacity`` is the number of keyframes whose patches are remembered."""
+        self._keyframes = np.full(capacity, -1, np.int64)  # id of the keyframe in each slot, or -1
         self._n_features = np.zeros(capacity, np.int64)
         self._pixels = np.empty((capacity, 0, PATCH_PIXELS), np.uint8)
         self._shift = np.empty((capacity, 0, 2), np.float32)
         self._next = 0
 
     def add(self, one: KeyframePatches) -> None:
-        """Remember those of another keyframe, and forget those of the oldest one."""
+        """Remember the patches of another keyframe and, if all slots are full, forget those of the
+        oldest one."""
         slot, n = self._next, len(one.pixels)
         if n > self._shift.shape[1]:
             self._pixels = _widened(self._pixels, n)
@@ -72,7 +75,7 @@ class RecentPatches:
         self._next = (slot + 1) % len(self._keyframes)
 
     def all(self) -> tuple[KeyframePatches, ...]:
-        """Of all keyframes, oldest first."""
+        """The patches of all remembered keyframes, oldest first."""
         slots = np.roll(np.arange(len(self._keyframes)), -self._next)
         return tuple(
             KeyframePatches(
@@ -85,7 +88,8 @@ class RecentPatches:
         )
 
     def of(self, map_: Map, ids: NDArray[np.int32]) -> LandmarkPatches:
-        """Those of ``(L,)`` landmarks, sorted, as the newest keyframe saw each; they hold until
+        """The patches of ``(L,)`` landmarks with sorted ids, each from the newest remembered
+        keyframe that observes it; landmarks without one are left out. The result is valid until
         ``add`` is called."""
         width, arrays = self._shift.shape[1], map_.arrays
         row, view = newest_rows(arrays, self._keyframes, ids)
@@ -111,11 +115,14 @@ def _widened(array: NDArray, n: int) -> NDArray:
 
 @kernel
 def newest_rows(a, keyframes, ids):
-    """Row by which the newest of ``keyframes`` observes each landmark, and which of them that is;
-    -1 for none.
+    """For each of ``(L,)`` landmarks, the row of its observation by the newest of ``keyframes``.
 
-    Of observations those of newer keyframes come first, or nearly: what lies behind one that is
-    older than all ``keyframes`` is not looked at.
+    The observations of a landmark are linked roughly from the newest to the oldest keyframe, so the
+    search ends at the first one that is older than all ``keyframes``.
+
+    Returns:
+        ``(L,)`` int64 row in the map's arrays and ``(L,)`` int64 index into ``keyframes``; -1 where
+        none of them observes the landmark.
     """
     found, view = np.full(len(ids), -1, np.int64), np.full(len(ids), -1, np.int64)
     newest = keyframes.max()

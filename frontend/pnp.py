@@ -1,7 +1,7 @@
-"""Pose of a camera from landmarks and pixels alone, without a start: P3P inside RANSAC.
+"""Pose of a camera from matched landmarks without an initial guess: P3P inside RANSAC.
 
-P3P after Persson and Nordberg, "Lambda Twist: An Accurate Fast Robust Perspective Three Point
-(P3P) Solver", ECCV 2018.
+The P3P solver follows Persson and Nordberg, "Lambda Twist: An Accurate Fast Robust Perspective
+Three Point (P3P) Solver", ECCV 2018.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ def solve_p3p(points, rays, T_cw):
     """Poses from which three points are seen along three rays.
 
     Args:
-        points: ``(3, 3)`` float64, a point of the world in each row.
-        rays: ``(3, 3)`` float64, unit directions in the camera's frame.
+        points: ``(3, 3)`` float64, one point in the world per row.
+        rays: ``(3, 3)`` float64, unit directions in the camera frame.
         T_cw: ``(4, 4, 4)`` float64, receives the poses.
 
     Returns:
-        How many there are, 0 to 4; none for points on a line.
+        Number of poses, 0 to 4; 0 for collinear points.
     """
     a12, a13, a23 = _squared(points, 0, 1), _squared(points, 0, 2), _squared(points, 1, 2)
     b12, b13, b23 = _dot(rays, 0, 1), _dot(rays, 0, 2), _dot(rays, 1, 2)
@@ -56,7 +56,7 @@ def solve_p3p(points, rays, T_cw):
         for j in range(3):
             D0[i, j] = D1[i, j] + g * D2[i, j]
     values, vectors = symmetric_eigen(D0)
-    # Of the three eigenvalues one is zero; the others must differ in sign.
+    # One of the three eigenvalues is zero; the other two must differ in sign.
     zero = 0
     for i in range(1, 3):
         if abs(values[i]) < abs(values[zero]):
@@ -75,8 +75,8 @@ def solve_p3p(points, rays, T_cw):
         if abs(n0) < 1e-14 * (abs(n1) + abs(n2)):
             continue
         w1, w2 = -n1 / n0, -n2 / n0  # l1 = w1 l2 + w2 l3
-        # With l3 = t l2 in l' D2' l = 0, D2' = a23 M_12 - a12 M_23 or its twin: a quadratic in t.
-        # The better conditioned of the two combinations is the one not parallel to D0.
+        # Substituting l3 = t l2 into l' D l = 0, with D1 or D2 as D, gives a quadratic in t. The
+        # one that is less parallel to D0 is better conditioned.
         D = D1 if abs(g) > 1.0 else D2
         A = D[0, 0] * w2 * w2 + 2.0 * D[0, 2] * w2 + D[2, 2]
         B = 2.0 * (D[0, 0] * w1 * w2 + D[0, 1] * w2 + D[0, 2] * w1 + D[1, 2])
@@ -84,7 +84,7 @@ def solve_p3p(points, rays, T_cw):
         discriminant = B * B - 4.0 * A * C
         if discriminant < 0.0:
             continue
-        # Vieta's form loses no digits where A is small.
+        # Vieta's formula avoids cancellation where A is small.
         half = -0.5 * (B + (np.sqrt(discriminant) if B >= 0.0 else -np.sqrt(discriminant)))
         for root in range(2):
             if root == 0:
@@ -126,7 +126,8 @@ def _dot(rays, i, j):
 
 @inner_kernel
 def _cross(points, out):
-    """Normal of the triangle of three points, twice its area long."""
+    """Write the normal of the triangle of three points into ``out``; its length is twice the
+    area."""
     for k in range(3):
         m, n = (k + 1) % 3, (k + 2) % 3
         out[k] = (points[1, m] - points[0, m]) * (points[2, n] - points[0, n])
@@ -144,7 +145,7 @@ def _determinant(A):
 
 @inner_kernel
 def _mixed(A, B):
-    """Coefficient of g in det(B g + A): the sum of A's cofactors times B."""
+    """Coefficient of g in det(B g + A): the sum over the cofactors of A times the entries of B."""
     total = 0.0
     for i in range(3):
         for j in range(3):
@@ -163,13 +164,13 @@ def _real_root(c3, c2, c1, c0):
     discriminant = 0.25 * q * q + p * p * p / 27.0
     if discriminant >= 0.0:
         s = np.sqrt(discriminant)
-        # The larger of the two cube roots has no cancellation, the other follows from p.
+        # The larger of the two cube roots is free of cancellation; the other follows from p.
         u = np.cbrt(-0.5 * q - s) if q >= 0.0 else np.cbrt(-0.5 * q + s)
         x = u - (p / (3.0 * u) if u != 0.0 else 0.0)
     else:
         r = np.sqrt(-p / 3.0)
         cos = min(1.0, max(-1.0, -0.5 * q / (r * r * r)))
-        # Of three real roots the outermost one is best separated.
+        # Of three real roots, the outermost one is separated best.
         angle = np.arccos(cos) / 3.0
         x = 2.0 * r * np.cos(angle) if q <= 0.0 else 2.0 * r * np.cos(angle + 2.0 * np.pi / 3.0)
     x -= shift
@@ -184,7 +185,7 @@ def _real_root(c3, c2, c1, c0):
 
 @inner_kernel
 def _refine_depths(depth, a12, a13, a23, b12, b13, b23):
-    """Newton on the three cosine laws (paper, section 3.6)."""
+    """Refine the depths by Newton's method on the three cosine laws (paper, section 3.6)."""
     for _ in range(5):
         l1, l2, l3 = depth[0], depth[1], depth[2]
         r1 = l1 * l1 + l2 * l2 - 2.0 * b12 * l1 * l2 - a12
@@ -210,7 +211,8 @@ def _refine_depths(depth, a12, a13, a23, b12, b13, b23):
 
 @inner_kernel
 def _pose_of_triangle(points, rays, depth, T):
-    """Write the motion that takes three points of the world to their places on the rays."""
+    """Write the pose that maps three points in the world to their positions on the rays into
+    ``T``."""
     placed = np.empty((3, 3))
     for i in range(3):
         for k in range(3):
@@ -233,7 +235,8 @@ def _pose_of_triangle(points, rays, depth, T):
 
 @inner_kernel
 def _triad(points, axes):
-    """Rows: first side, normal and their product, of unit length."""
+    """Write an orthonormal frame of a triangle into the rows of ``axes``: the first side, the
+    normal and their cross product."""
     _cross(points, axes[1])
     for k in range(3):
         axes[0, k] = points[1, k] - points[0, k]
@@ -248,7 +251,10 @@ def _triad(points, axes):
 
 @inner_kernel
 def _score_pose(T, points, uvr, inverse_sigma2, intrinsics, to_beat, inlier):
-    """MSAC score of a pose (Torr and Zisserman, CVIU 2000); sets ``inlier``, gives up early."""
+    """MSAC score of a pose and its number of inliers (Torr and Zisserman, CVIU 2000).
+
+    Sets ``inlier``. Returns -1, 0 as soon as the score can no longer exceed ``to_beat``.
+    """
     pinhole = unpacked(intrinsics)
     n = len(points)
     score, count = 0.0, 0
@@ -274,22 +280,24 @@ def _score_pose(T, points, uvr, inverse_sigma2, intrinsics, to_beat, inlier):
 
 @kernel
 def ransac_pose(points, uvr, inverse_sigma2, intrinsics, seed, min_inliers, max_draws, confidence):
-    """Pose on which most of N matches agree.
+    """Pose with the highest consensus among N matches.
 
-    Each draw takes P3P on the left image alone, so that monocular features do as well; a
-    u_right, where there is one, takes part in the judgement.
+    P3P uses the left image alone, so monocular features serve as well as stereo ones; the score of
+    a pose includes u_right where it is known.
 
     Args:
-        points: ``(N, 3)`` float64 landmarks in the world.
-        uvr: ``(N, 3)`` float64 observed u, v, u_right; NaN u_right: monocular.
+        points: ``(N, 3)`` float64 landmarks in the world frame.
+        uvr: ``(N, 3)`` float64 observed u, v, u_right; NaN u_right for a monocular feature.
         inverse_sigma2: ``(N,)`` float64, inverse variance of a pixel coordinate.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         seed: uint64; the same seed gives the same result.
-        min_inliers, max_draws, confidence: draws end when this confident that no pose with more
-            inliers, or none with ``min_inliers``, is left.
+        min_inliers: number of inliers of a pose that is worth finding.
+        max_draws: maximum number of samples.
+        confidence: sampling ends when a better pose with at least ``min_inliers`` inliers would
+            have been found with this probability.
 
     Returns:
-        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers of the best pose, few or many.
+        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers of the best pose, however few.
     """
     fx, fy, cx, cy, _, _ = intrinsics
     n = len(points)

@@ -23,20 +23,22 @@ def optimise_pose(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Pose that minimises the robust reprojection error of fixed landmarks.
 
-    Four rounds of Gauss-Newton; after each one the chi-square test sorts inliers from outliers,
-    and both get another chance in the next. The first two rounds use the Huber loss.
+    Runs four rounds of Gauss-Newton. After each round, the chi-square test classifies all
+    observations again, and only inliers take part in the next. The first two rounds use the Huber
+    loss.
 
     Args:
-        T_cw: ``(4, 4)`` start.
-        points: ``(N, 3)`` float64 landmarks in the world.
-        uvr: ``(N, 3)`` float64 observations u, v, u_right; NaN u_right: monocular.
+        T_cw: ``(4, 4)`` initial pose.
+        points: ``(N, 3)`` float64 landmarks in the world frame.
+        uvr: ``(N, 3)`` float64 observed u, v, u_right; NaN u_right for a monocular observation.
         inverse_sigma2: ``(N,)`` float64, inverse variance of a pixel coordinate.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
-        disparity_weight: ``(N,)`` float64, how many times surer a disparity is than its u and v;
-            None: as sure as the camera's intrinsics say.
+        disparity_weight: ``(N,)`` float64, standard deviation of u and v over that of the
+            disparity; None takes the weight in ``intrinsics``.
 
     Returns:
-        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers.
+        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers; no inliers if fewer than three observations
+        are left.
     """
     if disparity_weight is None:
         disparity_weight = np.full(len(points), intrinsics[5])
@@ -107,7 +109,7 @@ def _optimise(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics):
 
 @inner_kernel
 def classify(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier):
-    """Set ``inlier`` to those that pass the chi-square test at pose ``T``."""
+    """Set ``inlier`` to the observations that pass the chi-square test at pose ``T``."""
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     for i in range(len(points)):
         p = points[i]

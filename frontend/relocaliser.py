@@ -1,4 +1,5 @@
-"""Finding a lost frame in the whole map (ORB-SLAM, T-RO 2015, V-C)."""
+"""When a lost or doubtful frame is searched in the whole map, and at which places (ORB-SLAM, T-RO
+2015, V-C)."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ Locate = Callable[[Image | None, Features, Map], list[LoopCandidate]]
 
 
 class Recognise(Protocol):
-    """Finds a frame at one of the candidates where ORB descriptors do not."""
+    """Finds a frame at one of the candidates after matching by ORB descriptors has failed."""
 
     def __call__(
         self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
@@ -27,40 +28,46 @@ class Recognise(Protocol):
 
 
 class MapAccess(Protocol):
-    """Access to the map, while it may be read."""
+    """Access to the map when it may be read."""
 
     @property
     def is_merged(self) -> bool:
-        """Whether tracking sees all that was mapped."""
+        """Whether tracking sees everything that has been mapped, i.e. no keyframe is being
+        mapped."""
         ...
 
     def merge(self) -> Map:
-        """Wait for the keyframe that is being mapped, show it to tracking, and return the map."""
+        """Wait for the keyframe that is being mapped, make it visible to tracking, and return the
+        map."""
         ...
 
 
 class Relocaliser:
-    """Looks for a frame at the places that resemble it."""
+    """Searches for a frame at the keyframes that it resembles."""
 
     def __init__(self, context: TrackingContext, locate: Locate, recognise: Recognise) -> None:
         """
         Args:
-            locate: gives the keyframes that a frame resembles, best first.
-            recognise: asked where ORB descriptors find the frame at none of them.
+            locate: returns the keyframes that a frame resembles, best first.
+            recognise: called if matching by ORB descriptors fails at all of them.
         """
         self._context = context
         self._locate = locate
         self._recognise = recognise
 
     def relocalise_if_needed(self, frame: Frame, found: Found, owner: MapAccess) -> Found:
-        """Search the whole map for a frame that is lost, if no keyframe is being mapped, or
-        doubtful, which waits for the mapping. A doubtful frame keeps its tracked pose unless
-        relocalisation finds ``relocalization.better`` times as many inliers."""
+        """Search the whole map for a frame that is lost or doubtful; returns ``found`` if it is
+        neither, or if relocalisation fails.
+
+        A lost frame is searched only while no keyframe is being mapped. A doubtful frame waits for
+        the mapping, and keeps its tracked pose unless relocalisation finds
+        ``relocalization.better`` times as many inliers.
+        """
         if found.is_lost:
             return self._find(frame, owner.merge()) if owner.is_merged else found
         if not found.is_doubtful:
             return found
-        map_ = owner.merge()  # worth waiting for: a doubtful frame asks for a keyframe
+        map_ = owner.merge()  # worth the wait, because a doubtful frame will ask for a keyframe
         before = frame.snapshot()
         elsewhere = self._find(frame, map_)
         if elsewhere.n_inliers > self._context.config.relocalization.better * found.n_inliers:
@@ -69,7 +76,7 @@ class Relocaliser:
         return found
 
     def _find(self, frame: Frame, map_: Map) -> Found:
-        """Look for a frame in the whole map, first by ORB descriptors."""
+        """Search for a frame at the candidates, first by ORB descriptors, then by ``recognise``."""
         config = self._context.config.relocalization
         candidates = self._locate(frame.image, frame.features, map_)
         for candidate in candidates[: config.max_candidates]:

@@ -1,4 +1,4 @@
-"""Finding a lost camera in the map (ORB-SLAM, T-RO 2015, V-C)."""
+"""Finds the pose of a lost camera in the map (ORB-SLAM, T-RO 2015, V-C)."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from vslam.map_view import LocalMap
 def relocalise(
     frame: Frame, place: LocalMap, surroundings: LocalMap, context: TrackingContext, seed: int
 ) -> int:
-    """Find the pose of a frame of which nothing is known, at a place that it resembles.
+    """Find the pose of a frame, without any prediction, at a place that it resembles.
 
-    Descriptors are matched with the landmarks of the place; P3P inside RANSAC, which needs no
-    stereo, finds a pose; then all landmarks around are searched for near their projections, in a
-    wide and in the usual window.
+    Its descriptors are matched with the landmarks of the place, and P3P inside RANSAC, which needs
+    no stereo, estimates a pose. Then all landmarks of the surroundings are searched for near their
+    projections, first in a wide window, then in the usual one.
 
     Args:
-        frame: on success it gets its pose and its landmarks, otherwise it is left without both.
+        frame: receives its pose and its landmarks on success; otherwise both are reset.
         place: the landmarks of a candidate keyframe.
-        surroundings: those of the candidate and its covisible keyframes.
-        seed: of the draws; the same seed gives the same result.
+        surroundings: the landmarks of the candidate and its covisible keyframes.
+        seed: seed of the random samples; the same seed gives the same result.
 
     Returns:
-        Inliers, at least ``relocalization.min_inliers`` and not all on one object; 0 without
-        success.
+        Number of inliers, at least ``relocalization.min_inliers`` and not all on one object
+        (``count_elsewhere``); 0 if the frame was not found.
     """
     inliers = _locate(frame, place, surroundings, context, seed)
     config = context.config.relocalization

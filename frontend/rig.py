@@ -1,8 +1,8 @@
-"""What is known of a stereo pair beyond its rectification, and how it corrects frames.
+"""Corrects frames for errors of a stereo rig that rectification leaves.
 
-Two errors are corrected: the offset of all disparities, which the map learns while it grows
-(``backend/disparity_offset.py``), and the delay of the right image that the calibration file gives
-(``Camera.right_delay``). A delay is measured as well, but a measured one is only reported.
+Two errors are corrected: a common offset of all disparities, which is estimated while the map grows
+(``backend/disparity_offset.py``), and the delay of the right image given in the calibration file
+(``Camera.right_delay``). The delay is also measured, but the measurement is only reported.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class RigCalibration:
     of a frame.
 
     Attributes:
-        disparity_offset: pixels to be added to every measured disparity: ``Map.disparity_offset``
-            as of the last merge, which the owner of the map sets.
-        delay: the measured delay of the right side.
+        disparity_offset: pixels to be added to every measured disparity. The owner of the map sets
+            it to the map's disparity offset at each merge.
+        delay: the measured delay of the right image.
     """
 
     def __init__(self, camera: Camera, config: StereoConfig, scales: NDArray[np.float64]) -> None:
@@ -42,12 +42,12 @@ class RigCalibration:
         self._scales = scales
 
     def prepare(self, frame: Frame, twist: Matrix | None) -> None:
-        """Correct the columns of a frame's features in the right image for the disparity offset
-        and, if the motion is known, for the delay of the right image. Calling it again changes
-        nothing.
+        """Correct ``u_right`` of a frame for the disparity offset and, if the motion is known, for
+        the delay of the right image. Calling this again has no effect.
 
         Args:
-            twist: ``(6,)`` motion of the points past the camera, per second; None if unknown.
+            twist: ``(6,)`` velocity of the points relative to the camera, per second; None if
+                unknown.
         """
         self.correct_offset(frame)
         late = self._camera.right_delay
@@ -59,8 +59,8 @@ class RigCalibration:
         frame.delay_removed = True
 
     def correct_offset(self, frame: Frame) -> None:
-        """Correct the disparities of a frame by the present offset, whatever offset they were
-        corrected by before."""
+        """Replace the offset by which the disparities of a frame were corrected by the current
+        one."""
         change = self.disparity_offset - frame.disparity_offset
         if change == 0.0:
             return
@@ -69,21 +69,23 @@ class RigCalibration:
         frame.disparity_offset = self.disparity_offset
 
     def mark_corrected(self, frame: Frame) -> None:
-        """Mark the columns of a frame as corrected: it was prepared before it was saved."""
+        """Mark a frame that was restored from a checkpoint as corrected: it was prepared before it
+        was saved."""
         frame.disparity_offset, frame.delay_removed = self.disparity_offset, True
 
     def observe(self, frame: Frame, twist: Matrix | None) -> None:
         """Measure the delay in a tracked frame.
 
         Args:
-            twist: ``(6,)`` motion from the frame before to this one, per second; None if unknown.
+            twist: ``(6,)`` velocity between the previous frame and this one, per second; None if
+                unknown.
         """
         self.delay.add(frame.features, frame.row_offset, twist, self._scales)
 
     def state(self) -> DelayState:
-        """What was learned of the rig, except the disparity offset, which the map keeps."""
+        """The state of the measured delay; the disparity offset is part of the map."""
         return self.delay.state()
 
     def restore(self, state: DelayState) -> None:
-        """Continue from what ``state`` gave."""
+        """Continue from a state that ``state`` returned."""
         self.delay.restore(state)

@@ -1,14 +1,15 @@
-"""By how much the right side of a stereo pair is late, measured in the rows of its matches.
+"""Measures the delay of the right image of a stereo pair from the rows of stereo matches.
 
-In a rectified pair a point is in the same row of both images. If the right one is taken later, its
-row is moved on by the image's speed times the delay. Columns are moved as well, and bend the map:
-there, bundle adjustment takes much of the delay for depth and motion. A row shift does not depend
-on depth, so bundle adjustment cannot absorb a delay there, and no map is needed. A rig whose rows
-do not correspond, because its calibration is wrong, shows the same shift at every speed; a
-polynomial of the position in the image takes that.
+In a rectified pair a point lies in the same row of both images. If the right image is taken later,
+the point's row in it is shifted by its image velocity times the delay. Its column is shifted as
+well, which distorts the map: bundle adjustment explains much of a column shift by depth and motion.
+A row shift does not depend on depth, so bundle adjustment cannot absorb it, and no map is needed to
+measure it. If a wrong calibration misaligns the rows, they are shifted by the same amount at every
+speed; a polynomial of the position in the image models that part.
 
-The delay is measured and reported, never corrected on the way: it is known only after some seconds,
-when the map is bent already. ``Camera.right_delay`` corrects it wherever the motion is known.
+The delay is measured and reported, but not corrected during the run: it is known only after some
+seconds, when the map is already distorted. Set ``Camera.right_delay`` in the calibration to correct
+it in every frame whose motion is known.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from vslam.geometry import Matrix
 from vslam.image_motion import rays, row_speeds
 from vslam.kernels import inner_kernel, kernel
 
-EVERY = 8  # of that many features one is measured: they are a hundred an image
-ROUNDS = 3  # of Gauss-Newton, at most
-STILL = 0.05  # pixels; a smaller step ends them
-LARGEST = 3.0  # pixels of the feature's level: beyond, it is another thing
+EVERY = 8  # one in this many features is measured, about a hundred per image
+ROUNDS = 3  # maximum number of Gauss-Newton steps
+STILL = 0.05  # pixels; a smaller step ends the iteration
+LARGEST = 3.0  # pixels of the feature's level; a larger shift is a wrong match
 HUBER_PX = 0.3
 FRAMES_OF_A_GROUP, FEWEST_GROUPS, MOST_GROUPS = 5, 5, 16
-_DEGREE = 3  # of the polynomial
+_DEGREE = 3  # degree of the polynomial in the image coordinates
 _NUISANCES = (_DEGREE + 1) * (_DEGREE + 2) // 2
 _SOLUTION, _TWIST = (1 + _NUISANCES,), (6,)
 _WAITING, _GROUP = (7 + _NUISANCES, 7 + _NUISANCES), (2 + _NUISANCES, 2 + _NUISANCES)
@@ -41,8 +42,12 @@ _WAITING, _GROUP = (7 + _NUISANCES, 7 + _NUISANCES), (2 + _NUISANCES, 2 + _NUISA
 def row_offsets(
     left: Extraction, right: Extraction, u_right: NDArray[np.float32], config: StereoConfig
 ) -> NDArray[np.float32]:
-    """By how many pixels stereo matches are lower in the right image than in the left one:
-    ``(N,)`` float32, of some of them; NaN of all other features."""
+    """``(N,)`` float32, by how many full-resolution pixels the match of a feature is lower in the
+    right image than in the left one, measured for a subset of the features; NaN for the others.
+
+    Args:
+        u_right: ``(N,)`` columns of the left features in the right image, NaN without a match.
+    """
     pyramid = left.pyramid
     return _row_offsets(
         left.xy,
@@ -75,11 +80,12 @@ def _row_offsets(xy, octave, u_right, pixels_l, pixels_r, offsets, shapes, half)
 
 @inner_kernel
 def _row_shift(image_l, image_r, x, y, dx, half):
-    """Rows by which the patch around ``(x, y)`` is lower in the right image, NaN where it does not
-    tell; ``dx`` columns to the right of it is where to begin.
+    """Rows by which the patch around ``(x, y)`` of the left image is lower in the right one, in
+    pixels of the level; NaN if it has too little texture or cannot be found. The search starts at
+    the horizontal shift ``dx``.
 
-    The inverse compositional form of Lucas and Kanade's method (Baker and Matthews, IJCV 2004): the
-    gradients are those of the left patch.
+    Uses inverse compositional Lucas-Kanade (Baker and Matthews, IJCV 2004), so the gradients are
+    taken from the left patch.
     """
     height, width = image_l.shape
     edge = half + 1
@@ -110,7 +116,7 @@ def _row_shift(image_l, image_r, x, y, dx, half):
                 gy = 0.5 * (float(image_l[y + j + 1, x + k]) - float(image_l[y + j - 1, x + k]))
                 here = _between(image_r, x0 + k, y0 + j, a, b) - float(image_l[y + j, x + k])
                 rx, ry, total = rx + gx * here, ry + gy * here, total + here
-        # One side may be brighter.
+        # Subtracting the mean difference allows for a difference in brightness.
         mean = total / (2 * half + 1) ** 2
         rx, ry = rx - mean * sum_x, ry - mean * sum_y
         step_x, step_y = (yy * rx - xy * ry) / determinant, (xx * ry - xy * rx) / determinant
@@ -124,7 +130,7 @@ def _row_shift(image_l, image_r, x, y, dx, half):
 
 @inner_kernel
 def _between(image, x, y, a, b):
-    """Bilinear, at ``(x + a, y + b)``."""
+    """Grey value at ``(x + a, y + b)``, interpolated bilinearly."""
     upper = (1.0 - a) * float(image[y, x]) + a * float(image[y, x + 1])
     lower = (1.0 - a) * float(image[y + 1, x]) + a * float(image[y + 1, x + 1])
     return (1.0 - b) * upper + b * lower
@@ -132,17 +138,17 @@ def _between(image, x, y, a, b):
 
 @dataclass(frozen=True, eq=False)
 class DelayState:
-    """What ``SideDelay`` has learned.
+    """The state of ``SideDelay``. "Moments" are weighted second moments, see ``_moments``.
 
     Attributes:
-        n_group: frames in the group that is being filled.
-        length: frames in a full group.
-        solution: ``(1 + P,)`` the delay and the P coefficients of the polynomial, as of the last
-            full group.
-        twist: ``(6,)`` of the last frame, per second.
-        waiting: ``(7 + P, 7 + P)`` sums of the last frame.
-        group: ``(2 + P, 2 + P)`` sums of the group that is being filled.
-        groups: ``(G, 2 + P, 2 + P)`` sums of the full groups.
+        n_group: number of frames in the group that is being filled.
+        length: number of frames in a full group.
+        solution: ``(1 + P,)`` the delay in seconds and the P coefficients of the polynomial, as of
+            the last full group.
+        twist: ``(6,)`` velocity before the last frame, per second.
+        waiting: ``(7 + P, 7 + P)`` moments of the last frame.
+        group: ``(2 + P, 2 + P)`` moments of the group that is being filled.
+        groups: ``(G, 2 + P, 2 + P)`` moments of the full groups.
     """
 
     n_group: int
@@ -155,7 +161,7 @@ class DelayState:
 
     @classmethod
     def nothing(cls) -> DelayState:
-        """Before the first frame."""
+        """The state before the first frame."""
         return cls(
             n_group=0,
             length=FRAMES_OF_A_GROUP,
@@ -167,24 +173,25 @@ class DelayState:
         )
 
     def numbers(self) -> tuple[float, ...]:
-        """The state as a map file keeps it; ``of_numbers`` reads it."""
+        """The state as stored in a map file; ``of_numbers`` is the inverse."""
         arrays = (self.solution, self.twist, self.waiting, self.group, self.groups)
         flat = np.concatenate([array.ravel() for array in arrays])
         return (float(self.n_group), float(self.length), *flat.tolist())
 
     @classmethod
     def of_numbers(cls, numbers: tuple[float, ...]) -> DelayState:
-        """The state that ``numbers`` gave; of no numbers, that before the first frame.
+        """The state that ``numbers`` returned; an empty tuple gives the state before the first
+        frame.
 
         Raises:
-            ValueError: the numbers are no state.
+            ValueError: the length of ``numbers`` is not that of a state.
         """
         if not numbers:
             return cls.nothing()
         ends = np.cumsum([np.prod(shape) for shape in (_SOLUTION, _TWIST, _WAITING, _GROUP)])
         values = np.array(numbers[2:])
         if len(values) < ends[-1] or (len(values) - ends[-1]) % np.prod(_GROUP):
-            raise ValueError("what it knows of the delay between the sides is damaged")
+            raise ValueError("the stored measurement of the right image's delay is damaged")
         solution, twist, waiting, group, groups = np.split(values, ends)
         return cls(
             n_group=int(numbers[0]),
@@ -198,15 +205,17 @@ class DelayState:
 
 
 class SideDelay:
-    """What all frames so far tell of the delay, by least squares.
+    """Least-squares estimate of the delay of the right image from all frames so far.
 
-    The speed of the image at a frame is that between the frames before and after it: the sums of a
-    frame wait for the next one. They can, since a speed is linear in the twist.
+    The velocity at a frame is the mean of the velocities before and after it, so the moments of a
+    frame are kept until the next frame is tracked. This is possible because image velocities are
+    linear in the twist.
 
     Attributes:
-        seconds: by which the right side is late.
-        sigma: of that, from how much groups of frames contradict each other (Liang and Zeger,
-            Biometrika 1986); infinite until there are enough groups.
+        seconds: by how much the right image is later than the left one.
+        sigma: standard deviation of ``seconds``, from the disagreement between groups of frames
+            (cluster-robust: Liang and Zeger, Biometrika 1986); infinite until there are enough
+            groups.
     """
 
     _solution: NDArray[np.float64]
@@ -221,8 +230,8 @@ class SideDelay:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the delay differs from that of the calibration (``Camera.right_delay``) by more
-        than can be chance."""
+        """Whether the measured delay differs significantly from the calibrated one
+        (``Camera.right_delay``)."""
         least = max(self._config.least_delay, self._config.delay_sigmas * self.sigma)
         return abs(self.seconds - self._camera.right_delay) > least
 
@@ -233,14 +242,14 @@ class SideDelay:
         twist: Matrix | None,
         scales: NDArray[np.float64],
     ) -> None:
-        """Learn from a tracked frame.
+        """Add the measurements of a tracked frame.
 
         Args:
-            features: N of them.
-            row_offset: ``Extracted.row_offset``; without it, there is nothing to learn.
-            twist: ``(6,)`` per second, maps points of the camera before to those of this one; None
-                if unknown.
-            scales: ``(levels,)`` of the pyramid.
+            features: the N features of the frame.
+            row_offset: ``Extracted.row_offset``; without it the frame is skipped.
+            twist: ``(6,)`` per second; its exponential over the elapsed time maps points from the
+                previous camera frame to this one. None if unknown; then the frame is skipped.
+            scales: ``(levels,)`` pyramid scale factors.
         """
         if row_offset is None or twist is None:
             self._waiting[:] = 0.0
@@ -250,7 +259,7 @@ class SideDelay:
         self._waiting = self._moments(features, row_offset, twist, scales)
 
     def state(self) -> DelayState:
-        """All that was learned."""
+        """The state, for a saved map or a checkpoint."""
         return DelayState(
             self._n_group,
             self._length,
@@ -262,7 +271,7 @@ class SideDelay:
         )
 
     def restore(self, state: DelayState) -> None:
-        """Continue from what ``state`` gave."""
+        """Continue from a state that ``state`` returned."""
         self.seconds, self.sigma = 0.0, np.inf
         self._n_group, self._length = state.n_group, state.length
         self._solution = state.solution.copy()
@@ -279,8 +288,9 @@ class SideDelay:
         twist: Matrix,
         scales: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Weighted second moments of the derivatives of the speed by the twist, the polynomial and
-        the row offsets of a frame. What contradicts the rest weighs little (Huber)."""
+        """Weighted second moments ``(7 + P, 7 + P)`` of the regression of a frame: six derivatives
+        of the row velocity by the twist, the P terms of the polynomial, and the row offset.
+        Outliers are down-weighted (Huber)."""
         chosen = np.flatnonzero(np.isfinite(row_offset) & np.isfinite(features.u_right))
         xy = features.xy[chosen]
         x, y = rays(xy, self._camera)
@@ -296,7 +306,7 @@ class SideDelay:
         return moments
 
     def _take_in(self, twist: Matrix) -> None:
-        """Add the frame that waits, now that its motion is known from both sides."""
+        """Add the moments of the waiting frame to its group, with ``twist`` as its velocity."""
         if not self._waiting.any():
             return
         project = np.zeros((len(self._group), len(self._waiting)))
@@ -307,7 +317,7 @@ class SideDelay:
         if self._n_group == self._length:
             self._groups.append(self._group)
             self._group, self._n_group = np.zeros_like(self._group), 0
-            if len(self._groups) == MOST_GROUPS:  # each two become one
+            if len(self._groups) == MOST_GROUPS:  # merge them in pairs
                 self._groups = [
                     a + b for a, b in zip(self._groups[::2], self._groups[1::2], strict=True)
                 ]

@@ -1,8 +1,9 @@
-"""Whether both sides of a stereo rig see the same light, and what to do where they do not.
+"""Compares the exposure of both images of a stereo pair, and balances them where they differ.
 
-Patches of both images are compared grey value by grey value (SAD): a side that is a stop darker
-moves disparities, one that is two stops darker ruins them, without a frame being lost. The gain
-between the sides is that of the quantiles of all grey values: both look at the same scene.
+Stereo matching compares patches by the sum of absolute differences of their grey values. If one
+image is darker by one stop, disparities are biased; at two stops they are useless, although no
+frame is lost. Both cameras look at the same scene, so the gain between them follows from the
+quantiles of all grey values.
 """
 
 from __future__ import annotations
@@ -18,22 +19,22 @@ from vslam.config import StereoConfig
 
 Grey = NDArray[np.uint8]
 
-_STRIDE = 8  # a few thousand pixels tell quantiles to a grey level
+_STRIDE = 8  # a few thousand pixels suffice to know quantiles to a grey level
 _LOW, _HIGH = 0.05, 0.95
-_WITHIN = 0.98  # of their share, so that no quantile lies on its edge
-_LEAST_SHARE = 0.25  # of the pixels, for a gain to be told by
-_LEAST_RANGE = 4.0  # grey levels: below that a quantile's rounding is the gain
-_SEES = 16.0  # least range of the grey values of a side that shows something
+_WITHIN = 0.98  # upper quantile as a fraction of the share of pixels that are not overexposed
+_LEAST_SHARE = 0.25  # least share of the pixels from which a gain is estimated
+_LEAST_RANGE = 4.0  # grey levels; over a smaller range, rounding dominates the gain
+_SEES = 16.0  # least range of the grey values of an image that is not black
 
 
 @dataclass(frozen=True)
 class Sides:
-    """What sets the sides apart.
+    """The difference in exposure between the two images of a pair.
 
     Attributes:
-        darker_stops: by how much the right side is darker than the left; 0 where they differ by
-            less than the threshold, or not by a gain.
-        black: the side that shows nothing while the other one does.
+        darker_stops: by how many stops the right image is darker than the left one; 0 if they
+            differ by less than the threshold, or if no gain explains the difference.
+        black: the side that is black while the other is not; empty if there is none.
     """
 
     darker_stops: float = 0.0
@@ -41,7 +42,7 @@ class Sides:
 
 
 def compare_sides(left: Grey, right: Grey, config: StereoConfig) -> Sides:
-    """Compare the light of both ``(H, W)`` images of a rectified pair."""
+    """Compare the exposure of both ``(H, W)`` uint8 images of a rectified pair."""
     ours, theirs = _shares(left), _shares(right)
     if _is_black(ours, theirs, config):
         return Sides(black="left")
@@ -53,10 +54,10 @@ def compare_sides(left: Grey, right: Grey, config: StereoConfig) -> Sides:
 def balanced(
     left: Grey, right: Grey, config: StereoConfig, sides: Sides | None = None
 ) -> tuple[Grey, Grey]:
-    """Both images, the darker one brightened where a gain sets them apart; else as they are.
+    """Both images; if they differ by a gain, the darker one is brightened.
 
     Args:
-        sides: what ``compare_sides`` says of them, if that is known.
+        sides: the result of ``compare_sides``; None computes it.
     """
     stops = (sides or compare_sides(left, right, config)).darker_stops
     if stops > 0:
@@ -67,13 +68,14 @@ def balanced(
 
 
 def _shares(image: Grey) -> NDArray[np.float64]:
-    """``(256,)`` share of the pixels that are at most as bright."""
+    """``(256,)`` cumulative histogram: share of the pixels that are at most as bright."""
     counts = np.bincount(image[::_STRIDE, ::_STRIDE].ravel(), minlength=256)
     return np.cumsum(counts) / counts.sum()
 
 
 def _quantiles(shares: NDArray[np.float64], *at: float) -> list[float]:
-    # Within a grey value pixels are spread evenly: quantiles of few grey values stay smooth.
+    # Pixels of one grey value are taken to be spread evenly over it, so that quantiles vary
+    # smoothly even if only few grey values occur.
     values: list[float] = np.interp(at, shares, np.arange(256) + 0.5).tolist()
     return values
 
@@ -87,9 +89,9 @@ def _is_black(side: NDArray[np.float64], other: NDArray[np.float64], config: Ste
 
 
 def _stops(ours: NDArray[np.float64], theirs: NDArray[np.float64], config: StereoConfig) -> float:
-    """Logarithm of the gain from theirs to ours, 0 where it is below the threshold or no gain
-    explains dark and bright pixels alike. Pixels that are overexposed on
-    either side are left out of both."""
+    """Binary logarithm of the gain from ``theirs`` to ``ours``; 0 if it is below the threshold, or
+    if dark and bright pixels do not agree on a gain. Both images are compared below an upper
+    quantile that excludes the pixels that are overexposed in either of them."""
     below = config.clipped_from - 1
     top, dull = _HIGH, float(min(ours[below], theirs[below]))
     if dull <= top:
@@ -106,9 +108,9 @@ def _stops(ours: NDArray[np.float64], theirs: NDArray[np.float64], config: Stere
     gain = log2((a_low + a_high) / (b_low + b_high))
     if abs(gain) <= config.balance_from:
         return 0.0
-    if least >= _LEAST_RANGE:  # below, halves differ by rounding
+    if least >= _LEAST_RANGE:  # over a smaller range, the halves differ by rounding
         low, high = log2(a_low / b_low), log2(a_high / b_high)
-        # A few bright pixels more on one side stretch its upper half alone: that is no gain.
+        # A few more bright pixels in one image stretch only its upper half, which is no gain.
         if min(low * np.sign(gain), high * np.sign(gain)) <= config.balance_from:
             return 0.0
         if abs(low - high) > config.max_gain_disagreement:
@@ -117,7 +119,8 @@ def _stops(ours: NDArray[np.float64], theirs: NDArray[np.float64], config: Stere
 
 
 def _brightened(dark: Grey, bright: Grey, stops: float) -> Grey:
-    """Multiplied so, and shifted to the lower quantile of the bright side."""
+    """The dark image, multiplied by ``2 ** stops`` and shifted so that its lower quantile is that
+    of the bright image."""
     (low,), (target,) = _quantiles(_shares(dark), _LOW), _quantiles(_shares(bright), _LOW)
     table = (np.arange(256) + 0.5 - low) * 2.0**stops + target - 0.5
     return np.clip(np.rint(table), 0, 255).astype(np.uint8)[dark]

@@ -1,9 +1,9 @@
-"""The Gaussian blur before BRIEF, in OpenCV's fixed-point numbers.
+"""The Gaussian blur before BRIEF, with the same result as OpenCV's fixed-point version.
 
-``cv2.GaussianBlur`` with 7x7 pixels and a deviation of 2 weights bytes by 1/256 in rows and columns
-and rounds once at the end. Here every sum of a pass fits 16 bits, so that a register takes twice as
-many pixels as with 32: the sums of the rows are split into whole grey levels and 256ths, and the
-columns are summed over both.
+``cv2.GaussianBlur`` with a 7x7 kernel and a sigma of 2 weights bytes in multiples of 1/256, first
+along rows, then along columns, and rounds once at the end. Here every intermediate sum fits 16
+bits, so that a vector register holds twice as many pixels as with 32 bits: row sums are split into
+whole grey levels and 256ths, and both parts are summed along the columns.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ import numpy as np
 
 from vslam.kernels import borrowed, inner_kernel, kernel
 
-REACH = 3  # pixels to both sides
+REACH = 3  # radius of the kernel, pixels
 
 
 @kernel
 def smoothed(pixels):
-    """Blurred image, ``(H, W)`` uint8, of one of at least 4x4 pixels, mirrored at its border."""
+    """Blur an ``(H, W)`` uint8 image of at least 4x4 pixels, with mirrored borders."""
     height, width = pixels.shape
     taps = 2 * REACH + 1
     out = np.empty((height, width), np.uint8)
     row = np.empty(width + 2 * REACH, np.uint16)
-    rows = np.empty((taps, 2 * width), np.uint16)  # of the last rows, wholes and 256ths
+    rows = np.empty((taps, 2 * width), np.uint16)  # the last row sums: whole levels, then 256ths
     total = np.empty(2 * width, np.uint16)
     n = np.uintp(width)
     for y in range(-REACH, height + REACH):
@@ -59,6 +59,7 @@ def smoothed(pixels):
 
 @inner_kernel
 def weigh(a, b, c, d, e, f, g, out):
-    """The weights of a deviation of 2 in 256ths, as OpenCV rounds them so that their sum is 256."""
+    """Weighted sum of seven rows or shifted copies of one. The weights are those of a Gaussian of
+    sigma 2 in 256ths, rounded as OpenCV does so that they sum to 256."""
     for x in range(np.uintp(len(out))):
         out[x] = 18 * (a[x] + g[x]) + 34 * (b[x] + f[x]) + 48 * (c[x] + e[x]) + 56 * d[x]

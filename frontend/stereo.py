@@ -13,19 +13,22 @@ from vslam.features import MIN_DISPARITY, level_pixel
 from vslam.frontend.orb import Extraction
 from vslam.kernels import hamming, inline, inner_kernel, kernel
 
-LANES = 16  # shifts of the SAD window tried at once
-REFINE_HALF = 4  # of the patch that is refined: a larger one reaches over nearer things
-MEDIAN_FACTOR = 1.5 * 1.4826  # 1.5 standard deviations, from the median of a half-normal
+LANES = 16  # shifts of the SAD window that are evaluated at once
+# Half width of the patch used for sub-pixel refinement, pixels; a larger patch would more often
+# include a nearer object.
+REFINE_HALF = 4
+MEDIAN_FACTOR = 1.5 * 1.4826  # 1.5 standard deviations, estimated from the median
 
 
 def match_stereo(
     left: Extraction, right: Extraction, camera: Camera, config: StereoConfig
 ) -> NDArray[np.float32]:
-    """Column in the right image of each left feature, ``(N,)`` float32, NaN without a match.
+    """``(N,)`` float32, column of each left feature in the right image, NaN without a match.
 
-    Candidates lie in the same rows (2 px at the scale of the right feature), within an octave,
-    at a disparity from 0 to that of a point one baseline away. The descriptor chooses; a SAD
-    window slid at the left feature's level then places the match to a fraction of a pixel.
+    Candidates lie in the same row (within 2 px at the scale of the right feature) and at most one
+    octave apart, at a disparity between 0 and that of a point one baseline away. The candidate with
+    the closest descriptor is chosen; sliding a SAD window at the level of the left feature then
+    locates the match to a fraction of a pixel.
     """
     u_right, sad = _match(
         _Side.of_extraction(left),
@@ -43,8 +46,8 @@ def match_stereo(
 
 
 class _Side(NamedTuple):
-    """One image: ``xy`` (N, 2) f4, ``octave`` (N,) u1, ``descriptor`` (N, 4) u8 of its features;
-    ``pixels`` u1, its pyramid."""
+    """One image: ``xy`` (N, 2), ``octave`` (N,) and ``descriptor`` (N, 4) of its features, and the
+    ``pixels`` of its pyramid."""
 
     xy: NDArray[np.float32]
     octave: NDArray[np.uint8]
@@ -59,7 +62,8 @@ class _Side(NamedTuple):
 
 @kernel
 def rows_to_features(xy, octave, scales, height):
-    """Features that may match in each row, as ``start`` ``(height + 1,)`` and ``items``."""
+    """Index the features by the rows in which they may match: those of row r are
+    ``items[start[r]:start[r + 1]]``, with ``start`` ``(height + 1,)`` int64."""
     start = np.zeros(height + 1, np.int64)
     n = len(xy)
     for fill in range(2):
@@ -83,7 +87,8 @@ def rows_to_features(xy, octave, scales, height):
 
 @kernel
 def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, half, reach):
-    """Returns ``u_right`` ``(N,)`` float32 and the SAD of each match (-1 without), ``(N,)``."""
+    """Returns ``(N,)`` float32 ``u_right``, NaN without a match, and ``(N,)`` float32 SAD of each
+    match, -1 without one."""
     xy_l, octave_l, descriptors_l, pixels_l = left
     xy_r, octave_r, descriptors_r, pixels_r = right
     n = len(xy_l)
@@ -94,8 +99,8 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
     for i in range(n):
         u, v = xy_l[i, 0], xy_l[i, 1]
         row = int(v)
-        # Few of a row come into question, nobody could foretell which: they are listed without a
-        # branch.
+        # Only few features of a row are candidates, and no branch predictor could tell which, so
+        # they are listed without a branch.
         n_candidates = 0
         for k in range(start[row], start[row + 1]):
             j = items[k]
@@ -133,11 +138,11 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
 
 @kernel
 def drop_outliers(u_right, sad, octave):
-    """Unmatch what differs more than ``MEDIAN_FACTOR`` times the median of its octave.
+    """Remove matches whose SAD exceeds ``MEDIAN_FACTOR`` times the median of their octave.
 
     Args:
-        u_right: ``(N,)`` float32, NaN is written.
-        sad: ``(N,)`` float32 of each match, -1 without one.
+        u_right: ``(N,)`` float32; NaN is written for removed matches.
+        sad: ``(N,)`` float32, SAD of each match, -1 without one.
         octave: ``(N,)`` uint8, sorted.
     """
     first = 0
@@ -159,7 +164,9 @@ def drop_outliers(u_right, sad, octave):
 
 @kernel
 def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
-    """Offset from ``x_r`` at which the patches agree best, and their SAD; NaN if at the border."""
+    """Offset from ``x_r`` in pixels of the level at which the patches agree best, and their SAD.
+    The offset is NaN if a patch would leave the image or the minimum lies at the end of the
+    search range."""
     height, width = image_l.shape
     if (
         y_l < half
@@ -186,16 +193,16 @@ def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
 
 @inner_kernel
 def add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs):
-    """Sums of absolute differences at all shifts: a register holds ``LANES`` shifts, and four
-    columns of the patch are summed before it is stored.
+    """Add the sum of absolute differences at each shift to ``costs``.
 
-    Lanes beyond the last shift count for nothing and may lie in the next row.
+    A vector register holds ``LANES`` shifts, and four columns of the patch are summed before it is
+    stored. Lanes beyond the last shift are ignored by the caller and may read from the next row.
     """
     width = image_l.shape[1]
     flat_l, flat_r = image_l.reshape(image_l.size), image_r.reshape(image_r.size)
     side = 2 * half + 1
     one, two, three = np.uintp(1), np.uintp(2), np.uintp(3)
-    total = np.empty(LANES, np.uint16)  # of a row
+    total = np.empty(LANES, np.uint16)  # sums over one row of the patch
     for first in range(0, len(costs), LANES):
         for dy in range(-half, half + 1):
             row = (y_l + dy) * width
@@ -227,16 +234,18 @@ def add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs):
 
 @inline
 def difference(a, b):
-    """Absolute difference of two bytes: in bytes, so that a register takes many."""
+    """Absolute difference of two bytes, computed in bytes so that a register holds many."""
     return np.uint16(np.uint8(max(a, b) - min(a, b)))
 
 
 @inner_kernel
 def refine_shift(image_l, image_r, x_l, y_l, x_r, shift, half):
-    """Shift in pixels that minimises the squared differences, from ``shift`` in (-1, 1).
+    """Shift in pixels that minimises the sum of squared differences, from a first estimate
+    ``shift`` in (-1, 1).
 
-    The parabola through three sums of absolute differences is drawn to whole pixels; two steps
-    of Gauss-Newton on the interpolated patch are not (Lucas and Kanade, IJCAI 1981).
+    The minimum of a parabola through three sums of absolute differences is biased towards whole
+    pixels; two Gauss-Newton steps on the interpolated patch remove that bias (Lucas and Kanade,
+    IJCAI 1981).
     """
     start = shift
     width = image_r.shape[1]
@@ -253,7 +262,7 @@ def refine_shift(image_l, image_r, x_l, y_l, x_r, shift, half):
                 b0, b1 = np.float32(b[k]), np.float32(b[k + 1])
                 b2, b3 = np.float32(b[k + 2]), np.float32(b[k + 3])
                 value = b1 + part * (b2 - b1)
-                # Central difference, interpolated the same way.
+                # Central difference, interpolated in the same way.
                 slope = np.float32(0.5) * (b2 - b0 + part * ((b3 - b1) - (b2 - b0)))
                 numerator += slope * (np.float32(a[k]) - value)
                 denominator += slope * slope

@@ -1,4 +1,4 @@
-"""Where the camera is, given the frames before and a view of the map."""
+"""Tracks the camera from frame to frame against a view of the map."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from vslam.states import TrackerState
 
 
 class TrackerStatus(Enum):
-    """What the tracker has to go on."""
+    """What the tracker knows about the position of the camera."""
 
     UNKNOWN = "unknown"
-    """No frame was tracked in this map, and nothing tells where the camera is in it."""
+    """No frame has been tracked in this map, and the camera may be anywhere in it."""
     RESUMED = "resumed"
-    """No frame was tracked yet, but a drive is continued: the camera is where that stopped."""
+    """No frame has been tracked yet, but a drive is continued, so the camera is where it ended."""
     TRACKING = "tracking"
-    """The last frame was tracked, found again, or began a map."""
+    """The last frame was tracked or relocalised, or it started a map."""
     LOST = "lost"
     """The last frame was not tracked; an earlier one may have been."""
 
@@ -41,10 +41,11 @@ class Found:
 
     Attributes:
         state: OK, WEAK or LOST.
-        n_matches, n_inliers: of landmarks, before and after the last pose optimisation.
-        visible: ``(N,)`` int32, the landmarks that the frame should see.
-        keyframe: where it was found by searching the whole map; -1 if it was tracked.
-        is_doubtful: whether it has so few inliers that its matches may be wrong.
+        n_matches, n_inliers: number of matched landmarks before and after the last pose
+            optimisation.
+        visible: ``(N,)`` int32 ids of the landmarks that the frame should see.
+        keyframe: id of the keyframe at which the frame was relocalised; -1 if it was tracked.
+        is_doubtful: whether the frame has so few inliers that its matches may be wrong.
     """
 
     state: TrackingState
@@ -56,26 +57,27 @@ class Found:
 
     @classmethod
     def at_start(cls, frame: Frame, *, begun: bool) -> Found:
-        """What is found before there is a map: all that a map begins with, if it has begun."""
+        """The result for a frame before tracking starts: OK with all landmarks that it created if
+        it has started a map (``begun``), otherwise LOST."""
         n_landmarks = int(np.count_nonzero(frame.landmark >= 0))
         state = TrackingState.OK if begun else TrackingState.LOST
         return cls(state, n_landmarks, n_landmarks)
 
     @property
     def is_lost(self) -> bool:
-        """Whether the pose is not to be used."""
+        """Whether the pose must not be used."""
         return self.state == TrackingState.LOST
 
     @property
     def relocalised(self) -> bool:
-        """Whether the frame was found by searching the whole map."""
+        """Whether the frame was found by a search of the whole map."""
         return self.keyframe >= 0
 
 
 def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingState:
-    """What matches, and inliers of the pose optimisation, are worth."""
+    """The tracking state, from the numbers of matches and of inliers of the pose optimisation."""
     config = context.config.tracking
-    # In the wide windows of an RGB-D camera, a wrong pose too finds some inliers.
+    # In the wide search windows of an RGB-D camera, even a wrong pose finds some inliers.
     share = config.depth_min_inlier_ratio if context.camera.depth else 0.0
     if n_inliers < config.min_inliers_lost or n_inliers < share * n_matches:
         return TrackingState.LOST
@@ -83,12 +85,12 @@ def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingS
 
 
 class Tracker:
-    """Tracks one frame after the other. It never sees the map, only a view of it.
+    """Tracks one frame after the other. It has no access to the map, only to a view of it.
 
     Attributes:
-        status: what there is to go on.
+        status: what is known about the position of the camera.
         last: the frame that was tracked last, None before the first.
-        lost_frames: lost since then.
+        lost_frames: number of frames lost since then.
     """
 
     def __init__(self, context: TrackingContext) -> None:
@@ -102,16 +104,16 @@ class Tracker:
 
     @property
     def twist(self) -> Matrix | None:
-        """``(6,)`` speed of the camera, per second, when it was tracked last; None if unknown."""
+        """``(6,)`` velocity of the camera when it was last tracked, per second; None if unknown."""
         return self._resumed_twist if self.last is None else self.last.twist
 
     def predict(self, timestamp: float, frames: FramePoses, view: MapView) -> Matrix:
-        """Pose ``T_cw`` at a time, at constant velocity per second, so that dropped frames do not
-        disturb it. In a map that was loaded, the camera is taken to be at the reference keyframe
-        until it is found.
+        """Predict the ``(4, 4)`` pose ``T_cw`` at a time in seconds. The velocity is constant per
+        second, not per frame, so that dropped frames do not disturb it. In a loaded map, the camera
+        is predicted to be at the reference keyframe until it is found.
 
         Args:
-            frames: all frames before, lost ones included.
+            frames: poses of all earlier frames, including lost ones.
         """
         if not len(frames):
             return view.T_reference
@@ -122,11 +124,11 @@ class Tracker:
         return orthonormalised(se3_exp(self.twist * elapsed) @ T_last)
 
     def track(self, frame: Frame, T_cw: Matrix, view: MapView, frames: FramePoses) -> Found:
-        """Track a frame that is expected at ``T_cw``: first by what the last frame or the reference
-        keyframe saw, then by all landmarks around.
+        """Track a frame that is expected at ``T_cw``: first against the last frame or the reference
+        keyframe, then against all landmarks of the local map.
 
         Args:
-            frames: all frames before.
+            frames: poses of all earlier frames.
         """
         n_inliers = self._track_previous_frame(frame, T_cw, view)
         if n_inliers < self._config.tracking.min_inliers_frame:
@@ -139,11 +141,12 @@ class Tracker:
         return Found(state, n_matches, n_inliers, visible, is_doubtful=doubtful)
 
     def accept(self, frame: Frame, found: Found, frames: FramePoses) -> None:
-        """Go on from a frame that was found, and measure its twist: the motion since the last frame
-        tracked. Where the camera was found again, the leap to there is no motion.
+        """Continue from a frame that was found, and measure its twist from the motion since the
+        last tracked frame. A relocalised frame gets no twist, because the jump to its pose is not a
+        motion of the camera.
 
         Args:
-            frames: all frames before.
+            frames: poses of all earlier frames.
         """
         if not found.relocalised:
             last = -1 if self.last is None else self.last.index
@@ -153,24 +156,25 @@ class Tracker:
         self.start_from(frame)
 
     def start_from(self, frame: Frame) -> None:
-        """Go on from a frame with which a map or a sub-map began."""
+        """Continue from a frame that started a map or a sub-map."""
         self.last, self.lost_frames, self.status = frame, 0, TrackerStatus.TRACKING
 
     def lose(self) -> None:
-        """A frame was not tracked."""
+        """Note that a frame was not tracked."""
         self.lost_frames += 1
         self.status = TrackerStatus.LOST
 
     def resume(self, twist: Matrix | None = None) -> None:
-        """Continue a drive of which no frame is kept.
+        """Continue a drive whose last frame is not available.
 
         Args:
-            twist: ``(6,)`` the speed of the camera at its end, per second; None if unknown.
+            twist: ``(6,)`` velocity of the camera at its end, per second; None if unknown.
         """
         self.status, self._resumed_twist = TrackerStatus.RESUMED, twist
 
     def state(self) -> TrackerState | None:
-        """What is remembered between two frames; None before the first frame is tracked."""
+        """The state between two frames, for a checkpoint; None before the first frame is
+        tracked."""
         last = self.last
         if last is None:
             return None
@@ -186,10 +190,11 @@ class Tracker:
         )
 
     def restore(self, state: TrackerState, xyz: Matrix) -> Frame:
-        """Remember what ``state`` gave, and return the last frame.
+        """Continue from a state that ``state`` returned, and return the last frame.
 
         Args:
-            xyz: ``(N, 3)`` where the landmarks of the last frame are; NaN without one.
+            xyz: ``(N, 3)`` positions in the world of the landmarks that the last frame tracks, NaN
+                for features without a landmark.
         """
         extracted = Extracted(state.features)
         last = Frame.of(extracted, self._context.camera, state.index, state.timestamp)
@@ -202,8 +207,8 @@ class Tracker:
         return last
 
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
-        """Track along the prediction; where there is none or it fails, against the reference
-        keyframe. Returns inliers."""
+        """Track against the last frame with the predicted pose; if the motion is unknown or this
+        fails, against the reference keyframe. Returns the number of inliers."""
         if self.last is None and self.status is not TrackerStatus.RESUMED:
             return 0
         if self.last is not None and self.last.twist is not None:
@@ -216,8 +221,9 @@ class Tracker:
         return self._track_predicted(frame, T_cw, view)
 
     def _track_predicted(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
-        """Match all landmarks around near the prediction: after a jump of the light, what older
-        frames saw is found where the previous one saw other things. Returns inliers or 0."""
+        """Match all landmarks of the local map near their predicted positions. After a sudden
+        change of brightness, landmarks that older frames saw may still match where those of the
+        previous frame do not. Returns the number of inliers, 0 if the prediction was wrong."""
         frame.T_cw = T_cw
         frame.landmark[:], frame.xyz[:] = -1, np.nan
         window = self._config.tracking.predicted_window
@@ -234,9 +240,9 @@ class Tracker:
         return n_inliers >= max(config.min_inliers_motion, config.min_inlier_ratio * n_matches)
 
     def _is_doubtful(self, frame: Frame, n_inliers: int, view: MapView, frames: FramePoses) -> bool:
-        """Whether a frame has so few inliers that its matches may be wrong, and a reason for it:
-        a gap in time, no known motion to predict the pose with, or a sudden drop of the inliers, as
-        where the camera was carried."""
+        """Whether a frame has so few inliers that its matches may be wrong, and something else
+        casts doubt on them: a gap in time, no known motion to predict the pose with, or a sudden
+        drop in the number of inliers, for example after the camera was picked up and carried."""
         if self.last is None:
             return False
         config = self._config.relocalization
@@ -252,7 +258,8 @@ class Tracker:
 def result_of(
     frame: Frame, found: Found, is_keyframe: bool, stage_ms: dict[str, float]
 ) -> TrackResult:
-    """What a caller is told of a frame."""
+    """The result that a caller of the library gets for a frame; ``stage_ms`` holds the
+    milliseconds of each stage."""
     return TrackResult(
         index=frame.index,
         timestamp=frame.timestamp,

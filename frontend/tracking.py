@@ -1,7 +1,7 @@
 """Tracking of one frame against the map (ORB-SLAM2, section III; ORB-SLAM, section V).
 
-Everything here is a function of the frame, the previous frame and a ``LocalMap``; the map itself
-is never touched, so that local mapping can write it meanwhile.
+Everything here is a function of the frame, the previous frame and a ``LocalMap``. The map itself is
+never accessed, so local mapping can write to it at the same time.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ NEVER = np.iinfo(np.int64).max
 
 @dataclass(frozen=True)
 class TrackingContext:
-    """Camera and thresholds, with what follows from them."""
+    """The camera, the configuration, and quantities derived from them; ``scales`` ``(levels,)`` are
+    the pyramid scale factors."""
 
     camera: Camera
     config: Config
@@ -47,12 +48,12 @@ class TrackingContext:
 
     @property
     def close_depth(self) -> float:
-        """Depth (m) below which a stereo point is close (ORB-SLAM2, III-A)."""
+        """Depth below which a stereo point is close, metres (ORB-SLAM2, III-A)."""
         return self.config.stereo.close_depth_baselines * self.camera.baseline
 
     @property
     def motion_window(self) -> float:
-        """Search radius at octave 0 around what the previous frame saw, pixels."""
+        """Search radius at octave 0 around points that the previous frame saw, pixels."""
         config = self.config.tracking
         return config.depth_motion_window if self.camera.depth else config.motion_window
 
@@ -64,24 +65,25 @@ class TrackingContext:
 
 
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
-    """``(N,)`` depth in metres from stereo, NaN without a match."""
+    """``(N,)`` float64 depth from stereo, metres; NaN for features without a match."""
     return camera.bf / (features.xy[:, 0].astype(np.float64) - features.u_right)
 
 
 def track_motion(
     frame: Frame, previous: Frame, T_cw: NDArray[np.float64], context: TrackingContext
 ) -> tuple[int, int]:
-    """Match what the previous frame saw near where the predicted pose puts it; refine the pose.
+    """Project the points that the previous frame saw with the predicted pose, match them near
+    their projections, and optimise the pose.
 
-    Besides landmarks, close stereo points of the previous frame that are not in the map take part
-    (ORB-SLAM2's visual-odometry points): they steady the pose and are then forgotten.
+    In addition to landmarks, close stereo points of the previous frame that are not in the map take
+    part (the visual-odometry points of ORB-SLAM2). They stabilise the pose and are then discarded.
 
     Args:
+        frame: receives the pose and the matches.
         T_cw: ``(4, 4)`` predicted pose of the left camera.
 
     Returns:
-        Matches, and inliers of the pose optimisation; ``frame`` holds the pose and the matched
-        landmarks.
+        Number of matches, and number of inliers of the pose optimisation.
     """
     config, camera = context.config.tracking, context.camera
     points, source = trackable_points(previous, context)
@@ -91,8 +93,8 @@ def track_motion(
     ahead = in_camera[:, 2] > 0.1
     uvr = camera.project(np.where(ahead[:, None], in_camera, 1.0))
     advance = compose(previous.T_cw, inverse(T_cw))[2, 3]
-    # Moving on by more than the baseline, features can only grow (or shrink) in octave. Without
-    # a baseline nobody knows how far that is.
+    # After a motion of more than the baseline forwards (or backwards), the octave of a feature can
+    # only rise (or fall). A monocular camera has no baseline to compare the motion with.
     low, high = octave - 1, octave + 1
     if advance > camera.baseline > 0.0:
         low, high = octave, np.full_like(octave, NEVER)
@@ -128,7 +130,11 @@ def track_motion(
 def trackable_points(
     previous: Frame, context: TrackingContext
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """World points ``(M, 3)`` that a frame saw, and the ``(M,)`` features that saw them."""
+    """Points that a frame saw: its landmarks and its other close stereo points.
+
+    Returns:
+        ``(M, 3)`` points in the world frame, and ``(M,)`` indices of the features that saw them.
+    """
     points = previous.xyz.copy()
     known = np.isfinite(points[:, 0])
     depth = feature_depth(previous.features, context.camera)
@@ -145,14 +151,15 @@ def track_descriptors(
     T_cw: NDArray[np.float64],
     context: TrackingContext,
 ) -> int:
-    """Match landmarks by descriptor alone and refine the pose from ``T_cw``: no prediction needed.
+    """Match landmarks by their descriptors alone, which needs no prediction, and optimise the pose.
 
     Args:
+        frame: receives the pose and the matches.
         reference: the landmarks of the reference keyframe.
-        T_cw: ``(4, 4)`` pose of the left camera to start from.
+        T_cw: ``(4, 4)`` initial pose of the left camera for the optimisation.
 
     Returns:
-        Inliers of the pose optimisation; ``frame`` holds the pose and the matched landmarks.
+        Number of inliers of the pose optimisation.
     """
     config = context.config.tracking
     found = search_all(
@@ -178,19 +185,21 @@ def track_local_map(
     window: float | None = None,
     patches: LandmarkPatches = NO_PATCHES,
 ) -> tuple[int, int, NDArray[np.int32]]:
-    """Match every local landmark that should be visible, align the matches to a fraction of a
-    pixel, then refine the pose with them.
+    """Match every landmark of the local map that should be visible, align the matches to a
+    fraction of a pixel, and optimise the pose.
 
     Args:
-        window: search radius at octave 0, pixels; None: ``context.local_window``.
-        patches: of the landmarks that can be aligned.
+        frame: receives the pose and the matches.
+        window: search radius at octave 0, pixels; None takes ``context.local_window``.
+        patches: patches of the landmarks that can be aligned.
 
     Returns:
-        Matches, inliers, and the ids of the landmarks that should be visible.
+        Number of matches, number of inliers, and ``(V,)`` int32 ids of the landmarks that should be
+        visible.
     """
     config, camera = context.config.tracking, context.camera
     points = np.flatnonzero(frame.landmark < 0)
-    frame.xyz[points] = np.nan  # points outside the map have done their work
+    frame.xyz[points] = np.nan  # discard the points that are not in the map
     tracked = np.isin(local.ids, frame.landmark[frame.landmark >= 0])
     uvr, radius, octave = predict_view(
         frame.T_camera_w,
@@ -239,11 +248,11 @@ def refine(
     context: TrackingContext,
     shift: NDArray[np.float32] | None = None,
 ) -> int:
-    """Optimise the pose from all matches, drop the outliers, return the number of inliers.
+    """Optimise the pose from all matches, drop the outliers, and return the number of inliers.
 
     Args:
-        T_cw: ``(4, 4)`` pose of the left camera to start from.
-        shift: what ``frame.shift`` is to be; None: no match is aligned.
+        T_cw: ``(4, 4)`` initial pose of the left camera.
+        shift: the new ``Frame.shift``; None if no match is aligned.
     """
     frame.shift = shift
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
@@ -272,7 +281,8 @@ def refine(
 def observations(
     frame: Frame, feature: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``(N, 3)`` u, v, u_right of ``(N,)`` features, and ``(N,)`` their inverse variances."""
+    """``(N, 3)`` float64 u, v, u_right of ``(N,)`` features of a frame, and the ``(N,)`` inverse
+    variances of their coordinates."""
     features = frame.features
     uvr = stack_uvr(features.xy[feature], features.u_right[feature])
     return uvr, context.scales[features.octave[feature]] ** -2.0

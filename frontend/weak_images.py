@@ -1,9 +1,10 @@
-"""Features of images that show little: noise is taken out, faint contrast is raised.
+"""Features of noisy or faint images: noise is filtered and low contrast is raised first.
 
-FAST's thresholds are grey levels, made for images of a usual contrast. At night, in fog or under a
-wrong exposure a corner is a level or two high, and under heavy noise every pixel is a corner.
-Averaging pixels tells fractions of a grey level that rounding has spread over them, so that even
-five levels hold a scene. Neither is done to an image of usual light: it stays as it is.
+The thresholds of FAST are grey levels, chosen for images of normal contrast. At night, in fog or
+with a wrong exposure, a corner stands out by only one or two levels; under heavy noise every pixel
+is a corner. Averaging neighbouring pixels recovers fractions of a grey level that rounding has
+spread over them, so that a scene can be recognised in as few as five levels. Images of normal
+contrast and noise are left unchanged.
 """
 
 from __future__ import annotations
@@ -21,22 +22,27 @@ from vslam.kernels import kernel
 
 Grey = NDArray[np.uint8]
 
-ROW_STRIDE = 32  # of the rows that noise is measured in: 15 thousand pixels of a KITTI image
-# Of a normal number, the median of the size; of I[x-1] - 2 I[x] + I[x+1], the deviation.
+ROW_STRIDE = 32  # noise is measured in every 32nd row, in 15,000 pixels of a KITTI image
+# For Gaussian noise, median abs(I[x-1] - 2 I[x] + I[x+1]) = 0.6745 sqrt(6) sigma.
 _SECOND_DIFFERENCE = 0.6745 * 6.0**0.5
-_SPIKE_DEVIATIONS, LEAST_SPIKE = 4.0, 32.0  # of the noise, grey levels
-_MEDIAN = 5  # side of the filter against spikes, pixels
-_GAUSSIAN = 2.0 * np.pi**0.5  # noise after a blur of s pixels is a (2 sqrt(pi) s)-th
-_BLOCK = 16  # side of the blocks that contrast is measured in, pixels
-_SHOWS_NOTHING = 2  # grey levels between the darkest pixel and the brightest
+_SPIKE_DEVIATIONS, LEAST_SPIKE = 4.0, 32.0  # least height of a spike: in sigma, in grey levels
+_MEDIAN = 5  # side of the median filter against spikes, pixels
+_GAUSSIAN = 2.0 * np.pi**0.5  # a Gaussian blur of s pixels divides noise by 2 sqrt(pi) s
+_BLOCK = 16  # side of the blocks in which contrast is measured, pixels
+_SHOWS_NOTHING = 2  # grey levels between the darkest and the brightest pixel of an empty image
 
 
 def extract_in_any_light(
     images: Sequence[Grey], config: Config, image_map: ImageMap = map
 ) -> list[Extraction]:
-    """ORB features of ``(H, W)`` images of one moment: as ``extract`` has them, or where the
-    images are noisy or faint, of what can be made of them. All are treated alike, for patches of
-    one are compared with those of the other. A pure function.
+    """ORB features of ``(H, W)`` uint8 images that were taken at the same time: as from
+    ``extract``, but noisy images are filtered first, and the contrast of faint ones is raised. All
+    images are processed in the same way, because stereo matching compares their patches.
+
+    A pure function: the result does not depend on ``image_map``.
+
+    Args:
+        image_map: applies a function to all images, in turn or in parallel.
     """
     weak = config.weak_images
     images = without_noise(images, weak)
@@ -48,8 +54,9 @@ def extract_in_any_light(
 
 
 def without_noise(images: Sequence[Grey], config: WeakImageConfig) -> Sequence[Grey]:
-    """The images, those of usual noise themselves: pixels that stand out alone are replaced by
-    the median around, and normal noise is blurred to ``noise_left``."""
+    """Filter the noise of ``(H, W)`` uint8 images: a median filter replaces spikes (single pixels
+    that stand out), and a Gaussian blur reduces the rest to ``noise_left``. Images with normal
+    noise are returned unchanged."""
     measured = [grain(image, ROW_STRIDE, LEAST_SPIKE) for image in images]
     if max(spikes for _, spikes in measured) > config.spikes_from:
         images = [np.asarray(cv2.medianBlur(image, _MEDIAN), np.uint8) for image in images]
@@ -63,14 +70,15 @@ def without_noise(images: Sequence[Grey], config: WeakImageConfig) -> Sequence[G
 
 @kernel
 def grain(image, stride, least):
-    """Noise of an ``(H, W)`` uint8 image, and its spikes, from every ``stride``-th row.
+    """Estimate the noise and the spikes of an ``(H, W)`` uint8 image from every ``stride``-th row.
 
-    The median of second differences along a row looks past edges, which the mean does not
-    (Immerkaer, CVIU 1996, has the mean).
+    Noise is estimated from the median of absolute second differences along a row, which is robust
+    against edges; their mean (Immerkaer, CVIU 1996) is not.
 
     Returns:
-        Deviation of the noise in grey levels; share of the pixels that stand out from both
-        neighbours, to the same side, by ``least`` grey levels and by four deviations.
+        Standard deviation of the noise, grey levels; share of the pixels that are brighter than
+        both neighbours, or darker than both, by more than ``least`` grey levels and more than four
+        standard deviations.
     """
     height, width = image.shape
     counts = np.zeros(1021, np.int64)
@@ -100,8 +108,13 @@ def grain(image, stride, least):
 
 
 def is_faint(images: Sequence[Grey], counts: Sequence[int], config: Config) -> bool:
-    """Whether an image has few corners because of low contrast. One out of focus has few, too, but
-    raising it would raise its rounding; one that shows nothing at all is not asked."""
+    """Whether any of the images has few corners because of low contrast. An image that is out of
+    focus has few corners as well, but raising its contrast would only amplify rounding. An image
+    that shows nothing at all is ignored.
+
+    Args:
+        counts: number of features of each image.
+    """
     few = config.weak_images.few_features * config.orb.n_features
     return any(
         count < few and int(np.ptp(image)) > _SHOWS_NOTHING and _is_faint(image, config.weak_images)
@@ -115,12 +128,12 @@ def _is_faint(image: Grey, config: WeakImageConfig) -> bool:
 
 
 def detail(image: Grey) -> float:
-    """Mean size of second differences along the rows, grey levels."""
+    """Mean absolute second difference along the rows, grey levels."""
     return float(np.abs(np.diff(image[::2].astype(np.int16), 2, axis=1)).mean())
 
 
 def contrast(image: Grey) -> float:
-    """Median over blocks of the deviation of their grey values."""
+    """Median over blocks of the standard deviation of their grey values, grey levels."""
     rows, columns = (side // _BLOCK * _BLOCK for side in image.shape)
     if not rows or not columns:
         return 0.0
@@ -129,8 +142,9 @@ def contrast(image: Grey) -> float:
 
 
 def with_contrast(image: Grey, config: WeakImageConfig) -> Grey:
-    """Brought to the same deviation around every pixel (``contrast_window``), blurred by a pixel
-    first; flat parts, which show noise alone, are raised less."""
+    """Normalise the local contrast of an ``(H, W)`` uint8 image: after a blur of one pixel, grey
+    values are scaled so that their standard deviation in a window (``contrast_window``) around
+    every pixel is the same. Flat regions, which contain only noise, are raised less."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
     window = (config.contrast_window, config.contrast_window)
     mean = cv2.boxFilter(smooth, -1, window)

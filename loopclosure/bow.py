@@ -1,8 +1,8 @@
 """Loop detection by bag of words.
 
-Candidates are chosen as in ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-E and VII-A): by
-shared words, by likeness compared with the query's own neighbours, and by groups of covisible
-keyframes. The index gives the score of every keyframe at once, the neighbours' included.
+Candidates are chosen as in ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-E and VII-A): by the
+number of shared words, by a score that exceeds that of the query's covisible keyframes, and by
+groups of covisible keyframes. One pass over the index gives the scores of all keyframes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from vslam.map_kernels import count_shared
 
 
 class BowDetector:
-    """Remembers the words of keyframes. See ``LoopDetector``; ids must come in ascending order."""
+    """Implements ``LoopDetector`` by visual words. Keyframes must be added in ascending order."""
 
     name = "bow"
 
@@ -33,17 +33,17 @@ class BowDetector:
         self.vocabulary = vocabulary
         self.config = config or BowConfig()
         self._index = InvertedIndex(vocabulary.n_words)
-        # Words of all keyframes: those of keyframe k are entries start[k] to start[k + 1].
-        # Keyframes that were never added have none.
+        # The words of keyframe k are word[start[k]:start[k + 1]]; a keyframe that was never added
+        # has none.
         self._start = np.zeros(65, np.int64)
         self._word = np.empty(65536, np.int32)
         self._n_keyframes = 0  # one more than the newest id
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Remember the words of a keyframe; the image is not looked at.
+        """Remember the words of a keyframe; the image is ignored.
 
         Raises:
-            ValueError: the id is not greater than those before.
+            ValueError: the id is not greater than those of all earlier keyframes.
         """
         if keyframe < self._n_keyframes:
             raise ValueError(f"keyframe {keyframe} comes after {self._n_keyframes - 1}")
@@ -52,9 +52,9 @@ class BowDetector:
         self._index.add(keyframe, bow_vector(self.vocabulary, words))
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        """Living keyframes, not recent and not covisible, that look like a keyframe added before.
-
-        Without a covisible neighbour that sets the least score, every score will do.
+        """Candidates for a keyframe that was added: living keyframes that are neither recent nor
+        covisible with it, and whose score is at least the lowest one of its covisible keyframes. If
+        it has none, any score suffices.
         """
         config = self.config
         entries = self._entries(keyframe)
@@ -72,14 +72,14 @@ class BowDetector:
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """Living keyframes that look like a frame outside the map, best first."""
+        """Living keyframes that look similar to a frame outside the map, best first."""
         words = self.vocabulary.words(features.descriptors)
         likeness = self._index.compare(bow_vector(self.vocabulary, words))
         eligible = map_.arrays.keyframe_alive[: len(likeness.score)].copy()
         return self._candidates(-1, likeness, eligible, 0.0, map_)
 
     def memory(self) -> DetectorMemory:
-        """See :class:`LoopDetector`: the words of all features."""
+        """See :class:`LoopDetector`; the memory consists of the words of all keyframes."""
         first = self._start[: self._n_keyframes + 1]
         words = PerKeyframe(first, self._word[: first[-1]])
         return DetectorMemory(self.name, self._fingerprint, {"words": words})
@@ -146,9 +146,11 @@ class BowDetector:
 
 @inner_kernel
 def most_covisible(counts, minimum, keyframes, strength):
-    """Fill ``keyframes`` and ``strength``, ``(G,)`` int64, with those of the greatest counts.
+    """Write the keyframes with the greatest counts into ``keyframes``, and their counts into
+    ``strength``, both ``(G,)`` int64.
 
-    Greatest first, the lower id first of equals, none below ``minimum``. Returns how many.
+    They are sorted by descending count, then by ascending id; counts below ``minimum`` are left
+    out. Returns the number of keyframes.
     """
     n = 0
     for k in range(len(counts)):
@@ -178,20 +180,24 @@ def choose_candidates(
     group_score_ratio,
     max_groups,
 ):
-    """Candidates by shared words, score and groups, each once, best group first.
+    """Choose candidates by shared words, score and groups, without repetitions, best group first.
 
-    1. Those that share more than ``common_words_ratio`` of the most words that any shares, with
-       at least ``least_score``; of these the ``max_groups`` best.
-    2. Each gathers those of its ``group_size`` best covisible keyframes that also pass the first
-       test of 1; the group has the sum of their scores and stands for its best keyframe.
-    3. Groups with ``group_score_ratio`` of the best group's score.
+    1. A keyframe passes if it shares at least ``common_words_ratio`` times the greatest number of
+       words that any keyframe shares. Of those with a score of at least ``least_score``, the
+       ``max_groups`` best are kept.
+    2. Each of these forms a group with those of its ``group_size`` best covisible keyframes that
+       pass as well. The score of the group is the sum of its members' scores; its best member
+       represents it.
+    3. Groups with at least ``group_score_ratio`` times the best group score are returned.
 
     Args:
-        a, n_keyframes: of the map.
-        shared, score, eligible: ``(K,)``, K at most ``n_keyframes``.
+        a, n_keyframes: arrays and number of keyframes of the map.
+        shared: ``(K,)`` number of shared words; K is at most ``n_keyframes``.
+        score: ``(K,)`` score.
+        eligible: ``(K,)`` bool, keyframes that may be candidates.
 
     Returns:
-        ``(n,)`` int64 keyframes.
+        ``(n,)`` int64 ids of the keyframes.
     """
     n = len(shared)
     most = 0

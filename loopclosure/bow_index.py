@@ -1,9 +1,8 @@
-"""Which keyframes have a word: the inverted index of Galvez-Lopez and Tardos (T-RO 2012, IV).
+"""The inverted index from words to keyframes of Galvez-Lopez and Tardos (T-RO 2012, IV).
 
-The L1 score of two bags is the sum of the lesser weights of the words they share (vocabulary.py).
-So one pass over the postings of a query's words gives the shared words and the score of *every*
-keyframe at once. The price is a weight in each posting; the gain is work that does not depend on
-how many keyframes are to be scored.
+The L1 score of two bags of words is the sum, over their shared words, of the smaller of the two
+weights (vocabulary.py). So one pass over the postings of a query's words gives the number of shared
+words and the score of every keyframe. For this, each posting also stores a weight.
 """
 
 from __future__ import annotations
@@ -16,13 +15,14 @@ from numpy.typing import NDArray
 from vslam.kernels import kernel
 from vslam.loopclosure.vocabulary import BowVector
 
-FIRST_BLOCK = 8  # postings: one cache line
-UNIT = 2**31 - 1  # weights are whole multiples of 1 / UNIT: sums are exact in any order
-SHARED = 1 << 40  # counts shared words above the bits of a sum of weights
+FIRST_BLOCK = 8  # postings in the smallest block: one cache line
+UNIT = 2**31 - 1  # weights are multiples of 1 / UNIT, so that sums are exact in any order
+SHARED = 1 << 40  # one shared word, counted above the bits of a sum of weights
 
 
 def grown(array: NDArray, needed: int) -> NDArray:
-    """The array itself if it has room for ``needed``, else a copy greater by half at least."""
+    """The array itself if it has room for ``needed`` items, else a copy that is larger by at least
+    half."""
     if needed <= len(array):
         return array
     bigger = np.empty((max(needed, len(array) * 3 // 2), *array.shape[1:]), array.dtype)
@@ -31,21 +31,29 @@ def grown(array: NDArray, needed: int) -> NDArray:
 
 
 class Likeness(NamedTuple):
-    """An image against each keyframe: ``shared`` (K,) i4 words; ``score`` (K,) f8 in [0, 1]."""
+    """Comparison of an image with each of K keyframes.
+
+    Attributes:
+        shared: ``(K,)`` number of shared words.
+        score: ``(K,)`` L1 score in [0, 1].
+    """
 
     shared: NDArray[np.int32]
     score: NDArray[np.float64]
 
 
 class Postings(NamedTuple):
-    """Inverted index of W words: those of a word lie in one block, read as one stream.
+    """Inverted index of W words. The postings of a word are contiguous, in one block.
 
-    A block has room for 8, 16, 32 ... postings. A word that outgrows its block moves to one of
-    twice the size and leaves the old one to other words.
+    A block has room for 8, 16, 32 ... postings. If the block of a word is full, its postings move
+    to a block of twice the size, and the old block becomes free for other words.
 
-    ``start`` (W,) i8 first posting of each word; ``size`` (W,) i4; ``free`` (40,) i8 first
-    free block of each size, -1 for none, whose first entry names the next; ``pool`` (P,) i8
-    postings, ``keyframe << 32 | weight``.
+    Attributes:
+        start: ``(W,)`` index of the first posting of each word.
+        size: ``(W,)`` number of postings of each word.
+        free: ``(40,)`` first free block of each size, -1 for none; the first entry of a free block
+            is the index of the next one.
+        pool: ``(P,)`` postings, ``keyframe << 32 | weight``.
     """
 
     start: NDArray[np.int64]
@@ -55,7 +63,7 @@ class Postings(NamedTuple):
 
 
 class InvertedIndex:
-    """The keyframes of each word, with the weight that the word has there."""
+    """The keyframes that contain each word, and the weight of the word in each of them."""
 
     def __init__(self, n_words: int) -> None:
         self.n_keyframes = 0  # one more than the newest id
@@ -65,10 +73,10 @@ class InvertedIndex:
             free=np.full(40, -1, np.int64),
             pool=np.empty(65536, np.int64),
         )
-        self._used = 0  # of the pool
+        self._used = 0  # entries of the pool that are in blocks
 
     def add(self, keyframe: int, bag: BowVector) -> None:
-        """Remember the bag of a keyframe that has none yet."""
+        """Add the bag of words of a keyframe that has not been added before."""
         size = self._postings.size[bag.words].astype(np.int64)
         growing = np.where(size == 0, FIRST_BLOCK, 2 * size)[is_full(size)]
         pool = grown(self._postings.pool, self._used + int(growing.sum()))
@@ -77,26 +85,33 @@ class InvertedIndex:
         self.n_keyframes = max(self.n_keyframes, keyframe + 1)
 
     def compare(self, bag: BowVector) -> Likeness:
-        """Shared words and score of an image with every keyframe id up to the newest."""
+        """Compare an image with all keyframes, from id 0 to the newest one."""
         sums = compare_with_all(self._postings, self.n_keyframes, bag.words, fixed(bag.weights))
         return Likeness((sums // SHARED).astype(np.int32), sums % SHARED / UNIT)
 
 
 def fixed(weights: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Weights of a bag, in [0, 1], in whole units."""
+    """Weights in [0, 1] as multiples of 1 / ``UNIT``."""
     return np.rint(weights.astype(np.float64) * UNIT).astype(np.int64)
 
 
 def is_full(size):
-    """Whether a block with so many postings, or each of an array, has no room (as in ``post``)."""
+    """Whether the block of a word with ``size`` postings is full; ``size`` may be an array. The
+    condition is the same as in ``post``."""
     return (size & (size - 1) == 0) & ((size == 0) | (size >= FIRST_BLOCK))
 
 
 @kernel
 def post(postings, used, keyframe, words, weights):
-    """Add a keyframe's bag to the inverted index; returns how much of the pool is in use.
+    """Add the bag of words of a keyframe to the inverted index.
 
-    The pool must have room for a new block of each word whose block is full.
+    The pool must have room for a new block for each word whose block is full.
+
+    Args:
+        used: number of entries of the pool that are in blocks.
+
+    Returns:
+        The new value of ``used``.
     """
     start, sizes, free, pool = postings
     for i in range(len(words)):
@@ -126,10 +141,8 @@ def post(postings, used, keyframe, words, weights):
 
 @kernel
 def compare_with_all(postings, n_keyframes, words, weights):
-    """For each keyframe ``SHARED`` times the words in common, plus the sum of lesser weights.
-
-    One sum for both: a posting costs one addition. Returns ``(K,)`` int64.
-    """
+    """``(K,)`` int64, for each keyframe ``SHARED`` times the number of shared words plus the sum of
+    the smaller weights. Both are accumulated in one integer, so a posting costs one addition."""
     start, sizes, _, pool = postings
     sums = np.zeros(n_keyframes, np.int64)
     for i in range(len(words)):

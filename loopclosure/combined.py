@@ -1,4 +1,4 @@
-"""Several loop detectors as one: what any of them finds is a candidate."""
+"""A loop detector that merges the candidates of several others."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from vslam.map import Map
 class CombinedDetector:
     """Implements :class:`vslam.loopclosure.detector.LoopDetector`.
 
-    Candidates of the detectors in turn, the best of each first, since their scores do not compare.
-    Those at one place are one candidate, that of the detector named first.
+    The scores of different detectors are not comparable, so the candidates of all detectors are
+    interleaved: first the best one of each, then the second best, and so on. Candidates at the same
+    place are merged into the first of them.
     """
 
     def __init__(self, name: str, detectors: list[LoopDetector], min_shared: int) -> None:
-        """``min_shared``: landmarks that put two keyframes at one place."""
+        """``min_shared`` is the number of shared landmarks from which on two keyframes count as the
+        same place."""
         self.name = name
         self._detectors, self._min_shared = detectors, min_shared
 
@@ -42,7 +44,7 @@ class CombinedDetector:
         return self._merged([one.locate(image, features, map_) for one in self._detectors], map_)
 
     def memory(self) -> DetectorMemory:
-        """See :class:`LoopDetector`: the memories of the detectors, each under its name."""
+        """See :class:`LoopDetector`; contains the memory of each detector under its name."""
         memories = [one.memory() for one in self._detectors]
         tables = {
             f"{memory.name}/{name}": table
@@ -62,7 +64,7 @@ class CombinedDetector:
 
     def _merged(self, found: list[list[LoopCandidate]], map_: Map) -> list[LoopCandidate]:
         merged: list[LoopCandidate] = []
-        place: dict[int, int] = {}  # keyframe to the candidate at whose place it lies
+        place: dict[int, int] = {}  # keyframe -> index of the merged candidate at the same place
         for candidate in chain.from_iterable(zip_longest(*found)):
             if candidate is None:
                 continue
@@ -78,7 +80,8 @@ class CombinedDetector:
 
 
 def _joined(first: LoopCandidate, second: LoopCandidate) -> LoopCandidate:
-    """The candidate of one detector, at whose place that of another lies."""
+    """The first of two candidates at the same place, with the second detector's name and, if the
+    first has no ``alike`` of its own, that of the second."""
     names = first.proposed_by.split("+")
     if second.proposed_by not in names:
         names.append(second.proposed_by)

@@ -1,9 +1,11 @@
-"""One look-alike keyframe is no loop: candidates must persist, and verified loops must agree.
+"""Consistency over time: a loop needs candidates of several keyframes, and verified loops that
+agree.
 
-ORB-SLAM (T-RO 2015, VII-A) asks that the places which resemble consecutive keyframes overlap.
-That is evidence by looks. Two verified loops of neighbouring keyframes give a stronger one: both
-say by how much the map has drifted, and must say the same (ORB-SLAM3, T-RO 2021, section VI, has
-the same idea: verify first, then ask other keyframes to confirm).
+ORB-SLAM (T-RO 2015, VII-A) requires that consecutive keyframes resemble overlapping places, which
+is evidence from appearance. Geometry gives stronger evidence: each verified loop implies by how
+much the map has drifted, and the loops of neighbouring keyframes must imply the same drift.
+ORB-SLAM3 (T-RO 2021, section VI) does likewise: it verifies first and then looks for confirmation
+by other keyframes.
 """
 
 from __future__ import annotations
@@ -24,10 +26,10 @@ from vslam.states import ConsistencyState
 
 
 class LoopConsistency:
-    """Memory of what recent keyframes resembled, and of the loops verified for them.
+    """Remembers which places recent keyframes resembled, and which loops were verified for them.
 
     Call ``update`` once for every keyframe, with or without candidates, ``confirm`` for every
-    verified edge, and ``reset`` once a loop was closed.
+    verified edge, and ``reset`` after a loop was closed.
     """
 
     def __init__(self, config: ConsistencyConfig) -> None:
@@ -38,17 +40,19 @@ class LoopConsistency:
 
     @property
     def n_groups(self) -> int:
-        """Groups remembered: never more than the candidates of ``max_gap + 1`` keyframes."""
+        """Number of remembered groups; at most the number of candidates of the last ``max_gap + 1``
+        keyframes."""
         return len(self._groups)
 
     def update(
         self, keyframe: int, candidates: list[LoopCandidate], map_: Map
     ) -> tuple[list[LoopCandidate], list[LoopEdge]]:
-        """Candidates whose place resembled enough keyframes in a row, and edges for the others.
+        """Split the candidates of a keyframe into those whose place enough consecutive keyframes
+        resembled, and rejected edges for the others.
 
-        Each candidate continues the longest group that it overlaps and leaves exactly one group:
-        the number of groups is the number of candidates, however often they overlap. Candidates
-        with one and the same group count once.
+        Each candidate extends the longest group that its place overlaps, and results in exactly one
+        group, so the number of groups does not exceed the number of candidates. Candidates with
+        identical groups share one.
         """
         self._turn += 1
         groups: dict[frozenset[int], ResembledPlace] = {}
@@ -75,15 +79,15 @@ class LoopConsistency:
         return consistent, rejected
 
     def confirm(self, edge: LoopEdge, map_: Map) -> LoopEdge:
-        """A verified edge, once enough recent keyframes were verified with the same drift.
+        """Accept a verified edge only if the loops of enough recent keyframes imply the same drift.
 
-        The drift that an edge implies is the motion of the world that would bring the query to
-        where the edge puts it. Odometry between neighbouring keyframes is exact compared with the
-        tolerances, so that true loops imply one drift and chance ones do not.
+        The drift that an edge implies is the motion of the world that would move the query to where
+        the edge places it. Odometry between neighbouring keyframes is accurate compared with the
+        tolerances, so true loops imply the same drift and false ones do not.
 
         Returns:
-            The edge as it was, or not accepted, waiting for others. The best edge that agrees
-            counts once for each keyframe.
+            The edge unchanged, or not accepted until more keyframes agree. Each keyframe counts
+            once, however many of its edges agree.
         """
         if not edge.accepted:
             return edge
@@ -94,7 +98,7 @@ class LoopConsistency:
             for _, other in self._verified
             if other.query != edge.query and self.agree(edge, other, map_)
         }
-        votes = 1 + len(agreeing)  # that of the edge's own keyframe included
+        votes = 1 + len(agreeing)  # including the keyframe of this edge
         self._verified.append((self._turn, edge))
         if votes >= self.config.min_verified:
             return edge
@@ -104,10 +108,11 @@ class LoopConsistency:
     def confirmed_by_earlier(
         self, map_: Map, camera: Camera, config: VerificationConfig
     ) -> Iterator[LoopEdge]:
-        """Verified loops that wait for a second keyframe, the newest first, of which an earlier
-        keyframe confirms the drift: seen from there, the place passes the same tests.
+        """Loops that were verified but wait for more keyframes to agree, and that an earlier
+        keyframe now confirms: it is verified at the same place with the same drift. The newest loop
+        comes first.
 
-        ORB-SLAM3 (section VI) asks covisible keyframes first, too, and later ones after them.
+        ORB-SLAM3 (section VI) also tries covisible keyframes first, and later keyframes after them.
         """
         oldest = self._turn + 1 - self.config.verified_memory
         for waiting in [edge for turn, edge in reversed(self._verified) if turn >= oldest]:
@@ -120,8 +125,8 @@ class LoopConsistency:
     def _is_confirmed(
         self, edge: LoopEdge, map_: Map, camera: Camera, config: VerificationConfig
     ) -> bool:
-        """Whether a keyframe that shares landmarks with the query of an edge, and is some way off,
-        is verified with the same drift."""
+        """Whether a keyframe that is covisible with the query of an edge, but at least
+        ``min_moved`` away from it, is verified with the same drift."""
         assert edge.T_query_match is not None
         T_w_query = inverse(map_.keyframe_pose(edge.query))
         for keyframe in map_.covisible(edge.query)[0].tolist():
@@ -149,23 +154,23 @@ class LoopConsistency:
         )
 
     def state(self) -> ConsistencyState:
-        """What ``restore`` needs to continue from here."""
+        """The state, for a saved map or a checkpoint."""
         return ConsistencyState(tuple(self._groups), tuple(self._verified), self._turn)
 
     def restore(self, state: ConsistencyState) -> None:
-        """Continue from what ``state`` returned."""
+        """Continue from a state that ``state`` returned."""
         self._groups, self._verified = list(state.places), list(state.verified)
         self._turn = state.turn
 
     def reset(self) -> None:
-        """Forget everything: closing a loop has moved the map."""
+        """Forget everything, because closing a loop has moved the map."""
         self._groups.clear()
         self._verified.clear()
 
 
 def implied_drift(edge: LoopEdge, map_: Map) -> NDArray[np.float64]:
-    """``(4, 4)`` motion of the world that takes the query to where an edge puts it: a similarity,
-    its scale in the upper left 3x3 block, where the edge has a scale.
+    """``(4, 4)`` motion of the world that moves the query to where an edge places it. If the edge
+    has a scale, this is a similarity with the scale in its upper left 3x3 block.
 
     Raises:
         ValueError: the edge has no pose.
@@ -178,7 +183,7 @@ def implied_drift(edge: LoopEdge, map_: Map) -> NDArray[np.float64]:
 
 
 def _rigid(S: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A similarity without its scale; a motion as it is."""
+    """A similarity with its scale set to 1; a rigid motion is returned unchanged."""
     T, cube = S.copy(), np.linalg.det(S[:3, :3])
     if abs(cube - 1.0) > 1e-9:
         T[:3, :3] /= np.cbrt(cube)

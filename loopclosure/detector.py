@@ -1,4 +1,4 @@
-"""What a loop detector is: the plug-in point of the learned detectors and of the bag of words."""
+"""The interface of loop detectors: bag of words, learned networks, and plug-ins."""
 
 from __future__ import annotations
 
@@ -13,55 +13,63 @@ from vslam.map import Map
 
 
 class LoopDetector(Protocol):
-    """Remembers keyframes by their looks and finds those that look alike.
+    """Remembers the appearance of keyframes and finds keyframes that look similar.
 
-    Calls come in the order of the keyframes, from one thread at a time.
+    Methods are called in the order of the keyframes, by one thread at a time.
 
-    What follows a detector is the same code for all: rating and verification of candidates,
-    consistency, correction. Which descriptors verify is a threshold, ``verification.descriptors``.
-    Its default differs between detectors: ORB alone for ``bow``, ``capsule-paper`` and plug-ins;
-    ORB and, where that fails, the network's local descriptors for ``both`` and the networks, which
-    then also reorder their 20 most similar keyframes by these descriptors (those of the capsule
-    network's extractor, whichever network made the candidates). A comparison that is to isolate the
-    detectors sets it to ``orb`` or ``both`` for all of them.
+    All detectors share the code that follows them: rating and verification of candidates,
+    consistency, and correction. The setting ``verification.descriptors`` selects the descriptors
+    for verification, and its default depends on the detector. For ``bow``, ``capsule-paper`` and
+    plug-ins, candidates are verified by ORB descriptors alone. For ``both`` and the other networks,
+    candidates that ORB rejects are verified again by learned local descriptors; these detectors
+    also use the local descriptors to rank their 20 most similar keyframes. The local descriptors
+    always come from the feature extractor of the capsule network, whichever network proposed the
+    candidates. To compare detectors in isolation, set ``verification.descriptors`` to ``orb`` or
+    ``both`` for all of them.
     """
 
     name: str
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Remember a keyframe. ``image`` is its ``(H, W)`` left image, None if it was not kept."""
+        """Remember a keyframe. ``image`` is its ``(H, W)`` uint8 left image, None if it was not
+        kept."""
         ...
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        """Places that look like a keyframe added before, best first: living keyframes that are
+        """Candidates for a keyframe that was added, best first: similar living keyframes that are
         neither recent nor covisible with it."""
         ...
 
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """Living keyframes that look like a frame outside the map, best first, with query -1."""
+        """Living keyframes that look similar to a frame outside the map, best first; the candidates
+        have query -1."""
         ...
 
     def memory(self) -> DetectorMemory:
-        """What is known of all keyframes up to now, for a map file. Its arrays are not to be
-        written to: they are the detector's own."""
+        """What the detector remembers of all keyframes, for a map file. Do not write to its arrays:
+        the detector still uses them."""
         ...
 
     def restore(self, memory: DetectorMemory) -> None:
-        """Remember what a detector like this one knew, in place of ``add`` for each keyframe.
+        """Take over the memory of an equal detector, instead of calling ``add`` for each keyframe.
 
         Raises:
-            ValueError: in a few words: it was another detector, or the memory is damaged.
+            ValueError: the memory is that of another detector, or damaged.
         """
         ...
 
 
 def require_same(detector: DetectorMemory, memory: DetectorMemory) -> None:
-    """Refuse the memory of another detector than this one, whose own memory is ``detector``.
+    """Check that a memory belongs to a detector.
+
+    Args:
+        detector: the detector's own memory.
+        memory: the memory to be restored.
 
     Raises:
-        ValueError: it has another name, vocabulary or weights.
+        ValueError: the memory has another name, or another vocabulary or other weights.
     """
     if memory.name != detector.name:
         raise ValueError(f"made with the detector {memory.name}, not {detector.name}")
@@ -70,7 +78,7 @@ def require_same(detector: DetectorMemory, memory: DetectorMemory) -> None:
 
 
 class NoDetector:
-    """Finds nothing: odometry only."""
+    """A detector that never finds a loop, for odometry only."""
 
     name = "none"
 

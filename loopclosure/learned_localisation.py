@@ -1,8 +1,8 @@
-"""Finding the camera of an image at a place, by learned local descriptors.
+"""Estimates the pose of an image at a place in the map by learned local descriptors.
 
-Landmarks of the place are looked for anywhere in the image, not at its keypoints: by night, and
-from the other lane, corners are found elsewhere. Several keyframes of the place are matched where
-one does not suffice.
+Landmarks of the place are searched for anywhere in the image, not only at its keypoints, because by
+night or from the other lane the detector finds corners elsewhere. If one keyframe of the place does
+not give enough matches, further ones are added.
 """
 
 from __future__ import annotations
@@ -30,8 +30,13 @@ from vslam.reprojection import stack_uvr
 
 
 class View(NamedTuple):
-    """A keyframe of the place: ``maps`` of its image, ``(N,)`` landmarks and the pixels ``(N, 2)``
-    where it sees them."""
+    """A keyframe of the place.
+
+    Attributes:
+        maps: local descriptors of its image.
+        landmarks: ``(N,)`` ids of the landmarks that it observes.
+        xy: ``(N, 2)`` pixels at which it observes them.
+    """
 
     maps: DescriptorMaps
     landmarks: NDArray[np.int32]
@@ -39,14 +44,14 @@ class View(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """What a camera should see of M landmarks, and does see.
+    """The landmarks of a place that a camera should see, and those that it does see.
 
     Attributes:
-        landmarks: ``(M,)`` int32, those that should be visible.
-        uv: ``(M, 2)`` float64, where they should appear.
-        seen: ``(M,)`` bool, those found there.
-        n_matches: found near the predictions, outliers included.
-        T_cw: ``(4, 4)`` pose of the camera in the world of the landmarks.
+        landmarks: ``(M,)`` int32 ids of the landmarks that should be visible.
+        uv: ``(M, 2)`` float64, their predicted pixels.
+        seen: ``(M,)`` bool, whether each was found at its prediction (inliers).
+        n_matches: number of matches near the predictions, including outliers.
+        T_cw: ``(4, 4)`` pose of the camera in the world frame of the landmarks.
     """
 
     landmarks: NDArray[np.int32]
@@ -65,13 +70,15 @@ def localise(
     config: LearnedMatchingConfig,
     seed: int,
 ) -> Sight | str:
-    """Find the camera of an image at a place.
+    """Estimate the pose of an image at a place.
 
     Args:
-        keyframes: of the place, with images; the first is the best.
+        query: local descriptors of the image.
+        keyframes: ids of keyframes of the place that have images, best first.
+        seed: seed of the random samples; the same seed gives the same result.
 
     Returns:
-        What it sees of the place, or in a few words why it was not found.
+        The pose and the landmarks that it sees, or in a few words why there is none.
     """
     views: list[View] = []
     xyz, uv = np.empty((0, 3)), np.empty((0, 2))
@@ -81,7 +88,7 @@ def localise(
         coarse = match_coarse(view.maps, query, config.coarse_alike)
         share = homography_share(coarse, view.maps, query)
         if share < config.min_share:
-            return reason or f"{100 * share:.0f} % of the image match"
+            return reason or f"only {100 * share:.0f} % of the image matches"
         views.append(view)
         sought += len(view.xy)
         least = max(config.min_consensus, round(config.min_consensus_ratio * sought))
@@ -100,12 +107,12 @@ def localise(
         )
         if np.count_nonzero(inlier) >= least:
             return guided_search(map_, views, T_cw, query, camera, config)
-        reason = f"no motion that {least} of {len(uv)} learned matches agree on"
+        reason = f"no motion has {least} inliers among {len(uv)} learned matches"
     return reason or "no image of the place is kept"
 
 
 def view_of(map_: Map, keyframe: int, images: KeyframeImages) -> View:
-    """A keyframe and the living landmarks that it observes."""
+    """The ``View`` of a keyframe with an image."""
     a, rows = map_.arrays, map_.rows(keyframe)
     landmark = a.landmark[rows]
     observing = np.flatnonzero(landmark >= 0)
@@ -120,8 +127,7 @@ def guided_search(
     camera: Camera,
     config: LearnedMatchingConfig,
 ) -> Sight:
-    """Look for all landmarks of the views near where a pose puts them, refine the pose, and once
-    more."""
+    """Search for all landmarks of the views near their projections and refine the pose, twice."""
     _, first = np.unique(np.concatenate([view.landmarks for view in views]), return_index=True)
     landmarks = np.concatenate([view.landmarks for view in views])[first]
     xyz = map_.arrays.xyz[landmarks]
@@ -148,7 +154,7 @@ def guided_search(
 
 
 def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:
-    """``(N, 2)`` pixels of ``(N, 3)`` points, NaN for those out of view."""
+    """``(N, 2)`` pixels of ``(N, 3)`` points in the world, NaN for points out of view."""
     p = transform(T_cw, xyz)
     uv = np.full((len(p), 2), np.nan)
     ahead = p[:, 2] > 0.1
@@ -161,6 +167,7 @@ def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:
 def _observed(
     uv: Matrix, query: DescriptorMaps, config: LearnedMatchingConfig
 ) -> tuple[Matrix, Matrix]:
-    """``(N, 3)`` u, v, u_right of pixels, and ``(N,)`` their inverse variances."""
+    """``(N, 3)`` u, v, u_right of ``(N, 2)`` pixels (u_right is NaN), and ``(N,)`` inverse
+    variances."""
     sigma = config.sigma / query.scale
     return stack_uvr(uv, np.full(len(uv), np.nan)), np.full(len(uv), sigma**-2.0)

@@ -1,4 +1,4 @@
-"""Finding a lost frame by local descriptors of the network, where ORB's fail in another light."""
+"""Relocalisation by learned local descriptors, for lighting in which ORB descriptors fail."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vslam.map import Map
 
 
 class LearnedRelocalisation:
-    """Recognises places by their keyframes' images; none without images."""
+    """Implements ``Recognise`` by the images of keyframes; finds nothing if there are no images."""
 
     def __init__(self, images: KeyframeImages | None, camera: Camera, config: Config) -> None:
         self._images = images
@@ -22,7 +22,8 @@ class LearnedRelocalisation:
     def __call__(
         self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
     ) -> Sighting | None:
-        """Look for a frame at the candidates whose images are most alike."""
+        """Search for a frame at the candidates whose images are most similar to it; returns None if
+        it is found at none of them."""
         images, config = self._images, self._config
         if images is None or image is None:
             return None

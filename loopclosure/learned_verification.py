@@ -1,7 +1,8 @@
-"""Places found again by learned local descriptors, where ORB's do not survive the change.
+"""Verification of loop candidates by learned local descriptors, for changes of appearance that ORB
+descriptors do not survive.
 
-As :mod:`vslam.loopclosure.verification`: a pose, guided matching with all that the place knows,
-refinement, and the same evidence against look-alikes.
+The steps are those of :mod:`vslam.loopclosure.verification`: an initial pose, guided matching with
+all landmarks of the place, refinement, and the same tests against similar-looking places.
 """
 
 from __future__ import annotations
@@ -30,14 +31,16 @@ from vslam.map import Map
 from vslam.map_kernels import collect_landmarks
 from vslam.states import VerifierState
 
-_DEPTHS_AGREE = 0.15  # a keypoint that observes a landmark has its depth, to this share
+_DEPTHS_AGREE = 0.15  # largest relative difference of the depths of two landmarks of one feature
 
 
 class LearnedTrials:
-    """Chooses the candidates for learned verification, which takes forty times as long as ORB's.
+    """Chooses the candidates for learned verification, which takes forty times as long as
+    verification by ORB.
 
-    These are the ones whose images local descriptors find most alike, and alike enough. After a
-    failed attempt only clearly more alike candidates are chosen for some keyframes.
+    Candidates are chosen if the local descriptors of their images are among the most similar ones
+    and similar enough. After a failed attempt, only clearly more similar candidates are chosen for
+    the next ``learned.rest`` keyframes.
 
     Attributes:
         state: what is remembered of the last attempt.
@@ -48,20 +51,20 @@ class LearnedTrials:
         self.state = VerifierState()
 
     def choose(self, keyframe: int, candidates: Collection[LoopCandidate]) -> set[int]:
-        """Matches to try, of the candidates that are rated."""
+        """Ids of the matches to try; candidates without a rating are never chosen."""
         config = self._config
         least = config.min_alike
         if keyframe < self.state.resting_until:
-            least = max(least, config.more_alike * self.state.in_vain)
+            least = max(least, config.more_alike * self.state.failed_alike)
         alike = [(one.alike, one.match) for one in candidates if one.alike is not None]
         best = sorted(alike, reverse=True)[: config.max_candidates]
         return {match for likeness, match in best if likeness >= least}
 
     def record(self, candidate: LoopCandidate, *, located: bool) -> None:
-        """Remember an attempt.
+        """Remember the result of an attempt.
 
         Args:
-            located: whether it found a pose, even if that was refused later.
+            located: whether the attempt found a pose, even if the loop was then rejected.
         """
         if located:
             self.state = replace(self.state, resting_until=0)
@@ -77,12 +80,18 @@ def rated(
     config: LearnedMatchingConfig,
     beyond: NDArray[np.float64] | None = None,
 ) -> list[LoopCandidate]:
-    """Say of candidates how much local descriptors find alike, where the detector has not said it.
+    """Set ``alike``, the similarity by local descriptors, of candidates that the detector has not
+    rated.
 
     Args:
         candidates: best first; of those without a rating, the first ``config.rated`` get one.
-        glance: at the image that they are candidates of; called if there is something to rate.
-        beyond: of :func:`vslam.loopclosure.reach.beyond_reach`, if the camera cannot be anywhere.
+        glance: returns the coarse descriptors of the query image; called only if there is a
+            candidate to rate.
+        beyond: result of :func:`vslam.loopclosure.reach.beyond_reach`; keyframes out of reach are
+            not rated. None if the camera may be anywhere.
+
+    Returns:
+        The candidates in the same order.
     """
     unrated = [one.match for one in candidates if one.alike is None and one.match in images]
     if beyond is not None:
@@ -100,12 +109,12 @@ def rated(
 def is_image_redundant(
     map_: Map, keyframe: int, images: KeyframeImages, config: LearnedMatchingConfig
 ) -> bool:
-    """Whether a keyframe shows mostly what a keyframe with an image shows: no network need see it.
+    """Whether the image of a keyframe need not be kept, because another image shows nearly the same
+    view: the previous keyframe has an image, or a keyframe with an image shares most of its
+    landmarks.
 
-    One that follows a keyframe with an image is not seen either: of few keyframes, far apart, every
-    second one is enough. A camera that moves slowly, one that turns, and one that drives through a
-    mapped place again are told from one that sees something new in the same way, whatever makes
-    keyframes.
+    If keyframes are far apart, every second image is enough. The test by shared landmarks covers
+    slow motion, turns, and revisits of mapped places alike, whatever the keyframe policy.
     """
     if keyframe - 1 in images:
         return True
@@ -124,7 +133,9 @@ def verify_learned(
 ) -> LoopEdge:
     """:func:`verification.verify` by local descriptors of the keyframes' images.
 
-    The edge's features and landmarks are the inliers at which the query has a keypoint.
+    Returns:
+        The edge, accepted or with a reason; its features and landmarks are those inliers at which
+        the query has a keypoint.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate, matched_by="learned")
@@ -137,7 +148,8 @@ def verify_learned(
     if isinstance(sight, str):
         return replace(edge, reason=sight)
     feature, landmark = observed_features(map_, query, sight, camera, config)
-    # Once the pose is known, ORB features may match again: they are at home to a tenth of a pixel.
+    # Once the pose is known, ORB features may match after all, and they are located more precisely,
+    # to a tenth of a pixel.
     place = collect_landmarks(map_.arrays, np.array(keyframes, np.int64), map_.n_landmarks)
     guided = guided_match(map_, query, place, sight.T_cw, camera, gates)
     if np.count_nonzero(guided.seen) >= gates.min_inliers:
@@ -156,7 +168,7 @@ def verify_learned(
     if camera.monocular:
         scale = relative_scale(map_, edge, sight.T_cw, default=np.nan)
         if not np.isfinite(scale):
-            return replace(edge, reason="too few depths on both sides tell the scale")
+            return replace(edge, reason="too few depths on both sides to estimate the scale")
         edge = replace(edge, scale=scale)
     seen = _seen_of_query(map_, edge, keyframes[0], images, camera, config)
     reason = _rejection_reason(edge, sight, seen, camera, config, gates)
@@ -172,15 +184,16 @@ def recognise(
     camera: Camera,
     config: Config,
 ) -> Sighting | None:
-    """Find the camera of a frame outside the map at the place of a keyframe.
+    """Estimate the pose of a frame outside the map at the place of a keyframe.
 
     Args:
-        query: descriptors of the frame's image.
-        features: of the frame.
+        query: local descriptors of the frame's image.
+        features: ORB features of the frame.
+        match: id of the keyframe.
 
     Returns:
-        None unless it sees the place as a loop would have to, and enough keypoints lie where its
-        landmarks appear to go on tracking.
+        None unless the frame passes the tests of a loop, and enough of its keypoints coincide with
+        landmarks to continue tracking.
     """
     gates = config.verification
     around = [match, *map_.covisible(match)[0].tolist()]
@@ -200,11 +213,13 @@ def recognise(
 def observed_features(
     map_: Map, query: int, sight: Sight, camera: Camera, config: LearnedMatchingConfig
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Features of the query at which it sees landmarks of the place, and these, ``(N,)`` each,
-    neither twice.
+    """Pairs of features of the query and landmarks of the place that coincide in the image.
 
-    A feature that observes a landmark already must give it the depth of the other: a corner of a
-    car before a facade is no corner of the facade.
+    If a feature already observes a landmark of its own, the depths of both landmarks must agree: a
+    corner of a car in front of a facade is not a corner of the facade.
+
+    Returns:
+        ``(N,)`` indices of features and ``(N,)`` ids of landmarks, without repetitions.
     """
     a, rows = map_.arrays, map_.rows(query)
     landmarks, uv = sight.landmarks[sight.seen], sight.uv[sight.seen]
@@ -222,7 +237,8 @@ def joined(
     first: tuple[NDArray[np.int32], NDArray[np.int32]],
     second: tuple[NDArray[np.int32], NDArray[np.int32]],
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Pairs of features and landmarks, and those of a second list that repeat neither."""
+    """Pairs of features and landmarks of the first list, followed by those pairs of the second list
+    that repeat neither a feature nor a landmark of the first."""
     new = ~(np.isin(second[0], first[0]) | np.isin(second[1], first[1]))
     return np.r_[first[0], second[0][new]], np.r_[first[1], second[1][new]]
 
@@ -234,12 +250,20 @@ def nearest_features(
     scales: NDArray[np.float64],
     config: LearnedMatchingConfig,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Features ``(K,)`` next to some of ``(N, 2)`` pixels, and which of these, the nearest pairs
-    first."""
+    """Match pixels to the nearest features within ``config.fuse_pixels`` of their octave.
+
+    Args:
+        uv: ``(N, 2)`` pixels.
+        xy, octave: features of the image.
+
+    Returns:
+        ``(K,)`` indices of features, without repetitions, and ``(K,)`` indices of the pixels; the
+        nearest pairs come first.
+    """
     if not len(uv) or not len(xy):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    # 3 ms. SciPy's tree takes less, but 27 MB and 0.2 s to import, and of features at the same
-    # pixel it takes any; this takes the finest.
+    # This takes 3 ms. A k-d tree of SciPy is faster, but its import takes 27 MB and 0.2 s, and of
+    # several features at the same pixel it returns any; this returns the one of the finest octave.
     x, y = xy.T.astype(np.float64)
     feature = np.array([np.argmin((x - u) ** 2 + (y - v) ** 2) for u, v in uv.tolist()])
     distance = np.sqrt((x[feature] - uv[:, 0]) ** 2 + (y[feature] - uv[:, 1]) ** 2)
@@ -258,11 +282,11 @@ def _rejection_reason(
     config: LearnedMatchingConfig,
     gates: VerificationConfig,
 ) -> str:
-    """What speaks against a refined loop, "" if nothing does."""
+    """Why a refined loop must be rejected, "" if it passes all tests."""
     assert edge.T_query_match is not None
     distance = float(np.linalg.norm(inverse(edge.T_query_match)[:3, 3]))
     if distance > gates.max_distance:
-        return f"{distance:.0f} m from the place"
+        return f"the pose is {distance:.0f} m from the place"
     if reason := _too_little(sight, camera, config, gates):
         return reason
     seen, total = of_query
@@ -274,7 +298,7 @@ def _rejection_reason(
 def _too_little(
     sight: Sight, camera: Camera, config: LearnedMatchingConfig, gates: VerificationConfig
 ) -> str:
-    """Why too little of a place is seen, "" if it is enough."""
+    """Why a camera sees too little of a place, "" if it sees enough."""
     seen, total = int(np.count_nonzero(sight.seen)), len(sight.seen)
     if seen < config.min_inliers:
         return f"only {seen} learned matches fit"
@@ -295,11 +319,11 @@ def _seen_of_query(
     camera: Camera,
     config: LearnedMatchingConfig,
 ) -> tuple[int, int]:
-    """How many landmarks of the query the image of a keyframe at the place shows where the pose
-    puts them, and how many it should."""
+    """How many landmarks of the query are found at their projections in the image of a keyframe of
+    the place, and how many should be visible in it."""
     assert edge.T_query_match is not None
     T_match_query = inverse(edge.T_query_match)
-    T_match_query[:3, 3] *= edge.scale  # to the query's unit, which its landmarks are in
+    T_match_query[:3, 3] *= edge.scale  # in the query's unit, like its landmarks
     view = view_of(map_, edge.query, images)
     T_wm = inverse(map_.keyframe_pose(edge.match))
     T_wm[:3, 3] *= edge.scale
@@ -310,5 +334,5 @@ def _seen_of_query(
     match = images.maps(keyframe)
     found = locate_near(view.xy, expected, view.maps, match, config.guided_reach, config.alike)
     off = np.linalg.norm(found.xy - expected, axis=1) * match.scale
-    # 95 % of the radii of a two-dimensional normal distribution are below 2.45 deviations.
+    # For a two-dimensional normal distribution, 95 % of the distances are below 2.45 sigma.
     return int(np.count_nonzero(off < 2.45 * config.sigma)), int(np.isfinite(expected[:, 0]).sum())

@@ -1,8 +1,9 @@
-"""Matching of learned local descriptors, coarse to fine (after LoFTR, Sun et al., CVPR 2021).
+"""Coarse-to-fine matching of learned local descriptors (after LoFTR, Sun et al., CVPR 2021).
 
-Coarse: cells of two images that are each other's nearest. Fine: a keypoint of one image is
-searched in the other, anywhere and not only at keypoints, in windows about where the coarse
-matches around it say; the place is interpolated, and must lead back to the keypoint.
+Coarse matches are cells of two images that are mutual nearest neighbours. For a fine match, a
+keypoint of one image is searched for in the other, not only at its keypoints, but in windows around
+the positions that nearby coarse matches predict. The position is interpolated to a fraction of a
+cell, and accepted only if the reverse search returns to the keypoint.
 """
 
 from __future__ import annotations
@@ -14,18 +15,18 @@ from numpy.typing import NDArray
 
 from vslam.kernels import inner_kernel, kernel
 
-COARSE_STRIDE, FINE_STRIDE = 16, 4  # pixels of the image that the network read
+COARSE_STRIDE, FINE_STRIDE = 16, 4  # pixels of the network's input per cell
 _HOMOGRAPHY_PIXELS, _HOMOGRAPHY_DRAWS = 12.0, 300
 
 
 class DescriptorMaps(NamedTuple):
-    """Local descriptors of an image, all of length 1.
+    """Local descriptors of an image, normalised to length 1.
 
     Attributes:
-        coarse: ``(h, w, C)`` float32, or float16 of a glance that is kept; cell (i, j) lies at
-            pixel (16 j, 16 i) of the image that the network read.
-        fine: ``(H, W, D)`` float32, likewise at (4 j, 4 i).
-        scale: pixels of that image for one of the camera's.
+        coarse: ``(h, w, C)`` float32 (float16 if made by ``coarse_alone``); cell (i, j) lies at
+            pixel (16 j, 16 i) of the network's input.
+        fine: ``(H, W, D)`` float32; cell (i, j) lies at pixel (4 j, 4 i) of the network's input.
+        scale: pixels of the network's input per pixel of the camera image.
     """
 
     coarse: NDArray[np.float32] | NDArray[np.float16]
@@ -33,17 +34,18 @@ class DescriptorMaps(NamedTuple):
     scale: float
 
     def coarse_alone(self) -> DescriptorMaps:
-        """Without the fine ones, in half the memory: those of all keyframes are kept."""
+        """The coarse descriptors only, in half precision, because those of all keyframes are kept
+        in memory."""
         none = np.empty((0, *self.fine.shape[1:]), np.float32)
         return self._replace(coarse=self.coarse.astype(np.float16), fine=none)
 
 
 class CoarseMatches(NamedTuple):
-    """Cells of two images that are each other's nearest.
+    """Cells of two images that are mutual nearest neighbours.
 
     Attributes:
-        a, b: ``(N,)`` int64 cells, row by row.
-        alike: ``(N,)`` float32 cosines.
+        a, b: ``(N,)`` int64 indices of the cells in each image, row-major.
+        alike: ``(N,)`` float32 cosine similarities.
     """
 
     a: NDArray[np.int64]
@@ -52,22 +54,22 @@ class CoarseMatches(NamedTuple):
 
 
 class Located(NamedTuple):
-    """Where keypoints of one image lie in another.
+    """Positions of keypoints of one image in another.
 
     Attributes:
-        xy: ``(N, 2)`` float64 pixels of the camera, NaN where not found.
+        xy: ``(N, 2)`` float64 pixels of the camera image, NaN where not found.
     """
 
     xy: NDArray[np.float64]
 
     @property
     def found(self) -> NDArray[np.bool_]:
-        """``(N,)``."""
+        """``(N,)`` bool, keypoints that were found."""
         return np.asarray(np.isfinite(self.xy[:, 0]))
 
 
 def match_coarse(a: DescriptorMaps, b: DescriptorMaps, least: float) -> CoarseMatches:
-    """Mutual nearest neighbours with a cosine of at least ``least``."""
+    """Mutual nearest neighbours of the coarse descriptors with a cosine of at least ``least``."""
     cells = [one.coarse.reshape(-1, one.coarse.shape[2]).astype(np.float32) for one in (a, b)]
     best_a, best_b, alike = _nearest(cells[0], np.ascontiguousarray(cells[1].T))
     mutual = (best_b[best_a] == np.arange(len(best_a))) & (alike >= least)
@@ -76,7 +78,7 @@ def match_coarse(a: DescriptorMaps, b: DescriptorMaps, least: float) -> CoarseMa
 
 
 def positions(cells: NDArray[np.int64], maps: DescriptorMaps) -> NDArray[np.float64]:
-    """``(N, 2)`` pixels of the camera where coarse cells lie."""
+    """``(N, 2)`` positions of ``(N,)`` coarse cells, pixels of the camera image."""
     columns = maps.coarse.shape[1]
     return COARSE_STRIDE * np.stack([cells % columns, cells // columns], 1) / maps.scale
 
@@ -89,12 +91,14 @@ def locate(
     reach: int,
     least: float,
 ) -> Located:
-    """Find keypoints of one image in another where coarse matches lead.
+    """Search for keypoints of image a in image b, in windows around the positions that the coarse
+    matches near each keypoint predict.
 
     Args:
-        xy: ``(N, 2)`` pixels of camera a.
-        reach: cells of 4 pixels to either side that a window has.
-        least: cosine of a find.
+        xy: ``(N, 2)`` keypoints, pixels of camera image a.
+        coarse: coarse matches from a to b.
+        reach: half width of a window, fine cells.
+        least: least cosine of a match.
     """
     towards = np.full(a.coarse.shape[:2], -1, np.int64).reshape(-1)
     towards[coarse.a] = coarse.b
@@ -113,7 +117,13 @@ def locate_near(
     reach: int,
     least: float,
 ) -> Located:
-    """Find keypoints of one image in another about where ``expected`` ``(N, 2)`` puts them."""
+    """Search for keypoints of image a in image b, in windows around predicted positions.
+
+    Args:
+        xy: ``(N, 2)`` keypoints, pixels of camera image a.
+        expected: ``(N, 2)`` predicted positions, pixels of camera image b; NaN skips a keypoint.
+        reach, least: as in ``locate``.
+    """
     found = _locate_near(
         xy.astype(np.float64) * (a.scale / FINE_STRIDE),
         expected * (b.scale / FINE_STRIDE),
@@ -123,19 +133,21 @@ def locate_near(
 
 
 def likeness(a: DescriptorMaps, b: DescriptorMaps, least: float) -> float:
-    """Sum of the cosines of coarse matches over the cells of an image: 1 for the same image.
+    """Similarity of two images: the sum of the cosines of their coarse matches, divided by the
+    number of cells of the smaller image; 1 for identical images.
 
     Args:
-        least: cosine of a match.
+        least: least cosine of a match.
     """
     return float(match_coarse(a, b, least).alike.sum() / _fewest_cells(a, b))
 
 
 def homography_share(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMaps) -> float:
-    """Coarse matches that one homography explains, roughly, over the cells of an image.
+    """Share of the cells of the smaller image whose coarse matches one homography explains.
 
-    One homography is no model of a street. But what is far lies on one, and near things move by
-    less than a cell or two; in two images of different places no homography has as many.
+    A homography is not an exact model of a street. But it explains distant points, and near points
+    deviate from it by only a cell or two. In images of different places, no homography explains as
+    many matches.
     """
     import cv2
 
@@ -149,13 +161,18 @@ def homography_share(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMaps
 
 
 def _fewest_cells(a: DescriptorMaps, b: DescriptorMaps) -> int:
-    """Coarse cells of the smaller image."""
+    """Number of coarse cells of the smaller image."""
     return min(one.coarse.shape[0] * one.coarse.shape[1] for one in (a, b))
 
 
 @kernel
 def _nearest(a, b):
-    """Nearest of ``(N, C)`` and ``(C, M)``: for each of a, for each of b, cosines for a."""
+    """Nearest neighbours by cosine of descriptors a ``(N, C)`` and b ``(C, M)``.
+
+    Returns:
+        ``(N,)`` int64 nearest b of each a, ``(M,)`` int64 nearest a of each b, and ``(N,)`` float32
+        cosines of the former.
+    """
     n, channels = a.shape
     m = b.shape[1]
     best_a, best_b = np.zeros(n, np.int64), np.zeros(m, np.int64)
@@ -176,8 +193,9 @@ def _nearest(a, b):
 
 
 @inner_kernel
-def _read(fine, x, y, out):
-    """Descriptor at a place between four cells, of length 1; False outside."""
+def _interpolate(fine, x, y, out):
+    """Write the descriptor at (x, y), in cells, interpolated bilinearly and normalised to length 1,
+    into ``out``; returns False outside the image."""
     rows, columns, channels = fine.shape
     if not (x >= 0.0 and y >= 0.0 and x <= columns - 1 and y <= rows - 1):
         return False
@@ -199,8 +217,8 @@ def _read(fine, x, y, out):
 
 
 @inner_kernel
-def _alike(fine, i, j, descriptor):
-    # Four sums, since one would wait for itself.
+def _cosine(fine, i, j, descriptor):
+    # Four partial sums, because in a single one each addition would wait for the one before.
     s0, s1, s2, s3 = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for c in range(0, len(descriptor), 4):
         s0 += fine[i, j, c] * descriptor[c]
@@ -212,13 +230,14 @@ def _alike(fine, i, j, descriptor):
 
 @inner_kernel
 def _search(fine, descriptor, x, y, reach):
-    """Best cell within ``reach`` of a place; returns its column, row, cosine (-2: none)."""
+    """Find the best cell within ``reach`` of (x, y); returns its column, row and cosine (-2 if the
+    window is outside the image)."""
     rows, columns, _ = fine.shape
     best_i, best_j, best = -1, -1, np.float32(-2.0)
     middle_j, middle_i = int(np.rint(x)), int(np.rint(y))
     for i in range(max(0, middle_i - reach), min(rows, middle_i + reach + 1)):
         for j in range(max(0, middle_j - reach), min(columns, middle_j + reach + 1)):
-            alike = _alike(fine, i, j, descriptor)
+            alike = _cosine(fine, i, j, descriptor)
             if alike > best:
                 best_i, best_j, best = i, j, alike
     return best_j, best_i, best
@@ -226,16 +245,17 @@ def _search(fine, descriptor, x, y, reach):
 
 @inner_kernel
 def _peak(fine, descriptor, j, i, best):
-    """The top of the parabolas through the cosines beside the best cell."""
+    """Position of the best match to a fraction of a cell: the maxima of the parabolas through the
+    cosines of the best cell and of its neighbours in x and in y."""
     rows, columns, _ = fine.shape
     x, y = float(j), float(i)
     if 0 < j < columns - 1:
-        before, after = _alike(fine, i, j - 1, descriptor), _alike(fine, i, j + 1, descriptor)
+        before, after = _cosine(fine, i, j - 1, descriptor), _cosine(fine, i, j + 1, descriptor)
         bend = 2.0 * best - before - after
         if bend > 1e-6:
             x += min(0.5, max(-0.5, 0.5 * (after - before) / bend))
     if 0 < i < rows - 1:
-        before, after = _alike(fine, i - 1, j, descriptor), _alike(fine, i + 1, j, descriptor)
+        before, after = _cosine(fine, i - 1, j, descriptor), _cosine(fine, i + 1, j, descriptor)
         bend = 2.0 * best - before - after
         if bend > 1e-6:
             y += min(0.5, max(-0.5, 0.5 * (after - before) / bend))
@@ -243,11 +263,11 @@ def _peak(fine, descriptor, j, i, best):
 
 
 @inner_kernel
-def _place(fine_a, fine_b, descriptor, x, y, j, i, best, reach, other, found):
-    """Set ``found`` to the peak about the best cell of b, if what lies there is found again within
-    1.5 cells of where the descriptor came from, (x, y) in a; ``other`` is scratch."""
+def _accept_if_mutual(fine_a, fine_b, descriptor, x, y, j, i, best, reach, other, found):
+    """Set ``found`` to the peak around the best cell of b, if the reverse search from there ends
+    within 1.5 cells of the keypoint (x, y) in a; ``other`` is a workspace."""
     to_x, to_y = _peak(fine_b, descriptor, j, i, best)
-    if _read(fine_b, to_x, to_y, other):
+    if _interpolate(fine_b, to_x, to_y, other):
         back_j, back_i, _ = _search(fine_a, other, x, y, reach)
         if abs(back_j - x) <= 1.5 and abs(back_i - y) <= 1.5:
             found[0], found[1] = to_x, to_y
@@ -259,11 +279,11 @@ def _locate(xy, fine_a, fine_b, towards, columns_b, reach, least):
     rows_a, columns_a = towards.shape
     found = np.full((n, 2), np.nan)
     descriptor, other = np.empty(channels, np.float32), np.empty(channels, np.float32)
-    ratio = COARSE_STRIDE // FINE_STRIDE  # fine cells for a coarse one
+    ratio = COARSE_STRIDE // FINE_STRIDE  # fine cells per coarse cell
     tried = np.empty((9, 2))
     for k in range(n):
         x, y = xy[k]
-        if not _read(fine_a, x, y, descriptor):
+        if not _interpolate(fine_a, x, y, descriptor):
             continue
         cell_j, cell_i = int(np.rint(x / ratio)), int(np.rint(y / ratio))
         best_j, best_i, best = -1, -1, np.float32(-2.0)
@@ -286,7 +306,9 @@ def _locate(xy, fine_a, fine_b, towards, columns_b, reach, least):
                 if alike > best:
                     best_j, best_i, best = to_j, to_i, alike
         if best >= least:
-            _place(fine_a, fine_b, descriptor, x, y, best_j, best_i, best, reach, other, found[k])
+            _accept_if_mutual(
+                fine_a, fine_b, descriptor, x, y, best_j, best_i, best, reach, other, found[k]
+            )
     return found
 
 
@@ -297,9 +319,9 @@ def _locate_near(xy, expected, fine_a, fine_b, reach, least):
     descriptor, other = np.empty(channels, np.float32), np.empty(channels, np.float32)
     for k in range(n):
         x, y = xy[k]
-        if not (np.isfinite(expected[k, 0]) and _read(fine_a, x, y, descriptor)):
+        if not (np.isfinite(expected[k, 0]) and _interpolate(fine_a, x, y, descriptor)):
             continue
         j, i, best = _search(fine_b, descriptor, expected[k, 0], expected[k, 1], reach)
         if best >= least:
-            _place(fine_a, fine_b, descriptor, x, y, j, i, best, reach, other, found[k])
+            _accept_if_mutual(fine_a, fine_b, descriptor, x, y, j, i, best, reach, other, found[k])
     return found

@@ -1,4 +1,4 @@
-"""A loop detector of another package, watched: what it gives back is checked before it is used."""
+"""Wraps a loop detector of another package and checks its results before they are used."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ _METHODS = ("add", "query", "locate")
 
 
 class PlugInDetector:
-    """See `LoopDetector`. After its first failure the detector is asked no more.
+    """Implements ``LoopDetector``. After its first failure, the detector is not called again.
 
     Attributes:
-        problem: what failed, in one sentence, or None: the run ends then, with what it has.
+        problem: what failed, in one sentence; None if nothing did. A run ends at a problem and
+            keeps what it has computed.
     """
 
     def __init__(self, plugin: PlugIn, detector: LoopDetector) -> None:
@@ -47,7 +48,7 @@ class PlugInDetector:
         return self._candidates(-1, map_, self._detector.locate, _read_only(image), features, map_)
 
     def memory(self) -> DetectorMemory:
-        """What the package gives for a map file; the bare name if it gives nothing."""
+        """The memory of the package's detector; if it has none, only the detector's name."""
         bare = DetectorMemory(self.name)
         if not callable(getattr(self._detector, "memory", None)):
             return bare
@@ -56,28 +57,29 @@ class PlugInDetector:
             return bare
         if not isinstance(found, DetectorMemory):
             self.problem = (
-                f"{self._plugin}: memory gave {type(found).__name__}, no DetectorMemory; repair "
-                "the package"
+                f"{self._plugin}: memory returned {type(found).__name__}, not DetectorMemory; "
+                "repair the package"
             )
             return bare
         return replace(found, name=self.name)
 
     def restore(self, memory: DetectorMemory) -> None:
-        """See `LoopDetector`.
+        """See ``LoopDetector``.
 
         Raises:
-            ValueError: the package cannot: it has no such method, or it fails.
+            ValueError: the memory is that of another detector, or the package has no method
+                ``restore``, or it fails.
         """
         if memory.name != self.name:
             raise ValueError(f"made with the detector {memory.name}, not {self.name}")
         if not callable(getattr(self._detector, "restore", None)):
-            raise ValueError(f"{self._plugin} has no restore: it cannot go on in a map")
+            raise ValueError(f"{self._plugin} has no restore, so it cannot continue a saved map")
         self._ask(self._detector.restore, memory)
         if self.problem is not None:
             raise ValueError(self.problem)
 
     def _ask(self, method: Callable[..., Any], *arguments: object) -> Any:
-        """What a method gives back, None once the detector has failed."""
+        """Call a method; returns its result, or None if the detector fails or has failed before."""
         if self.problem is not None:
             return None
         try:
@@ -100,10 +102,10 @@ class PlugInDetector:
 
 
 def open_plugin(plugin: PlugIn, config: Config, weights: Path | None) -> PlugInDetector:
-    """Make a detector that remembers nothing yet.
+    """Create the detector of a plug-in, without any keyframes.
 
     Raises:
-        InputError: the package is broken, or what it makes is no detector.
+        InputError: the package is broken, or what it creates is not a detector.
     """
     made = plugin.call(config, weights)
     missing = [name for name in _METHODS if not callable(getattr(made, name, None))]
@@ -116,21 +118,25 @@ def open_plugin(plugin: PlugIn, config: Config, weights: Path | None) -> PlugInD
 
 
 def _wrong(found: object, query: int, map_: Map) -> str:
-    """What is wrong with candidates; empty if nothing is. Kernels trust these numbers."""
+    """What is wrong with the candidates for a query, "" if they are valid. They must be checked
+    because kernels use these numbers as indices without checks."""
     if not isinstance(found, (list, tuple)):
-        return f"gave {type(found).__name__}, no list"
+        return f"returned {type(found).__name__}, not a list"
     for candidate in found:
         if not isinstance(candidate, LoopCandidate):
-            return f"gave {type(candidate).__name__} in its list, no LoopCandidate"
+            return f"returned a list with {type(candidate).__name__}, not LoopCandidate"
         numbers = candidate.query, candidate.match, candidate.score
         kinds = (int, np.integer), (int, np.integer), (int, float, np.integer, np.floating)
         if not all(isinstance(x, kind) for x, kind in zip(numbers, kinds, strict=True)):
-            return f"gave a LoopCandidate of {', '.join(type(x).__name__ for x in numbers)}"
+            return f"returned a LoopCandidate of {', '.join(type(x).__name__ for x in numbers)}"
         if candidate.query != query or not isfinite(candidate.score):
-            return f"gave query {candidate.query} with score {candidate.score} for keyframe {query}"
+            return (
+                f"returned query {candidate.query} with score {candidate.score} for keyframe "
+                f"{query}"
+            )
         inside = 0 <= candidate.match < map_.n_keyframes
         if not inside or not map_.arrays.keyframe_alive[candidate.match]:
-            return f"gave keyframe {candidate.match}, which the map does not have"
+            return f"returned keyframe {candidate.match}, which is not in the map"
     return ""
 
 

@@ -1,7 +1,7 @@
-"""How good a loop detector's scores are: precision, recall and what follows from them.
+"""Evaluates the scores of a loop detector by precision, recall and measures derived from them.
 
-Definitions as in the field's benchmarks (Cummins and Newman, IJRR 2008: recall at 100 % precision)
-and, point for point, as in scikit-learn, which the tests compare with.
+The definitions are those of the field's benchmarks (for example recall at 100 % precision, Cummins
+and Newman, IJRR 2008), and the curves are identical to those of scikit-learn (checked by tests).
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ from vslam.errors import InputError
 
 @dataclass(frozen=True)
 class PrecisionRecall:
-    """A curve of K + 1 points, from the lowest threshold to the end point (1, 0).
+    """A precision-recall curve of K + 1 points, one per threshold and the end point with precision
+    1 and recall 0.
 
     Attributes:
         precision, recall: ``(K + 1,)`` float64.
-        thresholds: ``(K,)``, the distinct scores, increasing: accepted is what is not below.
+        thresholds: ``(K,)`` the distinct scores, ascending; a pair is accepted if its score is at
+            least the threshold.
     """
 
     precision: NDArray[np.float64]
@@ -32,22 +34,23 @@ def precision_recall(same: NDArray, score: NDArray) -> PrecisionRecall:
     """Precision and recall at each distinct score.
 
     Args:
-        same: ``(N,)`` bool, whether a pair truly shows one place.
-        score: ``(N,)`` greater is more alike.
+        same: ``(N,)`` bool, whether the two images of each pair show the same place.
+        score: ``(N,)`` similarity of each pair.
 
     Raises:
-        InputError: no true pair, unequal lengths, or a score that is NaN.
+        InputError: no pair shows the same place, the lengths differ, or a score is NaN.
     """
     same, score = np.asarray(same, bool), np.asarray(score, np.float64)
     if same.shape != score.shape or same.ndim != 1:
         raise InputError(f"precision-recall: {same.shape} labels do not fit {score.shape} scores.")
     if not same.any():
-        raise InputError("precision-recall: empty ground truth, no pair shows one place.")
+        raise InputError("precision-recall: empty ground truth, no pair shows the same place.")
     if np.isnan(score).any():
-        raise InputError("precision-recall: a score is NaN; look at the weights of the detector.")
+        raise InputError("precision-recall: a score is NaN; check the weights of the detector.")
     order = np.argsort(-score, kind="stable")
     ranked = score[order]
-    last = np.append(np.flatnonzero(np.diff(ranked)), len(ranked) - 1)  # of each distinct score
+    # The last index of each distinct score.
+    last = np.append(np.flatnonzero(np.diff(ranked)), len(ranked) - 1)
     right = np.cumsum(same[order])[last]
     precision, recall = right / (last + 1), right / right[-1]
     return PrecisionRecall(
@@ -56,28 +59,28 @@ def precision_recall(same: NDArray, score: NDArray) -> PrecisionRecall:
 
 
 def average_precision(curve: PrecisionRecall) -> float:
-    """AP: precision weighted by the steps of recall, without interpolation."""
+    """Average precision: precision weighted by the steps of recall, without interpolation."""
     return float(-np.sum(np.diff(curve.recall) * curve.precision[:-1]))
 
 
 def recall_at_full_precision(curve: PrecisionRecall) -> float:
-    """The highest recall without a single wrong pair."""
+    """The highest recall at which no accepted pair is wrong."""
     return float(curve.recall[curve.precision == 1.0].max())
 
 
 def precision_at_recall(curve: PrecisionRecall, recall: float = 0.7) -> float:
-    """The highest precision of any threshold that reaches this recall."""
+    """The highest precision of any threshold with at least this recall."""
     return float(curve.precision[curve.recall >= recall].max())
 
 
 def accepted_at(curve: PrecisionRecall, threshold: float) -> tuple[float, float]:
-    """Precision and recall of the pairs that a threshold accepts; 1 and 0 if it accepts none."""
+    """Precision and recall at a threshold; 1 and 0 if no pair is accepted."""
     k = int(np.searchsorted(curve.thresholds, threshold))
     return float(curve.precision[k]), float(curve.recall[k])
 
 
 def max_f1(curve: PrecisionRecall) -> tuple[float, float]:
-    """The highest harmonic mean of precision and recall, and its threshold."""
+    """The highest F1 score (harmonic mean of precision and recall), and its threshold."""
     p, r = curve.precision[:-1], curve.recall[:-1]
     f1 = np.divide(2 * p * r, p + r, out=np.zeros_like(p), where=p + r > 0)
     best = int(np.argmax(f1))
@@ -85,21 +88,24 @@ def max_f1(curve: PrecisionRecall) -> tuple[float, float]:
 
 
 def balanced_accuracy(same: NDArray, score: NDArray, threshold: float) -> float:
-    """Mean of the shares of true and of false pairs judged rightly.
+    """Mean of the true positive rate and the true negative rate at a threshold. It equals the
+    accuracy on a set with as many true as false pairs.
 
-    What accuracy is on as many true as false pairs.
+    Args:
+        same: ``(N,)`` bool, whether the two images of each pair show the same place.
+        score: ``(N,)`` similarity of each pair.
 
     Raises:
-        InputError: true or false pairs missing.
+        InputError: there are no true pairs, or no false pairs.
     """
     same, accepted = np.asarray(same, bool), np.asarray(score) >= threshold
     if same.all() or not same.any():
-        raise InputError("accuracy: both true and false pairs are needed.")
+        raise InputError("accuracy: both true and false pairs are needed; add the missing kind.")
     return float((accepted[same].mean() + (~accepted[~same]).mean()) / 2)
 
 
 def summary(same: NDArray, score: NDArray) -> dict[str, float]:
-    """Every figure that a report gives of one detector on one set of pairs."""
+    """All measures that a report shows for a detector on a set of pairs."""
     curve = precision_recall(same, score)
     f1, threshold = max_f1(curve)
     return {

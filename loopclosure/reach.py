@@ -1,4 +1,4 @@
-"""Which keyframes the camera may see again, as far as odometry tells: no others are compared."""
+"""Limits loop detection to keyframes whose view the camera may see again according to odometry."""
 
 from __future__ import annotations
 
@@ -10,23 +10,24 @@ from vslam.map import Map
 
 
 def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.float64]:
-    """How far each keyframe lies beyond what the error of odometry may hide.
+    """By how much the distance to each keyframe exceeds the possible error of odometry.
 
-    The error of a position grows with the way driven. A monocular map has no metres and its unit
-    drifts, so there the error is a larger share of the way alone. Keyframes of different sub-maps
-    are always within reach: where the camera was lost between them, their relative pose is unknown,
-    and in a monocular map so is the ratio of their units.
+    The error of a position grows with the distance driven. A monocular map has no metric scale and
+    its scale drifts, so its error is taken as a larger share of the distance driven, without a
+    constant part. Keyframes of different sub-maps are always within reach: the camera was lost
+    between them, so their relative pose is unknown, and in a monocular map also the ratio of their
+    units.
 
-    Within a sub-map, a keyframe that looks another way than the camera is out of reach wherever it
-    lies: odometry knows directions to a few degrees, and nothing here recognises a place from
-    behind or from the side.
+    Within a sub-map, a keyframe that faces another direction than the camera is out of reach at any
+    distance: odometry knows directions to a few degrees, and the detectors do not recognise a place
+    from behind or from the side.
 
     Args:
-        keyframe: where the camera is.
+        keyframe: id of the current keyframe.
 
     Returns:
-        ``(n_keyframes,)`` in the unit of the map; 0 or less for those that the camera may see
-        again, infinite for those that look another way.
+        ``(n_keyframes,)`` float64 in the unit of the map: at most 0 for keyframes within reach,
+        infinite for those that face another direction.
     """
     n, a = map_.n_keyframes, map_.arrays
     T = a.T_cw[:n]
@@ -41,7 +42,7 @@ def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.
         beyond = apart - config.reach - config.reach_share * way
     else:
         beyond = apart - config.monocular_reach_share * way
-    ahead = T[:, 2, :3]  # where each keyframe looks, in the world
+    ahead = T[:, 2, :3]  # viewing direction of each keyframe in the world
     beyond[ahead @ ahead[keyframe] < np.cos(np.radians(config.reach_angle))] = np.inf
     if map_.restarts:
         submap = map_.submaps()

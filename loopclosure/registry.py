@@ -1,4 +1,4 @@
-"""The loop detectors by name: vslam's own, and those of other packages (docs/plugins.md)."""
+"""Creates loop detectors by name: those of vslam and of other packages (docs/howto/plugins.md)."""
 
 from __future__ import annotations
 
@@ -21,25 +21,31 @@ DEFAULT_DETECTOR = "both"
 _ABOUT = {
     "none": "no loop closing",
     "bow": "the bag of words",
-    "both": "the Siamese capsule network beside the bag of words",
+    "both": "the Siamese capsule network together with the bag of words",
     "capsule": "the Siamese capsule network",
     "capsule-pruned": "the Siamese capsule network, pruned",
     "capsule-paper": "the Siamese capsule network as the paper describes it",
 }
-# Detectors whose candidates learned descriptors verify, too, unless the configuration says more.
+# Detectors whose candidates are also verified by learned descriptors, unless the configuration
+# selects others.
 LEARNED_VERIFICATION = ("both", *(name for name in NETWORKS if name != TO_THE_LETTER))
 
 
 def about(name: str) -> str:
-    """What a detector is, in a few words; its name for all others."""
+    """A description of a detector in a few words; for a plug-in, its name."""
     return _ABOUT.get(name, name)
 
 
 def require_detector(name: str, weights: Path | None = None, option: str = "--detector") -> None:
-    """Refuse what cannot be created, before anything heavy is imported or compiled.
+    """Check that a detector can be created, before anything expensive is imported or compiled.
+
+    Args:
+        name: name of the detector.
+        weights: weights for it, or None.
+        option: the option of the command line to name in the message.
 
     Raises:
-        InputError: no such detector, or no weights for it.
+        InputError: there is no such detector or no weights for it, or it takes no weights.
     """
     if name not in DETECTORS:
         others = plugins.find_plugins(plugins.DETECTORS)
@@ -50,11 +56,11 @@ def require_detector(name: str, weights: Path | None = None, option: str = "--de
     elif name in (*NETWORKS, "both"):
         find_weights(_network_of(name), weights)
     elif weights is not None:
-        raise InputError(f"--weights: the detector {name} has none; leave the option out.")
+        raise InputError(f"--weights: the detector {name} has no weights; leave the option out.")
 
 
 def problem_of(detector: LoopDetector) -> str | None:
-    """What failed in a detector of another package, in one sentence; None if nothing did."""
+    """What failed in a plug-in detector, in one sentence; None if nothing did."""
     return detector.problem if isinstance(detector, PlugInDetector) else None
 
 
@@ -66,18 +72,18 @@ def detector_with_images(
     local_weights: Path | None = None,
     late: bool = True,
 ) -> tuple[LoopDetector, KeyframeImages | None]:
-    """A detector that remembers nothing yet, and where it keeps the images of keyframes for
-    learned verification: both halves that :class:`vslam.slam.Slam` takes.
+    """Create a detector without any keyframes, and the store of keyframe images for learned
+    verification; :class:`vslam.slam.Slam` takes both.
 
     Args:
-        weights, late: as of :func:`create_detector`.
-        local_weights: of the local descriptors; None for those that vslam ships.
+        weights, late: as in :func:`create_detector`.
+        local_weights: weights of the local descriptors; None takes those that vslam ships.
 
     Returns:
-        The detector, and None in place of images where ORB alone verifies its candidates.
+        The detector, and the store of images, or None if candidates are verified by ORB alone.
 
     Raises:
-        InputError, ValueError: as :func:`create_detector`.
+        InputError, ValueError: as in :func:`create_detector`.
     """
     images = create_images(name, config, local_weights)
     return create_detector(name, config, weights, images, late=late), images
@@ -91,12 +97,13 @@ def create_detector(
     *,
     late: bool = False,
 ) -> LoopDetector:
-    """A detector that remembers nothing yet. What it needs is imported here, not before.
+    """Create a detector without any keyframes. Its dependencies are imported only here.
 
     Args:
-        weights: of a learned detector; None for those that vslam ships.
-        images: of the keyframes, from :func:`create_images`; given to ``verifier_for``, too.
-        late: load a network that vslam ships when the first image is shown to it.
+        weights: weights of a learned detector; None takes those that vslam ships.
+        images: the store of keyframe images from :func:`create_images`, which ``verifier_for``
+            must be given as well.
+        late: whether to load a network that vslam ships only when it gets its first image.
 
     Raises:
         InputError: its vocabulary or weights cannot be read, or its package is broken.
@@ -128,8 +135,8 @@ def create_detector(
 
 
 def create_images(name: str, config: Config, weights: Path | None = None) -> KeyframeImages | None:
-    """What keeps the images that learned descriptors rate and verify candidates with; None where
-    ORB alone verifies them (``verification.descriptors``).
+    """Create the store of keyframe images with which learned descriptors rate and verify
+    candidates; None if they are verified by ORB alone (``verification.descriptors``).
 
     Raises:
         InputError: the network cannot be read.
@@ -149,15 +156,15 @@ def create_images(name: str, config: Config, weights: Path | None = None) -> Key
 
 
 def _network_of(name: str) -> str:
-    """The learned half of ``both``; a network itself."""
+    """The network of a detector: for ``both``, ``capsule``."""
     return "capsule" if name == "both" else name
 
 
 def parse_weights(given: Collection[str], detectors: Collection[str]) -> dict[str, Path]:
-    """``NAME=FILE`` each: the weights of some of these detectors.
+    """Parse items ``NAME=FILE``, the weights of some of the detectors, into files by name.
 
     Raises:
-        InputError: an item of another form, or of no detector asked for.
+        InputError: an item has another form, or names none of the detectors.
     """
     files = {}
     for item in given:

@@ -1,8 +1,8 @@
-"""Motion between two cameras from landmarks that each of them holds of the same points.
+"""Motion between two cameras from matched 3D landmarks, by RANSAC.
 
-A stereo map has metric points on both sides of a loop, so that three matches fix the motion in
-closed form (Horn, JOSA A 1987; the scale as in Umeyama, PAMI 1991). RANSAC judges a motion as
-ORB-SLAM does (T-RO 2015, VII-B): by the reprojection errors in *both* keyframes.
+Both sides of a loop have landmarks of the same points, so three matches determine the motion in
+closed form (Horn, JOSA A 1987; the scale as in Umeyama, PAMI 1991). RANSAC scores a motion as
+ORB-SLAM does (T-RO 2015, VII-B), by the reprojection errors in *both* keyframes.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from vslam.reprojection import chi_square, chi_square_ratio, residual, unpacked
 
 REFITS = 4
 SAMPLE_ITERATIONS, REFIT_ITERATIONS = 3, 5
-# A triangle flatter than this (height over longest side) says little of the turn about that side.
+# A flatter triangle (height over longest side) hardly constrains the rotation about that side.
 MIN_FLATNESS = 0.03
 
 
 class Sightings(NamedTuple):
-    """Matched landmarks as one of the two cameras has them, in the order of the matches.
+    """The landmarks of N matches on one side of a loop, and their observations there.
 
-    ``points`` (N, 3) f8 in the camera's frame, metres; ``uvr`` (N, 3) f8 the observed u, v,
-    u_right in pixels, NaN u_right: monocular; ``inverse_sigma2`` (N,) f8 inverse variance of a
-    pixel coordinate.
+    Attributes:
+        points: ``(N, 3)`` landmarks in the camera frame, in the unit of the map.
+        uvr: ``(N, 3)`` observed u, v, u_right, pixels; NaN u_right for a monocular observation.
+        inverse_sigma2: ``(N,)`` inverse variance of a pixel coordinate.
     """
 
     points: NDArray[np.float64]
@@ -37,7 +38,13 @@ class Sightings(NamedTuple):
 
 
 class Alignment(NamedTuple):
-    """``p_a = scale * R p_b + t``; ``T_a_b`` holds R and t; ``inlier`` is (N,) bool."""
+    """The similarity ``p_a = scale * R p_b + t`` between two cameras.
+
+    Attributes:
+        T_a_b: ``(4, 4)`` with R and t.
+        scale: factor from lengths in b to lengths in a.
+        inlier: ``(N,)`` bool, matches that agree with it.
+    """
 
     T_a_b: NDArray[np.float64]
     scale: float
@@ -55,14 +62,16 @@ def align(
     confidence: float,
     fix_scale: bool = True,
 ) -> Alignment | None:
-    """Rigid motion, or similarity, on which most matches agree; None if too few do.
+    """Rigid motion or similarity with the highest consensus; None if it has fewer than
+    ``min_inliers`` inliers.
 
     Args:
-        a, b: the same N landmarks from both cameras.
-        intrinsics: ``(6,)`` of both, see ``Camera.intrinsics``.
-        seed: of the draws; the same seed gives the same result.
-        min_inliers: fewer are no consensus.
-        max_draws, confidence: draws end when this confident that none better is left.
+        a, b: the same N matches as seen by each camera.
+        intrinsics: ``(6,)`` of both cameras, see ``Camera.intrinsics``.
+        seed: seed of the random samples; the same seed gives the same result.
+        min_inliers: least number of inliers.
+        max_draws: maximum number of samples.
+        confidence: sampling ends when a better motion would have been found with this probability.
         fix_scale: True for metric maps (stereo, RGB-D), False for monocular ones.
     """
     if len(a.points) < max(3, min_inliers):
@@ -82,13 +91,15 @@ def align(
 
 @kernel
 def fit_motion(p_a, p_b, weights, fix_scale):
-    """Least-squares motion of weighted points, ``p_a = scale * R p_b + t`` (Horn 1987).
+    """Weighted least-squares motion ``p_a = scale * R p_b + t`` of points (Horn 1987).
 
     Args:
-        p_a, p_b: ``(N, 3)`` float64; weights: ``(N,)`` float64, 0 leaves a point out.
+        p_a, p_b: ``(N, 3)`` float64, at least three points that are not collinear
+            (``is_degenerate``).
+        weights: ``(N,)`` float64; a point with weight 0 is ignored.
 
     Returns:
-        ``(4, 4)`` with R and t, and the scale; needs three points off a line (``is_degenerate``).
+        ``(4, 4)`` with R and t, and the scale (1 if ``fix_scale``).
     """
     n = len(p_a)
     total = 0.0
@@ -157,7 +168,7 @@ def fit_motion(p_a, p_b, weights, fix_scale):
 
 @kernel
 def is_degenerate(p):
-    """Whether three points, rows of ``(3, 3)``, lie nearly on a line or on each other."""
+    """Whether three points, the rows of a ``(3, 3)`` array, are nearly collinear or coincide."""
     longest = 0.0
     for i in range(3):
         side = 0.0
@@ -175,10 +186,11 @@ def is_degenerate(p):
 
 @inner_kernel
 def _same_sides(p_a, p_b, bf):
-    """Whether two triangles can be one: most draws with a wrong match fail here, at no cost.
+    """Whether the sides of two triangles agree within the stereo error. This cheap test rejects
+    most samples that contain a wrong match.
 
-    A disparity wrong by a pixel moves a point by z^2 / bf; the ends of a side may each be off by
-    that much in each camera.
+    An error of one pixel in the disparity moves a point by z^2 / bf. Each end of a side may be
+    off by that much in each camera.
     """
     for i in range(3):
         j = (i + 1) % 3
@@ -194,10 +206,11 @@ def _same_sides(p_a, p_b, bf):
 
 @inner_kernel
 def _add_residual(p, motion, uvr, inverse_sigma2, intrinsics, H, b):
-    """Add one sighting to the normal equations.
+    """Add one observation to the normal equations, with the Huber loss.
 
     Args:
-        p: ``(3,)`` the point in the camera; motion: ``(3, 7)`` its derivative.
+        p: ``(3,)`` point in the camera frame.
+        motion: ``(3, 7)`` derivative of the point by the seven parameters of the similarity.
     """
     if p[2] <= 0.1:
         return
@@ -221,10 +234,18 @@ def _add_residual(p, motion, uvr, inverse_sigma2, intrinsics, H, b):
 
 @kernel
 def refine_motion(T, scale, a, b, chosen, intrinsics, iterations, fix_scale):
-    """Gauss-Newton on the reprojection errors of ``(M,)`` chosen matches in both cameras, Huber.
+    """Refine a motion by Gauss-Newton on the reprojection errors in both cameras, with the Huber
+    loss.
 
-    Stereo points are ten times less certain along the line of sight than across it: the fit of
-    ``fit_motion`` is a start, no more. Returns T and the scale.
+    This is needed because stereo points are ten times less certain along the line of sight than
+    across it, which the least-squares fit of ``fit_motion`` ignores.
+
+    Args:
+        T, scale: initial motion.
+        chosen: ``(M,)`` indices of the matches to use.
+
+    Returns:
+        The refined ``(4, 4)`` motion and scale.
     """
     points_a, uvr_a, weight_a = a
     points_b, uvr_b, weight_b = b
@@ -233,14 +254,14 @@ def refine_motion(T, scale, a, b, chosen, intrinsics, iterations, fix_scale):
     for _ in range(iterations):
         H, g = np.zeros((7, 7)), np.zeros(7)
         for i in chosen:
-            # In a: p = scale R p_b + t; its derivative by [v, w, log scale] is [I, -[p]x, p].
+            # In camera a: p = scale R p_b + t, with derivative [I, -[p]x, p] by [v, w, log scale].
             for row in range(3):
                 p[row] = T[row, 3]
                 for k in range(3):
                     p[row] += scale * T[row, k] * points_b[i, k]
             _derivative(p, fix_scale, turned)
             _add_residual(p, turned, uvr_a[i], weight_a[i], intrinsics, H, g)
-            # In b: p' = R' (p - t) / scale; the same motion, undone.
+            # In camera b: p' = R' (p - t) / scale, the inverse of the same motion.
             _derivative(points_a[i], fix_scale, turned)
             for row in range(3):
                 p[row] = 0.0
@@ -281,7 +302,7 @@ def _derivative(p, fix_scale, out):
 
 @inner_kernel
 def _error(x, y, z, uvr, inverse_sigma2, intrinsics):
-    """``chi_square_ratio``; 2 for a point that is not in front of the camera."""
+    """``chi_square_ratio`` of an observation; 2 if the point is not in front of the camera."""
     if z <= 0.1:
         return 2.0
     pinhole = unpacked(intrinsics)
@@ -290,7 +311,10 @@ def _error(x, y, z, uvr, inverse_sigma2, intrinsics):
 
 @inner_kernel
 def _score_motion(T, scale, a, b, intrinsics, to_beat, inlier):
-    """Score of a motion (MSAC, Torr and Zisserman, CVIU 2000); sets ``inlier``, gives up early."""
+    """MSAC score of a motion and its number of inliers (Torr and Zisserman, CVIU 2000).
+
+    Sets ``inlier``. Returns -1, 0 as soon as the score can no longer exceed ``to_beat``.
+    """
     points_a, uvr_a, weight_a = a
     points_b, uvr_b, weight_b = b
     n = len(points_a)
@@ -304,7 +328,7 @@ def _score_motion(T, scale, a, b, intrinsics, to_beat, inlier):
         y = scale * (T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2]) + T[1, 3]
         z = scale * (T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2]) + T[2, 3]
         in_a = _error(x, y, z, uvr_a[i], weight_a[i], intrinsics)
-        if not in_a <= 1.0:  # NaN: the refinement went astray
+        if not in_a <= 1.0:  # also true for NaN, if the refinement has diverged
             continue
         dx, dy, dz = points_a[i, 0] - T[0, 3], points_a[i, 1] - T[1, 3], points_a[i, 2] - T[2, 3]
         x = (T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz) / scale
@@ -321,7 +345,8 @@ def _score_motion(T, scale, a, b, intrinsics, to_beat, inlier):
 
 @kernel
 def _ransac(a, b, intrinsics, seed, min_inliers, max_draws, confidence, fix_scale):
-    """Draws of three, each better one refitted to its inliers. Returns T, scale, inlier, count."""
+    """RANSAC on samples of three matches; a motion that scores better than all before is refitted
+    to its inliers. Returns T, scale, inliers and their number."""
     points_a, points_b = a.points, b.points
     n = len(points_a)
     state = np.empty(1, np.uint64)
@@ -330,7 +355,7 @@ def _ransac(a, b, intrinsics, seed, min_inliers, max_draws, confidence, fix_scal
     best_inlier, inlier = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
     sample = np.empty(3, np.int64)
     three_a, three_b, ones = np.empty((3, 3)), np.empty((3, 3)), np.ones(3)
-    # With at least min_inliers among the matches, this many draws find them.
+    # If at least min_inliers of the matches are right, this many samples suffice.
     draws = draws_needed(min_inliers / n, confidence, max_draws)
     turn = 0
     while turn < draws:

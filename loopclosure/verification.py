@@ -1,10 +1,11 @@
-"""Geometric verification: is a loop candidate the same place, and where is the camera in it?
+"""Geometric verification of loop candidates: is it the same place, and what is the relative pose?
 
-ORB-SLAM's steps (T-RO 2015, VII-B; for stereo T-RO 2017, III-D): descriptors matched between two
-keyframes, a motion by RANSAC, guided matching with all that the place knows, refinement. ORB-SLAM
-then counts inliers. A facade or a car that looks like another brings inliers too, so that we ask
-for the opposite evidence as well: whether the rest of the scene fits, and how much each side
-should see of the other's landmarks and does not.
+The steps are those of ORB-SLAM (T-RO 2015, VII-B; for stereo T-RO 2017, III-D): match the
+descriptors of two keyframes, estimate a motion by RANSAC, match all landmarks of the place near
+their projections, and refine the pose. ORB-SLAM then counts inliers. But a facade or a car that
+looks like another one has inliers, too. So we also test for evidence against the loop: inliers must
+be spread over the image, and each side must find most of the landmarks of the other side that
+should be visible.
 """
 
 from __future__ import annotations
@@ -36,18 +37,18 @@ from vslam.map_kernels import collect_landmarks
 from vslam.reprojection import stack_uvr
 
 GRID_COLUMNS, GRID_ROWS = 8, 4
-MIN_DEPTHS = 10  # depths on both sides that a median ratio takes
+MIN_DEPTHS = 10  # least number of landmarks with depths on both sides for a ratio of scales
 
 
 class GuidedMatches(NamedTuple):
-    """What a camera should see of M landmarks, and does see.
+    """The landmarks that a camera should see, and those that it does see.
 
     Attributes:
-        landmarks: ``(M,)`` int32, those that should be visible.
+        landmarks: ``(M,)`` int32 ids of the landmarks that should be visible.
         feature: ``(M,)`` int32, inlier feature of each (index within the keyframe), or -1.
-        uv: ``(M, 2)`` float64, where they should appear.
-        n_matches: features found near the predictions, outliers included.
-        T_cw: ``(4, 4)`` pose of the camera in the world of the landmarks.
+        uv: ``(M, 2)`` float64, their predicted pixels.
+        n_matches: number of matches near the predictions, including outliers.
+        T_cw: ``(4, 4)`` pose of the camera in the world frame of the landmarks.
     """
 
     landmarks: NDArray[np.int32]
@@ -58,7 +59,7 @@ class GuidedMatches(NamedTuple):
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """``(M,)``: those with an inlier."""
+        """``(M,)`` bool, landmarks with an inlier."""
         return self.feature >= 0
 
 
@@ -68,12 +69,12 @@ def verify(
     camera: Camera,
     config: VerificationConfig,
 ) -> LoopEdge:
-    """Decide whether the query keyframe shows the place of the match. Reads the map only.
+    """Decide whether the query keyframe shows the place of the match. The map is not changed.
 
     Returns:
-        An edge that is accepted with reason "verified", or not, with what spoke against it.
-        Its pose and its matches are set as soon as there are any; features and landmarks are the
-        inliers: features of the query, and living landmarks of the place, neither of them twice.
+        An edge that is accepted with reason "verified", or not accepted with the reason why not.
+        Pose and matches are set as far as verification got. Features and landmarks are the inliers:
+        features of the query and living landmarks of the place, without repetitions.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate)
@@ -85,14 +86,14 @@ def verify(
     T_query_match, scale, n_inliers = _consensus(map_, query, match, rows_q, rows_m, camera, config)
     if T_query_match is None:
         return replace(
-            edge, reason=f"no motion that {config.min_consensus} of the matches agree on"
+            edge, reason=f"no motion has {config.min_consensus} inliers among the matches"
         )
     edge = replace(edge, n_inliers=n_inliers, T_query_match=T_query_match, scale=scale)
     return verify_near(map_, edge, camera, config)
 
 
 def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationConfig) -> LoopEdge:
-    """``verify`` from where an edge puts the query, with no descriptors matched before.
+    """``verify`` starting from the pose of an edge, without matching descriptors first.
 
     Raises:
         ValueError: the edge has no pose.
@@ -122,7 +123,8 @@ def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationC
 def match_keyframes(
     map_: Map, query: int, match: int, config: VerificationConfig
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of two keyframes, ``(N,)`` each, whose features observe landmarks and look alike."""
+    """Match the features of two keyframes that observe landmarks by their descriptors; returns
+    ``(N,)`` rows of each keyframe in the map's arrays."""
     a = map_.arrays
     rows_q, rows_m = (
         np.flatnonzero(a.landmark[map_.rows(k)] >= 0) + a.first_row[k] for k in (query, match)
@@ -147,7 +149,8 @@ def _consensus(
     camera: Camera,
     config: VerificationConfig,
 ) -> tuple[Matrix | None, float, int]:
-    """``T_query_match`` and scale of most of the matches, and how many; None if too few agree."""
+    """``T_query_match`` and scale with the highest consensus, and its number of inliers; the pose
+    is None if there is no consensus."""
     found = align(
         _sightings(map_, query, rows_q),
         _sightings(map_, match, rows_m),
@@ -161,16 +164,18 @@ def _consensus(
     if found is None:
         return None, 1.0, 0
     T_query_match = found.T_a_b.copy()
-    T_query_match[:3, 3] /= found.scale  # the query's unit to the match's
+    T_query_match[:3, 3] /= found.scale  # from the query's unit to that of the match
     return T_query_match, found.scale, int(np.count_nonzero(found.inlier))
 
 
 def relative_scale(map_: Map, edge: LoopEdge, T_cw: Matrix, *, default: float) -> float:
-    """Units around the query for one around the match: the median ratio of the depths that the
-    query's own landmarks and those of the place give the same features.
+    """Scale of a monocular loop: the factor from lengths around the match to lengths around the
+    query. It is the median, over features that observe a landmark on both sides, of the ratio of
+    the depths of the query's landmark and the landmark of the place.
 
     Args:
-        T_cw: pose of the query in the world of the place.
+        T_cw: ``(4, 4)`` pose of the query in the world frame of the place.
+        default: the result if there are too few such features.
     """
     a = map_.arrays
     assert edge.features is not None
@@ -191,14 +196,15 @@ def _sightings(map_: Map, keyframe: int, rows: NDArray[np.int64]) -> Sightings:
 
 
 def _observations(map_: Map, rows: NDArray[np.int64]) -> tuple[Matrix, Matrix]:
-    """``(N, 3)`` u, v, u_right of rows, and ``(N,)`` their inverse variances."""
+    """``(N, 3)`` u, v, u_right of ``(N,)`` rows, and ``(N,)`` inverse variances."""
     a = map_.arrays
     uvr = stack_uvr(a.xy[rows], a.u_right[rows])
     return uvr, map_.scales[a.octave[rows]] ** -2.0
 
 
 def place_of(map_: Map, match: int, query: int, config: VerificationConfig) -> NDArray[np.int64]:
-    """The match and its best covisible keyframes, none of which sees what the query sees."""
+    """Ids of the match and its best covisible keyframes, without those that are covisible with the
+    query."""
     near_query = {query, *map_.covisible(query)[0].tolist()}
     around = [k for k in map_.covisible(match)[0].tolist() if k not in near_query]
     return np.array([match, *around[: config.place_keyframes]], np.int64)
@@ -212,12 +218,12 @@ def guided_match(
     camera: Camera,
     config: VerificationConfig,
 ) -> GuidedMatches:
-    """Guided matching: find ``(N,)`` landmarks near where a pose of a keyframe puts them, refine
-    the pose with all that was found, and once more in narrower windows.
+    """Guided matching: search for ``(N,)`` landmarks near their projections and refine the pose
+    with all matches; then repeat this in narrower windows.
 
     Args:
-        T_cw: estimate of the keyframe's pose in the world of the landmarks, which is not the
-            world of its own landmarks where the map has drifted.
+        T_cw: ``(4, 4)`` estimated pose of the keyframe in the world frame of the landmarks. If the
+            map has drifted, this differs from its pose in the map.
     """
     a, rows = map_.arrays, map_.rows(keyframe)
     grid = FeatureGrid.of_positions(a.xy[rows], camera.width, camera.height)
@@ -263,14 +269,14 @@ def _rejection_reason(
     camera: Camera,
     config: VerificationConfig,
 ) -> str:
-    """What speaks against a refined loop, "" if nothing does."""
+    """Why a refined loop must be rejected, "" if it passes all tests."""
     if edge.n_inliers < config.min_inliers:
         return f"only {edge.n_inliers} landmarks of the place fit"
     if edge.n_inliers < config.min_inlier_ratio * edge.n_matches:
         return f"only {edge.n_inliers} of {edge.n_matches} matches fit"
     distance = float(np.linalg.norm(inverse(T_query_match)[:3, 3]))
     if distance > config.max_distance:
-        return f"{distance:.0f} m from the place"
+        return f"the pose is {distance:.0f} m from the place"
     if reason := spread_reason(guided.uv, guided.seen, camera, config, config.min_elsewhere):
         return reason
     seen, total = seen_of(map_, edge.match, guided)
@@ -291,11 +297,16 @@ def spread_reason(
     config: VerificationConfig,
     min_elsewhere: int,
 ) -> str:
-    """What speaks against a place of which the landmarks at ``uv`` ``(M, 2)`` should be visible
-    and some are ``seen``: that these lie together; "" if they do not."""
+    """Why inliers are not spread widely enough over the image, "" if they are.
+
+    Args:
+        uv: ``(M, 2)`` predicted pixels of the landmarks that should be visible.
+        seen: ``(M,)`` bool, the inliers.
+        min_elsewhere: least number of inliers outside one third of the image.
+    """
     expected, occupied = occupied_cells(uv, camera), occupied_cells(uv[seen], camera)
     if occupied < max(config.min_cells, config.min_cell_ratio * expected):
-        return f"inliers in {occupied} of {expected} cells of the image only"
+        return f"inliers in only {occupied} of {expected} cells of the image"
     elsewhere = count_elsewhere(uv[seen, 0], camera.width)
     if elsewhere < min_elsewhere:
         return f"only {elsewhere} inliers outside one third of the image"
@@ -309,21 +320,21 @@ def reverse_match(
     camera: Camera,
     config: VerificationConfig,
 ) -> GuidedMatches:
-    """What the match sees of the landmarks of the query."""
+    """Guided matching of the landmarks of the query in the match."""
     T_match_query = inverse(T_query_match)
-    T_match_query[:3, 3] *= edge.scale  # to the query's unit, which its landmarks are in
+    T_match_query[:3, 3] *= edge.scale  # in the query's unit, like its landmarks
     T_mw = T_match_query @ map_.keyframe_pose(edge.query)
     return guided_match(map_, edge.match, map_.landmarks_of(edge.query), T_mw, camera, config)
 
 
 def seen_of(map_: Map, keyframe: int, guided: GuidedMatches) -> tuple[int, int]:
-    """How many of the landmarks of a keyframe the camera sees, and how many it should see."""
+    """How many landmarks of a keyframe the camera sees, and how many of them it should see."""
     own = np.isin(guided.landmarks, map_.landmarks_of(keyframe))
     return int(np.count_nonzero(guided.seen & own)), int(np.count_nonzero(own))
 
 
 def occupied_cells(uv: Matrix, camera: Camera) -> int:
-    """Cells of the image in which ``(N, 2)`` pixels lie."""
+    """Number of cells of the image that contain any of ``(N, 2)`` pixels."""
     column = (uv[:, 0] * GRID_COLUMNS / camera.width).astype(np.int64)
     row = (uv[:, 1] * GRID_ROWS / camera.height).astype(np.int64)
     return len(np.unique(row * GRID_COLUMNS + column))

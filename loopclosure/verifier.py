@@ -1,6 +1,7 @@
-"""What verifies loop candidates: ORB descriptors, learned ones, or these where ORB fails.
+"""Verifiers of loop candidates: by ORB descriptors, by learned ones, or by ORB and, if that fails,
+by learned ones.
 
-Loop closing sees the :class:`Verifier` alone, so that it works alike for all of them.
+Loop closing knows only the interface :class:`Verifier`, so it is the same for all of them.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from vslam.states import VerifierState
 
 
 class Verifier(Protocol):
-    """Decides by geometry whether a keyframe shows the place that a detector takes it for.
+    """Decides by geometry whether a keyframe shows the place that a detector proposes.
 
-    Calls come in the order of the keyframes, from one thread at a time.
+    Methods are called in the order of the keyframes, by one thread at a time.
     """
 
     @property
@@ -40,56 +41,57 @@ class Verifier(Protocol):
 
     @property
     def verified_memory(self) -> int:
-        """For how many keyframes a verified loop waits for a second one that agrees with it."""
+        """For how many keyframes a verified loop waits for other loops that agree with it."""
         ...
 
     def is_image_redundant(self, map_: Map, keyframe: int) -> bool:
-        """Whether a keyframe shows so much of what other images show that its own is not needed."""
+        """Whether the image of a keyframe is not needed, because other images show nearly the same
+        view."""
         ...
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
-        """Keep what verification needs of a new keyframe.
+        """Remember the image of a new keyframe if verification needs images.
 
         Args:
-            image: its ``(H, W)`` left image; None if there is none or it is not needed.
+            image: ``(H, W)`` uint8 left image; None if there is none or it is not needed.
         """
         ...
 
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
-        """The candidates of a keyframe, in the same order, with ``alike`` and ``promising`` set
-        where this verifier has an opinion."""
+        """The candidates of a keyframe in the same order, with ``alike`` and ``promising`` set if
+        this verifier uses them."""
         ...
 
     def verify(
         self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
     ) -> LoopEdge:
-        """Decide whether a rated candidate is a loop. Only reads the map.
+        """Decide whether a rated candidate is a loop. The map is not changed.
 
         Args:
-            refusal: the edge of an earlier test that the candidate failed; None if it failed none.
+            refusal: the rejected edge if the candidate has failed an earlier test, else None.
 
         Returns:
-            An accepted edge with a pose, or one that is not accepted and says why.
+            An accepted edge with a pose, or one that is not accepted, with the reason.
         """
         ...
 
     def state(self) -> VerifierState:
-        """What ``restore`` needs to continue from here; the images are not part of it."""
+        """The state, for a saved map or a checkpoint, without the images."""
         ...
 
     def restore(self, state: VerifierState) -> None:
-        """Continue from what ``state`` returned."""
+        """Continue from a state that ``state`` returned."""
         ...
 
 
 def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None = None) -> Verifier:
-    """The verifier that ``config.verification.descriptors`` asks for.
+    """Create the verifier that ``config.verification.descriptors`` selects.
 
     Args:
-        images: where learned verification keeps the images of keyframes; None for ORB alone,
-            whatever the configuration says (``vslam.loopclosure.registry`` decides which).
+        images: the store of keyframe images for learned verification; None selects ORB alone,
+            whatever the configuration says (see ``vslam.loopclosure.registry.create_images``).
     """
     if images is None:
         return OrbVerifier(config, camera)
@@ -113,12 +115,12 @@ class OrbVerifier:
         return False
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
-        """Nothing to keep: the map has the descriptors."""
+        """Do nothing: the map already has the descriptors."""
 
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
-        """The candidates as they are."""
+        """The candidates, unchanged."""
         return candidates
 
     def verify(
@@ -130,19 +132,19 @@ class OrbVerifier:
         return verification.verify(map_, candidate, self._camera, self._config)
 
     def state(self) -> VerifierState:
-        """The default: nothing is remembered."""
+        """The default state: nothing is remembered."""
         return VerifierState()
 
     def restore(self, state: VerifierState) -> None:
-        """Nothing to restore."""
+        """Do nothing: there is no state."""
 
 
 class LearnedVerifier:
     """Implements :class:`Verifier` by learned local descriptors alone.
 
-    They cost forty times as much as ORB's, so that :class:`LearnedTrials` chooses which candidates
-    are worth it. These are tried even if the detector found the place for one keyframe only: a
-    camera that crosses a place by night may get one good view of it.
+    This takes forty times as long as verification by ORB, so :class:`LearnedTrials` chooses
+    promising candidates. These are tried even if only one keyframe resembled the place, because a
+    camera that crosses a place by night may get only one good view of it.
     """
 
     def __init__(self, config: Config, camera: Camera, images: KeyframeImages) -> None:
@@ -159,7 +161,7 @@ class LearnedVerifier:
         return is_image_redundant(map_, keyframe, self.images, self._config.learned)
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
-        """Keep the image, and forget those of keyframes that were culled."""
+        """Remember the image, and forget those of keyframes that were culled."""
         if image is not None:
             self.images.add(keyframe, image)
             self.images.keep(map_.arrays.keyframe_alive)
@@ -167,8 +169,8 @@ class LearnedVerifier:
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
-        """See :class:`Verifier`: compare the images of candidates that the detector did not rate,
-        and choose the promising ones."""
+        """See :class:`Verifier`: rate candidates that the detector has not rated by comparing their
+        images, and mark the promising ones."""
         images, config = self.images, self._config
         if keyframe in images and any(one.alike is None for one in candidates):
             beyond = beyond_reach(map_, keyframe, config.siamese)
@@ -180,9 +182,10 @@ class LearnedVerifier:
     def verify(
         self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
     ) -> LoopEdge:
-        """See :class:`Verifier`; only promising candidates are tried, whether refused or not."""
+        """See :class:`Verifier`; only promising candidates are tried, even if they have failed an
+        earlier test."""
         if not candidate.promising:
-            reason = "not alike enough for learned descriptors"
+            reason = "not similar enough for learned descriptors"
             return refusal or LoopEdge.of(candidate, reason, matched_by="learned")
         config = self._config
         edge = verify_learned(
@@ -204,7 +207,7 @@ class LearnedVerifier:
 
 
 class OrbThenLearnedVerifier(LearnedVerifier):
-    """Implements :class:`Verifier` by ORB descriptors, and by learned ones where ORB fails."""
+    """Implements :class:`Verifier` by ORB descriptors and, if these fail, by learned ones."""
 
     def __init__(self, config: Config, camera: Camera, images: KeyframeImages) -> None:
         super().__init__(config, camera, images)
@@ -213,6 +216,7 @@ class OrbThenLearnedVerifier(LearnedVerifier):
     def verify(
         self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
     ) -> LoopEdge:
-        """See :class:`Verifier`; a promising candidate that ORB refuses is tried once more."""
+        """See :class:`Verifier`; a promising candidate that ORB rejects is tried again by learned
+        descriptors."""
         edge = self._orb.verify(map_, candidate, refusal)
         return edge if edge.accepted else super().verify(map_, candidate, edge)

@@ -1,10 +1,10 @@
-"""Visual words: a tree of binary descriptors, and the bag of words of an image.
+"""Visual words: a vocabulary tree of binary descriptors, and the bag of words of an image.
 
-The tree is the hierarchical vocabulary of Nister and Stewenius (CVPR 2006) over binary
-descriptors (Galvez-Lopez and Tardos, T-RO 2012, section III): each node splits its descriptors
-into k clusters by Hamming distance, the centre of a cluster is the majority of each bit, and the
-leaves are the words. Nodes are numbered breadth first, so that the children of a node are
-neighbours in memory: going down a level reads one piece of 32 k bytes.
+The tree is the hierarchical vocabulary of Nister and Stewenius (CVPR 2006) for binary descriptors
+(Galvez-Lopez and Tardos, T-RO 2012, section III): each node splits its descriptors into k clusters
+by Hamming distance, the centre of a cluster is the bitwise majority of its descriptors, and the
+leaves are the words. Nodes are numbered breadth first, so that the children of a node are adjacent
+in memory and descending a level reads one block of 32 k bytes.
 """
 
 from __future__ import annotations
@@ -22,22 +22,24 @@ from vslam.untrusted import read_npz
 
 SCHEMA = 1
 SHIPPED = Path(__file__).with_name("vocabulary.npz")
-MAX_BRANCHING, MAX_LEVELS = 20, 10  # what DBoW2's text format admits, too
+MAX_BRANCHING, MAX_LEVELS = 20, 10  # the limits of DBoW2's text format
 
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """A tree of N nodes with W leaves, the words. Node 0 is the root and has no descriptor.
+    """A tree of N nodes whose W leaves are the words. Node 0 is the root and has no descriptor.
 
     Attributes:
-        branching: children that a node has at most, the k of the field.
-        levels: edges from the root to a leaf at most, the L of the field.
+        branching: maximum number of children of a node (k in the literature).
+        levels: maximum depth of a leaf (L in the literature).
         descriptors: ``(N, 4)`` uint64, centre of each node; zero for the root.
-        first_child: ``(N,)`` int32, children are ``first_child ... + n_children - 1``.
+        first_child: ``(N,)`` int32; the children of node i are
+            ``first_child[i] ... first_child[i] + n_children[i] - 1``.
         n_children: ``(N,)`` uint8, 0 for a leaf.
         parent: ``(N,)`` int32, -1 for the root.
-        level: ``(N,)`` uint8, edges from the root.
-        word: ``(N,)`` int32, the word that a leaf is, in order of the nodes; -1 for others.
+        level: ``(N,)`` uint8, depth of each node; 0 for the root.
+        word: ``(N,)`` int32, index of the word of a leaf, ascending with the nodes; -1 for inner
+            nodes.
         weight: ``(W,)`` float32, inverse document frequency ln(images / images with the word).
     """
 
@@ -56,7 +58,7 @@ class Vocabulary:
         return len(self.weight)
 
     def words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
-        """Word of each of ``(M, 32)`` uint8 descriptors, ``(M,)`` int32."""
+        """``(M,)`` int32, the word of each of ``(M, 32)`` uint8 descriptors."""
         return descend(
             np.ascontiguousarray(descriptors).view(np.uint64),
             self.descriptors,
@@ -66,10 +68,8 @@ class Vocabulary:
         )
 
     def ancestors(self, level: int) -> NDArray[np.int32]:
-        """Node of each word at a level counted from the root, ``(W,)`` int32.
-
-        A word that lies above that level is its own ancestor.
-        """
+        """``(W,)`` int32, the ancestor of each word at a level counted from the root; a word above
+        that level is its own ancestor."""
         nodes = np.flatnonzero(self.word >= 0).astype(np.int32)
         while (deep := self.level[nodes] > level).any():
             nodes[deep] = self.parent[nodes[deep]]
@@ -77,16 +77,18 @@ class Vocabulary:
 
 
 class BowVector(NamedTuple):
-    """Bag of words of an image: ``words`` (N,) i4 ascending; ``weights`` (N,) f4 of sum 1."""
+    """Bag of words of an image: ``(N,)`` int32 words, ascending, and ``(N,)`` float32 weights that
+    sum to 1."""
 
     words: NDArray[np.int32]
     weights: NDArray[np.float32]
 
 
 def bow_vector(vocabulary: Vocabulary, words: NDArray[np.int32]) -> BowVector:
-    """tf-idf weights of an image's ``(M,)`` words, scaled to an L1 norm of 1 (Nister, section 4).
+    """Bag of words of an image from its ``(M,)`` words, with tf-idf weights normalised to an L1
+    norm of 1 (Nister and Stewenius, section 4).
 
-    Words of weight 0, those seen in every training image, say nothing and are left out.
+    Words of weight 0, which occur in every training image, carry no information and are left out.
     """
     unique, count = np.unique(words, return_counts=True)
     weights = count * vocabulary.weight[unique].astype(np.float64)
@@ -96,10 +98,10 @@ def bow_vector(vocabulary: Vocabulary, words: NDArray[np.int32]) -> BowVector:
 
 
 def score(a: BowVector, b: BowVector) -> float:
-    """Likeness of two images in [0, 1]: 1 - |a - b| / 2 (T-RO 2012, equation 2).
+    """L1 score of two images in [0, 1]: 1 - |a - b| / 2 (T-RO 2012, equation 2).
 
-    With weights that are positive and sum to 1, that is the sum of the lesser weight of each
-    word that both have (Nister and Stewenius, section 4, equation 5, rearranged).
+    Since the weights are positive and sum to 1, this is the sum of the smaller weight of each
+    shared word (Nister and Stewenius, section 4, equation 5, rearranged).
     """
     _, in_a, in_b = np.intersect1d(a.words, b.words, assume_unique=True, return_indices=True)
     return float(np.minimum(a.weights[in_a], b.weights[in_b]).sum(dtype=np.float64))
@@ -107,10 +109,11 @@ def score(a: BowVector, b: BowVector) -> float:
 
 @kernel
 def descend(queries, descriptors, first_child, n_children, word):
-    """Follow the nearest child, the first of equals, from the root to a leaf.
+    """Descend from the root to a leaf, each time to the nearest child (the first of equally near
+    ones).
 
     Args:
-        queries: ``(M, 4)`` uint64; the others as in ``Vocabulary``.
+        queries: ``(M, 4)`` uint64 descriptors; the other arrays are those of ``Vocabulary``.
 
     Returns:
         ``(M,)`` int32 words.
@@ -131,9 +134,6 @@ def descend(queries, descriptors, first_child, n_children, word):
     return out
 
 
-# -- from its parts -------------------------------------------------------------------------------
-
-
 def from_children(
     branching: int,
     levels: int,
@@ -141,16 +141,17 @@ def from_children(
     n_children: NDArray[np.uint8],
     weight: NDArray[np.float32],
 ) -> Vocabulary:
-    """The vocabulary that the nodes in breadth-first order make.
+    """Build a vocabulary from its nodes in breadth-first order; see ``Vocabulary`` for the
+    arguments.
 
     Raises:
-        ValueError: what of the parts does not fit together.
+        ValueError: the arguments are out of range or do not fit together.
     """
     n = len(n_children)
     if not 2 <= branching <= MAX_BRANCHING:
-        raise ValueError(f"branching {branching} is not in 2 to {MAX_BRANCHING}")
+        raise ValueError(f"branching is {branching}, but must be 2 to {MAX_BRANCHING}")
     if not 1 <= levels <= MAX_LEVELS:
-        raise ValueError(f"{levels} levels are not 1 to {MAX_LEVELS}")
+        raise ValueError(f"levels is {levels}, but must be 1 to {MAX_LEVELS}")
     if n < 2 or descriptors.shape != (n, 4):
         raise ValueError(f"there are {n} nodes and descriptors of shape {descriptors.shape}")
     if n_children.max() > branching:
@@ -189,7 +190,8 @@ def from_children(
 
 
 def save(vocabulary: Vocabulary, path: Path) -> None:
-    """Write as npz, not compressed: random bits would not shrink, and it loads at once.
+    """Write a vocabulary as an npz file, uncompressed: its nearly random bits do not compress, and
+    the file loads faster.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -210,10 +212,10 @@ def save(vocabulary: Vocabulary, path: Path) -> None:
 
 
 def load(path: Path = SHIPPED) -> Vocabulary:
-    """Read what ``save`` wrote; without a path, the vocabulary that comes with vslam.
+    """Read a vocabulary that ``save`` wrote; by default, the one that vslam ships.
 
     Raises:
-        InputError: no such file, damaged, of another schema, or not a vocabulary.
+        InputError: the file is missing, damaged, of another schema, or not a vocabulary.
     """
     again = "make it again with vslam vocabulary train or convert"
     parts = read_npz(path, "a vocabulary", again)

@@ -1,9 +1,10 @@
-"""DBoW2's text format for vocabularies, which ORB-SLAM's ``ORBvoc.txt`` is in.
+"""DBoW2's text format for vocabularies, for example ORB-SLAM's ``ORBvoc.txt``.
 
-The first line is ``k L scoring weighting``. Each further line is a node: the number of its parent,
-whether it is a leaf (0 or 1), 32 bytes of descriptor, and its weight (of a leaf, the idf). Nodes
-are numbered from 1 in the order of their lines; 0 is the root, which has no line. Any order in
-which parents come before their children is read; we write breadth first.
+The first line is ``k L scoring weighting``. Each further line describes a node: the number of its
+parent, whether it is a leaf (0 or 1), the 32 bytes of its descriptor, and its weight (for a leaf,
+the inverse document frequency). Nodes are numbered from 1 in the order of their lines; node 0 is
+the root and has no line. Any order in which parents precede their children can be read; files are
+written breadth first.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from vslam.loopclosure.vocabulary import (
     save,
 )
 
-NUMBERS = 35  # in the line of a node: parent, leaf, 32 bytes, weight
-L1_NORM, TF_IDF = 0, 0  # DBoW2's numbers for the scoring and weighting that we have
+NUMBERS = 35  # numbers in the line of a node: parent, leaf, 32 bytes, weight
+L1_NORM, TF_IDF = 0, 0  # DBoW2's codes for the scoring and weighting that vslam uses
 
 _TOO_FEW, _TOO_MANY, _NO_NUMBER, _NO_BYTE, _NO_FLAG, _NO_PARENT, _NO_WEIGHT = range(1, 8)
 _FAULTS = {
@@ -40,32 +41,34 @@ _FAULTS = {
 
 
 def read_vocabulary(path: Path) -> Vocabulary:
-    """Read an npz file, or DBoW2's text if the name ends in .txt.
+    """Read an npz file or, if the name ends in .txt, DBoW2's text format.
 
     Raises:
-        InputError: another ending, or as ``load`` and ``read_text``.
+        InputError: the name has another ending, or as in ``load`` and ``read_text``.
     """
     return read_text(path) if is_text(path) else load(path)
 
 
 def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
-    """Write an npz file, or DBoW2's text if the name ends in .txt.
+    """Write an npz file or, if the name ends in .txt, DBoW2's text format.
 
     Raises:
-        InputError: another ending.
+        InputError: the name has another ending.
         ResultsError: the file cannot be written.
     """
     (write_text if is_text(path) else save)(vocabulary, path)
 
 
 def is_text(path: Path) -> bool:
-    """Whether the name says DBoW2's text rather than npz.
+    """Whether a file name means DBoW2's text format (.txt) rather than npz.
 
     Raises:
-        InputError: it says neither.
+        InputError: the name has neither ending.
     """
     if path.suffix not in (".txt", ".npz"):
-        raise InputError(f"{path}: a vocabulary's name ends in .npz or in .txt (DBoW2's format).")
+        raise InputError(
+            f"{path}: the name of a vocabulary must end in .npz or in .txt (DBoW2's format)."
+        )
     return path.suffix == ".txt"
 
 
@@ -73,7 +76,7 @@ def read_text(path: Path) -> Vocabulary:
     """Read a vocabulary in DBoW2's text format.
 
     Raises:
-        InputError: missing or damaged; the sentence names the line and what is wrong with it.
+        InputError: the file is missing or damaged; the message names the line and the error.
     """
     try:
         text = path.read_bytes()
@@ -98,7 +101,8 @@ def read_text(path: Path) -> Vocabulary:
     if level[-1] > levels:
         deep = int(order[np.argmax(level > levels)])
         raise InputError(
-            f"{path}: line {deep + 1} is at level {level.max()}, but line 1 says {levels} levels."
+            f"{path}: line {deep + 1} is at level {level.max()}, but line 1 says {levels} levels; "
+            "fetch or export it again."
         )
     n_children = np.bincount(parent[1:], minlength=n + 1)[order]
     return from_children(
@@ -111,7 +115,7 @@ def read_text(path: Path) -> Vocabulary:
 
 
 def write_text(vocabulary: Vocabulary, path: Path) -> None:
-    """Write a vocabulary so that DBoW2 and ORB-SLAM read it.
+    """Write a vocabulary in DBoW2's text format, for DBoW2 and ORB-SLAM.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -120,7 +124,7 @@ def write_text(vocabulary: Vocabulary, path: Path) -> None:
     weight = np.zeros(len(v.word), np.float32)
     weight[v.word >= 0] = v.weight
     byte = [f" {value}" for value in range(256)]
-    # No line break at the end: ORB-SLAM's reader takes what follows one for a node.
+    # No newline at the end, because ORB-SLAM's reader expects another node after each newline.
     lines = [f"{v.branching} {v.levels} {L1_NORM} {TF_IDF}"]
     rows = zip(
         v.parent[1:].tolist(),
@@ -147,8 +151,8 @@ def _read_header(path: Path, header: bytes) -> tuple[int, int]:
         ) from None
     if not (2 <= branching <= MAX_BRANCHING and 1 <= levels <= MAX_LEVELS):
         raise InputError(
-            f"{path}: line 1 says k {branching} and L {levels}, which are not "
-            f"in 2 to {MAX_BRANCHING} and 1 to {MAX_LEVELS}."
+            f"{path}: line 1 says k {branching} and L {levels}, but k must be 2 to "
+            f"{MAX_BRANCHING} and L 1 to {MAX_LEVELS}."
         )
     if (scoring, weighting) != (L1_NORM, TF_IDF):
         raise InputError(
@@ -161,11 +165,11 @@ def _read_header(path: Path, header: bytes) -> tuple[int, int]:
 def _check_family(
     path: Path, parent: NDArray[np.int64], leaf: NDArray[np.bool_], branching: int
 ) -> None:
-    """Leaves have no children, other nodes have one at least and ``branching`` at most."""
+    """Check that leaves have no children, and that other nodes have 1 to ``branching`` of them."""
     n_children = np.bincount(parent[1:], minlength=len(parent))
     for wrong, what in (
-        (leaf & (n_children > 0), "is a leaf and has children"),
-        (~leaf & (n_children == 0), "is no leaf and has no children: the file was cut short"),
+        (leaf & (n_children > 0), "is a leaf but has children"),
+        (~leaf & (n_children == 0), "is not a leaf but has no children, so the file is cut off"),
         (n_children > branching, f"has more children than the {branching} that line 1 says"),
     ):
         if wrong.any():
@@ -175,10 +179,10 @@ def _check_family(
 
 
 def _breadth_first(parent: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Nodes level by level, siblings together and in the order of their lines, and the levels."""
+    """Nodes in breadth-first order, siblings in the order of their lines, and the level of each."""
     by_parent = np.argsort(parent, kind="stable")
     n_children = np.bincount(parent[1:], minlength=len(parent))
-    first = 1 + np.cumsum(n_children) - n_children  # in by_parent, behind the root
+    first = 1 + np.cumsum(n_children) - n_children  # first child of each node in by_parent
     generations = [np.zeros(1, np.int64)]
     while True:
         parents = generations[-1][n_children[generations[-1]] > 0]
@@ -193,7 +197,8 @@ def _breadth_first(parent: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArra
 
 @inner_kernel
 def read_number(text, position):
-    """Decimal number at ``position``: (value, position behind it), or (nan, ...) if it is none."""
+    """Parse a decimal number at ``position``; returns its value, NaN if it is not a number, and the
+    position after it."""
     end = len(text)
     negative = False
     if position < end and (text[position] == ord("-") or text[position] == ord("+")):
@@ -226,17 +231,18 @@ def read_number(text, position):
         if digits == 0:
             return np.nan, position
         exponent += -power if down else power
-    # A division by a power of ten rounds once, a product with its inverse twice.
+    # Dividing by a power of ten rounds once; multiplying by its inverse would round twice.
     value = value / 10.0**-exponent if exponent < 0 else value * 10.0**exponent
     return (-value if negative else value), position
 
 
 @kernel
 def parse_nodes(text, parent, leaf, descriptors, weight):
-    """Read the lines of the nodes 1 ... n of ``(n + 1,)`` arrays, which are written.
+    """Parse the lines of the nodes 1 to n into ``(n + 1,)`` arrays.
 
     Returns:
-        node at fault, and the fault (one of ``_FAULTS``), or 0, 0.
+        The number of the first faulty node and its fault (a key of ``_FAULTS``); 0, 0 if there is
+        none.
     """
     position, end = 0, len(text)
     for node in range(1, len(parent)):

@@ -1,9 +1,10 @@
-"""Training of a vocabulary: k-majority clustering, level by level.
+"""Training of a vocabulary tree by k-majority clustering, level by level.
 
-Galvez-Lopez and Tardos (T-RO 2012, section III) on binary descriptors, after Nister and Stewenius
-(CVPR 2006): in each node, descriptors go to the nearest of k centres and each centre becomes the
-majority of its descriptors, bit by bit, until nothing changes. All arithmetic is on whole numbers
-and the random numbers are our own, so that a seed means the same tree everywhere.
+Follows Galvez-Lopez and Tardos (T-RO 2012, section III) for binary descriptors, after Nister and
+Stewenius (CVPR 2006): in each node, descriptors are assigned to the nearest of k centres, and each
+centre becomes the bitwise majority of its descriptors, until nothing changes. All arithmetic is on
+integers and the random numbers are generated here, so that a seed gives the same tree on every
+machine.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from numpy.typing import NDArray
 from vslam.kernels import hamming, inner_kernel, kernel
 from vslam.loopclosure.vocabulary import MAX_BRANCHING, MAX_LEVELS, Vocabulary, from_children
 
-TRIALS = 4  # about 2 + ln k, of greedy k-means++
-ITERATIONS = 12  # of the majority vote in a node; most nodes settle earlier
+TRIALS = 4  # candidates per centre in greedy k-means++, about 2 + ln k
+ITERATIONS = 12  # maximum number of majority votes in a node; most nodes converge earlier
 
 
 def train(
@@ -27,18 +28,22 @@ def train(
     seed: int = 0,
     on_level: Callable[[int, int], None] | None = None,
 ) -> Vocabulary:
-    """Grow a tree on the ``(n, 32)`` uint8 descriptors of each image; the same for the same seed.
+    """Train a vocabulary; the same input and seed give the same tree.
 
     Args:
-        on_level: told the levels done and the nodes so far.
+        descriptors_of_images: ``(n, 32)`` uint8 descriptors of each image.
+        branching: maximum number of children of a node.
+        levels: maximum depth of a leaf.
+        on_level: called after each level with the number of levels and of nodes so far.
 
     Raises:
-        ValueError: branching or levels out of range, or fewer than two different descriptors.
+        ValueError: branching or levels is out of range, or there are fewer than two different
+            descriptors.
     """
     if not (2 <= branching <= MAX_BRANCHING and 1 <= levels <= MAX_LEVELS):
         raise ValueError(
-            f"branching is 2 to {MAX_BRANCHING} and levels 1 to {MAX_LEVELS}, "
-            f"not {branching} and {levels}"
+            f"branching is {branching} and levels is {levels}, but they must be 2 to "
+            f"{MAX_BRANCHING} and 1 to {MAX_LEVELS}"
         )
     counts = [len(one) for one in descriptors_of_images]
     if sum(counts) == 0:
@@ -46,7 +51,7 @@ def train(
     data = np.ascontiguousarray(np.concatenate(descriptors_of_images)).view(np.uint64)
     order = np.arange(len(data), dtype=np.int64)
     centres, n_children = [np.zeros((1, 4), np.uint64)], []
-    starts = np.array([0, len(data)], np.int64)  # of the nodes of a level within `order`
+    starts = np.array([0, len(data)], np.int64)  # start of each node of the level in ``order``
     for level in range(levels):
         stream = np.uint64((seed * MAX_LEVELS + level) % 2**64)
         new, split, starts = split_level(data, order, starts, branching, stream, ITERATIONS)
@@ -63,14 +68,15 @@ def train(
     seen_in = np.zeros(n_leaves, np.int64)
     for one in descriptors_of_images:
         seen_in[np.unique(tree.words(one))] += 1
-    # Every leaf is the nearest of some training descriptor: none is seen nowhere.
+    # np.maximum only guards the division: each leaf is the word of some training descriptor.
     weight = np.log(len(counts) / np.maximum(seen_in, 1)).astype(np.float32)
     return from_children(branching, levels, nodes, children, weight)
 
 
 @inner_kernel
 def uniform(state):
-    """Next number of [0, 1) and the state after it: splitmix64 (Steele et al., OOPSLA 2014)."""
+    """Next random number in [0, 1) and the next state, by splitmix64 (Steele et al., OOPSLA
+    2014)."""
     state = state + np.uint64(0x9E3779B97F4A7C15)
     z = state
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -81,18 +87,20 @@ def uniform(state):
 
 @inner_kernel
 def seed_centres(data, members, branching, state, nearest, centres):
-    """Choose up to ``branching`` different members, far from each other.
+    """Choose up to ``branching`` different members that are far from each other as initial centres.
 
-    k-means++ (Arthur and Vassilvitskii, SODA 2007) draws a member by its squared distance to the
-    nearest centre so far; of bit vectors, that is the Hamming distance itself. Of ``TRIALS``
-    drawn, the one that brings all members nearest is taken (their section 7).
+    k-means++ (Arthur and Vassilvitskii, SODA 2007) draws a member with a probability proportional
+    to its squared distance from the nearest centre so far, which for bit vectors is the Hamming
+    distance. Of ``TRIALS`` drawn members, the one that minimises the sum of these distances is
+    chosen (their section 7).
 
     Args:
-        members: ``(n,)`` indices into data; nearest: ``(n,)`` int64 workspace.
-        centres: ``(branching, 4)`` uint64, written.
+        members: ``(n,)`` indices into data.
+        nearest: ``(n,)`` int64 workspace.
+        centres: ``(branching, 4)`` uint64, receives the centres.
 
     Returns:
-        How many there are; fewer only if there are no more different descriptors.
+        Number of centres, less than ``branching`` only if there are fewer different descriptors.
     """
     n = len(members)
     draw, state = uniform(state)
@@ -128,7 +136,8 @@ def seed_centres(data, members, branching, state, nearest, centres):
 
 @inner_kernel
 def assign(data, members, centres, n_centres, label):
-    """Give each member the nearest centre, the first of equals; returns how many changed."""
+    """Assign each member to the nearest centre (the first of equally near ones); returns the number
+    of changed labels."""
     changed = 0
     for i in range(len(members)):
         nearest, least = 0, 257
@@ -144,10 +153,12 @@ def assign(data, members, centres, n_centres, label):
 
 @inner_kernel
 def vote(data, members, label, n_centres, ones, size, centres):
-    """Set each bit of a centre that more than half of its members have; the others keep theirs.
+    """Set each centre to the bitwise majority of its members. A centre without members keeps its
+    value.
 
     Args:
-        ones: ``(branching, 256)`` int64, and size: ``(branching,)`` int64, workspace.
+        ones: ``(branching, 256)`` int64 workspace.
+        size: ``(branching,)`` int64 workspace.
     """
     for k in range(n_centres):
         size[k] = 0
@@ -173,18 +184,19 @@ def vote(data, members, label, n_centres, ones, size, centres):
 
 @kernel
 def split_level(data, order, starts, branching, stream, iterations):
-    """Split each node of a level into clusters, and sort ``order`` by them.
+    """Split each node of a level into clusters, and sort ``order`` by cluster.
 
     Args:
-        data: ``(M, 4)`` uint64; order: ``(M,)`` int64 indices into it, grouped by node, written.
-        starts: ``(n + 1,)`` int64, where the group of each of the n nodes starts; groups of
-            nodes that are leaves already have been left out of ``order``'s range.
-        stream: uint64 that the random numbers of this level follow from.
+        data: ``(M, 4)`` uint64 descriptors.
+        order: ``(M,)`` int64 indices into ``data``, grouped by node; overwritten.
+        starts: ``(n + 1,)`` int64, start of the group of each node in ``order``. Descriptors of
+            leaves of upper levels are not in this range.
+        stream: uint64 seed of the random numbers of this level.
 
     Returns:
-        centres: ``(c, 4)`` uint64 of the children, node by node.
-        n_children: ``(n,)`` uint8; a node with one descriptor only, many times, has none.
-        child_starts: ``(c + 1,)`` int64.
+        centres: ``(c, 4)`` uint64, centres of all children, node by node.
+        n_children: ``(n,)`` uint8; 0 for a node whose descriptors are all the same.
+        child_starts: ``(c + 1,)`` int64, start of the group of each child in ``order``.
     """
     n_nodes = len(starts) - 1
     centres = np.zeros((n_nodes * branching, 4), np.uint64)
@@ -202,16 +214,16 @@ def split_level(data, order, starts, branching, stream, iterations):
     for node in range(n_nodes):
         members = order[starts[node] : starts[node + 1]]
         n = len(members)
-        # Far apart for each node, so that no two read the same stretch of the sequence.
+        # The states of different nodes are far apart, so that their sequences do not overlap.
         state = stream * np.uint64(0xD1342543DE82EF95) + np.uint64(node) * np.uint64(1 << 40)
         n_centres = seed_centres(data, members, branching, state, nearest, own)
         if n_centres == 1:
-            continue  # one descriptor: a leaf
+            continue  # all descriptors are the same: the node is a leaf
         for i in range(n):
             label[i] = -1
         changed = assign(data, members, own, n_centres, label)
         iteration = 0
-        # The last step is an assignment: members are where a descent will find them.
+        # The last step is an assignment, so that a descent of the tree leads to the same clusters.
         while changed > 0 and iteration < iterations:
             vote(data, members, label, n_centres, ones, size, own)
             changed = assign(data, members, own, n_centres, label)
@@ -227,7 +239,7 @@ def split_level(data, order, starts, branching, stream, iterations):
         for i in range(n):
             sorted_members[cursor[label[i]]] = members[i]
             cursor[label[i]] += 1
-        # Leaves of upper levels leave holes: what is split moves together.
+        # Members of nodes that became leaves leave gaps, so the others are moved together.
         for i in range(n):
             order[filled + i] = sorted_members[i]
         for k in range(n_centres):

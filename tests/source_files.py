@@ -10,12 +10,23 @@ import numpy as np
 
 from vslam.camera import Camera
 from vslam.config import Config
+from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import parse_perturbation
+from vslam.datasets.sources import SourceOptions, open_source
 from vslam.run.outcome import RunOutcome, RunSettings
 from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 
+NO_OPTIONS = SourceOptions()
 LEFT, RIGHT = "/cam0/image_raw", "/cam1/image_raw"
+
+
+def open_from(
+    dataset: str, data: Path | str, options: SourceOptions = NO_OPTIONS, **more: object
+) -> Source:
+    """Open a source as a command does that is given these options."""
+    given = {"dataset": dataset, "data": str(data), **more}
+    return open_source(options.model_copy(update=given))
 
 
 def write_calibration(
@@ -44,10 +55,10 @@ def write_images(folder: Path, sides: dict[str, list[np.ndarray]], names: list[s
 def write_video(
     path: Path, images: list[np.ndarray], fps: float = 10.0, codec: str = "FFV1"
 ) -> Path:
-    """Without loss, by the codec FFV1."""
-    height, width = images[0].shape
-    fourcc = cv2.VideoWriter_fourcc(*codec)
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, (width, height), False)
+    """Without loss, by the codec FFV1; images in colour are blue, green, red."""
+    height, width = images[0].shape[:2]
+    fourcc, colour = cv2.VideoWriter_fourcc(*codec), images[0].ndim == 3
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, (width, height), colour)
     assert writer.isOpened()
     for image in images:
         writer.write(image)
@@ -62,6 +73,8 @@ def encoded(image: np.ndarray, encoding: str) -> np.ndarray:
         return image if encoding == "16UC1" else (image * np.float32(0.001)).astype("<f4")
     if encoding == "mono16":
         return image.astype("<u2") << 8 | 77
+    if image.ndim == 3:
+        return image[..., :: 1 if encoding == "bgr8" else -1]
     if encoding in ("bgr8", "rgb8"):
         return np.repeat(image[..., None], 3, axis=2)
     assert encoding in ("mono8", "8UC1")
@@ -144,7 +157,7 @@ def write_bag(
         pixels = encoded(image, kind)
         rows = pixels.reshape(len(image), -1).view(np.uint8)
         rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=99)
-        return types["Image"](header(stamp), *image.shape, kind, 0, rows.shape[1], rows.ravel())
+        return types["Image"](header(stamp), *image.shape[:2], kind, 0, rows.shape[1], rows.ravel())
 
     def info(side: int):
         P = np.array([camera.fx, 0, camera.cx, -side * camera.bf * baseline,
@@ -213,4 +226,4 @@ def run_source(source, *, threads: int = 2, perturb: str = "none", **more) -> Ru
         source.dataset, source.name, perturb, "none", "stereo", 0, threads, 0, 1, None, Config(),
         **more,
     )  # fmt: skip
-    return run_sequence(source, parse_perturbation(perturb, 0), settings, NullRecorder())
+    return run_sequence(source, parse_perturbation(perturb, 0), settings, Recorder())

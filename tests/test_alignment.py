@@ -108,16 +108,20 @@ def test_what_lies_farther_than_asked_for_is_refused():
     assert np.isnan(aligned(seen(scene, x=2.6), seen(scene))).all()
 
 
-@pytest.mark.parametrize("zoom", [0.3, 1e-30, np.nan])
-def test_sizes_that_the_patch_does_not_reach_are_refused(zoom):
-    image = seen(random_scene(0))
-    assert np.isnan(aligned(image, image, zoom)).all()
+OUTSIDE = [(np.nan, 0.0), (0.0, np.inf), (9.0, 0.0), (0.0, -1e30)]
 
 
-@pytest.mark.parametrize("centre", [(np.nan, 0.0), (0.0, np.inf), (9.0, 0.0), (0.0, -1e30)])
-def test_a_centre_that_is_no_place_in_the_patch_is_refused(centre):
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({"zoom": zoom} for zoom in (0.3, 1e-30, np.nan)),
+        *({"centre": np.array([centre], np.float32)} for centre in OUTSIDE),
+    ],
+    ids=str,
+)
+def test_what_the_patch_does_not_reach_is_refused(wrong):
     image = seen(random_scene(0))
-    assert np.isnan(aligned(image, image, centre=np.array([centre], np.float32))).all()
+    assert np.isnan(aligned(image, image, **wrong)).all()
 
 
 def test_patches_are_the_pixels_around_the_keypoints():

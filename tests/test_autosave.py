@@ -18,8 +18,8 @@ from test_pipeline import vslam
 
 from vslam.config import Config
 from vslam.datasets import open_sequence
+from vslam.datasets.frames import Source, stored_frames
 from vslam.datasets.perturbation import parse_perturbation
-from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.features import TrackingState, TrackResult
@@ -43,7 +43,7 @@ from vslam.run.options import RunOptions, read_options, write_options
 from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
 from vslam.run.pipeline import _with_earlier, run_sequence
 from vslam.run.progress import Progress, TrackLog, TrackTable, read_progress, write_progress
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 from vslam.slam import Slam
 from vslam.trajectory import read_trajectory
 
@@ -70,7 +70,7 @@ def drive(
     resume: Unfinished | None = None,
     config: Config = Config(),  # noqa: B008
     law: str = "none",
-    change: Callable[[Sequence], Sequence] = lambda sequence: sequence,
+    change: Callable[[Source], Source] = lambda sequence: sequence,
     compare: tuple[str, ...] = (),
     **options: object,
 ) -> RunOutcome:
@@ -84,7 +84,7 @@ def drive(
         sequence,
         parse_perturbation(law, 0),
         settings,
-        NullRecorder(),
+        Recorder(),
         resume=resume,
         **autosave,
         **options,
@@ -102,6 +102,7 @@ def ate(outcome: RunOutcome) -> float:
     return evaluate_trajectory(outcome.trajectory, truth).ate_rmse_m
 
 
+@pytest.mark.slow
 def test_saving_changes_no_byte(kitti_tree, tmp_path, undisturbed):
     saved = drive(kitti_tree, tmp_path)
     assert saved.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
@@ -111,6 +112,7 @@ def test_saving_changes_no_byte(kitti_tree, tmp_path, undisturbed):
     np.testing.assert_allclose(online.T_wc, as_tracked, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", [9, 17, 26])
 def test_a_killed_run_goes_on_at_the_next_frame(kitti_tree, tmp_path, undisturbed, frame):
     words = [sys.executable, "-c", KILLED, str(kitti_tree), str(tmp_path), str(frame)]
@@ -154,23 +156,21 @@ def test_ctrl_c_ends_a_run_and_a_save_is_offered_while_frames_are_dropped(kitti_
     assert len(find_unfinished(tmp_path).progress.tracks) == ended[0] + 1
 
 
-class Changed:
-    """A sequence with other times, or whose right side is black until a frame."""
+def with_times(source: Source, times: np.ndarray) -> Source:
+    """The first frames of a source, at other times."""
+    timed = zip(source.stored[: len(times)], times.tolist(), strict=True)
+    stored = tuple(replace(frame, timestamp=time) for frame, time in timed)
+    return replace(source, stored=stored, ground_truth=None)
 
-    def __init__(self, sequence, times=None, black_until=0):
-        self._sequence, self._black_until = sequence, black_until
-        self.timestamps = sequence.timestamps if times is None else times
-        self.ground_truth = None if times is not None else sequence.ground_truth
 
-    def __getattr__(self, name):
-        return getattr(self._sequence, name)
+def black_until(source: Source, index: int) -> Source:
+    """A source whose right side is black until a frame."""
 
-    def __len__(self):
-        return len(self.timestamps)
+    def read(k, image_map):
+        left, right = source.read(k, image_map)
+        return left, right * (k >= index)
 
-    def read(self, index, image_map=map):
-        left, right = self._sequence.read(index, image_map)
-        return left, right * (index >= self._black_until)
+    return replace(source, stored=stored_frames(source.timestamps, read))
 
 
 @pytest.mark.parametrize(("moved_s", "frames", "named"), [(1e-4, FRAMES, 7), (0.0, 9, 9)])
@@ -180,7 +180,7 @@ def test_other_images_do_not_resume_a_run(kitti_tree, tmp_path, moved_s, frames,
     times[7] += moved_s
     unfinished = find_unfinished(tmp_path)
     with pytest.raises(InputError, match=rf"frame {named} had the time .* put those back"):
-        drive(kitti_tree, tmp_path, unfinished, change=lambda source: Changed(source, times))
+        drive(kitti_tree, tmp_path, unfinished, change=lambda source: with_times(source, times))
     assert len(find_unfinished(tmp_path).progress.tracks) == 13
 
 
@@ -190,7 +190,7 @@ def test_warnings_of_the_rig_cover_both_parts(kitti_tree, tmp_path):
             signal.raise_signal(signal.SIGINT)
 
     def change(sequence):
-        return Changed(sequence, black_until=5)
+        return black_until(sequence, 5)
 
     drive(kitti_tree, tmp_path, on_frame=interrupt, change=change)
     whole = drive(kitti_tree, tmp_path, find_unfinished(tmp_path), change=change)
@@ -200,6 +200,7 @@ def test_warnings_of_the_rig_cover_both_parts(kitti_tree, tmp_path):
     ]
 
 
+@pytest.mark.slow
 def test_a_map_is_saved_where_every_frame_becomes_a_keyframe(kitti_tree, tmp_path):
     config = Config.model_validate({"keyframes": {"max_interval_s": 0.01}})
     saved: list[int] = []
@@ -220,6 +221,7 @@ def test_a_map_is_saved_where_every_frame_becomes_a_keyframe(kitti_tree, tmp_pat
     assert outcome.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
 
 
+@pytest.mark.slow
 def test_a_resumed_run_goes_on_without_the_detectors_compared(kitti_tree, tmp_path):
     def interrupt(result: TrackResult) -> None:
         if result.index == 12:
@@ -243,6 +245,7 @@ def test_half_written_files_of_killed_runs_go_with_the_rest(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["map.npz"]
 
 
+@pytest.mark.slow
 def test_images_of_another_camera_do_not_resume_a_run(kitti_tree, tmp_path):
     drive_until(kitti_tree, tmp_path, 5)
     write_options(tmp_path, RunOptions(data=str(kitti_tree), seq="00", sensor="mono"))
@@ -263,7 +266,8 @@ def test_a_full_disk_is_told_once_and_the_run_goes_on(
     assert outcome.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
     told = [record.message for record in caplog.records]
     assert told == [
-        f"{tmp_path / MAP}: cannot be written (No space left on device); the run goes on without."
+        f"{tmp_path / MAP}: cannot be written (No space left on device); "
+        "the run continues without it."
     ]
 
 
@@ -355,6 +359,7 @@ def test_where_no_lock_can_be_made_a_run_goes_on(tmp_path):
         assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     brief = ("--no-record", "--no-report", "--quiet")
     words = ("--data", kitti_tree, "--max-frames", 12, "--detector", "bow")
@@ -402,7 +407,8 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
 def test_a_resumed_run_writes_to_no_place_that_its_folder_names(kitti_tree, tmp_path):
     options = {"data": str(kitti_tree), "save_map": str(tmp_path / "elsewhere.npz")}
     (tmp_path / "run.json").write_text(json.dumps(options))
-    with pytest.raises(InputError, match=r"run\.json: damaged, or of another version; run again"):
+    refused = r"run\.json: damaged or from another version; start a new run"
+    with pytest.raises(InputError, match=refused):
         read_options(tmp_path)
 
 

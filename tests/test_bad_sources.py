@@ -9,21 +9,24 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
+import numpy as np
 import pytest
 from source_files import (
     LEFT,
     RIGHT,
     all_sources,
+    open_from,
     run_source,
     source_path,
     write_bag,
     write_calibration,
     write_images,
+    write_video,
 )
 
 from vslam.datasets import live_camera, video
-from vslam.datasets.sources import SourceOptions, open_source
-from vslam.datasets.stream import Selection, timed_frames
+from vslam.datasets.frames import selected
+from vslam.datasets.sources import SourceOptions
 from vslam.errors import InputError
 
 FRAMES = 12
@@ -36,12 +39,12 @@ def folder(corridor, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def side_by_side(folder) -> SourceOptions:
-    return SourceOptions((folder / "stereo.yaml",), side_by_side=True)
+    return SourceOptions(calib=(folder / "stereo.yaml",), side_by_side=True)
 
 
 def refused(match: str, dataset: str, data: Path | str, options: SourceOptions, **more):
     with pytest.raises(InputError, match=match) as caught:
-        open_source(dataset, str(data), "", options, **more)
+        open_from(dataset, data, options, **more)
     message = str(caught.value)
     assert message.endswith(".")
     assert "\n" not in message
@@ -50,9 +53,9 @@ def refused(match: str, dataset: str, data: Path | str, options: SourceOptions, 
 def test_topics(folder):
     bag = folder / "ros1.bag"
     listed = "image topics are /cam0/image_raw, /cam1/image_raw"
-    options = SourceOptions(topics=(LEFT, "/cam9"))
+    options = SourceOptions(topics=f"{LEFT},/cam9")
     refused(f"--topics /cam9: not in .*ros1.bag; {listed}", "bag", bag, options)
-    refused("or of the depth, or run with --sensor mono", "bag", bag, SourceOptions(topics=(LEFT,)))
+    refused("or of the depth, or run with --sensor mono", "bag", bag, SourceOptions(topics=LEFT))
     refused(f"choose with --topics TOPIC; {listed}", "bag", bag, SourceOptions(), sensor="mono")
 
 
@@ -80,16 +83,15 @@ def test_a_useless_camera_info_is_not_read_where_there_is_a_calibration(
     flaws = {"camera": corridor.camera, flaw: False}
     write_bag(tmp_path / "a.bag", "ros1", pair, [0, 10**8], **flaws)
     refused(part, "bag", tmp_path / "a.bag", SourceOptions())
-    options = SourceOptions((folder / "stereo.yaml",))
-    source = open_source("bag", str(tmp_path / "a.bag"), "", options)
+    options = SourceOptions(calib=(folder / "stereo.yaml",))
+    source = open_from("bag", tmp_path / "a.bag", options)
     assert source.camera == corridor.camera
 
 
 @pytest.mark.parametrize("realtime", [False, True])
 def test_a_stream_that_ends_before_its_first_frame(folder, side_by_side, realtime):
-    whole = open_source("video", str(folder / "pair.mkv"), "", side_by_side)
-    raw = replace(whole.raw, n_expected=None)
-    source = replace(whole, raw=raw, selection=Selection(start=FRAMES))
+    whole = open_from("video", folder / "pair.mkv", side_by_side)
+    source = selected(replace(whole, n_expected=None), start=FRAMES)
     with pytest.raises(InputError, match=f"--start {FRAMES}: pair has no frame there"):
         run_source(source, realtime=realtime)
 
@@ -108,7 +110,7 @@ def test_bags_cut_off(folder, tmp_path, kind, share):
     data = source.read_bytes()
     cut = tmp_path / source.name
     cut.write_bytes(data[: int(share * len(data))])
-    refused("cut off", "bag", cut, SourceOptions((folder / "stereo.yaml",)))
+    refused("cut off", "bag", cut, SourceOptions(calib=(folder / "stereo.yaml",)))
 
 
 def test_a_bag_damaged_in_the_middle_keeps_the_frames_before(folder, tmp_path):
@@ -118,7 +120,7 @@ def test_a_bag_damaged_in_the_middle_keeps_the_frames_before(folder, tmp_path):
     middle = int(len(data) * 0.6)
     data[middle : middle + len(data) // 10] = b"\xff" * (len(data) // 10)
     file.write_bytes(data)
-    outcome = run_source(open_source("bag", str(tmp_path / "bag"), "", SourceOptions()))
+    outcome = run_source(open_from("bag", tmp_path / "bag", SourceOptions()))
     assert 0 < len(outcome.trajectory) < FRAMES
     assert "damaged or cut off" in outcome.interrupted
 
@@ -126,8 +128,8 @@ def test_a_bag_damaged_in_the_middle_keeps_the_frames_before(folder, tmp_path):
 def test_an_image_of_another_size_is_one_lost_frame(corridor, tmp_path):
     images = [*corridor.left[:2], corridor.left[2][:80], *corridor.left[3:5]]
     write_bag(tmp_path / "a.bag", "ros1", {LEFT: images}, [k * 10**8 for k in range(5)])
-    options = SourceOptions((write_calibration(tmp_path / "c.yaml", corridor.camera),))
-    outcome = run_source(open_source("bag", str(tmp_path / "a.bag"), "", options, sensor="mono"))
+    options = SourceOptions(calib=(write_calibration(tmp_path / "c.yaml", corridor.camera),))
+    outcome = run_source(open_from("bag", tmp_path / "a.bag", options, sensor="mono"))
     assert len(outcome.tracks) == 5
     assert len(outcome.skipped) == 1
     assert "480x80 pixels where the first image has 480x160" in outcome.skipped[0]
@@ -137,15 +139,40 @@ def test_calibrations(folder):
     path = folder / "pair.mkv"
 
     def options(name):
-        return SourceOptions((folder / name,), side_by_side=True)
+        return SourceOptions(calib=(folder / name,), side_by_side=True)
 
     sizes = "made for 240x80 pixels but the images have 480x160"
     refused(f"other.yaml: {sizes}", "video", path, options("other.yaml"))
     wide = "made for 480x160 pixels but the images have 960x160; say --side-by-side"
-    refused(wide, "video", path, SourceOptions((folder / "mono.yaml",)), sensor="mono")
-    refused(sizes, "images", folder / "images", SourceOptions((folder / "other.yaml",)))
+    refused(wide, "video", path, SourceOptions(calib=(folder / "mono.yaml",)), sensor="mono")
+    refused(sizes, "images", folder / "images", SourceOptions(calib=(folder / "other.yaml",)))
     refused("right camera is missing", "video", path, options("mono.yaml"))
-    refused("no calibration; .*docs/cameras.md", "video", path, SourceOptions(side_by_side=True))
+    refused(
+        "no calibration; .*docs/howto/cameras.md", "video", path, SourceOptions(side_by_side=True)
+    )
+
+
+@pytest.mark.parametrize(("rows", "what"), [(0, "column"), (1, "column and row")])
+def test_an_encoder_that_cuts_off_a_column_is_named(corridor, tmp_path, rows, what):
+    """OpenCV's does so with images of odd sizes."""
+    images = [np.pad(image, ((0, rows), (0, 1))) for image in corridor.left[:3]]
+    path = write_video(tmp_path / "a.mkv", images)
+    camera = replace(corridor.camera, width=481, height=160 + rows)
+    options = SourceOptions(calib=(write_calibration(tmp_path / "c.yaml", camera),))
+    said = f"images have 480x160; an encoder seems to have cut off the last {what}; write this size"
+    refused(said, "video", path, options, sensor="mono")
+
+
+def test_a_rate_that_contradicts_the_video_is_said(folder, side_by_side, caplog):
+    given = {"data": folder / "pair.mkv", "options": side_by_side}
+    open_from("video", **given, fps=10.0)
+    assert not caplog.messages
+    open_from("video", **given, fps=25.0)
+    (said,) = caplog.messages
+    assert said == (
+        f"{folder / 'pair.mkv'}: --fps 25 contradicts the 10 frames per second of the video itself;"
+        " leave it out unless those are wrong."
+    )
 
 
 def test_videos(folder, tmp_path, side_by_side):
@@ -167,7 +194,7 @@ def test_a_codec_that_nobody_knows(folder, tmp_path, side_by_side):
 def test_a_video_cut_off_keeps_the_frames_before(folder, tmp_path, side_by_side):
     data = (folder / "pair.mkv").read_bytes()
     (tmp_path / "cut.mkv").write_bytes(data[: int(0.6 * len(data))])
-    outcome = run_source(open_source("video", str(tmp_path / "cut.mkv"), "", side_by_side))
+    outcome = run_source(open_from("video", tmp_path / "cut.mkv", side_by_side))
     assert 4 <= len(outcome.trajectory) <= 8
     assert "breaks off after" in outcome.interrupted
     assert not outcome.interrupted.endswith(".")
@@ -186,12 +213,12 @@ def test_a_video_without_time_stamps(folder, monkeypatch, side_by_side):
     monkeypatch.setattr(video, "open_capture", unstamped)
     path = folder / "pair.mkv"
     refused("no time stamps; give --fps", "video", path, side_by_side)
-    options = SourceOptions(side_by_side.calibration, side_by_side=True, fps=10.0)
-    assert len(list(timed_frames(open_source("video", str(path), "", options)))) == FRAMES
+    options = SourceOptions(calib=side_by_side.calib, side_by_side=True, fps=10.0)
+    assert len(list(open_from("video", path, options).frames())) == FRAMES
 
 
 def test_folders_of_images(folder, corridor, tmp_path):
-    options = SourceOptions((folder / "stereo.yaml",))
+    options = SourceOptions(calib=(folder / "stereo.yaml",))
     write_images(tmp_path, {"left": corridor.left[:3]}, ["0.png", "1.png", "2.png"])
     refused("left and right, image_0 and image_1", "images", tmp_path, options)
     refused("but only left has images, right has none", "images", tmp_path, options)
@@ -213,7 +240,7 @@ def test_folders_of_images(folder, corridor, tmp_path):
     refused(f"and {tmp_path} has both .name that", "images", tmp_path / "left", options)
     (tmp_path / "calib.txt").write_text("P0: 1")
     refused("sequence of KITTI; .* --seq", "images", tmp_path, SourceOptions(fps=10.0))
-    options = SourceOptions((folder / "stereo.yaml",), right=tmp_path)
+    options = SourceOptions(calib=(folder / "stereo.yaml",), right=tmp_path)
     refused("no images in this folder", "images", tmp_path / "left", options)
 
 
@@ -231,7 +258,7 @@ def test_cameras(folder, tmp_path, monkeypatch, side_by_side):
 @pytest.mark.parametrize(
     ("dataset", "options", "part"),
     [
-        ("kitti", {"topics": ("/a",)}, "--topics: only for --dataset bag, not kitti"),
+        ("kitti", {"topics": "/a"}, "--topics: only for --dataset bag, not kitti"),
         ("bag", {"fps": 10.0}, "--fps: only for --dataset images or video"),
         ("images", {"side_by_side": True}, "--side-by-side: only for --dataset video or camera"),
         ("video", {"right": Path("r")}, "--right: only for --dataset images"),
@@ -248,16 +275,16 @@ def test_options_of_a_second_image_with_the_left_camera_alone():
 
 
 def test_another_sensor(folder, kitti_tree):
-    options = SourceOptions((folder / "stereo.yaml",))
+    options = SourceOptions(calib=(folder / "stereo.yaml",))
     images = folder / "images"
     refused("rgb and depth, .* with --depth", "images", images, options, sensor="rgbd")
     refused("rgbd needs an image topic and one of depth; image topics are /cam0", "bag",
             folder / "ros1.bag", options, sensor="rgbd")  # fmt: skip
     with pytest.raises(InputError, match="--sensor rgbd: 00 is of sensor stereo"):
-        open_source("kitti", str(kitti_tree), None, SourceOptions(), sensor="rgbd")
+        open_from("kitti", kitti_tree, SourceOptions(), sensor="rgbd")
 
 
 @pytest.mark.parametrize("dataset", ["images", "video", "bag", "camera"])
 def test_only_data_sets_have_sequences(dataset):
     with pytest.raises(InputError, match=f"--seq 05: only for data sets, not {dataset}; leave it"):
-        open_source(dataset, "nowhere", "05", SourceOptions())
+        open_from(dataset, "nowhere", seq="05")

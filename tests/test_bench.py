@@ -306,6 +306,7 @@ def bench(stub: Path, kitti_tree: Path, tmp_path: Path, monkeypatch, capsys):
     return call
 
 
+@pytest.mark.slow
 def test_bench_runs_the_grid_and_writes_the_report(bench, stub: Path):
     code, out, err = bench("--jobs", 2)
     assert code == 0, err
@@ -323,6 +324,7 @@ def test_bench_runs_the_grid_and_writes_the_report(bench, stub: Path):
     assert "0 to do" in err
 
 
+@pytest.mark.slow
 def test_bench_shows_the_detectors_beside_the_first_one(bench):
     code, out, err = bench("--detectors", "bow,none,both")
     assert code == 0, err
@@ -338,6 +340,7 @@ def test_bench_shows_the_detectors_beside_the_first_one(bench):
     assert bench("--detectors", "both", "--quiet")[1] == ""
 
 
+@pytest.mark.slow
 def test_bench_shows_what_is_left_when_all_runs_of_the_baseline_fail(bench, stub: Path):
     for name in ("none-bow-0", "brightness:1-bow-0", "brightness:1-bow-1"):
         (stub / f"fail-00-{name}").touch()
@@ -354,6 +357,7 @@ def test_help_begins_with_the_table_of_the_mission():
     assert examples[:2] == [["vslam", "bench"], ["vslam", "bench", "--dataset", "synthetic"]]
 
 
+@pytest.mark.slow
 def test_bench_counts_failures_and_ends_with_1(bench, stub: Path):
     (stub / "fail-00-brightness:1-bow-1").touch()
     code, out, err = bench()
@@ -365,6 +369,7 @@ def test_bench_counts_failures_and_ends_with_1(bench, stub: Path):
     assert len(started(stub)) == 7
 
 
+@pytest.mark.slow
 def test_bench_loses_nothing_to_an_interrupt(bench, stub: Path, monkeypatch):
     add = table.GridProgress.add
 
@@ -405,6 +410,7 @@ def test_bench_refuses_before_it_starts(bench, words, parts):
     assert not Path("bench").exists()
 
 
+@pytest.mark.slow
 def test_a_real_grid_killed_and_resumed(kitti_tree: Path, tmp_path: Path):
     """SIGKILL in the second cell: its process ends, too, and the next start does that cell only."""
     out = tmp_path / "bench"
@@ -437,6 +443,7 @@ def test_a_real_grid_killed_and_resumed(kitti_tree: Path, tmp_path: Path):
     assert "brightness:1" in (out / "report.md").read_text()
 
 
+@pytest.mark.slow
 def test_a_cell_runs_with_the_networks_that_are_shipped(kitti_tree: Path, tmp_path: Path):
     options = execute.RunOptions(kitti_tree, CONFIG, threads=2, scratch=tmp_path / "scratch")
     cell = Cell("kitti", "00", "none", "both", 0)
@@ -454,6 +461,7 @@ def test_a_run_ends_by_itself_though_its_standard_input_is_open():
         assert process.wait(60) == 0
 
 
+@pytest.mark.slow
 def test_a_video_is_a_grid_of_one_sequence(corridor, tmp_path: Path, monkeypatch):
     """It runs once, and the same command again finds that done."""
     pairs = [np.hstack(pair) for pair in zip(corridor.left, corridor.right, strict=True)][:5]

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
-from vslam.config import BowConfig, OrbConfig
-from vslam.datasets.synthetic import store
-from vslam.datasets.synthetic.site import Variation
+from vslam.config import BowConfig
 from vslam.features import Features
-from vslam.frontend.orb import extract
 from vslam.lab.loopbench.node_matching import index_nodes, match_by_node
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.bow_index import InvertedIndex
 from vslam.loopclosure.detector import LoopDetector
-from vslam.loopclosure.vocabulary import Vocabulary, bow_vector, from_children, load, score
+from vslam.loopclosure.vocabulary import Vocabulary, bow_vector, from_children, score
 from vslam.loopclosure.vocabulary_training import train
 from vslam.map import Map
 from vslam.map_kernels import link_many
-from vslam.trajectory import read_kitti_poses
 
 WORDS = 400
 
@@ -279,59 +273,3 @@ def test_matching_by_node_is_matching_within_nodes():
         )  # fmt: skip
         np.testing.assert_array_equal(got, expected)
         assert max_distance < 50 or np.count_nonzero(got >= 0) > 60
-
-
-# -- speed and real images ------------------------------------------------------------------------
-
-
-def test_a_query_among_many_keyframes_is_fast():
-    """1,000 keyframes of 2,000 features; tools/experiments/design/bow_speed.py takes 5,000."""
-    rng = np.random.default_rng(4)
-    tree = load()
-    leaves = tree.descriptors[tree.word >= 0]
-    popular = np.cumsum(np.exp(-tree.weight.astype(float)))  # seen in so many training images
-    detector, map_ = BowDetector(tree), Map(np.ones(8))
-    for k in range(1000):
-        words = np.searchsorted(popular, rng.random(2000) * popular[-1])
-        image = features_of(leaves[words].view(np.uint8))
-        detector.add(k, None, image)
-        map_.add_keyframe(image_of(tree, []), np.eye(4), float(k), k)
-    elapsed = []
-    for k in range(990, 1000):
-        start = time.process_time()
-        detector.query(k, map_)
-        elapsed.append(time.process_time() - start)
-    assert min(elapsed) < 0.01
-
-
-def demo_images(every: int) -> tuple[list[np.ndarray], np.ndarray]:
-    root = store.cache_folder() / store.folder_name(Variation())
-    files = sorted((root / "sequences" / "demo" / "image_0").glob("*"))
-    if len(files) < 450 or not (root / "poses" / "demo.txt").is_file():
-        pytest.skip("the route demo is not rendered: vslam synth demo")
-    poses = read_kitti_poses(root / "poses" / "demo.txt")
-    images = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files[::every]]
-    return images, poses[::every]
-
-
-def test_the_end_of_a_round_trip_looks_like_its_beginning():
-    images, poses = demo_images(every=9)
-    tree = load()
-    index, bags = InvertedIndex(tree.n_words), []
-    for k, image in enumerate(images):
-        descriptors = extract(image, OrbConfig(n_features=1000)).descriptors
-        bags.append(bow_vector(tree, tree.words(descriptors)))
-        index.add(k, bags[k])
-    centres, ahead = poses[:, :3, 3], poses[:, :3, 2]
-    asked = 0
-    for k in range(len(images) // 2, len(images)):
-        past = np.arange(k - 10)
-        near = np.linalg.norm(centres[past] - centres[k], axis=1) < 5.0
-        true = near & (ahead[past] @ ahead[k] > 0.8)
-        if not true.any():
-            continue
-        asked += 1
-        likeness = index.compare(bags[k]).score[past]
-        assert true[likeness.argmax()], f"image {k} looks most like {likeness.argmax()}"
-        assert likeness[true].max() > 1.2 * likeness[~near].max()
-    assert asked >= 3

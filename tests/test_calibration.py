@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ from conftest import StereoSequence
 
 from vslam.calibration.models import Calibration, CameraModel, project, unproject, without_zeros
 from vslam.calibration.rectification import rectify
+from vslam.datasets.frames import RawSource, stored_frames
 from vslam.datasets.rectified import rectified
 from vslam.errors import InputError
 from vslam.geometry import se3_exp
@@ -87,6 +88,7 @@ RIGS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", RIGS)
 def test_rectified_rows_correspond_and_disparity_is_depth(rig):
     """Points in both images come from one row, at the disparity of the rectified camera."""
@@ -181,6 +183,7 @@ def test_a_distortion_that_folds_the_image():
         rectify(Calibration(replace(PINHOLE, distortion=(-2.0, 0.0, 0.0, 0.0))))
 
 
+@pytest.mark.slow
 def test_a_wide_lens_may_fold_its_corners():
     """As fits of action cameras do, whose targets never reach the corners."""
     wide = CameraModel(582.0, 582.0, 640, 360, 1280, 720, "pinhole", (-0.24, 0.05, 0, 0, -0.004))
@@ -193,22 +196,15 @@ def test_a_wide_lens_may_fold_its_corners():
     assert (found[4:-4, 4:-4] == 255).all()
 
 
-@dataclass(frozen=True)
-class Raw:
-    """Images in memory as a raw sequence."""
-
-    left: list
-    right: list
-    timestamps: np.ndarray
-    ground_truth: np.ndarray | None = None
-    dataset: str = "drawn"
-    name: str = "drawn"
-
-    def __len__(self):
-        return len(self.left)
-
-    def read(self, index, image_map=map):
-        return self.left[index], self.right[index]
+def drawn(corridor: StereoSequence, right: list) -> RawSource:
+    """Images in memory as a raw source."""
+    stored = stored_frames(corridor.timestamps, lambda k, image_map: (corridor.left[k], right[k]))
+    n_sides = 1 if right[0] is None else 2
+    size = corridor.camera.width, corridor.camera.height
+    return RawSource(
+        dataset="drawn", name="drawn", sizes=(size,) * n_sides, stored=stored,
+        ground_truth=corridor.T_wc,
+    )  # fmt: skip
 
 
 def test_a_rectified_sequence(corridor: StereoSequence):
@@ -216,7 +212,7 @@ def test_a_rectified_sequence(corridor: StereoSequence):
     model = CameraModel(c.fx, c.fy, c.cx, c.cy, c.width, c.height)
     shift = np.eye(4)
     shift[0, 3] = c.baseline
-    raw = Raw(corridor.left, corridor.right, corridor.timestamps, corridor.T_wc)
+    raw = drawn(corridor, corridor.right)
     same = rectified(raw, Calibration(model, model, shift))
     assert same.camera == c
     assert len(same) == len(corridor)
@@ -224,7 +220,7 @@ def test_a_rectified_sequence(corridor: StereoSequence):
     np.testing.assert_array_equal(same.ground_truth, corridor.T_wc)
 
     turned = rectified(raw, pair(model, model))
-    R = turned.rectification.R_left_rectified
+    R = rectify(pair(model, model)).R_left_rectified
     np.testing.assert_allclose(turned.ground_truth[5, :3, :3], corridor.T_wc[5, :3, :3] @ R)
     np.testing.assert_array_equal(turned.ground_truth[:, :3, 3], corridor.T_wc[:, :3, 3])
     assert turned.read(0)[0].shape == corridor.left[0].shape
@@ -233,6 +229,7 @@ def test_a_rectified_sequence(corridor: StereoSequence):
         rectified(raw, pair(PINHOLE, PINHOLE))
     with pytest.raises(InputError, match="right camera is missing"):
         rectified(raw, Calibration(model))
-    alone = rectified(replace(raw, right=[None] * len(raw)), Calibration(model, model, np.eye(4)))
+    nothing = [None] * len(corridor)
+    alone = rectified(drawn(corridor, nothing), Calibration(model, model, np.eye(4)))
     assert alone.read(0)[1] is None
     assert alone.camera.monocular

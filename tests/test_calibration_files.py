@@ -398,7 +398,7 @@ def test_one_camera_of_opencv(tmp_path):
 
 
 def test_the_example_of_the_manual(tmp_path):
-    text = (Path(__file__).parents[1] / "docs/cameras.md").read_text()
+    text = (Path(__file__).parents[1] / "docs/howto/cameras.md").read_text()
     (example,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
     (tmp_path / "mine.yaml").write_text(example)
     found = read_calibration([tmp_path / "mine.yaml"])

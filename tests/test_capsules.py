@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import reference_routing
 import torch
 from siamese_worlds import SMALL, small_network, views
 from torch.nn import functional
@@ -52,7 +53,7 @@ def test_squash_has_a_finite_gradient_at_zero():
 def test_couplings_sum_to_one(over, axis):
     u_hat = torch.randn(2, 5, 30, 4, generator=torch.Generator().manual_seed(1))
     for iterations in (1, 2, 3):
-        _, c = capsules.route(u_hat, iterations, over)
+        _, c = reference_routing.route(u_hat, iterations, over)
         assert torch.allclose(c.sum(axis), torch.ones(()), atol=1e-6)
         assert (c > 0).all()
 
@@ -61,7 +62,7 @@ def test_routing_stays_at_a_fixed_point_where_all_capsules_agree():
     one = torch.tensor([2.0, -1.0, 0.5])
     u_hat = one.expand(1, 1, 6, 3)
     for iterations in (1, 2, 3, 10):
-        v, c = capsules.route(u_hat, iterations)
+        v, c = reference_routing.route(u_hat, iterations)
         assert torch.allclose(c, torch.full((1, 1, 6), 1 / 6), atol=1e-6)
         assert torch.allclose(v[0, 0], capsules.squash(one), atol=1e-6)
 
@@ -69,8 +70,8 @@ def test_routing_stays_at_a_fixed_point_where_all_capsules_agree():
 def test_routing_turns_to_the_majority():
     many, one = torch.tensor([2.0, 0.0]), torch.tensor([0.0, 2.0])
     u_hat = torch.stack([many, many, many, one])[None, None]
-    first = capsules.route(u_hat, 1)[1][0, 0]
-    later = capsules.route(u_hat, 5)[1][0, 0]
+    first = reference_routing.route(u_hat, 1)[1][0, 0]
+    later = reference_routing.route(u_hat, 5)[1][0, 0]
     assert first.tolist() == pytest.approx([0.25] * 4)
     assert later[3] < 0.1
     assert later[0] > 0.3
@@ -79,7 +80,7 @@ def test_routing_turns_to_the_majority():
 def test_one_iteration_by_hand():
     u = torch.tensor([[[[1.0, 0.0], [0.0, 1.0]]]])  # one image, one type, two places
     W = torch.tensor([[[[2.0, 0.0], [0.0, 4.0]]]])  # (J, T, A, D) = (1, 1, 2, 2)
-    v, c = capsules.route_factored(u, W, iterations=2)
+    v, c = capsules.route(u, W, iterations=2)
     # s = (1, 2), |s|² = 5; agreement of (2, 0) and (0, 4) with v = s sqrt(5) / 6
     b = torch.tensor([2.0, 8.0]) * 5**0.5 / 6
     expected = torch.softmax(b, 0)
@@ -95,10 +96,8 @@ def test_factored_routing_is_the_paper_s_routing(over, iterations, some_dead):
     torch.manual_seed(2)
     u, W = capsules.squash(torch.randn(3, 5, 9, 4) * 2), torch.randn(6, 5, 4, 7)
     alive = torch.rand(45) > 0.3 if some_dead else None
-    wanted = capsules.route(capsules.predict(u, W), iterations, over, alive)
-    for mine, reference in zip(
-        capsules.route_factored(u, W, iterations, over, alive), wanted, strict=True
-    ):
+    wanted = reference_routing.route(reference_routing.predict(u, W), iterations, over, alive)
+    for mine, reference in zip(capsules.route(u, W, iterations, over, alive), wanted, strict=True):
         assert torch.allclose(mine, reference, atol=1e-5)
 
 
@@ -110,9 +109,9 @@ def test_gradients_are_finite_and_pass_through_the_last_iteration_only(over, ite
     u = capsules.squash(torch.randn(2, 3, 4, 5)).requires_grad_()
     W = torch.randn(2, 3, 5, 6, requires_grad=True)
     alive = torch.rand(12) > 0.3 if some_dead else None
-    v, c = capsules.route_factored(u, W, iterations, over, alive)
+    v, c = capsules.route(u, W, iterations, over, alive)
     assert not c.requires_grad
-    by_hand = capsules.squash(capsules.combine(c, capsules.predict(u, W)))
+    by_hand = capsules.squash(reference_routing.combine(c, reference_routing.predict(u, W)))
     weight = torch.randn_like(v)
     mine = torch.autograd.grad((v * weight).sum(), [u, W])
     wanted = torch.autograd.grad((by_hand * weight).sum(), [u, W])
@@ -162,6 +161,7 @@ def test_similarity_falls_with_distance():
     assert network.similarity(e[:1], near) > network.similarity(e[:1], e[1:2])
 
 
+@pytest.mark.slow
 def test_the_default_network_is_within_the_budget():
     network = build_network("capsule")
     assert network.n_parameters() <= 3_000_000
@@ -206,6 +206,7 @@ def test_texture_is_more_than_a_grey_level():
     assert at == [[0, 2], [1, 1], [1, 2]]  # what differs from the pixel on its right or below
 
 
+@pytest.mark.slow
 def test_a_pruned_network_is_the_masked_network():
     network = small_network().eval()
     branch = network.branch
@@ -237,6 +238,7 @@ def test_a_pruned_network_can_be_pruned_again():
         assert torch.allclose(pruned(once, drop).embed(x), masked(once, drop).embed(x), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_folding_changes_nothing_but_the_time():
     network = small_network().train()
     with torch.no_grad():
@@ -278,6 +280,7 @@ def test_bad_weights_are_named(tmp_path, content):
         load_network(path)
 
 
+@pytest.mark.slow
 def test_a_torchvision_file_of_another_network_is_refused(tmp_path):
     torch.save({"features.0.weight": torch.zeros(1)}, tmp_path / "x.pth")
     with pytest.raises(InputError, match="another network"):
@@ -286,6 +289,7 @@ def test_a_torchvision_file_of_another_network_is_refused(tmp_path):
         alexnet((227, 227)).load_torchvision(tmp_path / "none.pth")
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_before_training_alexnet_tells_images_apart_and_has_nothing_that_blurs_that():
     torch.manual_seed(0)
@@ -297,6 +301,7 @@ def test_before_training_alexnet_tells_images_apart_and_has_nothing_that_blurs_t
     assert float(training[0] @ training[1]) < 0.97
 
 
+@pytest.mark.slow
 def test_alexnet_takes_a_torchvision_file(tmp_path):
     torch.manual_seed(0)
     network = build_network("alexnet").eval()

@@ -104,6 +104,7 @@ def test_names_that_are_not_utf8_are_refused(call, kitti_tree, tmp_path):
         assert err.endswith("this name is not UTF-8; rename it.\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [
@@ -153,8 +154,8 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
     ("words", "parts"),
     [
         ("--detector vgg16", ["--detector vgg16", "ships no weights", "vslam train vgg16"]),
-        ("--detector capsule --weights no.safetensors", ["no.safetensors", "not there"]),
-        ("--detector bow --weights no.safetensors", ["--weights", "bow has none"]),
+        ("--detector capsule --weights no.safetensors", ["no.safetensors", "no such file"]),
+        ("--detector bow --weights no.safetensors", ["--weights", "bow has no weights"]),
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
         ("--dataset kitti", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
         ("--config nothing.json", ["nothing.json", "configuration"]),
@@ -165,7 +166,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--data nowhere", ["nowhere", "no such file or folder", "--data"]),
         ("--data .", ["the folder is empty", "--data"]),
         ("nowhere", ["nowhere", "no such file or folder", "--data"]),
-        ("nowhere --data .", ["nowhere: --data says what to run on, too"]),
+        ("nowhere --data .", ["nowhere: --data says what to read, too"]),
         ("--data ..", ["no data set that is known", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
@@ -177,17 +178,20 @@ def test_run_refuses_without_data(call, words, parts):
     assert not Path("runs").exists()
 
 
-def test_a_bare_run_without_data_says_what_to_do(call):
-    code, out, err = call("run")
+@pytest.mark.parametrize("command", ["run", "bench", "stress", "doctor", "perturb"])
+def test_a_bare_command_without_data_says_what_to_do(call, command):
+    code, out, err = call(command)
     assert (code, out) == (2, "")
-    assert err.startswith("error: there is nothing to run on; ")
-    commands = [line.split("  ")[1] for line in err.splitlines()[1:]]
-    assert commands == [
-        "vslam run --dataset synthetic --seq demo",
-        "vslam run DATA --calib FILE",
-        "vslam run --data FOLDER --seq 00",
-    ]
-    assert not Path("runs").exists()
+    assert err.startswith("error: there is nothing to read; ")
+    ways = [line.strip().split("  ")[0] for line in err.splitlines()[1:]]
+    assert ways == ["--dataset synthetic", "DATA --calib FILE", "--data FOLDER"]
+    assert not any(Path().iterdir())
+
+
+def test_the_environment_names_kitti_alone(call, root, monkeypatch):
+    monkeypatch.setenv("KITTI_ROOT", str(root))
+    refused(call("run"), "unequal counts")
+    refused(call("doctor", "--dataset", "euroc"), "--dataset euroc: name the data with --data")
 
 
 @pytest.mark.parametrize(
@@ -267,11 +271,6 @@ def test_run_refuses_bad_input(call, root, words, parts):
     assert not Path("runs").exists()
 
 
-def test_root_from_the_environment(call, root, monkeypatch):
-    monkeypatch.setenv("KITTI_ROOT", str(root))
-    refused(call("run"), "unequal counts")
-
-
 def test_misspelt_option(call):
     code, _, err = call("run", "--frames", "5")
     assert code == 2
@@ -332,7 +331,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
 
     monkeypatch.setattr(run_pipeline, "run_sequence", run_sequence)
     monkeypatch.setattr(run_pipeline, "begin", lambda camera, settings, saved=None: None)
-    monkeypatch.setattr(recorder, "NullRecorder", lambda: "null")
+    monkeypatch.setattr(recorder, "Recorder", lambda: "null")
     monkeypatch.setattr(recorder, "RerunRecorder", lambda target, pictures: str(target))
     monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[1])
     monkeypatch.setattr(figures, "draw_figures", draw_figures)
@@ -346,7 +345,7 @@ def test_run_writes_its_folder_and_a_summary(call, root, pipeline):
         "run", "--data", root, "--max-frames", 10, "--perturb", "blur:0.5", "--threads", 3
     )
     assert code == 0, err
-    assert "10 done, 1 lost, 0 unreadable" in out
+    assert re.search("Lost frames +1 +10.0 % of 10; 0 weak, 0 skipped", out)
     assert "5.0 fps" in out
     assert "report.html" in out
     assert "10/10" in err
@@ -372,18 +371,25 @@ def with_detector(pipeline) -> SimpleNamespace:
 def test_summary_counts_loops(call, root, with_detector):
     code, out, err = call("run", "--data", root, "--max-frames", 10, "--detector", "bow")
     assert code == 0, err
-    assert "loops          1 closed, 0 missed, 0 wrong, 2 candidates rejected\n" in out
-    assert "99 landmarks in 2 sub-maps" in out
-    assert "detector       bow: the bag of words\n" in out
+    assert re.search("Loops +1 closed .* 0 missed, 0 wrong, 2 candidates rejected\n", out)
+    assert re.search("Map +99 +landmarks, .* 2 sub-maps", out)
+    assert "detector bow (the bag of words)" in out
     assert "detectors together" not in out
     (root / "poses" / "00.txt").unlink()
     _, out, _ = call("run", "--data", root, "--max-frames", 10, "--detector", "bow")
-    assert "1 closed, 2 candidates rejected" in out
+    assert re.search("Loops +1 closed +2 candidates rejected", out)
 
 
 def test_summary_without_a_detector(call, root, pipeline):
     _, out, _ = call("run", "--data", root, "--max-frames", 10, "--detector", "none")
-    assert "not looked for, 0 missed" in out
+    assert re.search("Loops +off +no detector; no revisit", out)
+
+
+def detectors_in(out: str) -> list[list[str]]:
+    """Cells of the table of detectors that a run prints, its head first."""
+    table = out.split("Detectors\n\n")[1].split("\n\n")[0]
+    head, _, *rows = [re.split(r"  +", line.strip()) for line in table.splitlines()]
+    return [head, *rows]
 
 
 def test_compare_prints_a_row_for_each_detector(call, root, with_detector):
@@ -391,8 +397,8 @@ def test_compare_prints_a_row_for_each_detector(call, root, with_detector):
     code, out, err = call(*words, "--compare", "both, none,none")
     assert code == 0, err
     assert with_detector.settings.compare == ("both", "none")
-    assert "5.0 fps, all 3 detectors together" in out
-    head, *rows = [re.split(r"  +", line.strip()) for line in out.splitlines()[-4:]]
+    assert re.search("5.0 fps .* all 3 detectors together", out)
+    head, *rows = detectors_in(out)
     assert head == [
         "detector", "lost", "ATE", "causal ATE", "RPE", "loops found", "missed", "wrong", "time",
     ]  # fmt: skip
@@ -410,13 +416,13 @@ def test_compare_prints_a_row_for_each_detector(call, root, with_detector):
 def test_compare_without_ground_truth_counts_the_loops_closed(call, root, with_detector):
     (root / "poses" / "00.txt").unlink()
     words = ("run", "--data", root, "--max-frames", 10, "--detector", "bow", "--compare", "none")
-    head, *rows = [re.split(r"  +", line.strip()) for line in call(*words)[1].splitlines()[-3:]]
+    head, *rows = detectors_in(call(*words)[1])
     assert head == ["detector", "lost", "loops closed", "time"]
     assert rows == [["bow", "1", "1", "1.5 s"], ["none", "1", "0", "1.5 s"]]
     with_detector.interrupted = "Ctrl-C"
     code, out, _ = call(*words)
     assert code == 1
-    assert out.splitlines()[-1].endswith("1.5 s  Ctrl-C")
+    assert detectors_in(out)[-1][-2:] == ["1.5 s", "Ctrl-C"]
 
 
 @pytest.mark.parametrize(
@@ -436,7 +442,7 @@ def test_the_last_line_says_how_to_compare(call, root, pipeline, detector, other
 def test_a_monocular_run_says_that_its_scale_is_arbitrary(call, root, pipeline):
     code, out, err = call("run", "--data", root, "--sensor", "mono")
     assert code == 0, err
-    assert "scale" in out
+    assert "Scale" in out
     assert "arbitrary" in out
     assert pipeline.settings.sensor == "mono"
     assert pipeline.evaluation.alignment == "sim3"
@@ -486,7 +492,7 @@ def test_a_run_that_tracked_nothing_exits_with_1_and_says_why(call, root, pipeli
     code, out, err = call(*command)
     assert (code, "error" in err) == (1, False)
     assert "nothing was tracked in 10 frames" in out
-    assert why in out
+    assert why in " ".join(out.split())
     code, out, err = call(*command, "--quiet")
     assert (code, out) == (1, "")
     assert err.startswith("error: nothing was tracked in 10 frames")
@@ -528,6 +534,8 @@ def test_perturb_writes_a_contact_sheet(call, root):
     code, out, _ = call(*words, "--out", "sheet.png")
     assert code == 0
     assert "frames 0, 4, 9" in out
+    _, later, _ = call(*words[:-4], "--start", 5, "--every", 2, "--max-frames", 2, "--frames", 2)
+    assert "frames 5, 7" in later
     assert cv2.imread("sheet.png").shape[0] == 3 * 240
     refused(call(*words, "--out", "no/folder/sheet.png"), "no/folder/sheet.png", "--out")
 
@@ -551,8 +559,9 @@ def test_two_opencv_wheels_are_noticed():
 
 def test_defects_are_not_dressed_up_as_bad_input(call, monkeypatch):
     def broken() -> None:
-        raise ZeroDivisionError
+        raise ZeroDivisionError("no frames")
 
     monkeypatch.setattr(cli, "app", broken)
-    with pytest.raises(ZeroDivisionError):
-        call("info")
+    code, _, err = call("info")
+    assert code == 1
+    assert "no frames: this is a fault of vslam or of the machine; please report it" in err

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from ring import CAMERA, LAP, Oracle, Ring
 
-from vslam.backend.pose_graph import GAP, WEAK, held_by
+from vslam.backend.pose_graph import GAP, WEAK, connectivity
 from vslam.closing import LoopClosing
 from vslam.config import Config, ConsistencyConfig, KeyframeConfig, PoseGraphConfig
 from vslam.features import Extracted, Features, TrackingState
@@ -84,6 +84,7 @@ def closed():
     return run(DRIFTING, ROUND, Oracle(DRIFTING, ROUND))[0]
 
 
+@pytest.mark.slow
 def test_a_closed_loop_takes_the_drift_out(check_map):
     without, _ = run(DRIFTING, ROUND)
     slam = closed()
@@ -101,6 +102,7 @@ ZOOMING = Ring.create(focal_error=0.015, zoom=True)
 ENDS_EARLY = ROUND[: LAP + 14]
 
 
+@pytest.mark.slow
 def test_a_drive_that_ends_before_the_next_keyframe_asks_an_earlier_one():
     slam, _ = run(ZOOMING, ENDS_EARLY, Oracle(ZOOMING, ENDS_EARLY), finish=False)
     assert slam.loops[-1].reason == "verified by 1 of 2 keyframes"
@@ -114,6 +116,7 @@ def test_a_drive_that_ends_before_the_next_keyframe_asks_an_earlier_one():
     assert len(slam.loops) == before
 
 
+@pytest.mark.slow
 def test_a_loop_that_no_earlier_keyframe_far_enough_away_confirms_stays_open():
     config = Config(consistency=ConsistencyConfig(min_moved=20.0))
     slam, _ = run(ZOOMING, ENDS_EARLY, Oracle(ZOOMING, ENDS_EARLY), config=config)
@@ -140,11 +143,13 @@ def test_a_correction_says_where_the_keyframes_were():
     assert gap[1] < 0.1
 
 
+@pytest.mark.slow
 def test_same_bytes_with_one_thread_and_two():
     again = run(DRIFTING, ROUND, Oracle(DRIFTING, ROUND), threads=2)[0]
     assert again.trajectory().T_wc.tobytes() == closed().trajectory().T_wc.tobytes()
 
 
+@pytest.mark.slow
 def test_two_slams_may_share_the_features_of_their_frames():
     """As those of compared detectors do: neither writes to them, one closes the loop. All that is
     corrected in features is: disparities, and a right side that is late."""
@@ -181,6 +186,7 @@ def test_two_slams_may_share_the_features_of_their_frames():
         assert slam.map.arrays.xyz[:n].tobytes() == alone.map.arrays.xyz[:n].tobytes()
 
 
+@pytest.mark.slow
 def test_a_detector_that_is_wrong_changes_nothing():
     deceived = run(DRIFTING, ROUND, Deceived(DRIFTING, ROUND))[0]
     without = run(DRIFTING, ROUND, NoDetector())[0]
@@ -206,6 +212,7 @@ def test_a_camera_carried_back_is_lost_without_a_detector():
     assert slam.map.restarts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_parts_of_the_map_are_joined_by_a_loop(check_map, threads):
     frames = [*ROUND[:80], *ROUND[140:]]  # 60 frames, 90 m, cut out
@@ -219,6 +226,7 @@ def test_parts_of_the_map_are_joined_by_a_loop(check_map, threads):
     check_map(slam.map)
 
 
+@pytest.mark.slow
 def test_two_seconds_of_darkness_lose_no_pose(check_map):
     slam, results = run(EXACT, ROUND, Oracle(EXACT, ROUND), dark=range(60, 80))
     assert len(slam.trajectory()) == len(ROUND)
@@ -270,6 +278,7 @@ def open_loop(gap):
 STIFF = Config(pose_graph=PoseGraphConfig(weak_translation=10.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gap", "unpredicted", "config", "expected"),
     [
@@ -379,6 +388,7 @@ def test_where_no_speed_was_known_a_restart_is_unpredicted():
     assert slam.map.restarts == slam.map.unpredicted_restarts == [1]
 
 
+@pytest.mark.slow
 def test_a_wrong_keyframe_bends_the_map_and_the_loops_that_tell_are_refused():
     """A camera is carried 45 m on, and its next image agrees with wrong landmarks."""
     ring = Sticker(EXACT.points, EXACT.descriptors)
@@ -391,7 +401,7 @@ def test_a_wrong_keyframe_bends_the_map_and_the_loops_that_tell_are_refused():
     assert sum("contradicted" in edge.reason for edge in slam.loops) > 4
     assert not slam.corrections
     wrong = slam.map.frames.tolist().index(60)
-    held = held_by(slam.map)
+    held = connectivity(slam.map)
     assert int(held[1:].argmin()) + 1 == wrong
     expected = max(
         len(set(slam.map.landmarks_of(i).tolist()) & set(slam.map.landmarks_of(j).tolist()))
@@ -421,6 +431,7 @@ class Confused(Oracle):
         return sorted(found, key=lambda one: -one.score)
 
 
+@pytest.mark.slow
 def test_a_sound_map_is_not_doubted_whatever_many_keyframes_resemble():
     frames = ROUND[: LAP // 2 + 60]
     slam, _ = run(twofold(), frames, Confused(twofold(), frames))

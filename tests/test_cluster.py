@@ -59,6 +59,7 @@ def cluster(stub: Path, tmp_path: Path) -> Iterator[tuple[str, list[psutil.Popen
             process.wait()
 
 
+@pytest.mark.slow
 def test_the_cell_of_a_dead_worker_is_run_elsewhere(cluster, stub: Path, tmp_path: Path):
     address, workers = cluster
     held = stub / "hold-00-none-bow-0"
@@ -83,6 +84,7 @@ def test_the_cell_of_a_dead_worker_is_run_elsewhere(cluster, stub: Path, tmp_pat
     assert execute.finished_cells(CELLS, out, CONFIG) == CELLS[:4]
 
 
+@pytest.mark.slow
 def test_leaving_stops_the_workers_runs(cluster, stub: Path, tmp_path: Path):
     address, workers = cluster
     (stub / "hold-00-none-bow-0").touch()
@@ -103,6 +105,7 @@ def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
         next(running)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("address", "said"),
     [("foo://bar", "nothing answers there"), ("tls://127.0.0.1:9", "Dask has no certificates")],

@@ -1,4 +1,4 @@
-"""Who may import whom (docs/design.md, section 2), read from the source.
+"""Who may import whom (docs/explanation/design.md, section 2), read from the source.
 
 Every folder and module has a level; an import may lead down or stay on its level, and no modules
 import each other in a circle. Beside that a few libraries belong to one place each.
@@ -262,6 +262,38 @@ def test_only_its_commands_import_the_training():
     assert {m for m in users if not within(m, TRAINING)} == {TRAINING_COMMANDS}
 
 
+def names_of(path: Path) -> set[str]:
+    """What a module can be asked for by name: all that it binds outside of functions."""
+    names, waiting = set(), list(ast.parse(path.read_text()).body)
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            names.update((one.asname or one.name).partition(".")[0] for one in node.names)
+        else:
+            names.update(n.id for n in ast.walk(node) if isinstance(n, ast.Name))
+            waiting += [n for n in ast.iter_child_nodes(node) if isinstance(n, ast.stmt)]
+    return names
+
+
+def test_the_tools_import_what_there_is():
+    """No test runs an experiment for hours: this shows when what it needs has moved."""
+    missing = []
+    for path in sorted((ROOT / "tools").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and within(node.module or "", "vslam"):
+                here = names_of(SOURCES[node.module]) if node.module in SOURCES else set()
+                asked = {name.name for name in node.names}
+                missing += [
+                    f"{path.relative_to(ROOT)}: {node.module}.{name}"
+                    for name in asked - here
+                    if f"{node.module}.{name}" not in SOURCES
+                ]
+    assert missing == []
+
+
+@pytest.mark.slow
 def test_the_library_does_not_print():
     printing = set()
     for module, path in SOURCES.items():
@@ -271,6 +303,7 @@ def test_the_library_does_not_print():
     assert printing == set()
 
 
+@pytest.mark.slow
 def test_tracking_and_mapping_load_no_heavy_library():
     script = (
         f"import sys, vslam.slam\nsys.stdout.write(' '.join({set(ONLY_IN)} & set(sys.modules)))"
@@ -279,6 +312,7 @@ def test_tracking_and_mapping_load_no_heavy_library():
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
+@pytest.mark.slow
 def test_a_run_loads_what_it_needs(kitti_tree, tmp_path):
     """A third of the start are imports: without pages, recording or ground truth a run does
     without these."""

@@ -9,14 +9,11 @@ import cv2
 import numpy as np
 import pytest
 from conftest import StereoSequence, corridor_depth
-from source_files import run_source, write_bag, write_calibration, write_images
+from source_files import open_from, run_source, write_bag, write_calibration, write_images
 
 from vslam.camera import Camera
-from vslam.datasets.depth_images import DepthFiles
 from vslam.datasets.detection import detect_dataset
-from vslam.datasets.rectified import RectifiedSequence
-from vslam.datasets.sources import SourceOptions, open_source
-from vslam.datasets.stream import timed_frames
+from vslam.datasets.sources import SourceOptions
 from vslam.errors import InputError
 
 FRAMES = 8
@@ -53,8 +50,8 @@ def folders(corridor, depths, tmp_path_factory) -> Path:
 
 def opened(data: Path, calib: Path | None = None, **options):
     sensor = options.pop("sensor", None)
-    given = SourceOptions(() if calib is None else (calib,), **options)
-    return open_source(detect_dataset(str(data)), str(data), None, given, sensor=sensor)
+    given = SourceOptions(calib=() if calib is None else (calib,), **options)
+    return open_from(detect_dataset(str(data)), data, given, sensor=sensor)
 
 
 def refused(match: str, data: Path, calib: Path, **options):
@@ -94,7 +91,7 @@ def test_a_bag_gives_the_trajectory_of_the_folders(
 def test_compressed_inverse_depth(corridor, depths, calib, tmp_path):
     sides = {COLOUR: corridor.left[:2], DEPTH: depths[:2]}
     bag = write_bag(tmp_path / "a.bag", "ros1", sides, STAMPS[:2], depth_encoding="32FC1 png")
-    first = next(iter(timed_frames(opened(bag, calib))))
+    first = next(opened(bag, calib).frames())
     found = first.read(map)[1]
     true = depths[0] / 1000.0
     assert np.array_equal(found > 0, true > 0)
@@ -105,7 +102,7 @@ def test_compressed_inverse_depth(corridor, depths, calib, tmp_path):
 def test_a_scale_comes_before_that_of_the_encoding(corridor, depths, calib, tmp_path):
     sides = {COLOUR: corridor.left[:2], DEPTH: depths[:2]}
     bag = write_bag(tmp_path / "a.bag", "ros1", sides, STAMPS[:2])
-    first = next(iter(timed_frames(opened(bag, calib, depth_scale=500.0))))
+    first = next(opened(bag, calib, depth_scale=500.0).frames())
     np.testing.assert_allclose(first.read(map)[1], depths[0] / 500.0, rtol=1e-6)
 
 
@@ -121,7 +118,7 @@ def test_each_image_gets_the_nearest_depth(corridor, depths, calib, tmp_path):
     stamps = [k * 33_000_000 for k in range(FRAMES)]
     sides = {DEPTH: depths, COLOUR: corridor.left[:FRAMES]}
     bag = write_bag(tmp_path / "a.bag", "ros1", sides, stamps, lag=18_000_000)
-    frames = list(timed_frames(opened(bag, calib)))
+    frames = list(opened(bag, calib).frames())
     assert len(frames) == FRAMES - 1  # each takes the depth behind it, so that the last has none
     for k, frame in enumerate(frames):
         assert np.array_equal(frame.read(map)[1], depths[k + 1] * np.float32(0.001))
@@ -131,12 +128,12 @@ def test_topics_of_bags_with_depth(corridor, depths, calib, tmp_path):
     two, small = {COLOUR: corridor.left[:2], DEPTH: depths[:2]}, [d[:80] for d in depths[:2]]
     more = {"/infra/image_raw": corridor.right[:2]}
     bag = write_bag(tmp_path / "more.bag", "ros1", two | more, STAMPS[:2])
-    assert not opened(bag, calib, topics=(COLOUR,), sensor="mono").camera.depth
-    assert opened(bag, calib, topics=(COLOUR, DEPTH)).camera.depth
+    assert not opened(bag, calib, topics=COLOUR, sensor="mono").camera.depth
+    assert opened(bag, calib, topics=f"{COLOUR},{DEPTH}").camera.depth
     refused("choose with --topics COLOUR,DEPTH; image topics are", bag, calib, sensor="rgbd")
-    refused(f"{DEPTH} holds depth; name the images first", bag, calib, topics=(DEPTH, COLOUR))
+    refused(f"{DEPTH} holds depth; name the images first", bag, calib, topics=f"{DEPTH},{COLOUR}")
     refused("encoding 'mono8' is no depth; known are 16UC1", bag, calib,
-            topics=(COLOUR, "/infra/image_raw"), sensor="rgbd")  # fmt: skip
+            topics=f"{COLOUR},/infra/image_raw", sensor="rgbd")  # fmt: skip
     other = write_bag(tmp_path / "s.bag", "ros1", {**two, DEPTH: small}, STAMPS[:2])
     refused("depth of 480x80 pixels in .* images of 480x160 in .* registered", other, calib)
     alone = write_bag(tmp_path / "d.bag", "ros1", {DEPTH: depths[:2]}, STAMPS[:2])
@@ -157,14 +154,13 @@ def test_folders_by_option_and_by_times(corridor, depths, calib, folders, tmp_pa
     assert alone.read(0)[1] is None
 
 
-def test_a_scale_out_of_the_calibration(folders, corridor, tmp_path):
+def test_a_scale_out_of_the_calibration(folders, corridor, depths, tmp_path):
     path = write_calibration(tmp_path / "c.yaml", corridor.camera, mono=True)
     source = opened(
         folders, with_baseline(path, corridor.camera, ', "depth_scale": 1000'), fps=10.0
     )
-    assert isinstance(source, RectifiedSequence)
-    assert isinstance(source.raw, DepthFiles)
-    assert (source.raw.depth_scale, source.camera.baseline) == (1000.0, corridor.camera.baseline)
+    assert source.camera.baseline == corridor.camera.baseline
+    np.testing.assert_array_equal(source.read(1)[1], depths[1] * np.float32(0.001))
 
 
 def test_bad_folders_with_depth(corridor, depths, calib, folders, tmp_path):

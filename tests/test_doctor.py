@@ -125,6 +125,7 @@ def faults(seen, config: OrbConfig = FEW) -> list[str]:
     return [finding.check for finding in found]
 
 
+@pytest.mark.slow
 def test_nothing_is_wrong_with_the_corridor(clean):
     diagnosis = examine(clean, FEW)
     assert [f for f in diagnosis.findings if f.verdict != "good"] == []
@@ -132,12 +133,14 @@ def test_nothing_is_wrong_with_the_corridor(clean):
     assert len(diagnosis.pictures) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_planted_fault_is_found_alone(clean, fault):
     plant, check = FAULTS[fault]
     assert faults(plant(clean)) == [check]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("baseline", "verdict"), [(0.12, "good"), (12.0, "fault"), (1e-4, "fault")]
 )
@@ -162,6 +165,7 @@ def test_how_late_the_right_side_is(clean):
     assert "2 frames early" in finding.fix
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_still_says_nothing_of_synchronisation(clean):
     still = replace(clean, left=clean.left[:1] * len(clean), second=clean.second[:1] * len(clean))
     found = {f.check: f.verdict for f in examine(still, FEW).findings}
@@ -169,6 +173,7 @@ def test_a_camera_that_stands_still_says_nothing_of_synchronisation(clean):
     assert "fault" not in found.values()
 
 
+@pytest.mark.slow
 def test_sides_of_different_places(clean):
     noise = np.random.default_rng(0).integers(0, 256, clean.left[0].shape).astype(np.uint8)
     assert faults(right(clean, lambda i: noise)) == ["stereo"]
@@ -228,6 +233,7 @@ def windows_of_desk() -> list[tuple[list, list]]:
     return [tuple(zip(*map(desk.read, window), strict=True)) for window in frames]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (REAL / "tum").is_dir(), reason="TUM sequence absent")
 def test_depth_of_fr1_desk_is_no_fault_but_moved_it_is():
     windows = windows_of_desk()
@@ -287,6 +293,7 @@ def test_few_frames_have_no_rhythm():
     assert [f.verdict for f in check_times(np.array([0.0, 1.0]))] == ["unknown"]
 
 
+@pytest.mark.slow
 def test_the_command(kitti_tree, tmp_path):
     page, config = tmp_path / "page.html", tmp_path / "config.json"
     config.write_text('{"orb": {"n_features": 500}}')
@@ -299,9 +306,10 @@ def test_the_command(kitti_tree, tmp_path):
     assert "median vertical error" in text
 
 
+@pytest.mark.slow
 def test_the_command_looks_at_the_beginning_of_a_video(corridor, tmp_path, monkeypatch):
     """Frames of a stream cannot be had again: the first ones are kept."""
-    monkeypatch.setattr("vslam.doctor.first_frames._FRAMES", 9)
+    monkeypatch.setattr("vslam.datasets.frames._FIRST_FRAMES", 9)
     pairs = [np.hstack(pair) for pair in zip(corridor.left, corridor.right, strict=True)]
     video = write_video(tmp_path / "drive.mkv", pairs)
     calibration = write_calibration(tmp_path / "stereo.yaml", corridor.camera)
@@ -342,11 +350,13 @@ def test_the_command_turns_bad_input_into_a_finding(kitti_tree, tmp_path):
     assert "made for 640x480" in page.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (REAL / "kitti").is_dir(), reason="KITTI sample absent")
 def test_nothing_is_wrong_with_kitti():
     assert faults(open_kitti(REAL / "kitti", "06"), OrbConfig()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (REAL / "euroc").is_dir(), reason="EuRoC clip absent")
 def test_nothing_is_wrong_with_euroc():
     sequence = open_euroc(REAL / "euroc/V1_01_start", "")
@@ -356,6 +366,7 @@ def test_nothing_is_wrong_with_euroc():
     assert float(rows.split()[3]) < 0.3
 
 
+@pytest.mark.slow
 def test_what_was_found_is_said_where_the_page_cannot_be_written(kitti_tree):
     options = ["--seq", "00", "--out", str(kitti_tree / "poses" / "00.txt" / "page.html")]
     done = CliRunner().invoke(app, ["doctor", str(kitti_tree), *options])
@@ -363,6 +374,7 @@ def test_what_was_found_is_said_where_the_page_cannot_be_written(kitti_tree):
     assert isinstance(done.exception, ResultsError)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.7, 0.9, 1.1, 1.3])
 def test_a_wrong_focal_length_shows_when_the_camera_turns(clean, factor):
     c = clean.camera
@@ -374,6 +386,7 @@ def test_a_wrong_focal_length_shows_when_the_camera_turns(clean, factor):
     assert said == pytest.approx(c.fx, rel=0.03)
 
 
+@pytest.mark.slow
 def test_straight_ahead_no_focal_length_shows(clean):
     """Frames 0 to 7 go straight on."""
     straight = replace(

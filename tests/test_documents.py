@@ -85,11 +85,11 @@ def test_tables_are_rectangular(table):
 
 
 def test_the_table_of_drives_is_made_from_its_figures(monkeypatch, tmp_path):
-    """docs/results/drives.csv is what tools/synth_table.py writes of the rows kept beside it."""
+    """drives.csv is what tools/synth_table.py writes of the rows kept beside it."""
     monkeypatch.syspath_prepend(str(ROOT / "tools"))
     import synth_table
 
-    kept = ROOT / "docs" / "results" / "drives.json"
+    kept = ROOT / "docs" / "research" / "results" / "drives.json"
     synth_table._write(tmp_path / "drives.csv", json.loads(kept.read_text()))
     assert (tmp_path / "drives.csv").read_text() == kept.with_suffix(".csv").read_text()
     assert (tmp_path / "drives.json").read_text() == kept.read_text()

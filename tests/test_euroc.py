@@ -20,7 +20,7 @@ from vslam.errors import InputError, UnreadableImageError
 from vslam.geometry import se3_exp
 from vslam.run.outcome import RunSettings
 from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 from vslam.trajectory import Trajectory
 
 REAL = Path(__file__).parents[2] / "shared/data/euroc/V1_01_start"
@@ -224,6 +224,7 @@ def test_missing_data_and_images(root):
     refused(root, images[3].name, "empty")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="EuRoC clip absent")
 def test_the_real_vehicle_stands_still():
     sequence = open_euroc(REAL, "", start=21, max_frames=25)
@@ -232,6 +233,6 @@ def test_the_real_vehicle_stands_still():
         dataset="euroc", sequence=sequence.name, perturb="none", detector="none", sensor="stereo",
         seed=0, threads=1, start=21, every=1, max_frames=25, config=Config(),
     )  # fmt: skip
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     moved = np.linalg.norm(outcome.trajectory.T_wc[:, :3, 3], axis=1)
     assert moved.max() < 0.005

@@ -80,14 +80,28 @@ def test_second_lap_is_one_revisit_of_the_first():
     assert found.last_match[0] == pytest.approx(lap, abs=1.5)
 
 
-def test_one_lap_is_no_revisit():
-    T_wc = laps(0.97)
-    assert len(revisits(T_wc, times(T_wc))) == 0
+def ramp() -> Poses:
+    """Around the block, ever higher."""
+    T_wc = block()
+    T_wc[:, 1, 3] = -np.linspace(0.0, 20.0, len(T_wc))
+    return T_wc
 
 
-@pytest.mark.parametrize(("offset", "expected"), [(0.0, 1), (3.5, 1), (4.9, 1), (5.1, 0), (8.0, 0)])
-def test_other_lane(offset, expected):
-    T_wc = block(offset=offset)
+@pytest.mark.parametrize(
+    ("T_wc", "expected"),
+    [
+        pytest.param(laps(0.97), 0, id="less than a lap"),
+        *(pytest.param(block(offset=x), 1, id=f"lane {x} m beside") for x in (0.0, 3.5, 4.9)),
+        *(pytest.param(block(offset=x), 0, id=f"lane {x} m beside") for x in (5.1, 8.0)),
+        # 5 m more than the overlap are near enough.
+        pytest.param(block(overlap=12.0), 0, id="short"),
+        pytest.param(block(overlap=18.0), 1, id="long enough"),
+        pytest.param(ramp(), 0, id="height counts as distance"),
+        pytest.param(along((0, 0), (0, 150), (4, 150), (4, 0)), 0, id="way back"),
+        pytest.param(along((0, 0), (0, 100), (80, 100), (80, 50), (-80, 50)), 0, id="crossing"),
+    ],
+)
+def test_what_counts_as_a_revisit(T_wc, expected):
     assert len(revisits(T_wc, times(T_wc))) == expected
 
 
@@ -99,22 +113,6 @@ def test_sparse_frames_find_the_same_stretch(every):
     assert found.length_m[0] == pytest.approx(63.0, abs=2.0 * every)
 
 
-def test_height_counts_as_distance():
-    T_wc = block()
-    T_wc[:, 1, 3] = -np.linspace(0.0, 20.0, len(T_wc))  # ever higher: a ramp around the block
-    assert len(revisits(T_wc, times(T_wc))) == 0
-
-
-def test_way_back_is_no_revisit():
-    T_wc = along((0, 0), (0, 150), (4, 150), (4, 0))
-    assert len(revisits(T_wc, times(T_wc))) == 0
-
-
-def test_crossing_is_no_revisit():
-    T_wc = along((0, 0), (0, 100), (80, 100), (80, 50), (-80, 50))
-    assert len(revisits(T_wc, times(T_wc))) == 0
-
-
 def test_acute_crossing_is_as_long_as_the_lanes_are_near():
     # At 15 degrees the paths are within 5 m of each other for 10 / sin 15 = 38.6 m.
     turn = np.radians(15.0)
@@ -122,12 +120,6 @@ def test_acute_crossing_is_as_long_as_the_lanes_are_near():
     start, end = np.array([0.0, 60.0]) - 60.0 * ahead, np.array([0.0, 60.0]) + 60.0 * ahead
     T_wc = along((0, 0), (0, 120), (150, 120), (150, -60), tuple(start), tuple(end))
     assert revisits(T_wc, times(T_wc)).length_m == pytest.approx([10.0 / np.sin(turn)], abs=2.5)
-
-
-@pytest.mark.parametrize(("overlap", "expected"), [(12.0, 0), (18.0, 1)])
-def test_short_revisits_are_not_expected(overlap, expected):
-    T_wc = block(overlap=overlap)  # 5 m more than this are near enough
-    assert len(revisits(T_wc, times(T_wc))) == expected
 
 
 @pytest.mark.parametrize(("interruption", "expected"), [(8, 1), (12, 2)])

@@ -116,6 +116,7 @@ def test_alignment_of_position_noise():
     assert result.errors_m.shape == (2001,)
 
 
+@pytest.mark.slow
 def test_scale_error_is_drift_in_se3_and_none_in_sim3():
     truth = straight(2001, 0.5)
     drift = kitti_drift(scaled(truth, 1.01).T_wc, truth.T_wc)
@@ -198,6 +199,7 @@ def test_unknown_alignment():
         evaluate_trajectory(drive(9), drive(9), "rigid")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alignment", ["se3", "sim3", "none"])
 @pytest.mark.parametrize("write", [lambda p, t: write_kitti(p, t.T_wc), write_tum])
 def test_evo_command_reproduces_the_ate(tmp_path, write, alignment):

@@ -193,6 +193,7 @@ fetch("report.html").then(answer => answer.text())
 </script>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [400, 1200])
 def test_the_explorer_in_a_browser(run: Path, tmp_path: Path, width: int):
     """The slider moves through time, buttons zoom, nothing is asked for."""
@@ -316,6 +317,7 @@ for (const path of ["/", "/run/0", "/run/1"])
 </script>"""
 
 
+@pytest.mark.slow
 def test_a_script_in_a_report_reads_no_other_one(server, run: Path, tmp_path: Path):
     (tmp_path / "<b>second" / "report.html").write_text(SPY)
     links = re.findall(r'href="(/run/\d)"[^>]*>&lt;b&gt;second', ask(server, "/")[1])
@@ -362,6 +364,7 @@ def test_what_cannot_be_served_is_said(tmp_path: Path, server):
         make_server([tmp_path], server.server_port)
 
 
+@pytest.mark.slow
 def test_the_command_serves_until_it_is_interrupted(run: Path):
     import signal
 

@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from source_files import write_calibration
+from source_files import write_calibration, write_video
 from test_pipeline import KITTI, needs_kitti
 from test_pipeline import run as run_pipeline
 from typer.testing import CliRunner
@@ -40,6 +40,7 @@ from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap
 from vslam.report.finished_run import FinishedRun, pose_graph, read_report, read_run
 from vslam.report.folder import write_results
+from vslam.run.options import RunOptions, write_options
 from vslam.trajectory import Trajectory, write_euroc
 
 CAMERA = Camera(300.0, 310.0, 159.5, 119.5, 0.4, 320, 240)
@@ -83,6 +84,7 @@ def small() -> Reconstruction:
 def corridor_run(kitti_tree, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("corridor")
     write_results(folder, run_pipeline(kitti_tree), pages=False)
+    write_options(folder, RunOptions(data=str(kitti_tree), dataset="kitti", seq="00"))
     return folder
 
 
@@ -408,7 +410,7 @@ def vslam(*words: object) -> str:
 
 @pytest.mark.parametrize("link", [False, True])
 def test_export_colmap_and_nerfstudio(corridor_run, kitti_tree, tmp_path, link):
-    options = ["--data", kitti_tree, *(["--link"] if link else [])]
+    options = ["--link"] if link else []
     vslam("export", "colmap", corridor_run, "--out", tmp_path / "c", *options, "--quiet")
     out = vslam("export", "nerfstudio", corridor_run, "--out", tmp_path / "n", *options)
     finished = read_run(corridor_run)
@@ -431,8 +433,8 @@ def test_export_colmap_and_nerfstudio(corridor_run, kitti_tree, tmp_path, link):
     assert all((tmp_path / "n" / frame["file_path"]).is_file() for frame in content["frames"])
 
 
-def test_export_files_into_the_folder_of_the_run(corridor_run, kitti_tree):
-    vslam("export", "ply", corridor_run, "--data", kitti_tree)
+def test_export_files_into_the_folder_of_the_run(corridor_run):
+    vslam("export", "ply", corridor_run)
     vslam("export", "g2o", corridor_run)
     vslam("export", "euroc", corridor_run)
     finished = read_run(corridor_run)
@@ -507,43 +509,70 @@ def test_refusals(corridor_run, kitti_tree, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def rerun(folder: Path, original: Path, **changes: object) -> Path:
-    """A run with another report."""
-    folder.mkdir()
-    for name in ("map.npz", "config.json"):
-        (folder / name).symlink_to(original / name)
-    report = json.loads((original / "report.json").read_text())
-    (folder / "report.json").write_text(json.dumps({**report, **changes}))
-    return folder
-
-
-@pytest.mark.parametrize("source", ["images", "video", "bag", "camera"])
-def test_what_can_be_exported_of_images_that_are_of_no_data_set(corridor_run, tmp_path, source):
-    run = rerun(tmp_path / "run", corridor_run, dataset=source)
+def test_what_can_be_exported_of_a_live_camera(corridor_run, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    for name in ("map.npz", "config.json", "run.json"):
+        (run / name).symlink_to(corridor_run / name)
+    report = json.loads((corridor_run / "report.json").read_text())
+    (run / "report.json").write_text(json.dumps({**report, "dataset": "camera"}))
     for kind in ("colmap", "nerfstudio", "ply"):
-        message = refusal("export", kind, run, "--data", tmp_path)
-        assert f"images of {source} cannot be opened again" in message
+        message = refusal("export", kind, run)
+        assert "what a camera has shown cannot be seen again" in message
         assert "export g2o, euroc or ply --no-colours" in message
     vslam("export", "ply", run, "--no-colours")
     vslam("export", "g2o", run)
 
 
-def test_images_are_opened_by_the_calibration_of_the_run(corridor_run, kitti_tree, tmp_path):
-    sequence = tmp_path / "kitti/sequences/00"
-    sequence.mkdir(parents=True)
-    for name in ("image_0", "image_1", "times.txt"):
-        (sequence / name).symlink_to(kitti_tree / "sequences/00" / name)
-    calib = write_calibration(tmp_path / "own.yaml", read_run(corridor_run).camera)
-    run = rerun(tmp_path / "run", corridor_run, calib=[str(calib)])
-    vslam("export", "ply", run, "--data", tmp_path / "kitti")
-    assert read_ply(run / "landmarks.ply")[1] is not None
+def test_images_are_opened_as_the_run_opened_them(corridor_run, kitti_tree, tmp_path):
+    """By its calibration, every second frame, in another place."""
+    camera = read_run(corridor_run).camera
+    calib = write_calibration(tmp_path / "own.yaml", camera)
+    words = ("--calib", calib, "--every", "2", "--no-record", "--no-report", "--quiet")
+    vslam("run", "--data", kitti_tree, *words, "--out", tmp_path / "runs")
+    run = tmp_path / "runs" / "latest"
+    there = json.loads((run / "run.json").read_text())["data"]
+    assert there == str(kitti_tree)
+    vslam("export", "colmap", run)
+    (tmp_path / "moved").symlink_to(kitti_tree)
+    vslam("export", "colmap", run, "--data", tmp_path / "moved", "--out", tmp_path / "again")
+    names = sorted(path.name for path in (run / "colmap/images").iterdir())
+    sequence = open_sequence("kitti", kitti_tree, "00", every=2)
+    for folder in (run / "colmap", tmp_path / "again"):
+        for name in names:
+            image = cv2.imread(str(folder / "images" / name), cv2.IMREAD_GRAYSCALE)
+            np.testing.assert_array_equal(image, sequence.read(int(name[:6]))[0])
 
 
+def test_a_phone_video_in_two_commands(corridor, tmp_path, monkeypatch):
+    """Keyframes and landmarks come in colour, though the run itself was grey."""
+    monkeypatch.chdir(tmp_path)
+    tinted = [np.dstack([image // 2, image, 255 - image]) for image in corridor.left]
+    write_video(Path("phone.mkv"), tinted)
+    write_calibration(Path("phone.yaml"), corridor.camera, mono=True)
+    words = ("--sensor", "mono", "--calib", "phone.yaml", "--no-record", "--no-report", "--quiet")
+    vslam("run", "phone.mkv", *words)
+    for what in ("colmap", "nerfstudio"):
+        vslam("export", what, "runs/latest")
+    images = sorted(Path("runs/latest/colmap/images").iterdir())
+    assert len(images) > 3
+    for path in images:
+        np.testing.assert_array_equal(cv2.imread(str(path)), tinted[int(path.stem)])
+    points = read_binary(Path("runs/latest/colmap/sparse/0")).points.values()
+    red, green, blue = np.array([point[1] for point in points], int).T
+    assert np.array_equal(red, 255 - green)
+    assert np.array_equal(blue, green // 2)
+    _, colours = read_ply(Path("runs/latest/nerfstudio/sparse_pc.ply"))
+    assert len(np.unique(colours, axis=0)) > 10
+
+
+@pytest.mark.slow
 @needs_kitti
 def test_real_keyframes_reproject_within_a_pixel(tmp_path):
     write_results(tmp_path, run_pipeline(KITTI, "06", max_frames=51), pages=False)
+    write_options(tmp_path, RunOptions(data=str(KITTI), dataset="kitti", seq="06", max_frames=51))
     for what in ("colmap", "nerfstudio"):
-        vslam("export", what, tmp_path, "--data", KITTI, "--quiet")
+        vslam("export", what, tmp_path, "--quiet")
     finished = read_run(tmp_path)
     reconstruction = reconstruction_of(finished.map, finished.camera)
     assert len(reconstruction.xyz) > 1000

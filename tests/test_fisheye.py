@@ -31,6 +31,7 @@ def folder(route: Route, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return render_fisheye(route, Variation(), folder, until=FRAMES, threads=1)
 
 
+@pytest.mark.slow
 def test_both_calibrations_tell_the_same(folder):
     ours, kalibr = (read_calibration([path]) for path in (folder, folder / "camchain.yaml"))
     assert (ours.left, ours.right) == (kalibr.left, kalibr.right)
@@ -39,6 +40,7 @@ def test_both_calibrations_tell_the_same(folder):
     assert not np.allclose(ours.T_left_right[:3, :3], np.eye(3), atol=0.01)
 
 
+@pytest.mark.slow
 def test_rectified_images_are_those_of_a_pinhole_pair(folder, route):
     sequence = open_euroc(folder, "")
     assert len(sequence) == FRAMES
@@ -60,6 +62,7 @@ def test_rectified_images_are_those_of_a_pinhole_pair(folder, route):
         assert difference.mean() < 0.5 * shifted.mean()
 
 
+@pytest.mark.slow
 def test_the_ground_truth_is_the_drive(folder, route):
     found = open_euroc(folder, "").ground_truth
     np.testing.assert_allclose(found[:, :3, 3], route.ground_truth[:FRAMES, :3, 3], atol=1e-9)

@@ -27,6 +27,7 @@ def fuzz(monkeypatch):
     return fuzz
 
 
+@pytest.mark.slow
 def test_every_reader_survives_damaged_files(fuzz, tmp_path: Path):
     names = [name for name in fuzz.READERS if name not in SLOW or INPUTS > 100]
     names.remove("map-meaning")
@@ -43,6 +44,7 @@ def test_every_reader_survives_damaged_files(fuzz, tmp_path: Path):
     assert sum(line["outcome"] == "refused" for line in tried) > len(tried) / 4
 
 
+@pytest.mark.slow
 def test_maps_that_say_what_cannot_be_are_refused_or_used_to_the_end(fuzz):
     """Of the right kinds and shapes, with wrong values: kernels rely on them unseen."""
     found = fuzz.fuzz("map-meaning", 8 * INPUTS, 0)
@@ -58,6 +60,7 @@ def test_mutations_are_seeded_and_change_the_file(fuzz):
     assert made[0] != data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hang", "wall", "code"), [("import time; time.sleep(60)", 15, 1), ("pass", 300, -27)]
 )

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from source_files import run_source, write_calibration
+from source_files import open_from, run_source, write_calibration
 
-from vslam.datasets.sources import SourceOptions, open_source
-from vslam.datasets.stream import count_expected, timed_frames
+from vslam.datasets.sources import SourceOptions
 from vslam.errors import InputError
 
 av = pytest.importorskip("av")
@@ -37,7 +36,7 @@ def write_h264(path: Path, images, times, *, options=None, container=None) -> Pa
 @pytest.fixture(scope="module")
 def options(corridor, tmp_path_factory) -> SourceOptions:
     path = tmp_path_factory.mktemp("calib") / "c.yaml"
-    return SourceOptions((write_calibration(path, corridor.camera),), side_by_side=True)
+    return SourceOptions(calib=(write_calibration(path, corridor.camera),), side_by_side=True)
 
 
 @pytest.fixture(scope="module")
@@ -47,16 +46,17 @@ def beside(corridor) -> list[np.ndarray]:
 
 
 def opened(path: Path, options: SourceOptions):
-    return open_source("video", str(path), None, options)
+    return open_from("video", path, options)
 
 
+@pytest.mark.slow
 def test_a_video_as_encoders_write_it(corridor, beside, options, tmp_path):
     """With frames that are stored in another order than they are shown in."""
     times = np.arange(FRAMES) / 10
     path = write_h264(tmp_path / "a.mp4", beside, times, options={"bf": "3"})
     source = opened(path, options)
-    assert count_expected(source) == FRAMES
-    frames = list(timed_frames(source))
+    assert source.n_expected == FRAMES
+    frames = list(source.frames())
     np.testing.assert_allclose([frame.timestamp for frame in frames], times, atol=1e-5)
     for k, frame in enumerate(frames):
         for image, true in zip(frame.read(map), (corridor.left[k], corridor.right[k]), strict=True):
@@ -65,14 +65,16 @@ def test_a_video_as_encoders_write_it(corridor, beside, options, tmp_path):
     assert all(track.state == "OK" for track in outcome.tracks)
 
 
+@pytest.mark.slow
 def test_a_rate_that_varies(beside, options, tmp_path):
     steps = np.resize([0.033, 0.041, 0.1, 0.02], FRAMES - 1)
     times = np.concatenate([[0.0], np.cumsum(steps)])
     path = write_h264(tmp_path / "vfr.mp4", beside, times)
-    found = [frame.timestamp for frame in timed_frames(opened(path, options))]
+    found = [frame.timestamp for frame in opened(path, options).frames()]
     np.testing.assert_allclose(found, times, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_file_cut_off_has_no_index(beside, options, tmp_path):
     data = write_h264(tmp_path / "a.mp4", beside, np.arange(FRAMES) / 10).read_bytes()
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) * 3 // 5])
@@ -80,6 +82,7 @@ def test_a_file_cut_off_has_no_index(beside, options, tmp_path):
         opened(tmp_path / "cut.mp4", options)
 
 
+@pytest.mark.slow
 def test_a_file_in_fragments_keeps_the_frames_before_the_cut(beside, options, tmp_path):
     fragments = {"movflags": "frag_keyframe+empty_moov"}
     path = write_h264(
@@ -87,7 +90,7 @@ def test_a_file_in_fragments_keeps_the_frames_before_the_cut(beside, options, tm
     )
     data = path.read_bytes()
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) * 3 // 5])
-    found = list(timed_frames(opened(path, options)))
+    found = list(opened(path, options).frames())
     assert len(found) == FRAMES
     source = opened(tmp_path / "cut.mp4", options)
     outcome = run_source(source)

@@ -69,12 +69,14 @@ def run(folder: Path, *words: str, **variables: str) -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.mark.slow
 def test_a_kernel_is_loaded_without_what_compiles(tmp_path: Path) -> None:
     (tmp_path / "inner.py").write_text(INNER)
     assert run(tmp_path, "-c", CALL)[0] == "6.0 [0.0, 1.0, 2.0, 3.0] 0"
     assert run(tmp_path, "-c", CALL) == ["6.0 [0.0, 1.0, 2.0, 3.0] 1", "False False"]
 
 
+@pytest.mark.slow
 def test_a_kernel_is_compiled_from_loaded_ones(tmp_path: Path) -> None:
     (tmp_path / "inner.py").write_text(INNER)
     (tmp_path / "outer.py").write_text(OUTER)
@@ -90,6 +92,7 @@ def test_the_installed_release_of_numba_is_known() -> None:
     assert numba.__version__.startswith(TESTED_NUMBA)
 
 
+@pytest.mark.slow
 def test_an_unknown_release_uses_its_own_cache(tmp_path: Path) -> None:
     (tmp_path / "inner.py").write_text(INNER.replace("from vslam.kernels", UNKNOWN, 1))
     for hits in "01":
@@ -102,6 +105,7 @@ def damage(path: Path, how: str) -> None:
     path.write_bytes(keep.ljust(size, b"\0") if how == "zeroed" else keep)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["emptied", "cut", "zeroed"])
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
 def test_damaged_kernels_are_compiled_again(tmp_path: Path, how: str, kind: str) -> None:
@@ -123,6 +127,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
 """
 
 
+@pytest.mark.slow
 def test_kernels_that_do_not_fit_on_the_disk(tmp_path: Path) -> None:
     (tmp_path / "inner.py").write_text(INNER)
     errors = tmp_path / "errors"
@@ -131,6 +136,7 @@ def test_kernels_that_do_not_fit_on_the_disk(tmp_path: Path) -> None:
         assert errors.read_text().count("cannot be kept (File too large)") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numba_of", ["from vslam.kernels", "UNKNOWN"])
 def test_an_installation_without_a_writable_folder(tmp_path: Path, numba_of: str) -> None:
     source = INNER if numba_of != "UNKNOWN" else INNER.replace("from vslam.kernels", UNKNOWN, 1)

@@ -76,7 +76,7 @@ def test_selection(root):
     sequence = open_kitti(root, "00", start=1, every=2, max_frames=2)
     np.testing.assert_allclose(sequence.timestamps, [0.1, 0.3])
     np.testing.assert_array_equal(sequence.ground_truth[:, 2, 3], [1, 3])
-    assert [path.stem for path in sequence.left] == ["000001", "000003"]
+    assert [frame.file.stem for frame in sequence.stored] == ["000001", "000003"]
 
 
 def test_only_selected_frames_are_checked(root):
@@ -105,6 +105,15 @@ def test_archives_unpacked_into_dataset(root):
 def test_calibration_without_prefixes(root):
     (root / "sequences/00/calib.txt").write_text(f"{row(P0)}\n{row(P1)}\n")
     assert open_kitti(root, "00").camera.baseline == 0.5
+
+
+@pytest.mark.parametrize("text", [f"P0: {row(P0)}\nP1: {row(P0)}\n", f"P0: {row(P0)}\n"])
+def test_one_camera_needs_no_baseline(root, text):
+    (root / "sequences/00/calib.txt").write_text(text)
+    camera = open_kitti(root, "00", monocular=True).camera
+    assert (camera.sensor, camera.fx, camera.cx, camera.cy) == ("mono", 50, 30, 16)
+    with pytest.raises(InputError):
+        open_kitti(root, "00")
 
 
 def test_excerpt_is_matched_by_number_to_longer_times_and_poses(root):

@@ -85,6 +85,7 @@ def imagenet(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_the_published_network_is_computed(imagenet):
     """Grey images of deviation 1 in, what the network makes of them at deviation 0.5 out."""
@@ -98,6 +99,7 @@ def test_the_published_network_is_computed(imagenet):
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixels", [97, 129, 160, 193])
 def test_the_grid_has_the_places_that_the_shape_says(pixels):
     shape = CapsuleShape(extractor="lite0", pixels=pixels, types=2, outputs=2)
@@ -127,6 +129,7 @@ def test_without_its_weights_the_extractor_is_not_trained():
         starting_network(settings, views(8), None, "cpu")
 
 
+@pytest.mark.slow
 def test_fine_tuning_leaves_the_first_blocks_and_moves_the_rest_slowly(tmp_path, imagenet):
     settings = small_settings(
         shape=CapsuleShape(extractor="lite0", pixels=65, types=4, outputs=4),
@@ -177,6 +180,7 @@ def test_weights_that_speak_of_what_was_left_out_are_read_if_nothing_was():
         CapsuleShape.model_validate({"skipped": [2]})
 
 
+@pytest.mark.slow
 def test_a_lite_network_is_pruned_trained_and_read_again(tmp_path, imagenet):
     settings = small_settings(
         shape=CapsuleShape(extractor="lite0", pixels=64, types=4, outputs=4), epochs=1, pairs=8

@@ -29,6 +29,7 @@ def picture(seed: int, rows: int = 376, columns: int = 1241) -> np.ndarray:
     return np.asarray(cv2.resize(rough, (columns, rows), interpolation=cv2.INTER_CUBIC))
 
 
+@pytest.mark.slow
 def test_the_shipped_file_says_what_torch_says(network):
     head = LocalHead()
     head.load_state_dict({k: v.float() for k, v in
@@ -69,7 +70,7 @@ def test_doubling_keeps_what_lies_on_the_grid():
 
 
 def test_files_that_are_not_the_local_descriptors(tmp_path):
-    with pytest.raises(InputError, match="are not there"):
+    with pytest.raises(InputError, match="are missing"):
         LocalDescriptors(tmp_path / "missing.onnx")
     with pytest.raises(InputError, match="not the local descriptors"):
         LocalDescriptors(SHIPPED / "capsule.onnx").describe(picture(0))
@@ -119,6 +120,7 @@ def test_images_of_culled_keyframes_are_forgotten(network):
         images.maps(1)
 
 
+@pytest.mark.slow
 def test_export_reads_any_size(tmp_path):
     torch.manual_seed(0)
     branch = build_network("capsule", load_network(SHIPPED / "capsule.safetensors")[0].branch.shape)

@@ -57,8 +57,8 @@ from vslam.errors import InputError
 from vslam.lock_file import locked
 
 folder = Path(sys.argv[1])
-until, entered = time.monotonic() + 3.0, 0
-while time.monotonic() < until:
+entered = 0
+while entered < 100:
     try:
         with locked(folder / ".lock", folder, "works here"):
             (folder / "inside").touch(exist_ok=False)
@@ -68,14 +68,12 @@ while time.monotonic() < until:
         (folder / ".lock").write_text("999999999")  # as a killed process once left it
     except InputError:
         pass
-print(entered)
 """
 
 
+@pytest.mark.slow
 def test_processes_that_race_get_in_one_at_a_time(tmp_path):
     """The one that leaves removes the file that others may just have opened."""
     command = [sys.executable, "-c", RACER, str(tmp_path)]
-    racers = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(4)]
-    entered = [racer.communicate(timeout=60)[0] for racer in racers]
-    assert [racer.returncode for racer in racers] == [0] * 4
-    assert sum(map(int, entered)) > 100
+    racers = [subprocess.Popen(command) for _ in range(4)]
+    assert [racer.wait(timeout=300) for racer in racers] == [0] * 4

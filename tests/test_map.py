@@ -255,6 +255,7 @@ def test_pose_of_a_keyframe_is_a_copy():
     np.testing.assert_array_equal(map_.arrays.T_cw[0], before)
 
 
+@pytest.mark.slow
 def test_a_long_chain_of_culled_keyframes_still_has_poses():
     """A camera that stands still culls keyframes by the thousand, each the next one's parent."""
     rng = np.random.default_rng(0)
@@ -372,6 +373,7 @@ def test_content_survives_growth(check_map):
     check_map(map_)
 
 
+@pytest.mark.slow
 def test_grows_to_5000_keyframes_and_a_million_landmarks_in_bounded_memory():
     rng = np.random.default_rng(0)
     features = random_features(rng, 200)

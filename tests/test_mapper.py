@@ -615,17 +615,17 @@ def test_a_change_that_fails_where_no_job_runs_leaves_no_other_map(failing, chan
 
 @pytest.mark.parametrize("failing", [0, 2])
 @pytest.mark.parametrize("threads", [1, 2])
-def test_a_map_that_is_incomplete_is_not_saved(failing, threads, tmp_path):
-    class Detector(NoDetector):
-        """Fails at one of the keyframes."""
+def test_a_map_that_is_incomplete_is_not_saved(failing, threads, tmp_path, monkeypatch):
+    def fail(map_, keyframe, *_):
+        if keyframe == failing:
+            raise BrokenError
 
-        def add(self, keyframe, image, features):
-            if keyframe == failing:
-                raise BrokenError
-
+    # The first keyframe is mapped at once, the others by a job.
+    function = "map_and_calibrate" if failing else "map_stereo_points"
+    monkeypatch.setattr(f"vslam.mapping.{function}", fail)
     path = tmp_path / "map.npz"
     path.write_bytes(b"an older map")
-    slam = Slam(CAMERA, detector=Detector(), threads=threads)
+    slam = Slam(CAMERA, detector="none", threads=threads)
     results = []
 
     def drive() -> None:
@@ -647,6 +647,27 @@ def test_a_map_that_is_incomplete_is_not_saved(failing, threads, tmp_path):
             use()
     assert path.read_bytes() == b"an older map"
     assert [file.name for file in tmp_path.iterdir()] == ["map.npz"]
+
+
+def test_a_detector_that_fails_costs_its_loops_alone(tmp_path, caplog):
+    class Detector(NoDetector):
+        """Fails at each keyframe."""
+
+        def add(self, keyframe, image, features):
+            raise BrokenError
+
+    slam = Slam(CAMERA, detector=Detector(), threads=2)
+    without = Slam(CAMERA, detector="none", threads=2)
+    for k in range(40):
+        for one in (slam, without):
+            one.step_features(Extracted(POINTS.see(at(k))), 0.1 * k)
+    slam.finish()
+    without.finish()
+    assert slam.trajectory().T_wc.tobytes() == without.trajectory().T_wc.tobytes()
+    assert slam.problems == ["Looking for loops failed (BrokenError); the map stays as it was."]
+    assert [record.getMessage() for record in caplog.records] == slam.problems  # once
+    slam.save(tmp_path / "map.npz")
+    assert Slam.load(tmp_path / "map.npz", detector=NoDetector()).map.n_keyframes > 2
 
 
 # -- state ----------------------------------------------------------------------------------------

@@ -72,6 +72,7 @@ def test_the_first_landmarks_make_the_unit():
     assert second >= 1
 
 
+@pytest.mark.slow
 def test_a_loop_corrects_the_scale(check_map):
     without, _ = run(ROUND)
     slam, _ = closed()
@@ -81,11 +82,13 @@ def test_a_loop_corrects_the_scale(check_map):
     check_map(slam.map)
 
 
+@pytest.mark.slow
 def test_same_bytes_with_one_thread_and_two():
     again, _ = run(ROUND, Oracle(RING, ROUND), threads=2)
     assert again.trajectory().T_wc.tobytes() == closed()[0].trajectory().T_wc.tobytes()
 
 
+@pytest.mark.slow
 def test_a_lost_camera_begins_a_sub_map_that_a_loop_joins(check_map):
     frames = [*ROUND[:80], *ROUND[140:], *(k + LAP for k in ROUND[40:70])]
     slam, results = run(frames, Oracle(RING, frames))
@@ -117,6 +120,7 @@ def test_darkness_at_the_beginning_only_delays_it():
     assert len(slam.trajectory()) == 40
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_still_begins_no_map():
     slam, results = run([3.0 + 1e-6 * k for k in range(30)])
     assert slam.map.n_keyframes == 0

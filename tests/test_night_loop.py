@@ -18,8 +18,10 @@ from vslam.evaluation.loops import evaluate_loops
 from vslam.loopclosure.registry import DEFAULT_DETECTOR
 from vslam.run.outcome import RunSettings
 from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 from vslam.slam import Slam
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +50,7 @@ def compared(round_the_block):
         "synthetic", "block", "none", DEFAULT_DETECTOR, "stereo", seed=0, threads=2, start=0,
         every=1, max_frames=None, config=Config(), compare=("bow",),
     )  # fmt: skip
-    return run_sequence(round_the_block, parse_perturbation("none", 0), settings, NullRecorder())
+    return run_sequence(round_the_block, parse_perturbation("none", 0), settings, Recorder())
 
 
 def test_the_default_closes_a_loop_by_night_that_the_bag_of_words_misses(compared):

@@ -354,6 +354,7 @@ def test_command_refuses_in_one_sentence(arguments, said, tmp_path, monkeypatch)
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_command_on_a_rendered_drive(tmp_path, monkeypatch):
     monkeypatch.setenv("VSLAM_CACHE", str(tmp_path / "cache"))
     arguments = ["--protocol", "online", "--detectors", "bow,thumbnail,ibow", "--quiet"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import email
-import json
 import os
 import re
 import shutil
@@ -53,10 +52,12 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return made[0], made[1]
 
 
+@pytest.mark.slow
 def test_the_same_bytes_twice(wheels):
     assert wheels[0].read_bytes() == wheels[1].read_bytes()
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_every_source_and_the_files_beside_them(wheels):
     with zipfile.ZipFile(wheels[0]) as archive:
         inside = set(archive.namelist())
@@ -80,6 +81,7 @@ def test_the_wheel_holds_every_source_and_the_files_beside_them(wheels):
     assert not {name for name in inside if "tests/" in name or name.endswith(".pyc")}
 
 
+@pytest.mark.slow
 def test_its_metadata_are_complete(wheels):
     with zipfile.ZipFile(wheels[0]) as archive:
         (name,) = (n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
@@ -112,6 +114,7 @@ def readme_for(source: str, tmp_path: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_the_readme_of_a_registry_has_no_link_that_leads_nowhere(wheels, tmp_path: Path):
     with zipfile.ZipFile(wheels[0]) as archive:
         (name,) = (n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
@@ -121,7 +124,7 @@ def test_the_readme_of_a_registry_has_no_link_that_leads_nowhere(wheels, tmp_pat
     assert link.search((ROOT / "README.md").read_text())
     for text in (shown, readme_for("", tmp_path), readme_for("https://example.org/v/", tmp_path)):
         assert not link.search(text)
-    assert "](https://example.org/v/blob/main/docs/cameras.md)" in text
+    assert "](https://example.org/v/blob/main/docs/howto/cameras.md)" in text
     assert "![" not in readme_for("", tmp_path)
     assert "![The same street" in text
     assert "](https://example.org/v/raw/main/docs/images/night.jpg)" in text
@@ -155,7 +158,7 @@ def test_a_comment_says_what_each_dependency_is_needed_for():
 
 
 def make_targets() -> set[str]:
-    return set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    return set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 
 
 def test_the_image_is_not_root_and_copies_what_exists():
@@ -183,7 +186,15 @@ def test_the_image_is_not_root_and_copies_what_exists():
         assert f"def {name[1]}(" in source.read_text()
 
 
-def test_the_development_container_names_targets_of_make():
-    content = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text())
-    named = set(re.findall(r"make (\w+)", json.dumps(content)))
-    assert {"dev", "demo", "test"} <= named <= make_targets()
+@pytest.mark.parametrize(
+    ("file", "at_least"),
+    [
+        (".devcontainer/devcontainer.json", {"dev", "demo", "test"}),
+        (".ci/run", {"check", "test"}),
+        (".github/workflows/ci.yml", {"test-fast"}),
+        (".pre-commit-config.yaml", {"types", "dev"}),
+    ],
+)
+def test_files_name_targets_of_make(file, at_least):
+    named = re.findall(r"make ((?:[a-z-]+ ?)+)", (ROOT / file).read_text())
+    assert at_least <= {target for words in named for target in words.split()} <= make_targets()

@@ -1,14 +1,14 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
 import pytest
 
+from vslam.camera import Camera
+from vslam.datasets.frames import Source, TimedFrame, stored_frames
 from vslam.datasets.perturbation import contact_sheet, ou_walk, parse_perturbation, perturbed
-from vslam.datasets.stream import TimedFrame
 from vslam.errors import InputError
 
 TIMES = 0.1 * np.arange(300)
@@ -21,6 +21,7 @@ def walk_of(duration, deviation, rng, jumps=()):
     return np.fromiter(islice(ou_walk(deviation, rng, jumps), int(duration / 0.01) + 1), float)
 
 
+@pytest.mark.slow
 def test_walk_has_the_stated_deviation_and_correlation_time():
     walk = walk_of(20_000.0, 0.35, np.random.default_rng(0))
     # 20,000 s hold about 5,000 independent values: the deviation is known to about 1 %.
@@ -139,6 +140,7 @@ def test_time_of_day_does_not_matter():
     assert not np.array_equal(early[1], TEXTURE)
 
 
+@pytest.mark.slow
 def test_a_walk_is_drawn_as_far_as_needed_and_its_beginning_stays():
     far, near = (parse_perturbation("brightness,gamma", 4) for _ in range(2))
     far.apply(0, 3600.0, TEXTURE, RAMP)
@@ -241,15 +243,11 @@ def test_the_left_camera_alone_sees_what_it_sees_beside_the_right_one():
         assert nothing is None
 
 
-@dataclass(frozen=True)
-class _Sequence:
-    timestamps = TIMES
-
-    def read(self, index):
-        return TEXTURE, RAMP
-
-
 def test_contact_sheet():
-    sheet = contact_sheet(_Sequence(), parse_perturbation("blur", 0), [0, 10, 20])
+    height, width = TEXTURE.shape
+    camera = Camera(100.0, 100.0, width / 2, height / 2, 0.5, width, height)
+    stored = stored_frames(TIMES, lambda k, image_map: (TEXTURE, RAMP))
+    source = Source(dataset="drawn", name="drawn", camera=camera, stored=stored)
+    sheet = contact_sheet(source, parse_perturbation("blur", 0), [0, 10, 20])
     assert sheet.shape == (3 * 120, 3 * 480)
     assert sheet.dtype == np.uint8

@@ -1,4 +1,4 @@
-"""Plug-ins: the package of docs/plugins.md, installed and used, and packages that are broken."""
+"""Plug-ins: the package of docs/howto/plugins.md, installed and used, and broken packages."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from source_files import open_from
 
 from vslam import plugins
 from vslam.cli import main as cli
 from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import Perturbation, parse_perturbation
-from vslam.datasets.sources import SourceOptions, open_source
-from vslam.datasets.stream import Stream
 from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 from vslam.features import Features
 from vslam.loopclosure.registry import create_detector, problem_of, require_detector
@@ -25,10 +24,10 @@ from vslam.map import Map
 from vslam.report.folder import create_run_folder, write_results
 from vslam.run.outcome import RunSettings
 from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "plugins.md"
+PAGE = ROOT / "docs" / "howto" / "plugins.md"
 MODULES = ("vslam_example", "broken")
 NO_FEATURES = Features(
     np.zeros((0, 2), np.float32),
@@ -114,6 +113,7 @@ def test_the_package_of_the_page_is_found(installed):
     assert "vslam_example" not in sys.modules  # found, not imported
 
 
+@pytest.mark.slow
 def test_a_run_with_reader_perturbation_and_detector(target: Path, corridor, tmp_path: Path):
     """In a process of its own, as a user types it; the help lists all three."""
     data = write_frames(tmp_path / "data", corridor, 12)
@@ -268,7 +268,7 @@ def test_a_detector_that_fails_ends_the_run_with_what_it_has(broken, kitti_tree,
     settings = RunSettings(
         "kitti", "00", "none", "mine", "stereo", 0, threads, 0, 1, None, Config()
     )
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     assert outcome.interrupted is not None
     assert outcome.interrupted.startswith("the detector mine of the package broken 2.0 failed")
     assert "RuntimeError: out of memory" in outcome.interrupted
@@ -278,6 +278,7 @@ def test_a_detector_that_fails_ends_the_run_with_what_it_has(broken, kitti_tree,
     assert (folder / "trajectory.tum").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_compared_detector_that_fails_ends_alone(broken, kitti_tree, tmp_path, threads):
     broken(FAILING, "[vslam.detectors]\nmine = broken:Detector\n")
@@ -285,7 +286,7 @@ def test_a_compared_detector_that_fails_ends_alone(broken, kitti_tree, tmp_path,
     settings = RunSettings(
         "kitti", "00", "none", "none", "stereo", 0, threads, 0, 1, None, Config(), compare=("mine",)
     )
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     assert outcome.interrupted is None
     assert len(outcome.trajectory) == len(sequence)
     assert 3 <= len(outcome.compared[0].trajectory) <= len(sequence)
@@ -299,13 +300,13 @@ def test_a_compared_detector_that_fails_ends_alone(broken, kitti_tree, tmp_path,
 @pytest.mark.parametrize(
     ("answer", "says"),
     [
-        ("None", "query gave NoneType, no list"),
-        ("[7]", "query gave int in its list, no LoopCandidate"),
-        ("[LoopCandidate(0, 5, 1.0)]", "gave keyframe 5, which the map does not have"),
+        ("None", "query returned NoneType, not a list"),
+        ("[7]", "query returned a list with int, not LoopCandidate"),
+        ("[LoopCandidate(0, 5, 1.0)]", "returned keyframe 5, which is not in the map"),
         ("[LoopCandidate(0, 0, float('nan'))]", "with score nan"),
-        ("[LoopCandidate(4, 0, 1.0)]", "gave query 4"),
-        ("[LoopCandidate(0, 0.5, 1.0)]", "gave a LoopCandidate of int, float, float"),
-        ("[LoopCandidate(0, 0, '1')]", "gave a LoopCandidate of int, int, str"),
+        ("[LoopCandidate(4, 0, 1.0)]", "returned query 4"),
+        ("[LoopCandidate(0, 0.5, 1.0)]", "returned a LoopCandidate of int, float, float"),
+        ("[LoopCandidate(0, 0, '1')]", "returned a LoopCandidate of int, int, str"),
     ],
 )
 def test_candidates_that_are_none_are_caught_before_kernels_see_them(broken, answer, says):
@@ -323,19 +324,18 @@ def test_candidates_that_are_none_are_caught_before_kernels_see_them(broken, ans
 
 def test_a_reader_that_fails_costs_one_frame(broken, kitti_tree):
     source = (
+        "from dataclasses import replace\n"
         "from vslam.datasets import open_sequence\n"
-        "class Reader:\n"
-        "    def __init__(self, root, name):\n"
-        "        inner = open_sequence('kitti', root, name)\n"
-        "        self.__dict__.update(inner=inner, name='x', camera=inner.camera,\n"
-        "            timestamps=inner.timestamps, ground_truth=inner.ground_truth)\n"
-        "    def __len__(self): return len(self.inner)\n"
-        "    def read(self, index, image_map=map):\n"
+        "from vslam.datasets.frames import stored_frames\n"
+        "def reader(root, name):\n"
+        "    inner = open_sequence('kitti', root, name)\n"
+        "    def read(index, image_map):\n"
         "        if index == 2: raise KeyError('gone')\n"
-        "        left, right = self.inner.read(index)\n"
+        "        left, right = inner.read(index)\n"
         "        return (left[:-1] if index == 3 else left), right\n"
+        "    return replace(inner, stored=stored_frames(inner.timestamps, read))\n"
     )
-    broken(source, "[vslam.readers]\nmine = broken:Reader\n")
+    broken(source, "[vslam.readers]\nmine = broken:reader\n")
     sequence = open_sequence("mine", kitti_tree, "00")
     with pytest.raises(UnreadableImageError, match=r"broken 2.0 failed at frame 2 \(KeyError"):
         sequence.read(2)
@@ -346,28 +346,24 @@ def test_a_reader_that_fails_costs_one_frame(broken, kitti_tree):
 
 STREAM = (
     "from vslam.datasets import open_sequence\n"
-    "from vslam.datasets.stream import timed_frames\n"
-    "class Reader:\n"
-    "    name, live, n_expected = 'x', LIVE, None\n"
-    "    def __init__(self, root, name):\n"
-    "        self.inner = open_sequence('kitti', root, name)\n"
-    "        self.camera = self.inner.camera\n"
-    "    def frames(self):\n"
-    "        for k, frame in enumerate(timed_frames(self.inner)):\n"
+    "from vslam.datasets.frames import Source\n"
+    "def reader(root, name):\n"
+    "    inner = open_sequence('kitti', root, name)\n"
+    "    def play():\n"
+    "        for k, frame in enumerate(inner.frames()):\n"
     "            if k == 8: raise OSError('unplugged')\n"
     "            yield frame\n"
+    "    return Source(dataset='mine', name='x', camera=inner.camera, play=play, live=LIVE)\n"
 )
 
 
 def test_a_reader_that_streams(broken, kitti_tree):
     """Frames are selected, a failure ends the stream, and what takes all frames refuses it."""
-    broken(STREAM.replace("LIVE", "True"), "[vslam.readers]\nmine = broken:Reader\n")
-    with pytest.raises(InputError, match="a stream, whose length nobody knows"):
+    broken(STREAM.replace("LIVE", "True"), "[vslam.readers]\nmine = broken:reader\n")
+    with pytest.raises(InputError, match="a stream, which cannot seek"):
         open_sequence("mine", kitti_tree, "00")
-    source = open_source(
-        "mine", str(kitti_tree), "00", SourceOptions(), start=1, every=2, sensor="mono"
-    )
-    assert isinstance(source, Stream)
+    source = open_from("mine", kitti_tree, start=1, every=2, sensor="mono")
+    assert not source.seekable
     assert (source.live, source.n_expected, source.camera.monocular) == (True, None, True)
     inner = open_sequence("kitti", kitti_tree, "00")
     frames = source.frames()
@@ -379,30 +375,34 @@ def test_a_reader_that_streams(broken, kitti_tree):
     assert times == inner.timestamps[1:8:2].tolist()
     assert all(right is None for _, right in images)
     assert np.array_equal(images[1][0], inner.read(3)[0])
-    few = open_source("mine", str(kitti_tree), "00", SourceOptions(), max_frames=3)
+    few = open_from("mine", kitti_tree, max_frames=3)
     assert few.n_expected == len(list(few.frames())) == 3
 
 
 def test_a_run_on_a_reader_that_streams(broken, kitti_tree):
-    broken(STREAM.replace("LIVE", "False"), "[vslam.readers]\nmine = broken:Reader\n")
-    source = open_source("mine", str(kitti_tree), "00", SourceOptions(), max_frames=6)
+    broken(STREAM.replace("LIVE", "False"), "[vslam.readers]\nmine = broken:reader\n")
+    source = open_from("mine", kitti_tree, max_frames=6)
     settings = RunSettings("mine", "x", "none", "none", "stereo", 0, 1, 0, 1, 6, Config())
-    outcome = run_sequence(source, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(source, Perturbation("none"), settings, Recorder())
     assert len(outcome.trajectory) == 6
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("self.camera = self.inner.camera", "pass"), "Reader has no camera"),
-        (("self.inner.camera", "3"), "camera is int, no vslam.camera.Camera"),
-        (("n_expected = 'x', LIVE, None", "n_expected = 'x', True, -1"), "n_expected is no number"),
+        (("return Source", "return dict"), "gave dict, not vslam.datasets.frames.Source"),
+        (("camera=inner.camera", "camera=3"), "camera is int, not vslam.camera.Camera"),
+        (("live=LIVE", "n_expected=-1"), "n_expected is -1, neither None nor a number"),
+        (
+            ("play=play", "stored=(*inner.stored, inner.stored[0])"),
+            "x: the times of its frames do not increase",
+        ),
     ],
 )
 def test_what_is_no_stream_is_refused(broken, kitti_tree, change, says):
-    broken(STREAM.replace(*change).replace("LIVE", "True"), "[vslam.readers]\nmine = broken:Reader")
+    broken(STREAM.replace(*change).replace("LIVE", "True"), "[vslam.readers]\nmine = broken:reader")
     with pytest.raises(InputError, match=says):
-        open_source("mine", str(kitti_tree), "00", SourceOptions())
+        open_from("mine", kitti_tree)
 
 
 def test_a_perturbation_that_fails_costs_one_frame(broken):

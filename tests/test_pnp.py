@@ -17,6 +17,7 @@ def unit(rays: np.ndarray) -> np.ndarray:
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
+@pytest.mark.slow
 def test_p3p_finds_the_pose_and_only_poses():
     rng = np.random.default_rng(0)
     poses = np.empty((4, 4, 4))

@@ -222,7 +222,7 @@ def test_culled_keyframes_are_left_out_and_their_loops_kept():
 
 
 def test_the_loop_edge_wins_over_the_edge_of_the_same_keyframes():
-    """docs/design.md, section 13: a drifted covisibility edge won; ATE rose from 0.96 to 5.2 m."""
+    """A drifted covisibility edge won, and the ATE rose from 0.96 to 5.2 m (design.md, 13)."""
     map_ = line_map()
     T_covisible, T_tree = translation(0, 0, 1.5), translation(0, 0, 0.75)
     for loops in (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -15,13 +16,13 @@ import pytest
 
 from vslam.config import Config, OrbConfig
 from vslam.datasets import open_sequence
+from vslam.datasets.frames import TimedFrame
 from vslam.datasets.perturbation import Perturbation
-from vslam.datasets.stream import TimedFrame
 from vslam.features import TrackingState
 from vslam.run.outcome import RunSettings
 from vslam.run.pipeline import run_sequence
 from vslam.run.realtime import play
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 from vslam.slam import Slam
 
 
@@ -43,7 +44,6 @@ def test_no_frame_comes_before_its_time_and_the_last_one_always_comes(threads):
             index = round((played.timestamp - 100.0) / 0.02)
             assert played.made[0] == played.timestamp
             assert played.made[1] >= played.came >= begin + 0.02 * index
-            assert played.came == pytest.approx(begin + 0.02 * index, abs=0.5)
     assert [played.timestamp for played in seen] == times.tolist()  # dropped ones too
     assert seen[0].made is not None
     assert seen[-1].made is not None
@@ -51,17 +51,22 @@ def test_no_frame_comes_before_its_time_and_the_last_one_always_comes(threads):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_who_is_late_gets_the_newest_frame(threads):
-    seen, waits = [], []
-    for played in play(frames_at(0.01 * np.arange(60)), lambda frame: frame, threads):
-        seen.append(played.made)
-        if played.made is not None:
-            waits.append(time.perf_counter() - played.came)
-            time.sleep(0.05)
-    assert len(seen) == 60
-    assert len(waits) <= 60 / 5 + 3  # five frames come while one is used
-    assert seen[-1] is not None
-    # None queues: a frame waits while one other is used, not for all before it.
-    assert np.median(waits) < 0.2
+    """The camera sends nine frames while the first one is used."""
+    sent = threading.Event()
+
+    def film():
+        yield from frames_at(np.arange(10.0))
+        sent.set()
+
+    seen = []
+    for played in play(film(), lambda frame: frame, threads, live=True):
+        seen.append(played)
+        assert played.made is None or sent.wait(60)
+    assert [played.timestamp for played in seen] == [*range(10)]
+    used = [played.timestamp for played in seen if played.made is not None]
+    assert (used[0], used[-1]) == (0.0, 9.0)
+    # With two threads, a second frame is prepared while the first one is used.
+    assert len(used) <= 1 + threads
 
 
 def test_with_one_thread_a_frame_is_prepared_after_the_last_one_was_used():
@@ -153,7 +158,7 @@ def test_one_camera_in_real_time(kitti_tree, threads):
     settings = RunSettings(
         "kitti", "00", "none", "none", "mono", 0, threads, 0, 1, 6, Config(), realtime=True
     )
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     assert len(outcome.tracks) == 6
     assert len(outcome.latency_ms) == sum(track.n_features > 0 for track in outcome.tracks) > 0
 
@@ -169,7 +174,7 @@ def test_an_unreadable_image_in_real_time(kitti_tree, threads, tmp_path):
     settings = RunSettings(
         "kitti", "00", "none", "none", "stereo", 0, threads, 0, 1, 6, Config(), realtime=True
     )
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     assert len(outcome.trajectory) == len(outcome.tracks) == 6
     assert outcome.tracks[5].state == TrackingState.LOST
     assert [str(image) in message for message in outcome.skipped] == [True]
@@ -182,13 +187,14 @@ def test_a_compared_detector_drops_the_frames_that_the_main_one_drops(kitti_tree
         "kitti", "00", "none", "bow", "stereo", 0, 2, 0, 1, 8, Config(),
         realtime=True, compare=("none",),
     )  # fmt: skip
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     (other,) = outcome.compared
     assert len(outcome.tracks) == len(other.tracks) == 8
     for own, compared in zip(outcome.tracks, other.tracks, strict=True):
         assert (own.timestamp, own.n_features) == (compared.timestamp, compared.n_features)
 
 
+@pytest.mark.slow
 def test_command_line_in_real_time(kitti_tree, tmp_path):
     command = [sys.executable, "-m", "vslam", "run", "--data", str(kitti_tree), "--realtime"]
     done = subprocess.run(
@@ -196,7 +202,7 @@ def test_command_line_in_real_time(kitti_tree, tmp_path):
         cwd=tmp_path, capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "frames dropped, latency" in done.stdout
+    assert re.search("Latency +.* dropped", done.stdout)
     folder = tmp_path / "runs" / "latest"
     report = json.loads((folder / "report.json").read_text())
     assert report["realtime"] is True

@@ -25,7 +25,6 @@ from vslam.map import Map
 from vslam.run import recorder as recorder_module
 from vslam.run.moments import LoopPictureRecorder
 from vslam.run.recorder import (
-    NullRecorder,
     Recorder,
     RerunRecorder,
     SeveralRecorders,
@@ -250,10 +249,6 @@ def test_a_run_without_frames(tmp_path: Path) -> None:
     assert rows(tmp_path / "recording.rrd", "world")
 
 
-def test_null_recorder_takes_every_call() -> None:
-    record(NullRecorder(), frames=4)
-
-
 def test_unwritable_path_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING, "vslam.run.recorder"):
         record(RerunRecorder(tmp_path / "missing" / "recording.rrd"), frames=4)
@@ -273,7 +268,7 @@ def test_almost_full_disk_ends_the_recording_cleanly(
     assert len(rows(tmp_path / "recording.rrd", "world/camera")) == 7
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on the size of files")
+@pytest.mark.slow
 def test_failing_disk_neither_ends_nor_hangs_the_run(tmp_path: Path) -> None:
     # Rerun's writer thread dies at the limit; in a process of its own, for it must end, too.
     script = """
@@ -336,8 +331,9 @@ def test_a_window_shows_the_run_and_the_recording_is_the_same(tmp_path, window, 
         assert len(rows(tmp_path / "recording.rrd", entity)) == len(rows(recording, entity))
 
 
+@pytest.mark.slow
 def test_a_window_that_is_closed_does_not_end_the_recording(tmp_path, window, recording, caplog):
-    class Closing(NullRecorder):
+    class Closing(Recorder):
         def map(self, map_: Map) -> None:
             if map_.n_keyframes == 10:
                 window[0].kill()

@@ -125,7 +125,7 @@ PARTS = {  # what fails: where it is looked up, the name of the result that it c
     "write_frames": (folder, "frames.csv"),
     "summarize": (folder, "report.json"),
     "draw_figures": (figures, "figures"),
-    "render_markdown": (render, "report.md"),
+    "markdown": (render, "report.md"),
     "explorer_data": (explorer, "report.html"),
 }
 ALL = {
@@ -135,6 +135,7 @@ ALL = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PARTS)
 def test_a_result_that_fails_costs_itself_alone(tmp_path, monkeypatch, name):
     """Whatever it raises: a fault of the figures once took the map with it."""

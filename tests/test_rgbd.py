@@ -28,7 +28,7 @@ from vslam.frontend.tracking import TrackingContext
 from vslam.maps.storage import load_map, save_map
 from vslam.run.outcome import RunOutcome, RunSettings
 from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory, write_tum
 
@@ -93,7 +93,7 @@ def run_on(tree: Path, *, threads: int = 1, **options) -> RunOutcome:
         sensor=sequence.camera.sensor, seed=0, threads=threads, start=0, every=1, max_frames=None,
         config=Config(),
     )  # fmt: skip
-    return run_sequence(sequence, parse_perturbation("none", 0), settings, NullRecorder())
+    return run_sequence(sequence, parse_perturbation("none", 0), settings, Recorder())
 
 
 def ate_of(outcome: RunOutcome) -> float:
@@ -294,6 +294,7 @@ def test_a_map_keeps_its_camera(outcome, tmp_path):
     assert load_map(tmp_path / "map.npz").camera == outcome.sequence.camera
 
 
+@pytest.mark.slow
 def test_the_command_names_the_sensor(tree, tmp_path, capsys):
     def call(*words: str) -> tuple[int, str]:
         with pytest.raises(SystemExit) as stopped:
@@ -308,6 +309,7 @@ def test_the_command_names_the_sensor(tree, tmp_path, capsys):
     assert "rgbd" in report
 
 
+@pytest.mark.slow
 def test_rendered_rgbd(tmp_path):
     small = Camera(140.0, 140.0, 119.5, 39.5, 0.5, 240, 80)
     route = replace(built_in_route("demo"), camera=small)
@@ -324,6 +326,7 @@ def test_rendered_rgbd(tmp_path):
     assert np.median(abs(depth[72:80, 110:130] / road[:, None] - 1)) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="TUM sample absent")
 def test_real_sample():
     whole = open_tum(REAL, "")

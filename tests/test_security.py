@@ -22,10 +22,12 @@ from test_report import make_outcome, report_of
 from vslam.calibration.documents import read_document
 from vslam.datasets.bag import open_bag
 from vslam.datasets.image_files import read_grey
+from vslam.datasets.video import open_video
 from vslam.errors import InputError, UnreadableImageError
 from vslam.loopclosure.vocabulary import load
 from vslam.maps.storage import load_map
-from vslam.report.render import render_html
+from vslam.report.render import html
+from vslam.report.run_page import run_page
 from vslam.run.progress import read_progress
 from vslam.untrusted import MOST_PIXELS, read_npz
 
@@ -156,6 +158,19 @@ def test_images_of_absurd_size_are_refused_by_their_header(tmp_path: Path, width
     assert int(peak) < 400  # MB
 
 
+def test_a_video_of_absurd_size_is_refused_by_its_header(tmp_path: Path, monkeypatch):
+    class Capture:
+        """A video of 144 million pixels a frame, of which no frame may be read."""
+
+        def get(self, kind: int) -> float:
+            return 12_000.0
+
+    (tmp_path / "a.mp4").write_bytes(b"a video")
+    monkeypatch.setattr("vslam.datasets.video.open_capture", lambda name: Capture())
+    with pytest.raises(InputError, match="134 million are the limit, so scale the video down"):
+        open_video(tmp_path / "a.mp4", monocular=True)
+
+
 def test_a_damaged_image_says_so(tmp_path: Path):
     (tmp_path / "a.png").write_bytes(png(64, 64)[:40])
     with pytest.raises(UnreadableImageError, match="cannot be decoded"):
@@ -179,6 +194,7 @@ def test_yaml_makes_no_objects_and_no_bombs(tmp_path: Path):
     assert read_document(path).numbers("b") == (2.0, 2.0)
 
 
+@pytest.mark.slow
 def test_what_people_write_is_escaped_in_pages(tmp_path: Path):
     evil = "<script>alert(1)</script>\"'&"
     report = report_of(make_outcome(20), tmp_path).model_copy(
@@ -191,7 +207,7 @@ def test_what_people_write_is_escaped_in_pages(tmp_path: Path):
             "skipped_messages": (evil,),
         }
     )
-    page = render_html(report, evil, [])
+    page = html(run_page(report, config=evil))
     assert "alert(1)" in page
     assert "<script>alert" not in page
 
@@ -201,6 +217,7 @@ FORBIDDEN = {"eval", "exec", "system", "popen", "extractall", "extract", "unpack
 FORBIDDEN_MODULES = {"pickle", "dill", "shelve", "marshal", "tarfile", "joblib"}
 
 
+@pytest.mark.slow
 def test_no_source_executes_what_it_reads():
     found = []
     for path in SOURCES:
@@ -253,6 +270,7 @@ def test_a_header_that_is_a_number_is_not_that_many_bytes(tmp_path: Path, read):
     tracemalloc.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("read", [lambda p: read_npz(p, "a map"), load_map, read_progress])
 def test_an_archive_may_not_unpack_to_far_more_than_its_size(tmp_path: Path, read):
     """There may be memory for it, but not for a small file."""

@@ -101,6 +101,7 @@ def test_a_delay_is_measured_and_reported_unless_the_calibration_gives_it(delay)
     assert not learned(delay, known=delay).is_wrong
 
 
+@pytest.mark.slow
 def test_a_known_delay_costs_a_drive_little():
     """A quarter of a ring road at 15 m/s, the right image 5 ms late. What is left comes from the
     first frame, whose motion is not known."""

@@ -69,15 +69,18 @@ def pages(site: Path) -> dict[Path, Page]:
     return {path: Page(path) for path in site.rglob("*.html")}
 
 
+@pytest.mark.slow
 def test_every_page_of_the_issue_is_there(pages, site):
     wanted = (
-        "index tutorial/first_run tutorial/own_camera tutorial/report plugins howto/kitti "
-        "howto/euroc howto/tum sources bench training reference/commands reference/modules "
-        "reference/generated/vslam.slam design loops results"
+        "index tutorial/first_run tutorial/own_camera tutorial/report howto/plugins howto/kitti "
+        "howto/euroc howto/tum howto/sources howto/bench howto/training reference/commands "
+        "reference/modules reference/generated/vslam.slam explanation/design research/loops "
+        "research/results"
     )
     assert {site / f"{name}.html" for name in wanted.split()} <= pages.keys()
 
 
+@pytest.mark.slow
 def test_no_link_within_the_site_is_broken(pages, site):
     broken = []
     for path, page in pages.items():
@@ -93,6 +96,7 @@ def test_no_link_within_the_site_is_broken(pages, site):
     assert broken == []
 
 
+@pytest.mark.slow
 def test_no_page_asks_another_host(pages, site):
     outside = [x for page in pages.values() for x in page.loaded if re.match(r"(https?:)?//", x)]
     assert outside == []
@@ -100,6 +104,7 @@ def test_no_page_asks_another_host(pages, site):
         assert not re.search(r"(@import|url\()\s*[\"']?(https?:)?//", style.read_text()), style
 
 
+@pytest.mark.slow
 def test_the_reference_has_every_command_and_option(site):
     from typer.main import get_command
 
@@ -159,6 +164,7 @@ def test_the_calibration_of_the_tutorial_is_read(tmp_path: Path):
     assert read_calibration([tmp_path / "camera.yaml"]).left.fx == 240.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
 def test_commands_of_the_tutorials_run(path: Path, corridor, tmp_path: Path):
     """Every shell block, on fewer frames; the video is the corridor of the tests."""
@@ -203,11 +209,13 @@ next();
 </script>"""
 
 
+@pytest.mark.slow
 def test_pages_in_a_browser_as_wide_as_a_phone(site: Path, tmp_path: Path):
     """Chromium, 400 px: nothing sticks out, letters are large enough, no other host is asked."""
     chromium()
-    shown = ["index", "tutorial/first_run", "reference/commands", "thresholds", "design", "plugins",
-             "reference/generated/vslam.slam", "results"]  # fmt: skip
+    shown = ["index", "tutorial/first_run", "reference/commands", "reference/thresholds",
+             "explanation/design", "howto/plugins", "reference/generated/vslam.slam",
+             "research/results"]  # fmt: skip
     probe = _PROBE.replace("PAGES", json.dumps([f"{name}.html" for name in shown]))
     (site / "probe.html").write_text(probe)
 

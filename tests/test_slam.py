@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -167,12 +168,21 @@ def test_landmarks_lie_on_the_walls_and_the_ground(corridor):
     assert np.mean(distance < 0.3) > 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
 def test_same_bytes_with_one_thread_and_two_and_again(corridor, config):
     runs = [bytes_of(*run(corridor, config, threads=threads)) for threads in (1, 2, 2, 1)]
     assert len(set(runs)) == 1
 
 
+def test_two_in_threads_of_their_own_have_the_bytes_of_one(corridor):
+    expected = bytes_of(*run(corridor))
+    with ThreadPoolExecutor(2) as pool:
+        both = [pool.submit(lambda: bytes_of(*run(corridor, threads=2))) for _ in range(2)]
+        assert [one.result() for one in both] == [expected] * 2
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
 def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, monkeypatch):
     """Mapping as late as can be (when it is merged) and as early as can be: a race would show."""
@@ -181,6 +191,7 @@ def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, mon
     assert bytes_of(*run(corridor, config, threads=2)) == late
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
 @pytest.mark.parametrize("dark", [(), range(9, 14)])
 def test_dropping_dead_landmarks_changes_no_byte(corridor, config, dark, monkeypatch, check_map):
@@ -207,6 +218,7 @@ def test_the_map_cannot_be_read_while_a_keyframe_is_mapped(corridor):
     assert slam.map.n_keyframes == 2
 
 
+@pytest.mark.slow
 def test_map_stays_sound_with_a_keyframe_each_frame(corridor, check_map):
     """Fusion merges landmarks that the frame in hand tracks both."""
     slam, results = run(corridor, EAGER)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from source_files import (
     LEFT,
     RIGHT,
     all_sources,
+    open_from,
     run_source,
     source_path,
     write_bag,
@@ -30,23 +32,25 @@ from source_files import (
     write_video,
 )
 from test_security import png
+from typer.testing import CliRunner
 
 from vslam.camera import Camera
+from vslam.cli.main import app
 from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.bag_messages import grey_of
 from vslam.datasets.detection import detect_dataset
+from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.image_folders import open_images
 from vslam.datasets.perturbation import parse_perturbation
-from vslam.datasets.sources import SourceOptions, open_source
-from vslam.datasets.stream import TimedFrame, count_expected, timed_frames
+from vslam.datasets.sources import SourceOptions
 from vslam.datasets.synthetic.video import write_side_by_side
 from vslam.errors import InputError
 from vslam.features import TrackingState
 from vslam.report.folder import create_run_folder
 from vslam.run.outcome import RunOutcome, RunSettings
 from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 
 FRAMES = 12
 STAMPS = [k * 10**8 for k in range(FRAMES)]
@@ -63,9 +67,9 @@ def opened(folder: Path, kind: str, **options):
     dataset = detect_dataset(path)
     assert dataset == (kind if kind in ("images", "video") else "bag")
     given = () if kind == "folder" else (folder / "stereo.yaml",)
-    topics = (LEFT, RIGHT) if kind == "ros1" else ()
-    chosen = SourceOptions(given, side_by_side=dataset == "video", topics=topics)
-    return open_source(dataset, path, None, chosen, **options)
+    topics = f"{LEFT},{RIGHT}" if kind == "ros1" else ""
+    chosen = SourceOptions(calib=given, side_by_side=dataset == "video", topics=topics)
+    return open_from(dataset, path, chosen, **options)
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +83,8 @@ def expected(kitti_tree) -> RunOutcome:
 def test_the_same_pixels_give_the_same_trajectory(folder, corridor, expected, kind):
     source = opened(folder, kind)
     assert source.camera == expected.sequence.camera
-    assert count_expected(source) == FRAMES
-    for k, frame in enumerate(timed_frames(source)):
+    assert source.n_expected == FRAMES
+    for k, frame in enumerate(source.frames()):
         left, right = frame.read(map)
         assert np.array_equal(left, corridor.left[k])
         assert np.array_equal(right, corridor.right[k])
@@ -95,8 +99,8 @@ def test_the_same_pixels_give_the_same_trajectory(folder, corridor, expected, ki
 @pytest.mark.parametrize("kind", ["images", "video", "ros1"])
 def test_selected_frames(folder, corridor, kind):
     source = opened(folder, kind, start=2, every=3, max_frames=3)
-    assert count_expected(source) == 3
-    frames = list(timed_frames(source))
+    assert source.n_expected == 3
+    frames = list(source.frames())
     np.testing.assert_allclose([frame.timestamp for frame in frames], [0.2, 0.5, 0.8])
     for frame, k in zip(frames, (2, 5, 8), strict=True):
         assert np.array_equal(frame.read(map)[0], corridor.left[k])
@@ -108,7 +112,7 @@ def test_selected_frames(folder, corridor, kind):
 def test_the_left_camera_alone(folder, corridor, kind):
     source = opened(folder, kind, sensor="mono")
     assert source.camera.monocular
-    left, right = next(timed_frames(source)).read(map)
+    left, right = next(source.frames()).read(map)
     assert np.array_equal(left, corridor.left[0])
     assert right is None
 
@@ -117,9 +121,9 @@ def test_a_video_that_loses_stays_close(corridor, tmp_path):
     beside = [np.hstack(pair) for pair in zip(corridor.left, corridor.right, strict=True)][:3]
     write_video(tmp_path / "pair.avi", beside, codec="MJPG")
     calib = write_calibration(tmp_path / "calib.yaml", corridor.camera)
-    options = SourceOptions((calib,), side_by_side=True)
-    source = open_source("video", str(tmp_path / "pair.avi"), "", options)
-    for k, frame in enumerate(timed_frames(source)):
+    options = SourceOptions(calib=(calib,), side_by_side=True)
+    source = open_from("video", tmp_path / "pair.avi", options)
+    for k, frame in enumerate(source.frames()):
         error = np.subtract(frame.read(map)[1], corridor.right[k], dtype=float)
         assert np.abs(error).mean() < 4.0
 
@@ -130,19 +134,42 @@ def test_a_bag_in_real_time_has_every_frame(folder):
     np.testing.assert_allclose(outcome.trajectory.timestamps, np.array(STAMPS) / 1e9)
 
 
+@pytest.mark.parametrize("kind", ["images", "video", "bgr8", "rgb8", "png"])
+def test_colours(corridor, tmp_path, kind):
+    """Read as they were taken beside the grey image, which stays what it is."""
+    tinted = [np.dstack([image, image // 2, 255 - image]) for image in corridor.left[:3]]
+    calib = write_calibration(tmp_path / "left.yaml", corridor.camera, mono=True)
+    options = SourceOptions(calib=(calib,), sensor="mono")
+    if kind == "images":
+        data = write_images(tmp_path, {"left": tinted}, ["0.1.png", "0.2.png", "0.3.png"]) / "left"
+    elif kind == "video":
+        data = write_video(tmp_path / "a.mkv", tinted)
+    else:
+        stamps = [k * 10**8 for k in range(1, 4)]
+        data = write_bag(tmp_path / "a.bag", "ros1", {LEFT: tinted}, stamps, encoding=kind)
+    source = open_from({"images": "images", "video": "video"}.get(kind, "bag"), data, options)
+    for frame, image in zip(source.frames(), tinted, strict=True):
+        assert np.array_equal(frame.colour(), image[..., ::-1])
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        assert np.abs(frame.read(map)[0].astype(int) - grey).max() <= 1
+
+
+def test_a_grey_video_has_no_colours(folder, corridor):
+    frame = next(opened(folder, "video").frames())
+    assert np.array_equal(frame.colour(), corridor.left[0])
+
+
 def test_images_without_a_partner_in_time_are_left_out(corridor, tmp_path):
     pair = {LEFT: corridor.left[:4], RIGHT: corridor.right[:4]}
     write_bag(tmp_path / "lag.bag", "ros1", pair, STAMPS[:4], lag=6_000_000, camera=corridor.camera)
     with pytest.raises(InputError, match="no images of one time"):
-        open_source("bag", str(tmp_path / "lag.bag"), "", SourceOptions())
+        open_from("bag", tmp_path / "lag.bag")
 
 
 def test_a_bag_with_a_rectified_topic_uses_its_projection_matrix(corridor, tmp_path):
     pair = {"/a/image_rect": corridor.left[:2], "/b/image_rect": corridor.right[:2]}
     write_bag(tmp_path / "b.bag", "ros1", pair, STAMPS[:2], camera=corridor.camera)
-    assert (
-        open_source("bag", str(tmp_path / "b.bag"), "", SourceOptions()).camera == corridor.camera
-    )
+    assert open_from("bag", tmp_path / "b.bag").camera == corridor.camera
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
@@ -173,7 +200,7 @@ def test_bayer_patterns_are_told_apart(pattern):
 def test_times_in_names(corridor, tmp_path, names, times):
     write_images(tmp_path, {"cam0": corridor.left[:2]}, names)
     calib = write_calibration(tmp_path / "c.yaml", corridor.camera)
-    found = open_source("images", str(tmp_path), "", SourceOptions((calib,)), sensor="mono")
+    found = open_from("images", tmp_path, SourceOptions(calib=(calib,)), sensor="mono")
     assert found.timestamps[0] == pytest.approx(times[0], abs=1e-6)
     assert np.diff(found.timestamps)[0] == pytest.approx(times[1], abs=1e-6)
 
@@ -209,7 +236,7 @@ def test_times_in_exif(corridor, tmp_path):
         exif.get_ifd(0x8769).update({0x9003: "2024:05:17 10:20:30", 0x9291: subsec})
         Image.fromarray(corridor.left[k]).save(tmp_path / f"IMG_{k}.jpg", exif=exif)
     calib = write_calibration(tmp_path / "c.yaml", corridor.camera)
-    found = open_source("images", str(tmp_path), "", SourceOptions((calib,)), sensor="mono")
+    found = open_from("images", tmp_path, SourceOptions(calib=(calib,)), sensor="mono")
     assert np.diff(found.timestamps)[0] == pytest.approx(0.5, abs=1e-6)
 
 
@@ -219,16 +246,16 @@ def test_an_image_too_large_for_pillow_has_no_time_in_exif(tmp_path):
         (tmp_path / f"IMG_{k}.png").write_bytes(png(20_000, 20_000))
     calib = write_calibration(tmp_path / "c.yaml", Camera(60.0, 60.0, 31.5, 23.5, 0.2, 64, 48))
     with pytest.raises(InputError, match="no time stamps"):
-        open_source("images", str(tmp_path), "", SourceOptions((calib,)), sensor="mono")
+        open_from("images", tmp_path, SourceOptions(calib=(calib,)), sensor="mono")
 
 
 def test_frames_a_second_come_before_all_other_times(folder):
-    options = SourceOptions((folder / "stereo.yaml",), fps=4.0)
-    source = open_source("images", str(folder / "images"), "", options)
+    options = SourceOptions(calib=(folder / "stereo.yaml",), fps=4.0)
+    source = open_from("images", folder / "images", options)
     np.testing.assert_allclose(source.timestamps, np.arange(FRAMES) / 4)
-    options = SourceOptions((folder / "stereo.yaml",), fps=4.0, side_by_side=True)
-    source = open_source("video", str(folder / "pair.mkv"), "", options)
-    times = [frame.timestamp for frame in timed_frames(source)]
+    options = SourceOptions(calib=(folder / "stereo.yaml",), fps=4.0, side_by_side=True)
+    source = open_from("video", folder / "pair.mkv", options)
+    times = [frame.timestamp for frame in source.frames()]
     np.testing.assert_allclose(times, np.arange(FRAMES) / 4)
 
 
@@ -251,11 +278,11 @@ def served(folder):
 
 
 def test_a_camera_at_a_url(folder, served):
-    options = SourceOptions((folder / "stereo.yaml",), side_by_side=True)
-    source = open_source("camera", served, "", options)
+    options = SourceOptions(calib=(folder / "stereo.yaml",), side_by_side=True)
+    source = open_from("camera", served, options)
     assert (source.dataset, source.name) == ("camera", "127.0.0.1/pair.mkv")
     assert source.live
-    assert count_expected(source) is None
+    assert source.n_expected is None
     outcome = run_source(source, realtime=True)
     assert len(outcome.tracks) == FRAMES - 1  # the first image has told the size
     assert "no image came after 11" in outcome.interrupted
@@ -286,8 +313,8 @@ class FakeCamera:
 def test_ctrl_c_is_the_regular_end_of_a_camera(folder, corridor, monkeypatch):
     FakeCamera.images = [np.hstack(p) for p in zip(corridor.left, corridor.right, strict=True)]
     monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
-    options = SourceOptions((folder / "stereo.yaml",), side_by_side=True)
-    source = open_source("camera", "0", "", options)
+    options = SourceOptions(calib=(folder / "stereo.yaml",), side_by_side=True)
+    source = open_from("camera", "0", options)
     settings = RunSettings(
         "camera", "0", "none", "none", "stereo", 0, 2, 0, 1, None, Config(), realtime=True
     )
@@ -297,12 +324,13 @@ def test_ctrl_c_is_the_regular_end_of_a_camera(folder, corridor, monkeypatch):
             signal.raise_signal(signal.SIGINT)
 
     law = parse_perturbation("brightness", 0)
-    outcome = run_sequence(source, law, settings, NullRecorder(), on_frame=on_frame)
+    outcome = run_sequence(source, law, settings, Recorder(), on_frame=on_frame)
     assert outcome.interrupted is None
     assert len(outcome.trajectory) == len(outcome.tracks) >= 31
     assert TrackingState.DROPPED in {track.state for track in outcome.tracks}
 
 
+@pytest.mark.slow
 def test_command_line_finds_out_what_it_is_given(folder, tmp_path):
     calib = str(folder / "stereo.yaml")
     words = ["--data", str(folder / "pair.mkv"), "--side-by-side", "--calib", calib, "--no-record"]
@@ -311,7 +339,7 @@ def test_command_line_finds_out_what_it_is_given(folder, tmp_path):
         cwd=tmp_path, capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert f"{FRAMES} done, 0 lost" in done.stdout
+    assert re.search(f"Lost frames +0 +of {FRAMES}", done.stdout)
     run_folder = (tmp_path / "runs" / "latest").resolve()
     assert run_folder.name.endswith("-video-pair-none-none")
     report = json.loads((run_folder / "report.json").read_text())
@@ -319,14 +347,42 @@ def test_command_line_finds_out_what_it_is_given(folder, tmp_path):
     assert (run_folder / "report.html").exists()
 
 
+def test_a_contact_sheet_of_a_video(folder, tmp_path):
+    words = ["perturb", folder / "pair.mkv", "--side-by-side", "--calib", folder / "stereo.yaml"]
+    words += ["--perturb", "blur", "--frames", "2", "--start", "3", "--out", tmp_path / "a.png"]
+    done = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
+    assert f"frames 3, {FRAMES - 1}" in done.output
+    assert cv2.imread(str(tmp_path / "a.png")).shape == (2 * 160, 3 * 480, 3)
+
+
+@pytest.mark.slow
+def test_a_stress_test_of_a_video(folder, tmp_path):
+    """Its cells read the video as the command was told to; laws that look ahead are left out."""
+    words = ["stress", folder / "pair.mkv", "--side-by-side", "--calib", folder / "stereo.yaml"]
+    words += ["--laws", "bias,desync", "--detectors", "none", "--seeds", "1", "--steps", "1"]
+    words += ["--max-frames", "8", "--out", tmp_path / "stress"]
+    done = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
+    assert "1 of 1 searches ended" in done.output
+    report = json.loads((tmp_path / "stress" / "stress.json").read_text())
+    assert [(b["sequence"], b["law"]) for b in report["boundaries"]] == [("pair", "bias")]
+    assert "desync: looks at the next frame" in report["notes"][0]
+
+
+def test_other_systems_are_not_tested_on_videos(folder, tmp_path):
+    words = ["stress", folder / "pair.mkv", "--side-by-side", "--calib", folder / "stereo.yaml"]
+    words += ["--systems", "mine", "--system", "mine=mine {folder} {out}", "--out", tmp_path / "a"]
+    done = CliRunner().invoke(app, list(map(str, words)))
+    assert "--systems mine: other systems read KITTI's format" in str(done.exception)
+
+
 def test_a_sequence_written_side_by_side_comes_back(kitti_tree, tmp_path):
     sequence = open_sequence("kitti", kitti_tree, "00", max_frames=5)
     calib = write_side_by_side(sequence, tmp_path / "new" / "town.mkv")
     assert calib == tmp_path / "new" / "town.yaml"
-    options = SourceOptions((calib,), side_by_side=True)
-    source = open_source("video", str(tmp_path / "new" / "town.mkv"), "", options)
+    options = SourceOptions(calib=(calib,), side_by_side=True)
+    source = open_from("video", tmp_path / "new" / "town.mkv", options)
     assert source.camera == sequence.camera
-    frames = list(timed_frames(source))
+    frames = list(source.frames())
     assert [frame.timestamp for frame in frames] == sequence.timestamps.tolist()
     for index, frame in enumerate(frames):
         assert all(map(np.array_equal, frame.read(map), sequence.read(index)))
@@ -337,10 +393,8 @@ def test_a_sequence_written_side_by_side_comes_back(kitti_tree, tmp_path):
 class There:
     """The corridor there and back as a stream; counts the images that somebody holds."""
 
-    dataset, name, live, n_expected = "video", "there", False, None
-
     def __init__(self, corridor):
-        self.corridor, self.camera = corridor, corridor.camera
+        self.corridor = corridor
         self.alive, self.most = 0, 0
 
     def frames(self):
@@ -355,14 +409,17 @@ class There:
         self.alive -= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_images_of_a_stream_are_let_go(corridor, threads):
-    stream = There(corridor)
-    outcome = run_source(stream, threads=threads)
+    there = There(corridor)
+    source = Source(dataset="video", name="there", camera=corridor.camera, play=there.frames)
+    outcome = run_source(source, threads=threads)
     assert len(outcome.tracks) == 108
-    assert stream.most <= 2 * threads + 4
+    assert there.most <= 2 * threads + 4
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
 def test_a_viewer_is_refused_before_the_run(folder, tmp_path):
     calib = str(folder / "stereo.yaml")
@@ -385,6 +442,7 @@ def test_a_run_of_a_url_has_a_folder_with_a_plain_name(tmp_path):
     assert len(folder.name) < 120
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quiet", [[], ["--quiet"]])
 def test_swapped_sides_end_a_run_with_1_and_the_way_to_swap_them(folder, tmp_path, quiet):
     left, right = (folder / "images" / side for side in ("left", "right"))
@@ -408,7 +466,5 @@ def test_swapped_topics_of_a_bag_are_named(corridor, tmp_path):
     pair = {"/a/image_rect": corridor.left[:2], "/b/image_rect": corridor.right[:2]}
     write_bag(tmp_path / "b.bag", "ros1", pair, STAMPS[:2], camera=corridor.camera)
     with pytest.raises(InputError, match=r"the sides seem swapped.*--topics"):
-        open_source(
-            "bag", str(tmp_path / "b.bag"), "",
-            SourceOptions(topics=("/b/image_rect", "/a/image_rect")),
+        open_from("bag", tmp_path / "b.bag", SourceOptions(topics="/b/image_rect,/a/image_rect"),
         )  # fmt: skip

@@ -23,8 +23,8 @@ from vslam.lab.stress.external import check_template, export_kitti, run_external
 from vslam.lab.stress.figures import draw_curves
 from vslam.lab.stress.kitti_c import CORRUPTIONS
 from vslam.lab.stress.plan import Plan, parse_laws
+from vslam.lab.stress.report import boundary_sections, render_csv, title, write_report
 from vslam.lab.stress.report import cell as cell_text
-from vslam.lab.stress.report import render_boundaries, render_csv, title, write_report
 from vslam.lab.stress.run import Results, run_all
 from vslam.lab.stress.search import boundary, next_position, strength_at
 from vslam.lab.stress.summary import corruption_entries, mean_error, summarise
@@ -217,6 +217,7 @@ def test_a_system_that_fails_on_clean_images_is_left_out_with_a_note(tmp_path):
     assert any("other" in note and "no licence" in note for note in report.notes)
 
 
+@pytest.mark.slow
 def test_the_report_says_it_in_every_form(tmp_path):
     _, report = conducted(tmp_path)
     write_report(tmp_path, report, {})
@@ -234,7 +235,8 @@ def test_the_report_says_it_in_every_form(tmp_path):
     assert 'src="http' not in html
     assert [figure.name for figure in draw_curves(report)] == ["00-blur", "00-night"]
     assert render_csv(report) == (tmp_path / "boundaries.csv").read_text()
-    assert "| night | stops | 10 " in render_boundaries(report)
+    (boundaries,) = boundary_sections(report)
+    assert ("night", "stops", "10") in [row[:3] for row in boundaries.parts[0].rows]
 
 
 def test_the_title_is_a_sentence(tmp_path):
@@ -428,6 +430,7 @@ def test_a_template_must_hold_both_places(template):
         check_template("slam", template)
 
 
+@pytest.mark.slow
 def test_from_the_command_line_with_another_system(tmp_path):
     """The clean run is perfect; darkness turns the ruler's path to a wrong one."""
     root = make_kitti(tmp_path / "data")
@@ -485,7 +488,8 @@ def test_the_table_of_boundaries_is_that_of_the_csv(monkeypatch):
     monkeypatch.syspath_prepend(str(root / "tools" / "experiments" / "stress"))
     import boundary_table
 
-    page = (root / "docs" / "stress.md").read_text()
+    docs = root / "docs" / "research"
+    page = (docs / "stress.md").read_text()
     for name, theirs in (("kitti00", "orbslam3"), ("demo", "both")):
-        made = boundary_table.table(root / "docs" / "stress" / f"{name}.csv", "bow", theirs)
+        made = boundary_table.table(docs / "stress" / f"{name}.csv", "bow", theirs)
         assert made in page, "run: python tools/experiments/stress/boundary_table.py"

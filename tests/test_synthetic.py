@@ -223,6 +223,7 @@ def clearance(surfaces, cameras):
     return tree.query(points)[0].min(initial=np.inf)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROUTES)
 def test_nothing_stands_near_a_camera_of_any_route(name, unpainted):
     route = built_in_route(name)
@@ -240,6 +241,7 @@ def test_pairs_keep_clear_of_the_town_beside_the_route(route, unpainted):
         assert clearance(built, cameras) >= 2.5
 
 
+@pytest.mark.slow
 def test_moving_cars_keep_clear(unpainted):
     route = built_in_route("demo")
     variation = Variation(moving=5)
@@ -254,6 +256,7 @@ def test_moving_cars_keep_clear(unpainted):
     assert seen > 20
 
 
+@pytest.mark.slow
 def test_sight_lines_are_closed_at_bends(unpainted):
     """All over the demo's loop hardly a ray near the horizon meets nothing."""
     route = built_in_route("demo")
@@ -268,6 +271,7 @@ def test_sight_lines_are_closed_at_bends(unpainted):
     renderer.close()
 
 
+@pytest.mark.slow
 def test_aliased_facades_repeat(route, monkeypatch, unpainted):
     painted = []
     monkeypatch.setattr(
@@ -282,6 +286,7 @@ def test_aliased_facades_repeat(route, monkeypatch, unpainted):
     assert len(set(painted)) <= 4 * ALIASES
 
 
+@pytest.mark.slow
 def test_places_match_themselves_only(route, town):
     renderer = Renderer(route.camera, town.atlas, town.sky)
     moment = Passes(route, town, Variation(seed=3)).at(0)
@@ -322,6 +327,7 @@ def tree(root):
     return {p.relative_to(root): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes_on_any_number_of_threads(route, rendered, tmp_path):
     again = store.render_sequence(
         route, Variation(seed=3), tmp_path, until=3, depth=True, threads=2
@@ -454,6 +460,7 @@ def there_and_back(n=85):
     return T
 
 
+@pytest.mark.slow
 def test_change_between_passes(unpainted):
     route = route_of_poses(there_and_back(), "twice")
     variation = Variation(change=1.0, moving=3)
@@ -501,6 +508,7 @@ def rounds(n, radius=32.0, laps=1.6):
     return T
 
 
+@pytest.mark.slow
 def test_pairs_are_labelled(tmp_path):
     route = route_of_poses(rounds(160), "round")
     cheap = replace(route, camera=Camera(180.0, 180.0, 155.0, 47.0, 0.54, 310, 94))
@@ -606,6 +614,7 @@ def test_a_name_says_how_the_town_varies():
         open_sequence("synthetic", None, "77+change:0.5")
 
 
+@pytest.mark.slow
 def test_a_drive_with_a_name_of_its_own_is_that_route_in_that_town(tmp_path, monkeypatch):
     monkeypatch.setenv("VSLAM_CACHE", str(tmp_path))
     words = ["synth", "night", "--max-frames", "1", "--quiet"]

@@ -1,4 +1,4 @@
-"""docs/thresholds.md says what vslam/config/ says."""
+"""docs/reference/thresholds.md says what vslam/config/ says."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from vslam.config import Config, OrbConfig
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "thresholds.md"
+PAGE = ROOT / "docs" / "reference" / "thresholds.md"
 SECTIONS = list(Config.model_fields)
 
 

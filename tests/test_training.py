@@ -42,6 +42,7 @@ def _one_thread():
     torch.set_num_threads(before)
 
 
+@pytest.mark.slow
 def test_a_share_of_what_was_learned_is_kept(tmp_path):
     collection = views(20)
     before, settings = small_network(1).state_dict(), small_settings(learned_share=0.25, epochs=1)
@@ -77,6 +78,7 @@ def test_settings_that_would_do_nothing_are_refused(tmp_path, changes, message):
         train(views(8), small_settings(**changes), tmp_path, threads=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("loss", "epochs", "mixed"),
     [("bce", 14, False), ("bce+contrast", 12, False), ("bce+contrast", 12, True)],
@@ -100,6 +102,7 @@ def test_64_pairs_are_learned_by_heart(tmp_path, loss, epochs, mixed):
     assert outcome.figures["average_precision"] > 0.9  # of places it never saw
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mixed", [True, False, None])
 def test_mixed_precision_is_what_the_settings_say(tmp_path, mixed):
     start, computed_in = small_network(1), []
@@ -121,6 +124,7 @@ def test_a_gpu_without_bfloat16_is_not_asked_for_it(monkeypatch):
         training._mixed_precision(small_settings(mixed_precision=True), cuda)
 
 
+@pytest.mark.slow
 def test_a_resumed_training_has_the_bits_of_an_uninterrupted_one(tmp_path):
     collection, settings = views(20), small_settings()
     whole = train(collection, settings, tmp_path / "whole", threads=1)
@@ -152,6 +156,7 @@ def test_a_resumed_training_has_the_bits_of_an_uninterrupted_one(tmp_path):
     assert lists[0][0].read_text().startswith("# seed 0\na,b,same\n")
 
 
+@pytest.mark.slow
 def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_good_checkpoint(tmp_path, monkeypatch):
     collection, settings = views(20), small_settings(epochs=3)
     calls = []
@@ -171,6 +176,7 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_good_checkpoint(tmp_
     assert train(collection, gentler, tmp_path, threads=1, resume=True).finished
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
     collection = views(20)
     train(collection, small_settings(epochs=1), tmp_path, threads=1)
@@ -181,6 +187,7 @@ def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
         train(collection, small_settings(), tmp_path, threads=1, resume=True)
 
 
+@pytest.mark.slow
 def test_no_better_epoch_for_long_ends_the_training(tmp_path):
     settings = small_settings(epochs=50, patience=2, learning_rate=1e-12)
     outcome = train(views(20), settings, tmp_path, threads=1)
@@ -191,6 +198,7 @@ def test_no_better_epoch_for_long_ends_the_training(tmp_path):
         assert len(list(csv.DictReader(file))) == outcome.progress.epoch
 
 
+@pytest.mark.slow
 def test_the_card_tells_where_the_weights_come_from(tmp_path):
     collection, settings = views(20), small_settings(epochs=1)
     outcome = train(collection, settings, tmp_path, threads=1)
@@ -207,6 +215,7 @@ def test_the_card_tells_where_the_weights_come_from(tmp_path):
     assert "--data pairs:x" in paths[1].read_text()
 
 
+@pytest.mark.slow
 def test_a_network_goes_on_with_larger_images(tmp_path):
     collection, settings = views(20), small_settings(epochs=3)
     small = train(collection, settings, tmp_path / "small", threads=1)
@@ -236,6 +245,7 @@ def test_a_network_goes_on_with_larger_images(tmp_path):
         resized(branch, Layout((96, 96)))
 
 
+@pytest.mark.slow
 def test_pruning_and_fine_tuning(tmp_path):
     collection, settings = views(20), small_settings(epochs=1)
     full = train(collection, settings, tmp_path / "full", threads=1)
@@ -350,8 +360,7 @@ def test_settings_are_read_and_checked(tmp_path):
         load_settings(path)
 
 
-def test_cuda_is_refused_where_there_is_none(tmp_path):
-    if torch.cuda.is_available():
-        pytest.skip("there is one")
+def test_cuda_is_refused_where_there_is_none(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(InputError, match="--device cpu"):
         train(views(20), small_settings(), tmp_path, device="cuda")

@@ -156,7 +156,7 @@ def test_chance_matches_agree_on_no_motion():
     a.descriptor[rows_q] = a.descriptor[rows_m]
     edge = check(world)
     assert edge.n_matches >= 55
-    assert edge.reason == "no motion that 15 of the matches agree on"
+    assert edge.reason == "no motion has 15 inliers among the matches"
     assert not edge.accepted
 
 

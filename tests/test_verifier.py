@@ -98,7 +98,7 @@ def test_a_promising_candidate_is_verified_by_learned_descriptors(by_night, kind
 def test_learned_descriptors_alone_try_no_other_candidate(by_night):
     verifier = LearnedVerifier(CONFIG, CAMERA, by_night.images)
     edge = verifier.verify(by_night.map, PLAIN)
-    assert (edge.accepted, edge.reason) == (False, "not alike enough for learned descriptors")
+    assert (edge.accepted, edge.reason) == (False, "not similar enough for learned descriptors")
     assert verifier.verify(by_night.map, PLAIN, REFUSAL) is REFUSAL
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -157,8 +156,8 @@ def test_idf_counts_images_not_features():
     [
         ([], 10, 5, "no descriptors"),
         ([np.zeros((50, 32), np.uint8)], 10, 5, "the same"),
-        ([np.eye(32, dtype=np.uint8)], 21, 5, "branching is 2 to 20"),
-        ([np.eye(32, dtype=np.uint8)], 10, 11, "levels 1 to 10"),
+        ([np.eye(32, dtype=np.uint8)], 21, 5, "branching is 21"),
+        ([np.eye(32, dtype=np.uint8)], 10, 11, "levels is 11"),
     ],
 )
 def test_training_refuses(images, k, levels, why):
@@ -210,14 +209,9 @@ def test_npz_round_trip(small, tmp_path):
     assert same(load(tmp_path / "v.npz"), small)
 
 
-def test_the_shipped_vocabulary_is_small_and_loads_at_once():
+def test_the_shipped_vocabulary_is_small():
     assert SHIPPED.stat().st_size <= 5_000_000
-    elapsed = []
-    for _ in range(3):
-        start = time.perf_counter()
-        tree = load()
-        elapsed.append(time.perf_counter() - start)
-    assert min(elapsed) < 0.1
+    tree = load()
     assert (tree.branching, tree.levels) == (10, 5)
     assert 90_000 < tree.n_words <= 100_000
     assert np.count_nonzero(tree.weight == 0) == 0
@@ -234,7 +228,7 @@ def parts_of(tree: Vocabulary) -> dict[str, object]:
         ({"schema": 9}, "schema 9, this version reads 1"),
         ({"branching": 3}, "a node has 5 children, more than 3"),
         ({"levels": 2}, "deeper than 2 levels"),
-        ({"levels": 99}, "not 1 to 10"),
+        ({"levels": 99}, "must be 1 to 10"),
         ({"weight": np.ones(7, np.float32)}, "leaves have 7 weights"),
         ({"n_children": np.zeros(9, np.uint8)}, "9 nodes"),
     ],
@@ -360,8 +354,8 @@ def test_text_round_trip(small, tmp_path):
         (3, node_line(1, 1, 0, -2), "line 3 has a weight"),
         (3, node_line(1, 1, 0, 1e39), "line 3 has a weight"),
         (3, node_line(1, 1)[:-3] + "nan", "line 3 holds something that is not a number"),
-        (2, node_line(0, 1), "line 2 is a leaf and has children"),
-        (4, node_line(0, 0), "line 4 is no leaf and has no children"),
+        (2, node_line(0, 1), "line 2 is a leaf but has children"),
+        (4, node_line(0, 0), "line 4 is not a leaf but has no children"),
     ],
 )
 def test_damaged_text_is_named_by_line(tmp_path, number, line, why):
@@ -432,11 +426,11 @@ def test_commands_train_convert_and_show(call, tmp_path):
     [
         (("train", "nowhere"), "nowhere: no image there"),
         (("train", "broken.jpg"), "1 of 1 images cannot be read"),
-        (("train", "broken.jpg", "--out", "v.dat"), "name ends in .npz or in .txt"),
+        (("train", "broken.jpg", "--out", "v.dat"), "must end in .npz or in .txt"),
         (("train", "broken.jpg", "--out", "none/v.npz"), "there is no folder none"),
-        (("convert", "v.npz", "v.dat"), "name ends in .npz or in .txt"),
+        (("convert", "v.npz", "v.dat"), "must end in .npz or in .txt"),
         (("convert", "v.npz", "v.txt"), "v.npz: not a vocabulary (No such file"),
-        (("info", "broken.jpg"), "name ends in .npz or in .txt"),
+        (("info", "broken.jpg"), "must end in .npz or in .txt"),
     ],
 )
 def test_commands_refuse(call, tmp_path, words, why):

@@ -49,6 +49,7 @@ def pairs(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactory) ->
     return folder
 
 
+@pytest.mark.slow
 def test_all_but_training_works_without_torch(kitti_tree: Path, pairs: Path, tmp_path: Path):
     """In processes that cannot import it, those that a benchmark starts included."""
     blocked = tmp_path / "blocked"

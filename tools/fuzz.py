@@ -28,20 +28,16 @@ import traceback
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from ring import Ring
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-    from vslam.slam import Slam
+import valid_files
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
 SECONDS, MEGABYTES = 20, 600
 WALL_SECONDS = 300  # for what waits and does nothing; a busy machine is slow
 ADDRESS_SPACE = 8 * 2**30  # beyond it there is a MemoryError: this machine stays usable
@@ -60,321 +56,15 @@ class Reader:
     mutation: Callable[[bytes, np.random.Generator, str], bytes] | None = None
 
 
-# -- valid files ----------------------------------------------------------------------------------
-
-
-def _camera():
-    from vslam.camera import Camera
-
-    return Camera(60.0, 60.0, 31.5, 23.5, 0.2, 64, 48)
-
-
-def _images(n: int = 3) -> list[np.ndarray]:
-    rng = np.random.default_rng(5)
-    return [rng.integers(0, 256, (48, 64), dtype=np.uint8) for _ in range(n)]
-
-
-def _write_images(folder: Path) -> None:
-    from source_files import write_calibration, write_images
-
-    names = [f"{k}.png" for k in range(3)]
-    write_images(folder, {"left": _images(), "right": _images()}, names)
-    (folder / "times.txt").write_text("0.0\n0.1\n0.2\n")
-    write_calibration(folder / "stereo.yaml", _camera())
-
-
-def _write_other_images(folder: Path) -> None:
-    """One image of each kind of file, time stamps in their names."""
-    import cv2
-    from source_files import write_calibration
-
-    for k, suffix in enumerate(("png", "jpg", "webp", "bmp", "tif", "pgm", "ppm")):
-        colour = np.repeat(_images()[0][..., None], 3, axis=2)
-        image = colour if suffix == "ppm" else colour[..., 0]
-        assert cv2.imwrite(str(folder / f"{1_700_000_000 + k}.{suffix}"), image)
-    write_calibration(folder.parent / "mono.yaml", _camera(), mono=True)
-
-
-def _write_kitti(folder: Path) -> None:
-    import cv2
-
-    from vslam.trajectory import write_kitti
-
-    sequence = folder / "sequences" / "00"
-    for side in ("image_0", "image_1"):
-        (sequence / side).mkdir(parents=True)
-        for k, image in enumerate(_images()):
-            cv2.imwrite(str(sequence / side / f"{k:06d}.png"), image)
-    c = _camera()
-    rows = (
-        f"P{k}: {c.fx} 0 {c.cx} {-c.bf * (k % 2)} 0 {c.fy} {c.cy} 0 0 0 1 0\n" for k in range(4)
-    )
-    (sequence / "calib.txt").write_text("".join(rows))
-    (sequence / "times.txt").write_text("0.0\n0.1\n0.2\n")
-    (folder / "poses").mkdir()
-    write_kitti(folder / "poses" / "00.txt", np.tile(np.eye(4), (3, 1, 1)))
-
-
-def _write_tum(folder: Path) -> None:
-    import cv2
-    from source_files import write_calibration
-
-    for side, images in (("rgb", _images()), ("depth", [i.astype(np.uint16) for i in _images()])):
-        (folder / side).mkdir()
-        lines = ["# time file\n"]
-        for k, image in enumerate(images):
-            cv2.imwrite(str(folder / side / f"{k}.png"), image)
-            lines.append(f"{100 + 0.1 * k:.2f} {side}/{k}.png\n")
-        (folder / f"{side}.txt").write_text("".join(lines))
-    (folder / "groundtruth.txt").write_text(
-        "".join(f"{99.9 + 0.1 * k:.2f} {k} 0 0 0 0 0 1\n" for k in range(6))
-    )
-    write_calibration(folder / "calibration.yaml", _camera(), mono=True)
-
-
-def _write_euroc(folder: Path) -> None:
-    import cv2
-
-    for side in range(2):
-        camera = folder / "mav0" / f"cam{side}"
-        (camera / "data").mkdir(parents=True)
-        lines = ["#timestamp [ns],filename\n"]
-        for k, image in enumerate(_images()):
-            stamp = 1_403_636_579_763_555_584 + 50_000_000 * k
-            cv2.imwrite(str(camera / "data" / f"{stamp}.png"), image)
-            lines.append(f"{stamp},{stamp}.png\n")
-        (camera / "data.csv").write_text("".join(lines))
-        (camera / "sensor.yaml").write_text(_EUROC.format(shift=0.1 * side))
-    truth = folder / "mav0" / "state_groundtruth_estimate0"
-    truth.mkdir()
-    rows = (
-        f"{1_403_636_579_663_555_584 + 50_000_000 * k},{k},0,0,1,0,0,0,0,0,0,0,0,0,0,0,0\n"
-        for k in range(9)
-    )
-    (truth / "data.csv").write_text("#timestamp,p\n" + "".join(rows))
-    (truth / "sensor.yaml").write_text("T_BS:\n  data: [1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1]\n")
-
-
-_EUROC = """sensor_type: camera
-T_BS:
-  cols: 4
-  rows: 4
-  data: [1, 0, 0, {shift}, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
-resolution: [64, 48]
-camera_model: pinhole
-intrinsics: [60, 60, 31.5, 23.5]
-distortion_model: radial-tangential
-distortion_coefficients: [-0.28, 0.07, 0.0002, 1.7e-05]
-"""
-_CALIBRATIONS = {
-    "own.yaml": "left: {size: [64, 48], focal: [60, 60], centre: [31.5, 23.5], lens: fisheye, "
-    "distortion: [0.01, 0, 0, 0]}\nright: {size: [64, 48], focal: [60, 60], centre: [31.5, 23.5]}"
-    "\nT_left_right: [1,0,0,0.2, 0,1,0,0, 0,0,1,0, 0,0,0,1]\n",
-    "kalibr.yaml": "cam0:\n  camera_model: pinhole\n  intrinsics: [60, 60, 31.5, 23.5]\n"
-    "  distortion_model: equidistant\n  distortion_coeffs: [0.01, 0, 0, 0]\n"
-    "  resolution: [64, 48]\ncam1:\n  camera_model: pinhole\n  intrinsics: [60, 60, 31.5, 23.5]\n"
-    "  distortion_model: radtan\n  distortion_coeffs: [0.01, 0, 0, 0]\n  resolution: [64, 48]\n"
-    "  T_cn_cnm1:\n  - [1, 0, 0, -0.2]\n  - [0, 1, 0, 0]\n  - [0, 0, 1, 0]\n  - [0, 0, 0, 1]\n",
-    "euroc.yaml": _EUROC.format(shift=0.0),
-    "ros.yaml": "image_width: 64\nimage_height: 48\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
-    "  data: [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]\ndistortion_model: plumb_bob\n"
-    "distortion_coefficients:\n  data: [0.1, 0, 0, 0, 0]\nrectification_matrix:\n"
-    "  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nprojection_matrix:\n"
-    "  data: [60, 0, 31.5, 0, 0, 60, 23.5, 0, 0, 0, 1, 0]\n",
-    "opencv.yml": "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
-    "   data: [ 60., 0., 31.5, 0., 60., 23.5, 0., 0., 1. ]\nD1: !!opencv-matrix\n   data: [0.1, 0,"
-    " 0, 0, 0]\nM2: !!opencv-matrix\n   data: [ 60., 0., 31.5, 0., 60., 23.5, 0., 0., 1. ]\n"
-    "D2: !!opencv-matrix\n   data: [0, 0, 0, 0, 0]\nR: !!opencv-matrix\n"
-    "   data: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nT: !!opencv-matrix\n   data: [-0.2, 0, 0]\n",
-    "orbslam2.yaml": "%YAML:1.0\nCamera.fx: 60\nCamera.fy: 60\nCamera.cx: 31.5\nCamera.cy: 23.5\n"
-    "Camera.k1: 0.1\nCamera.k2: 0\nCamera.p1: 0\nCamera.p2: 0\nCamera.width: 64\n"
-    "Camera.height: 48\nCamera.bf: 12\n",
-}
-
-
-def _write_calibrations(folder: Path) -> None:
-    for name, text in _CALIBRATIONS.items():
-        (folder / name).write_text(text)
-
-
-def _write_bag(kind: str, encoding: str, folder: Path, compression: str = "") -> None:
-    from source_files import LEFT, RIGHT, write_bag
-
-    sides = {LEFT: _images(), RIGHT: _images()}
-    name = {"ros1": "a.bag"}.get(kind, "a")
-    write_bag(folder / name, kind, sides, [10**8 * (k + 1) for k in range(3)], encoding=encoding,
-              camera=_camera(), compression=compression)  # fmt: skip
-
-
-def _write_video(folder: Path) -> None:
-    from source_files import write_calibration, write_video
-
-    write_video(folder / "a.mkv", _images(8))
-    write_video(folder / "b.avi", [np.tile(i, (1, 2)) for i in _images(8)], codec="MJPG")
-    write_calibration(folder.parent / "mono.yaml", _camera(), mono=True)
-    wide = replace(_camera(), width=2 * _camera().width)
-    write_calibration(folder.parent / "wide.yaml", wide, mono=True)
-
-
-def _write_map(folder: Path) -> None:
-    from vslam.features import PATCH_PIXELS, Features, KeyframePatches
-    from vslam.frame_poses import FrameTable
-    from vslam.loops import LoopEdge, ResembledPlace
-    from vslam.map import Map
-    from vslam.map_kernels import link_many, merge_landmarks, refresh_landmarks
-    from vslam.maps.storage import save_map
-    from vslam.maps.stored_map import StoredMap
-    from vslam.states import (
-        Checkpoint,
-        ClosingState,
-        ConsistencyState,
-        MapperState,
-        PolicyState,
-        TrackerState,
-    )
-
-    rng = np.random.default_rng(3)
-    map_ = Map(1.2 ** np.arange(8))
-    n = 12
-    for k in range(3):
-        features = Features(
-            rng.uniform(0, 48, (n, 2)).astype(np.float32),
-            rng.integers(0, 8, n).astype(np.uint8),
-            rng.uniform(0, 6, n).astype(np.float32),
-            rng.integers(0, 256, (n, 32)).astype(np.uint8),
-            np.full(n, np.nan, np.float32),
-        )
-        map_.add_keyframe(features, np.eye(4), 0.1 * k, k)
-        map_.parents[k] = k - 1
-    descriptors = rng.integers(0, 2**63, (n, 4)).astype(np.uint64)
-    ids = map_.add_landmarks(rng.uniform(1, 9, (n, 3)), descriptors, 0)
-    for k in range(3):
-        rows = np.arange(n * k, n * (k + 1))
-        link_many(map_.arrays, rows, ids.astype(np.int32))
-    refresh_landmarks(map_.arrays, ids, map_.scales)
-    merge_landmarks(map_.arrays, 0, 1)
-    map_.cull_keyframe(1)
-    waits = LoopEdge(2, 0, 0.5, True, "", T_query_match=np.eye(4))
-    patches = KeyframePatches(
-        2, np.zeros((n, PATCH_PIXELS), np.uint8), np.zeros((n, 2), np.float32)
-    )
-    checkpoint = Checkpoint(
-        TrackerState(2, 0.2, features, ids.astype(np.int32), np.eye(4), np.zeros(6), 0, n),
-        MapperState(2, 2, 0.2, (patches,)),
-        PolicyState(100.0, False),
-        ClosingState(ConsistencyState((ResembledPlace(frozenset((0,)), 1),), ((3, waits),), 3)),
-    )
-    frames = FrameTable(
-        0.1 * np.arange(3), np.array([0, 2, 2]), np.tile(np.eye(4), (3, 1, 1)), np.ones(3, bool),
-        np.ones(3),
-    )  # fmt: skip
-    stored = StoredMap(map_, _camera(), frames=frames, checkpoint=checkpoint)
-    save_map(folder / "map.npz", stored, resumable=True)
-
-
-def _drive(places: range, seed: int) -> Slam:
-    """SLAM in a ring of landmarks, after a drive through these places."""
-    from ring import CAMERA
-
-    from vslam.slam import Slam
-
-    slam = Slam(CAMERA, None, "bow", threads=1)
-    _drive_on(slam, places, seed, 0.0)
-    slam.finish()
-    return slam
-
-
-def _drive_on(slam: Slam, places: range, seed: int, start: float) -> None:
-    from vslam.features import Extracted, Features
-
-    camera = slam.context.camera  # that of a map may be another one
-    for i, place in enumerate(places):
-        seen = _ring().see(place, seed)
-        inside = (seen.xy < (camera.width, camera.height)).all(1)
-        seen = Features(**{name: column[inside] for name, column in vars(seen).items()})
-        slam.step_features(Extracted(seen), start + 0.1 * i)
-
-
-@cache
-def _ring() -> Ring:
-    from ring import Ring
-
-    return Ring.create()
-
-
-def _write_drives(folder: Path) -> None:
-    """A map with a checkpoint, a loop and a place in the world, and one that meets it."""
-    from vslam.loops import LoopEdge
-    from vslam.maps.storage import save_map
-    from vslam.maps.stored_map import World
-
-    stored = _drive(range(24), 0).stored_map("ring 0")
-    n = stored.map.n_keyframes
-    loop = LoopEdge(n - 1, 0, 0.5, True, "closed", 40, 30, np.eye(4))
-    stored = replace(stored, loops=(loop,), world=World("ring", np.eye(4)))
-    save_map(folder / "map.npz", stored, resumable=True)
-    save_map(folder / "other.npz", _drive(range(18, 40), 1).stored_map("ring 1"))
-
-
-def _write_json(kind: str, folder: Path) -> None:
-    from vslam.config import Config
-
-    if kind == "config":
-        (folder / "config.json").write_text(Config().model_dump_json())
-        return
-    from test_report import make_outcome, report_of
-
-    report_of(make_outcome(20), folder)
-
-
-def _write_vocabulary(folder: Path) -> None:
-    from vslam.loopclosure.vocabulary import from_children
-    from vslam.loopclosure.vocabulary_text import write_vocabulary
-
-    rng = np.random.default_rng(1)
-    descriptors = rng.integers(0, 2**63, (13, 4)).astype(np.uint64)
-    descriptors[0] = 0
-    children = np.array([3, 3, 3, 3] + [0] * 9, np.uint8)
-    made = from_children(3, 2, descriptors, children, rng.uniform(0.1, 1, 9).astype(np.float32))
-    for name in ("words.npz", "words.txt"):
-        write_vocabulary(made, folder / name)
-
-
-def _write_trajectories(folder: Path) -> None:
-    from vslam.trajectory import Trajectory, write_kitti, write_tum
-
-    T_wc = np.tile(np.eye(4), (5, 1, 1))
-    write_kitti(folder / "a.kitti", T_wc)
-    write_tum(folder / "a.tum", Trajectory(0.1 * np.arange(5), T_wc))
-
-
-def _write_onnx(folder: Path) -> None:
-    from vslam.loopclosure.siamese.weights import SHIPPED
-
-    shutil.copy(SHIPPED / "capsule-pruned.onnx", folder / "net.onnx")
-
-
-def _write_weights(folder: Path) -> None:
-    shipped = ROOT / "loopclosure" / "siamese" / "weights"
-    found = sorted(shipped.glob("*.safetensors"))
-    if found:
-        shutil.copy(found[0], folder / "net.safetensors")
-        return
-    from vslam.loopclosure.training.siamese import build_network, save_network
-
-    save_network(build_network("squeezenet", None), folder / "net.safetensors", {})
-
-
 # -- readers --------------------------------------------------------------------------------------
 
 
 def _use(source) -> None:
     """Every frame of it; a frame may be refused, alone."""
-    from vslam.datasets.stream import timed_frames
     from vslam.errors import InputError, UnreadableImageError
 
     try:
-        for frame in timed_frames(source):
+        for frame in source.frames():
             try:
                 frame.read(map)
             except UnreadableImageError:
@@ -400,11 +90,9 @@ def _each(read: Callable[[str], object], names: Iterable[str]) -> None:
 def _read_source(dataset: str, data: str, folder: Path, **options) -> None:
     from vslam.datasets.sources import SourceOptions, open_source
 
-    more = {key: options.pop(key) for key in ("sensor",) if key in options}
-    calibration = options.pop("calib", None)
-    if calibration:
-        options["calibration"] = (folder / calibration,)
-    _use(open_source(dataset, str(folder / data), None, SourceOptions(**options), **more))
+    if "calib" in options:
+        options["calib"] = (folder / options["calib"],)
+    _use(open_source(SourceOptions(dataset=dataset, data=str(folder / data), **options)))
 
 
 def _read_video(folder: Path) -> None:
@@ -422,9 +110,9 @@ def _read_calibrations(folder: Path) -> None:
     def read(name: str) -> None:
         found = rectify(read_calibration([folder / name], (64, 48)))
         if (found.camera.width, found.camera.height) == (64, 48):
-            found.left(_images()[0])
+            found.left(valid_files.noise()[0])
 
-    _each(read, _CALIBRATIONS)
+    _each(read, valid_files.CALIBRATIONS)
 
 
 def _read_map(folder: Path) -> None:
@@ -473,7 +161,7 @@ def _use_map_in(file: Path, other: Path, out: Path) -> None:
     stored.select(in_box(map_, (-5.0, 5.0, -5.0, 5.0)))
     for options, start in (({"resume": True}, 2.4), ({}, 0.0), ({"localize": True}, 0.0)):
         slam = Slam.load(file, detector="bow", threads=1, **options)
-        _drive_on(slam, range(24, 28), 0, start)
+        valid_files.drive_on(slam, range(24, 28), 0, start)
         slam.finish()
         slam.trajectory()
         if "localize" not in options:
@@ -499,11 +187,13 @@ def _read_config(folder: Path) -> None:
 def _read_report(folder: Path) -> None:
     from vslam.lab.overview import write_overview
     from vslam.report.finished_run import read_report
-    from vslam.report.render import render_html, render_markdown
+    from vslam.report.render import html, markdown
+    from vslam.report.run_page import run_page
 
     report = read_report(folder)
-    render_html(report, "", [])
-    render_markdown(report)
+    page = run_page(report)
+    html(page)
+    markdown(page)
     write_overview([folder], [], folder / "overview")
 
 
@@ -536,7 +226,7 @@ def _read_weights(folder: Path) -> None:
 
 
 def _bag(kind: str, encoding: str, data: str, changed: str, compression: str = "") -> Reader:
-    write = partial(_write_bag, kind, encoding, compression=compression)
+    write = partial(valid_files.bag, kind, encoding, compression=compression)
     return Reader(write, partial(_read_source, "bag", data), changed)
 
 
@@ -605,31 +295,31 @@ def _other_number(value: object, rng: np.random.Generator) -> object:
 
 READERS: dict[str, Reader] = {
     "images": Reader(
-        _write_images, partial(_read_source, "images", "", calib="stereo.yaml"), "**/*.*"
+        valid_files.images, partial(_read_source, "images", "", calib="stereo.yaml"), "**/*.*"
     ),
     "image-kinds": Reader(
-        _write_other_images,
+        valid_files.other_images,
         partial(_read_source, "images", "", calib="../mono.yaml", sensor="mono"),
         "*.*",
     ),
-    "kitti": Reader(_write_kitti, partial(_read_source, "kitti", ""), "**/*.*"),
-    "tum": Reader(_write_tum, partial(_read_source, "tum", ""), "**/*.*"),
-    "euroc": Reader(_write_euroc, partial(_read_source, "euroc", ""), "**/*.*"),
-    "calibration": Reader(_write_calibrations, _read_calibrations, "*.*"),
+    "kitti": Reader(valid_files.kitti, partial(_read_source, "kitti", ""), "**/*.*"),
+    "tum": Reader(valid_files.tum, partial(_read_source, "tum", ""), "**/*.*"),
+    "euroc": Reader(valid_files.euroc, partial(_read_source, "euroc", ""), "**/*.*"),
+    "calibration": Reader(valid_files.calibrations, _read_calibrations, "*.*"),
     "bag-ros1": _bag("ros1", "mono8", "a.bag", "a.bag"),
     "bag-ros2": _bag("ros2", "png", "a", "a/*"),
     "bag-mcap": _bag("folder", "mono16", "a", "a/*"),
     "bag-lz4": _bag("ros1", "mono8", "a.bag", "a.bag", "lz4"),
     "bag-zstd": _bag("folder", "mono8", "a", "a/*", "storage"),
-    "video": Reader(_write_video, _read_video, "*.*"),
-    "map": Reader(_write_map, _read_map, "map.npz"),
-    "map-meaning": Reader(_write_drives, _use_map, "map.npz", mutation=_mutate_meaning),
-    "config": Reader(partial(_write_json, "config"), _read_config, "config.json"),
-    "report": Reader(partial(_write_json, "report"), _read_report, "*.json"),
-    "vocabulary": Reader(_write_vocabulary, _read_vocabulary, "words.*"),
-    "trajectory": Reader(_write_trajectories, _read_trajectories, "a.*"),
-    "onnx": Reader(_write_onnx, _read_onnx, "net.onnx"),
-    "weights": Reader(_write_weights, _read_weights, "net.safetensors"),
+    "video": Reader(valid_files.video, _read_video, "*.*"),
+    "map": Reader(valid_files.map_file, _read_map, "map.npz"),
+    "map-meaning": Reader(valid_files.drives, _use_map, "map.npz", mutation=_mutate_meaning),
+    "config": Reader(partial(valid_files.config_or_report, "config"), _read_config, "config.json"),
+    "report": Reader(partial(valid_files.config_or_report, "report"), _read_report, "*.json"),
+    "vocabulary": Reader(valid_files.vocabulary, _read_vocabulary, "words.*"),
+    "trajectory": Reader(valid_files.trajectories, _read_trajectories, "a.*"),
+    "onnx": Reader(valid_files.onnx, _read_onnx, "net.onnx"),
+    "weights": Reader(valid_files.weights, _read_weights, "net.safetensors"),
 }
 
 

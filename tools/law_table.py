@@ -1,4 +1,4 @@
-"""Write docs/stress/laws.csv: every law of ``--perturb`` with its unit and range.
+"""Write docs/howto/laws.csv: every law of ``--perturb`` with its unit and range.
 
 python tools/law_table.py            # writes it
 python tools/law_table.py --check    # exits 1 if the file differs
@@ -14,7 +14,7 @@ from pathlib import Path
 
 from vslam.datasets.perturbation import LAWS
 
-TABLE = Path(__file__).parents[1] / "docs" / "stress" / "laws.csv"
+TABLE = Path(__file__).parents[1] / "docs" / "howto" / "laws.csv"
 
 
 def table() -> str:

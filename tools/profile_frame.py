@@ -24,7 +24,7 @@ from typing import Any
 # Stage, and the functions whose time it is: module, and name or Class.name there.
 STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("start: vocabulary", (("vslam.run.pipeline", "detector_with_images"),)),
-    ("read both images", (("vslam.datasets.kitti", "KittiImages.read"),)),
+    ("read both images", (("vslam.datasets.image_files", "read_files"),)),
     ("pyramids", (("vslam.frontend.orb", "build_pyramid"),)),
     ("corners, orientations, smoothing, descriptors", (("vslam.frontend.orb", "extract_levels"),)),
     ("weak images", (("vslam.frontend.extraction", "extract_in_any_light"),)),

@@ -1,18 +1,20 @@
-"""Write docs/results/drives.csv: vslam, with and without loop closing, and ORB-SLAM3 on rendered
-drives.
+"""Write docs/research/results/drives.csv: vslam, with and without loop closing, and ORB-SLAM3 on
+rendered drives.
 
     python tools/synth_table.py --routes demo,05 --lights "clean;brightness:1.0" \
         [--kitti KITTI --along 00,07] [--aliased demo:10] [--sensor mono] \
         [--orbslam3-python PY --orbslam3-script run_orbslam3.py --vocabulary voc.txt]
 
-A drive is a built-in route; with ``--along`` the poses of a KITTI sequence (KITTI/poses/NN.txt) in
-a rendered town; with ``--aliased ROUTE:N`` a built-in route through N towns of few facades. What is
-missing is rendered first. A light is ``clean``, a perturbation as of ``vslam run --perturb``, or
-a kidnapping: ``cut:300`` takes 300 frames out, ``black:20`` blackens 20. What is changed is written
-to a folder, and every system reads the same images. Each finished row is kept in a JSON file beside
-the table and not measured again unless the bytes of the drives changed or ``--again`` names its
-system. The table is always written whole. For what the script of ORB-SLAM3 takes and prints see
-compare_orbslam3.py.
+A drive is a built-in route; ``01/4`` is one with a quarter of its baseline, so that nearly all
+points are far. With ``--along`` it has the poses of a KITTI sequence (KITTI/poses/NN.txt) in a
+rendered town; with ``--aliased ROUTE:N`` it is a built-in route through N towns of few facades.
+What is missing is rendered first. A light is ``clean`` or a perturbation as of ``vslam run
+--perturb``. In its place, ``cut:300`` takes 300 frames out, ``black:20`` blackens 20, and
+``every:3`` keeps every third frame, so that the camera is three times as fast. Changed images are
+written to a folder, and every system reads the same ones. Each finished row is kept in a JSON file
+beside the table and is not measured again unless the bytes of the drives changed or ``--again``
+names its system. The table is always written whole. systems.py describes what the script of
+ORB-SLAM3 takes and prints.
 """
 
 from __future__ import annotations
@@ -23,10 +25,11 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from changed_drive import changed_drive, run_over
+from systems import OrbSlam3, add_orbslam3_options, changed_drive, orbslam3_of, run_over
 
 OURS = {"vslam": "bow", "vslam without loops": "none"}
 ORBSLAM3 = "ORB-SLAM3"
@@ -41,12 +44,16 @@ COLUMNS = {  # of the table: of a row
     "lost_frames": "lost",
     "ate_m": "ate_m",
     "ate_percent": "ate_percent",
+    "rpe_m": "rpe_m",
     "t_rel_percent": "t_rel",
     "loops_closed": "loops_closed",
     "loops_missed": "loops_missed",
     "loops_wrong": "loops_wrong",
+    "keyframes": "keyframes",
+    "cpu_ms": "process_cpu_ms",
+    "fps": "process_fps",
 }
-DECIMALS = {"ate_m": 3, "ate_percent": 3, "t_rel": 3}
+DECIMALS = {"ate_m": 3, "ate_percent": 3, "rpe_m": 4, "t_rel": 3, "process_fps": 1}
 Row = dict[str, Any]
 
 
@@ -67,20 +74,18 @@ def main() -> None:
     parser.add_argument(
         "--lights", default="clean", help="clean, perturbations, kidnappings; with semicolons"
     )
-    parser.add_argument("--out", type=Path, default=Path("docs/results/drives.csv"))
+    parser.add_argument("--out", type=Path, default=Path("docs/research/results/drives.csv"))
     parser.add_argument("--sensor", default="stereo", choices=("stereo", "mono"))
     parser.add_argument("--again", default="", help="systems to measure again, with commas")
-    parser.add_argument("--orbslam3-python", type=Path)
-    parser.add_argument("--orbslam3-script", type=Path)
-    parser.add_argument("--vocabulary", type=Path)
+    add_orbslam3_options(parser)
     options = parser.parse_args()
-    again = options.again.split(",")
+    again, orbslam3 = options.again.split(","), orbslam3_of(options)
     kept = {key: row for key, row in _read(options.out).items() if row["system"] not in again}
     for drive in _drives(options):
         for light in options.lights.split(";"):
             # Without loop closing vslam runs once for each drive.
             systems = [*OURS] if light == "clean" and "aliased" not in drive.title else ["vslam"]
-            systems += [ORBSLAM3] if options.orbslam3_python else []
+            systems += [ORBSLAM3] if orbslam3 else []
             sensor = ", mono" if options.sensor == "mono" else ""
             wanted = {f"{drive.title}, {light}, {system}{sensor}": system for system in systems}
             missing = {key: system for key, system in wanted.items() if key not in kept}
@@ -88,7 +93,10 @@ def main() -> None:
                 continue
             with _in_light(drive, light) as data:
                 for key, system in missing.items():
-                    kept[key] = _row(drive, light, system, data, options)
+                    kept[key] = _row(
+                        drive, light, system, data, options.sensor,
+                        orbslam3 if system == ORBSLAM3 else None,
+                    )  # fmt: skip
                     _write(options.out, kept)
     _write(options.out, kept)
 
@@ -100,7 +108,13 @@ def _drives(options: argparse.Namespace) -> Iterator[Drive]:
 
     cache = cache_folder()
     for name in filter(None, options.routes.split(",")):
-        yield Drive(name, render_sequence(built_in_route(name), Variation(), cache), name)
+        name, _, part = name.partition("/")
+        route, title = built_in_route(name), name
+        if part:
+            camera = replace(route.camera, baseline=route.camera.baseline / int(part))
+            route = replace(route, name=f"{name}-short", camera=camera)
+            title = f"{name}, 1/{part} of the baseline"
+        yield Drive(title, render_sequence(route, Variation(), cache), route.name)
     for name in filter(None, options.along.split(",")):
         calibration = "00-02" if name < "03" else "03" if name == "03" else "04-12"
         poses = read_kitti_poses(options.kitti / "poses" / f"{name}.txt")
@@ -118,8 +132,8 @@ def _drives(options: argparse.Namespace) -> Iterator[Drive]:
 def _in_light(drive: Drive, light: str) -> Iterator[Path]:
     """A KITTI tree with the drive's images as they are or, in a temporary folder, changed.
 
-    ``cut:N`` takes N frames out, a third of the way; ``black:N`` blackens N frames there. Anything
-    else is a perturbation of ``vslam run``.
+    ``cut:N`` takes N frames out, a third of the way; ``black:N`` blackens N frames there;
+    ``every:N`` keeps every N-th. Anything else is a perturbation of ``vslam run``.
     """
     from vslam.datasets import open_sequence
 
@@ -129,13 +143,16 @@ def _in_light(drive: Drive, light: str) -> Iterator[Path]:
     count = len(open_sequence("kitti", drive.root, drive.name))
     kind, _, length = light.partition(":")
     gap = range(count // 3, count // 3 + int(length)) if kind in GAPS else range(0)
-    frames = [k for k in range(count) if kind != "cut" or k not in gap]
-    law = "none" if gap else light
+    every = int(length) if kind == "every" else 1
+    frames = [k for k in range(0, count, every) if kind != "cut" or k not in gap]
+    law = "none" if gap or kind == "every" else light
     with changed_drive(drive.root, drive.name, frames, law, black=gap) as root:
         yield root
 
 
-def _row(drive: Drive, light: str, system: str, data: Path, options: argparse.Namespace) -> Row:
+def _row(
+    drive: Drive, light: str, system: str, data: Path, sensor: str, orbslam3: OrbSlam3 | None
+) -> Row:
     import numpy as np
 
     from vslam.datasets.kitti import read_kitti_poses
@@ -143,14 +160,16 @@ def _row(drive: Drive, light: str, system: str, data: Path, options: argparse.Na
     from vslam.evaluation.trajectories import path_length
 
     truth = read_kitti_poses(data / "poses" / f"{drive.name}.txt")
-    _, found = run_over(data, drive.name, options, OURS.get(system), sensor=options.sensor)
+    words = ("--no-report", "--detector", OURS[system]) if system in OURS else ()
+    run, found = run_over(data, drive.name, orbslam3, *words, sensor=sensor)
     return {
         "drive": drive.title,
         "light": light,
         "system": system,
-        "sensor": options.sensor,
+        "sensor": sensor,
         "frames": len(truth),
         "path_m": float(path_length(truth)[-1]),
+        "keyframes": run.report.get("keyframes"),
         **{key: None if np.isnan(value) else value for key, value in found.items()},
         "load": os.getloadavg()[1],
         "bytes": store.VERSION,
@@ -163,7 +182,7 @@ def _cells(row: Row) -> list[str]:
     row["ate_percent"] = None if ate is None else 100 * ate / row["path_m"]
 
     def shown(key: str) -> str:
-        value = row[key]
+        value = row.get(key)
         if value is None or isinstance(value, str):
             return value or ""
         return f"{value:.{DECIMALS.get(key, 0)}f}"

@@ -1,4 +1,4 @@
-"""Write docs/thresholds.md: every threshold of vslam/config/ with its unit and source.
+"""Write docs/reference/thresholds.md: every threshold of vslam/config/ with its unit and source.
 
     python tools/threshold_table.py            # writes it
     python tools/threshold_table.py --check    # exits 1 if the file differs
@@ -23,14 +23,14 @@ from pydantic import BaseModel
 
 from vslam.config import Config
 
-PAGE = Path(__file__).parents[1] / "docs" / "thresholds.md"
+PAGE = Path(__file__).parents[1] / "docs" / "reference" / "thresholds.md"
 DESCRIPTION = re.compile(
     r"(?P<text>\S.*\.) "
     r"\[(?P<source>(?:(?:OS1|OS2|ZS)(?: [IVX]+(?:-[A-F])?)?, (?:printed|customary|own))|own)\]"
 )
 HEAD = """# Thresholds
 
-Written by `python tools/threshold_table.py` from `vslam/config/`; `tests/test_threshold_table.py` compares the two. `vslam run --config FILE` sets any of them: `{"orb": {"n_features": 1500}}`. [design.md](design.md) describes the methods.
+Written by `python tools/threshold_table.py` from `vslam/config/`; `tests/test_threshold_table.py` compares the two. `vslam run --config FILE` sets any of them: `{"orb": {"n_features": 1500}}`. [design.md](../explanation/design.md) describes the methods.
 
 The source names the paper and section of the rule and says what the value is: *printed* in that section, *customary* in the programs and KITTI configurations of the ORB-SLAM family, or our *own*. OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS: Zhou and Sun, Sci Rep 15, 7644 (2025). Descriptor distances and ratios of best over second-best distance are upper bounds; a descriptor has 256 bits. A search radius at octave 0 grows with the scale of the pyramid level.
 
@@ -82,8 +82,8 @@ def page(config: Config) -> str:
     """The page for a configuration: one table for each section, its docstring above."""
     lines = [HEAD]
     for section in type(config).model_fields:
-        title, _, rest = (type(getattr(config, section)).__doc__ or "").partition("\n")
-        title = title.removesuffix(".")
+        title, _, rest = (type(getattr(config, section)).__doc__ or "").partition("\n\n")
+        title = " ".join(title.split()).removesuffix(".")
         lines += [f"## `{section}`: {title}\n"]
         lines += [f"{' '.join(rest.split())}\n"] if rest.strip() else []
         lines += ["| name | default | what it is | source |", "|---|---|---|---|"]

@@ -17,31 +17,31 @@ Image = NDArray[np.uint8]  # (H, W) grey
 DepthImage = NDArray[np.float32]  # (H, W) metres along z, 0 where unknown
 Sensor = Literal["stereo", "mono", "rgbd"]
 
-# How much surer the disparity of an observation is than its column and row: the factor on its
-# reprojection error (docs/motorway.md, tools/experiments/motorway/noise_model.py).
+# The disparity of an observation is more accurate than its column and row; its reprojection error
+# has this weight (docs/research/motorway.md, tools/experiments/motorway/noise_model.py).
 DISPARITY_WEIGHT = 3.0
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A rectified stereo pair: both cameras share one focal length, rows correspond. Or a camera
-    with a depth image, or one camera alone.
+    """A rectified stereo pair, whose cameras share one focal length and corresponding rows; or an
+    RGB-D camera; or a single camera.
 
     Attributes:
         fx, fy: focal lengths in pixels.
         cx, cy: principal point of the left camera in pixels.
-        baseline: distance from the left to the right camera in metres; 0 says that there is no
-            right camera, and a map has no metres but a unit of its own (``backend/two_views.py``).
-            With a depth image it is virtual: it says how sure depths are (``frontend/depth.py``).
+        baseline: distance from the left to the right camera in metres. It is 0 for a single camera,
+            whose map has a unit of its own instead of metres (``backend/two_views.py``). For an
+            RGB-D camera it is virtual and sets the uncertainty of depth (``frontend/depth.py``).
         width, height: image size in pixels.
-        depth: whether the second image is not that of a right camera but the depth of the left
-            one's pixels.
+        depth: whether the second image is the depth of the left image's pixels instead of a right
+            image.
         right_delay: seconds by which the right image of a pair is taken later than the left one,
             negative if it is taken earlier; 0 for cameras that share a trigger.
 
     Raises:
-        ValueError: a size or focal length that is not positive, a negative baseline, or a principal
-            point further from the image than the image is wide or high.
+        ValueError: a size or focal length is not positive, the baseline is negative, or the
+            principal point is farther from the image than the image is wide or high.
     """
 
     fx: float
@@ -55,10 +55,10 @@ class Camera:
     right_delay: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse numbers that no camera has.
+        """Refuse impossible numbers.
 
         Raises:
-            ValueError: in one sentence which number is wrong.
+            ValueError: a number is impossible; the message says which one.
         """
         size = f"{self.width}x{self.height}"
         if not (self.width > 0 and self.height > 0):
@@ -70,7 +70,7 @@ class Camera:
                 f"the baseline of {self.baseline} m must not be negative; "
                 "it is 0 for a single camera"
             )
-        # A rectified view may well have its principal point beside the image, but not far from it.
+        # The principal point of a rectified image may lie outside it, but not far away.
         near = -self.width <= self.cx <= 2 * self.width
         if not (near and -self.height <= self.cy <= 2 * self.height):
             raise ValueError(
@@ -79,14 +79,14 @@ class Camera:
 
     @property
     def sensor(self) -> Sensor:
-        """What the images are, in the word of ``--sensor``."""
+        """The kind of camera, as named by ``--sensor``."""
         if self.monocular:
             return "mono"
         return "rgbd" if self.depth else "stereo"
 
     @property
     def monocular(self) -> bool:
-        """Whether there is a left camera only."""
+        """Whether there is only a left camera."""
         return self.baseline == 0.0
 
     def left_camera(self) -> Camera:
@@ -102,13 +102,12 @@ class Camera:
 
     @property
     def bf(self) -> float:
-        """Baseline times focal length: disparity in pixels is ``bf / z``."""
+        """The baseline times the focal length; a disparity in pixels is ``bf / z``."""
         return self.baseline * self.fx
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``, the form that the kernels
-        take."""
+        """``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``, the form for kernels."""
         return np.array([self.fx, self.fy, self.cx, self.cy, self.bf, DISPARITY_WEIGHT])
 
     def project(self, p_c: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -128,7 +127,7 @@ class Camera:
 
 
 def same_camera(one: Camera, other: Camera) -> bool:
-    """Whether two cameras are one, up to the rounding of calibration files."""
+    """Whether two cameras are the same, up to the rounding of calibration files."""
     shapes = [(c.width, c.height, c.depth, c.monocular) for c in (one, other)]
     first, second = ([*c.intrinsics, c.right_delay] for c in (one, other))
     return shapes[0] == shapes[1] and bool(np.allclose(first, second, rtol=1e-6))
@@ -139,8 +138,8 @@ Made = TypeVar("Made")
 
 
 class ImageMap(Protocol):
-    """How a function is applied to the images of a frame: ``map``, one after the other, or the
-    ``map`` of a pool of threads, both at once. The results and their order are the same."""
+    """Applies a function to the images of a frame: the built-in ``map``, one image after the other,
+    or the ``map`` of a thread pool, in parallel. The results and their order are the same."""
 
     def __call__(
         self, function: Callable[[Given], Made], images: Iterable[Given], /
@@ -148,10 +147,10 @@ class ImageMap(Protocol):
 
 
 def check_images(left: Image, second: Image | DepthImage | None, camera: Camera) -> None:
-    """Refuse images that a camera does not give (``Slam.step``).
+    """Refuse images that do not fit a camera (``Slam.step``).
 
     Raises:
-        ValueError: in one sentence what is wrong with their sizes, types or number.
+        ValueError: the sizes, types or number of the images are wrong; the message says which.
     """
     if (second is None) != camera.monocular:
         what = "depth" if camera.depth else "right"

@@ -1,9 +1,9 @@
 """Loop closing: from a keyframe that looks familiar to a corrected map (ORB-SLAM, section VII).
 
-Whoever calls these methods is the only one to change the map at that moment, usually the mapping
-job of a keyframe. Only the global bundle adjustment after a loop runs in parallel, on a snapshot.
-It is merged after a number of keyframes that depends on the size of the problem alone, so that a
-run has one result.
+The caller of these methods, usually the mapping job of a keyframe, must be the map's only writer
+meanwhile. Only the global bundle adjustment after a loop runs in parallel, on a snapshot.
+Its result is merged after a number of keyframes that depends only on the size of the problem, so
+that the same input always gives the same map.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +35,7 @@ from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.verifier import Verifier
 from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map
+from vslam.plugins import reason
 from vslam.states import ClosingState
 
 _log = logging.getLogger(__name__)
@@ -43,11 +45,12 @@ class LoopClosing:
     """Finds, verifies and closes loops.
 
     Attributes:
-        detector: what finds candidates.
-        verifier: what decides which candidates are loops.
-        edges: every candidate and what became of it, in order.
+        detector: proposes candidates.
+        verifier: decides which candidates are loops.
+        edges: the outcome of every candidate, in order.
         corrections: the loops that were closed.
         closed: all closed edges, those of a loaded map first, in the current units of the map.
+        problems: what failed without harm to the map, a sentence each.
     """
 
     def __init__(
@@ -64,13 +67,14 @@ class LoopClosing:
         self.edges: list[LoopEdge] = []
         self.corrections: list[LoopCorrection] = []
         self.closed: list[LoopEdge] = []
+        self.problems: list[str] = []
         self._camera = camera
         self._config = config
         memory = {"verified_memory": verifier.verified_memory}
         self._consistency = LoopConsistency(config.consistency.model_copy(update=memory))
         self._executor = ThreadPoolExecutor(1, "global-adjustment") if threads > 1 else None
         self._global: _PendingAdjustment | None = None
-        self._followed = 0  # times that an old keyframe served instead of a new one
+        self._followed = 0  # how often an old keyframe was reused instead of a new one
 
     def process(
         self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
@@ -78,14 +82,24 @@ class LoopClosing:
         """Look for loops at a keyframe whose local mapping is done; close the first real one."""
         if self._is_due(keyframe):
             self.finish(map_)
-        if self.verifier.is_image_redundant(map_, keyframe):
-            image = None  # no network needs to see it
-        self.detector.add(keyframe, image, features)
-        self.verifier.add(map_, keyframe, image)
-        self.consider(map_, keyframe, self.detector.query(keyframe, map_))
+        found = None
+        with self._sparing_the_map("Looking for loops"):
+            if self.verifier.is_image_redundant(map_, keyframe):
+                image = None  # no network needs to see it
+            self.detector.add(keyframe, image, features)
+            self.verifier.add(map_, keyframe, image)
+            found = self._find(map_, keyframe, self.detector.query(keyframe, map_))
+        if found is not None:
+            self._close(map_, found)
 
     def consider(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> None:
         """Verify the candidates of a keyframe, best first, and close the first real loop."""
+        found = self._find(map_, keyframe, candidates)
+        if found is not None:
+            self._close(map_, found)
+
+    def _find(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> _Loop | None:
+        """The first real loop among candidates, best first. Only reads the map."""
         candidates = self.verifier.rate(map_, keyframe, candidates)
         _, refused = self._consistency.update(keyframe, candidates, map_)
         refusals = {edge.match: edge for edge in refused}
@@ -95,15 +109,15 @@ class LoopClosing:
         for number, candidate in enumerate(tried):
             edge = self.verifier.verify(map_, candidate, refusals.get(candidate.match))
             edge = self._consistency.confirm(edge, map_)
-            if edge.accepted:
-                edge = self._close(map_, edge)
-            self.edges.append(edge)
-            if edge.accepted:
+            if not edge.accepted:
+                self.edges.append(edge)
+            elif (loop := self._solve(map_, edge)) is not None:
                 self.edges += [_superseded(other) for other in tried[number + 1 :]]
-                break
+                return loop
+        return None
 
     def state(self) -> ClosingState:
-        """What ``restore`` needs to continue from here, with the detector and images restored."""
+        """What ``restore`` needs to continue from here, apart from the detector and the images."""
         return ClosingState(self._consistency.state(), self.verifier.state(), self._followed)
 
     def restore(self, state: ClosingState) -> None:
@@ -114,12 +128,12 @@ class LoopClosing:
 
     @property
     def is_adjusting(self) -> bool:
-        """Whether a global bundle adjustment is yet to be merged."""
+        """Whether the result of a global bundle adjustment is still to be merged."""
         return self._global is not None
 
     def count_reused_keyframe(self, keyframe: int) -> bool:
-        """Count a keyframe that was not inserted after ``keyframe``, since its place is mapped
-        already; returns whether the global bundle adjustment is due to be merged."""
+        """Count a keyframe that was not inserted after ``keyframe`` because its place was mapped
+        already; returns whether the global bundle adjustment must be merged now."""
         self._followed += 1
         return self._is_due(keyframe)
 
@@ -127,48 +141,64 @@ class LoopClosing:
         return self._global is not None and keyframe + self._followed >= self._global.due
 
     def conclude(self, map_: Map) -> None:
-        """At the end of a drive, close a verified loop that still waits for a second keyframe, if
-        an earlier keyframe confirms it."""
-        gates = self._config.verification
-        for edge in self._consistency.confirmed_by_earlier(map_, self._camera, gates):
-            edge = self._close(map_, edge)
-            self.edges.append(edge)
-            if edge.accepted:
-                return
+        """At the end of a drive, close a verified loop that no second keyframe has confirmed yet,
+        if an earlier keyframe confirms it."""
+        gates, found = self._config.verification, None
+        with self._sparing_the_map("Looking for loops"):
+            for edge in self._consistency.confirmed_by_earlier(map_, self._camera, gates):
+                if (found := self._solve(map_, edge)) is not None:
+                    break
+        if found is not None:
+            self._close(map_, found)
 
     def finish(self, map_: Map) -> None:
-        """Merge the global bundle adjustment that is under way, if there is one.
+        """Wait for the running global bundle adjustment, if there is one, and merge its result.
 
-        The map is sound without it: if it failed, a warning is logged and the map stays as it is.
+        The map is sound without it: after a failure, a warning is logged and the map stays as it
+        was.
         """
         pending, self._global = self._global, None
         if pending is None:
             return
-        try:
+        solution = None
+        with self._sparing_the_map("Global bundle adjustment after a loop"):
             solution = pending.solution()
-        except Exception as error:
-            _log.warning(
-                "Global bundle adjustment after a loop failed (%s: %s); the map stays as it was.",
-                type(error).__name__,
-                error,
-            )
-            return
-        merge_solution(map_, pending.snapshot, solution)
+        if solution is not None:
+            merge_solution(map_, pending.snapshot, solution)
 
-    def _close(self, map_: Map, edge: LoopEdge) -> LoopEdge:
-        """Correct the map by a verified loop; if it contradicts the rest, leave the map alone."""
+    @contextmanager
+    def _sparing_the_map(self, what: str) -> Iterator[None]:
+        """Report what fails without having changed the map, which is sound without it."""
+        try:
+            yield
+        except Exception as error:
+            problem = f"{what} failed ({reason(error)}); the map stays as it was."
+            if problem not in self.problems:
+                self.problems.append(problem)
+                _log.warning(problem)
+
+    def _solve(self, map_: Map, edge: LoopEdge) -> _Loop | None:
+        """How a verified loop would correct the map; None if it contradicts the rest. What became
+        of the loop is added to ``edges``."""
         start = time.perf_counter()
-        solution = self._solve(map_, edge, Hypothesis.PREDICTED)
+        solution = self._solution(map_, edge, Hypothesis.PREDICTED)
         if not solution.verdict.consistent and solution.has_gaps:
-            solution = self._solve(map_, edge, Hypothesis.KIDNAPPED)
+            solution = self._solution(map_, edge, Hypothesis.KIDNAPPED)
         if not solution.verdict.consistent:
-            return replace(edge, accepted=False, reason=solution.verdict.reason)
-        if self._global is not None:  # it knows nothing of this loop
+            self.edges.append(replace(edge, accepted=False, reason=solution.verdict.reason))
+            return None
+        self.edges.append(replace(edge, reason="closed"))
+        return _Loop(edge, solution, start)
+
+    def _close(self, map_: Map, loop: _Loop) -> None:
+        """Correct the map by a verified loop that agrees with the rest."""
+        edge, solution = loop.edge, loop.solution
+        if self._global is not None:  # it started before this loop was known
             self._global.cancel()
             self._global = None
         keyframes = solution.graph.keyframes
         before = map_.arrays.T_cw[keyframes]
-        # Before fusion: afterwards each side has the neighbours of both.
+        # Fusion makes the two sides neighbours, so their own neighbours are collected before it.
         query_side = [edge.query, *strong_neighbours(map_, edge.query, self._config)]
         match_side = [edge.match, *strong_neighbours(map_, edge.match, self._config)]
         self.closed.append(edge)
@@ -176,13 +206,13 @@ class LoopClosing:
         fuse_loop(map_, edge, query_side, match_side, self._camera, self._config)
         adjust_locally(map_, edge.query, self._camera, self._config)
         edge = replace(edge, reason="closed")
-        seconds = time.perf_counter() - start
+        seconds = time.perf_counter() - loop.start
         self.corrections.append(LoopCorrection(edge, keyframes, before, solution.T_cw, seconds))
-        self._consistency.reset()  # it compares places of the map before the correction
-        self._global = self._start_global(map_, edge.query)
-        return edge
+        self._consistency.reset()  # its places are those of the map before the correction
+        with self._sparing_the_map("Global bundle adjustment after a loop"):
+            self._global = self._start_global(map_, edge.query)
 
-    def _solve(self, map_: Map, edge: LoopEdge, hypothesis: Hypothesis) -> Solution:
+    def _solution(self, map_: Map, edge: LoopEdge, hypothesis: Hypothesis) -> Solution:
         return solve(
             map_,
             self.closed,
@@ -193,7 +223,7 @@ class LoopClosing:
         )
 
     def _correct(self, map_: Map, solution: Solution) -> None:
-        """Move the keyframes, and what hangs on them, to where a solution puts them."""
+        """Move the keyframes and their landmarks to the poses of a solution."""
         keyframes = solution.graph.keyframes
         if self._camera.monocular:
             growth = move_keyframes_similarly(map_, keyframes, solution.S_wc)
@@ -221,6 +251,15 @@ class LoopClosing:
 
 def _superseded(candidate: LoopCandidate) -> LoopEdge:
     return LoopEdge.of(candidate, "another loop was closed at this keyframe")
+
+
+@dataclass(frozen=True)
+class _Loop:
+    """A verified loop, how it corrects the map, and when that was asked (``perf_counter``)."""
+
+    edge: LoopEdge
+    solution: Solution
+    start: float
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Failures that a user can cause or repair."""
+"""Errors that a user can cause or repair."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class InputError(Exception):
 class UnreadableImageError(InputError):
     """One image of a sequence cannot be decoded or has the wrong size.
 
-    During a run such a frame is reported, skipped and counted; before a run it is an error.
+    During a run the frame is reported, skipped and counted; before a run it is an error.
     """
 
     def __init__(self, path: Path, why: str) -> None:
@@ -22,27 +22,27 @@ class UnreadableImageError(InputError):
 
 
 class DroppedFrameError(UnreadableImageError):
-    """A frame that a perturbation keeps back; during a run it counts as dropped, not as lost."""
+    """A perturbation dropped this frame; during a run it counts as dropped, not as lost."""
 
     def __init__(self, frame: int) -> None:
         super().__init__(Path(f"frame {frame}"), "dropped by --perturb")
 
 
 class BrokenSourceError(InputError):
-    """A video, bag or camera ended before its time: a file cut off, a device unplugged.
+    """A video, bag or camera ended early: the file is cut off, or the device was unplugged.
 
-    During a run all frames before it count; before the first one it is an error.
+    During a run the frames before the break are kept; if there are none, it is an error.
     """
 
 
 class ResultsError(Exception):
-    """Results cannot be written, on a full disk for example. The CLI exits with 1."""
+    """Results cannot be written, for example because the disk is full. The CLI exits with 1."""
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """`` (did you mean NAME?)`` with the known name that a misspelt word is most like; empty if it
-    is like none."""
-    from difflib import get_close_matches  # only a mistake needs it
+    """`` (did you mean NAME?)`` with the known name that a misspelt word resembles most; empty if
+    it resembles none."""
+    from difflib import get_close_matches  # slow to import, and only an error message needs it
 
     near = get_close_matches(word.lower(), list(known), n=1)
     return f" (did you mean {near[0]}?)" if near else ""

@@ -1,4 +1,4 @@
-"""Image features, what the images of a frame give, and what tracking says of a frame."""
+"""Image features, and the results of extraction and of tracking for one frame."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from vslam.kernels import inner_kernel, kernel
 
-MIN_DISPARITY = 0.01  # pixels; a point farther away counts as so far
-PATCH_RADIUS = 8  # of the pixels that are kept around a feature, in its octave
+MIN_DISPARITY = 0.01  # pixels; farther points are clamped to the depth of this disparity
+PATCH_RADIUS = 8  # half width of the patch kept around a feature, in pixels of its octave
 PATCH_SIDE = 2 * PATCH_RADIUS + 1
 PATCH_PIXELS = PATCH_SIDE**2
 CELL = 16  # pixels of a FeatureGrid cell; search windows are 5 to 60 px wide
@@ -20,14 +20,14 @@ CELL = 16  # pixels of a FeatureGrid cell; search windows are 5 to 60 px wide
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Levels of one image, back to back in one buffer so that kernels can take all of them.
+    """Image pyramid with all levels in one buffer, so that kernels take it as one array.
 
     Attributes:
-        pixels: ``(P + SPARE,)`` uint8, the levels row by row; kernels may read, and ignore, as much
-            as a register holds beyond the end.
+        pixels: ``(P + SPARE,)`` uint8, the levels row by row, then padding: vectorised kernels may
+            read, and ignore, up to a register beyond the last pixel.
         offsets: ``(L,)`` int64, where each level starts.
         shapes: ``(L, 2)`` int64, height and width.
-        scales: ``(L,)`` float64, full-resolution pixels for each pixel of the level.
+        scales: ``(L,)`` float64, full-resolution pixels per pixel of the level.
     """
 
     pixels: NDArray[np.uint8]
@@ -44,7 +44,8 @@ class Pyramid:
 
 @inner_kernel
 def level_pixel(x, ratio):
-    """Pixel of a level at a coordinate of the image, which has ``ratio`` pixels for one of it."""
+    """Coordinate in a pyramid level, rounded, of the coordinate ``x`` in an image that has
+    ``ratio`` pixels per pixel of the level."""
     return int(np.rint((np.float64(x) + 0.5) / ratio - 0.5))
 
 
@@ -71,7 +72,7 @@ class Features:
 
     @classmethod
     def none(cls) -> Features:
-        """Those of a frame without images."""
+        """No features, for a frame without images."""
         return cls(
             np.empty((0, 2), np.float32),
             np.empty(0, np.uint8),
@@ -90,16 +91,16 @@ class Side(StrEnum):
 
 @dataclass(frozen=True)
 class Extracted:
-    """What the images of one frame give.
+    """The result of extraction for one frame.
 
     Attributes:
         features: the N features that were extracted from the image of ``side``.
-        pyramid: of that image; None if matches are not to be aligned in it.
-        row_offset: ``(N,)`` float32, by how many pixels a stereo match is lower in the right image
-            than in the left one; NaN for features of which this was not measured. None if it was
-            measured for none.
-        side: the camera that took that image: the right one only where the left image is black,
-            and no feature has a stereo match then.
+        pyramid: the pyramid of that image; None if matches are not aligned in it.
+        row_offset: ``(N,)`` float32, row of the stereo match in the right image minus row in the
+            left image, in pixels; NaN for features without this measurement. None if no feature
+            has it.
+        side: the camera whose image was used: the right one only if the left image is black, and
+            then no feature has a stereo match.
     """
 
     features: Features
@@ -109,13 +110,19 @@ class Extracted:
 
     @classmethod
     def nothing(cls) -> Extracted:
-        """What a frame without images gives."""
+        """The result for a frame without images."""
         return cls(Features.none())
 
 
 class KeyframePatches(NamedTuple):
-    """Of the N features of a keyframe: ``pixels`` (N, PATCH_PIXELS) u1 around the keypoints, and
-    ``shift`` (N, 2) f4 from there to what each observes, in pixels of its octave."""
+    """Image patches of the N features of a keyframe.
+
+    Attributes:
+        keyframe: id of the keyframe.
+        pixels: ``(N, PATCH_PIXELS)`` uint8, the square patch around each keypoint, row by row.
+        shift: ``(N, 2)`` float32, from the keypoint to the aligned position of the landmark that it
+            observes, in pixels of its octave.
+    """
 
     keyframe: int
     pixels: NDArray[np.uint8]
@@ -123,10 +130,17 @@ class KeyframePatches(NamedTuple):
 
 
 class LandmarkPatches(NamedTuple):
-    """Of N landmarks: ``ids`` (N,) i4, sorted; ``where`` (N,) i8 row of each in ``pixels`` (P,
-    PATCH_PIXELS) u1 and ``shift`` (P, 2) f4, which are as of ``KeyframePatches``; ``view`` (N,) i8
-    the camera that saw it, of ``T_cw`` (K, 4, 4) f8; ``size`` (N,) f8 full-resolution pixels for
-    one of its patch."""
+    """Image patches of N landmarks, taken from K keyframes.
+
+    Attributes:
+        ids: ``(N,)`` int32 landmark ids, sorted.
+        where: ``(N,)`` int64, row of each landmark in ``pixels`` and ``shift``.
+        view: ``(N,)`` int64, index into ``T_cw`` of the keyframe that the patch was taken from.
+        size: ``(N,)`` float64, full-resolution pixels per pixel of the patch.
+        pixels: ``(P, PATCH_PIXELS)`` uint8, as in ``KeyframePatches``.
+        shift: ``(P, 2)`` float32, as in ``KeyframePatches``.
+        T_cw: ``(K, 4, 4)`` float64 poses of the keyframes.
+    """
 
     ids: NDArray[np.int32]
     where: NDArray[np.int64]
@@ -151,13 +165,17 @@ NO_PATCHES = LandmarkPatches(
 def shifted_columns(
     u_right: NDArray[np.float32], u: NDArray[np.float32], change: float | NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """``(N,)`` columns in the right image, ``change`` pixels further to the left, but never so far
-    to the right that the point would lie behind the camera. NaN stays NaN."""
+    """Move ``(N,)`` columns of the right image ``change`` pixels to the left.
+
+    The disparity never falls below ``MIN_DISPARITY``, so that no point comes to lie behind the
+    camera. NaN stays NaN.
+    """
     return np.minimum(u_right - np.asarray(change, np.float32), u - np.float32(MIN_DISPARITY))
 
 
 class FeatureGrid(NamedTuple):
-    """Features by image cell, row by row: those of cell c are ``items[start[c]:start[c + 1]]``."""
+    """Feature indices sorted by image cell, the cells row by row: cell c holds
+    ``items[start[c]:start[c + 1]]``."""
 
     start: NDArray[np.int64]
     items: NDArray[np.int32]
@@ -165,7 +183,7 @@ class FeatureGrid(NamedTuple):
 
     @classmethod
     def of_positions(cls, xy: NDArray[np.float32], width: int, height: int) -> FeatureGrid:
-        """Sort ``(N, 2)`` positions into the cells of an image."""
+        """Sort ``(N, 2)`` pixel positions into the cells of an image."""
         columns, rows = -(-width // CELL), -(-height // CELL)
         start, items = build_grid(xy, columns, rows)
         return cls(start, items, columns)
@@ -193,8 +211,12 @@ def build_grid(xy, columns, rows):
 
 
 class TrackingState(StrEnum):
-    """OK: enough inliers. WEAK: a pose, but on few inliers. LOST: the pose is predicted. DROPPED:
-    the images came while others were worked on (``--realtime``); the pose is interpolated."""
+    """How a frame was tracked.
+
+    OK: with enough inliers. WEAK: the pose rests on few inliers. LOST: the pose is only predicted.
+    DROPPED: the images arrived while earlier ones were being processed (``--realtime``); the pose
+    is interpolated.
+    """
 
     OK = "OK"
     WEAK = "WEAK"
@@ -204,21 +226,21 @@ class TrackingState(StrEnum):
 
 @dataclass(frozen=True)
 class TrackResult:
-    """Outcome of one frame; lost frames have one too.
+    """The result of tracking one frame; lost frames have one too.
 
     Attributes:
         index: frame number within the run, from 0.
         timestamp: seconds.
-        T_wc: ``(4, 4)`` float64 pose at the time of tracking (camera to world); the final
-            trajectory, after later bundle adjustments, comes from ``Slam.trajectory()``.
+        T_wc: ``(4, 4)`` float64 pose (camera to world) as tracked; ``Slam.trajectory()`` returns
+            the final poses, after later bundle adjustments.
         state: OK, WEAK, LOST or DROPPED.
         n_features: features extracted from the left image.
         n_stereo: of these, features with a stereo match.
         n_matches: landmark matches before the last pose optimisation.
-        n_inliers: matches that survived it.
+        n_inliers: matches that are inliers of it.
         is_keyframe: whether the frame became a keyframe.
-        relocalised: whether it was looked for in the whole map, and found.
-        stage_ms: milliseconds by stage of the pipeline (wall time of that stage).
+        relocalised: whether the frame was searched for in the whole map and found there.
+        stage_ms: wall time of each stage of the pipeline, in milliseconds.
     """
 
     index: int

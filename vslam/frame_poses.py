@@ -1,4 +1,4 @@
-"""The pose of every frame of a run, relative to a keyframe: where that moves, it follows."""
+"""The pose of every frame of a run relative to a keyframe, so that frames follow corrections."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from vslam.trajectory import Trajectory, bridge_gaps
 
 
 class KeyframePoses(Protocol):
-    """What frames are placed by: the poses of keyframes as they are now.
+    """The present poses of the keyframes that frame poses are relative to.
 
     Attributes:
-        n_keyframes: how many there are, culled ones included.
-        reference: the keyframe that new frames are placed by.
+        n_keyframes: number of keyframes, culled ones included.
+        reference: the keyframe that the poses of new frames are relative to.
     """
 
     @property
@@ -29,14 +29,22 @@ class KeyframePoses(Protocol):
         ...
 
     def unit_scale(self, keyframe: int) -> float:
-        """Units of the map around a keyframe that were one when it was added: 1 in metric maps."""
+        """Length in today's map units, around a keyframe, of what was one unit long when the
+        keyframe was added: 1 in metric maps."""
         ...
 
 
 class FrameTable(NamedTuple):
-    """The poses of N frames. ``unit_scale`` (N,) f8 is that of the keyframe ``reference`` (N,) i8
-    when ``T_c_reference`` (N, 4, 4) f8 was measured; ``timestamp`` (N,) f8 seconds; ``tracked``
-    (N,) bool: not only predicted."""
+    """The poses of N frames.
+
+    Attributes:
+        timestamp: ``(N,)`` float64 seconds.
+        reference: ``(N,)`` int64, the keyframe that each pose is relative to.
+        T_c_reference: ``(N, 4, 4)`` float64.
+        tracked: ``(N,)`` bool, False where the pose is only predicted.
+        unit_scale: ``(N,)`` float64, the unit scale of ``reference`` when ``T_c_reference`` was
+            measured.
+    """
 
     timestamp: NDArray[np.float64]
     reference: NDArray[np.int64]
@@ -45,7 +53,7 @@ class FrameTable(NamedTuple):
     unit_scale: NDArray[np.float64]
 
     def until(self, frames: int) -> FrameTable:
-        """The first ones."""
+        """The first ``frames`` frames."""
         return FrameTable._make(values[:frames] for values in self)
 
 
@@ -60,10 +68,10 @@ def _room_for(frames: int) -> FrameTable:
 
 
 class FramePoses:
-    """The poses of all frames, in order; those before the first keyframe are in the world."""
+    """The poses of all frames, in order; before the first keyframe, relative to the world."""
 
     def __init__(self, keyframes: KeyframePoses, before: FrameTable | None = None) -> None:
-        """``before``: frames of the same drive that were placed already."""
+        """``before``: the poses of earlier frames of the same drive."""
         self._keyframes = keyframes
         self._n = 0 if before is None else len(before.timestamp)
         self._frames = _room_for(max(1024, self._n))
@@ -75,7 +83,7 @@ class FramePoses:
             mine[: len(values)] = values
 
     def table(self) -> FrameTable:
-        """A copy of all frames."""
+        """A copy of the poses of all frames."""
         return FrameTable._make(values.copy() for values in self._frames.until(self._n))
 
     def __len__(self) -> int:
@@ -83,18 +91,19 @@ class FramePoses:
 
     @property
     def unit(self) -> float:
-        """``unit_scale`` of the reference keyframe, 1 before there is one."""
+        """``unit_scale`` of the reference keyframe; 1 while there is none."""
         keyframes = self._keyframes
         return keyframes.unit_scale(keyframes.reference) if keyframes.n_keyframes else 1.0
 
     def timestamp(self, index: int) -> float:
-        """Seconds, of a frame; the last one is -1."""
+        """Timestamp of a frame in seconds; index -1 is the last frame."""
         return float(self._frames.timestamp[self._number(index)])
 
     def append(self, timestamp: float, T_cw: Matrix, *, tracked: bool) -> None:
-        """Place the next frame.
+        """Append the pose of the next frame.
 
         Args:
+            timestamp: seconds.
             tracked: False for a pose that is only predicted.
         """
         if self._n == len(self._frames.timestamp):
@@ -106,13 +115,13 @@ class FramePoses:
         self.follow_reference(self._n - 1, T_cw)
 
     def replace(self, index: int, keyframe: int) -> None:
-        """A frame has become a keyframe: from now on it is where that is."""
+        """Give a frame that became a keyframe the pose of that keyframe."""
         unit = self._keyframes.unit_scale(keyframe)
         self._frames.tracked[self._number(index)] = True
         self._set(index, keyframe, np.eye(4), unit)
 
     def follow_reference(self, index: int, T_cw: Matrix) -> None:
-        """The reference keyframe is another one: from now on a frame at ``T_cw`` follows that."""
+        """Make the pose ``T_cw`` of a frame relative to the present reference keyframe."""
         keyframes = self._keyframes
         reference = keyframes.reference
         T_rw = keyframes.keyframe_pose(reference) if keyframes.n_keyframes else np.eye(4)
@@ -130,7 +139,7 @@ class FramePoses:
         return index % self._n
 
     def pose(self, index: int) -> Matrix:
-        """``T_cw`` of a frame as its keyframe is placed now; the last one is -1."""
+        """``T_cw`` of a frame, from the present pose of its keyframe; index -1 is the last one."""
         index = self._number(index)
         T_c_reference = self._frames.T_c_reference[index].copy()
         if self._keyframes.n_keyframes == 0:
@@ -142,8 +151,11 @@ class FramePoses:
         return T_c_reference @ self._keyframes.keyframe_pose(reference)
 
     def trajectory(self) -> Trajectory:
-        """Pose of every frame, those that were only predicted interpolated between the frames
-        tracked before and after; those before the first one tracked stand where that is."""
+        """The pose of every frame.
+
+        Predicted poses are replaced by an interpolation between the tracked frames before and
+        after. Frames before the first tracked one get its pose.
+        """
         frames = self._frames.until(self._n)
         poses = [inverse(self.pose(k)) for k in range(self._n)]
         T_wc = np.array(poses, np.float64).reshape(-1, 4, 4)

@@ -1,4 +1,4 @@
-"""SE(3) algebra, for NumPy callers and for kernels alike.
+"""SE(3) algebra that both Python code and Numba kernels call.
 
 Conventions. Camera frame: x right, y down, z forward. World: the first left camera. ``T_a_b`` is a
 4x4 float64 matrix that maps points of frame b to frame a; ``T_cw`` is used where points are
@@ -113,10 +113,14 @@ def se3_log(T: Matrix) -> Matrix:
 
 @kernel
 def solve_positive(H: Matrix, b: Matrix) -> Matrix:
-    """Solve a small symmetric positive definite system by Cholesky; zeros if it is not.
+    """Solve ``H x = b`` for a small symmetric positive definite ``H`` by Cholesky.
 
     Args:
-        H: ``(n, n)``, of which the lower triangle is read; b: ``(n,)``.
+        H: ``(n, n)``; only the lower triangle is read.
+        b: ``(n,)``.
+
+    Returns:
+        ``(n,)`` the solution, or zeros if ``H`` is not positive definite.
     """
     n = len(b)
     L = np.zeros((n, n))
@@ -147,10 +151,10 @@ def solve_positive(H: Matrix, b: Matrix) -> Matrix:
 
 @kernel
 def symmetric_eigen(A: Matrix) -> tuple[Matrix, Matrix]:
-    """Eigenvalues ``(n,)``, in no order, and eigenvectors (columns) of a small symmetric matrix.
+    """Unsorted eigenvalues ``(n,)`` and eigenvectors (columns) of a small symmetric matrix.
 
-    Cyclic Jacobi rotations (Golub and Van Loan, "Matrix Computations", 8.5): exact to round-off,
-    and multiple eigenvalues do no harm.
+    Cyclic Jacobi rotations (Golub and Van Loan, "Matrix Computations", 8.5), which are exact to
+    round-off even for multiple eigenvalues.
     """
     n = len(A)
     D, V = A.copy(), np.eye(n)

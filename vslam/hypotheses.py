@@ -1,8 +1,8 @@
-"""The pose graph of a loop under two hypotheses about where the camera was lost.
+"""The pose graph of a loop under two hypotheses about how the camera moved while it was lost.
 
-Where tracking was lost a new sub-map begins, and its place in the map is only predicted. Either the
-camera went on about as predicted, so that the prediction is a measurement with a known error; or it
-was kidnapped, that is carried to an unknown place, and the prediction says nothing. A loop is tried
+Where tracking was lost, a new sub-map begins whose place in the map is only predicted. Either the
+camera moved about as predicted, and the prediction is a measurement with a known error; or it was
+kidnapped, that is, carried to an unknown place, and the prediction is worthless. A loop is tried
 under the first hypothesis, then under the second.
 """
 
@@ -38,7 +38,7 @@ from vslam.map import Map
 class Hypothesis(Enum):
     """What the camera did while tracking was lost."""
 
-    PREDICTED = "it went on about as predicted"
+    PREDICTED = "it moved about as predicted"
     KIDNAPPED = "it was carried to an unknown place"
 
 
@@ -50,7 +50,7 @@ class Solution:
         graph: N keyframes, with the poses that the optimisation started from.
         T_cw: ``(N, 4, 4)`` optimised poses.
         S_wc: ``(N, 4, 4)`` the same as similarities, whose scale is 1 in a metric map.
-        verdict: whether the edges of the optimised graph agree.
+        verdict: whether the edges of the optimised graph are consistent.
     """
 
     graph: PoseGraph
@@ -60,8 +60,8 @@ class Solution:
 
     @property
     def has_gaps(self) -> bool:
-        """Whether tracking was lost between keyframes of the graph, so that the other hypothesis
-        may give another solution."""
+        """Whether tracking was lost between keyframes of the graph; only then can the two
+        hypotheses give different solutions."""
         return bool(np.isin(self.graph.kind, (GAP, WEAK)).any())
 
 
@@ -74,12 +74,12 @@ def solve(
     *,
     monocular: bool,
 ) -> Solution:
-    """Build and optimise the pose graph with a new loop. Only reads the map.
+    """Build and optimise the pose graph with a new loop. The map is only read.
 
     Args:
-        closed: loops that were closed before, in today's units.
+        closed: loops that were closed before, in the map's present units.
         edge: the new loop, with its pose.
-        monocular: whether scale drifts, too, so that keyframes have similarities.
+        monocular: whether scale drifts too, so that similarities are optimised.
     """
     predicted = hypothesis is Hypothesis.PREDICTED
     graph = essential_graph(
@@ -92,7 +92,7 @@ def solve(
     )
     T_cw = map_.arrays.T_cw[: map_.n_keyframes]
     if monocular:
-        S_wc = inverses(T_cw) if predicted else _similarly_aligned(map_, closed, edge)
+        S_wc = inverses(T_cw) if predicted else _aligned_similarities(map_, closed, edge)
         start = S_wc[graph.keyframes]
         found = optimise_similarities(graph, start, config)
         verdict = check_similarity_graph(graph, start, found, config)
@@ -104,7 +104,7 @@ def solve(
 
 
 def joined_submaps(map_: Map, closed: Sequence[LoopEdge]) -> NDArray[np.int64]:
-    """``(n_keyframes,)`` sub-map of each keyframe; those joined by closed loops count as one."""
+    """``(n_keyframes,)`` sub-map of each keyframe; sub-maps joined by closed loops count as one."""
     submap = map_.submaps()
     for edge in closed:
         one, other = submap[edge.query], submap[edge.match]
@@ -113,8 +113,8 @@ def joined_submaps(map_: Map, closed: Sequence[LoopEdge]) -> NDArray[np.int64]:
 
 
 def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
-    """Start poses ``T_cw`` ``(n_keyframes, 4, 4)`` of a kidnapped camera: the sub-map that a loop
-    joins to another is moved as a whole to where the loop puts it."""
+    """Initial ``(n_keyframes, 4, 4)`` ``T_cw`` for a kidnapped camera: the sub-map at one end of
+    the loop is moved rigidly to where the loop places it."""
     T_cw = map_.arrays.T_cw[: map_.n_keyframes].copy()
     moving, keyframes = _moving_submap(map_, closed, edge)
     assert edge.T_query_match is not None
@@ -128,9 +128,9 @@ def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
     return T_cw
 
 
-def _similarly_aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
-    """``_aligned`` for a monocular map: similarities ``S_wc``, since the sub-map that moves takes
-    on the unit of the other one."""
+def _aligned_similarities(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
+    """``_aligned`` for a monocular map: similarities ``S_wc``, since the sub-map that moves adopts
+    the unit of the other one."""
     T_cw = map_.arrays.T_cw[: map_.n_keyframes]
     S_wc = inverses(T_cw)
     moving, keyframes = _moving_submap(map_, closed, edge)
@@ -148,11 +148,11 @@ def _similarly_aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) ->
 def _moving_submap(
     map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge
 ) -> tuple[int, NDArray[np.int64]]:
-    """The end of a loop whose sub-map is moved to the other end's, and the keyframes of that
-    sub-map; no keyframes if both ends are in one sub-map."""
+    """The end of a loop whose sub-map moves, and the keyframes of that sub-map; there are none if
+    both ends lie in one sub-map."""
     submap = joined_submaps(map_, closed)
     if submap[edge.query] == submap[edge.match]:
         return edge.query, np.empty(0, np.int64)
-    # The sub-map of the first keyframe defines the world. Of two others, the query's moves.
+    # The sub-map of the first keyframe defines the world and never moves.
     moving = edge.match if submap[edge.query] == submap[0] else edge.query
     return moving, np.flatnonzero(submap == submap[moving])

@@ -1,9 +1,9 @@
-"""How fast points of a rectified pair move in its images, and columns of a right image that was
-taken later than the left one.
+"""Image velocities of points in a rectified stereo pair, and the correction of the right image's
+columns if the right camera exposes later than the left one.
 
-With depth z, a twist [v, w] moves the point (x, y, 1) z of the left camera so that its image moves
-as in Longuet-Higgins and Prazdny (Proc. R. Soc. B, 1980), eq. 2.9 to 2.11; the signs are those of
-points that move past a camera. In the right camera x is less by the baseline over z.
+The velocities are those of Longuet-Higgins and Prazdny (Proc. R. Soc. B, 1980), eq. 2.9 to 2.11,
+for the point (x, y, 1) z of the left camera. The twist [v, w] here is that of the points relative
+to the camera, hence the signs. In the right camera x is smaller by the baseline divided by z.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _ROUNDS = 3  # the speed depends on the disparity, and the disparity on the spee
 def rays(
     xy: NDArray[np.float32], camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``(N,)`` each: x and y at depth 1 in the left camera, of ``(N, 2)`` pixels."""
+    """``(N,)`` x and ``(N,)`` y at depth 1 in the left camera, for ``(N, 2)`` pixels."""
     u, v = xy.astype(np.float64).T
     return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
 
@@ -29,7 +29,8 @@ def rays(
 def row_speeds(
     x: NDArray[np.float64], y: NDArray[np.float64], inverse_depth: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """``(N, 6)`` derivatives of the row by the twist, in focal lengths; alike in both images."""
+    """``(N, 6)`` derivative of a point's row velocity with respect to the twist, in focal lengths;
+    it is the same in both images."""
     zero = np.zeros_like(x)
     return np.column_stack([zero, inverse_depth, -y * inverse_depth, -1.0 - y * y, x * y, x])
 
@@ -40,7 +41,8 @@ def column_speeds(
     inverse_depth: NDArray[np.float64],
     baseline: float,
 ) -> NDArray[np.float64]:
-    """The same of the column in the right image."""
+    """``(N, 6)`` derivative of a point's column velocity in the right image with respect to the
+    twist, in focal lengths."""
     zero, right = np.zeros_like(x), x - baseline * inverse_depth
     return np.column_stack(
         [inverse_depth, zero, -right * inverse_depth, -right * y, 1.0 + right * x, -y]
@@ -57,9 +59,9 @@ def columns_without_delay(
     """``(N,)`` columns in the right image as if it had been taken ``delay`` seconds earlier.
 
     Args:
-        xy: ``(N, 2)`` in the left image.
-        u_right: ``(N,)``; NaN stays NaN.
-        twist: ``(6,)`` of the points against the camera, per second.
+        xy: ``(N, 2)`` pixels in the left image.
+        u_right: ``(N,)`` columns in the right image; NaN stays NaN.
+        twist: ``(6,)`` of the points relative to the camera, per second.
     """
     x, y = rays(xy, camera)
     seen = xy[:, 0].astype(np.float64) - u_right

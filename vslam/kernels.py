@@ -1,20 +1,20 @@
 """How vslam compiles its kernels, and the bit arithmetic that several of them share.
 
-A kernel is compiled once for each machine, kept in Numba's cache, and holds no GIL: threads of
-the pipeline run kernels side by side. ``error_model="numpy"`` and fused multiply-add are the only
-liberties; no re-association, so that a result never depends on how a loop was vectorised.
+A kernel is compiled once on each machine and kept in Numba's cache. It releases the GIL, so that
+threads of the pipeline run kernels side by side. ``error_model="numpy"`` and fused multiply-add are
+the only relaxations; without re-association, a result never depends on how a loop was vectorised.
 
-Numba makes itself ready to compile before it looks into its cache: it imports all that it can
-compile, and scipy for the linear algebra, 0.25 s of CPU time. With each kernel it loads the
-environments of all functions in it, for which it imports their modules, and parses the code that
-would be needed to inline the kernel into another one. A run that finds all kernels in the cache
-compiles none, and needs none of these: ``_KernelCache`` leaves them out, or to when a kernel is
-compiled. Loading takes a fifth of the time. What is written is in Numba's format. This uses inner
-workings of Numba: with a release that it was not tested with, Numba's own cache is taken.
+Numba prepares to compile before it looks into its cache: it imports everything that it can compile,
+and scipy for the linear algebra, which takes 0.25 s of CPU time. For each kernel it also loads the
+environments of all functions in it, which imports their modules, and parses the code that would be
+needed to inline the kernel into another one. A run that finds all kernels in the cache needs none
+of this. ``_KernelCache`` skips it, or defers it until a kernel is compiled, and so loads kernels in
+a fifth of the time. Its files have Numba's format. It relies on Numba's internals: with a release
+of Numba that it was not tested with, Numba's own cache is used.
 
-A cache never ends a run. Files that a power cut damaged are found by their checksum and written
-again; code cut short would abort Python. Where no folder can be written to, neither beside the
-source nor in the home, the process has a temporary cache.
+A cache problem never ends a run. Files that a power cut damaged are found by their checksum and
+written again; truncated code would abort Python. If neither the folder of the source nor the home
+folder is writable, the process uses a temporary cache.
 """
 
 from __future__ import annotations
@@ -55,16 +55,16 @@ _OPTIONS: dict[str, Any] = {
 
 
 class _KernelFormat(CompileResultCacheImpl):
-    """What of a kernel is written, and how it is loaded."""
+    """Which parts of a kernel are written to its cache file, and how they are loaded."""
 
     def reduce(self, compiled: Any) -> tuple[Any, ...]:
         *parts, environments = super().reduce(compiled)
-        # One without constants has nothing that code without Python objects could ask for.
+        # Code without Python objects needs nothing of an environment without constants.
         return *parts, tuple(one for one in environments if one.consts)
 
     def rebuild(self, target_context: Any, payload: tuple[Any, ...]) -> Any:
         (name, kind, (machine_code, bitcode)), function, *rest = payload
-        # What Python calls; a kernel that only kernels call has none.
+        # The entry point for calls from Python, which an inner kernel lacks.
         entry = function.llvm_cpython_wrapper_name
         if entry.encode() in machine_code:
             target_context.codegen()._engine._defined_symbols.add(entry)
@@ -82,7 +82,7 @@ def _no_bitcode() -> bytes:
 
 
 def _parsed(library: Any, bitcode: bytes) -> Any:
-    """The module to inline a loaded kernel from, once another kernel that calls it is compiled."""
+    """The LLVM module of a loaded kernel, parsed when another kernel inlines it."""
     if library._shared_module is None:
         module = llvm.parse_bitcode(bitcode)
         library.codegen._engine._load_defined_symbols(module)
@@ -97,12 +97,12 @@ def _warn(message: str) -> None:
 
 
 class _CheckedFiles(IndexDataCacheFile):
-    """The files of a kernel's cache: those with code end with the checksum of what goes before."""
+    """The cache files of a kernel; those with code end with a checksum of the code."""
 
     def _load_index(self) -> dict[Any, str]:
         try:
             return dict(super()._load_index())
-        except Exception:  # unpickling damaged bytes raises anything
+        except Exception:  # unpickling damaged bytes may raise any exception
             _warn(_DAMAGED)
             return {}
 
@@ -143,42 +143,42 @@ class _KernelCache(FunctionCache):
             _warn(f"Compiled kernels cannot be kept ({error.strerror}); each run compiles them.")
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        rtsys.initialize(target_context)  # the functions that count references
+        rtsys.initialize(target_context)  # loaded kernels call Numba's reference counting
         with self._guard_against_spurious_io_errors():
             return self._load_overload(signature, target_context)
 
     def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
-        # Not what Numba wrote itself, with every environment.
+        # Never load an entry that Numba itself wrote, without a checksum.
         return (*super()._index_key(signature, codegen), "vslam, with checksums")
 
 
 def _use_temporary_cache() -> None:
-    """Keep the kernels of this process, and of those that it starts, in a temporary folder."""
+    """Keep the kernels of this process and of its child processes in a temporary folder."""
     try:
         folder = tempfile.mkdtemp(prefix="vslam-kernels-")
     except OSError as error:
         raise InputError(
-            "No folder can be written to, and compiled kernels must be kept somewhere; set "
-            "NUMBA_CACHE_DIR to a writable folder."
+            "There is no writable folder for compiled kernels; set NUMBA_CACHE_DIR to a writable "
+            "folder."
         ) from error
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     config: Any = numba.config
     config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = folder
     _warn(
-        "There is no writable folder to keep compiled kernels in; each run compiles them, which "
-        "takes a minute. Set NUMBA_CACHE_DIR to a writable folder."
+        "There is no writable folder for compiled kernels, so each run compiles them, which takes "
+        "a minute. Set NUMBA_CACHE_DIR to a writable folder."
     )
 
 
 def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
-    """Numba's compiled function with a cache."""
+    """Compile a function with Numba and attach the cache."""
     made = numba.njit(**options)(function)
     if not isinstance(made, Dispatcher):  # NUMBA_DISABLE_JIT
         return made
     dispatcher: Any = made
     try:
         _enable_cache(dispatcher, function)
-    except RuntimeError:  # no folder of Numba's can be written to
+    except RuntimeError:  # none of Numba's cache folders is writable
         _use_temporary_cache()
         _enable_cache(dispatcher, function)
     return dispatcher
@@ -197,7 +197,7 @@ def kernel(function: Function) -> Function:
 
 
 def inner_kernel(function: Function) -> Function:
-    """A kernel that only kernels call: it compiles faster, since Python cannot call it."""
+    """Compile a function that only kernels call; without an entry point for Python it is faster."""
     return cast(Function, _cached(function, _OPTIONS | {"no_cpython_wrapper": True}))
 
 
@@ -208,7 +208,7 @@ def inline(function: Function) -> Function:
 
 @intrinsic
 def popcount(typing_context, value):
-    """Number of bits set in a uint64: one instruction."""
+    """Number of set bits of a uint64, as one instruction."""
 
     def generate(context, builder, signature, arguments):
         return builder.ctpop(arguments[0])
@@ -218,7 +218,7 @@ def popcount(typing_context, value):
 
 @intrinsic
 def trailing_zeros(typing_context, value):
-    """Number of the lowest bit set in a uint64 other than 0: one instruction."""
+    """Index of the lowest set bit of a non-zero uint64, as one instruction."""
 
     def generate(context, builder, signature, arguments):
         never_zero = context.get_constant(types.boolean, True)
@@ -229,10 +229,10 @@ def trailing_zeros(typing_context, value):
 
 @intrinsic
 def borrowed(typing_context, array):
-    """The same array without its count of references, valid while a caller holds the original.
+    """The same array without reference counting, valid while a caller holds the original.
 
-    Numba counts references where an array is handed to another function: an atomic operation each
-    time, which costs more than a small function does.
+    Numba counts a reference whenever an array is passed to another function. This atomic operation
+    costs more than a small function does.
     """
 
     def generate(context, builder, signature, arguments):

@@ -1,4 +1,4 @@
-"""One process at a time: the operating system's lock on a file."""
+"""A lock on a file that admits one process at a time."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from vslam.errors import InputError
 
 @contextmanager
 def locked(lock: Path, folder: Path, doing: str) -> Iterator[None]:
-    """Keep other processes from writing to a folder. The lock of a killed process ends with it.
+    """Keep other processes from writing to a folder; the lock also ends if its process is killed.
 
     Args:
-        lock: file to make and to remove.
-        folder: what it stands for, in the message.
-        doing: what its process does to that folder, "is rendering it".
+        lock: the lock file, which is created and removed.
+        folder: the folder that the lock protects, for the error message.
+        doing: what the process does to the folder, such as "is rendering it".
 
     Raises:
-        InputError: another process has the lock.
-        OSError: it cannot be made, on a file system without locks for example.
+        InputError: another process holds the lock.
+        OSError: the lock cannot be created, for example on a file system without locks.
     """
     while True:
         with lock.open("ab") as file:
@@ -34,7 +34,7 @@ def locked(lock: Path, folder: Path, doing: str) -> Iterator[None]:
                     f"{folder}: another process {doing}; wait until it is done."
                 ) from None
             if not _is_at(file, lock):
-                continue  # its owner has removed it since it was opened
+                continue  # its owner has removed the file since it was opened here
             try:
                 yield
             finally:

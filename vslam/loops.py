@@ -1,4 +1,4 @@
-"""What passes between loop detection, verification and correction, and what is kept of it."""
+"""The types that loop detection, verification and correction exchange and store."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class LoopCandidate:
-    """A keyframe that a detector takes for the place of another.
+    """A pair of keyframes that, according to a detector, show the same place.
 
     Attributes:
-        query: keyframe whose place is looked for; -1 for a frame that is not in the map.
-        match: keyframe of the same place, alive in the map.
-        score: the detector's own measure, greater is more alike.
-        alike: how much of the two images local descriptors of a network find alike, so that they
-            may verify what ORB's do not; None where they were not asked.
-        promising: whether its verifier wants to try it even if the consistency test refuses it.
-        proposed_by: name of the detector that found it; several are joined by ``+``.
+        query: keyframe whose place is searched for; -1 for a frame that is not in the map.
+        match: keyframe that shows the same place, alive in the map.
+        score: the detector's own measure; greater means more similar.
+        alike: similarity of the two images by the network's local descriptors, which tells whether
+            these may verify a candidate that ORB does not; None if it was not computed.
+        promising: whether the verifier tries it even if the consistency test refuses it.
+        proposed_by: name of the detector that proposed it; several names are joined by ``+``.
     """
 
     query: int
@@ -45,21 +45,21 @@ class Sighting(NamedTuple):
 
 @dataclass(frozen=True)
 class LoopEdge:
-    """What became of a candidate, accepted or not: rejected ones are kept for the report.
+    """The outcome of a candidate; rejected ones are kept for the report.
 
     Attributes:
         query, match, score, proposed_by: as in the candidate.
         accepted: whether the loop was closed.
-        reason: "closed", or in a few words what spoke against it.
+        reason: "closed", or in a few words why the candidate was rejected.
         n_matches: landmarks of the place matched to features of the query.
-        n_inliers: of these, how many agree with ``T_query_match``.
+        n_inliers: how many of these agree with ``T_query_match``.
         T_query_match: ``(4, 4)`` float64, maps the match's camera to the query's, in the unit of
-            the map around the match; None if the candidate fell before geometry was looked at.
+            the map around the match; None if the candidate was rejected before it was computed.
         features: ``(N,)`` int32, inlier features of the query (index within the keyframe).
         landmarks: ``(N,)`` int32, the landmark of the place that each of them observes.
-        scale: length around the query, in its unit, of what is 1 around the match: 1 in metric
-            maps, whatever drift made of it in monocular ones.
-        matched_by: "orb" or "learned", the descriptors that the geometry comes from.
+        scale: map units around the query per map unit around the match: 1 in metric maps; scale
+            drift changes it in monocular ones.
+        matched_by: "orb" or "learned", the descriptors that were matched.
     """
 
     query: int
@@ -83,7 +83,7 @@ class LoopEdge:
         reason: str = "",
         matched_by: Literal["orb", "learned"] = "orb",
     ) -> LoopEdge:
-        """The edge of a candidate that is not accepted yet, or for this reason."""
+        """The edge of a candidate that is not accepted (yet), with the reason if there is one."""
         return cls(
             candidate.query,
             candidate.match,
@@ -96,7 +96,7 @@ class LoopEdge:
 
 
 def loop_entry(loop: LoopEdge) -> dict[str, Any]:
-    """An edge for JSON, without its features and landmarks."""
+    """A loop as a JSON object, without its features and landmarks."""
     entry = {name: value for name, value in vars(loop).items() if name not in _LEFT_OUT}
     T = loop.T_query_match
     return entry | {"T_query_match": None if T is None else T.tolist()}
@@ -106,10 +106,10 @@ _LEFT_OUT = ("features", "landmarks")
 
 
 def loop_of(entry: dict[str, Any]) -> LoopEdge:
-    """The edge of an entry.
+    """The loop that ``loop_entry`` wrote.
 
     Raises:
-        KeyError, TypeError, ValueError: it is none.
+        KeyError, TypeError, ValueError: the entry does not describe a loop.
     """
     T = entry["T_query_match"]
     T_query_match = None if T is None else np.array(T, np.float64).reshape(4, 4)
@@ -118,13 +118,13 @@ def loop_of(entry: dict[str, Any]) -> LoopEdge:
 
 @dataclass(frozen=True)
 class LoopCorrection:
-    """What one closed loop did to the map.
+    """How one closed loop corrected the map.
 
     Attributes:
         edge: the loop.
-        keyframes: ``(N,)`` living keyframes at the time.
+        keyframes: ``(N,)`` the keyframes that were alive at the time.
         T_cw_before, T_cw_after: ``(N, 4, 4)`` their poses before and after the pose graph.
-        seconds: wall time of the correction, global bundle adjustment not included.
+        seconds: wall time of the correction without the global bundle adjustment.
     """
 
     edge: LoopEdge
@@ -135,18 +135,18 @@ class LoopCorrection:
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The numbers ``first[i] ... first[i] + count[i] - 1`` of each of N ranges, in one row."""
+    """Concatenate N ranges: ``first[i] ... first[i] + count[i] - 1`` for each i."""
     before = np.cumsum(count) - count
     return np.arange(int(count.sum()), dtype=np.int64) + np.repeat(first - before, count)
 
 
 @dataclass(frozen=True)
 class PerKeyframe:
-    """Something of each of K keyframes, of any length each: words, a descriptor, an image file.
+    """Values of different length for each of K keyframes: words, a descriptor, an image file.
 
     Attributes:
-        first: ``(K + 1,)`` int64, where that of each keyframe begins.
-        values: ``(N, ...)``; those of keyframe k are ``values[first[k]:first[k + 1]]``.
+        first: ``(K + 1,)`` int64 offsets.
+        values: ``(N, ...)``; keyframe k has ``values[first[k]:first[k + 1]]``.
     """
 
     first: NDArray[np.int64]
@@ -156,30 +156,30 @@ class PerKeyframe:
         return len(self.first) - 1
 
     def of(self, keyframe: int) -> NDArray:
-        """What a keyframe has."""
+        """The values of a keyframe."""
         return self.values[self.first[keyframe] : self.first[keyframe + 1]]
 
     def select(self, keyframes: NDArray[np.int64]) -> PerKeyframe:
-        """Those of ``(M,)`` keyframes, numbered anew; of keyframes not known here, nothing."""
+        """The values of ``(M,)`` keyframes, renumbered from 0; unknown keyframes have none."""
         nothing = self.values[:0]
         parts = [self.of(k) if k < len(self) else nothing for k in keyframes.tolist()]
         first = np.cumsum([0, *map(len, parts)]).astype(np.int64)
         return PerKeyframe(first, np.concatenate([nothing, *parts]))
 
     def followed_by(self, other: PerKeyframe) -> PerKeyframe:
-        """Those of another map's keyframes appended."""
+        """These values, then those of another map's keyframes."""
         first = np.concatenate([self.first, self.first[-1] + other.first[1:]])
         return PerKeyframe(first, np.concatenate([self.values, other.values]))
 
 
 @dataclass(frozen=True)
 class DetectorMemory:
-    """What a loop detector knows of keyframes, for a file.
+    """What a loop detector has stored about keyframes, in a form that can be saved.
 
     Attributes:
-        name: of the detector.
-        fingerprint: of the vocabulary or weights that it was made with.
-        tables: by the detector's own names.
+        name: name of the detector.
+        fingerprint: checksum of the vocabulary or weights that it used.
+        tables: its values for each keyframe, by names that the detector chooses.
     """
 
     name: str = "none"
@@ -191,7 +191,7 @@ class DetectorMemory:
 class ResembledPlace:
     """A place that resembled recent keyframes: a candidate with its covisible keyframes.
 
-    ``length`` keyframes in a row resembled it, ``age`` keyframes ago the last of them.
+    ``length`` consecutive keyframes resembled it, the last of them ``age`` keyframes ago.
     """
 
     keyframes: frozenset[int]

@@ -1,4 +1,4 @@
-"""This machine and this process. Nothing heavy is imported to find it out."""
+"""Properties of this machine and this process, found without slow imports."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-# Of glibc's malloc.h.
+# From glibc's malloc.h.
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
 KEPT_BYTES = 1 << 28
 _PACKAGES = (
@@ -30,7 +30,7 @@ _PACKAGES = (
 
 
 def versions() -> dict[str, str]:
-    """Version of Python and of each package that is installed."""
+    """Version of Python and of each listed package that is installed."""
     found = {"python": platform.python_version()}
     for name in _PACKAGES:
         try:
@@ -41,7 +41,7 @@ def versions() -> dict[str, str]:
 
 
 def opencv_conflict(found: dict[str, str]) -> str | None:
-    """A warning where two wheels that overwrite each other's ``cv2`` are installed."""
+    """A warning if several wheels that overwrite each other's ``cv2`` are installed, else None."""
     wheels = [name for name in found if name.startswith("opencv-")]
     if len(wheels) < 2:
         return None
@@ -52,7 +52,7 @@ def opencv_conflict(found: dict[str, str]) -> str | None:
 
 
 def available_cores() -> int:
-    """Cores that this process may use, which in a container are fewer than the machine has."""
+    """Number of cores that this process may use; a container may have fewer than its machine."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -61,7 +61,8 @@ def available_cores() -> int:
 def process_age() -> float:
     """Seconds since this process started."""
     with suppress(OSError, AttributeError):  # not Linux
-        # The name, in brackets, may have any characters; field 22 counts ticks since the boot.
+        # The process name, in brackets, may contain spaces; field 22 is the start time in ticks
+        # since boot.
         started = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
         return time.clock_gettime(time.CLOCK_BOOTTIME) - int(started) / os.sysconf("SC_CLK_TCK")
     import psutil
@@ -70,10 +71,10 @@ def process_age() -> float:
 
 
 def peak_memory_mb() -> float:
-    """Most memory that this process has held so far."""
+    """Peak resident memory of this process so far, in MB (2**20 bytes)."""
     import resource
 
-    # Linux's getrusage counts what the parent had before this process was its own program.
+    # Linux's getrusage includes the memory of the parent process from before exec.
     with suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
@@ -83,11 +84,11 @@ def peak_memory_mb() -> float:
 
 
 def keep_memory() -> None:
-    """Let the C library keep large blocks that are freed, for the next frame's images.
+    """Let the C library keep large freed blocks for the next frame's images.
 
-    It gives them back to the system otherwise, which must clear each page again: 150,000 faults in
-    216 frames of KITTI, a thirtieth of the CPU time. All threads share what is kept; otherwise each
-    keeps what it once needed, 40 MB together. Nothing where the library is not glibc.
+    By default it returns them to the system, which must clear each page again: 150,000 page faults
+    in 216 frames of KITTI, a thirtieth of the CPU time. One arena serves all threads, which saves
+    40 MB against an arena for each thread. Does nothing if the C library is not glibc.
     """
     import ctypes
 
@@ -99,7 +100,7 @@ def keep_memory() -> None:
 
 
 def give_back_memory() -> None:
-    """Give the system what ``keep_memory`` has kept and nobody uses. Nothing without glibc."""
+    """Return the unused memory that ``keep_memory`` retained to the system (glibc only)."""
     import ctypes
 
     with suppress(OSError, AttributeError):
@@ -107,7 +108,7 @@ def give_back_memory() -> None:
 
 
 def cpu_name() -> str:
-    """The processor's name as its maker writes it."""
+    """The processor's model name."""
     # platform.processor() is empty or just "x86_64" on Linux.
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -121,13 +122,13 @@ def cpu_name() -> str:
 
 @dataclass
 class StageClock:
-    """Wall time by stage, in milliseconds, since it was made."""
+    """Wall time of each stage, in milliseconds."""
 
     ms: dict[str, float] = field(default_factory=dict)
     last: float = field(default_factory=time.perf_counter)
 
     def lap(self, stage: str) -> None:
-        """The time since the last lap belongs to a stage."""
+        """Add the time since the last lap to a stage."""
         now = time.perf_counter()
         self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (now - self.last)
         self.last = now

@@ -1,10 +1,11 @@
 """The map: keyframes, landmarks and observations as a structure of arrays.
 
-A *row* is one keypoint of one keyframe; rows of a keyframe are consecutive. The table of rows is
-the table of observations too: ``landmark[row]`` names the landmark that the keypoint observes, and
-``next_row`` chains the rows of each landmark. Nothing is derived twice: covisibility is counted
-from the rows when it is needed (after DPVO's PatchGraph, arrays instead of objects). Ids of
-keyframes are never reused, those of landmarks until dead ones are dropped; arrays grow by half.
+A *row* is one keypoint of one keyframe; the rows of a keyframe are consecutive. The table of rows
+is also the table of observations: ``landmark[row]`` is the landmark that the keypoint observes, and
+``next_row`` links the rows of each landmark into a chain. Covisibility is not stored, but counted
+from the rows when it is needed. Arrays instead of objects follow DPVO's PatchGraph. Ids of
+keyframes are never reused; ids of landmarks change only when dead landmarks are dropped. Arrays
+grow by half their size.
 
 To add a column, declare it in ``Arrays`` or ``KeyframeTable`` with an empty array of its dtype and
 shape as the default. A number that describes the map as a whole belongs in ``Scalars``. It is then
@@ -31,18 +32,20 @@ _FEW_LANDMARKS = 8192  # 1 MB
 
 
 class Arrays(NamedTuple):
-    """The map as kernels see it. K keyframes, L landmarks, R rows (capacities, not counts).
+    """The part of the map that kernels read and write, as arrays of capacity K keyframes, L
+    landmarks and R rows.
 
     Keyframes: ``T_cw`` (K, 4, 4) f8; ``first_row`` (K + 1,) i8; ``keyframe_alive`` (K,) bool.
     Landmarks: ``xyz`` (L, 3) f8 world; ``normal`` (L, 3) f8 mean viewing direction;
-    ``distance_range`` (L, 2) f8 least and greatest distance at which the pyramid sees it;
-    ``landmark_descriptor`` (L, 4) u8; ``first_keyframe`` (L,) i4; ``visible``, ``found`` (L,) i4
-    frames that should, and did, see it; ``landmark_alive`` (L,) bool; ``merged_into`` (L,) i4;
-    ``head`` (L,) i4 first row of its chain; ``n_observations`` (L,) i4, stereo ones counting twice
-    (ORB-SLAM2).
-    Rows: ``xy`` (R, 2) f4; ``u_right`` (R,) f4; ``octave`` (R,) u1; ``angle`` (R,) f4;
-    ``descriptor`` (R, 4) u8; ``keyframe`` (R,) i4; ``landmark``, ``next_row`` (R,) i4;
-    ``certainty`` (R,) u1 how many times smaller the variance of ``xy`` is than that of a keypoint.
+    ``distance_range`` (L, 2) f8 least and greatest distance at which the pyramid detects it;
+    ``landmark_descriptor`` (L, 4) u8; ``first_keyframe`` (L,) i4 that observed it; ``visible``,
+    ``found`` (L,) i4 number of frames in which it should be, and was, found; ``landmark_alive``
+    (L,) bool; ``merged_into`` (L,) i4; ``head`` (L,) i4 first row of its chain; ``n_observations``
+    (L,) i4, in which a stereo observation counts twice (ORB-SLAM2).
+    Rows: ``xy`` (R, 2) f4 pixels; ``u_right`` (R,) f4; ``octave`` (R,) u1; ``angle`` (R,) f4
+    radians; ``descriptor`` (R, 4) u8; ``keyframe`` (R,) i4; ``landmark``, ``next_row`` (R,) i4;
+    ``certainty`` (R,) u1, the variance of a keypoint over the variance of ``xy``.
+    The types are NumPy's: f8 is float64, u8 is uint64. An id of -1 means none.
     """
 
     T_cw: NDArray[np.float64] = np.zeros((0, 4, 4))
@@ -79,17 +82,16 @@ PREDICTED, UNPREDICTED = 1, 2  # values of KeyframeTable.restart
 
 
 class KeyframeTable(NamedTuple):
-    """What is known of keyframes besides ``Arrays``; kernels do not need it. K keyframes (their
-    capacity, not their count).
+    """The columns of keyframes that kernels do not need, with a capacity of K keyframes.
 
-    ``timestamp`` (K,) f8 seconds; ``frame`` (K,) i8 index of the frame it was made of;
+    ``timestamp`` (K,) f8 seconds; ``frame`` (K,) i8 index of the frame that became the keyframe;
     ``parent`` (K,) i8 its parent in the spanning tree, or -1;
-    ``session`` (K,) i8 the drive, counted from 0, that its time and its frame belong to;
-    ``unit_scale`` (K,) f8 how many of today's units of the map around it were one unit when it was
-    added: 1 in metric maps, while the loops of monocular maps change it;
+    ``session`` (K,) i8 the drive, counted from 0, that its timestamp and frame index belong to;
+    ``unit_scale`` (K,) f8 length in the map's present units, around the keyframe, of what was one
+    unit long when it was added: 1 in metric maps; loops of monocular maps change it;
     ``T_c_parent`` (K, 4, 4) f8 the pose of a culled keyframe relative to its parent, identity while
     the keyframe is alive;
-    ``restart`` (K,) u1 whether mapping began anew at this keyframe after the camera was lost, which
+    ``restart`` (K,) u1 whether mapping restarted at this keyframe after the camera was lost, which
     makes it the root of a sub-map: 0 if not; ``PREDICTED`` if its pose relative to its parent is a
     prediction; ``UNPREDICTED`` if it is not even that, because the speed of the camera was unknown.
     """
@@ -105,12 +107,12 @@ class KeyframeTable(NamedTuple):
 
 @dataclass(frozen=True)
 class Scalars:
-    """What is known of the map as a whole.
+    """Numbers that describe the map as a whole.
 
     Attributes:
-        session: the drive of the keyframes to come.
-        disparity_offset: pixels by which the pair sees every disparity too small; ``u_right`` of
-            all rows is free of it (``backend/disparity_offset.py``).
+        session: the drive that new keyframes belong to.
+        disparity_offset: pixels by which the stereo pair measures every disparity too small;
+            ``u_right`` of all rows is corrected for it (``backend/disparity_offset.py``).
         offset_information: inverse variance of the measurements behind ``disparity_offset``.
         calibrated_until: the newest keyframe that those measurements used, or -1.
     """
@@ -128,13 +130,13 @@ def _grown(array: NDArray, capacity: int) -> NDArray:
 
 
 class Map:
-    """Growable map. One writer at a time: the caller orders tracking and local mapping.
+    """A growable map. Callers must ensure that there is one writer at a time.
 
     Attributes:
-        arrays: everything that kernels touch.
-        keyframes: what else is known of each keyframe.
-        scalars: what is known of the map as a whole.
-        n_keyframes, n_landmarks, n_rows: how much of the capacity is in use, dead ones included.
+        arrays: the columns that kernels use.
+        keyframes: the other columns of keyframes.
+        scalars: numbers that describe the map as a whole.
+        n_keyframes, n_landmarks, n_rows: how much of the capacity is in use, with dead entries.
     """
 
     def __init__(self, scales: NDArray[np.float64]) -> None:
@@ -177,12 +179,12 @@ class Map:
 
     @property
     def restarts(self) -> list[int]:
-        """Keyframes at which mapping began anew after the camera was lost, in order."""
+        """Keyframes at which mapping restarted after the camera was lost, in order."""
         return np.flatnonzero(self.keyframes.restart[: self.n_keyframes]).tolist()
 
     @property
     def unpredicted_restarts(self) -> list[int]:
-        """Those of ``restarts`` whose pose is not even a prediction."""
+        """The ``restarts`` whose pose is not even a prediction."""
         unpredicted = self.keyframes.restart[: self.n_keyframes] == UNPREDICTED
         return np.flatnonzero(unpredicted).tolist()
 
@@ -191,7 +193,7 @@ class Map:
         if used + extra <= capacity:
             return
         target = max(used + extra, capacity + capacity // 2)
-        for name in fields:  # one after the other: two copies of all of them are much memory
+        for name in fields:  # one by one, so that only one column exists twice in memory
             grown = _grown(getattr(self.arrays, name), target + (name == "first_row"))
             self.arrays = self.arrays._replace(**{name: grown})
 
@@ -212,7 +214,11 @@ class Map:
         """Append a keyframe without observations; returns its id.
 
         Args:
-            certainty: ``(N,)`` of the features.
+            features: the N features of the keyframe.
+            T_cw: ``(4, 4)`` its pose.
+            timestamp: seconds.
+            frame: index of the frame that becomes the keyframe.
+            certainty: ``(N,)`` certainty of the features (``Arrays``).
         """
         k, n = self.n_keyframes, len(features)
         self._reserve_keyframes(1)
@@ -244,7 +250,7 @@ class Map:
     ) -> NDArray[np.int32]:
         """Append ``(N, 3)`` landmarks first seen by ``keyframe``; returns their ``(N,)`` ids.
 
-        They have no observation yet: link them before the next use of the map.
+        They have no observation yet; link them before the map is used again.
         """
         n, start = len(xyz), self.n_landmarks
         self._reserve(LANDMARK_FIELDS, start, n)
@@ -260,8 +266,7 @@ class Map:
         return np.arange(start, start + n, dtype=np.int32)
 
     def columns(self) -> dict[str, NDArray]:
-        """Views of all columns of ``arrays`` and ``keyframes`` by name, without the capacity that
-        is not in use."""
+        """Views of all columns of ``arrays`` and ``keyframes`` by name, without unused capacity."""
         of_arrays = {
             name: getattr(self.arrays, name)[:size]
             for fields, size in (
@@ -276,7 +281,7 @@ class Map:
         return of_arrays | {name: column[: self.n_keyframes] for name, column in of_keyframes}
 
     def with_columns(self, columns: dict[str, NDArray]) -> Map:
-        """This map with other columns, as ``columns`` returns them; they are not copied."""
+        """This map with other columns, named as by ``columns``; they are not copied."""
         found = copy.copy(self)
         found.arrays = Arrays(**{name: columns[name] for name in Arrays._fields})
         found.keyframes = KeyframeTable(**{name: columns[name] for name in KeyframeTable._fields})
@@ -286,31 +291,31 @@ class Map:
         return found
 
     def copy(self) -> Map:
-        """A copy without the capacity that is not in use."""
+        """A copy without unused capacity."""
         return self.with_columns({name: column.copy() for name, column in self.columns().items()})
 
     def begin_drive(self) -> None:
-        """Let the keyframes to come belong to another drive."""
+        """Begin a new drive, which later keyframes belong to."""
         self.scalars = replace(self.scalars, session=self.scalars.session + 1)
 
     @property
     def many_dead_landmarks(self) -> bool:
-        """Whether dead landmarks take so much room that ``drop_dead_landmarks`` is worth it."""
+        """Whether dead landmarks take so much memory that ``drop_dead_landmarks`` is worth it."""
         living = int(np.count_nonzero(self.arrays.landmark_alive[: self.n_landmarks]))
         return self.n_landmarks - living > max(_FEW_LANDMARKS, living // 2)
 
     def drop_dead_landmarks(self) -> NDArray[np.int32]:
-        """Forget the landmarks that are dead; the others are numbered anew, in their order.
+        """Remove dead landmarks and renumber the others in their order.
 
-        Most landmarks die within a few keyframes of their birth.
+        Most landmarks die within a few keyframes of their creation.
 
         Returns:
-            ``(n_landmarks,)`` by old id, the new one of the landmark that it stands for
+            ``(n_landmarks,)`` for each old id, the new id of the landmark that it stands for
             (``resolve``), or -1.
         """
         a, living = self.arrays, self.living_landmarks()
         stands_for = resolve(a, np.arange(self.n_landmarks, dtype=np.int32))
-        new_id = np.full(self.n_landmarks + 1, NONE, np.int32)  # the last one is that of -1
+        new_id = np.full(self.n_landmarks + 1, NONE, np.int32)  # index -1, the last, gives -1
         new_id[living] = np.arange(len(living))
         for name in LANDMARK_FIELDS:
             values = getattr(a, name)
@@ -333,23 +338,24 @@ class Map:
     def covisible(
         self, keyframe: int, minimum: int = 1
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Keyframes sharing at least ``minimum`` landmarks, most first, and how many they share."""
+        """``(N,)`` keyframes that share at least ``minimum`` landmarks with a keyframe, most
+        landmarks first, and ``(N,)`` how many they share."""
         counts = count_shared(self.arrays, keyframe, self.n_keyframes)
-        enough = np.flatnonzero(counts >= max(1, minimum))  # of many thousands that share none
+        enough = np.flatnonzero(counts >= max(1, minimum))  # few; only these are sorted
         order = enough[np.argsort(-counts[enough], kind="stable")]
         return order, counts[order]
 
     def keyframe_pose(self, keyframe: int) -> NDArray[np.float64]:
-        """Copy of ``T_cw``; a culled keyframe follows the living one that took its place."""
+        """Copy of ``T_cw``; the pose of a culled keyframe follows from that of its parent."""
         if self.arrays.keyframe_alive[keyframe]:
             return self.arrays.T_cw[keyframe].copy()
         table = self.keyframes
         return table.T_c_parent[keyframe] @ self.arrays.T_cw[table.parent[keyframe]]
 
     def cull_keyframe(self, keyframe: int) -> None:
-        """Remove a keyframe and its observations; its children move to its parent.
+        """Remove a keyframe and its observations; its children become children of its parent.
 
-        Keyframes culled before it are children too: every parent is alive.
+        These include keyframes that were culled before, so every parent is alive.
         """
         a, table, parents = self.arrays, self.keyframes, self.parents
         parent = parents[keyframe]
@@ -363,13 +369,13 @@ class Map:
         a.keyframe_alive[keyframe] = False
 
     def begin_submap(self, keyframe: int, parent: int, *, predicted: bool) -> None:
-        """Note that mapping began anew at a keyframe; its pose relative to the parent is a
-        prediction, or not even that."""
+        """Record that mapping restarted at a keyframe; ``predicted`` tells whether its pose
+        relative to the parent is at least a prediction."""
         self.keyframes.parent[keyframe] = parent
         self.keyframes.restart[keyframe] = PREDICTED if predicted else UNPREDICTED
 
     def submaps(self) -> NDArray[np.int64]:
-        """``(n_keyframes,)`` the sub-map of each keyframe, by the keyframe at which it began."""
+        """``(n_keyframes,)`` the sub-map of each keyframe, as the id of its first keyframe."""
         root = np.zeros(self.n_keyframes, np.int64)
         restart, parents = self.keyframes.restart.tolist(), self.parents.tolist()
         for keyframe in range(1, self.n_keyframes):
@@ -386,10 +392,10 @@ class Map:
 
 
 def loop_of_living(map_: Map, loop: LoopEdge) -> LoopEdge:
-    """A loop between the living keyframes that its ends, where they were culled, are placed by.
+    """The same loop between living keyframes: a culled end is replaced by its parent.
 
     Raises:
-        ValueError: it has no pose.
+        ValueError: the loop has no pose.
     """
     if loop.T_query_match is None:
         raise ValueError(f"The loop from keyframe {loop.query} to {loop.match} has no pose.")

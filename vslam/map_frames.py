@@ -1,6 +1,6 @@
-"""What passes between a frame and the map: observations, landmarks, places.
+"""Functions that connect a frame with the map through observations, landmarks and places.
 
-Free functions; whoever calls them is the one who may read, or write, the map at that moment.
+The caller must ensure that no other thread writes the map meanwhile.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ def add_frame(
     A frame that tracks no landmark of another keyframe begins a sub-map.
 
     Args:
-        certainty: ``(N,)`` of its features (``Arrays.certainty``).
-        reference: the parent of such a sub-map's first keyframe.
-        predicted: whether the pose of such a keyframe is at least a prediction.
+        certainty: ``(N,)`` certainty of the frame's features (``Arrays.certainty``).
+        reference: the parent of the keyframe if it begins a sub-map.
+        predicted: whether its pose is at least a prediction if it begins a sub-map.
 
     Returns:
-        The keyframe.
+        The id of the keyframe.
     """
     keyframe = map_.add_keyframe(
         frame.refined_features(), frame.T_cw, frame.timestamp, frame.index, certainty
@@ -56,10 +56,10 @@ def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, 
     """Add the two keyframes of a monocular map or sub-map, and the points that both see.
 
     Args:
-        reference: the parent of a sub-map's first keyframe.
+        reference: the parent of the first keyframe if it begins a sub-map.
 
     Returns:
-        The keyframes.
+        The ids of the two keyframes.
     """
     frames = start.first, start.second
     first, second = map_two_views(
@@ -79,19 +79,20 @@ def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, 
 
 
 class LandmarkCounts:
-    """Which landmarks frames should have seen and did see, until the map is free to count them."""
+    """Collects which landmarks each frame should have seen and did see, until the map is free and
+    its counters can be updated."""
 
     def __init__(self) -> None:
         self._visible: list[NDArray[np.int32]] = []
         self._found: list[NDArray[np.int32]] = []
 
     def add(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
-        """Remember those of a frame, ``(N,)`` and ``(M,)`` ids."""
+        """Add a frame with the ids ``(N,)`` of visible landmarks and ``(M,)`` of found ones."""
         self._visible.append(visible)
         self._found.append(found)
 
     def write(self, map_: Map) -> None:
-        """Add what is remembered to the counters of the map."""
+        """Update the map's counters and forget the frames."""
         a = map_.arrays
         for seen, counter in ((self._visible, a.visible), (self._found, a.found)):
             for ids in seen:
@@ -100,7 +101,7 @@ class LandmarkCounts:
 
 
 def drop_dead_landmarks(map_: Map, frames: Sequence[Frame]) -> None:
-    """Make room in the map; the landmarks that frames track keep their meaning under new ids."""
+    """Drop the map's dead landmarks, and renumber the landmarks that the frames track."""
     new_id = map_.drop_dead_landmarks()
     for frame in {id(frame): frame for frame in frames}.values():
         tracked = frame.landmark >= 0
@@ -109,23 +110,23 @@ def drop_dead_landmarks(map_: Map, frames: Sequence[Frame]) -> None:
 
 
 def has_more_points(map_: Map, keyframe: int, frame: Frame) -> bool:
-    """Whether a keyframe is the first of a map or sub-map, no other follows it yet, and a frame is
-    the one that it was made of: then its far stereo points are not mapped yet."""
+    """Whether the far stereo points of a keyframe are still to be mapped: it is the first of a map
+    or sub-map, no other keyframe follows it, and ``frame`` is the frame that became it."""
     begins = keyframe == 0 or keyframe in map_.restarts
     return begins and keyframe == map_.n_keyframes - 1 and map_.frames[keyframe] == frame.index
 
 
 def observe_keyframe(frame: Frame, map_: Map, keyframe: int) -> None:
-    """Let a frame track all landmarks that the keyframe it became observes."""
+    """Let a frame that became a keyframe track all landmarks that the keyframe observes."""
     frame.landmark = map_.arrays.landmark[map_.rows(keyframe)]
     update_landmarks(frame, map_)
 
 
 def update_landmarks(frame: Frame, map_: Map) -> None:
-    """Bring the landmarks of a frame up to date: those that were merged into others are replaced,
-    those that are gone become -1, and ``frame.xyz`` is where they are now.
+    """Update a frame's landmarks: ids of merged landmarks are replaced, ids of dead ones become -1,
+    and ``frame.xyz`` gets their present positions.
 
-    Two landmarks may have become one: the first feature keeps it.
+    If two tracked landmarks were merged, only the first feature keeps the result.
     """
     arrays = map_.arrays
     ids = resolve(arrays, frame.landmark)
@@ -138,7 +139,7 @@ def update_landmarks(frame: Frame, map_: Map) -> None:
 
 
 def count_shared_landmarks(map_: Map, frame: Frame) -> NDArray[np.int64]:
-    """``(n_keyframes,)`` how many of the landmarks that a frame tracks each keyframe observes."""
+    """``(n_keyframes,)`` the number of landmarks that each keyframe shares with a frame."""
     a, n = map_.arrays, map_.n_keyframes
     _, rows = gather_observations(a, frame.landmark[frame.landmark >= 0], np.arange(n))
     return np.bincount(a.keyframe[rows], minlength=n)
@@ -148,9 +149,9 @@ class OldPlace(NamedTuple):
     """A place that was mapped some time ago, or on an earlier drive.
 
     Attributes:
-        keyframe: that shares the most landmarks with a frame.
+        keyframe: the keyframe that shares the most landmarks with a frame.
         n_shared: how many it shares.
-        n_place: how many of the keyframe's landmarks at least three keyframes observe.
+        n_place: how many of its landmarks are observed by at least three keyframes.
     """
 
     keyframe: int
@@ -159,8 +160,8 @@ class OldPlace(NamedTuple):
 
 
 def find_old_place(map_: Map, frame: Frame, known_after_s: float) -> OldPlace | None:
-    """The place that shares the most landmarks with a frame, among the keyframes that are at least
-    ``known_after_s`` seconds old; None if none shares any."""
+    """The place that shares the most landmarks with a frame, among keyframes that are at least
+    ``known_after_s`` seconds old; None if these share no landmark with it."""
     young = map_.sessions == map_.scalars.session
     young &= map_.timestamps > frame.timestamp - known_after_s
     shared = np.where(young, 0, count_shared_landmarks(map_, frame))
@@ -171,17 +172,17 @@ def find_old_place(map_: Map, frame: Frame, known_after_s: float) -> OldPlace | 
 
 
 def keyframe_trajectory(map_: Map) -> Trajectory:
-    """Pose of every keyframe of the last drive that was not culled."""
+    """The poses of the living keyframes of the last drive."""
     living = map_.living_keyframes()
     living = living[map_.sessions[living] == map_.scalars.session]
     return Trajectory(map_.timestamps[living], inverses(map_.arrays.T_cw[living]))
 
 
 def in_first_part(map_: Map, closed: Sequence[LoopEdge], frames: FrameTable) -> NDArray[np.bool_]:
-    """``(N,)`` frames tracked in the part of the map that holds its first keyframe.
+    """``(N,)`` bool: which frames were tracked in the part of the map with its first keyframe.
 
     Args:
-        closed: loops; sub-maps that they join are one part.
+        closed: closed loops; the sub-maps that they join form one part.
     """
     if not map_.n_keyframes:
         return frames.tracked

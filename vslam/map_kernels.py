@@ -1,7 +1,8 @@
 """Kernels that read and write the observations of a map.
 
-``a`` is the map's ``Arrays`` (vslam/map.py): the rows of a landmark hang on a chain from ``head``
-through ``next_row``, so that adding, removing and merging touch nothing but that chain.
+``a`` is the map's ``Arrays`` (vslam/map.py). The rows of a landmark form a linked list that begins
+at ``head`` and continues through ``next_row``, so that adding, removing and merging observations
+change only that list.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from vslam.kernels import hamming, inner_kernel, kernel
 
 @kernel
 def count_shared(a, keyframe, n_keyframes):
-    """Landmarks shared with each keyframe, ``(n_keyframes,)`` int64; 0 for itself."""
+    """``(n_keyframes,)`` int64, landmarks that ``keyframe`` shares with each one; 0 for itself."""
     counts = np.zeros(n_keyframes, np.int64)
     for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
         landmark = a.landmark[row]
@@ -45,7 +46,7 @@ def link_many(a, rows, landmarks):
 
 @kernel
 def unlink(a, row):
-    """Remove one observation. A landmark left with none is dead."""
+    """Remove one observation. A landmark without observations is dead."""
     landmark = a.landmark[row]
     if a.head[landmark] == row:
         a.head[landmark] = a.next_row[row]
@@ -85,7 +86,7 @@ def detach_keyframe(a, keyframe):
 
 @kernel
 def observed_by(a, landmark, keyframe):
-    """Row of ``keyframe`` that observes the landmark, or -1."""
+    """The row of ``keyframe`` that observes the landmark, or -1."""
     row = a.head[landmark]
     while row >= 0:
         if a.keyframe[row] == keyframe:
@@ -98,7 +99,8 @@ def observed_by(a, landmark, keyframe):
 def merge_landmarks(a, loser, winner):
     """Move the observations of ``loser`` to ``winner``; a keyframe that sees both keeps one.
 
-    int64 is what other callers give ``link`` and ``observed_by``: compiled once, not twice.
+    Rows and keyframes are cast to int64, as other callers pass them, so that ``link`` and
+    ``observed_by`` are compiled only once.
     """
     row = np.int64(a.head[loser])
     while row >= 0:
@@ -118,7 +120,7 @@ def merge_landmarks(a, loser, winner):
 
 @kernel
 def resolve(a, landmarks):
-    """Follow merges: living landmark that each id stands for today, or -1. Returns ``(N,)`` i4."""
+    """``(N,)`` int32, the living landmark that each id was merged into, or -1 if it is dead."""
     out = np.empty(len(landmarks), np.int32)
     for i in range(len(landmarks)):
         landmark = landmarks[i]
@@ -130,7 +132,7 @@ def resolve(a, landmarks):
 
 @inner_kernel
 def lower_median(values, n):
-    """Median of the first ``n`` values, the lower one of two; sorts them by insertion."""
+    """Lower median of the first ``n`` values, which are sorted in place (insertion sort)."""
     for i in range(1, n):
         value, j = values[i], i
         while j > 0 and values[j - 1] > value:
@@ -142,11 +144,11 @@ def lower_median(values, n):
 
 @kernel
 def refresh_landmarks(a, landmarks, scales):
-    """Recompute what follows from the observations: descriptor, normal and distance range.
+    """Recompute descriptor, normal and distance range of landmarks from their observations.
 
-    The descriptor is the observation's with the least median distance to the others (ORB-SLAM,
-    III-C); the distance range follows from the octave in the first keyframe that
-    observes it. At most the newest 32 observations vote on the descriptor: bounded work.
+    The descriptor is that of the observation with the least median distance to the others
+    (ORB-SLAM, III-C), among the newest 32 to bound the work. The distance range follows from the
+    octave in the first keyframe that observes the landmark.
     """
     limit = 32
     rows = np.empty(limit, np.int64)
@@ -201,7 +203,7 @@ def refresh_landmarks(a, landmarks, scales):
 
 @kernel
 def predict_octave(distance, farthest, log_scale, levels):
-    """Pyramid level at which a landmark should appear at a distance (ORB-SLAM, V-D)."""
+    """Pyramid level at which a landmark should be detected at a distance (ORB-SLAM, V-D)."""
     level = int(np.ceil(np.log(farthest / distance) / log_scale))
     return min(max(level, 0), levels - 1)
 
@@ -219,7 +221,7 @@ def collect_landmarks(a, keyframes, n_landmarks):
 
 @kernel
 def count_seen_by(a, keyframe, needed):
-    """Landmarks of a keyframe that at least ``needed`` keyframes see, it included."""
+    """Number of a keyframe's landmarks that at least ``needed`` keyframes observe, with itself."""
     count = 0
     for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
         if a.landmark[row] < 0:
@@ -238,8 +240,8 @@ def count_seen_by(a, keyframe, needed):
 def covisible_pairs(a, keyframes, n_keyframes, minimum):
     """Pairs of ``(N,)`` keyframes that share at least ``minimum`` landmarks, in one pass.
 
-    Returns ``(M, 2)`` int64 with the lower id first, in ascending order, and ``(M,)`` how many
-    landmarks each pair shares.
+    Returns ``(M, 2)`` int64 pairs in ascending order, each with the lower id first, and ``(M,)``
+    how many landmarks each pair shares.
     """
     counts = np.zeros(n_keyframes, np.int64)
     listed = np.zeros(n_keyframes, np.bool_)
@@ -278,7 +280,10 @@ def covisible_pairs(a, keyframes, n_keyframes, minimum):
 
 @kernel
 def gather_observations(a, landmarks, index):
-    """Rows of each landmark in keyframes with an index, as ``first`` ``(P + 1,)`` and rows."""
+    """Rows that observe each of ``(P,)`` landmarks in keyframes with ``index[keyframe] >= 0``.
+
+    Returns ``(P + 1,)`` int64 offsets and the rows, one landmark after the other.
+    """
     first = np.zeros(len(landmarks) + 1, np.int64)
     for i in range(len(landmarks)):
         first[i + 1] = first[i]

@@ -31,10 +31,11 @@ class LocalMap(NamedTuple):
 def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
     """Copy the landmarks of a keyframe and of its covisible keyframes (ORB-SLAM, V-D).
 
-    ORB-SLAM adds neighbours of neighbours; those changed no figure here (docs/design.md).
+    ORB-SLAM also takes the neighbours of neighbours, which made no difference here
+    (docs/explanation/design.md).
 
     Args:
-        limit: at most this many keyframes, nearest in covisibility first.
+        limit: greatest number of keyframes; those that share the most landmarks are taken.
     """
     first, _ = map_.covisible(keyframe)
     chosen = [keyframe, *first[: limit - 1].tolist()]
@@ -56,17 +57,19 @@ NO_LANDMARKS = LocalMap(
 
 @dataclass(frozen=True)
 class MapView:
-    """What tracking sees of the map: as of the last merge of local mapping, whatever the mapping
-    thread writes meanwhile. The defaults are those of an empty map.
+    """The map as tracking sees it: its state at the last merge of local mapping, which the mapping
+    thread does not change. The defaults are those of an empty map.
 
     Attributes:
-        reference: the keyframe that frames are tracked against and placed by, usually the newest.
+        reference: the keyframe that frames are tracked against and that their poses are relative
+            to, usually the newest.
         T_reference: ``(4, 4)`` its ``T_cw``.
-        unit_scale: ``Map.unit_scale`` of it.
-        n_keyframes: keyframes made so far, culled ones included.
-        local_landmarks: those of the reference keyframe and of its covisible keyframes.
-        reference_landmarks: those of the reference keyframe alone.
-        n_reference: how many of these at least three keyframes observe (all, in a young map).
+        unit_scale: its ``Map.unit_scale``.
+        n_keyframes: number of keyframes so far, culled ones included.
+        local_landmarks: landmarks of the reference keyframe and of its covisible keyframes.
+        reference_landmarks: landmarks of the reference keyframe alone.
+        n_reference: how many of these are observed by at least three keyframes (in a map of fewer
+            keyframes, by all of them).
         patches: image patches of the local landmarks that the newest keyframes observe.
     """
 
@@ -87,12 +90,12 @@ def view_of(
 
     Args:
         local: the landmarks of the keyframe and of its covisible keyframes.
-        patches: image patches of these landmarks, where the newest keyframes observe them.
+        patches: image patches of those landmarks that the newest keyframes observe.
         monocular: whether the camera is monocular.
     """
     living = map_.living_keyframes()
     if monocular and map_.restarts:
-        # A sub-map is young once more: without stereo nothing but this tells when to go on.
+        # A new sub-map counts as a young map: the monocular keyframe decision depends on it.
         living = living[living >= map_.restarts[-1]]
     return MapView(
         reference=keyframe,

@@ -1,9 +1,9 @@
-"""Local mapping beside tracking, with the same result on every machine.
+"""Local mapping in parallel with tracking, with the same result on every machine.
 
 ``Mapper`` owns the map. Each keyframe is mapped by a job in another thread. Tracking sees the job's
-result from a fixed frame number on, however long the job took; this is called the merge. Between
-two merges tracking reads a ``MapView``, a copy that the last merge left. Every method that needs
-the merged map merges by itself, and frames that are held follow the map when a merge moves it.
+result from a fixed frame index on, however long the job took; this is called the merge. Between
+two merges tracking reads a ``MapView``, a copy that the last merge made. Every method that needs
+the merged map merges by itself, and held frames are updated when a merge moves the map.
 """
 
 from __future__ import annotations
@@ -51,9 +51,10 @@ class Mapper:
     """The owner of the map: all changes are made by its methods or by the jobs that it starts.
 
     Attributes:
-        view: what tracking may see of the map.
+        view: the copy of the map that tracking reads.
         frames: the pose of every frame, relative to a keyframe.
-        last_frame, last_timestamp: index and seconds of the frame that became the last keyframe.
+        last_frame, last_timestamp: index and time (seconds) of the frame that became the last
+            keyframe.
     """
 
     def __init__(
@@ -67,10 +68,12 @@ class Mapper:
     ) -> None:
         """
         Args:
-            rig: corrects frames; it is told the map's disparity offset.
-            executor: runs mapping jobs, one at a time; None runs each where its result is needed.
+            context: camera, thresholds and pyramid scales.
+            closing: processes new keyframes for loop closing.
+            rig: corrects frames, and receives the map's disparity offset.
+            executor: runs mapping jobs, one at a time; None runs each when its result is needed.
             map_: a map to continue in; None begins an empty one.
-            frames: frames of the same drive that are placed already.
+            frames: poses of earlier frames of the same drive.
         """
         self.view = MapView()
         self.last_frame = -1
@@ -88,26 +91,26 @@ class Mapper:
         if self.map.n_keyframes:
             self.refer_to(int(self.map.living_keyframes()[-1]))
 
-    # What may be seen at any time
+    # Properties that may be read at any time
 
     @property
     def n_keyframes(self) -> int:
-        """Keyframes made so far, culled ones included."""
+        """Number of keyframes so far, culled ones included."""
         return self.view.n_keyframes
 
     @property
     def reference(self) -> int:
-        """The keyframe that new frames are placed by."""
+        """The keyframe that the poses of new frames are relative to."""
         return self.view.reference
 
     @property
     def is_merged(self) -> bool:
-        """Whether tracking sees all that was mapped."""
+        """Whether tracking sees the results of all mapping jobs."""
         return self._is_merged
 
     @property
     def is_mapping(self) -> bool:
-        """Whether a keyframe is being mapped, so that another thread may be writing the map."""
+        """Whether a keyframe is being mapped, so that another thread may write the map."""
         return self._shared.is_busy
 
     @property
@@ -120,19 +123,19 @@ class Mapper:
         return self._shared.map
 
     def keyframe_pose(self, keyframe: int) -> Matrix:
-        """``T_cw`` as of the last merge; before the next one, of the reference keyframe only."""
+        """``T_cw`` of a keyframe at the last merge; while a job runs, only of the reference."""
         if not self._is_merged and keyframe == self.view.reference:
             return self.view.T_reference
         return self.map.keyframe_pose(keyframe)
 
     def unit_scale(self, keyframe: int) -> float:
-        """``Map.unit_scale``, of the keyframes that ``keyframe_pose`` knows."""
+        """``Map.unit_scale`` of a keyframe, under the same condition as ``keyframe_pose``."""
         if not self._is_merged and keyframe == self.view.reference:
             return self.view.unit_scale
         return float(self.map.unit_scale[keyframe])
 
     def trajectory(self) -> Trajectory:
-        """Pose of every frame (``FramePoses.trajectory``).
+        """The pose of every frame (``FramePoses.trajectory``).
 
         Raises:
             RuntimeError: as ``map``.
@@ -143,31 +146,32 @@ class Mapper:
     # The schedule
 
     def hold(self, *frames: Frame | None) -> None:
-        """Choose the frames whose poses, landmarks and twists are updated whenever a merge changes
-        the map; they replace those held before."""
+        """Choose the frames whose poses, landmarks and twists are updated when a merge changes the
+        map; they replace the frames held before."""
         self._held = tuple(frame for frame in frames if frame is not None)
 
     def admit(self, frame: Frame, last: Frame | None, twist: Matrix | None) -> None:
-        """Take in the next frame, which is not tracked yet: merge if a merge is due at its index,
-        and correct its columns in the right image as far as the rig is known.
+        """Prepare the next frame for tracking: merge if a merge is due at its index, and correct
+        its columns in the right image by what is known about the rig.
 
-        Until the next frame is admitted, this frame and the last tracked one follow the map.
+        Until the next frame is admitted, merges update this frame and the last tracked one.
 
         Args:
-            last: the frame tracked last; None before the first.
-            twist: ``(6,)`` motion of the points past the camera, per second; None if unknown.
+            frame: the next frame, not tracked yet.
+            last: the last tracked frame; None before the first.
+            twist: ``(6,)`` of the points relative to the camera, per second; None if unknown.
         """
         self.hold(last, frame)
         self.merge_if_due(frame.index)
         self._rig.prepare(frame, twist)
 
     def append_pose(self, frame: Frame, *, tracked: bool, near: int = -1) -> PlacedFrame:
-        """Record the pose of the next frame, and return the frame as one that is placed.
+        """Record the pose of the next frame, and return it as a frame with a recorded pose.
 
         Args:
             tracked: False for a pose that is only predicted.
-            near: the keyframe near which the frame was found, which becomes the reference; -1 if
-                the frame was not looked for.
+            near: the keyframe near which relocalisation found the frame, which becomes the
+                reference; -1 without relocalisation.
         """
         if near >= 0:
             self.refer_to(near)
@@ -175,20 +179,21 @@ class Mapper:
         return PlacedFrame(frame)
 
     def count(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
-        """Let the map count that a frame should have seen some landmarks and did see others."""
+        """Count the landmarks that a frame should have seen, ``(N,)`` ids, and those that it found,
+        ``(M,)`` ids."""
         self._counts.add(visible, found)
 
     def merge_if_due(self, frame: int) -> None:
-        """Merge if the last keyframe was made so many frames ago that this is the frame for it."""
+        """Merge if the last keyframe is at least ``merge_after_frames`` older than this frame."""
         if frame - self.last_frame >= self._config.keyframes.merge_after_frames:
             self.merge()
 
     def merge(self) -> Map:
-        """Wait for the keyframe that is being mapped, show the result to tracking, and return the
+        """Wait for the running mapping job, make its result visible to tracking, and return the
         map.
 
         Raises:
-            RuntimeError: an earlier keyframe's mapping failed, so that the map is incomplete.
+            RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         map_ = self.complete()
         if not self._is_merged:
@@ -197,8 +202,8 @@ class Mapper:
         return map_
 
     def complete(self) -> Map:
-        """Wait for the keyframe that is being mapped without showing the result to tracking, and
-        return the map. Whether and when this is called changes no result.
+        """Wait for the running mapping job without making its result visible to tracking, and
+        return the map. Calling this does not change any result.
 
         Raises:
             RuntimeError: as ``merge``.
@@ -208,23 +213,23 @@ class Mapper:
         return map_
 
     def finish(self) -> None:
-        """Complete all that is under way, global bundle adjustment included."""
+        """Complete all running work, including global bundle adjustment."""
         with self._changing() as map_:
             self._closing.conclude(map_)
             self._closing.finish(map_)
         if self.n_keyframes:
             self._renew_view()
 
-    # Changes of the map, each of which begins with a merge
+    # Changes of the map; each begins with a merge
 
     def insert(self, frame: PlacedFrame, *, predicted: bool = True) -> None:
-        """Make the frame placed last a keyframe, map its stereo points and start its mapping job.
+        """Make the newest frame a keyframe, map its stereo points and start its mapping job.
 
-        The frame then tracks all landmarks that its features observe, new ones included. A frame
-        that shares none with the map begins a sub-map.
+        The frame then tracks all landmarks that its features observe, including new ones. A frame
+        that shares no landmark with the map begins a sub-map.
 
         Args:
-            predicted: whether the pose of such a frame is at least a prediction.
+            predicted: if the frame begins a sub-map, whether its pose is at least a prediction.
         """
         with self._changing() as map_:
             self._make_room(map_, frame)
@@ -241,10 +246,11 @@ class Mapper:
 
     def map_far_points(self, frame: Frame) -> bool:
         """Map all stereo points of a frame that is the first keyframe of a map or sub-map, if no
-        keyframe follows it yet. Returns whether any were new.
+        keyframe follows it yet. Returns whether points were added.
 
-        ORB-SLAM2 (III-B) begins with all of them. Far points bend the first poses by the error of
-        the pair's calibration; but at speed close points leave the view within a frame.
+        ORB-SLAM2 (III-B) maps all of them from the start. The calibration error of the pair biases
+        far points and thus the first poses, so they are added only when they are needed: at high
+        speed, close points leave the view within a frame.
         """
         with self._changing() as map_:
             keyframe = self.reference
@@ -257,13 +263,13 @@ class Mapper:
         return len(new) > 0
 
     def begin(self, start: TwoViewStart, twist: Callable[[], Matrix | None]) -> None:
-        """Begin a monocular map or sub-map with two keyframes; the second is the frame placed last.
+        """Begin a monocular map or sub-map with two keyframes; the second is the newest frame.
 
         Its twist becomes that of the two views, and it tracks all landmarks that it observes.
 
         Args:
-            twist: asked after the merge: the speed of the camera before, None if unknown. A
-                sub-map takes its unit from it.
+            twist: called after the merge, returns the ``(6,)`` twist of the camera before, per
+                second, or None if unknown. The unit of a sub-map is derived from it.
         """
         with self._changing() as map_:
             start = start.at_speed(twist(), self._config.initialization.max_rescaling)
@@ -279,12 +285,11 @@ class Mapper:
             start.second.twist = start.twist
 
     def find_old_place(self, frame: Frame) -> OldPlace | None:
-        """The place that the frame has come back to, if it was mapped long enough ago."""
+        """The old place to which the frame has returned, or None (``find_old_place``)."""
         return find_old_place(self.merge(), frame, self._config.keyframes.known_after_s)
 
     def use_existing_keyframe(self, place: OldPlace, frame: PlacedFrame) -> None:
-        """Make an existing keyframe the reference instead of inserting the frame placed last as a
-        new one."""
+        """Make an existing keyframe the reference instead of inserting the newest frame."""
         self.merge()
         self.last_timestamp = frame.timestamp
         self.refer_to(place.keyframe)
@@ -293,10 +298,10 @@ class Mapper:
             self.last_frame = frame.index
             self._start(self._closing.finish)
 
-    # The reference keyframe, which is no part of the map
+    # The reference keyframe, which is not part of the map
 
     def refer_to(self, keyframe: int) -> None:
-        """Make a keyframe the reference, so that tracking sees what is around it."""
+        """Make a keyframe the reference, so that tracking sees the landmarks around it."""
         map_, config = self.map, self._config.tracking
         local = local_map(map_, keyframe, config.local_keyframes)
         patches = self._aligner.patches_of(map_, local.ids)
@@ -311,21 +316,21 @@ class Mapper:
         if shared[best] and best != self.reference:
             self.refer_to(best)
 
-    # What is kept in a file
+    # State for checkpoints
 
     def state(self) -> MapperState:
-        """What is remembered besides the map."""
+        """The state of the mapper without the map."""
         patches = self._aligner.state()
         return MapperState(self.reference, self.last_frame, self.last_timestamp, patches)
 
     def restore(self, state: MapperState) -> None:
-        """Remember what ``state`` gave, in the map as it was then."""
+        """Restore what ``state`` returned; the map must be the one that it was taken with."""
         self.last_frame, self.last_timestamp = state.last_frame, state.last_timestamp
         self._aligner.restore(state.patches)
         self.refer_to(state.reference)
 
     def continue_drive(self) -> None:
-        """Take the newest keyframe for the last one made, unless an earlier drive made it."""
+        """Treat the reference keyframe as the last inserted one if it belongs to this drive."""
         map_, newest = self.map, self.reference
         if map_.n_keyframes and map_.sessions[newest] == map_.scalars.session:
             self.last_frame = int(map_.frames[newest])
@@ -333,19 +338,19 @@ class Mapper:
 
     @contextmanager
     def _changing(self) -> Iterator[Map]:
-        """The merged map, to be changed; after an exception it cannot be used any more."""
+        """Yield the merged map for changes; after an exception it cannot be used any more."""
         self.merge()
         with self._shared.change() as map_:
             yield map_
 
     def _make_room(self, map_: Map, frame: Frame) -> None:
-        """Drop dead landmarks where they are many. The others get new ids, so that it has to wait
-        while a global bundle adjustment is under way, which knows its landmarks by their ids."""
+        """Drop dead landmarks if there are many. This changes the ids of the others, so it must
+        wait for a running global bundle adjustment, which refers to landmarks by id."""
         if not self._closing.is_adjusting and map_.many_dead_landmarks:
             drop_dead_landmarks(map_, (*self._held, frame))
 
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
-        """The frame has become the newest keyframe: later ones are tracked against it."""
+        """Record that a frame became the newest keyframe, and make it the reference."""
         map_ = self.map
         self._aligner.remember(frame, keyframe, map_.scales)
         self.last_frame, self.last_timestamp = frame.index, frame.timestamp
@@ -359,8 +364,8 @@ class Mapper:
             self._move(frame, before)
 
     def _move(self, frame: Frame, before: MapView) -> None:
-        """Bring a frame to where the map is now. One that is placed moves with its keyframe, one
-        that is not yet with the reference keyframe."""
+        """Update a frame after the map moved. A frame whose pose is recorded follows its keyframe,
+        any other the reference keyframe."""
         grown = self.view.unit_scale / before.unit_scale
         self._rig.correct_offset(frame)
         update_landmarks(frame, self.map)
@@ -380,6 +385,6 @@ class Mapper:
         self._closing.process(map_, keyframe, features, image)
 
     def _start(self, job: Callable[[Map], None]) -> None:
-        """Start a job that maps; tracking goes on with the view as it is."""
-        self._is_merged = False
+        """Start a mapping job; tracking continues with the present view."""
         self._shared.start(job)
+        self._is_merged = False

@@ -1,9 +1,9 @@
-"""Maps of several drives made one: loops between them, found and verified as those of one drive.
+"""Merging the maps of several drives by loops between them, which are found and verified as usual.
 
-A map is appended to another as a sub-map of which nobody knows where it lies, and each of its
-keyframes asks the other's detector where it is. From there on everything is loop closing: the
-first loop moves the sub-map to its place, the others correct what drifted, landmarks are fused,
-and at the end all is adjusted at once.
+A map is appended to another as a sub-map at an unknown place, and the other map's detector proposes
+candidates for each of its keyframes. From there on everything is loop closing: the first loop moves
+the sub-map to its place, later loops correct drift and fuse landmarks, and a global bundle
+adjustment ends the merge.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ Memory = tuple[LoopDetector, KeyframeImages | None]
 
 @dataclass(frozen=True)
 class MergedMaps:
-    """What became of M maps.
+    """The result of merging several maps, which are named by their position in the input.
 
     Attributes:
-        stored: the first map with those that it was joined to.
-        joined: of the others, in the order in which they were joined.
-        left_out: those that no verified loop leads to.
-        loops: of each map, by its number, the loops that join it to those before.
+        stored: the first map together with all maps that were joined to it.
+        joined: the joined maps, in the order in which they were joined.
+        left_out: the maps that no verified loop connects to the others.
+        loops: for each joined map, the loops that connect it to the maps before it.
     """
 
     stored: StoredMap
@@ -50,15 +50,15 @@ def merge_maps(
     create: Callable[[], Memory],
     on_keyframe: Callable[[], None] = lambda: None,
 ) -> MergedMaps:
-    """Join maps to the first one; a map that meets it only by way of another is joined after that.
+    """Join maps to the first one; a map that overlaps only another map is joined after that one.
 
     Args:
-        maps: two or more, of one camera, pyramid and detector.
-        create: makes a detector like theirs that remembers nothing, and what keeps its images.
+        maps: two or more maps with the same camera, pyramid and detector.
+        create: creates an empty detector of that kind, and the store of its images.
         on_keyframe: called for each keyframe that was compared.
 
     Raises:
-        ValueError: in a few words why these maps are not to be made one.
+        ValueError: the maps cannot be merged; the message gives the reason in a few words.
     """
     whole, waiting = maps[0].compact(), dict(enumerate(maps))
     del waiting[0]
@@ -86,23 +86,23 @@ def join(
     memory: Memory,
     on_keyframe: Callable[[], None] = lambda: None,
 ) -> tuple[StoredMap, list[LoopEdge]] | None:
-    """Join two compact maps; the world is that of the first.
+    """Join two compact maps; the world frame is that of the first.
 
     Args:
-        memory: a detector that remembers nothing, and what keeps its images.
+        memory: an empty detector, and the store of its images.
 
     Returns:
-        The map of both and the loops that were closed between them, or None: they do not meet.
+        The joined map and the loops that were closed between the two, or None if there are none.
 
     Raises:
-        ValueError: the detector is not that of the maps.
+        ValueError: the detector differs from that of the maps.
     """
     detector, images = memory
     detector.restore(one.detector)
     both = appended(one, other)
     if images is not None and both.images is not None:
         images.restore(both.images, one.camera.width)
-    # One thread: the global adjustment waits until it is asked for, after the last loop.
+    # With one thread, the global adjustment runs only in finish(), after the last loop.
     verifier = verifier_for(config, one.camera, images)
     closing = LoopClosing(detector, verifier, one.camera, config, threads=1)
     closing.closed = list(both.loops)
@@ -125,7 +125,8 @@ def _candidates(
     images: KeyframeImages | None,
     config: Config,
 ) -> list[LoopCandidate]:
-    """Keyframes of the first map that look like one of the second and share no landmarks yet."""
+    """Keyframes of the first map that resemble a keyframe of the second and do not share landmarks
+    with it yet."""
     image = images.image(keyframe) if images is not None and keyframe in images else None
     found = detector.locate(image, features_of(map_, keyframe), map_)
     joined = set(map_.covisible(keyframe, config.consistency.min_shared)[0].tolist())
@@ -133,7 +134,7 @@ def _candidates(
 
 
 def features_of(map_: Map, keyframe: int) -> Features:
-    """What a keyframe saw."""
+    """The features of a keyframe."""
     a, rows = map_.arrays, map_.rows(keyframe)
     descriptors = a.descriptor[rows].view(np.uint8)
     return Features(a.xy[rows], a.octave[rows], a.angle[rows], descriptors, a.u_right[rows])

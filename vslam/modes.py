@@ -1,4 +1,4 @@
-"""What SLAM does with a frame that was tracked or lost: build the map, or leave it as it is."""
+"""The two modes of SLAM: build a map from the frames, or localise in a map that stays as it is."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ from vslam.states import PolicyState
 
 
 class Mode(Protocol):
-    """What becomes of the map.
+    """How frames change the map.
 
     Attributes:
-        changes_map: whether a drive in this mode leaves anything in the map.
+        changes_map: whether a drive in this mode changes the map.
     """
 
     changes_map: bool
 
     def begin(self, frame: PlacedFrame) -> bool:
-        """Begin a map, or a sub-map, with a frame that is placed but not tracked, if it can be;
-        returns whether."""
+        """Try to begin a map or sub-map with a frame that has a pose but was not tracked; returns
+        whether it did."""
         ...
 
     def begin_after_loss(self, frame: PlacedFrame) -> bool:
-        """``begin``, but only if the camera was lost for long enough."""
+        """``begin``, but only if the camera has been lost for long enough."""
         ...
 
     def map_far_points(self) -> bool:
-        """Add the far stereo points of the first keyframe of a map or sub-map, if the frame right
-        after it was lost; returns whether any were added, so that tracking may be tried again."""
+        """Map the far stereo points of the first keyframe of a map or sub-map if the frame right
+        after it was lost; returns whether points were added, so that tracking can be retried."""
         ...
 
     def update_map(self, frame: PlacedFrame, found: Found) -> bool:
-        """Count the landmarks that a tracked frame saw, and insert it as a keyframe if the policy
-        asks for one; returns whether it did."""
+        """Count the landmarks that a tracked frame saw, and insert the frame as a keyframe if the
+        policy wants one; returns whether it was inserted."""
         ...
 
     def state(self) -> PolicyState | None:
-        """What ``restore`` needs; None if no checkpoint is possible now."""
+        """The state for a checkpoint; None if no checkpoint is possible now."""
         ...
 
     def restore(self, state: PolicyState) -> None:
-        """Remember what ``state`` gave."""
+        """Restore what ``state`` returned."""
         ...
 
 
@@ -81,7 +81,7 @@ class Localising:
 
 
 class MapBuilding:
-    """Makes keyframes of frames that see something new.
+    """Inserts frames that see something new as keyframes.
 
     Attributes:
         starter: finds the frames with which a map or a sub-map begins.
@@ -150,8 +150,8 @@ class MapBuilding:
         return True
 
     def state(self) -> PolicyState | None:
-        """What is remembered between two frames; None while a frame waits for a second one to begin
-        a map with."""
+        """The state of the keyframe policy; None while the starter keeps a frame and waits for a
+        second one to begin a map with."""
         return None if self.starter.is_waiting else self.policy.state()
 
     def restore(self, state: PolicyState) -> None:

@@ -1,7 +1,7 @@
 """Detectors, readers and perturbations of other packages, found by their entry points.
 
-docs/plugins.md tells how to write one. The packages' metadata name them; a package is imported when
-its plug-in is used, not before, and a broken one hurts nobody who does not use it.
+docs/howto/plugins.md explains how to write one. Plug-ins are found in the metadata of packages. A
+package is imported only when its plug-in is used, so a broken one does not affect other runs.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PlugIn:
-    """What a package offers under a name; nothing of it has been imported yet.
+    """A named plug-in of an installed package, which has not been imported yet.
 
     Attributes:
         group: one of `KINDS`.
-        name: as people type it.
-        packages: all that offer it, each with its version; more than one is an error on use.
-        entry_point: of the first of them.
+        name: the name on the command line.
+        packages: all packages that offer this name, with versions; using a plug-in that more than
+            one package offers is an error.
+        entry_point: the entry point of the first package.
     """
 
     group: str
@@ -49,14 +50,14 @@ class PlugIn:
         """Import what the entry point names and call it.
 
         Raises:
-            InputError: it cannot be imported, is nothing that can be called, fails, or is offered
-                by two packages.
+            InputError: it cannot be imported, is not callable, fails, or is offered by two
+                packages.
         """
         if len(self.packages) > 1:
-            raise InputError(f"{self}: two packages offer one name; uninstall one of them.")
+            raise InputError(f"{self}: two packages offer this name; uninstall one of them.")
         try:
             made = self.entry_point.load()
-        except Exception as error:  # anything can go wrong in an import
+        except Exception as error:  # importing foreign code may raise anything
             raise InputError(
                 f"{self}: {self.entry_point.value} cannot be imported ({reason(error)}); repair "
                 "or uninstall the package."
@@ -72,13 +73,13 @@ class PlugIn:
         """Call a function of the package.
 
         Raises:
-            InputError: it fails; an `InputError` of its own is passed on.
+            InputError: the function failed; an `InputError` that it raises itself is passed on.
         """
         try:
             return function(*arguments, **named)
         except InputError:
             raise
-        except Exception as error:  # a package of other people raises what it likes
+        except Exception as error:  # foreign code may raise anything
             raise InputError(
                 f"{self} failed ({reason(error)}); repair or uninstall the package."
             ) from error
@@ -100,7 +101,11 @@ def find_plugins(group: str) -> dict[str, PlugIn]:
     for package, entry_point in _entry_points(group):
         name = entry_point.name
         if not _NAME.fullmatch(name):
-            _log.warning("%s: its plug-in '%s' has a name that nobody can type", package, name)
+            _log.warning(
+                "%s: its plug-in '%s' is ignored; a name may only have letters, digits and ._-",
+                package,
+                name,
+            )
             continue
         others = found[name].packages if name in found else ()
         if package not in others:
@@ -110,7 +115,7 @@ def find_plugins(group: str) -> dict[str, PlugIn]:
 
 
 def _entry_points(group: str) -> list[tuple[str, EntryPoint]]:
-    """Package with its version, and entry point."""
+    """Pairs of a package, with its version, and an entry point."""
     found = []
     for distribution in distributions():
         text = distribution.read_text("entry_points.txt")

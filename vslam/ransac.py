@@ -1,7 +1,7 @@
-"""What the RANSAC kernels share: a random generator of their own, and how often to draw.
+"""Random generator and stopping rule of the RANSAC kernels (Fischler and Bolles, CACM 1981).
 
-A kernel that owns its generator gives the same answer for the same seed, whatever other threads
-draw (Fischler and Bolles, CACM 1981, for the method).
+Each kernel owns the state of its generator, so that the same seed gives the same result whatever
+other threads draw.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ _S27, _S30, _S31, _S33 = np.uint64(27), np.uint64(30), np.uint64(31), np.uint64(
 
 @kernel
 def random_index(state, n):
-    """A number below ``n``; advances ``state`` ``(1,)`` uint64 (SplitMix64, Steele et al. 2014)."""
+    """Random integer in ``[0, n)``; advances ``state`` ``(1,)`` uint64 (SplitMix64, Steele et al.
+    2014)."""
     state[0] += _STEP
     z = state[0]
     z = (z ^ (z >> _S30)) * _MIX_A
@@ -30,7 +31,7 @@ def random_index(state, n):
 
 @kernel
 def draw_three(state, n):
-    """Three different numbers below ``n`` (at least 3)."""
+    """Three different random integers in ``[0, n)``; ``n`` is at least 3."""
     i = random_index(state, n)
     j = random_index(state, n - 1)
     k = random_index(state, n - 2)
@@ -46,10 +47,8 @@ def draw_three(state, n):
 
 @kernel
 def draws_needed(inlier_share, confidence, limit):
-    """Draws of three until, with ``confidence``, one of them holds inliers only; ``limit`` at most.
-
-    Fischler and Bolles 1981, section II-B.
-    """
+    """Number of draws of three, at most ``limit``, until with probability ``confidence`` at least
+    one of them has only inliers (Fischler and Bolles 1981, section II-B)."""
     good = inlier_share**3
     if good >= 1.0:
         return 1

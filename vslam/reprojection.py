@@ -1,10 +1,10 @@
-"""Reprojection errors: how observations are laid out, and the test that tells inliers.
-
-``chi_square_ratio`` is for those who only test; optimisers, which need the ``residual``, test that
-with ``chi_square``.
+"""Reprojection errors: the layout of observations and the inlier test.
 
 An observation is a row ``u, v, u_right`` in pixels; ``u_right`` is NaN without a stereo match, and
-every kernel decides monocular or stereo by that alone.
+only this tells kernels whether the observation is monocular or stereo.
+
+Kernels that only test for inliers call ``chi_square_ratio``; optimisers, which also need the
+``residual``, test it with ``chi_square``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def stack_uvr(xy: NDArray[np.floating], u_right: NDArray[np.floating]) -> Matrix
 
 @inner_kernel
 def unpacked(intrinsics):
-    """``Camera.intrinsics`` as a tuple: numbers stay in registers, an array is read anew."""
+    """``Camera.intrinsics`` as a tuple: its values stay in registers, those of an array do not."""
     return (
         intrinsics[0],
         intrinsics[1],
@@ -43,12 +43,12 @@ def unpacked(intrinsics):
 
 @inner_kernel
 def chi_square_ratio(x, y, z, u, v, u_right, inverse_sigma2, pinhole):
-    """Squared reprojection error of a point in the camera over its chi-square limit: at most 1 for
-    an inlier. The point must lie in front of the camera.
+    """Squared reprojection error of a point ``x, y, z`` in the camera frame, divided by its
+    chi-square limit: at most 1 for an inlier. The point must lie in front of the camera.
 
     Args:
         u, v, u_right: float64 observation; inverse_sigma2: inverse variance of a pixel coordinate.
-        pinhole: intrinsics as ``unpacked`` gives them.
+        pinhole: intrinsics as ``unpacked`` returns them.
     """
     fx, fy, cx, cy, bf, disparity_weight = pinhole
     chi2 = (u - fx * x / z - cx) ** 2 + (v - fy * y / z - cy) ** 2
@@ -61,8 +61,8 @@ def chi_square_ratio(x, y, z, u, v, u_right, inverse_sigma2, pinhole):
 
 @inner_kernel
 def residual(x, y, z, u, v, u_right, pinhole):
-    """Reprojection error of a point in the camera in u, v and minus the disparity, which is
-    weighted and 0 where there is none, and whether the observation is stereo. Arguments as of
+    """Reprojection error in u, in v and in the negative disparity (weighted; 0 without a stereo
+    match), and whether the observation is stereo. The arguments are those of
     ``chi_square_ratio``."""
     fx, fy, cx, cy, bf, disparity_weight = pinhole
     iz = 1.0 / z
@@ -73,7 +73,7 @@ def residual(x, y, z, u, v, u_right, pinhole):
 
 @inner_kernel
 def chi_square(r_u, r_v, r_disparity, stereo, inverse_sigma2):
-    """Squared error of a ``residual`` in variances, and the limit of an inlier, which is where the
-    Huber loss becomes linear, too."""
+    """Squared error of a ``residual`` in variances, and the limit for an inlier, which is also
+    where the Huber loss becomes linear."""
     chi2 = (r_u * r_u + r_v * r_v + r_disparity * r_disparity) * inverse_sigma2
     return chi2, CHI2_STEREO if stereo else CHI2_MONO

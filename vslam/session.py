@@ -1,4 +1,4 @@
-"""How SLAM continues in a map that was made before, and what of it a map file holds."""
+"""Continuing in a stored map, and collecting everything that a map file stores."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from vslam.states import Checkpoint
 
 @dataclass(frozen=True)
 class OpenedMap:
-    """A map, new or stored, that a drive begins in.
+    """The map, new or stored, in which a drive begins.
 
     Attributes:
         map: None for a new one.
-        frames: frames of the same drive that are placed already; None for a new drive.
-        checkpoint: with which that drive continues to the byte, or None.
-        drives: what the images of the drives before were, "kitti 06" for example.
-        world: where the map lies in that of a ground truth; None if unknown.
+        frames: poses of the drive's earlier frames; None for a new drive.
+        checkpoint: state from which the drive continues with identical results, or None.
+        drives: sources of the images of the earlier drives, such as "kitti 06".
+        world: the map's place in the world of a ground truth; None if unknown.
     """
 
     map: Map | None = None
@@ -48,15 +48,14 @@ def open_map(
     localize: bool,
     resume: bool,
 ) -> OpenedMap:
-    """Restore detector, images and closed loops from a stored map, and begin a new drive in it
-    unless the last one is resumed or the map is only localised in. None begins a new map.
+    """Restore detector, images and closed loops from a stored map, or begin a new map (None).
 
     Args:
-        localize: the map is to stay as it is.
+        localize: leave the map as it is; otherwise a new drive begins in it.
         resume: continue the map's last drive instead of starting a new one.
 
     Raises:
-        ValueError: in a few words why the map cannot be continued.
+        ValueError: the map cannot be continued; the message gives the reason in a few words.
     """
     if localize and (stored is None or not stored.map.n_keyframes):
         raise ValueError("there is no map to localise in")
@@ -84,7 +83,7 @@ def open_map(
 
 @dataclass(frozen=True)
 class Session:
-    """The parts of SLAM, as far as they remember anything, and the map that the drive began in."""
+    """The parts of SLAM that have a state, and the map in which the drive began."""
 
     context: TrackingContext
     closing: LoopClosing
@@ -95,10 +94,10 @@ class Session:
     opened: OpenedMap
 
     def stored_map(self, drive: str) -> StoredMap:
-        """The map, with a checkpoint if there can be one now. Its arrays are those of the map.
+        """The map, with a checkpoint if one is possible now. The map is not copied.
 
         Args:
-            drive: what the images since the start were.
+            drive: source of the present drive's images, such as "kitti 06".
         """
         map_, images, opened = self.mapper.complete(), self.closing.verifier.images, self.opened
         return StoredMap(
@@ -114,9 +113,11 @@ class Session:
         )
 
     def state(self) -> Checkpoint | None:
-        """What all parts remember between two frames; None where that takes more than is kept:
-        before the first frame is tracked, when only localising, while a keyframe is mapped, a
-        monocular map begins or a global bundle adjustment is under way."""
+        """The state of all parts between two frames, or None if no checkpoint is possible now.
+
+        That is so before the first frame is tracked, when only localising, while a keyframe is
+        being mapped, while a monocular map begins, and during a global bundle adjustment.
+        """
         tracker, policy = self.tracker.state(), self.mode.state()
         if tracker is None or policy is None:
             return None
@@ -131,7 +132,7 @@ class Session:
         )
 
     def restore(self, state: Checkpoint) -> None:
-        """Let all parts remember what ``state`` gave, in the map as it was then."""
+        """Restore the state of all parts; the map must be the one that ``state`` was taken with."""
         self.mapper.restore(state.mapper)
         self.mode.restore(state.policy)
         self.closing.restore(state.closing)
@@ -142,8 +143,11 @@ class Session:
         self.rig.mark_corrected(self.tracker.restore(state.tracker, xyz))
 
     def resume(self) -> None:
-        """Expect the next frame after the last one of the drive that is continued, if one is: to
-        the byte with a checkpoint, else as far as the poses of the last frames tell."""
+        """Continue after the last frame of a resumed drive, if there is one.
+
+        With a checkpoint the results are identical to those of an uninterrupted run; without one,
+        only the pose and the speed of the last frames are known.
+        """
         frames = self.opened.frames
         if frames is None:
             return

@@ -1,4 +1,4 @@
-"""A map that a job in another thread may be writing."""
+"""A map that a job in another thread may write."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from vslam.map import Map
 
 
 def mapping_executor(threads: int) -> Executor | None:
-    """What runs mapping jobs: a thread beside tracking, or nothing with one thread in all."""
+    """A second thread for mapping jobs; None if there is only one thread in all."""
     return ThreadPoolExecutor(1, "mapping") if threads > 1 else None
 
 
 class SharedMap:
-    """A map and the job that is working on it, of which there is one at a time."""
+    """A map, and the job that may write it; there is at most one job at a time."""
 
     def __init__(self, map_: Map, executor: Executor | None) -> None:
-        """``executor``: runs the jobs; None runs each where its result is needed."""
+        """``executor`` runs the jobs; with None, each job runs when its result is needed."""
         self._map = map_
         self._executor = executor
         self._job: Callable[[], None] | None = None
@@ -38,7 +38,7 @@ class SharedMap:
         """The map.
 
         Raises:
-            RuntimeError: a job may be writing it, or one failed, or this process is a fork.
+            RuntimeError: a job may be writing it, a job failed, or this process is a fork.
         """
         self._refuse_fork()
         if self._failure:
@@ -48,7 +48,7 @@ class SharedMap:
         return self._map
 
     def start(self, job: Callable[[Map], None]) -> None:
-        """Leave the map to a job until ``wait`` is called."""
+        """Start a job that may write the map until ``wait`` is called."""
         map_ = self.map
         if self._executor is None:
             self._job = lambda: job(map_)
@@ -57,16 +57,16 @@ class SharedMap:
             self._job = self._future.result
 
     def wait(self) -> Map:
-        """The map, once the job is done.
+        """Wait for the job and return the map.
 
         Raises:
-            RuntimeError: an earlier job failed, or this process is a fork. This job's own error is
-                raised as it is.
+            RuntimeError: an earlier job failed, or this process is a fork. An error of this job is
+                raised unchanged.
         """
         self._refuse_fork()
         if self._job is not None:
             if self._future is not None:
-                wait_for([self._future])  # Ctrl-C here leaves the job to be waited for again
+                wait_for([self._future])  # after Ctrl-C here, a later call can wait again
             job, self._job = self._job, None
             with self._invalidated_on_error():
                 job()
@@ -74,7 +74,7 @@ class SharedMap:
 
     @contextmanager
     def change(self) -> Iterator[Map]:
-        """The map, once no job is working on it, to be changed.
+        """Wait for the job, then yield the map for changes.
 
         Raises:
             RuntimeError: as ``wait``.
@@ -85,7 +85,7 @@ class SharedMap:
 
     @contextmanager
     def _invalidated_on_error(self) -> Iterator[None]:
-        """After an exception, the map is incomplete: every later access raises."""
+        """An exception leaves the map incomplete, so every later access raises an error."""
         try:
             yield
         except BaseException as error:
@@ -96,7 +96,7 @@ class SharedMap:
             raise
 
     def _refuse_fork(self) -> None:
-        """A fork has no copy of the thread that does the jobs: it would wait for ever."""
+        """A fork lacks the thread that runs the jobs, and would wait for it forever."""
         if self._executor is not None and os.getpid() != self._process:
             raise RuntimeError(
                 "this Slam was made by another process, whose threads a fork does not copy; make "

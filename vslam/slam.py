@@ -39,7 +39,7 @@ from vslam.trajectory import Trajectory
 
 
 class Slam:
-    """Stereo or RGB-D SLAM; monocular SLAM, in a unit of its own, with a camera without a baseline.
+    """Stereo, RGB-D or monocular SLAM; a monocular map has a unit of its own instead of metres.
 
     >>> slam = Slam(camera)
     >>> for left, right, timestamp in frames:
@@ -48,14 +48,14 @@ class Slam:
     >>> slam.trajectory().T_wc
     >>> slam.save(path)
 
-    ``Slam.load(path)`` continues in that map: the camera is looked for in all of it, and what is
-    new is added. Where it is not found, a new sub-map begins, until a loop joins it. With
-    ``localize=True`` the map stays as it is, to the byte.
+    ``Slam.load(path)`` continues in that map: the camera is searched for in the whole map, and new
+    places are added. If the camera is not found, a new sub-map begins, which a loop may join to the
+    map later. With ``localize=True`` the map is not changed.
 
     Attributes:
-        context: camera, thresholds and pyramid scales, as ``extract_features`` takes them.
-        detector: finds loops and relocalises.
-        rig: what is known of the stereo pair, the measured delay of its right side for example.
+        context: camera, thresholds and pyramid scales, for ``extract_features``.
+        detector: proposes loop candidates and places for relocalisation.
+        rig: what has been measured of the stereo pair, such as the delay of its right camera.
     """
 
     def __init__(
@@ -72,23 +72,24 @@ class Slam:
     ) -> None:
         """
         Args:
-            camera: the rectified pair that the images come from, or ``camera.left_camera()``.
-            config: thresholds; the defaults are those of the papers.
-            detector: finds loops and relocalises: a name (``vslam.loopclosure.registry``; ``both``
-                is the capsule network beside the bag of words, ``none`` is odometry only) or an
-                object.
-            images: for a detector that is an object: where the images of keyframes are kept for
-                learned descriptors, which verify loops where ORB's fail; None for ORB alone.
-            threads: with 1, a keyframe is mapped where the result is needed instead of beside
-                tracking. The result is the same.
-            start: a map to begin in, of the same camera, detector and pyramid; it becomes this
-                one's own. ``Slam.load`` reads one from a file.
-            localize: only track in that map.
-            resume: continue the map's last drive; otherwise a new drive begins, with a clock of its
-                own.
+            camera: the rectified camera that the images come from; ``camera.left_camera()`` for
+                monocular SLAM.
+            config: thresholds; None uses the defaults.
+            detector: proposes loop candidates and places for relocalisation: a name
+                (``vslam.loopclosure.registry``; ``both`` is the capsule network together with the
+                bag of words, ``none`` is odometry only) or an object.
+            threads: with 1, a keyframe is mapped when its result is needed instead of in parallel
+                with tracking. The results are the same.
+            images: if ``detector`` is an object: store of the keyframe images for learned
+                descriptors, which verify loops where ORB fails; None verifies with ORB only.
+            start: a map to continue in, made with the same camera, detector and pyramid; it is
+                changed in place. ``Slam.load`` reads one from a file.
+            localize: only track in that map, without changing it.
+            resume: continue the map's last drive; otherwise a new drive begins, whose timestamps
+                are independent of those before.
 
         Raises:
-            ValueError: in a few words why the map cannot be continued.
+            ValueError: the map cannot be continued; the message gives the reason in a few words.
         """
         config = config or Config()
         if isinstance(detector, str):
@@ -121,37 +122,42 @@ class Slam:
         """Continue in a map that ``save`` or a run wrote.
 
         Args:
-            detector: like the one that the map was made with, a name or an object; None for just
-                that one, as it is shipped.
-            config, resume, options: as for a new map: ``threads``, ``images``, ``localize``.
+            path: the map file.
+            config: as for a new map.
+            detector: the detector that the map was made with, as a name or an object; None uses
+                the shipped detector of that name.
+            resume: as for a new map.
+            options: ``threads``, ``images`` and ``localize``, as for a new map.
 
         Raises:
-            InputError: no map, a damaged one, or one of another detector or pyramid.
+            InputError: the file is not a map or is damaged, or the map was made with another
+                detector or pyramid.
         """
         stored = load_checkpoint(path) if resume else load_map(path)
         detector = stored.detector.name if detector is None else detector
         try:
             return cls(stored.camera, config, detector, start=stored, resume=resume, **options)
         except (ValueError, KeyError) as error:
-            raise InputError(f"{path}: {error}; go on with the options of its run.") from error
+            raise InputError(f"{path}: {error}; use the options of that run.") from error
 
     def save(self, path: Path | str, drive: str = "", *, resumable: bool = False) -> None:
-        """Write the map to a file, in place of what is there: all that ``load`` needs.
+        """Write everything that ``load`` needs to a file; an existing file is replaced.
 
         Args:
-            drive: what the images since the start were, "kitti 06" for example.
-            resumable: include what tracking remembers and what was culled. Loaded with
-                ``resume=True``, such a file gives the poses of a run that was not stopped, to the
-                byte.
+            path: the file.
+            drive: source of the images of this drive, such as "kitti 06".
+            resumable: include the state of tracking and the culled parts of the map. A run that
+                loads such a file with ``resume=True`` gives the same poses, to the byte, as a run
+                that was not interrupted.
 
         Raises:
             RuntimeError: mapping failed, so that the map is incomplete.
-            OSError: the file cannot be written; one that was there is as it was.
+            OSError: the file cannot be written; an existing file is unchanged.
         """
         save_map(path, self.stored_map(drive), resumable=resumable)
 
     def stored_map(self, drive: str = "") -> StoredMap:
-        """What ``save`` writes. Its arrays are those of the map: call ``compact()``, which copies
+        """What ``save`` writes. It shares the map's arrays, so call ``compact()``, which copies
         them, before the next step.
 
         Raises:
@@ -160,22 +166,22 @@ class Slam:
         return self._session.stored_map(drive)
 
     def step(self, left: Image, second: Image | DepthImage | None, timestamp: float) -> TrackResult:
-        """Track one rectified stereo pair, an image with its depth, or a monocular image, and map
-        it if it is new.
+        """Track one rectified stereo pair, RGB-D image or monocular image, and insert it as a
+        keyframe if it shows something new.
 
-        The images are the caller's: what is kept of them is copied, so that a camera may write the
-        next ones into the same arrays.
+        The images are copied where they are kept, so that a camera may write the next ones into the
+        same arrays.
 
         Args:
             left: ``(H, W)`` uint8.
-            second: the right image, uint8; with ``camera.depth`` the depth of the left image's
-                pixels, ``(H, W)`` float32 metres, 0 where unknown; None for a monocular camera,
-                and only then.
+            second: the right image, ``(H, W)`` uint8; with ``camera.depth`` the depth of the left
+                image's pixels, ``(H, W)`` float32 metres, 0 where unknown; None for a monocular
+                camera.
             timestamp: seconds, later than that of the last call.
 
         Raises:
-            ValueError: images of another size or type, or a timestamp that goes back or is
-                not finite.
+            ValueError: the images have another size or type, or the timestamp is not finite or not
+                later than the last one.
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         check_images(left, second, self.context.camera)
@@ -192,12 +198,14 @@ class Slam:
         image: Image | None = None,
         stage_ms: dict[str, float] | None = None,
     ) -> TrackResult:
-        """``step`` for a pair whose features were extracted elsewhere (``extract_features``).
+        """``step`` for a frame whose features were extracted before (``extract_features``).
 
         Args:
+            extracted: the features.
+            timestamp: as for ``step``.
             image: ``(H, W)`` uint8 that the features were extracted from, for loop detectors that
-                look at it. It is kept as it is: do not write to it afterwards.
-            stage_ms: wall time by stage so far, milliseconds, for the result.
+                need it. It is not copied: do not write to it afterwards.
+            stage_ms: wall time of the stages so far in milliseconds, which the result includes.
         """
         clock = StageClock(dict(stage_ms or {}))
         frame = self._next_frame(extracted, timestamp, image)
@@ -233,8 +241,8 @@ class Slam:
         return result_of(frame, found, is_keyframe, clock.ms)
 
     def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
-        """Account for a frame without images, at the predicted pose: it is LOST, or DROPPED if
-        there was only no time for it."""
+        """Add a frame without images at the predicted pose: it is LOST, or DROPPED if there was
+        merely no time to process it."""
         frame = self._next_frame(Extracted.nothing(), timestamp, None)
         frame.T_cw = self._tracker.predict(timestamp, self._mapper.frames, self._mapper.view)
         self._mapper.append_pose(frame, tracked=False)
@@ -244,7 +252,7 @@ class Slam:
         return result_of(frame, found, False, {})
 
     def finish(self) -> None:
-        """Complete what is being mapped; map and trajectory are final until the next step."""
+        """Complete all mapping, so that map and trajectory stay as they are until the next step."""
         self._mapper.finish()
 
     def _next_frame(self, extracted: Extracted, timestamp: float, image: Image | None) -> Frame:
@@ -260,18 +268,18 @@ class Slam:
         """Keyframes, landmarks and observations.
 
         Raises:
-            RuntimeError: a keyframe is being mapped: look at ``is_mapping``, or call ``finish()``.
+            RuntimeError: a keyframe is being mapped; check ``is_mapping`` or call ``finish()``.
         """
         return self._mapper.map
 
     @property
     def frame(self) -> Frame | None:
-        """The last frame that was tracked, for drawing; None before the first."""
+        """The last tracked frame, for visualisation; None before the first."""
         return self._tracker.last
 
     @property
     def world(self) -> World | None:
-        """Where the map that was loaded lies in that of a ground truth, None if unknown."""
+        """The place of the loaded map in the world of a ground truth; None if unknown."""
         return self._session.opened.world
 
     @property
@@ -281,29 +289,35 @@ class Slam:
 
     @property
     def is_adjusting(self) -> bool:
-        """Whether a global bundle adjustment is yet to be merged."""
+        """Whether the result of a global bundle adjustment is still to be merged."""
         return self._closing.is_adjusting
 
     @property
     def loops(self) -> list[LoopEdge]:
-        """Every loop candidate so far and what became of it."""
+        """The outcome of every loop candidate so far."""
         return self._closing.edges
 
     @property
+    def problems(self) -> list[str]:
+        """What failed so far without harm to the map, a sentence each: looking for loops, or a
+        global bundle adjustment."""
+        return self._closing.problems
+
+    @property
     def corrections(self) -> list[LoopCorrection]:
-        """What each closed loop did to the keyframes."""
+        """How each closed loop corrected the keyframes."""
         return self._closing.corrections
 
     def trajectory(self) -> Trajectory:
-        """Pose of every frame as the map is now, lost frames included: where the camera was lost,
-        its motion is interpolated between the frames tracked before and after."""
+        """The pose of every frame according to the present map. Where the camera was lost, its
+        motion is interpolated between the frames tracked before and after."""
         return self._mapper.trajectory()
 
     def keyframe_trajectory(self) -> Trajectory:
-        """Pose of every keyframe of this drive that was not culled."""
+        """The poses of the living keyframes of this drive."""
         return keyframe_trajectory(self.map)
 
     def in_map(self) -> NDArray[np.bool_]:
-        """``(N,)`` frames tracked in the part of the map that holds its first keyframe, sub-maps
-        joined to it by loops included."""
+        """``(N,)`` bool: which frames were tracked in the part of the map with its first keyframe,
+        including sub-maps that loops have joined to it."""
         return in_first_part(self.map, self._closing.closed, self._mapper.frames.table())

@@ -1,7 +1,7 @@
-"""How a map, or a sub-map after the camera was lost, begins.
+"""The start of a map, and of a sub-map after the camera was lost.
 
-A frame of a stereo or RGB-D camera begins a map alone, if it has enough points. A monocular map
-needs two: a frame is kept until a later one forms a pair with it.
+One frame of a stereo or RGB-D camera with enough points begins a map. A monocular map needs two
+frames: a frame is kept until a later one forms a pair with it.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from vslam.geometry import Matrix, se3_log
 
 @dataclass(frozen=True)
 class TwoViewStart:
-    """Two frames that make a map.
+    """Two frames that begin a monocular map.
 
     Attributes:
-        first, second: the frames; the first has the pose that the map is to begin at.
-        T_2_1: ``(4, 4)`` motion from the first to the second.
-        features: ``(N,)`` int64 features of both that see the same point.
-        points: ``(N, 3)`` in the first camera.
-        predicted: whether the unit follows from the speed of the camera before.
+        first, second: the frames; the first has the pose at which the map begins.
+        T_2_1: ``(4, 4)`` maps points of the first camera to the second.
+        features: for each frame, ``(N,)`` int64 features; the i-th of both see the same point.
+        points: ``(N, 3)`` these points in the first camera.
+        predicted: whether the map's unit was derived from the camera's speed before the loss.
     """
 
     first: Frame
@@ -43,12 +43,12 @@ class TwoViewStart:
         return se3_log(self.T_2_1) / (self.second.timestamp - self.first.timestamp)
 
     def at_speed(self, twist: Matrix | None, max_rescaling: float) -> TwoViewStart:
-        """The start of a sub-map in the unit of the map before it, as far as anything tells: the
-        camera drives on as fast as it did.
+        """Scale the start of a sub-map such that the camera has kept its speed, which gives the
+        sub-map approximately the unit of the map before it.
 
         Args:
-            twist: ``(6,)`` speed of the camera before, per second; None if unknown.
-            max_rescaling: beyond this factor the speed tells nothing.
+            twist: ``(6,)`` twist of the camera per second before it was lost; None if unknown.
+            max_rescaling: if the factor is larger than this, the start remains as it is.
         """
         if twist is None:
             return self
@@ -63,7 +63,7 @@ class TwoViewStart:
 
 @dataclass(frozen=True)
 class OneViewStart:
-    """A frame whose stereo points make a map."""
+    """A frame whose stereo points begin a map."""
 
     frame: PlacedFrame
 
@@ -72,7 +72,7 @@ Start = OneViewStart | TwoViewStart
 
 
 class Starter:
-    """Looks for the frames that a map, or a sub-map, can begin with."""
+    """Finds the frames with which a map or a sub-map can begin."""
 
     def __init__(self, context: TrackingContext) -> None:
         self._context = context
@@ -80,23 +80,22 @@ class Starter:
 
     @property
     def is_waiting(self) -> bool:
-        """Whether a frame is kept that waits for a second one."""
+        """Whether a first frame is kept until a second one forms a pair with it."""
         return self._first is not None
 
     def reset(self) -> None:
-        """Forget the frame that is kept."""
+        """Discard the first frame if one is kept."""
         self._first = None
 
     def offer(self, frame: PlacedFrame) -> Start | None:
-        """Try to begin with a frame, which is untracked; None if that is not possible yet."""
+        """Try to begin with an untracked frame; None if that is not possible yet."""
         if self._context.camera.monocular:
             return self._offer_monocular(frame)
         enough = frame.n_stereo >= self._context.config.tracking.min_stereo_start
         return OneViewStart(frame) if enough else None
 
     def _offer_monocular(self, frame: PlacedFrame) -> TwoViewStart | None:
-        """Try a frame with the one that is kept; where they have too little in common, keep this
-        one instead."""
+        """Try to pair a frame with the kept one; if they share too little, keep the new one."""
         config = self._context.config.initialization
         if self._first is None or frame.timestamp - self._first.timestamp > config.max_seconds:
             self._keep(frame)

@@ -1,7 +1,7 @@
-"""What each part of SLAM remembers between two frames besides the map.
+"""The state of each part of SLAM between two frames, apart from the map.
 
-Every part gives its state by ``state()`` and takes it back by ``restore(state)``. With all of them
-and the map as it was, a run continues to the byte as if it had not stopped.
+Every part returns its state from ``state()`` and accepts it in ``restore(state)``. With all states
+and the map, a run continues with the same results, to the byte, as if it had not stopped.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from vslam.loops import LoopEdge, ResembledPlace
 
 @dataclass(frozen=True)
 class TrackerState:
-    """Of the tracker.
+    """State of the tracker.
 
     Attributes:
-        index, timestamp: of the last frame tracked.
+        index, timestamp: index and time (seconds) of the last tracked frame.
         features: its N features.
-        landmark: ``(N,)`` int32, the landmark that each of them tracks, or -1.
+        landmark: ``(N,)`` int32, the landmark that each feature observes, or -1.
         T_cw: ``(4, 4)`` its pose.
-        twist: ``(6,)`` the speed of the camera then, per second; None if unknown.
-        lost_frames: since the last frame tracked.
-        n_tracked: landmarks that it tracked at the time.
+        twist: ``(6,)`` twist of the camera at that time, per second; None if unknown.
+        lost_frames: number of lost frames since then.
+        n_tracked: number of landmarks that the frame tracked.
     """
 
     index: int
@@ -42,12 +42,14 @@ class TrackerState:
 
 @dataclass(frozen=True)
 class MapperState:
-    """Of the mapper.
+    """State of the mapper.
 
     Attributes:
-        reference: the keyframe that frames are tracked against and placed by.
-        last_frame, last_timestamp: index and seconds of the frame that became the last keyframe.
-        patches: of the newest keyframes, oldest first.
+        reference: the keyframe that frames are tracked against and that their poses are relative
+            to.
+        last_frame, last_timestamp: index and time (seconds) of the frame that became the last
+            keyframe.
+        patches: image patches of the newest keyframes, oldest first.
     """
 
     reference: int
@@ -58,11 +60,11 @@ class MapperState:
 
 @dataclass(frozen=True)
 class PolicyState:
-    """Of the keyframe policy.
+    """State of the keyframe policy.
 
     Attributes:
-        gained_close: close points that the first frame after a keyframe tracks, on average.
-        gain_awaited: whether the next frame is such a frame.
+        gained_close: mean number of close points that the first frame after a keyframe tracks.
+        gain_awaited: whether the next frame is the first after a keyframe.
     """
 
     gained_close: float
@@ -71,12 +73,12 @@ class PolicyState:
 
 @dataclass(frozen=True)
 class ConsistencyState:
-    """Of the consistency test of loop candidates.
+    """State of the consistency test of loop candidates.
 
     Attributes:
-        places: that recent keyframes resembled.
-        verified: loops that wait for others to agree, each with the ``turn`` of its keyframe.
-        turn: keyframes asked about so far.
+        places: places that recent keyframes resembled.
+        verified: verified loops that others must confirm, each with the ``turn`` of its keyframe.
+        turn: number of keyframes tested so far.
     """
 
     places: tuple[ResembledPlace, ...] = ()
@@ -86,24 +88,24 @@ class ConsistencyState:
 
 @dataclass(frozen=True)
 class VerifierState:
-    """Of the verifier of loop candidates: its last failed attempt by learned descriptors.
+    """State of the verifier of loop candidates: its last failed attempt with learned descriptors.
 
     Attributes:
-        resting_until: before this keyframe, only clearly more alike candidates are tried.
-        in_vain: how alike the images of the failed attempt were.
+        resting_until: before this keyframe, only clearly more similar candidates are tried.
+        failed_alike: similarity of the two images of the failed attempt.
     """
 
     resting_until: int = 0
-    in_vain: float = 0.0
+    failed_alike: float = 0.0
 
 
 @dataclass(frozen=True)
 class ClosingState:
-    """Of loop closing.
+    """State of loop closing.
 
     Attributes:
         consistency, verifier: the states of its parts.
-        followed: times that an old keyframe served instead of a new one.
+        followed: how often an old keyframe was reused instead of a new one.
     """
 
     consistency: ConsistencyState = field(default_factory=ConsistencyState)
@@ -116,7 +118,7 @@ class Checkpoint:
     """The states of all parts.
 
     Attributes:
-        rig: what was learned of the delay between the sides (``SideDelay``).
+        rig: the estimate of the delay between the two cameras (``SideDelay``).
     """
 
     tracker: TrackerState

@@ -1,8 +1,9 @@
 """Trajectories: one pose for each frame, read and written in the field's text formats.
 
-KITTI: the 12 numbers of the upper 3x4 part of ``T_wc`` a line, row by row, without time (Geiger et
-al., CVPR 2012). TUM: ``t x y z qx qy qz qw`` a line, seconds and metres (Sturm et al., IROS 2012).
-EuRoC, written only: ``t,x,y,z,qw,qx,qy,qz`` a line, nanoseconds (Burri et al., IJRR 2016).
+A line holds, in KITTI's format, the upper 3x4 part of ``T_wc``, row by row, without time (Geiger et
+al., CVPR 2012); in TUM's, ``t x y z qx qy qz qw`` in seconds and metres (Sturm et al., IROS 2012);
+in EuRoC's, which is only written, ``t,x,y,z,qw,qx,qy,qz`` with t in nanoseconds (Burri et al., IJRR
+2016).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from vslam.geometry import compose, inverse, orthonormalised, se3_exp, se3_log
 
 _FORMAT_OF_COLUMNS: dict[int, Literal["kitti", "tum"]] = {12: "kitti", 8: "tum"}
 
-# Poses in the wild are rounded to 7 digits; beyond this a matrix is no rotation but a mistake.
+# Published poses are rounded to about 7 digits; a larger error means that it is not a rotation.
 _ROTATION_TOLERANCE = 1e-3
 
 
@@ -35,15 +36,16 @@ class Trajectory:
         return len(self.T_wc)
 
     def select(self, indices: NDArray[np.int64]) -> Trajectory:
-        """The poses ``indices`` in their order."""
+        """The poses at ``(M,)`` indices, in that order."""
         return Trajectory(self.timestamps[indices], self.T_wc[indices])
 
 
 def bridge_gaps(trajectory: Trajectory, known: NDArray[np.bool_]) -> Trajectory:
-    """Replace poses between known ones by those of a constant velocity from one to the next.
+    """Replace the poses between known ones by interpolation at constant velocity.
 
     Args:
-        known: ``(N,)`` poses to keep; those before the first and after the last are kept as well.
+        known: ``(N,)`` bool, the poses to keep. Poses before the first known one and after the last
+            are kept as well.
     """
     T_wc, times = trajectory.T_wc.copy(), trajectory.timestamps
     anchors = np.flatnonzero(known)
@@ -60,19 +62,19 @@ def bridge_gaps(trajectory: Trajectory, known: NDArray[np.bool_]) -> Trajectory:
 def read_table(
     path: Path | str, columns: tuple[int, ...], what: str, max_rows: int | None = None
 ) -> NDArray[np.float64]:
-    """Read a text file of numbers; blank lines and lines that begin with ``#`` are passed over.
+    """Read a text file of numbers; blank lines and lines that begin with ``#`` are skipped.
 
     Args:
         path: file to read.
-        columns: the numbers of columns allowed; all lines must agree.
+        columns: the allowed numbers of columns; all lines must have the same number.
         what: what a line holds, for the error messages ("a pose").
-        max_rows: read and check no more than so many.
+        max_rows: stop reading after this many rows.
 
     Returns:
         ``(N, C)`` float64 with N >= 1, all finite.
 
     Raises:
-        InputError: missing, empty or malformed file, NaN or infinity in it.
+        InputError: the file is missing, empty or malformed, or it holds NaN or infinity.
     """
     try:
         lines = Path(path).read_text().splitlines()
@@ -112,7 +114,7 @@ def read_table(
 
 
 def trajectory_format(path: Path | str) -> Literal["kitti", "tum"]:
-    """Tell the two formats apart by the number of columns of the first pose.
+    """Determine the format by the number of columns of the first pose.
 
     Raises:
         InputError: as :func:`read_table`.
@@ -124,7 +126,7 @@ def read_kitti_poses(path: Path | str) -> NDArray[np.float64]:
     """Read a KITTI pose file into ``(N, 4, 4)`` float64 ``T_wc``.
 
     Raises:
-        InputError: missing or malformed file, NaN, or a 3x3 part that is no rotation.
+        InputError: the file is missing or malformed, or a 3x3 part is not a rotation.
     """
     return _poses_of_rows(path, read_table(path, (12,), "a KITTI pose"))
 
@@ -134,12 +136,12 @@ def read_trajectory(path: Path | str, timestamps: NDArray[np.float64] | None = N
 
     Args:
         path: file to read.
-        timestamps: ``(N,)`` seconds of the poses of a KITTI file; without them the frame number
-            stands in. A TUM file has its own and ignores these.
+        timestamps: ``(N,)`` seconds of the poses of a KITTI file; None uses the frame number. A
+            TUM file has its own timestamps and ignores these.
 
     Raises:
-        InputError: malformed file, another number of poses than of timestamps, no rotation, or
-            TUM times that do not increase.
+        InputError: the file is malformed, the numbers of poses and timestamps differ, a pose has
+            no rotation, or TUM times do not increase.
     """
     rows = read_table(path, (12, 8), "a pose")
     if _FORMAT_OF_COLUMNS[rows.shape[1]] == "kitti":
@@ -148,7 +150,7 @@ def read_trajectory(path: Path | str, timestamps: NDArray[np.float64] | None = N
         elif len(timestamps) != len(rows):
             raise InputError(
                 f"{path}: {len(rows)} poses but {len(timestamps)} timestamps; "
-                "give the times of just these frames."
+                "give the times of exactly these frames."
             )
         return Trajectory(np.asarray(timestamps, np.float64), _poses_of_rows(path, rows))
 
@@ -160,7 +162,7 @@ def read_trajectory(path: Path | str, timestamps: NDArray[np.float64] | None = N
             "sort the poses by time."
         )
     if not np.allclose(np.linalg.norm(rows[:, 4:], axis=1), 1.0, atol=_ROTATION_TOLERANCE):
-        raise InputError(f"{path}: a quaternion is not of length 1; write qx qy qz qw normalised.")
+        raise InputError(f"{path}: a quaternion is not of length 1; normalise qx qy qz qw.")
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
     T_wc[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
     T_wc[:, :3, 3] = rows[:, 1:4]
@@ -169,7 +171,7 @@ def read_trajectory(path: Path | str, timestamps: NDArray[np.float64] | None = N
 
 def write_kitti(path: Path | str, T_wc: NDArray[np.float64]) -> None:
     """Write ``(N, 4, 4)`` poses in KITTI's format with 13 significant digits."""
-    rows = T_wc[:, :3, :].reshape(-1, 12) + 0.0  # no "-0": equal poses give equal bytes
+    rows = T_wc[:, :3, :].reshape(-1, 12) + 0.0  # turns -0 into 0: equal poses give equal bytes
     lines = (" ".join([f"{x:.12e}" for x in row]) + "\n" for row in rows.tolist())
     Path(path).write_text("".join(lines))
 
@@ -177,13 +179,13 @@ def write_kitti(path: Path | str, T_wc: NDArray[np.float64]) -> None:
 def tum_line(timestamp: float, T_wc: NDArray[np.float64]) -> str:
     """One ``(4, 4)`` pose as a line of TUM's format."""
     quaternion = quaternions(T_wc[None, :3, :3])[0].tolist()
-    # Twelve digits keep the quaternion on the unit sphere to the rounding of the poses.
+    # Twelve digits keep the norm of the quaternion at 1 within the rounding of the poses.
     numbers = [f"{x:.9f}" for x in T_wc[:3, 3].tolist()] + [f"{x:.12f}" for x in quaternion]
     return " ".join([f"{timestamp:.9f}", *numbers]) + "\n"
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
-    """Write a trajectory in TUM's format: nanoseconds, nanometres, quaternions with qw >= 0."""
+    """Write a trajectory in TUM's format with nine decimals and quaternions with qw >= 0."""
     T_wc = trajectory.T_wc
     rows = np.column_stack([T_wc[:, :3, 3], quaternions(T_wc[:, :3, :3])]).tolist()
     Path(path).write_text(
@@ -191,8 +193,7 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
             f"{t:.9f} "
             + " ".join(f"{x:.9f}" for x in row[:3])
             + " "
-            # Twelve digits keep the quaternion on the unit sphere to the rounding of the poses.
-            + " ".join(f"{x:.12f}" for x in row[3:])
+            + " ".join(f"{x:.12f}" for x in row[3:])  # digits as in tum_line
             + "\n"
             for t, row in zip(trajectory.timestamps.tolist(), rows, strict=True)
         )
@@ -200,9 +201,9 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
 
 
 def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
-    """Write a trajectory as EuRoC's ground truth is written, without velocities and biases.
+    """Write a trajectory in the format of EuRoC's ground truth, without velocities and biases.
 
-    Times are whole nanoseconds, but no better than float64 seconds: 0.2 us in Unix time.
+    Times are written in nanoseconds, but float64 seconds resolve only 0.2 us of Unix time.
     """
     names = ("x [m]", "y [m]", "z [m]"), ("w []", "x []", "y []", "z []")
     columns = [*(f"p_RS_R_{name}" for name in names[0]), *(f"q_RS_{name}" for name in names[1])]
@@ -215,10 +216,11 @@ def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
 
 
 def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``(N, 4)`` float64 x, y, z, w with w >= 0 of ``(N, 3, 3)`` rotations, to the last bit those
-    of ``scipy.spatial.transform.Rotation``, whose import takes longer than all files of a run.
+    """``(N, 4)`` float64 quaternions x, y, z, w with w >= 0 of ``(N, 3, 3)`` rotations.
 
-    A matrix that is off by more than 1e-12 is taken for the nearest rotation.
+    They equal those of ``scipy.spatial.transform.Rotation`` to the last bit; importing it would
+    take longer than writing all files of a run. A matrix whose error is above 1e-12 is replaced by
+    the nearest rotation.
     """
     error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3))
     off = (error > 1e-12 + 1e-5 * np.eye(3)).any(axis=(1, 2))
@@ -228,8 +230,8 @@ def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
         R[off] = U @ Vt
     diagonal = R[:, [0, 1, 2], [0, 1, 2]]
     trace = diagonal[:, 0] + diagonal[:, 1] + diagonal[:, 2]
-    # The largest of the four components is divided by, so that none loses digits (Markley, Journal
-    # of Guidance, Control and Dynamics, 2008).
+    # Dividing by the largest of the four components loses no digits (Markley, Journal of Guidance,
+    # Control and Dynamics, 2008).
     largest = np.argmax(np.column_stack([diagonal, trace]), axis=1)
     q = np.empty((len(R), 4))
     for i in range(3):
@@ -245,7 +247,7 @@ def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
     q[rest, 3] = 1.0 + trace[rest]
     x, y, z, w = q.T
     q /= np.sqrt(x * x + y * y + z * z + w * w)[:, None]
-    # Of the two that stand for a half turn, the one that begins with a positive number.
+    # Of the two quaternions of a half turn, choose the one whose first non-zero number is positive.
     first = np.where(q[:, 0] != 0, q[:, 0], np.where(q[:, 1] != 0, q[:, 1], q[:, 2]))
     return np.where(((q[:, 3] < 0) | ((q[:, 3] == 0) & (first < 0)))[:, None], -q, q)
 

@@ -1,7 +1,7 @@
-"""Files of other people: limits on what they may make this machine do.
+"""Limits on the memory that untrusted files can make this process allocate.
 
-A small file can speak of a huge one: an image header of 100,000 x 100,000 pixels, a zip member that
-unpacks to 100 GB. What is promised is compared with what is there before memory is taken for it.
+A small file can announce a huge one, such as an image of 100,000 x 100,000 pixels or a zip member
+that unpacks to 100 GB. The announced size is checked before memory is allocated.
 """
 
 from __future__ import annotations
@@ -15,33 +15,33 @@ from typing import TYPE_CHECKING, Any
 
 from vslam.errors import InputError
 
-if TYPE_CHECKING:  # `vslam --help` loads this, but not NumPy
+if TYPE_CHECKING:  # `vslam --help` loads this module and must not load NumPy
     from numpy.typing import NDArray
 
 MOST_PIXELS = 2**27
-"""Of an image file: 11,585 x 11,585; OpenCV itself allows eight times as many."""
+"""Most pixels of an image file (11,585 x 11,585); OpenCV itself allows eight times as many."""
 
 _OPENCV_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
-_ANY_SIZE = 2**27  # bytes that every archive may unpack to
-_MOST_PACKED = 20  # beyond that, so many times its own size
+_ANY_SIZE = 2**27  # bytes; every archive may unpack to this size
+_MOST_PACKED = 20  # a larger archive may unpack to this many times its own size
 ARCHIVE_ERRORS = (
     EOFError, ValueError, KeyError, RuntimeError, OverflowError, zlib.error,
     zipfile.BadZipFile, zipfile.LargeZipFile,
 )  # fmt: skip
-"""What NumPy, zipfile and zlib raise for an archive of arrays that is damaged, encrypted, packed in
-an unknown way, or none."""
+"""What NumPy, zipfile and zlib raise for a file that is not an archive of arrays, or a damaged,
+encrypted or unusually compressed one."""
 
 
 def limit_images() -> None:
-    """Let OpenCV refuse larger images by their header; it asks once, when it is first imported."""
+    """Make OpenCV refuse larger images by their header; it reads this limit when it is imported."""
     os.environ.setdefault(_OPENCV_LIMIT, str(MOST_PIXELS))
 
 
 def require_utf8(path: Path) -> None:
-    """Refuse a name that reports, which are text, cannot hold.
+    """Refuse a file name that text files such as reports cannot contain.
 
     Raises:
-        InputError: it is not UTF-8.
+        InputError: the name is not UTF-8.
     """
     try:
         str(path).encode()
@@ -51,14 +51,15 @@ def require_utf8(path: Path) -> None:
 
 
 def read_npz(path: Path, what: str, fix: str = "name another file") -> dict[str, NDArray[Any]]:
-    """All arrays of an npz file; Python objects (pickles) are refused.
+    """Read all arrays of an npz file; Python objects (pickles) are refused.
 
     Args:
-        what: that the file should be, with an article, and ``fix``: for the messages.
+        what: what the file should be, with an article, for the error messages.
+        fix: what the user can do, for the error messages.
 
     Raises:
-        InputError: missing, damaged, no npz, or arrays that are not in the file or beyond the
-            memory of this machine.
+        InputError: the file is missing, damaged or not an npz file, or its arrays do not fit into
+            the memory of this machine.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -77,22 +78,22 @@ def read_npz(path: Path, what: str, fix: str = "name another file") -> dict[str,
 
 
 def read_json(array: NDArray[Any]) -> Any:
-    """The JSON in an array of bytes.
+    """Parse the JSON in an array of bytes.
 
     Raises:
-        ValueError: it is no such array, or no JSON.
+        ValueError: the array does not hold bytes, or these are not JSON.
     """
-    if array.dtype != "uint8" or array.ndim != 1:  # bytes() of a number is as many zeros
+    if array.dtype != "uint8" or array.ndim != 1:  # bytes() of a number n would be n zeros
         raise ValueError("the header is no text")
     return json.loads(array.tobytes())
 
 
 def require_memory(path: Path, what: str) -> None:
-    """Refuse an archive that unpacks to far more than its size, or to more than the free memory;
-    other files pass.
+    """Check that an archive unpacks neither to far more than its size nor to more than the free
+    memory. Files that are not archives pass.
 
     Raises:
-        InputError: it does.
+        InputError: the archive unpacks to more.
     """
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
@@ -118,7 +119,7 @@ def _check_size(path: Path, archive: zipfile.ZipFile, what: str) -> None:
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """An array, after a look at its header: it must not be larger than its member."""
+    """Read an array after checking that its member is as long as its header says."""
     import numpy as np
 
     layout = np.lib.format
@@ -137,4 +138,4 @@ def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[A
             raise ValueError(f"{member.filename} is not as long as its header says")
         array = np.frombuffer(file.read(), dtype, count) if count else np.zeros(0, dtype)
     ordered = array.reshape(shape[::-1]).T if fortran else array.reshape(shape)
-    return ordered.copy()  # writable, and in the order of C
+    return ordered.copy()  # writable and C-contiguous

@@ -1,4 +1,4 @@
-"""Siamese networks that tell whether two images show one place, as runs ask them: without torch.
+"""Siamese networks that decide whether two images show the same place: inference without torch.
 
-Their training is in :mod:`vslam.loopclosure.training`.
+Training is in :mod:`vslam.loopclosure.training`.
 """

@@ -1,4 +1,4 @@
-"""Loop detectors that compare descriptors of a Siamese network."""
+"""The loop detector that compares image descriptors of a Siamese network."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ from vslam.map import Map
 class SiameseDetector:
     """Implements :class:`vslam.loopclosure.detector.LoopDetector`.
 
-    Where images are kept, the network sees a keyframe only once the camera is near enough to it
-    that it may be there again (:func:`beyond_reach`), or lost: on a drive that never returns, none.
+    If the images of keyframes are stored (``images``), the network computes the descriptor of a
+    keyframe only when the camera comes within reach of it (:func:`beyond_reach`) or is lost. So on
+    a drive that never returns the network is not run at all.
 
-    Descriptors of the keyframes that the network has seen are rows of one matrix that grows by
-    half. It has no columns before the network was asked.
+    Descriptors are rows of a matrix that grows by half when it is full. The matrix has no columns
+    until the network has computed the first descriptor.
     """
 
     def __init__(
@@ -38,13 +39,14 @@ class SiameseDetector:
         learned: LearnedMatchingConfig | None = None,
         images: KeyframeImages | None = None,
     ) -> None:
-        """The network's name becomes the detector's.
+        """The detector takes the name of the network.
 
         Args:
-            learned: how candidates are matched.
-            images: where they are kept, local descriptors put the most similar keyframes in order:
-                by night the place is among these more often than the first. Then the threshold is
-                ``offered``. None for the similarity alone.
+            learned: thresholds for local descriptors; None takes the defaults.
+            images: the store of keyframe images. If it is given, the most similar keyframes are
+                ranked again by local descriptors, because by night the right place is often among
+                them but not first; and the threshold on the similarity is ``offered``. None ranks
+                by the similarity alone, with ``threshold``.
         """
         self.name = network.name
         self._network = network
@@ -52,11 +54,11 @@ class SiameseDetector:
         self._images = images
         self._config = config
         self._descriptors = np.zeros((64, 0), np.float32)
-        self._n_seen = 0  # rows in use
-        self._row = np.full(64, -1, np.int64)  # of each keyframe, -1 for those not seen
+        self._n_seen = 0  # number of rows in use
+        self._row = np.full(64, -1, np.int64)  # row of each keyframe, -1 without a descriptor
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Remember a keyframe. Without its image it can be neither query nor match."""
+        """Remember a keyframe. Without an image it can be neither a query nor a match."""
         if keyframe >= len(self._row):
             more = max(keyframe + 1 - len(self._row), len(self._row) // 2)
             self._row = np.pad(self._row, (0, more), constant_values=-1)
@@ -64,7 +66,7 @@ class SiameseDetector:
             self._remember(keyframe, image)
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        """Best first: alive, neither recent nor covisible, similarity at or above the threshold."""
+        """See :class:`LoopDetector`; candidates have at least the threshold's similarity."""
         if keyframe >= len(self._row) or not (self._known[keyframe] or self._pending(keyframe)):
             return []
         eligible = self._alive(map_)
@@ -91,9 +93,9 @@ class SiameseDetector:
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """The living keyframes most like a frame outside the map, whatever their similarity.
+        """The living keyframes that are most similar to a frame outside the map, best first.
 
-        Relocalisation verifies them by geometry and has nothing to lose: no threshold.
+        There is no threshold, because relocalisation verifies candidates by geometry anyway.
         """
         if image is None:
             return []
@@ -107,7 +109,7 @@ class SiameseDetector:
         return self._best(-1, p, order, map_)
 
     def memory(self) -> DetectorMemory:
-        """See :class:`LoopDetector`: the descriptors of the keyframes with an image."""
+        """See :class:`LoopDetector`; contains the descriptors that were computed."""
         first = np.concatenate([[0], np.cumsum(self._known)]).astype(np.int64)
         table = PerKeyframe(first, self._descriptors[self._row[self._known]])
         return DetectorMemory(self.name, self._network.fingerprint, {"descriptors": table})
@@ -127,11 +129,12 @@ class SiameseDetector:
 
     @property
     def _known(self) -> NDArray[np.bool_]:
-        """``(K,)`` keyframes that the network has seen."""
+        """``(K,)`` bool, keyframes with a descriptor."""
         return self._row >= 0
 
     def _alive(self, map_: Map) -> NDArray[np.bool_]:
-        """``(n,)`` living keyframes with a descriptor, or with an image for one."""
+        """``(n,)`` bool, living keyframes with a descriptor, or with an image to compute it
+        from."""
         n = min(map_.n_keyframes, len(self._row))
         able = self._known[:n].copy()
         able[[k for k in np.flatnonzero(~able).tolist() if self._pending(k)]] = True
@@ -144,7 +147,7 @@ class SiameseDetector:
         return np.flatnonzero(keyframes & ~self._known[: len(keyframes)])
 
     def _see(self, keyframes: Iterable[int]) -> None:
-        """Embed keyframes that are not yet."""
+        """Compute the descriptors of keyframes that have none yet."""
         assert self._images is not None
         for keyframe in keyframes:
             if not self._known[keyframe]:
@@ -165,12 +168,13 @@ class SiameseDetector:
     def _similarities(
         self, descriptor: NDArray[np.float32], eligible: NDArray[np.bool_]
     ) -> NDArray[np.float32]:
-        """``(N,)``, -1 for keyframes that are not eligible."""
+        """``(N,)`` similarity of each keyframe, -1 for keyframes that are not eligible."""
         p = np.full(len(eligible), -1.0, np.float32)
         rows = self._row[: len(eligible)][eligible]
         if len(rows):
-            # In the order of the keyframes, in whichever order they were seen: the last bits of a
-            # product of matrices may depend on where a row stands. Without gaps, nothing is copied.
+            # Rows are passed in the order of the keyframes, not in that of their computation,
+            # because the last bits of a matrix product may depend on the position of a row.
+            # Consecutive rows are passed as a view, without a copy.
             in_a_row = (np.diff(rows) == 1).all()
             gallery = (
                 self._descriptors[rows[0] : rows[-1] + 1] if in_a_row else self._descriptors[rows]
@@ -179,8 +183,8 @@ class SiameseDetector:
         return p
 
     def _reranked(self, p: NDArray[np.float32], query: DescriptorMaps) -> NDArray[np.float32]:
-        """``(N,)``: how much of the image looks alike, of the most similar keyframes; -1 of the
-        others."""
+        """``(N,)`` similarity of the images by local descriptors for the most similar keyframes, -1
+        for the others."""
         assert self._images is not None
         order = np.full(len(p), -1.0, np.float32)
         for keyframe in np.argsort(-p, kind="stable")[: self._config.reranked].tolist():
@@ -196,13 +200,14 @@ class SiameseDetector:
         order: NDArray[np.float32],
         map_: Map,
     ) -> list[LoopCandidate]:
-        """Candidates by descending ``order`` ``(N,)``, which is -1 for those that are none."""
+        """Candidates in descending ``order`` ``(N,)``; it is -1 for keyframes that are not
+        candidates."""
         order = order.copy()
         found: list[LoopCandidate] = []
         most = self._config.max_candidates
         if self._images is not None:
             most = min(most, self._learned.max_candidates)
-        # Neighbours of a good match match well, too: they would crowd out the other places.
+        # The neighbours of a good match are similar as well and would crowd out other places.
         while len(order) and len(found) < most:
             best = int(np.argmax(order))
             if order[best] < 0.0:
@@ -224,16 +229,16 @@ def open_detector(
     *,
     late: bool = False,
 ) -> SiameseDetector:
-    """A detector with its weights.
+    """Create a detector and load its network.
 
     Args:
         name: one of ``NETWORKS``.
-        weights: ONNX file; None for the ones that vslam ships.
-        config, learned, images: as :class:`SiameseDetector` takes them.
-        late: load the weights that vslam ships when the first image comes.
+        weights: ONNX file; None takes the weights that vslam ships.
+        config, learned, images: as in :class:`SiameseDetector`.
+        late: whether to load weights that vslam ships only when the first image comes.
 
     Raises:
-        InputError: unknown name, no weights, or weights of another network.
+        InputError: the name is unknown, or there are no weights, or those of another network.
     """
     late = late and weights is None
     network = LateNetwork(name) if late else open_network(name, weights)

@@ -1,4 +1,4 @@
-"""Images of the FAB-MAP collections; their ground-truth matrices tell which show one place."""
+"""Reads the FAB-MAP image collections with their ground-truth matrices."""
 
 from __future__ import annotations
 
@@ -22,18 +22,23 @@ _UNDISTORT_COLUMNS = (8, 9)
 
 
 def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[ImageSource]:
-    """Images of one of the FAB-MAP collections with its ground-truth matrix.
+    """Read a FAB-MAP collection: a folder of images and a ground-truth matrix.
 
-    The matrix has a row for each image, or one for each pair of left and right images (odd and
-    even numbers): then the images of one camera are taken. A ``calibration.txt`` in the folder (fx
-    fy cx cy k1 k2 p1 p2 [k3] on one line) has the images undistorted.
+    The matrix has a row for each image, or a row for each pair of a left and a right image (odd and
+    even numbers); in the latter case only the images of one camera are used. If the folder has a
+    ``calibration.txt`` (fx fy cx cy k1 k2 p1 p2 [k3] on one line), the images are undistorted.
+
+    Args:
+        folder: folder of the images.
+        truth: ``.mat`` file of the matrix; by default the first one in the folder.
+        side: "left" or "right", the camera to use if the matrix has a row for each pair.
 
     Raises:
-        InputError: no images, no matrix, or sizes that do not belong together.
+        InputError: there are no images or no matrix, or their sizes do not fit together.
     """
     files = images_in(folder)
     if not files:
-        raise InputError(f"{folder}: no images; see datasets.md.")
+        raise InputError(f"{folder}: no images; see docs/reference/datasets.md.")
     named = Path(truth).expanduser() if truth else None
     path = named or next(iter(sorted(folder.glob("*.mat"))), None)
     if path is None:
@@ -49,7 +54,7 @@ def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[Image
         )
     relation = np.where(loops | loops.T, SAME, DIFFERENT).astype(np.int8)
     index = np.arange(n)
-    # The matrices leave out the images just before and after, which overlap all the same.
+    # The matrices do not mark the images just before and after, although they overlap.
     beside = np.abs(index[:, None] - index[None]) <= 20
     relation[beside & (relation == DIFFERENT)] = UNKNOWN
     np.fill_diagonal(relation, SAME)

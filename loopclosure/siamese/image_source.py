@@ -1,4 +1,4 @@
-"""One source of images: the type that all readers return, and what several of them need."""
+"""The type of image source that all readers return, and functions that several readers share."""
 
 from __future__ import annotations
 
@@ -14,25 +14,30 @@ from vslam.loopclosure.siamese.images import Fit, Size, read_grey, to_size
 
 SAME, UNKNOWN, DIFFERENT = 1, 0, -1
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".ppm", ".pgm"}
+_NO_TRUTH = (
+    "{}: no ground truth in it (no square matrix with a match); name the loop matrix of these "
+    "images."
+)
 
 
 @dataclass(frozen=True)
 class ImageSource:
-    """One source of N images.
+    """A source of N images with known relations between them.
 
     Attributes:
-        name: of the source, part of every image's name.
-        family: sources of one family may show the same places.
-        names: of the N images, ``folder/file``.
-        images: N files, or their encoded bytes as ``(B,)`` uint8.
-        relation: ``(N, N)`` int8, symmetric, 1 same, -1 different, 0 unknown; the diagonal is 1:
-            an image and another augmentation of it.
-        unit: ``(N,)`` int32; images of one unit (a folder, a stretch of road) stay together when
-            training and validation are divided.
-        calibration: ``(8,)`` or ``(9,)`` fx fy cx cy k1 k2 p1 p2 [k3], None if rectified.
+        name: name of the source.
+        family: sources of the same family may show the same places.
+        names: names of the N images, ``folder/file``.
+        images: the N files, or their encoded bytes as ``(B,)`` uint8.
+        relation: ``(N, N)`` int8, symmetric: 1 same place, -1 different places, 0 unknown. The
+            diagonal is 1, because an image shows the same place as its augmentations.
+        unit: ``(N,)`` int32; images of the same unit (a folder, a stretch of road) are not split
+            between training and validation.
+        calibration: ``(8,)`` or ``(9,)`` fx fy cx cy k1 k2 p1 p2 [k3], None if the images are
+            rectified.
         is_query: ``(N,)`` bool, the queries of a benchmark, which are searched for among the other
-            images; None for a drive, where each image is searched for among those long before it.
-        times: ``(N,)`` seconds at which the images were taken, None if not known.
+            images; None for a drive, where each image is searched for among much earlier ones.
+        times: ``(N,)`` times at which the images were taken, seconds; None if unknown.
     """
 
     name: str
@@ -49,24 +54,24 @@ class ImageSource:
         return len(self.images)
 
     def read(self, index: int, size: Size, fit: Fit) -> NDArray[np.uint8]:
-        """The image, undistorted and of that size.
+        """Read an image, undistorted and resized, as uint8.
 
         Raises:
-            UnreadableImageError: missing or damaged.
+            UnreadableImageError: the image is missing or damaged.
         """
         return to_size(self.grey(index), size, fit)
 
     def grey(self, index: int) -> NDArray[np.uint8]:
-        """The image, undistorted, ``(H, W)``.
+        """Read an image, undistorted, as ``(H, W)`` uint8.
 
         Raises:
-            UnreadableImageError: missing or damaged.
+            UnreadableImageError: the image is missing or damaged.
         """
         image = read_grey(self.images[index], self.names[index])
         return image if self.calibration is None else undistorted(image, self.calibration)
 
     def select(self, chosen: NDArray[np.int64]) -> ImageSource:
-        """The images ``chosen``, in their order."""
+        """The source with only the images ``chosen`` ``(M,)``, in this order."""
         return replace(
             self,
             names=tuple(self.names[i] for i in chosen),
@@ -79,7 +84,7 @@ class ImageSource:
 
 
 def undistorted(image: NDArray[np.uint8], calibration: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Remove radial and tangential distortion (Brown's model), same size and camera matrix."""
+    """Remove radial and tangential distortion (Brown's model); size and camera matrix are kept."""
     import cv2
 
     fx, fy, cx, cy = calibration[:4]
@@ -88,25 +93,26 @@ def undistorted(image: NDArray[np.uint8], calibration: NDArray[np.float64]) -> N
 
 
 def images_in(folder: Path) -> list[Path]:
-    """The image files of a folder in the order of their names; none if there is no such folder."""
+    """The image files of a folder, sorted by name; empty if there is no such folder."""
     if not folder.is_dir():
         return []
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
 
 
 def names_of(files: Iterable[Path]) -> tuple[str, ...]:
-    """Names of images in a source: ``folder/file``."""
+    """The names ``folder/file`` of images in a source."""
     return tuple(f"{file.parent.name}/{file.name}" for file in files)
 
 
 def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
-    """The largest square matrix of a ``.mat`` file, ``(N, N)`` bool: which images close a loop.
+    """``(N, N)`` bool, which images close a loop: the largest square matrix of a ``.mat`` file.
 
-    It may be dense or sparse, and of any name: Oxford's and Lip6's are called ``truth``, those for
-    KITTI after their sequence. Most mark a pair once, in the row of the later image.
+    The matrix may be dense or sparse, and may have any name (``truth`` in those of Oxford and Lip6,
+    the name of the sequence in those for KITTI). Most matrices mark each pair once, in the row of
+    the later image.
 
     Raises:
-        InputError: no such file, or no such matrix in it.
+        InputError: there is no such file, or it contains no such matrix.
     """
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
@@ -120,9 +126,9 @@ def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
     matrices = [m for key, m in content.items() if not key.startswith("__")]
     matrices = [m for m in matrices if m.ndim == 2 and m.shape[0] == m.shape[1] and m.size > 1]
     if not matrices:
-        raise InputError(f"{path}: no ground truth in it (no square matrix with a match).")
+        raise InputError(_NO_TRUTH.format(path))
     largest = max(matrices, key=lambda m: m.shape[0])
     found = largest.toarray() if hasattr(largest, "toarray") else largest
     if not found.any():
-        raise InputError(f"{path}: no ground truth in it (no square matrix with a match).")
+        raise InputError(_NO_TRUTH.format(path))
     return np.asarray(found != 0)

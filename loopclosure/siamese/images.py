@@ -1,4 +1,4 @@
-"""From a camera image to the input of a network."""
+"""Reads images and resizes them to the input size of a network."""
 
 from __future__ import annotations
 
@@ -10,36 +10,37 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError, UnreadableImageError
 
-_FIELD_OF_VIEW = 80.0  # degrees, of the camera that turn_homography turns
+_FIELD_OF_VIEW = 80.0  # horizontal field of view assumed by turn_homography, degrees
 
 Fit = Literal["squash", "crop"]
-
-
 Size = tuple[int, int]
 """Height and width, pixels."""
 
 
 def parse_size(text: str) -> Size:
-    """``129`` or ``81x145`` to height and width.
+    """Parse ``129`` (a square) or ``81x145`` (height and width).
 
     Raises:
-        InputError: anything else, or fewer than 32 pixels.
+        InputError: the text has another form, or a side is below 32 pixels.
     """
     height, by, width = text.lower().partition("x")
     if not by:
         width = height
     if not (height.isdecimal() and width.isdecimal()):
-        raise InputError(f"--pixels {text}: write the side, 129, or height and width, 81x145.")
+        raise InputError(
+            f"--pixels {text}: write the side of a square, as in 129, or height and width, as in "
+            "81x145."
+        )
     if min(int(height), int(width)) < 32:
-        raise InputError(f"--pixels {text}: a network needs 32 pixels each way at least.")
+        raise InputError(f"--pixels {text}: a network needs 32 pixels or more on each side.")
     return int(height), int(width)
 
 
 def to_size(image: NDArray[np.uint8], size: Size, fit: Fit = "squash") -> NDArray[np.uint8]:
-    """Resize ``(H, W)`` to ``size``.
+    """Resize an ``(H, W)`` uint8 image to ``size``.
 
-    ``squash`` keeps the whole view and loses the aspect; ``crop`` keeps the aspect and loses what
-    is beyond the largest rectangle of the wanted aspect in the middle.
+    ``squash`` keeps the whole view but changes the aspect ratio; ``crop`` keeps the aspect ratio
+    but uses only the largest central rectangle with the aspect ratio of ``size``.
     """
     import cv2
 
@@ -59,11 +60,11 @@ def read_grey(source: Path | NDArray[np.uint8], name: str = "") -> NDArray[np.ui
     """Decode an image as ``(H, W)`` uint8.
 
     Args:
-        source: file, or its ``(B,)`` encoded bytes.
-        name: of an image given as bytes, for the message.
+        source: the file, or its ``(B,)`` encoded bytes.
+        name: name of an image that is given as bytes, for the error message.
 
     Raises:
-        UnreadableImageError: missing, empty or damaged.
+        UnreadableImageError: the image is missing, empty or damaged.
     """
     import cv2
 
@@ -79,10 +80,11 @@ def read_grey(source: Path | NDArray[np.uint8], name: str = "") -> NDArray[np.ui
 
 
 def turn_homography(width: int, height: int, degrees: float) -> NDArray[np.float64]:
-    """Pixels before to pixels after a camera turned to the right where it stands, ``(3, 3)``.
+    """``(3, 3)`` homography from the pixels of an image to those after the camera has turned to the
+    right on the spot.
 
-    Of a camera that sees 80 degrees across, as those on cars do. Heights only scale, so it holds
-    for images that were squashed, too.
+    The horizontal field of view is taken to be 80 degrees, as is common on cars. Vertical
+    coordinates are only scaled, so the homography also holds for squashed images.
     """
     focal = width / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])

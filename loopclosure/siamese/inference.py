@@ -1,4 +1,4 @@
-"""Trained networks in ONNX Runtime, on one thread: what runs use. torch is not imported."""
+"""Runs trained networks in ONNX Runtime on one thread, without torch."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from vslam.loopclosure.siamese.weights import SHIPPED, find_weights
 
 # Keys of the metadata.
 FORMAT, NAME, ABOUT, COMPARISON = "vslam", "name", "about", "comparison"
-VERSION = "1"  # of the format
+VERSION = "1"  # value of FORMAT
 _NO_RUNTIME = "learned loop detectors need ONNX Runtime: pip install onnxruntime."
-
-
 _FOREIGN = "not a network of this version of vslam"
 _FIX = "write one with 'vslam export onnx', or name another file"
 
 
 class OnnxNetwork:
-    """A network that ``vslam export onnx`` wrote: images to descriptors, and what compares them.
+    """A network that ``vslam export onnx`` wrote: a graph from images to descriptors, and a graph
+    that compares descriptors.
 
     Attributes:
         name: one of ``NETWORKS``.
-        size: height and width of the images it takes.
-        dimensions: D of its descriptors.
-        fingerprint: of the file.
-        about: what the weights were made of; ``parameters``, numbers learned.
+        size: height and width of its input images.
+        dimensions: length D of its descriptors.
+        fingerprint: identifies the file, see ``fingerprint_of``.
+        about: how the weights were trained; ``parameters`` is the number of learned parameters.
     """
 
     def __init__(self, path: Path) -> None:
-        """Load it.
+        """Load the network.
 
         Raises:
-            InputError: missing, damaged or foreign file, or no ONNX Runtime.
+            InputError: the file is missing, damaged or not a network of vslam, or ONNX Runtime is
+                not installed.
         """
         self._embedding = open_session(path, path, "image")
         metadata = self._embedding.get_modelmeta().custom_metadata_map
@@ -66,21 +66,22 @@ class OnnxNetwork:
                 self.about["parameters"] + 0
         except InputError:
             raise
-        except Exception as error:  # what a file may lack, and a dozen kinds of onnxruntime
+        except Exception as error:  # missing metadata, or a dozen types raised by onnxruntime
             raise InputError(f"{path}: {_FOREIGN}; {_FIX}.") from error
 
     def embed(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Descriptor ``(D,)`` of norm 1 of a grey image ``(H, W)`` of the network's size."""
+        """``(D,)`` float32 descriptor of norm 1 of an ``(H, W)`` uint8 image of the size
+        ``size``."""
         (descriptor,) = self._embedding.run(None, {"image": image})
         return np.asarray(descriptor, np.float32)
 
     def compare(
         self, query: NDArray[np.float32], gallery: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Probability ``(N,)`` in (0, 1) that a descriptor ``(D,)`` and each of ``(N, D)`` show
-        one place."""
+        """``(N,)`` probabilities in (0, 1) that the image of a descriptor ``(D,)`` shows the same
+        place as that of each descriptor of a gallery ``(N, D)``."""
         views = gallery.reshape(-1, *self._views)
-        # onnxruntime takes four times as long for the lengths as NumPy.
+        # NumPy computes the lengths four times as fast as onnxruntime.
         lengths = np.sqrt(np.einsum("nvd,nvd->nv", views, views))
         given = {"query": query.reshape(self._views), "gallery": views, "lengths": lengths}
         (similarity,) = self._comparison.run(None, {name: given[name] for name in self._compared})
@@ -88,17 +89,18 @@ class OnnxNetwork:
 
 
 class LateNetwork:
-    """A network that is loaded when the first image comes: most of a drive never needs it.
+    """A network that is loaded when the first image comes, because many drives never need it.
 
     Attributes:
-        name, fingerprint: as of :class:`OnnxNetwork`.
+        name, fingerprint: as in :class:`OnnxNetwork`.
     """
 
     def __init__(self, name: str) -> None:
-        """The network of that name that vslam ships.
+        """``name`` is that of a network that vslam ships.
 
         Raises:
-            InputError: unknown name, no weights shipped, or ONNX Runtime is not installed.
+            InputError: the name is unknown, vslam ships no weights for it, or ONNX Runtime is not
+                installed.
         """
         if find_spec("onnxruntime") is None:
             raise InputError(_NO_RUNTIME)
@@ -131,19 +133,19 @@ class LateNetwork:
 
 
 def fingerprint_of(path: Path) -> str:
-    """What tells the weights of a file from all others."""
+    """A hash that identifies the contents of a file."""
     return sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def open_network(name: str, weights: Path | None = None) -> OnnxNetwork:
-    """The network of that name.
+    """Load a network.
 
     Args:
         name: one of ``NETWORKS``.
-        weights: ONNX file; None for the one that vslam ships.
+        weights: ONNX file; None takes the one that vslam ships.
 
     Raises:
-        InputError: unknown name, no weights, or weights of another network.
+        InputError: the name is unknown, or there are no weights, or those of another network.
     """
     path = find_weights(name, weights)
     network = OnnxNetwork(path)
@@ -153,16 +155,17 @@ def open_network(name: str, weights: Path | None = None) -> OnnxNetwork:
 
 
 def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
-    """An ``onnxruntime.InferenceSession`` on one thread: its sums, and so its bits, do not depend
-    on the number of cores.
+    """Open an ``onnxruntime.InferenceSession`` on one thread, so that its results are bit-identical
+    on any number of cores.
 
     Args:
-        path: of the file, for the message.
+        path: path of the file, for error messages.
         model: the file, or its bytes.
-        first_input: name of the first input, without which it is no graph of ours.
+        first_input: expected name of the first input; a graph with another one is refused.
 
     Raises:
-        InputError: it cannot be read, is no such graph, or ONNX Runtime is not installed.
+        InputError: the file cannot be read or is not such a graph, or ONNX Runtime is not
+            installed.
     """
     try:
         import onnxruntime
@@ -171,17 +174,19 @@ def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
     try:
         given = model if isinstance(model, bytes) else model.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: the weights cannot be read ({error.strerror}).") from error
+        raise InputError(
+            f"{path}: the weights cannot be read ({error.strerror}); name another file."
+        ) from error
     if path.parent != SHIPPED:
         _refuse_beyond_limits(path, given)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # what it says of damaged files is in the exception, too
-    options.enable_mem_pattern = False  # it saves no time here, and takes 10 MB
-    options.enable_cpu_mem_arena = False  # activations are given back after each image
+    options.log_severity_level = 4  # errors are raised as exceptions anyway
+    options.enable_mem_pattern = False  # it would take 10 MB and save no time here
+    options.enable_cpu_mem_arena = False  # free the memory of activations after each image
     try:
         session = onnxruntime.InferenceSession(given, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime raises a dozen kinds
+    except Exception as error:  # onnxruntime raises a dozen types
         raise InputError(f"{path}: not a readable ONNX file; name another file.") from error
     if [one.name for one in session.get_inputs()][:1] != [first_input]:
         raise InputError(f"{path}: {_FOREIGN}; {_FIX}.")
@@ -193,8 +198,8 @@ def _refuse_beyond_limits(path: Path, file: bytes) -> None:
         from vslam.loopclosure.siamese.onnx_limits import check_graph
     except ImportError as error:
         raise InputError(
-            f"{path}: weights that vslam does not ship are checked by the package onnx, which is "
-            "not installed; pip install 'vslam[train]'."
+            f"{path}: weights that vslam does not ship must be checked with the package onnx, "
+            "which is not installed; pip install 'vslam[train]'."
         ) from error
     try:
         check_graph(file)

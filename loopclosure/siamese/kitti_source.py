@@ -1,4 +1,4 @@
-"""Images of a KITTI sequence; its poses, or a matrix of its loops, tell which show one place."""
+"""Reads images of a KITTI sequence; its poses or a loop matrix define which show the same place."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vslam.loopclosure.siamese.image_source import (
 )
 from vslam.trajectory import read_kitti_poses, read_table
 
-_FAR = 25.0  # m, beyond which two images of a drive show different places
+_FAR = 25.0  # images that are farther apart than this show different places, metres
 
 
 def read_kitti(
@@ -33,20 +33,22 @@ def read_kitti(
     truth: str = "",
     near: str = "5",
 ) -> list[ImageSource]:
-    """Left grey images of a KITTI sequence; those numbered first to last, both included.
+    """Read left grey images of a KITTI sequence.
 
     Args:
         root: KITTI root.
-        seq, first, last, every: which images; every second one for 2.
-        frames: ranges instead of first and last, ``0-249+1500-1699``.
-        truth: ``.mat`` file with a matrix of the whole sequence that marks the same places; the
-            others are different beyond 25 m and not known below.
-        near: metres within which two images show one place, below 25. The matrices of loop
-            detection count places as the same up to 20 m apart and more.
+        seq: name of the sequence.
+        first, last: numbers of the first and the last image, both included.
+        every: step between images; 2 takes every second one.
+        frames: ranges of numbers, ``0-249+1500-1699``, instead of ``first`` and ``last``.
+        truth: ``.mat`` file with a loop matrix of the whole sequence, which defines the same
+            places. Other pairs show different places beyond 25 m and are unknown below.
+        near: distance in metres, below 25, within which two images show the same place. Published
+            loop matrices count images up to 20 m apart and more as the same place.
 
     Raises:
-        InputError: no images in that range, no poses for them, no such matrix, or a ``near`` that
-            is out of range, or times that do not fit.
+        InputError: there are no images in that range, no poses for them or no such matrix, or
+            ``near`` is out of range, or the file of times does not fit.
     """
     base = root if (root / "sequences").is_dir() else root / "dataset"
     folder = base / "sequences" / seq / "image_0"
@@ -56,17 +58,18 @@ def read_kitti(
     files = [f for f in files if any(int(f.stem) in span for span in wanted)]
     if len(files) < 2:
         numbers = frames or f"{first} to {last}"
-        raise InputError(f"{folder}: no images numbered {numbers}; see datasets.md.")
+        raise InputError(f"{folder}: no images numbered {numbers}; see docs/reference/datasets.md.")
     poses = read_kitti_poses(base / "poses" / f"{seq}.txt")
     number = np.array([int(f.stem) for f in files])
     if number[-1] >= len(poses):
         raise InputError(
-            f"{base}/poses/{seq}.txt: {len(poses)} poses, none for image {files[-1].stem}; take "
-            "the file of this sequence."
+            f"{base}/poses/{seq}.txt: has {len(poses)} poses and none for image {files[-1].stem}; "
+            "use the file of this sequence."
         )
     T_wc = poses[number]
     steps = np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1)
-    stretch = (np.concatenate([[0.0], np.cumsum(steps)]) // 100.0).astype(np.int32)  # of 100 m
+    # Stretches of road of 100 m.
+    stretch = (np.concatenate([[0.0], np.cumsum(steps)]) // 100.0).astype(np.int32)
     if not 0.0 < float(near) < _FAR:
         raise InputError(f"near={near}: must be above 0 and below {_FAR:g} m.")
     relation = relation_of_poses(T_wc, near=float(near))
@@ -75,8 +78,8 @@ def read_kitti(
         loops = read_loop_matrix(path)
         if len(loops) <= number[-1]:
             raise InputError(
-                f"{path}: {len(loops)} rows, none for image {files[-1].stem}; take the matrix of "
-                "this sequence."
+                f"{path}: has {len(loops)} rows and none for image {files[-1].stem}; use the "
+                "matrix of this sequence."
             )
         marked = loops[np.ix_(number, number)]
         relation[relation == SAME] = UNKNOWN
@@ -88,13 +91,13 @@ def read_kitti(
 
 
 def _times(path: Path, number: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    """Times of the images of these numbers; None if the sequence comes without."""
+    """Times in seconds of the images with these numbers; None if the sequence has no times."""
     if not path.exists():
         return None
     times = read_table(path, (1,), "a time")[:, 0]
     if len(times) <= number[-1] or (np.diff(times) < 0).any():
         raise InputError(
-            f"{path}: times must ascend and reach image {number[-1]:06d}; take the file of this "
+            f"{path}: times must ascend and reach image {number[-1]:06d}; use the file of this "
             "sequence."
         )
     return times[number]
@@ -107,7 +110,9 @@ def relation_of_poses(
     turned: float = 30.0,
     far: float = _FAR,
 ) -> NDArray[np.int8]:
-    """Same place: nearer than ``near`` metres and ``turned`` degrees; different: beyond ``far``."""
+    """``(N, N)`` int8 relation of images by their ``(N, 4, 4)`` poses: the same place if less than
+    ``near`` metres and ``turned`` degrees apart, different places if more than ``far`` metres
+    apart, otherwise unknown."""
     centre, forward = T_wc[:, :3, 3], T_wc[:, :3, 2]
     apart = np.linalg.norm(centre[:, None] - centre[None], axis=2)
     cosine = forward @ forward.T

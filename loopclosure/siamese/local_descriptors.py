@@ -1,4 +1,4 @@
-"""Local descriptors of images, by ONNX Runtime, and the images of keyframes for it."""
+"""Computes local descriptors of images with ONNX Runtime, and stores the images of keyframes."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from vslam.loopclosure.siamese.weights import SHIPPED
 from vslam.loops import PerKeyframe
 
 SHIPPED_LOCAL = SHIPPED / "local.onnx"
-WIDTH = 640  # pixels of the image that the network reads; docs/loops.md has other widths
-GLANCE_WIDTH = 320  # of a first look
-_QUALITY = 90  # of the JPEG files of keyframes in memory
-_JPEG = b"\xff\xd8"
-_KEPT = 4  # descriptor maps, the latest used
+WIDTH = 640  # width of the network's input, pixels; compared in docs/research/loops.md
+GLANCE_WIDTH = 320  # width of the input for a quick comparison ("glance"), pixels
+_QUALITY = 90  # JPEG quality of the keyframe images in memory
+_JPEG = b"\xff\xd8"  # the first bytes of a JPEG file
+_KEPT = 4  # number of cached descriptor maps, the most recently used ones
 
 
 class LocalDescriptors:
-    """The network of local descriptors; it is loaded when the first image comes."""
+    """The network of local descriptors, which is loaded when the first image comes."""
 
     def __init__(self, path: Path = SHIPPED_LOCAL) -> None:
         """
@@ -34,11 +34,11 @@ class LocalDescriptors:
             path: ONNX file that ``tools/training/train_local.py`` wrote.
 
         Raises:
-            InputError: no such file.
+            InputError: there is no such file.
         """
         if not path.exists():
             fix = "install vslam again" if path == SHIPPED_LOCAL else "name another file"
-            raise InputError(f"{path}: the local descriptors are not there; {fix}.")
+            raise InputError(f"{path}: the weights of the local descriptors are missing; {fix}.")
         self._path = path
 
     @cached_property
@@ -46,14 +46,18 @@ class LocalDescriptors:
         session = open_session(self._path, self._path, "image")
         metadata = session.get_modelmeta().custom_metadata_map
         if metadata.get(FORMAT) != VERSION or metadata.get(NAME) != "local":
-            raise InputError(f"{self._path}: not the local descriptors of this version of vslam.")
+            raise InputError(
+                f"{self._path}: not the local descriptors of this version of vslam; name another "
+                "file."
+            )
         return session
 
     def describe(self, image: NDArray[np.uint8], width: int = WIDTH) -> DescriptorMaps:
-        """Descriptors of a grey image ``(H, W)``, reduced to so many columns.
+        """Local descriptors of an ``(H, W)`` uint8 image, which is first resized to ``width``
+        pixels.
 
         Raises:
-            InputError: damaged or foreign file, or no ONNX Runtime.
+            InputError: the file is damaged or not such a network, or ONNX Runtime is not installed.
         """
         scale = width / image.shape[1]
         coarse, fine = self._session.run(None, {"image": resized(image, width)})
@@ -61,7 +65,7 @@ class LocalDescriptors:
 
 
 def resized(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    """An image of so many columns, of at least 64 rows."""
+    """An image resized to a width in pixels, with the same aspect ratio but at least 64 rows."""
     scale = width / image.shape[1]
     size = width, max(64, round(image.shape[0] * scale))
     if size == image.shape[::-1]:
@@ -71,8 +75,8 @@ def resized(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
 
 
 class KeyframeImages:
-    """Images of keyframes as JPEG files in memory, about 40 kB each: their descriptors take thirty
-    times as much, and few are ever asked for."""
+    """Images of keyframes as JPEG files in memory, about 40 kB each. Local descriptors, which take
+    thirty times as much, are computed when they are needed, because few of them ever are."""
 
     def __init__(self, network: LocalDescriptors) -> None:
         self.network = network
@@ -81,35 +85,38 @@ class KeyframeImages:
         self._glances: dict[int, DescriptorMaps] = {}
 
     def add(self, keyframe: int, image: NDArray[np.uint8]) -> None:
-        """Keep an image ``(H, W)``."""
+        """Store the ``(H, W)`` uint8 image of a keyframe."""
         small = resized(image, WIDTH)
         file = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
         self._files[keyframe] = file.tobytes(), WIDTH / image.shape[1]
 
     def files(self, n_keyframes: int) -> PerKeyframe:
-        """The JPEG files of so many keyframes, uint8, for a map file."""
+        """The JPEG files of the first ``n_keyframes`` keyframes as uint8, for a map file."""
         files = [self._files[k][0] if k in self._files else b"" for k in range(n_keyframes)]
         first = np.cumsum([0, *map(len, files)]).astype(np.int64)
         return PerKeyframe(first, np.frombuffer(b"".join(files), np.uint8))
 
     def restore(self, files: PerKeyframe, width: int) -> None:
-        """Keep what ``files`` gave, of images that had so many columns.
+        """Store the files that ``files`` returned.
+
+        Args:
+            width: width of the camera images, pixels.
 
         Raises:
-            ValueError: in a few words: something is no image.
+            ValueError: a file is not a JPEG file.
         """
         for keyframe in range(len(files)):
             file = files.of(keyframe).tobytes()
             if file and not file.startswith(_JPEG):
-                raise ValueError(f"the image of keyframe {keyframe} is no JPEG file")
+                raise ValueError(f"the image of keyframe {keyframe} is not a JPEG file")
             if file:
                 self._files[keyframe] = file, WIDTH / width
 
     def keep(self, alive: NDArray[np.bool_]) -> None:
-        """Forget the images of keyframes that are gone from the map.
+        """Remove the images of keyframes that were culled from the map.
 
         Args:
-            alive: ``(K,)`` of all keyframes up to the last one added.
+            alive: ``(K,)`` bool for all keyframes up to the last one added.
         """
         for keyframe in [one for one in self._files if not alive[one]]:
             for kept in (self._files, self._maps, self._glances):
@@ -119,7 +126,7 @@ class KeyframeImages:
         return keyframe in self._files
 
     def maps(self, keyframe: int) -> DescriptorMaps:
-        """Descriptors of a keyframe that was added."""
+        """Local descriptors of a keyframe that was added."""
         if keyframe not in self._maps:
             self._maps[keyframe] = self._described(keyframe, WIDTH)
             while len(self._maps) > _KEPT:
@@ -128,26 +135,29 @@ class KeyframeImages:
         return self._maps[keyframe]
 
     def glance(self, keyframe: int) -> DescriptorMaps:
-        """Coarse descriptors of its image at half the size, for a quarter of the time; kept."""
+        """Coarse descriptors of the image of a keyframe at half the width, which take a quarter of
+        the time; they are kept in memory."""
         if keyframe not in self._glances:
             maps = self._described(keyframe, GLANCE_WIDTH)
             self._glances[keyframe] = maps.coarse_alone()
         return self._glances[keyframe]
 
     def glance_at(self, image: NDArray[np.uint8]) -> DescriptorMaps:
-        """The same of an image that is not kept."""
+        """Descriptors of an image that is not stored, at the width of a ``glance``."""
         return self.network.describe(image, GLANCE_WIDTH)
 
     def image(self, keyframe: int) -> NDArray[np.uint8]:
-        """The image of a keyframe that was added, reduced to 640 columns.
+        """The image of a keyframe that was added, as uint8, ``WIDTH`` pixels wide.
 
         Raises:
-            InputError: its file, from a map that was loaded, is damaged.
+            InputError: the file comes from a loaded map and is damaged.
         """
         file, _ = self._files[keyframe]
         image = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_GRAYSCALE)
         if image is None:
-            raise InputError(f"the map's image of keyframe {keyframe} is damaged; save it again.")
+            raise InputError(
+                f"the image of keyframe {keyframe} in the map is damaged; build the map again."
+            )
         return np.asarray(image, np.uint8)
 
     def _described(self, keyframe: int, width: int) -> DescriptorMaps:

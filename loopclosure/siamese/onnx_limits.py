@@ -1,8 +1,8 @@
-"""What an ONNX file of somebody else may ask of this machine.
+"""Checks that an ONNX file from an untrusted source uses limited time and memory.
 
-A graph of a few hundred bytes can loop for ever, or make tensors of any size, and ONNX Runtime sets
-no limit. The graphs of vslam have a few dozen operators, and all sizes follow from those of the
-inputs: what else there is in a file is refused before it runs.
+A graph of a few hundred bytes can loop forever or create tensors of any size, and ONNX Runtime sets
+no limits. The graphs of vslam use a few dozen operators, and all tensor sizes follow from those of
+the inputs. A file with anything else is refused before it is run.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from onnx import GraphProto, ModelProto, NodeProto, TensorProto, numpy_helper, s
 from onnx.reference import ReferenceEvaluator
 
 MOST_NUMBERS = 2**27
-"""That a graph computes, all tensors together; those of VGG-16 are 104 million."""
+"""Most numbers that a graph may compute, over all tensors; VGG-16 computes 104 million."""
 MOST_PRODUCTS = 2**38
-"""Of all convolutions and matrix products of a graph."""
+"""Most multiplications in all convolutions and matrix products of a graph."""
 _MOST_NODES = 10_000
-_SMALL = 64  # numbers of a tensor that is a shape, or a part of one
-_SIDE = 512  # of an image, where a graph takes any size; descriptors compared, likewise
+_SMALL = 64  # most numbers in a tensor that is a shape or part of one
+_SIDE = 512  # assumed for each dimension of an input that the graph leaves open
 
-# Those that the networks of vslam have. None holds a graph of its own.
+# The operators that the networks of vslam use. None of them contains another graph.
 _OPERATORS = {
     "Abs", "Add", "AveragePool", "Cast", "Clip", "Concat", "Conv", "Div", "Exp", "Expand", "Gather",
     "Gemm", "Greater", "GridSample", "LeakyRelu", "MatMul", "Max", "MaxPool", "Mul", "Pad", "Pow",
@@ -39,23 +39,23 @@ _KINDS = {
 
 
 def check_graph(file: bytes) -> None:
-    """Refuse a graph of operators that vslam does not use, or beyond the limits.
+    """Check that a graph uses only operators of vslam and stays within the limits.
 
     Args:
-        file: its bytes.
+        file: bytes of the ONNX file.
 
     Raises:
-        ValueError: in a few words why.
+        ValueError: the file is not an ONNX file, or its graph is refused; the message says why.
     """
     try:
         model = onnx.load_model_from_string(file)
-    except Exception as error:  # protobuf has kinds of its own
+    except Exception as error:  # protobuf raises types of its own
         raise ValueError("not a readable ONNX file") from error
     graph = model.graph
     _check_nodes(model)
     for tensor in graph.initializer:
         if math.prod(tensor.dims) > tensor.ByteSize():
-            raise ValueError("its weights are not in it")
+            raise ValueError("it does not contain its weights")
         is_weight = tensor.data_type in (TensorProto.FLOAT, TensorProto.FLOAT16)
         if is_weight and math.prod(tensor.dims) > _SMALL:  # only the shape matters from here on
             tensor.CopyFrom(
@@ -66,26 +66,31 @@ def check_graph(file: bytes) -> None:
         computed = {name for node in graph.node for name in node.output if name}
         numbers = sum(math.prod(shapes[name]) for name in computed)
         products = sum(_products(node, shapes) for node in graph.node)
-    except Exception as error:  # of onnx, and KeyError where there is no shape
+    except Exception as error:  # errors of onnx, and KeyError for a tensor without a shape
         raise ValueError("the sizes of its tensors are unknown") from error
     if numbers > MOST_NUMBERS or products > MOST_PRODUCTS:
-        raise ValueError(f"it asks for {numbers:.1e} numbers and {products:.1e} products")
+        raise ValueError(
+            f"it computes {numbers:.1e} numbers and {products:.1e} products, more than the "
+            f"{MOST_NUMBERS:.1e} and {MOST_PRODUCTS:.1e} that are allowed"
+        )
 
 
 def _check_nodes(model: ModelProto) -> None:
     graph = model.graph
     if len(graph.node) > _MOST_NODES or model.functions or graph.sparse_initializer:
-        raise ValueError("not a graph as vslam writes them")
+        raise ValueError("its graph differs from those that vslam writes")
     for node in graph.node:
         if node.domain or node.op_type not in _OPERATORS:
-            raise ValueError(f"vslam uses no operator {node.op_type[:40]!r}")
+            raise ValueError(f"vslam does not use the operator {node.op_type[:40]!r}")
 
 
 def _shapes(model: ModelProto) -> dict[str, tuple[int, ...]]:
-    """Of all tensors, whatever the file itself says of those between input and output.
+    """Shapes of all tensors, inferred from those of the inputs. Shapes that the file itself states
+    for other tensors are ignored.
 
     Raises:
-        Exception: they do not follow from those of the inputs, or are of another kind.
+        Exception: a shape does not follow from those of the inputs, or a tensor has a type that
+            vslam does not use.
     """
     graph = model.graph
     for value in graph.input:
@@ -111,7 +116,8 @@ def _shapes(model: ModelProto) -> dict[str, tuple[int, ...]]:
 
 
 def _compute_shapes(graph: GraphProto) -> None:
-    """Replace what follows from the shape of an input by its value: onnx does not divide."""
+    """Replace nodes that compute with the shapes of the inputs by their results, because onnx's
+    shape inference does not evaluate divisions."""
     known = {
         tensor.name: numpy_helper.to_array(tensor)
         for tensor in graph.initializer
@@ -137,7 +143,8 @@ def _compute_shapes(graph: GraphProto) -> None:
 
 
 def _products(node: NodeProto, shapes: dict[str, Any]) -> int:
-    """Multiplications of a node beyond a few for each number of its result."""
+    """Number of multiplications of a convolution or a matrix product; 0 for other nodes, which need
+    only a few for each number of their result."""
     if node.op_type == "Conv":
         return math.prod(shapes[node.output[0]]) * math.prod(shapes[node.input[1]][1:])
     if node.op_type in ("MatMul", "Gemm"):

@@ -1,4 +1,5 @@
-"""Image sources in one small file, for machines that cannot hold the original images."""
+"""Writes and reads image sources as one small file, for machines without room for the original
+images."""
 
 from __future__ import annotations
 
@@ -14,9 +15,8 @@ from vslam.untrusted import read_npz
 
 
 def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> None:
-    """Write sources as one file: images at the size of the network, JPEG, with their relations.
-
-    See docs/training.md.
+    """Write sources as one file: images at the input size of a network, encoded as JPEG, and their
+    relations (docs/research/training.md).
 
     Raises:
         UnreadableImageError: an image is missing or damaged.
@@ -41,10 +41,10 @@ def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> 
 
 
 def read_pack(path: Path) -> list[ImageSource]:
-    """Read what `write_pack` wrote.
+    """Read the sources from a file that ``write_pack`` wrote.
 
     Raises:
-        InputError: missing or damaged file.
+        InputError: the file is missing or damaged.
     """
     content = read_npz(path, "a pack of places", "write it with 'vslam export places'")
     try:

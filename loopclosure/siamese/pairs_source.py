@@ -1,4 +1,5 @@
-"""Pairs of views that ``vslam synth --pairs`` rendered; where the cameras stood tells the rest."""
+"""Reads pairs of images that ``vslam synth --pairs`` rendered; the poses of the cameras relate
+images of different pairs."""
 
 from __future__ import annotations
 
@@ -12,17 +13,19 @@ from vslam.errors import InputError
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, ImageSource, names_of
 
 _VIEW = ("x_a", "z_a", "yaw_a", "x_b", "z_b", "yaw_b")
-_CELL = 80.0  # m, of a rendered town: stays together when training and validation are divided
+# Side of the cells of a rendered town that are not split between training and validation, metres.
+_CELL = 80.0
 
 
 def read_pairs(folder: Path) -> list[ImageSource]:
-    """Rendered pairs: ``pairs.csv`` with columns a, b (files) and same (1 or 0), others allowed.
+    """Read rendered pairs from a folder with a file ``pairs.csv``.
 
-    With the columns x_a, z_a, yaw_a and those of b (m, degrees), images of different pairs are
-    related, too: `relation_of_views`. Without, nothing is known across pairs.
+    The file must have the columns a, b (image files) and same (1 or 0), and may have others. With
+    the columns x_a, z_a, yaw_a, x_b, z_b, yaw_b (metres, degrees), images of different pairs are
+    related by ``relation_of_views``; without them, these relations are unknown.
 
     Raises:
-        InputError: no or malformed list, or no pair in it.
+        InputError: the list is missing, malformed or empty.
     """
     path = folder / "pairs.csv"
     try:
@@ -73,10 +76,12 @@ def relation_of_views(
     sight: float = 160.0,
     street: float = 25.0,
 ) -> NDArray[np.int8]:
-    """Same place: nearer than ``near`` metres and ``turned`` degrees.
+    """``(N, N)`` int8 relation of images by their poses.
 
-    Different: beyond ``far`` metres, and not within ``sight`` in one street (``street`` metres to
-    the side) seen in one direction or against it.
+    Two images show the same place if they are less than ``near`` metres and ``turned`` degrees
+    apart. They show different places if they are more than ``far`` metres apart, unless both look
+    along the same street, in the same or in opposite directions, less than ``sight`` metres apart
+    and less than ``street`` metres to the side. Otherwise the relation is unknown.
 
     Args:
         views: ``(N, 3)`` x and z in metres, yaw in degrees from z towards x.

@@ -1,4 +1,4 @@
-"""Sets of photographs; folders and a NOTES.txt tell which show one place."""
+"""Reads sets of photographs; their folders and a NOTES.txt define which show the same place."""
 
 from __future__ import annotations
 
@@ -19,18 +19,20 @@ from vslam.loopclosure.siamese.image_source import (
     names_of,
 )
 
-_STRETCH = 25  # frames of a video that stay together when training and validation are divided
+_STRETCH = 25  # frames of a video that are not split between training and validation
 
 
 @dataclass(frozen=True)
 class _SpecialSet:
-    """What holds for a set beyond its kind, from its own notes.
+    """Properties of a set that its kind does not determine, from its notes.
 
     Attributes:
-        reach: photographs of a folder farther apart in its order may show different things.
-        region: of a folder; what folders of one region have in common is not known.
-        family: of the set.
-        singles: folders of photographs that have nothing to do with each other.
+        reach: photographs of a folder that are more than this many apart in its order may show
+            different places.
+        region: maps the name of a folder to a region; relations between folders of the same region
+            are unknown.
+        family: family of the set, see ``ImageSource``.
+        singles: folders whose photographs are unrelated to each other.
     """
 
     reach: int | None = None
@@ -40,15 +42,15 @@ class _SpecialSet:
 
 
 _SPECIAL_SETS = {
-    # Turning round one standpoint: distant photographs show different things.
+    # Rotation about one standpoint: photographs far apart show different things.
     "pano_rotation": _SpecialSet(reach=1, family="landmarks"),
-    # Opposite walls of one yard.
+    # Opposite walls of the same yard.
     "strecha": _SpecialSet(reach=3, family="landmarks"),
-    # Folders are headings of one walk, and overlap at their borders.
+    # Folders are headings of the same walk and overlap at their ends.
     "pano360": _SpecialSet(reach=2, region=lambda folder: folder.split("_")[0]),
-    # Several passes of one floor.
+    # Several passes of the same floor.
     "ie_tower": _SpecialSet(reach=1, region=lambda folder: folder.split("__")[0]),
-    # Windows cut from one panorama.
+    # Views cut from one panorama.
     "webcams": _SpecialSet(region=lambda folder: folder.split("_")[0]),
     "multiview": _SpecialSet(reach=4, family="landmarks"),
     "wxbs_evd": _SpecialSet(family="landmarks"),
@@ -66,18 +68,20 @@ _SPECIAL_SETS = {
 
 
 def read_photos(folder: Path) -> list[ImageSource]:
-    """Sets of photographs of places, ``folder/SET/SUBFOLDER/*`` with ``folder/SET/NOTES.txt``.
+    """Read sets of photographs, ``folder/SET/SUBFOLDER/*`` with ``folder/SET/NOTES.txt``.
 
-    The first line of the notes tells the kind: (a) each subfolder shows one place, (b) each is a
-    video in order, whose neighbours overlap, (c) unrelated photographs. ``_SPECIAL_SETS`` holds
-    what a set's own notes add.
+    The first line of the notes states the kind of the set: (a) each subfolder shows one place, (b)
+    each subfolder is a video, in which consecutive frames overlap, (c) the photographs are
+    unrelated. ``_SPECIAL_SETS`` adds further properties from the notes of some sets.
 
     Raises:
-        InputError: no such set, or notes that name no kind.
+        InputError: there is no such set, or the notes state no kind.
     """
     notes = sorted(folder.glob("*/NOTES.txt")) or sorted(folder.glob("NOTES.txt"))
     if not notes:
-        raise InputError(f"{folder}: no set of photographs (SET/NOTES.txt); see datasets.md.")
+        raise InputError(
+            f"{folder}: no set of photographs (SET/NOTES.txt); see docs/reference/datasets.md."
+        )
     return [_read_photo_set(path.parent) for path in notes]
 
 

@@ -1,4 +1,4 @@
-"""A network as a function of images, for benchmarks."""
+"""Similarities of images by a network, for benchmarks."""
 
 from __future__ import annotations
 
@@ -13,18 +13,23 @@ from vslam.loopclosure.siamese.inference import open_network
 
 
 class NetworkScorer:
-    """Similarities of images by one of ``NETWORKS``, on one thread.
+    """Computes similarities of images by one of ``NETWORKS`` on one thread.
 
     Attributes:
-        name: of the network.
-        parameters: numbers learned.
+        name: name of the network.
+        parameters: number of learned parameters.
     """
 
     def __init__(self, name: str, weights: Path | None, fit: Fit) -> None:
-        """Load it; ``weights`` None for those that vslam ships.
+        """Load the network.
+
+        Args:
+            name: one of ``NETWORKS``.
+            weights: ONNX file; None takes the weights that vslam ships.
+            fit: how images are resized, see ``to_size``.
 
         Raises:
-            InputError: no weights, or those of another network.
+            InputError: there are no weights, or those of another network.
         """
         self._network, self._fit = open_network(name, weights), fit
         self.name, self.parameters = name, int(self._network.about["parameters"])
@@ -32,16 +37,18 @@ class NetworkScorer:
     def scores(
         self, queries: NDArray[np.float32], gallery: NDArray[np.float32]
     ) -> NDArray[np.float64]:
-        """p ``(Q, G)`` that two images show one place, from descriptors ``(Q, D)``, ``(G, D)``."""
+        """``(Q, G)`` probabilities that two images show the same place, from the ``(Q, D)`` and
+        ``(G, D)`` descriptors of the queries and of the gallery."""
         return np.stack([self.compare(query, gallery) for query in queries]).astype(np.float64)
 
     def embed(self, images: Collection[NDArray[np.uint8]]) -> NDArray[np.float32]:
-        """Descriptors ``(N, D)`` of images ``(H, W)``."""
+        """``(N, D)`` descriptors of ``(H, W)`` uint8 images."""
         size = self._network.size
         return np.stack([self._network.embed(to_size(one, size, self._fit)) for one in images])
 
     def compare(
         self, descriptor: NDArray[np.float32], gallery: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """p ``(N,)`` of one descriptor ``(D,)`` with each of ``(N, D)``."""
+        """``(N,)`` probabilities that the image of a ``(D,)`` descriptor shows the same place as
+        those of a gallery ``(N, D)``."""
         return self._network.compare(descriptor, gallery)

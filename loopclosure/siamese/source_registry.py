@@ -1,26 +1,27 @@
-"""Sources of images by name: what the networks learn from and what detectors are compared on.
+"""Opens sources of images by name, for training networks and comparing detectors.
 
-A source is one set of images with a matrix that says for each pair: same place (1), another place
-(-1), or not known and never used (0). Images of different sources show different places, unless
-the sources are of one family (the same region photographed twice): then nothing is known.
+A source is a set of images with a matrix that states for each pair whether the images show the same
+place (1) or different places (-1), or that this is unknown (0); unknown pairs are never used.
+Images of different sources show different places, unless the sources belong to the same family (for
+example the same region photographed twice); then their relation is unknown.
 
-A source is named on the command line as ``KIND:PATH``, or ``KIND:PATH[option=value,...]``. The
-kinds and their options:
+On the command line, a source is named ``KIND:PATH`` or ``KIND:PATH[option=value,...]``. The kinds
+and their options are:
 
-``kitti:DIR``: left grey images of a KITTI sequence with ground-truth poses (`kitti_source`).
-    ``seq``: the sequence, 00 without it.
-    ``first``, ``last``: numbers of the first and the last image, all images without them.
-    ``every``: 2 for every second image.
-    ``frames``: ranges of numbers in place of first and last, ``frames=0-249+1500-1699``.
-    ``near``: metres within which two images show one place, 5 without it.
-    ``truth``: ``.mat`` file with a matrix of loops, which then says what is the same place.
-``fabmap:DIR``: Oxford CityCentre or NewCollege, Cummins and Newman 2008, or other images in order
-    with a matrix, as Lip6's (`fabmap_source`).
-    ``truth``: ``.mat`` file with the matrix of loops, the first one in the folder without it.
-    ``side``: ``left`` or ``right`` camera, where the matrix has one row for both; left without it.
-``pairs:DIR``: what ``vslam synth --pairs`` wrote (`pairs_source`); no options.
-``photos:DIR``: folders of photographs with a NOTES.txt (`photo_source`); no options.
-``pack:FILE.npz``: what ``vslam export places`` wrote of any of these (`pack`); no options.
+``kitti:DIR``: left grey images of a KITTI sequence with ground-truth poses (``kitti_source``).
+    ``seq``: the sequence; default 00.
+    ``first``, ``last``: numbers of the first and the last image; default all images.
+    ``every``: step between images; 2 takes every second one.
+    ``frames``: ranges of numbers instead of first and last, ``frames=0-249+1500-1699``.
+    ``near``: distance in metres within which two images show the same place; default 5.
+    ``truth``: ``.mat`` file with a loop matrix, which then defines the same places.
+``fabmap:DIR``: Oxford CityCentre or NewCollege (Cummins and Newman 2008), or another ordered set of
+    images with a loop matrix, for example those of Lip6 (``fabmap_source``).
+    ``truth``: ``.mat`` file with the loop matrix; default the first one in the folder.
+    ``side``: ``left`` or ``right`` camera, if the matrix has one row for both; default left.
+``pairs:DIR``: output of ``vslam synth --pairs`` (``pairs_source``); no options.
+``photos:DIR``: folders of photographs with a NOTES.txt (``photo_source``); no options.
+``pack:FILE.npz``: output of ``vslam export places`` (``pack``); no options.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from vslam.loopclosure.siamese.pack import read_pack
 from vslam.loopclosure.siamese.pairs_source import read_pairs
 from vslam.loopclosure.siamese.photo_source import read_photos
 
-# Of each kind: its reader and the names of its options.
+# The reader of each kind and the names of its options.
 _READERS: dict[str, tuple[Callable[..., list[ImageSource]], tuple[str, ...]]] = {
     "kitti": (read_kitti, ("seq", "first", "last", "every", "frames", "truth", "near")),
     "fabmap": (read_fabmap, ("truth", "side")),
@@ -48,7 +49,8 @@ _READERS: dict[str, tuple[Callable[..., list[ImageSource]], tuple[str, ...]]] = 
 
 
 def split_spec(spec: str) -> tuple[str, str, dict[str, str]]:
-    """``kind:path[key=value,...]`` in its parts; no path where it is spelled otherwise."""
+    """Split ``kind:path[key=value,...]`` into kind, path and options; the path is empty if the text
+    has another form."""
     kind, _, rest = spec.partition(":")
     found = re.fullmatch(r"(.+?)(?:\[(.*)\])?", rest)
     if found is None:
@@ -58,15 +60,15 @@ def split_spec(spec: str) -> tuple[str, str, dict[str, str]]:
 
 
 def open_source(spec: str) -> list[ImageSource]:
-    """Open ``kind:path[options]``, see the module.
+    """Open ``kind:path[options]``; the module's documentation lists the kinds.
 
     Raises:
-        InputError: unknown kind or option, or data that is missing or malformed.
+        InputError: the kind or an option is unknown, or data is missing or malformed.
     """
     kind, path, options = split_spec(spec)
     if kind not in _READERS or not path:
         raise InputError(
-            f"--data {spec}: must be KIND:PATH, with one of the kinds {', '.join(_READERS)}."
+            f"--data {spec}: must be KIND:PATH, where KIND is one of {', '.join(_READERS)}."
         )
     reader, known = _READERS[kind]
     if wrong := [key for key in options if key not in known]:

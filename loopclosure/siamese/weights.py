@@ -1,4 +1,4 @@
-"""The networks by name, and where the weights that a run reads are."""
+"""The names of the networks, and the files of their weights."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ NETWORKS = (
     "mobilenet", "squeezenet", "pcanet",
 )  # fmt: skip
 PRUNED = ("capsule-pruned", "capsule-paper")
-"""Made from trained weights of ``capsule`` by removing primary capsules."""
+"""Networks made from trained weights of ``capsule`` by removing primary capsules."""
 TO_THE_LETTER = "capsule-paper"
-"""The paper's own method: no keyframe image is kept, so neither odometry nor learned local
-descriptors have a part in what it finds."""
+"""The method of the paper without additions: no keyframe images are kept, so that neither odometry
+nor learned local descriptors influence which loops it finds."""
 SHIPPED = Path(__file__).parent / "weights"
 
 
 def find_weights(name: str, weights: Path | None = None) -> Path:
-    """The ONNX file of a detector.
+    """Path of the ONNX file of a network.
 
     Args:
         name: one of ``NETWORKS``.
-        weights: the file that the user names; None for the one that vslam ships.
+        weights: the file that the user has named; None takes the one that vslam ships.
 
     Raises:
-        InputError: unknown name, or no such file.
+        InputError: the name is unknown, or there is no such file.
     """
     if name not in NETWORKS:
         raise InputError(f"--detector {name}: unknown; choose one of {', '.join(NETWORKS)}.")
     path = weights or SHIPPED / f"{name}.onnx"
     if path.suffix == ".safetensors" and path.exists():
         raise InputError(
-            f"--weights {path}: runs read ONNX files; write one with 'vslam export onnx --weights "
-            f"{path}'."
+            f"--weights {path}: a run needs an ONNX file; write one with 'vslam export onnx "
+            f"--weights {path}'."
         )
     if path.exists():
         return path
@@ -43,4 +43,4 @@ def find_weights(name: str, weights: Path | None = None) -> Path:
             f"--detector {name}: vslam ships no weights for it; train it with 'vslam train {name}' "
             "and name the .onnx file with --weights."
         )
-    raise InputError(f"--weights {path}: not there; name the .onnx file of a training.")
+    raise InputError(f"--weights {path}: no such file; name the .onnx file of a trained network.")

@@ -1,12 +1,11 @@
-"""Capsules: prediction vectors and dynamic routing, an equation of the paper for each function.
+"""Capsules and dynamic routing.
 
 Zhou and Sun, Sci Rep 15, 7644 (2025), equations 4 to 9, after Sabour et al., NIPS 2017.
 N images, I primary capsules of A numbers, J output capsules of D numbers. Primary capsules come in
 T types (learned by the extractor) at P places of a grid: i = t P + p.
 
-``route`` is the paper, letter by letter: the reference. ``route_factored`` computes the same from
-the sums that matrices shared by the places of a type allow, without ever forming the prediction
-vectors; it is what the network runs.
+``route`` uses the sums that matrices shared by the places of a type allow, and never forms the
+prediction vectors. ``tests/reference_routing.py`` has the paper's equations as they are written.
 """
 
 from __future__ import annotations
@@ -32,77 +31,24 @@ def length(v: Tensor) -> Tensor:
     return torch.sqrt((v * v).sum(-1) + TINY)
 
 
-def predict(u: Tensor, W: Tensor) -> Tensor:
-    """Eq. 4: prediction vectors ``û_j|i = W_ij u_i``.
-
-    Args:
-        u: ``(N, T, P, A)`` primary capsules.
-        W: ``(J, T, A, D)``, shared by the places of a type.
-
-    Returns:
-        ``(N, J, I, D)``.
-    """
-    u_hat = torch.einsum("ntpa,jtad->njtpd", u, W)
-    return u_hat.flatten(2, 3)
-
-
-def couple(b: Tensor, over: Over = "primary") -> Tensor:
-    """Eq. 6: coupling coefficients, softmax of the logits ``b`` ``(N, J, I)``.
-
-    ``primary``: the sum over i is 1, as the paper writes; ``output``: the sum over j is 1, as in
-    Sabour et al.
-    """
-    return torch.softmax(b, dim=2 if over == "primary" else 1)
-
-
-def combine(c: Tensor, u_hat: Tensor) -> Tensor:
-    """Eq. 5: ``s_j = Σ_i c_ij û_j|i``, from ``(N, J, I)`` and ``(N, J, I, D)`` to ``(N, J, D)``."""
-    return torch.einsum("nji,njid->njd", c, u_hat)
-
-
-def agree(u_hat: Tensor, v: Tensor) -> Tensor:
-    """Eq. 7: ``û_j|i · v_j``, what a logit grows by, ``(N, J, I)``."""
-    return torch.einsum("njid,njd->nji", u_hat, v)
-
-
 def route(
-    u_hat: Tensor, iterations: int = 3, over: Over = "primary", alive: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Dynamic routing as the paper writes it; gradients flow through the last iteration only.
-
-    Args:
-        u_hat: ``(N, J, I, D)`` prediction vectors.
-        iterations: at least 1.
-        over: what the coupling coefficients are normalised over.
-        alive: ``(I,)`` bool; a capsule that is not takes no part, as if it were removed.
-
-    Returns:
-        Output capsules ``v`` ``(N, J, D)`` and the coupling coefficients ``(N, J, I)`` behind them.
-    """
-    n, outputs, primaries, _ = u_hat.shape
-    with torch.no_grad():
-        b = u_hat.new_zeros((n, outputs, primaries))
-        for _ in range(iterations - 1):
-            b = b + agree(u_hat, squash(combine(_masked_couple(b, over, alive), u_hat)))
-        c = _masked_couple(b, over, alive)
-    return squash(combine(c, u_hat)), c
-
-
-def route_factored(
     u: Tensor, W: Tensor, iterations: int = 3, over: Over = "primary", alive: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """``route(predict(u, W), ...)`` without the prediction vectors.
+    """Dynamic routing; gradients flow through the last iteration only.
 
     ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and ``û_j|i · v_j = u_tp · (W_tjᵀ v_j)``: sums over places
     of A numbers take the place of ``I J D`` numbers written once and read five times.
 
     Args:
         u: ``(N, T, P, A)`` primary capsules.
-        W: ``(J, T, A, D)``.
-        iterations, over, alive: as in :func:`route`.
+        W: ``(J, T, A, D)``, shared by the places of a type.
+        iterations: at least 1.
+        over: what the coupling coefficients are normalised over: ``primary``, their sum over i is
+            1, as the paper writes; ``output``, their sum over j is 1, as in Sabour et al.
+        alive: ``(I,)`` bool; a capsule that is not takes no part, as if it were removed.
 
     Returns:
-        As :func:`route`.
+        Output capsules ``v`` ``(N, J, D)`` and the coupling coefficients ``(N, J, I)`` behind them.
     """
     v, e, total = _route_undivided(u, W, iterations, over, alive)
     return v, _divided(e, total)
@@ -173,13 +119,6 @@ def _route_undivided(
                 b += agreements(squash(combined(*couplings(b))))
             e, total = couplings(b)
     return squash(combined(e, total)), e, total
-
-
-def _masked_couple(b: Tensor, over: Over, alive: Tensor | None) -> Tensor:
-    if alive is None:
-        return couple(b, over)
-    # Over outputs, a capsule that takes no part has the softmax of -inf throughout: NaN.
-    return torch.nan_to_num(couple(b.masked_fill(~alive, -torch.inf), over), nan=0.0)
 
 
 class CapsuleLayer(nn.Module):

@@ -61,7 +61,7 @@ class TrainSettings(BaseModel):
     )
 
 
-# Small networks need mild changes to learn anything in so short a time, see docs/training.md.
+# Small networks need mild changes to learn anything in so short a time (docs/research/training.md).
 _MILD = Augmentation(
     homography=0.05, shift=0.05, log_gain=0.2, bias=10.0, log_gamma=0.2, masks=1, noise=3.0,
     blur=0.5,
@@ -88,7 +88,7 @@ PRESETS = {
     # less mining and validation, suit the two cores that it was trained on.
     "best": _BEST,
     # The same from ImageNet weights (--weights). Filters for edges and corners stay as they are,
-    # the rest of the extractor learns slowly. 129 pixels: see docs/training.md.
+    # the rest of the extractor learns slowly. 129 pixels: see docs/research/training.md.
     "pretrained": _BEST.model_copy(
         update={
             "shape": CapsuleShape(extractor="lite0", pixels=129),
@@ -99,8 +99,9 @@ PRESETS = {
             "augmentation": STRONG.model_copy(update={"turn": 30.0}),
         }
     ),
-    # One recipe for all architectures, from random weights and with one head: docs/rivals.md. No
-    # pairs are mined and few images validate, since that would cost slow networks the most.
+    # One recipe for all architectures, from random weights and with one head
+    # (docs/research/rivals.md). No pairs are mined and few images validate, since that would cost
+    # slow networks the most.
     "rivals": _BEST.model_copy(
         update={
             "shape": CapsuleShape(pixels=129),

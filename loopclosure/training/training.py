@@ -129,55 +129,45 @@ def train(
     before = copy.deepcopy(network.state_dict()) if settings.learned_share < 1 else None
     optimiser = _optimiser(network, settings)
     progress, pairs = TrainingProgress(), None
-    steps = max(1, settings.pairs // settings.batch)
+    checkpoint = folder / CHECKPOINT
     weights = folder / f"{settings.network}.safetensors"
-    if resume and (folder / CHECKPOINT).exists():
-        progress, pairs = load_checkpoint(folder / CHECKPOINT, settings, network, optimiser)
+    if resume and checkpoint.exists():
+        progress, pairs = load_checkpoint(checkpoint, settings, network, optimiser)
     else:  # so that there is one to keep, whatever the first steps do
-        save_checkpoint(folder / CHECKPOINT, settings, network, optimiser, progress, None)
+        save_checkpoint(checkpoint, settings, network, optimiser, progress, None)
     saved = time.monotonic()
     with ThreadPoolExecutor(threads) as pool:
+        run = _Training(
+            collection, settings, network, optimiser, progress, train_images, where, half, pool
+        )
         while progress.epoch < settings.epochs and progress.stale < settings.patience:
             began = time.monotonic()
             if pairs is None:
-                pairs = _pairs_of_epoch(
-                    collection, train_images, settings, network, progress, where
-                )
-                write_pairs(
-                    folder / "pairs" / f"epoch_{progress.epoch:03d}.csv",
-                    collection, pairs, settings.seed,
-                )  # fmt: skip
-            while progress.step < steps:
-                batch = slice(progress.step * settings.batch, (progress.step + 1) * settings.batch)
-                loss = _step(
-                    network, optimiser, collection, pairs, batch, settings, progress, steps, pool,
-                    where, half,
-                )  # fmt: skip
+                pairs = run.pairs_of_epoch()
+                file = folder / "pairs" / f"epoch_{progress.epoch:03d}.csv"
+                write_pairs(file, collection, pairs, settings.seed)
+            while progress.step < run.steps:
+                loss = run.step(pairs)
                 if not math.isfinite(loss):
                     raise ResultsError(
                         f"{folder}: the loss is {loss} in epoch {progress.epoch}, step "
                         f"{progress.step}; the last good checkpoint is kept, resume it with a "
                         "lower learning rate."
                     )
-                progress.step += 1
-                progress.loss_sum += loss
-                progress.images += 2 * (min(batch.stop, len(pairs)) - batch.start)
                 if on_step:
-                    on_step(progress.epoch, progress.step, steps, loss)
+                    on_step(progress.epoch, progress.step, run.steps, loss)
                 stop = should_stop is not None and should_stop()
                 if stop or time.monotonic() - saved > _CHECKPOINT_EVERY_S:
                     progress.seconds += time.monotonic() - began
                     began = saved = time.monotonic()
-                    save_checkpoint(
-                        folder / CHECKPOINT, settings, network, optimiser, progress, pairs
-                    )
+                    save_checkpoint(checkpoint, settings, network, optimiser, progress, pairs)
                 if stop:
                     return TrainingOutcome(False, {}, progress, weights, train_images, validation)
-            _end_epoch(network, collection, validation, settings, progress, weights, steps, where)
+            run.end_epoch(validation, weights)
             progress.seconds += time.monotonic() - began
             progress.history[-1]["seconds"] = progress.seconds
             pairs = None
-            save_checkpoint(folder / CHECKPOINT, settings, network, optimiser, progress, None)
+            save_checkpoint(checkpoint, settings, network, optimiser, progress, None)
             saved = time.monotonic()
             write_log(folder / "log.csv", progress.history)
     best, about = load_network(weights)
@@ -213,114 +203,110 @@ def calibrated(
     return figures
 
 
-def _step(
-    network: SiameseNetwork,
-    optimiser: torch.optim.Optimizer,
-    collection: Collection,
-    pairs: Pairs,
-    batch: slice,
-    settings: TrainSettings,
-    progress: TrainingProgress,
-    steps: int,
-    pool: ThreadPoolExecutor,
-    device: torch.device,
-    half: bool,
-) -> float:
-    """One step of Adam; the weights are untouched where the loss is not finite."""
-    a, b = pairs.a[batch], pairs.b[batch]
-    same = torch.from_numpy(pairs.same[batch]).to(device)
-    images = _augmented(collection, a, b, batch.start, settings, progress.epoch, pool).to(device)
-    rate = _learning_rate(settings, progress.epoch * steps + progress.step, settings.epochs * steps)
-    for group in optimiser.param_groups:
-        group["lr"] = rate * group["factor"]
-    network.train()
-    with torch.autocast(device.type, torch.bfloat16, enabled=half):
-        descriptors = network.embed(images)
-    first, second = descriptors[: len(a)], descriptors[len(a) :]
-    loss = cross_entropy(network.logits(first, second), same)
-    if settings.loss == "bce+contrast":
-        both = np.concatenate([a, b])
-        relation = torch.from_numpy(collection.relation[np.ix_(both, both)]).to(device)
-        loss = loss + contrast(
-            network.cosines(descriptors, descriptors), same, relation, settings.temperature
-        )
-    value = loss.item()
-    if math.isfinite(value):
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        optimiser.step()
-    return value
+@dataclass(frozen=True)
+class _Training:
+    """A training under way: what its steps read, and the network, optimiser and progress that they
+    change."""
 
+    collection: Collection
+    settings: TrainSettings
+    network: SiameseNetwork
+    optimiser: torch.optim.Optimizer
+    progress: TrainingProgress
+    images: NDArray[np.int64]
+    device: torch.device
+    half: bool
+    pool: ThreadPoolExecutor
 
-def _augmented(
-    collection: Collection,
-    a: NDArray[np.int64],
-    b: NDArray[np.int64],
-    first: int,
-    settings: TrainSettings,
-    epoch: int,
-    pool: ThreadPoolExecutor,
-) -> torch.Tensor:
-    def one(job: tuple[int, int, int]) -> NDArray[np.uint8]:
-        image, pair, side = job
-        picture = collection.images[image]
-        if settings.augmentation.mirror and (pair + epoch) // 2 % 2:
-            picture = np.ascontiguousarray(picture[:, ::-1])
-        rng = np.random.default_rng([settings.seed, 3, epoch, pair, side])
-        return augment(picture, settings.augmentation, rng)
+    @property
+    def steps(self) -> int:
+        """Of an epoch."""
+        return max(1, self.settings.pairs // self.settings.batch)
 
-    jobs = [(int(image), first + k, 0) for k, image in enumerate(a)]
-    jobs += [(int(image), first + k, 1) for k, image in enumerate(b)]
-    return to_tensor(np.stack(list(pool.map(one, jobs))))
+    def step(self, pairs: Pairs) -> float:
+        """One step of Adam; weights and progress are untouched where the loss is not finite."""
+        settings, network, progress = self.settings, self.network, self.progress
+        first = progress.step * settings.batch
+        a, b, same_place = (x[first : first + settings.batch] for x in vars(pairs).values())
+        same = torch.from_numpy(same_place).to(self.device)
+        images = self._augmented(a, b, first).to(self.device)
+        rate = self._learning_rate()
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate * group["factor"]
+        network.train()
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.half):
+            descriptors = network.embed(images)
+        loss = cross_entropy(network.logits(descriptors[: len(a)], descriptors[len(a) :]), same)
+        if settings.loss == "bce+contrast":
+            both = np.concatenate([a, b])
+            relation = torch.from_numpy(self.collection.relation[np.ix_(both, both)])
+            alike = network.cosines(descriptors, descriptors)
+            loss = loss + contrast(alike, same, relation.to(self.device), settings.temperature)
+        value = loss.item()
+        if math.isfinite(value):
+            self.optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            self.optimiser.step()
+            progress.step += 1
+            progress.loss_sum += value
+            progress.images += 2 * len(a)
+        return value
 
+    def _augmented(self, a: NDArray[np.int64], b: NDArray[np.int64], first: int) -> torch.Tensor:
+        settings, epoch = self.settings, self.progress.epoch
 
-def _pairs_of_epoch(
-    collection: Collection,
-    images: NDArray[np.int64],
-    settings: TrainSettings,
-    network: SiameseNetwork,
-    progress: TrainingProgress,
-    device: torch.device,
-) -> Pairs:
-    rng = np.random.default_rng([settings.seed, 4, progress.epoch])
-    hard = None
-    if progress.epoch > 0 and settings.hard_share > 0:  # random weights find nothing hard
-        if len(images) > settings.mined_images:
-            images = np.sort(rng.choice(images, settings.mined_images, replace=False))
-        d = torch.from_numpy(embed_all(network, collection.images[images], device))
-        alike = torch.cat([network.cosines(rows, d) for rows in d.split(512)])
-        hard = mine(collection, images, alike.numpy())
-    return draw_pairs(
-        collection, images, settings.pairs, rng, hard, settings.hard_share,
-        same_share=settings.same_share, together=settings.together, emphasis=settings.emphasis,
-    )  # fmt: skip
+        def one(job: tuple[int, int, int]) -> NDArray[np.uint8]:
+            image, pair, side = job
+            picture = self.collection.images[image]
+            if settings.augmentation.mirror and (pair + epoch) // 2 % 2:
+                picture = np.ascontiguousarray(picture[:, ::-1])
+            rng = np.random.default_rng([settings.seed, 3, epoch, pair, side])
+            return augment(picture, settings.augmentation, rng)
 
+        jobs = [
+            (int(image), first + k, side)
+            for side, chosen in enumerate((a, b))
+            for k, image in enumerate(chosen)
+        ]
+        return to_tensor(np.stack(list(self.pool.map(one, jobs))))
 
-def _end_epoch(
-    network: SiameseNetwork,
-    collection: Collection,
-    validation: NDArray[np.int64],
-    settings: TrainSettings,
-    progress: TrainingProgress,
-    weights: Path,
-    steps: int,
-    device: torch.device,
-) -> None:
-    figures = validate(network, collection, validation, settings.augmentation, device)[0]
-    row = {"epoch": float(progress.epoch), "loss": progress.loss_sum / steps, **figures}
-    progress.history.append(row)
-    if figures["average_precision"] > progress.best:
-        progress.best, progress.stale = figures["average_precision"], 0
-        save_network(network, weights, {"epoch": progress.epoch, "validation": figures})
-    else:
-        progress.stale += 1
-    progress.epoch, progress.step, progress.loss_sum = progress.epoch + 1, 0, 0.0
+    def pairs_of_epoch(self) -> Pairs:
+        """Those to learn from next."""
+        settings, network, images, hard = self.settings, self.network, self.images, None
+        rng = np.random.default_rng([settings.seed, 4, self.progress.epoch])
+        # Random weights find nothing hard.
+        if self.progress.epoch > 0 and settings.hard_share > 0:
+            if len(images) > settings.mined_images:
+                images = np.sort(rng.choice(images, settings.mined_images, replace=False))
+            d = torch.from_numpy(embed_all(network, self.collection.images[images], self.device))
+            alike = torch.cat([network.cosines(rows, d) for rows in d.split(512)])
+            hard = mine(self.collection, images, alike.numpy())
+        return draw_pairs(
+            self.collection, images, settings.pairs, rng, hard, settings.hard_share,
+            same_share=settings.same_share, together=settings.together,
+            emphasis=settings.emphasis,
+        )  # fmt: skip
 
+    def end_epoch(self, validation: NDArray[np.int64], weights: Path) -> None:
+        """Validate, and write the weights if they are the best so far."""
+        network, progress = self.network, self.progress
+        augmentation = self.settings.augmentation
+        figures = validate(network, self.collection, validation, augmentation, self.device)[0]
+        loss = progress.loss_sum / self.steps
+        progress.history.append({"epoch": float(progress.epoch), "loss": loss, **figures})
+        if figures["average_precision"] > progress.best:
+            progress.best, progress.stale = figures["average_precision"], 0
+            save_network(network, weights, {"epoch": progress.epoch, "validation": figures})
+        else:
+            progress.stale += 1
+        progress.epoch, progress.step, progress.loss_sum = progress.epoch + 1, 0, 0.0
 
-def _learning_rate(settings: TrainSettings, step: int, steps: int) -> float:
-    if settings.schedule == "constant":
-        return settings.learning_rate
-    return settings.learning_rate * 0.5 * (1.0 + math.cos(math.pi * step / steps))
+    def _learning_rate(self) -> float:
+        settings, progress = self.settings, self.progress
+        if settings.schedule == "constant":
+            return settings.learning_rate
+        done, steps = progress.epoch * self.steps + progress.step, settings.epochs * self.steps
+        return settings.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done / steps))
 
 
 def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.Optimizer:

@@ -36,7 +36,7 @@ _TOWNS = {
     "town31": ("05", "--seed", "31", "--change", "0.3", *_OTHER_LANE),
     "town34": ("02", "--seed", "34", "--change", "0.3", *_OTHER_LANE),
 }
-# Frame 1500 is the first of the range that docs/loops.md tests on.
+# Frame 1500 is the first of the range that docs/research/loops.md tests on.
 _FRAMES = "seq=00,first=250,last=1499,near=20"
 
 

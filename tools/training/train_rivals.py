@@ -1,4 +1,4 @@
-"""Train every architecture of docs/rivals.md under equal conditions, in both of its ways.
+"""Train every architecture of docs/research/rivals.md under equal conditions, in both of its ways.
 
 python tools/training/train_rivals.py --data SOURCE [--data SOURCE ...] --out DIR
         [--networks NAMES] [--pixels N] [--images N] [--core-minutes M] [--epochs N]
@@ -110,7 +110,7 @@ class StepClock:
         return statistics.median(self._taken) if self._taken else float("nan")
 
 
-def main() -> None:
+def main(words: list[str] | None = None) -> None:
     """Parse the command line and run what is left to do."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--data", action="append", required=True, help="source of images")
@@ -124,7 +124,7 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, help="that these are divided into")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--dry-run", action="store_true", help="print the plan only")
-    args = parser.parse_args()
+    args = parser.parse_args(words)
 
     set_threads(1)
     settings = PRESETS["rivals"]

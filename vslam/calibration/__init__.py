@@ -1,1 +1,1 @@
-"""Cameras as they are: distortion, where two of them stand, and images rectified on the way in."""
+"""Camera models, calibration files and the rectification of images."""

@@ -1,8 +1,8 @@
-"""YAML of calibration files, as everybody writes it: numbers out of it, or one sentence.
+"""The YAML of calibration files: typed access to its values, or an error in one sentence.
 
-OpenCV's dialect is understood, too: the header ``%YAML:1.0``, ``!!opencv-matrix``, and brackets
-straight behind a colon. Scalars are read as text and turned into what is asked for, because YAML
-1.1 takes ``1e-05`` for text and OpenCV takes it for a number.
+OpenCV's dialect is understood too: the header ``%YAML:1.0``, ``!!opencv-matrix``, and brackets
+directly after a colon. Scalars are read as text and converted on access, because YAML 1.1 reads
+``1e-05`` as text while OpenCV writes it as a number.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from vslam.calibration.models import Array
 from vslam.errors import InputError
 
 _HEADER = re.compile(r"\A\ufeff?%YAML[: ]1\.\d.*\n?")
-_MOST_BYTES = 100_000  # parsed in a second or two; a calibration has 5,000
-_MOST_STEPS = 10_000  # lists and numbers at one key
+_MOST_BYTES = 100_000  # parsed within two seconds; a calibration file has about 5,000
+_MOST_STEPS = 10_000  # upper bound of the lists and numbers at one key
 _NO_SPACE = re.compile(r"^(\s*[\w.]+):(?=\[)", re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class Document:
-    """A mapping of a file.
+    """A mapping of a YAML file.
 
     Attributes:
-        source: file, and section in it, for messages.
+        source: the file and the section in it, for error messages.
         values: text, lists and mappings by key.
     """
 
@@ -57,12 +57,12 @@ class Document:
         return self._numbers(key, "one number", 1)[0]
 
     def numbers(self, key: str, *counts: int) -> tuple[float, ...]:
-        """Numbers at a key, flat, of one of these counts; of any without."""
+        """The numbers at a key, flattened; there must be one of ``counts``, if any is given."""
         wanted = " or ".join(map(str, counts))
         return self._numbers(key, f"{wanted} numbers" if counts else "numbers", *counts)
 
     def matrix(self, key: str, rows: int, columns: int) -> Array:
-        """A matrix at a key, written row by row in whatever brackets."""
+        """The ``(rows, columns)`` matrix at a key, written row by row, nested or flat."""
         found = self._numbers(key, f"{rows}x{columns} numbers", rows * columns)
         return np.array(found).reshape(rows, columns)
 
@@ -89,7 +89,7 @@ def read_document(path: Path) -> Document:
     """Read a YAML file whose top is a mapping.
 
     Raises:
-        InputError: missing, unreadable or no YAML.
+        InputError: the file is missing, unreadable, too large or not YAML.
     """
     import yaml
 
@@ -98,24 +98,26 @@ def read_document(path: Path) -> Document:
         text = "" if too_large else path.read_text("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{path}: the calibration is no text; name the file with the cameras' numbers."
+            f"{path}: the calibration is not a text file; name the YAML file with the parameters "
+            "of the cameras."
         ) from error
     except FileNotFoundError as error:
         raise InputError(f"{path}: the calibration is missing; name another file.") from error
     except OSError as error:
         raise InputError(
-            f"{path}: the calibration cannot be read ({error.strerror}); name another."
+            f"{path}: the calibration cannot be read ({error.strerror}); name another file."
         ) from error
     if too_large:
         raise InputError(
-            f"{path}: larger than {_MOST_BYTES // 1000} kB, which no calibration is; name another."
+            f"{path}: larger than {_MOST_BYTES // 1000} kB, which no calibration is; name another "
+            "file."
         )
     if not text.strip():
-        raise InputError(f"{path}: the calibration is empty; name another.")
+        raise InputError(f"{path}: the calibration is empty; name another file.")
     if text.lstrip("\ufeff \n").startswith("<?xml"):
         raise InputError(
-            f"{path}: the calibration is XML, which is not read; write it with a name that ends in "
-            ".yml (cv2.FileStorage then writes YAML)."
+            f"{path}: the calibration is XML, which is not read; save it under a name that ends in "
+            ".yml, for which cv2.FileStorage writes YAML."
         )
     text = _NO_SPACE.sub(r"\1: ", _HEADER.sub("", text))
     try:
@@ -123,15 +125,18 @@ def read_document(path: Path) -> Document:
     except (yaml.YAMLError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f" at line {mark.line + 1}" if mark else ""
-        raise InputError(f"{path}: the calibration is no YAML{line}; repair it.") from error
+        raise InputError(f"{path}: the calibration is no YAML{line}; correct it.") from error
     if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
         raise InputError(f"{path}: the calibration must be a list of keys with values, in YAML.")
     return Document(str(path), values)
 
 
 def _flat(value: object) -> list[str]:
-    """All texts in lists of lists. A list of aliases of lists of aliases, and so on, is a few lines
-    of text and gigabytes of numbers, or has no end: beyond any matrix it is no number."""
+    """Flatten nested lists of text.
+
+    Nested YAML aliases can expand a few lines into gigabytes or form a cycle, so that a list with
+    more items than any matrix becomes "no number", which the caller refuses.
+    """
     found: list[str] = []
     waiting = [value]
     for _ in range(_MOST_STEPS):

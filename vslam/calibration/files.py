@@ -1,4 +1,4 @@
-"""Calibration files; the format is found out from what they hold."""
+"""Reading calibration files, whose format is recognised by their keys."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from vslam.calibration.models import Calibration
 from vslam.errors import InputError
 
 _Reader = Callable[[Sequence[Document], Size | None], Calibration]
-# The first whose keys are all in one of the files decides.
+# Keys of a format, its reader and its largest number of files; the first format whose keys are all
+# in one file is used.
 _FORMATS: tuple[tuple[set[str], _Reader, int], ...] = (
     ({"left"}, read_own, 1),
     ({"cam0"}, read_kalibr, 1),
@@ -34,7 +35,7 @@ _FORMATS: tuple[tuple[set[str], _Reader, int], ...] = (
     ({"K1"}, read_opencv, 2),
     ({"cameraMatrix1"}, read_opencv, 2),
 )
-_PAIRS = (  # in a folder
+_PAIRS = (  # searched for in a folder, in this order
     ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml"),
     ("cam0/sensor.yaml", "cam1/sensor.yaml"),
     ("left.yaml", "right.yaml"),
@@ -44,15 +45,15 @@ _PAIRS = (  # in a folder
 
 
 def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> Calibration:
-    """Read a calibration in any of the formats of docs/cameras.md.
+    """Read a calibration in any of the formats of docs/howto/cameras.md.
 
     Args:
-        files: one file, or one of each camera, left first, or a folder that holds them.
-        size: width and height of the images, for files that do not say.
+        files: one file, or one for each camera, left first, or a folder that holds them.
+        size: width and height of the images, for files without them.
 
     Raises:
-        InputError: missing files, unknown format or model, missing keys, numbers that no camera
-            can have.
+        InputError: a file or key is missing, the format or model is unknown, or a number is
+            impossible for a camera.
     """
     paths = [
         found
@@ -65,14 +66,14 @@ def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> C
             if len(documents) > most:
                 raise InputError(
                     f"--calib {paths[most]}: a file too many; this format has "
-                    f"{'one' if most == 1 else 'at most two'}."
+                    f"{'one' if most == 1 else 'at most two'}, leave the others out."
                 )
             return reader(documents, size)
     there = ", ".join(" ".join(key.split())[:20] for key in sorted(documents[0].values)[:6])
     raise InputError(
-        f"{paths[0]}: no known calibration (it has the keys {there}); it must be vslam's own "
-        "(docs/cameras.md), Kalibr's camchain, OpenCV's, EuRoC's sensor.yaml, "
-        "ROS's camera_info or settings of ORB-SLAM."
+        f"{paths[0]}: no known calibration (it has the keys {there}); give one in vslam's own "
+        "format (docs/howto/cameras.md), Kalibr's camchain, OpenCV's YAML, EuRoC's sensor.yaml, "
+        "ROS's camera_info or the settings of ORB-SLAM."
     )
 
 

@@ -1,6 +1,6 @@
-"""What each calibration format says, as a `Calibration`; docs/cameras.md describes them.
+"""Readers of the calibration formats, which docs/howto/cameras.md describes.
 
-One file because each format is a few lines on the same helpers. The formats' own documentation:
+They share one file because each is a few lines on the same helpers. The formats are documented in
 Kalibr's wiki (yaml formats), OpenCV's samples ``stereo_calib.cpp`` and ``camera_calibration.cpp``,
 the ASL dataset format of EuRoC (Burri et al., IJRR 2016), ROS's ``sensor_msgs/CameraInfo``, the
 settings files of ORB-SLAM2 and ``Calibration_Tutorial.pdf`` of ORB-SLAM3.
@@ -44,14 +44,14 @@ _OWN_KEYS = {
     "virtual_baseline",
 }
 _OWN_CAMERA_KEYS = {"lens", "size", "focal", "centre", "distortion"}
-_OFF_CENTRE = 0.2  # of the size: at half the resolution it is 0.5, at twice 0.25
-_ROUNDED = 1e-3  # rotations in files are rounded
-_LONGEST_DELAY_S = 0.1  # between both images of a pair
+_OFF_CENTRE = 0.2  # of the image size; images of half the resolution give 0.5, of twice it 0.25
+_ROUNDED = 1e-3  # tolerance for rotations, which are rounded in files
+_LONGEST_DELAY_S = 0.1  # between the two images of a pair
 
 
 def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """vslam's own: ``left``, ``right``, ``T_left_right`` or ``baseline``, ``right_delay``,
-    ``depth_scale``."""
+    """Read vslam's own format: ``left``, ``right``, ``T_left_right`` or ``baseline``,
+    ``right_delay``, ``depth_scale`` and ``virtual_baseline``."""
     (document,) = documents
     _refuse_unknown(document, _OWN_KEYS)
     _refuse_contradictions(document)
@@ -75,7 +75,7 @@ def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
 
 
 def _right_delay(document: Document) -> float:
-    """Seconds by which the right image is late, 0 where the file does not say."""
+    """Seconds by which the right image is taken later than the left one; 0 if not in the file."""
     if "right_delay" not in document:
         return 0.0
     delay = document.number("right_delay")
@@ -89,7 +89,7 @@ def _right_delay(document: Document) -> float:
 
 
 def _refuse_contradictions(document: Document) -> None:
-    """A pair has one transformation and no depth, one camera has no transformation."""
+    """Check that a pair has one transformation and no depth, and a single camera neither."""
     transformations = [key for key in ("T_left_right", "baseline") if key in document]
     of_pair = [*transformations, *(key for key in ("right_delay",) if key in document)]
     of_depth = [key for key in ("depth_scale", "virtual_baseline") if key in document]
@@ -110,7 +110,7 @@ def _refuse_contradictions(document: Document) -> None:
 
 
 def read_kalibr(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """``camchain.yaml`` of Kalibr: ``cam0`` and, to its right, ``cam1``."""
+    """Read Kalibr's ``camchain.yaml``: ``cam0`` and, to its right, ``cam1``."""
     (document,) = documents
     sections = [document.section(key) for key in ("cam0", "cam1") if key in document]
     models = [_named_camera(section, "distortion_coeffs", size) for section in sections]
@@ -125,7 +125,7 @@ def read_kalibr(documents: Sequence[Document], size: Size | None) -> Calibration
 
 
 def read_euroc(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """``sensor.yaml`` of one or two cameras, with ``T_BS`` from the camera to the body."""
+    """Read EuRoC's ``sensor.yaml`` of one or two cameras; ``T_BS`` maps the camera to the body."""
     models = [_named_camera(document, "distortion_coefficients", size) for document in documents]
     if len(models) == 1:
         return Calibration(models[0], source=documents[0].source)
@@ -134,7 +134,8 @@ def read_euroc(documents: Sequence[Document], size: Size | None) -> Calibration:
 
 
 def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """``camera_info``, a file of ``camera_calibration`` or a printed message, of one or two."""
+    """Read ROS's ``camera_info`` of one or two cameras: a printed message or a file of
+    ``camera_calibration``."""
     found = [_ros_names(document) for document in documents]
     models = [_matrix_camera(d, d.source, "K", "D", _ros_lens(d), size) for d in found]
     if len(models) == 1:
@@ -144,16 +145,17 @@ def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
     if P[0, 3] == 0 and "P" in left and left.matrix("P", 3, 4)[0, 3] != 0:
         raise InputError(
             f"{_sources(documents)}: the sides seem swapped, since the baseline is in the first "
-            "camera's projection matrix and belongs into the right one's; name the left camera "
-            "first, with --topics or --calib."
+            "camera's projection matrix instead of the second's; name the left camera first, with "
+            "--topics or --calib."
         )
     T_left_right = _unrectified(left.matrix("R", 3, 3), right.matrix("R", 3, 3), P, right.source)
     return _pair(_sources(documents), models[0], models[1], T_left_right)
 
 
 def read_opencv(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """What OpenCV's samples write by ``FileStorage``: ``camera_matrix``, or ``M1 D1 M2 D2 R T`` in
-    one file or two; for M also K, or the names of its manual, ``cameraMatrix1 distCoeffs1``."""
+    """Read what OpenCV's samples write: ``camera_matrix``, or ``M1 D1 M2 D2 R T`` in one file or
+    two. M may also be called K, and both may have the names of OpenCV's manual, ``cameraMatrix1``
+    and ``distCoeffs1``."""
     source = _sources(documents)
     document = Document(source, {k: v for each in documents for k, v in each.values.items()})
     lens: Lens = "fisheye" if _flag(document, "fisheye_model") else "pinhole"
@@ -170,7 +172,7 @@ def read_opencv(documents: Sequence[Document], size: Size | None) -> Calibration
 
 
 def read_orbslam(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """Settings of ORB-SLAM2 and ORB-SLAM3: monocular, stereo or RGB-D."""
+    """Read the settings of ORB-SLAM2 or ORB-SLAM3: monocular, stereo or RGB-D."""
     (document,) = documents
     source = document.source
     if "LEFT.K" in document:
@@ -219,7 +221,7 @@ def _own_camera(document: Document, size: Size | None) -> CameraModel:
 
 
 def _named_camera(document: Document, distortion: str, size: Size | None) -> CameraModel:
-    """Kalibr's and EuRoC's way: the names of the camera and distortion models as words."""
+    """A camera as in Kalibr's and EuRoC's files, which name the camera and distortion models."""
     if (kind := document.text("camera_model")) != "pinhole":
         raise InputError(
             f"{document.source}: camera_model {kind} is unknown; known is pinhole, with one of "
@@ -238,7 +240,7 @@ def _named_camera(document: Document, distortion: str, size: Size | None) -> Cam
 def _matrix_camera(
     document: Document, source: str, K: str, D: str, lens: Lens, size: Size | None
 ) -> CameraModel:
-    """OpenCV's way: a matrix and a vector."""
+    """A camera as in OpenCV's files: a camera matrix and a vector of distortion coefficients."""
     matrix = document.matrix(K, 3, 3)
     numbers = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     if "image_width" in document or size is None:
@@ -246,8 +248,8 @@ def _matrix_camera(
     elif max(abs(c / n - 0.5) for c, n in zip(numbers[2:], size, strict=True)) > _OFF_CENTRE:
         raise InputError(
             f"{source}: the principal point ({numbers[2]:.1f}, {numbers[3]:.1f}) is far from the "
-            f"centre of the {size[0]}x{size[1]} images; take the calibration of these images, of "
-            "their resolution and not turned, or add image_width and image_height if it is theirs."
+            f"centre of the {size[0]}x{size[1]} images; give a calibration made at this resolution "
+            "and orientation, or add image_width and image_height if it was."
         )
     return _camera(source, lens, tuple(map(float, numbers)), document.numbers(D), size)
 
@@ -278,7 +280,7 @@ def _orbslam2_unrectified(document: Document, size: Size | None) -> Calibration:
 
 
 def _ros_names(document: Document) -> Document:
-    """The names of a printed message, for a file of ``camera_calibration`` too."""
+    """Rename the keys of a ``camera_calibration`` file to those of a printed message."""
     names = {
         "camera_matrix": "K",
         "distortion_coefficients": "D",
@@ -345,7 +347,7 @@ def _camera(
         raise InputError(f"{source}: the image size {width}x{height} must be positive.")
     if width * height > MOST_PIXELS:
         raise InputError(
-            f"{source}: no camera has images of {width}x{height} pixels; mend the size."
+            f"{source}: no camera has images of {width}x{height} pixels; correct the size."
         )
     if fx <= 0 or fy <= 0:
         raise InputError(f"{source}: the focal lengths {fx:g}, {fy:g} must be positive.")
@@ -364,16 +366,17 @@ def _pair(source: str, left: CameraModel, right: CameraModel, T_left_right: Arra
             f"{source}: the transformation between the cameras holds no rotation; "
             "check its numbers and their order."
         )
-    U, _, Vt = np.linalg.svd(R)  # the nearest rotation to the rounded one
+    U, _, Vt = np.linalg.svd(R)  # U Vt is the rotation nearest to the rounded one
     return Calibration(left, right, _rigid(U @ Vt, T_left_right[:3, 3]), source=source)
 
 
 def _unrectified(R_left: Array, R_right: Array, P: Array, source: str) -> Array:
-    """``T_left_right`` from the rotations into the rectified frames and the right projection."""
+    """``T_left_right`` from the rotations into the rectified frames and the right camera's
+    projection matrix."""
     if P[0, 0] <= 0 or P[0, 3] == 0:
         raise InputError(
-            f"{source}: the projection matrix holds no baseline; the fourth number of the right "
-            "camera's is minus its distance times the focal length."
+            f"{source}: the projection matrix holds no baseline; its fourth number must be minus "
+            "the baseline in metres times the focal length."
         )
     baseline = np.array([-P[0, 3] / P[0, 0], 0.0, 0.0])
     return _rigid(R_left.T @ R_right, R_left.T @ baseline)

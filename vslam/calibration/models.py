@@ -1,8 +1,8 @@
 """Camera models: pinhole with radial-tangential distortion, and equidistant (Kannala-Brandt).
 
-Camera frame: x right, y down, z forward. Pixels count from the centre of the upper left one.
-Formulas: OpenCV's documentation of ``calib3d`` (radial-tangential) and of ``fisheye``, the latter
-after Kannala and Brandt, PAMI 2006, equation 6.
+Camera frame: x right, y down, z forward. The centre of the upper left pixel is (0, 0). The formulas
+are those of OpenCV's documentation of ``calib3d`` (radial-tangential) and of ``fisheye``, the
+latter after Kannala and Brandt, PAMI 2006, equation 6.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ Lens = Literal["pinhole", "fisheye"]
 
 N_COEFFICIENTS: dict[Lens, tuple[int, ...]] = {"pinhole": (0, 4, 5, 8), "fisheye": (4,)}
 _NEWTON_STEPS = 30
-_OUTWARD = np.linspace(0.0, 1.0, 17)  # parts of the way from the axis to a ray
+_OUTWARD = np.linspace(0.0, 1.0, 17)  # fractions of the way from the axis to a ray
 _SOLVED_PX = 1e-3  # an unprojected pixel must come back this close
 
 
 @dataclass(frozen=True)
 class CameraModel:
-    """How one camera maps rays to pixels.
+    """The intrinsic parameters of one camera, which map rays to pixels.
 
     Attributes:
         fx, fy: focal lengths in pixels.
         cx, cy: principal point in pixels.
         width, height: image size in pixels.
         lens: ``pinhole`` or ``fisheye`` (equidistant).
-        distortion: pinhole: none, or ``k1 k2 p1 p2``, ``k3`` behind it, ``k4 k5 k6`` behind that
+        distortion: pinhole: none, or ``k1 k2 p1 p2``, which ``k3`` and ``k4 k5 k6`` may follow
             (OpenCV's order); fisheye: ``k1 k2 k3 k4``.
     """
 
@@ -46,23 +46,23 @@ class CameraModel:
 
     @property
     def undistorted(self) -> bool:
-        """Whether straight lines are straight in the image."""
+        """Whether the camera is a pinhole without distortion."""
         return self.lens == "pinhole" and not any(self.distortion)
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """One camera or a stereo pair, as a calibration file tells.
+    """One camera or a stereo pair, as described by a calibration file.
 
     Attributes:
         left: the left camera, or the only one.
         right: the right camera, or None.
         T_left_right: ``(4, 4)`` float64, maps points of the right camera to the left one; None
             without a right camera.
-        depth_scale: what a depth image counts in a metre, None where the file does not say.
-        virtual_baseline: metres, with which depth is turned into disparity, None likewise.
+        depth_scale: value of one metre in depth images; None if not in the file.
+        virtual_baseline: metres, converts depth to disparity; None if not in the file.
         right_delay: seconds by which the right image is taken later than the left one.
-        source: file or files that it was read from, for messages.
+        source: file or files that it was read from, for error messages.
     """
 
     left: CameraModel
@@ -79,9 +79,10 @@ class Calibration:
 
 
 def project(model: CameraModel, rays: Array) -> Array:
-    """Pixels ``(N, 2)`` of ``(N, 3)`` points in the camera frame; NaN where the model has none.
+    """Project ``(N, 3)`` points in the camera frame to pixels ``(N, 2)`` float64.
 
-    That is behind a pinhole camera, and just behind a fisheye one.
+    Points without a projection give NaN: those behind a pinhole camera, and those on the negative z
+    axis of a fisheye camera.
     """
     x, y, z = rays.T
     if model.lens == "fisheye":
@@ -98,8 +99,11 @@ def project(model: CameraModel, rays: Array) -> Array:
 
 
 def unproject(model: CameraModel, xy: Array) -> Array:
-    """Unit rays ``(N, 3)`` float64 of ``(N, 2)`` pixels; NaN where the distortion has no inverse:
-    Newton's method finds none, or the image is folded on the way there."""
+    """Unit rays ``(N, 3)`` float64 of ``(N, 2)`` pixels.
+
+    NaN where the distortion cannot be inverted: Newton's method does not converge, or the
+    distortion folds the image between the principal point and the pixel.
+    """
     plane = (xy - (model.cx, model.cy)) / (model.fx, model.fy)
     if model.lens == "fisheye":
         radius = np.hypot(*plane.T)
@@ -116,7 +120,8 @@ def unproject(model: CameraModel, xy: Array) -> Array:
 
 
 def without_zeros(lens: Lens, distortion: tuple[float, ...]) -> tuple[float, ...]:
-    """The same distortion in as few coefficients as the model of the lens has forms for."""
+    """The same distortion without trailing zeros, as far as the lens model allows fewer
+    coefficients."""
     for n in N_COEFFICIENTS[lens]:
         if n <= len(distortion) and not any(distortion[n:]):
             return distortion[:n]
@@ -140,7 +145,7 @@ def _distorted(distortion: tuple[float, ...], plane: Array) -> Array:
 
 
 def _undistorted(distortion: tuple[float, ...], wanted: Array) -> Array:
-    """Newton's method with the Jacobian by central differences."""
+    """Invert ``_distorted`` by Newton's method, with a Jacobian from central differences."""
     if not distortion:
         return wanted
     plane = wanted.copy()
@@ -160,7 +165,7 @@ def _undistorted(distortion: tuple[float, ...], wanted: Array) -> Array:
 
 
 def _bent(distortion: tuple[float, ...], angle: Array) -> Array:
-    """Distance from the principal point, in focal lengths, of rays at an angle to the axis."""
+    """Distance from the principal point, in focal lengths, of rays at ``angle`` to the axis."""
     k1, k2, k3, k4 = distortion
     a2 = angle * angle
     return angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
@@ -179,5 +184,5 @@ def _unbent(distortion: tuple[float, ...], radius: Array) -> Array:
 
 
 def _folds(reach: list[Array]) -> NDArray[np.bool_]:
-    """Whether the way outward in the world leads inward in the image somewhere."""
+    """Whether the distance from the image centre ever decreases as the angle to the axis grows."""
     return np.any(~(np.diff(reach, axis=0) >= 0.0), axis=0)

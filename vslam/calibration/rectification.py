@@ -1,9 +1,10 @@
-"""Images as a rectified pinhole camera, or pair of them, would have taken them.
+"""Warping images to those of a rectified pinhole camera or stereo pair.
 
-The rectified pair looks half-way between both cameras, turned until its x axis is the baseline.
-It sees the largest rectangle that both images cover: no pixel is black, because corners at a black
-border would be features that stand still. (``cv2.stereoRectify`` estimates that rectangle from a
-9x9 grid, ``cv2.fisheye.stereoRectify`` from four points; both can leave black corners.)
+The rectified pair looks half-way between the two cameras, turned so that its x axis is the
+baseline. It shows the largest rectangle that both images cover. No pixel is black, because corners
+at a black border would become features that never move. (``cv2.stereoRectify`` estimates that
+rectangle from a 9x9 grid, ``cv2.fisheye.stereoRectify`` from four points; both can leave black
+corners.)
 """
 
 from __future__ import annotations
@@ -22,28 +23,28 @@ from vslam.errors import InputError
 Image = NDArray[np.uint8]
 Pixels = TypeVar("Pixels", bound=NDArray[np.generic])
 
-# At 60 degrees off the axis a pinhole image is four times as long as at its centre: what a wider
-# fisheye image shows there would be blown up, and its centre shrunk.
+# At 60 degrees off the axis a pinhole image is stretched four times as much as at its centre; a
+# wider view would magnify the border and shrink the centre even more.
 _MAX_HALF_VIEW = np.tan(np.radians(60.0))
-_FARTHEST_M = 20.0  # that one camera of a pair stands from the other
-_SAME = 1e-5  # radians; with focal lengths below 2000 px, rows are true to 0.02 px
+_FARTHEST_M = 20.0  # longest baseline
+_SAME = 1e-5  # radians; with focal lengths below 2000 px, rows agree to 0.02 px
 _SAME_PX = 1e-3
 
 
 @dataclass(frozen=True)
 class Rectification:
-    """What rectifies the images of one camera or of a pair.
+    """The functions that rectify the images of one camera or of a pair.
 
     Attributes:
-        camera: of the rectified images.
-        R_left_rectified: ``(3, 3)`` float64, maps directions of the rectified left camera to the
-            left one's own. Both have their centre in common.
-        left, right: ``(H, W)`` uint8 images of the calibrated size to rectified ones of the left
-            one's size, bilinear; the images themselves where there is nothing to do. ``right`` is
-            the identity where there is no right camera.
-        left_depth: the same for depth images of any type, by nearest neighbour; only of a camera
-            that is not turned, because its values are depths along the left camera's own axis.
-        identity: whether images are handed on as they are.
+        camera: the rectified camera or pair.
+        R_left_rectified: ``(3, 3)`` float64, maps directions from the rectified left camera to the
+            original one; both have the same centre.
+        left, right: map ``(H, W)`` uint8 images of the calibrated size to rectified ones of the
+            left camera's size, bilinearly. Images that need no rectification are returned
+            unchanged; without a right camera, ``right`` returns every image unchanged.
+        left_depth: the same for depth images of any type, by nearest neighbour. It is valid only
+            for a camera that is not turned, since depth is measured along the camera's own axis.
+        identity: whether images are returned unchanged.
     """
 
     camera: Camera
@@ -55,11 +56,11 @@ class Rectification:
 
 
 def rectify(calibration: Calibration) -> Rectification:
-    """Compute the maps once; the functions of the result are safe to call from several threads.
+    """Compute the rectification; its functions may be called from several threads.
 
     Raises:
-        InputError: the cameras do not look the same way from places side by side, are swapped, or
-            a distortion cannot be inverted within the image.
+        InputError: the cameras do not look the same way from places side by side, they are swapped,
+            or a distortion cannot be inverted within the image.
     """
     if calibration.right is None or calibration.T_left_right is None:
         return _rectify_one(calibration)
@@ -68,7 +69,7 @@ def rectify(calibration: Calibration) -> Rectification:
 
 
 def unchanged(image: Pixels) -> Pixels:
-    """The identity."""
+    """Return the image itself."""
     return image
 
 
@@ -137,7 +138,8 @@ def _is_rectified(
 
 
 def _between(R_left_right: Array, centre: Array, source: str) -> Array:
-    """``R_left_rectified``: x along the baseline, z as near as can be to half-way between both."""
+    """``R_left_rectified``: x along the baseline, z as close as possible to the mean direction of
+    the two cameras."""
     import cv2
 
     turn = cv2.Rodrigues(R_left_right)[0].ravel()
@@ -150,7 +152,7 @@ def _between(R_left_right: Array, centre: Array, source: str) -> Array:
     if baseline > _FARTHEST_M:
         raise InputError(
             f"{source}: the cameras stand {baseline:.4g} m apart, as if a length in millimetres or "
-            "centimetres were in the file; write the translation between them in metres (a "
+            "centimetres was taken for metres; write the translation between them in metres (a "
             "checkerboard calibration has the unit of the squares)."
         )
     x = centre / baseline
@@ -173,12 +175,12 @@ def _between(R_left_right: Array, centre: Array, source: str) -> Array:
 
 
 def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline: float) -> Camera:
-    """The pinhole camera of the left one's size that sees the most of what all images cover."""
+    """The pinhole camera of the left image's size that shows the most of what all images cover."""
     bounds = np.array([_inner_rectangle(model, R, source) for model, R in cameras])
     (x0, y0), (x1, y1) = bounds[:, 0].max(axis=0), bounds[:, 1].min(axis=0)
     if x0 >= x1 or y0 >= y1:
         raise InputError(
-            f"{source}: the cameras see nothing in common; check the transformation between them."
+            f"{source}: the cameras have no common view; check the transformation between them."
         )
     width, height = cameras[0][0].width, cameras[0][0].height
     focal = max((width - 1) / (x1 - x0), (height - 1) / (y1 - y0))
@@ -193,9 +195,9 @@ def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline
 
 def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) -> Array:
     """Corners ``[[x0, y0], [x1, y1]]``, on the plane z = 1 of the rectified camera, of a rectangle
-    that the image covers: it ends where its border comes nearest to the centre.
+    that the image covers. Each side lies where the image's border is nearest to the centre.
 
-    The polynomial of a wide lens may fold corners of the image, which then bound nothing.
+    The polynomial of a wide lens may fold the image's corners, which are then ignored.
     """
     found = []
     for k, border in enumerate(_borders(model.width, model.height)):
@@ -211,7 +213,7 @@ def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) ->
 
 
 def _check_view(model: CameraModel, R_own_rectified: Array, camera: Camera, source: str) -> None:
-    """Refuse a view of which an image shows a part twice or not at all."""
+    """Refuse a view of which the image shows a part twice or not at all."""
     xy = np.concatenate(_borders(camera.width, camera.height))
     rays = camera.backproject(xy, np.ones(len(xy))) @ R_own_rectified.T
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -221,7 +223,7 @@ def _check_view(model: CameraModel, R_own_rectified: Array, camera: Camera, sour
 
 
 def _borders(width: int, height: int) -> tuple[Array, ...]:
-    """Pixels ``(N, 2)`` of an image's left, upper, right and lower border."""
+    """Pixels ``(N, 2)`` of the left, upper, right and lower border of an image."""
     across, down = np.arange(float(width)), np.arange(float(height))
     top, left = np.zeros(width), np.zeros(height)
     return (
@@ -240,7 +242,7 @@ def _folded(source: str) -> InputError:
 
 
 def _maps(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray[np.float32]:
-    """``(H, W, 2)`` float32 pixels of the camera's own image for every rectified one."""
+    """``(H, W, 2)`` float32, for each rectified pixel its position in the original image."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = np.stack(
         [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1
@@ -250,7 +252,7 @@ def _maps(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray
 
 
 def _linear(maps: NDArray[np.float32]) -> Callable[[Image], Image]:
-    """Bilinear in fixed point, a 32nd of a pixel: three times as fast as in floating point."""
+    """Interpolate bilinearly in fixed point (1/32 pixel), three times as fast as floating point."""
     import cv2
 
     fixed, weights = cv2.convertMaps(maps[..., 0], maps[..., 1], cv2.CV_16SC2)

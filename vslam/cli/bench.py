@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from vslam.cli.options import (
-    KITTI_ROOT,
-    Calib,
-    Depth,
-    DepthScale,
-    FramesPerSecond,
-    Right,
-    Sensor,
-    SideBySide,
-    Source,
-    SourceKind,
     Thresholds,
-    Topics,
     Weights,
     kind_of_source,
     names_in,
-    source_options,
+    open_given,
+    reads_source,
 )
 from vslam.cli.report import write_overview_of
 from vslam.errors import InputError
@@ -33,6 +22,7 @@ from vslam.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Generator
 
+    from vslam.datasets.frames import Source
     from vslam.datasets.sources import SourceOptions
     from vslam.lab.bench.execute import CellOutcome, RunOptions
     from vslam.lab.bench.grid import Cell
@@ -52,7 +42,7 @@ _EXAMPLES = """
 
   vslam bench --data drive.mp4 --side-by-side --calib stereo.yaml --runs 1
 
-The same command again continues where it was stopped. docs/bench.md tells more.
+The same command again continues where it was stopped. docs/howto/bench.md tells more.
 """
 
 
@@ -61,9 +51,9 @@ def register(app: typer.Typer) -> None:
     app.command(epilog=_EXAMPLES)(bench)
 
 
+@reads_source(without=("seq", "start", "every"))
 def bench(
-    dataset: SourceKind = None,
-    data: Source = str(KITTI_ROOT),
+    given: SourceOptions,
     seqs: Annotated[
         str | None,
         typer.Option(
@@ -71,14 +61,6 @@ def bench(
             show_default="00-05; of euroc and tum the only one there",
         ),
     ] = None,
-    calib: Calib = None,
-    right: Right = None,
-    depth: Depth = None,
-    fps: FramesPerSecond = None,
-    side_by_side: SideBySide = False,
-    topics: Topics = "",
-    depth_scale: DepthScale = None,
-    sensor: Sensor = None,
     perturb: Annotated[
         str,
         typer.Option(
@@ -91,9 +73,6 @@ def bench(
     ] = "bow,both",
     weights: Weights = None,
     runs: Annotated[int, typer.Option(min=1, help="Seeds of each random perturbation.")] = 3,
-    max_frames: Annotated[
-        int | None, typer.Option(min=1, help="Stop each run after so many frames.")
-    ] = None,
     jobs: Annotated[
         int, typer.Option(min=1, help="Runs at a time; give 1 for frames per second that count.")
     ] = 1,
@@ -124,27 +103,19 @@ def bench(
     for name in chosen or [""]:
         require_detector(name, files.get(name), option="--detectors")
     laws = parse_perturbations(perturb)
-    kind = kind_of_source(dataset, data)
-    if kind == "camera":
-        raise InputError(f"--data {data}: a camera cannot be seen twice; record a video or a bag.")
-    root = Path(data).absolute()
-    given = source_options(
-        None if calib is None else [path.absolute() for path in calib],
-        None if right is None else right.absolute(),
-        None if depth is None else depth.absolute(),
-        fps, side_by_side, topics, depth_scale,
-    )  # fmt: skip
     out = out.absolute()
-    options = replace(
-        cell_options(kind, root, config, threads, jobs, scheduler, out),
-        source=tuple(_words_of(given)),
-    )
-    frames, identity = open_all(kind, root, seqs, given, max_frames, sensor, shown=not quiet)
+    kind = kind_of_source(given)
+    given = absolute(given)
+    if seqs is None and kind in ("kitti", "synthetic"):
+        seqs = _FIRST_SEQUENCES
+    opened = open_all(kind, given, seqs, shown=not quiet)
+    frames = {name: source.n_expected or _UNKNOWN_LENGTH for name, source in opened.items()}
+    options = cell_options(kind, given, config, threads, jobs, scheduler, out)
     cells = make_grid(
-        kind, frames, laws, chosen, runs, max_frames, files,
-        sensor=sensor, calib=tuple(map(str, given.calibration)),
+        kind, frames, laws, chosen, runs, given.max_frames, files,
+        sensor=given.sensor, calib=tuple(map(str, given.calib)),
     )  # fmt: skip
-    execute.prepare(out, identity)
+    execute.prepare(out, identity_of(kind, given))
     finished = execute.finished_cells(cells, out, options.config)
     progress = GridProgress(cells, finished, frames, out, jobs)
     missing = progress.missing
@@ -182,77 +153,88 @@ def bench(
         raise typer.Exit(1)
 
 
+def absolute(given: SourceOptions) -> SourceOptions:
+    """The same options with absolute paths, since runs have folders of their own."""
+    paths = {
+        name: path.absolute()
+        for name in ("right", "depth")
+        if (path := getattr(given, name)) is not None
+    }
+    data = given.data
+    if data and Path(data).exists():
+        data = str(Path(data).absolute())
+    calib = tuple(path.absolute() for path in given.calib)
+    return given.model_copy(update={**paths, "data": data, "calib": calib})
+
+
 def cell_options(
     kind: str,
-    root: Path,
+    given: SourceOptions,
     config: Path | None,
     threads: int | None,
     jobs: int,
     scheduler: str | None,
     out: Path,
 ) -> RunOptions:
-    """What is the same for all cells of a data set below ``root``, by the options of a command."""
+    """What is the same for all cells of a source, by the options of a command."""
     from vslam.config import Config, load_config
     from vslam.lab.bench.execute import RunOptions, scratch_folder
     from vslam.machine import available_cores
 
     thresholds = Config() if config is None else load_config(config)
     return RunOptions(
-        data=root if kind != "synthetic" else None,
+        data=Path(given.data) if kind != "synthetic" else None,
         config=thresholds.model_dump_json(indent=2) + "\n",  # as a run writes it
         threads=threads or max(1, min(available_cores() // jobs, 4)),
         scratch=None if scheduler else scratch_folder(out),
+        source=tuple(_words_of(given)),
     )
 
 
-def _words_of(options: SourceOptions) -> list[str]:
-    """Of ``vslam run``; calibrations are the cells' own."""
-    words = ["--side-by-side"] if options.side_by_side else []
+def _words_of(given: SourceOptions) -> list[str]:
+    """Of ``vslam run``; sequence, sensor, calibrations and number of frames are the cells' own."""
+    words = ["--side-by-side"] if given.side_by_side else []
     values = {
-        "--right": options.right,
-        "--depth": options.depth,
-        "--fps": options.fps,
-        "--topics": ",".join(options.topics) or None,
-        "--depth-scale": options.depth_scale,
+        "--right": given.right,
+        "--depth": given.depth,
+        "--fps": given.fps,
+        "--topics": given.topics or None,
+        "--depth-scale": given.depth_scale,
     }
     return words + [str(x) for pair in values.items() if pair[1] is not None for x in pair]
 
 
+def identity_of(kind: str, given: SourceOptions) -> str:
+    """What tells this data from other data."""
+    if kind != "synthetic":
+        return " ".join([given.data, *_words_of(given), *map(str, given.calib)])
+    from vslam.datasets.synthetic import Variation, store
+
+    return f"rendered towns {store.folder_name(Variation())}"
+
+
 def open_all(
-    kind: str,
-    root: Path,
-    seqs: str | None,
-    options: SourceOptions,
-    max_frames: int | None,
-    sensor: str | None,
-    *,
-    shown: bool,
-) -> tuple[dict[str, int], str]:
-    """Open every sequence, so that what is missing is said before the first run and not after the
-    last: frames of each by name, and what tells this data from other data.
+    kind: str, given: SourceOptions, seqs: str | None, *, shown: bool
+) -> dict[str, Source]:
+    """Open every sequence by name, so that what is missing is said before the first run and not
+    after the last.
 
     Rendered ones are rendered here: two runs cannot render one sequence at a time.
     """
     from vslam.cli.console import console
-    from vslam.datasets.sources import open_source
-    from vslam.datasets.stream import count_expected
     from vslam.lab.bench.grid import parse_sequences
 
-    if seqs is None and kind in ("kitti", "synthetic"):
-        seqs = _FIRST_SEQUENCES
-    frames = {}
+    once = f"--data {given.data}: a camera cannot be seen twice; record a video or a bag."
+    if kind == "camera":
+        raise InputError(once)
+    opened = {}
     for name in [None] if seqs is None else parse_sequences(seqs):
-        with console(shown=shown).render_bar() as on_render:
-            found = open_source(
-                kind, str(root), name, options,
-                max_frames=max_frames, sensor=sensor, on_render=on_render,
-            )  # fmt: skip
-        frames[name or found.name] = count_expected(found) or _UNKNOWN_LENGTH
-    if kind != "synthetic":
-        return frames, " ".join([str(root), *_words_of(options), *map(str, options.calibration)])
-    from vslam.datasets.synthetic import Variation, store
-
-    return frames, f"rendered towns {store.folder_name(Variation())}"
+        options = given.model_copy(update={"dataset": kind, "seq": name})
+        source = open_given(options, console(shown=shown))
+        if source.live:
+            raise InputError(once)
+        opened[name or source.name] = source
+    return opened
 
 
 def outcomes_of(

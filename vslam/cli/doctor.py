@@ -3,29 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.options import (
-    Calib,
-    Depth,
-    DepthScale,
-    Every,
-    FramesPerSecond,
-    MaxFrames,
-    Right,
-    Sensor,
-    Seq,
-    SideBySide,
-    SourceKind,
-    Start,
-    Thresholds,
-    Topics,
-    kind_of_source,
-    source_options,
-)
+from vslam.cli.console import console
+from vslam.cli.options import Thresholds, open_given, reads_source, require_data
 from vslam.errors import InputError
+
+if TYPE_CHECKING:
+    from vslam.datasets.sources import SourceOptions
 
 _EXAMPLES = """
 [b]Examples[/b]
@@ -43,42 +30,23 @@ def register(app: typer.Typer) -> None:
     app.command(epilog=_EXAMPLES)(doctor)
 
 
+@reads_source()
 def doctor(
-    source: Annotated[str, typer.Argument(help="What to look at, as --data of a run.")],
-    dataset: SourceKind = None,
-    seq: Seq = None,
-    calib: Calib = None,
-    right: Right = None,
-    depth: Depth = None,
-    fps: FramesPerSecond = None,
-    side_by_side: SideBySide = False,
-    topics: Topics = "",
-    depth_scale: DepthScale = None,
-    start: Start = 0,
-    every: Every = 1,
-    max_frames: MaxFrames = None,
-    sensor: Sensor = None,
+    given: SourceOptions,
     config: Thresholds = None,
     out: Annotated[Path, typer.Option(help="HTML page to write.")] = Path("doctor.html"),
 ) -> None:
     """Check images, calibration and times before a run; exit code 1 if there is a fault."""
     from vslam.config import Config, load_config
-    from vslam.datasets.sources import open_source
-    from vslam.datasets.stream import Stream
+    from vslam.datasets.frames import first_frames
     from vslam.doctor.examine import Diagnosis, examine
     from vslam.doctor.findings import Finding
-    from vslam.doctor.first_frames import first_frames
     from vslam.doctor.page import write_page
 
+    require_data(given)
     thresholds = Config() if config is None else load_config(config)
     try:
-        options = source_options(calib, right, depth, fps, side_by_side, topics, depth_scale)
-        found = open_source(
-            kind_of_source(dataset, source), source, seq, options,
-            start=start, every=every, max_frames=max_frames, sensor=sensor,
-        )  # fmt: skip
-        sequence = first_frames(found) if isinstance(found, Stream) else found
-        diagnosis = examine(sequence, thresholds.orb)
+        diagnosis = examine(first_frames(open_given(given, console(shown=True))), thresholds.orb)
     except InputError as error:
         measured, _, fix = str(error).rstrip(".").rpartition("; ")
         diagnosis = Diagnosis([Finding("input", "fault", measured or fix, fix if measured else "")])
@@ -86,7 +54,8 @@ def doctor(
         typer.echo(f"{finding.verdict:<8} {finding.check:<16} {finding.measured}")
         if finding.fix:
             typer.echo(f"{'':<8} {'':<16} fix: {finding.fix}")
-    write_page(diagnosis, f"Doctor: {source}", out)  # after what it says: a disk may be full
+    # The page comes after the findings, because a disk may be full.
+    write_page(diagnosis, f"Doctor: {given.data or given.dataset}", out)
     n = len(diagnosis.faults)
     typer.echo(f"{out}: {n or 'no'} fault{'' if n == 1 else 's'}")
     if diagnosis.faults:

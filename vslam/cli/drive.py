@@ -5,18 +5,18 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
 from vslam.cli.console import console
+from vslam.cli.options import open_given
 from vslam.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
     from vslam.cli.console import Console
+    from vslam.datasets.frames import Source
     from vslam.datasets.perturbation import Perturbation
-    from vslam.datasets.sequence import Sequence
-    from vslam.datasets.stream import Stream
     from vslam.run.autosave import Unfinished
     from vslam.run.moments import LoopPictureRecorder
     from vslam.run.options import RunOptions
@@ -52,20 +52,19 @@ def drive(
     if options.localize and output.save_map is not None:
         raise InputError("--save-map: localising changes no map; leave it out.")
     told = console(shown=not output.quiet)
-    kind, source, perturbation = _open(options, told)
+    source, perturbation = _open(options, told)
     _refuse_camera(source, resume)
 
     # Bad input has been refused by now; what follows takes a second to import.
-    from vslam.cli.summary import print_summary
-    from vslam.datasets.stream import count_expected
+    from vslam.cli.tables import print_summary
     from vslam.doctor.nothing_tracked import why_nothing_was_tracked
     from vslam.report.folder import write_results
-    from vslam.run.autosave import FolderAutosave, remove_autosave
+    from vslam.run.autosave import MAP, FolderAutosave, remove_autosave
     from vslam.run.moments import LoopPictureRecorder, MomentRecorder
     from vslam.run.options import settings_of
     from vslam.run.pipeline import begin, run_sequence
 
-    settings = settings_of(options, kind, source, perturbation.name)
+    settings = settings_of(options, source, perturbation.name)
     with ExitStack() as lock:
         unfinished = _unfinished(options, source, resume, lock)
         _compile(settings, told)
@@ -77,7 +76,7 @@ def drive(
         # When only localising there is nothing to save but the poses.
         period = 0.0 if options.localize else options.autosave
         autosave = FolderAutosave(folder, period, f"{settings.dataset} {source.name}")
-        with told.progress_bar(count_expected(source)) as on_frame:
+        with told.progress_bar(source.n_expected) as on_frame:
             outcome = run_sequence(
                 source, perturbation, settings, recorder,
                 on_frame=on_frame, autosave=autosave, resume=unfinished, slam=slam,
@@ -94,37 +93,26 @@ def drive(
         print_summary(report, folder)
     if why and output.quiet:  # else the summary has said it
         raise ResultsError(f"{why}.")
+    if outcome.interrupted and outcome.interrupted != "Ctrl-C":
+        go_on = f"; vslam run --resume {folder} goes on" if (folder / MAP).exists() else ""
+        raise ResultsError(f"{folder}: ended early: {outcome.interrupted}{go_on}.")
     if why or outcome.interrupted:
         raise typer.Exit(1)
 
 
-def _open(options: RunOptions, told: Console) -> tuple[str, Sequence | Stream, Perturbation]:
+def _open(options: RunOptions, told: Console) -> tuple[Source, Perturbation]:
     """The images and what is done to them. Refuses laws that the data cannot serve."""
-    from vslam.cli.options import SourceName, kind_of_source, source_options
     from vslam.datasets.perturbation import parse_perturbation
-    from vslam.datasets.sources import open_source
 
-    o = options
-    kind = kind_of_source(cast("SourceName | None", o.dataset), o.data)
-    perturbation = parse_perturbation(o.perturb, o.seed)
-    of_source = source_options(
-        list(o.calib), o.right, o.depth, o.fps, o.side_by_side, o.topics, o.depth_scale
-    )
-    with told.render_bar() as on_render:
-        source = open_source(
-            kind, o.data, o.seq, of_source,
-            start=o.start, every=o.every, max_frames=o.max_frames, sensor=o.sensor,
-            on_render=on_render,
-        )  # fmt: skip
+    perturbation = parse_perturbation(options.perturb, options.seed)
+    source = open_given(options, told)
     perturbation.bound_to(source)
-    return kind, source, perturbation
+    return source, perturbation
 
 
-def _refuse_camera(source: Sequence | Stream, resume: Path | None) -> None:
+def _refuse_camera(source: Source, resume: Path | None) -> None:
     """What a camera has shown is gone."""
-    from vslam.datasets.stream import is_live
-
-    if is_live(source) and resume is not None:
+    if source.live and resume is not None:
         raise InputError(
             f"--resume {resume}: what a camera has shown is gone; go on in its map with "
             "--map FOLDER/autosave.npz."
@@ -132,7 +120,7 @@ def _refuse_camera(source: Sequence | Stream, resume: Path | None) -> None:
 
 
 def _unfinished(
-    options: RunOptions, source: Sequence | Stream, resume: Path | None, lock: ExitStack
+    options: RunOptions, source: Source, resume: Path | None, lock: ExitStack
 ) -> Unfinished | None:
     """What to go on from, of a run that is resumed. Refuses images of another camera than that of
     the map to go on in."""
@@ -189,7 +177,7 @@ def _recorder(
     pictures: LoopPictureRecorder,
 ) -> Recorder:
     """All that is to be told of the run: a file, a viewer, and what the report shows."""
-    from vslam.run.recorder import NullRecorder, RerunRecorder, SeveralRecorders
+    from vslam.run.recorder import Recorder, RerunRecorder, SeveralRecorders
 
     recorders: list[Recorder] = []
     if output.record:
@@ -202,5 +190,5 @@ def _recorder(
     if output.pages:
         recorders.append(moments)
     if not recorders:
-        return NullRecorder()
+        return Recorder()
     return SeveralRecorders((pictures, *recorders))  # pictures first, since the others show them

@@ -34,7 +34,7 @@ def evaluate_files(
     """Compare a trajectory with the ground truth: ATE, RPE and KITTI drift."""
     import json
 
-    from vslam.cli.summary import error_rows, print_rows
+    from vslam.cli.tables import print_rows
     from vslam.evaluation.trajectories import evaluate_trajectory, evo_command, read_pair
     from vslam.trajectory import trajectory_format
 
@@ -44,7 +44,18 @@ def evaluate_files(
         typer.echo(json.dumps(evaluation.summary(), indent=2))
         return
     matched = f"{evaluation.frames} matched of {len(trajectory)}"
-    rows = [("frames", matched), ("alignment", align), *error_rows(evaluation)]
+    rows = [
+        ("frames", matched),
+        ("alignment", align),
+        ("ATE RMSE", f"{evaluation.ate_rmse_m:.3f} m"),
+        ("ATE mean, max", f"{evaluation.ate_mean_m:.3f} m, {evaluation.ate_max_m:.3f} m"),
+        ("RPE per frame", f"{evaluation.rpe_m:.4f} m, {evaluation.rpe_deg:.4f} deg"),
+    ]
+    if evaluation.t_rel_percent is None:
+        rows.append(("drift", "path shorter than 100 m"))
+    else:
+        rows.append(("t_rel", f"{evaluation.t_rel_percent:.3f} %"))
+        rows.append(("r_rel", f"{evaluation.r_rel_deg_per_100m:.3f} deg/100 m"))
     # evo compares files of one format only.
     if (format_ := trajectory_format(gt)) == trajectory_format(estimate):
         rows.append(("reproduce", evo_command(estimate, gt, align, format_)))

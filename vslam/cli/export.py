@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.options import KITTI_ROOT, Data
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,20 +16,26 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vslam.backend.pose_graph import PoseGraph
-    from vslam.datasets.sequence import Sequence
+    from vslam.datasets.frames import TimedFrame
     from vslam.map import Map
     from vslam.maps.reconstruction import Reconstruction
     from vslam.report.finished_run import FinishedRun
 
 commands = typer.Typer(
-    help="Export the map of a run for other programs (docs/exports.md), a trained network, or "
-    "images to train on.",
+    help="Export the map of a run for other programs (docs/howto/exports.md), a trained network, "
+    "or images to train on.",
     no_args_is_help=True,
 )
 
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, like runs/latest.")]
 RunOrFile = Annotated[
     Path, typer.Argument(metavar="RUN|FILE", help="Folder of a run, or a map.npz.")
+]
+Data = Annotated[
+    str | None,
+    typer.Option(
+        help="Where the images of the run are now.", show_default="where they were, by run.json"
+    ),
 ]
 Link = Annotated[
     bool, typer.Option("--link", help="Link the image files of the data set, do not copy them.")
@@ -47,10 +52,10 @@ def _out(default: str) -> typer.models.OptionInfo:
     return typer.Option("--out", help="Where to write.", show_default=f"RUN/{default}")
 
 
-@commands.command(epilog="[b]Example[/b]\n\n  vslam export colmap runs/latest --data ~/kitti")
+@commands.command(epilog="[b]Example[/b]\n\n  vslam export colmap runs/latest")
 def colmap(
     run: Run,
-    data: Data = KITTI_ROOT,
+    data: Data = None,
     out: Annotated[Path | None, _out("colmap")] = None,
     text: Annotated[bool, typer.Option("--text", help="Text files, not binary ones.")] = False,
     link: Link = False,
@@ -63,9 +68,8 @@ def colmap(
     finished, reconstruction = _read(run)
     target = out or run / "colmap"
     with new_folder(target) as folder:
-        sequence = _open(finished, data, quiet=quiet)
         names, colours = _write_images(
-            folder / "images", sequence, reconstruction, link=link, quiet=quiet
+            folder / "images", finished, data, reconstruction, link=link, quiet=quiet
         )
         model = folder / "sparse" / "0"
         model.mkdir(parents=True)
@@ -73,10 +77,10 @@ def colmap(
     _say(target, reconstruction, quiet=quiet)
 
 
-@commands.command(epilog="[b]Example[/b]\n\n  vslam export nerfstudio runs/latest --data ~/kitti")
+@commands.command(epilog="[b]Example[/b]\n\n  vslam export nerfstudio runs/latest")
 def nerfstudio(
     run: Run,
-    data: Data = KITTI_ROOT,
+    data: Data = None,
     out: Annotated[Path | None, _out("nerfstudio")] = None,
     link: Link = False,
     quiet: Quiet = False,
@@ -88,18 +92,17 @@ def nerfstudio(
     finished, reconstruction = _read(run)
     target = out or run / "nerfstudio"
     with new_folder(target) as folder:
-        sequence = _open(finished, data, quiet=quiet)
         names, colours = _write_images(
-            folder / "images", sequence, reconstruction, link=link, quiet=quiet
+            folder / "images", finished, data, reconstruction, link=link, quiet=quiet
         )
         save_nerfstudio(folder, reconstruction, [f"images/{name}" for name in names], colours)
     _say(target, reconstruction, quiet=quiet)
 
 
-@commands.command(epilog="[b]Example[/b]\n\n  vslam export ply runs/latest --data ~/kitti")
+@commands.command(epilog="[b]Example[/b]\n\n  vslam export ply runs/latest")
 def ply(
     run: RunOrFile,
-    data: Data = KITTI_ROOT,
+    data: Data = None,
     out: Annotated[Path | None, _out("landmarks.ply")] = None,
     colours: Annotated[
         bool, typer.Option(help="Colours from the images; without, no image is needed.")
@@ -119,9 +122,8 @@ def ply(
     with new_file(target) as file:
         seen = None
         if colours:
-            sequence = _open(finished, data, quiet=quiet)
-            images = _left_images(sequence, reconstruction.frames.tolist(), quiet=quiet)
-            seen = landmark_colours(reconstruction, images)
+            frames = _keyframes(finished, data, quiet=quiet)
+            seen = landmark_colours(reconstruction, map(_image_of, frames))
         save_ply(file, reconstruction.xyz, seen)
     _say(target, reconstruction, quiet=quiet)
 
@@ -204,48 +206,63 @@ def _read(run: Path) -> tuple[FinishedRun, Reconstruction]:
     return finished, reconstruction_of(finished.map, finished.camera)
 
 
-def _open(finished: FinishedRun, data: Path, *, quiet: bool) -> Sequence:
+def _keyframes(finished: FinishedRun, data: str | None, *, quiet: bool) -> Iterator[TimedFrame]:
     from vslam.cli.console import console
-    from vslam.report.finished_run import open_images
+    from vslam.report.finished_run import keyframe_frames, open_images
 
-    with console(shown=not quiet).render_bar() as on_render:
-        return open_images(finished, data, on_render)
-
-
-def _left_images(
-    sequence: Sequence, frames: list[int], *, quiet: bool
-) -> Iterator[NDArray[np.uint8]]:
-    from vslam.cli.console import console
-
-    with console(shown=not quiet).count_bar("images", len(frames)) as advance:
-        for frame in frames:
-            yield sequence.read(frame)[0]
+    told = console(shown=not quiet)
+    with told.render_bar() as on_render:
+        source = open_images(finished, data, on_render)
+    with told.count_bar("images", len(finished.map.frames)) as advance:
+        for frame in keyframe_frames(finished, source):
+            yield frame
             advance()
 
 
 def _write_images(
-    folder: Path, sequence: Sequence, reconstruction: Reconstruction, *, link: bool, quiet: bool
+    folder: Path,
+    finished: FinishedRun,
+    data: str | None,
+    reconstruction: Reconstruction,
+    *,
+    link: bool,
+    quiet: bool,
 ) -> tuple[list[str], NDArray[np.uint8]]:
     """Write the keyframe images; returns their names, and the colours of the landmarks."""
-    from vslam.datasets.kitti import KittiSequence
-    from vslam.maps.keyframe_images import landmark_colours, saved_images
+    from vslam.maps.keyframe_images import landmark_colours, save_image
 
     folder.mkdir()
-    frames = reconstruction.frames.tolist()
-    images = _left_images(sequence, frames, quiet=quiet)
-    if not link:
-        names = [f"{frame:06d}.png" for frame in frames]
-        images = saved_images(images, [folder / name for name in names])
-    elif isinstance(sequence, KittiSequence):
-        files = [sequence.left[frame] for frame in frames]
-        names = [f"{frame:06d}{file.suffix}" for frame, file in zip(frames, files, strict=True)]
-        for name, file in zip(names, files, strict=True):
-            (folder / name).symlink_to(file.resolve())
-    else:
+    names: list[str] = []
+
+    def saved() -> Iterator[NDArray[np.uint8]]:
+        frames = _keyframes(finished, data, quiet=quiet)
+        for index, frame in zip(reconstruction.frames.tolist(), frames, strict=True):
+            image = _image_of(frame)
+            if link:
+                file = _own_file(frame, finished)
+                names.append(f"{index:06d}{file.suffix}")
+                (folder / names[-1]).symlink_to(file.resolve())
+            else:
+                names.append(f"{index:06d}.png")
+                save_image(image, folder / names[-1])
+            yield image
+
+    colours = landmark_colours(reconstruction, saved())
+    return names, colours
+
+
+def _image_of(frame: TimedFrame) -> NDArray[np.uint8]:
+    """The left image, in colour if the source has it."""
+    return frame.read(map)[0] if frame.colour is None else frame.colour()
+
+
+def _own_file(frame: TimedFrame, finished: FinishedRun) -> Path:
+    if frame.file is None:
         raise InputError(
-            f"--link: images of {sequence.dataset} are not used as they lie there; leave it out."
+            f"--link: images of {finished.report.dataset} are not used as they lie there; leave it "
+            "out."
         )
-    return names, landmark_colours(reconstruction, images)
+    return frame.file
 
 
 def _say(target: Path, reconstruction: Reconstruction, *, quiet: bool) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
-from vslam.cli.options import KITTI_ROOT, Data
-from vslam.cli.summary import print_rows
+from vslam.cli.options import kitti_root
+from vslam.cli.tables import print_rows
 from vslam.errors import InputError
 
 
@@ -17,11 +18,17 @@ def register(app: typer.Typer) -> None:
     app.command()(info)
 
 
-def info(data: Data = KITTI_ROOT) -> None:
+def info(
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Folder with KITTI's data.", show_default="$KITTI_ROOT or data/kitti"),
+    ] = None,
+) -> None:
     """Show versions, cores, compiled kernels and the data found."""
     from vslam import machine, plugins
     from vslam.datasets.kitti import list_kitti
 
+    root = Path(kitti_root()) if data is None else data
     versions = machine.versions()
     cores = machine.available_cores()
     rows = [*versions.items(), ("cores", f"{cores} (--threads {min(cores, 4)} unless given)")]
@@ -32,9 +39,9 @@ def info(data: Data = KITTI_ROOT) -> None:
     try:
         rows += [
             (f"kitti {name}", f"{left} left, {right} right images")
-            for name, left, right in list_kitti(data)
+            for name, left, right in list_kitti(root)
         ]
-        rows.append(("kitti root", str(data)))
+        rows.append(("kitti root", str(root)))
     except InputError as error:
         rows.append(("kitti", str(error)))
     rows += [

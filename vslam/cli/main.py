@@ -35,6 +35,7 @@ from vslam.cli import (
 from vslam.cli import map as map_
 from vslam.errors import InputError, ResultsError, did_you_mean
 from vslam.machine import keep_memory
+from vslam.plugins import reason
 from vslam.untrusted import require_utf8
 
 _GROUPS: tuple[ModuleType, ...] = (
@@ -128,4 +129,13 @@ def main() -> None:
         sys.exit(2)
     except ResultsError as error:
         typer.echo(f"error: {error}", err=True)
+        sys.exit(1)
+    except Exception as error:
+        if sys.flags.dev_mode:
+            raise
+        typer.echo(
+            f"error: {reason(error)}: this is a fault of vslam or of the machine; please report "
+            "it with what PYTHONDEVMODE=1 adds.",
+            err=True,
+        )
         sys.exit(1)

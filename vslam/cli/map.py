@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from vslam.cli.summary import Rows
+    from vslam.cli.tables import Rows
     from vslam.map import Map
     from vslam.maps.reconstruction import Reconstruction
     from vslam.maps.stored_map import StoredMap
 
 commands = typer.Typer(
-    help="Look at the maps of runs, make several one, cut parts out (docs/maps.md).",
+    help="Look at the maps of runs, make several one, cut parts out (docs/howto/maps.md).",
     no_args_is_help=True,
 )
 
@@ -42,7 +42,7 @@ def info(
     run: Annotated[Path, typer.Argument(metavar="RUN|FILE", help="Folder of a run, or a map.npz.")],
 ) -> None:
     """Show what a map holds: keyframes, landmarks, observations, length, sub-maps, sizes."""
-    from vslam.cli.summary import print_rows
+    from vslam.cli.tables import print_rows
     from vslam.maps.reconstruction import reconstruction_of
     from vslam.maps.storage import load_map, map_file_of
 
@@ -91,12 +91,12 @@ def _contents(map_: Map, reconstruction: Reconstruction) -> Rows:
 
 def _weakest_place(map_: Map) -> Rows:
     """Where the fewest landmarks hold the map together."""
-    from vslam.backend.pose_graph import held_by
+    from vslam.backend.pose_graph import connectivity
 
     living = map_.living_keyframes()[1:]
     if not len(living):
         return []
-    held = held_by(map_)[living]
+    held = connectivity(map_)[living]
     at = int(held.argmin())
     return [("weakest place", f"frame {map_.frames[living[at]]}, held by {held[at]} landmarks")]
 

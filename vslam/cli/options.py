@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
+import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
@@ -11,11 +14,13 @@ from vslam import plugins
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
+    from vslam.cli.console import Console
+    from vslam.datasets.frames import Source
     from vslam.datasets.sources import SourceOptions
 
 
 def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
-    """vslam's own names, then those of other packages (docs/plugins.md)."""
+    """vslam's own names, then those of other packages (docs/howto/plugins.md)."""
     return (*names, *(name for name in plugins.find_plugins(group) if name not in names))
 
 
@@ -38,86 +43,21 @@ _LAWS = _with_plugins(
     plugins.PERTURBATIONS,
 )  # fmt: skip
 
-Data = Annotated[
-    Path,
-    typer.Option(envvar="KITTI_ROOT", help="Folder with the data set, see datasets.md."),
-]
 if TYPE_CHECKING:
-    DatasetName = str
     SourceName = str
     DetectorName = str
 else:  # what is installed decides
-    DatasetName = Literal[_DATASETS]
     SourceName = Literal[(*_DATASETS, *_SOURCES)]
     DetectorName = Literal[_DETECTORS]
-Dataset = Annotated[DatasetName, typer.Option(help="Data set.")]
-Source = Annotated[
-    str,
-    typer.Option(
-        "--data",
-        envvar="KITTI_ROOT",
-        help="Data set, folder of images, video, bag, number of a camera or URL, see "
-        "docs/sources.md.",
-    ),
-]
-SourceKind = Annotated[
-    SourceName | None,
-    typer.Option("--dataset", help="What it is.", show_default="found out from what is there"),
-]
-Seq = Annotated[
-    str | None,
-    typer.Option(
-        help="Sequence of a data set, 00 for example.",
-        show_default="00; of euroc and tum the only one there",
-    ),
-]
-Calib = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--calib",
-        help="Calibration to rectify images with, see docs/cameras.md; twice for a file of each "
-        "camera, left first.",
-    ),
-]
-Right = Annotated[
-    Path | None, typer.Option(help="Folder of the right images, --data has the left ones.")
-]
-Depth = Annotated[
-    Path | None,
-    typer.Option(help="Folder of the depth images, --data has the images they belong to."),
-]
-FramesPerSecond = Annotated[
-    float | None,
-    typer.Option("--fps", help="Frames a second of images or a video without time stamps."),
-]
-SideBySide = Annotated[
-    bool, typer.Option("--side-by-side", help="Video or camera of both sides in one image.")
-]
-Topics = Annotated[
-    str,
-    typer.Option(
-        metavar="LEFT,RIGHT", help="Image topics of a bag: one with mono, COLOUR,DEPTH with rgbd."
-    ),
-]
-DepthScale = Annotated[
-    float | None,
-    typer.Option(
-        help="What depth images count in a metre.",
-        show_default="the calibration's; of tum 5000, of a bag as its encoding says",
-    ),
-]
 Perturb = Annotated[
     str,
     typer.Option(
         help="Laws of light, weather, glass, sensor and stereo rig, each with a strength in its "
-        f"unit (docs/stress.md), joined by commas: {', '.join(_LAWS)}. Example: "
+        f"unit (docs/howto/stress.md), joined by commas: {', '.join(_LAWS)}. Example: "
         "[b]brightness:1.5,fog:60[/b]"
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all that is random.")]
-Start = Annotated[int, typer.Option(min=0, help="First frame.")]
-Every = Annotated[int, typer.Option(min=1, help="Take every N-th frame.")]
-MaxFrames = Annotated[int | None, typer.Option(min=1, help="Stop after so many frames.")]
 Thresholds = Annotated[
     Path | None,
     typer.Option("--config", help="JSON file with thresholds, as config.json of a run."),
@@ -128,16 +68,14 @@ Weights = Annotated[
 ]
 SensorName = Literal["stereo", "mono", "rgbd"]
 ViewerName = Literal["native", "web"]
-Sensor = Annotated[
-    SensorName | None,
-    typer.Option(
-        help="[b]mono[/b] reads the left camera alone; its scale is arbitrary.",
-        show_default="all that the data has",
-    ),
-]
 AlignmentName = Literal["se3", "sim3", "none"]
 
-KITTI_ROOT = Path("data/kitti")
+KITTI_ROOT = "data/kitti"  # where $KITTI_ROOT names no other folder
+
+_WITHOUT_DATA = """there is nothing to read; name some images, or take rendered ones:
+  --dataset synthetic    rendered drives, which need no download
+  DATA --calib FILE      images, video, bag or camera (docs/howto/sources.md)
+  --data FOLDER          KITTI, also by $KITTI_ROOT (datasets.md)"""
 
 
 def names_in(text: str) -> list[str]:
@@ -145,38 +83,176 @@ def names_in(text: str) -> list[str]:
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
-def kind_of_source(named: SourceName | None, data: str) -> str:
-    """What ``--dataset`` says, or what is found at ``--data``; KITTI where neither was given.
+def kitti_root() -> str:
+    """Where KITTI's data is if no option says it."""
+    return os.environ.get("KITTI_ROOT") or KITTI_ROOT
+
+
+def _source_options(
+    source: Annotated[
+        str | None,
+        typer.Argument(help="What to read; the same as [b]--data[/b].", show_default=False),
+    ] = None,
+    data: Annotated[
+        str | None,
+        typer.Option(
+            help="Data set, folder of images, video, bag, number of a camera or URL, see "
+            "docs/howto/sources.md.",
+            show_default="$KITTI_ROOT or data/kitti, for KITTI alone",
+        ),
+    ] = None,
+    dataset: Annotated[
+        SourceName | None,
+        typer.Option(help="What it is.", show_default="detected from the files"),
+    ] = None,
+    seq: Annotated[
+        str | None,
+        typer.Option(
+            help="Sequence of a data set, 00 for example.",
+            show_default="00; of euroc and tum the only one there",
+        ),
+    ] = None,
+    calib: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Calibration to rectify images with, see docs/howto/cameras.md; twice for a file "
+            "of each camera, left first.",
+        ),
+    ] = None,
+    right: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the right images; [b]--data[/b] names the left ones."),
+    ] = None,
+    depth: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the depth images; [b]--data[/b] names the images they belong to."
+        ),
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(help="Frames per second of images or a video without time stamps."),
+    ] = None,
+    side_by_side: Annotated[
+        bool,
+        typer.Option(
+            "--side-by-side", help="Each image of the video or camera holds both sides of a pair."
+        ),
+    ] = False,
+    topics: Annotated[
+        str,
+        typer.Option(
+            metavar="LEFT,RIGHT",
+            help="Image topics of a bag: one with mono, COLOUR,DEPTH with rgbd.",
+        ),
+    ] = "",
+    depth_scale: Annotated[
+        float | None,
+        typer.Option(
+            help="Units of the depth images per metre.",
+            show_default="the calibration's; of tum 5000, of a bag as its encoding says",
+        ),
+    ] = None,
+    sensor: Annotated[
+        SensorName | None,
+        typer.Option(
+            help="[b]mono[/b] reads the left camera alone; its scale is arbitrary.",
+            show_default="all that the data has",
+        ),
+    ] = None,
+    start: Annotated[int, typer.Option(min=0, help="First frame.")] = 0,
+    every: Annotated[int, typer.Option(min=1, help="Take every N-th frame.")] = 1,
+    max_frames: Annotated[
+        int | None, typer.Option(min=1, help="Stop after so many frames.")
+    ] = None,
+) -> SourceOptions:
+    """What the options say about the source."""
+    from vslam.datasets.sources import SourceOptions
+
+    if source is not None and data is not None:
+        raise InputError(f"{source}: --data says what to read, too; leave one of them out.")
+    data = source if source is not None else data
+    if data is None and dataset in (None, "kitti"):
+        data = kitti_root()
+        dataset = "kitti" if data != KITTI_ROOT else dataset
+    elif data is None and dataset != "synthetic":
+        raise InputError(f"--dataset {dataset}: name the data with --data.")
+    return SourceOptions(
+        data=data or "", dataset=dataset, seq=seq, calib=tuple(calib or ()), right=right,
+        depth=depth, fps=fps, side_by_side=side_by_side, topics=topics, depth_scale=depth_scale,
+        sensor=sensor, start=start, every=every, max_frames=max_frames,
+    )  # fmt: skip
+
+
+_NAMES = {"SourceOptions": object}  # of annotations that cost an import
+
+
+def reads_source(
+    *, without: tuple[str, ...] = ()
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of a source, in place of its parameter ``given``.
+
+    Args:
+        without: options that the command does not take.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        source = [p for p in _parameters(_source_options) if p.name not in without]
+        own = [p for p in _parameters(command) if p.name != "given"]
+        for parameter in source:
+            parameter.annotation.__metadata__[0].rich_help_panel = "Input"
+
+        def called(**values: Any) -> None:
+            given = {parameter.name: values.pop(parameter.name) for parameter in source}
+            command(given=_source_options(**given), **values)
+
+        called.__signature__ = inspect.Signature([*source, *own])  # type: ignore[attr-defined]
+        called.__annotations__ = {p.name: p.annotation for p in (*source, *own)}
+        called.__name__, called.__doc__ = command.__name__, command.__doc__
+        return called
+
+    return decorate
+
+
+def _parameters(function: Callable[..., object]) -> list[inspect.Parameter]:
+    """The parameters of a function with their annotations evaluated."""
+    hints = get_type_hints(function, localns=_NAMES, include_extras=True)
+    return [
+        parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
+        for name, parameter in inspect.signature(function).parameters.items()
+    ]
+
+
+def require_data(options: SourceOptions) -> None:
+    """Refuse a command that names no data where there is no KITTI either.
 
     Raises:
-        InputError: nothing there, or nothing known.
+        InputError: there is nothing to read.
+    """
+    if options.dataset is None and options.data == KITTI_ROOT and not Path(KITTI_ROOT).exists():
+        raise InputError(_WITHOUT_DATA)
+
+
+def kind_of_source(options: SourceOptions) -> str:
+    """What the options say the data is, or what is found there.
+
+    Raises:
+        InputError: there is nothing to read, or nothing that is known.
     """
     from vslam.datasets.detection import detect_dataset
 
-    if named is not None:
-        return named
-    return "kitti" if data == str(KITTI_ROOT) else detect_dataset(data)
+    require_data(options)
+    return options.dataset or detect_dataset(options.data)
 
 
-def source_options(
-    calib: list[Path] | None,
-    right: Path | None,
-    depth: Path | None,
-    fps: float | None,
-    side_by_side: bool,
-    topics: str,
-    depth_scale: float | None,
-) -> SourceOptions:
-    """What some kinds of sources need to be told.
+def open_given(options: SourceOptions, told: Console) -> Source:
+    """Open the source that the options name, with a bar while a town is rendered.
 
     Raises:
-        InputError: a rate or scale that is no positive number.
+        InputError: as `vslam.datasets.sources.open_source`, or there is nothing to read.
     """
-    from vslam.datasets.sources import SourceOptions
+    from vslam.datasets.sources import open_source
 
-    for option, value in (("--fps", fps), ("--depth-scale", depth_scale)):
-        if value is not None and not 0.0 < value < float("inf"):
-            raise InputError(f"{option} {value}: must be a positive number.")
-    return SourceOptions(
-        calib or (), right, depth, fps, side_by_side, tuple(names_in(topics)), depth_scale
-    )
+    require_data(options)
+    with told.render_bar() as on_render:
+        return open_source(options, on_render)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.options import KITTI_ROOT, Data, Dataset, Every, MaxFrames, Perturb, Seed, Seq, Start
+from vslam.cli.console import console
+from vslam.cli.options import Perturb, Seed, open_given, reads_source
 from vslam.errors import InputError
+
+if TYPE_CHECKING:
+    from vslam.datasets.sources import SourceOptions
 
 _EXAMPLE = """
 [b]Examples[/b]
@@ -24,14 +28,10 @@ def register(app: typer.Typer) -> None:
     app.command("perturb", epilog=_EXAMPLE)(preview)
 
 
+@reads_source()
 def preview(
-    data: Data = KITTI_ROOT,
-    dataset: Dataset = "kitti",
-    seq: Seq = None,
+    given: SourceOptions,
     perturb: Perturb = "brightness",
-    start: Start = 0,
-    every: Every = 1,
-    max_frames: MaxFrames = None,
     seed: Seed = 0,
     frames: Annotated[int, typer.Option(min=1, help="Frames to show, evenly spread.")] = 8,
     out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("perturbation.png"),
@@ -43,7 +43,7 @@ def preview(
     import cv2
     import numpy as np
 
-    from vslam.datasets import open_sequence
+    from vslam.datasets.frames import first_frames
     from vslam.datasets.perturbation import (
         contact_sheet,
         law_kind,
@@ -53,9 +53,10 @@ def preview(
     )
 
     name = perturb if perturb == "all" else parse_perturbation(perturb, seed).name
-    sequence = open_sequence(dataset, data, seq, start=start, every=every, max_frames=max_frames)
+    opened = open_given(given, console(shown=True))
+    sequence = first_frames(opened)
     if perturb == "all":
-        fit, unfit = laws_for(sequence)
+        fit, unfit = laws_for(opened)
         for why in unfit.values():
             typer.echo(f"left out: {why}", err=True)
         shown = [min(10, len(sequence) - 1)]
@@ -63,7 +64,9 @@ def preview(
         image = sheet_of_laws(sequence, specs, shown[0], seed)
     else:
         shown = np.unique(np.linspace(0, len(sequence) - 1, frames).round().astype(int)).tolist()
-        image = contact_sheet(sequence, parse_perturbation(perturb, seed), shown)
+        image = contact_sheet(
+            sequence, parse_perturbation(perturb, seed), shown, given.start, given.every
+        )
     sheet = cv2.imencode(".png", image)[1]
     try:
         out.write_bytes(sheet.tobytes())
@@ -71,4 +74,5 @@ def preview(
         raise InputError(
             f"{out}: cannot be written ({error.strerror}); name another file with --out."
         ) from error
-    typer.echo(f"{out}: {name}, seed {seed}, frames {', '.join(map(str, shown))}")
+    frames_shown = ", ".join(str(given.start + given.every * frame) for frame in shown)
+    typer.echo(f"{out}: {name}, seed {seed}, frames {frames_shown}")

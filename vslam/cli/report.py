@@ -87,13 +87,13 @@ def write_overview_of(
 ) -> None:
     """Write the report of finished runs; unless ``quiet``, show its first tables and say where it
     is."""
-    from vslam.cli.tables import show_tables
+    from vslam.cli.tables import show_sections
     from vslam.lab.overview import write_overview
     from vslam.lab.overview.versus import versus
 
     written = write_overview(runs, trajectories, out, baseline)
     if not quiet:
-        show_tables(versus(written))
+        show_sections(versus(written))
         for note in written.notes:
             typer.echo(f"note: {note}", err=True)
         typer.echo(f"\n{out / 'report.html'}: {len(written.runs)} runs")

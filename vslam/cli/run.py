@@ -3,34 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from vslam.cli.drive import Output, drive
-from vslam.cli.options import (
-    KITTI_ROOT,
-    Calib,
-    Depth,
-    DepthScale,
-    DetectorName,
-    Every,
-    FramesPerSecond,
-    MaxFrames,
-    Perturb,
-    Right,
-    Seed,
-    Sensor,
-    Seq,
-    SideBySide,
-    Source,
-    SourceKind,
-    Start,
-    Thresholds,
-    Topics,
-    ViewerName,
-)
+from vslam.cli.options import DetectorName, Perturb, Seed, Thresholds, ViewerName, reads_source
 from vslam.errors import InputError
+
+if TYPE_CHECKING:
+    from vslam.datasets.sources import SourceOptions
 
 _EXAMPLES = """
 [b]Examples[/b]
@@ -55,36 +37,16 @@ _EXAMPLES = """
 """
 
 
-_WITHOUT_DATA = """there is nothing to run on; name some images, or take rendered ones:
-  vslam run --dataset synthetic --seq demo          a drive that needs no download
-  vslam run DATA --calib FILE                       images, video, bag or camera (docs/sources.md)
-  vslam run --data FOLDER --seq 00                  KITTI, also by $KITTI_ROOT (datasets.md)"""
-
-
 def register(app: typer.Typer) -> None:
     """Add the command to the application."""
     app.command(epilog=_EXAMPLES)(run)
 
 
+@reads_source()
 def run(
     context: typer.Context,
-    source: Annotated[
-        str | None, typer.Argument(help="What to run on; the same as --data.", show_default=False)
-    ] = None,
-    data: Source = str(KITTI_ROOT),
-    dataset: SourceKind = None,
-    seq: Seq = None,
-    calib: Calib = None,
-    right: Right = None,
-    depth: Depth = None,
-    fps: FramesPerSecond = None,
-    side_by_side: SideBySide = False,
-    topics: Topics = "",
-    depth_scale: DepthScale = None,
+    given: SourceOptions,
     perturb: Perturb = "none",
-    start: Start = 0,
-    every: Every = 1,
-    max_frames: MaxFrames = None,
     seed: Seed = 0,
     threads: Annotated[
         int | None,
@@ -107,10 +69,10 @@ def run(
     local_weights: Annotated[
         Path | None,
         typer.Option(
-            help="ONNX file of the local descriptors that verify loops (docs/local_descriptors.md)."
+            help="ONNX file of the local descriptors that verify loops "
+            "(docs/research/local_descriptors.md)."
         ),
     ] = None,
-    sensor: Sensor = None,
     out: Annotated[Path, typer.Option(help="Where the folders of the runs go.")] = Path("runs"),
     config: Thresholds = None,
     compare: Annotated[
@@ -178,15 +140,10 @@ def run(
     output = Output(record=record, view=view, pages=pages, ply=ply, save_map=save_map, quiet=quiet)
     if resume is not None:
         _refuse_beside_resume(context)
-        from vslam.run.options import read_options
+        from vslam.run.options import resumed_options
 
-        drive(read_options(resume), output, resume=resume)
+        drive(resumed_options(resume), output, resume=resume)
         return
-    if source is not None:
-        given = context.get_parameter_source("data")
-        if given is not None and given.name == "COMMANDLINE":
-            raise InputError(f"{source}: --data says what to run on, too; leave one of them out.")
-        data = source
     if local_weights is not None and not local_weights.is_file():
         raise InputError(f"--local-weights {local_weights}: no such file; name an .onnx file.")
     if localize and map_file is None:
@@ -211,26 +168,13 @@ def run(
     from vslam.run.options import RunOptions
 
     options = RunOptions(
-        data=data,
-        dataset=dataset,
-        seq=seq,
-        calib=tuple(calib or ()),
-        right=right,
-        depth=depth,
-        fps=fps,
-        side_by_side=side_by_side,
-        topics=topics,
-        depth_scale=depth_scale,
+        **given.model_dump(),
         perturb=perturb,
-        start=start,
-        every=every,
-        max_frames=max_frames,
         seed=seed,
         threads=threads or min(available_cores(), 4),
         detector=detector,
         weights=weights,
         local_weights=local_weights,
-        sensor=sensor,
         thresholds=Config() if config is None else load_config(config),
         map_file=map_file,
         localize=localize,
@@ -238,8 +182,6 @@ def run(
         realtime=realtime,
         autosave=autosave,
     )
-    if dataset is None and data == str(KITTI_ROOT) and not KITTI_ROOT.exists():
-        raise InputError(_WITHOUT_DATA)
     drive(options, output, out=out)
 
 

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from vslam.cli.bench import cell_options, open_all, outcomes_of
-from vslam.cli.options import KITTI_ROOT, Data, Dataset, MaxFrames, Sensor, Thresholds, names_in
+from vslam.cli.bench import absolute, cell_options, identity_of, open_all, outcomes_of
+from vslam.cli.options import Thresholds, kind_of_source, names_in, open_given, reads_source
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
-    from vslam.datasets.sequence import Sequence
+    from vslam.datasets.frames import Source
+    from vslam.datasets.sources import SourceOptions
     from vslam.lab.bench.execute import CellOutcome
     from vslam.lab.bench.grid import Cell
 
@@ -32,7 +33,7 @@ _EXAMPLES = """
 
   vslam stress --seqs 00 --preset kitti-c --baseline bow
 
-The same command again goes on where it was stopped. docs/stress.md tells more.
+The same command again goes on where it was stopped. docs/howto/stress.md tells more.
 """
 _ORBSLAM3 = "orbslam3"
 
@@ -43,10 +44,16 @@ def register(app: typer.Typer) -> None:
     app.command("foreign", hidden=True, context_settings={"allow_extra_args": True})(foreign)
 
 
+@reads_source(without=("seq", "start", "every"))
 def stress(
-    dataset: Dataset = "kitti",
-    data: Data = KITTI_ROOT,
-    seqs: Annotated[str, typer.Option(help="Sequences, 00-05 or 00,demo for example.")] = "00",
+    given: SourceOptions,
+    seqs: Annotated[
+        str | None,
+        typer.Option(
+            help="Sequences of a data set, 00-05 or 00,demo for example.",
+            show_default="00; of euroc and tum the only one there",
+        ),
+    ] = None,
     laws: Annotated[
         str, typer.Option(help="Laws without strengths, with commas, or [b]all[/b].")
     ] = "all",
@@ -59,7 +66,7 @@ def stress(
         typer.Option(
             metavar="NAME=COMMAND",
             help="Another system: a command with {folder}, in KITTI's format, and {out}, see "
-            "docs/stress.md.",
+            "docs/howto/stress.md.",
         ),
     ] = None,
     orbslam3_python: Annotated[
@@ -87,8 +94,6 @@ def stress(
     ate_least: Annotated[
         float, typer.Option(min=0.0, help="Metres of ATE below which no run fails by it.")
     ] = 0.25,
-    max_frames: MaxFrames = None,
-    sensor: Sensor = None,
     jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 1,
     threads: Annotated[
         int | None,
@@ -106,13 +111,12 @@ def stress(
 ) -> None:
     """Find the strength of each perturbation at which a run fails, and report on it."""
     from vslam.cli.console import console
-    from vslam.datasets import open_sequence
-    from vslam.datasets.sources import SourceOptions
+    from vslam.cli.tables import show_sections
+    from vslam.datasets.frames import first_frames
     from vslam.lab.bench import execute
-    from vslam.lab.bench.grid import parse_sequences
     from vslam.lab.stress.criterion import Criterion
     from vslam.lab.stress.plan import Plan, parse_laws
-    from vslam.lab.stress.report import render_boundaries, write_report
+    from vslam.lab.stress.report import boundary_sections, write_report
     from vslam.lab.stress.run import Results, run_all
     from vslam.lab.stress.summary import summarise
     from vslam.loopclosure.registry import require_detector
@@ -121,34 +125,35 @@ def stress(
     chosen = names_in(detectors) if "vslam" in names_in(systems) else []
     for name in chosen:
         require_detector(name, None, option="--detectors")
-    names, sequences = [*chosen, *others], parse_sequences(seqs)
+    names = [*chosen, *others]
     if clash := [name for name in chosen if name in others]:
         raise InputError(f"--system {clash[0]}: a detector of this test has that name; rename it.")
     if not names:
         raise InputError("--systems: no system; name vslam, orbslam3 or one of --system.")
     if baseline is not None and baseline not in names:
         raise InputError(f"--baseline {baseline}: not tested; choose from {', '.join(names)}.")
-    if sensor == "mono" and others:
+    if given.sensor == "mono" and others:
         raise InputError("--sensor mono: of vslam alone; other systems get both sides.")
     out = out.absolute()
+    kind = kind_of_source(given)
+    given = absolute(given)
+    opened = open_all(kind, given, seqs, shown=not quiet)
+    if others and not all(source.seekable for source in opened.values()):
+        raise InputError(
+            f"--systems {next(iter(others))}: other systems read KITTI's format, which is written "
+            "from data sets and folders of images alone; extract the images, or test vslam alone."
+        )
     options = replace(
-        cell_options(dataset, data.absolute(), config, threads, jobs, scheduler, out),
+        cell_options(kind, given, config, threads, jobs, scheduler, out),
         others={name: _program(name, command) for name, command in others.items()},
     )
-    _, identity = open_all(
-        dataset, data.absolute(), seqs, SourceOptions(), max_frames, sensor, shown=not quiet
-    )
-    opened = {
-        name: open_sequence(dataset, data, name, max_frames=max_frames, monocular=sensor == "mono")
-        for name in sequences
-    }
     fitting, notes = _fitting(parse_laws(laws), opened) if preset is None else ([], [])
     plan = Plan(
-        dataset, tuple(sequences), tuple(fitting), tuple(names), seeds, steps, max_frames,
+        kind, tuple(opened), tuple(fitting), tuple(names), seeds, steps, given.max_frames,
         baseline or names[0], Criterion(max_lost, ate_factor, ate_least), tuple(others), preset,
-        sensor,
+        given.sensor, tuple(map(str, given.calib)),
     )  # fmt: skip
-    execute.prepare(out, identity)
+    execute.prepare(out, identity_of(kind, given))
     searches, results = plan.searches(), Results(out, options.config)
 
     def run(cells: Collection[Cell]) -> Generator[CellOutcome, None, None]:
@@ -167,51 +172,49 @@ def stress(
     finally:
         execute.tidy(out)
     report = summarise(plan, searches, results, notes)
-    write_report(out, report, opened)
+    write_report(out, report, {name: first_frames(source) for name, source in opened.items()})
     if not quiet:
-        typer.echo(render_boundaries(report))
+        show_sections(boundary_sections(report))
         ended = f"{len(report.boundaries)} of {len(searches)} searches ended"
         typer.echo(f"{out / 'report.html'}: {ended}")
     if stopped or len(report.boundaries) < len(searches):
         raise typer.Exit(1)
 
 
+@reads_source(without=("source", "start", "every"))
 def foreign(
     context: typer.Context,
+    given: SourceOptions,
     name: str,
     template: str,
     word: str,
-    dataset: Annotated[str, typer.Option()],
-    seq: Annotated[str, typer.Option()],
     perturb: Annotated[str, typer.Option()],
     detector: Annotated[str, typer.Option()],
     seed: Annotated[int, typer.Option()],
     threads: Annotated[int, typer.Option()],
     config: Annotated[Path, typer.Option()],
     out: Annotated[Path, typer.Option()],
-    data: Annotated[Path, typer.Option()] = KITTI_ROOT,
-    max_frames: Annotated[int | None, typer.Option()] = None,
     no_record: Annotated[bool, typer.Option("--no-record")] = False,
     no_report: Annotated[bool, typer.Option("--no-report")] = False,
     quiet: Annotated[bool, typer.Option("--quiet")] = False,
 ) -> None:
     """Run another system as [b]vslam run[/b] would run vslam: for [b]vslam stress[/b]."""
+    from vslam.cli.console import console
     from vslam.config import load_config
-    from vslam.datasets import open_sequence
     from vslam.datasets.perturbation import parse_perturbation
     from vslam.lab.stress.external import run_external
     from vslam.report.folder import create_run_folder
     from vslam.run.options import RunOptions, settings_of
 
     options = RunOptions(
-        data=str(data), dataset=dataset, seq=seq, perturb=perturb, seed=seed, threads=threads,
-        max_frames=max_frames, detector=name, thresholds=load_config(config),
+        **given.model_dump(), perturb=perturb, seed=seed, threads=threads, detector=name,
+        thresholds=load_config(config),
     )  # fmt: skip
-    sequence = open_sequence(dataset, data, seq, max_frames=max_frames)
+    source = open_given(given, console(shown=False))
     perturbation = parse_perturbation(perturb, seed)
-    settings = settings_of(options, dataset, sequence, perturbation.name)
-    folder = create_run_folder(out, dataset, seq, perturbation.name, name)
-    run_external(sequence, perturbation, settings, template, folder)
+    settings = settings_of(options, source, perturbation.name)
+    folder = create_run_folder(out, source.dataset, source.name, perturbation.name, name)
+    run_external(source, perturbation, settings, template, folder)
 
 
 def _others(
@@ -250,7 +253,7 @@ def _program(name: str, template: str) -> tuple[str, ...]:
     return (sys.executable, "-m", "vslam.cli.child", "foreign", name, template)
 
 
-def _fitting(laws: list[str], opened: Mapping[str, Sequence]) -> tuple[list[str], list[str]]:
+def _fitting(laws: list[str], opened: Mapping[str, Source]) -> tuple[list[str], list[str]]:
     """The laws that every sequence has the data for, and a note of each other one."""
     from vslam.datasets.perturbation import laws_for
 

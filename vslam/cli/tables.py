@@ -1,51 +1,52 @@
-"""Tables of reports in a terminal."""
+"""Results in a terminal."""
 
 from __future__ import annotations
 
-import re
-import shutil
 import sys
-import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
+from vslam.report.page import Pairs, Section
 
 if TYPE_CHECKING:
-    from vslam.report.page import Table
+    from vslam.report.schema import ReportJson
+
+Rows = list[tuple[str, str]]
+_LOOK_AT = (("report", "report.html"), ("recording", "recording.rrd"))
 
 
-def show_tables(tables: Iterable[Table]) -> None:
-    """Print tables on stdout, each with its title above, its note and its points below.
+def show_sections(sections: Iterable[Section]) -> None:
+    """Print sections of a report on stdout, without breaking lines where it is not a terminal."""
+    from rich.console import Console
 
-    Sentences are folded at the width of a terminal, lines of a table never: a number that is torn
-    apart cannot be read.
-    """
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 1000
-    for table in tables:
-        typer.echo(f"\n{table.title}\n")
-        for line in table_lines(table):
-            typer.echo(line)
-        typer.echo()
-        for sentence in filter(None, (table.note, *(f"- {point}" for point in table.points))):
-            indent = "  " if sentence.startswith("- ") else ""
-            typer.echo(textwrap.fill(sentence, width, subsequent_indent=indent))
+    from vslam.report.render import show
+
+    show(sections, Console(width=None if sys.stdout.isatty() else 1000))
 
 
-def table_lines(table: Table) -> Iterator[str]:
-    """The lines of a table in columns; headings are broken at their commas and brackets."""
-    broken = [re.split(r", | (?=\()", name) for name in table.head]
-    height = max(map(len, broken))
-    head = list(zip(*([""] * (height - len(lines)) + lines for lines in broken), strict=True))
-    widths = [max(map(len, column)) for column in zip(*head, *table.rows, strict=True)]
+def print_rows(rows: Rows) -> None:
+    """Print names and values, the values one below the other."""
+    show_sections([Section("", [Pairs(rows)])])
 
-    def line(cells: tuple[str, ...]) -> str:
-        columns = zip(table.head, cells, widths, strict=True)
-        return " ".join(
-            cell.ljust(width) if name in table.texts else cell.rjust(width)
-            for name, cell, width in columns
-        ).rstrip()
 
-    yield from map(line, head)
-    yield "-" * (sum(widths) + len(widths) - 1)
-    yield from map(line, table.rows)
+def print_summary(report: ReportJson, folder: Path) -> None:
+    """Print the first sections of the page of a run that is over; ``folder`` holds its results."""
+    from vslam.report.run_page import run_page
+
+    page = run_page(report)
+    summary, detectors, *_ = page.sections
+    there = [(name, str(folder / file)) for name, file in _LOOK_AT if (folder / file).exists()]
+    rows = [("folder", str(folder)), *there, *_how_to_compare(report)]
+    about = Section("", [" · ".join(page.about)])
+    show_sections([about, summary, detectors, Section("", [Pairs(rows)])])
+
+
+def _how_to_compare(report: ReportJson) -> Rows:
+    """What to type for a comparison, where the ground truth could judge one."""
+    refused = report.realtime or report.map is not None  # as of the command line
+    if report.detectors or report.compare or report.alignment is None or refused:
+        return []
+    if report.detector in ("bow", "none"):
+        return [("compare", "add --compare both to set the capsule network beside it")]
+    return [("compare", "add --compare bow to set the bag of words beside it")]

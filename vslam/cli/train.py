@@ -59,7 +59,7 @@ DataSources = Annotated[
     list[str],
     typer.Option(
         "--data", help="Source of images, [b]KIND:PATH\\[options][/b]; again for more. Kinds: "
-        "kitti, fabmap, pairs, photos, pack (docs/training.md).",
+        "kitti, fabmap, pairs, photos, pack (docs/howto/training.md).",
     ),
 ]  # fmt: skip
 
@@ -70,7 +70,8 @@ def train(
     preset: Annotated[
         PresetName,
         typer.Option(
-            help="Settings; [b]paper[/b]'s, better ones, or one recipe for all (docs/rivals.md)."
+            help="Settings; [b]paper[/b]'s, better ones, or one recipe for all "
+            "(docs/research/rivals.md)."
         ),
     ] = "paper",
     settings: Annotated[

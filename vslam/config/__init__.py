@@ -1,6 +1,6 @@
-"""Every threshold of the pipeline in one tree; docs/thresholds.md is made from it.
+"""All thresholds of the pipeline, with one module for each stage.
 
-Each module holds the thresholds of one stage.
+docs/reference/thresholds.md is generated from these modules.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ __all__ = [
 
 
 class Config(Section):
-    """The whole configuration, written to ``config.json`` of each run and read by --config."""
+    """The whole configuration: each run writes it to ``config.json``, and --config reads it."""
 
     orb: OrbConfig = OrbConfig()
     weak_images: WeakImageConfig = WeakImageConfig()
@@ -72,10 +72,11 @@ class Config(Section):
 
 
 def load_config(path: Path | str) -> Config:
-    """Read a configuration in JSON; keys left out keep their defaults.
+    """Read a configuration from a JSON file; keys that it omits keep their defaults.
 
     Raises:
-        InputError: missing file, no JSON, unknown key or value out of range.
+        InputError: the file is missing or is not JSON, a key is unknown, or a value is out of
+            range.
     """
     try:
         return Config.model_validate_json(Path(path).read_bytes())

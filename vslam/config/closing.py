@@ -11,10 +11,11 @@ class LoopConfig(Section):
     """Global bundle adjustment after a verified loop [OS1, VII]."""
 
     global_iterations: int = Field(10, ge=1)
-    """Upper bound of the iterations of global bundle adjustment. [OS2 III-D, customary]"""
+    """Upper bound of the number of iterations of global bundle adjustment.
+    [OS2 III-D, customary]"""
     observations_per_keyframe: int = Field(25000, ge=1)
-    """Global bundle adjustment is merged one keyframe later for every this many observations that
-    it has. [own]"""
+    """The result of global bundle adjustment is merged one keyframe after its loop, and one more
+    keyframe later for every this many observations in the problem. [own]"""
 
 
 class PoseGraphConfig(Section):
@@ -23,16 +24,16 @@ class PoseGraphConfig(Section):
     Drift is modelled as a random walk: its standard deviation grows with the square root of the
     distance travelled. With the default values it is 1.2 % after 400 m, nearly all of it caused by
     errors of rotation. A gap is an edge over frames in which tracking was lost and the motion was
-    only predicted. Such an edge is weak if there was no prediction, or if the camera is taken to
-    have been carried meanwhile.
+    only predicted. Such an edge is weak if there was no prediction, or under the hypothesis that
+    the camera was carried elsewhere meanwhile.
     """
 
     min_shared: int = Field(100, ge=1)
-    """Number of shared landmarks from which a covisibility edge is strong and belongs to the graph.
+    """A covisibility edge belongs to the graph if its ends share at least this many landmarks.
     [OS1 III-D, printed]"""
     min_shared_tree: int = Field(15, ge=1)
-    """A tree edge that leads past a restart is weak if its ends share fewer landmarks than this.
-    [OS1 III-D, printed]"""
+    """An edge of the spanning tree across a restart of mapping is weak if its ends share fewer
+    landmarks than this. [OS1 III-D, printed]"""
     translation_drift: float = Field(0.03, gt=0)
     """Standard deviation of odometry, in metres per square root of a metre. [own]"""
     rotation_drift: float = Field(0.001, gt=0)
@@ -41,7 +42,7 @@ class PoseGraphConfig(Section):
     """Standard deviation of monocular odometry, in log scale per square root of a map unit.
     [own]"""
     min_length: float = Field(0.3, gt=0)
-    """Lower bound of the length that an edge counts with, in metres. [own]"""
+    """Shorter edges count as this long in the drift model, in metres. [own]"""
     loop_translation: float = Field(0.1, gt=0)
     """Standard deviation of a verified loop, in metres. [own]"""
     loop_rotation: float = Field(0.005, gt=0)
@@ -64,7 +65,7 @@ class PoseGraphConfig(Section):
     gap_scale: float = Field(0.3, gt=0)
     """Standard deviation of a gap, in log scale. [own]"""
     min_gap: float = Field(0.3, gt=0)
-    """Lower bound of the time that a gap counts with, in seconds. [own]"""
+    """Shorter gaps count as this long, in seconds. [own]"""
     robust_scale: float = Field(3.0, gt=0)
     """Scale of the Cauchy loss on loops, in standard deviations. [own]"""
     iterations: int = Field(50, ge=1)

@@ -16,33 +16,33 @@ class StereoConfig(Section):
     """Half width of the patch that is compared by its sum of absolute differences, in pixels of the
     keypoint's octave. [OS2 III-A, customary]"""
     sad_search: int = Field(5, ge=1)
-    """Distance to each side over which that patch is searched, in pixels of the keypoint's octave.
+    """The patch is searched for up to this far to each side, in pixels of the keypoint's octave.
     [OS2 III-A, customary]"""
     balance_from: float = Field(0.3, ge=0)
-    """The darker of the two images is brightened if the gain between them is above this, in stops.
+    """The darker image is brightened if the gain between the two images is above this, in stops.
     [own]"""
     max_gain_disagreement: float = Field(0.75, gt=0)
-    """A difference in brightness is taken for a gain only if the gains of dark and of bright pixels
+    """A difference in brightness counts as a gain only if the gains of dark and of bright pixels
     differ by at most this, in stops. [own]"""
     clipped_from: int = Field(250, ge=1, le=255)
-    """Grey value from which a pixel is overexposed, and left out when the gain is measured. Video
-    of limited range (16 to 235) needs about 230. [own]"""
+    """A pixel is overexposed, and ignored when the gain is measured, if its grey value is at least
+    this. Video of limited range (16 to 235) needs about 230. [own]"""
     black_below: float = Field(6.0, gt=0, le=255)
-    """An image is black, and not used, if its 95 % quantile is below this while the other image
-    shows something, in grey levels. Video of limited range (16 to 235) needs about 22. [own]"""
+    """An image is black, and not used, if its 95 % quantile is below this while the other image has
+    contrast, in grey levels. Video of limited range (16 to 235) needs about 22. [own]"""
     close_depth_baselines: float = Field(40.0, gt=0)
     """A point is close if its depth is below this, in baselines. [OS2 III-A, printed]"""
     offset_sigma: float = Field(0.2, ge=0)
-    """Standard deviation that is assumed of the common offset of all disparities before the motion
-    of the camera reveals it, in pixels; 0 disables the estimation of the offset (docs/motorway.md).
-    [own]"""
+    """Prior standard deviation of the common offset of all disparities, which is estimated from the
+    motion of the camera, in pixels; 0 disables the estimation (docs/research/motorway.md). [own]"""
     offset_keyframes: int = Field(12, ge=3)
-    """Number of keyframes after which the offset is measured anew. [own]"""
+    """The offset is measured again after this many keyframes. [own]"""
     least_delay: float = Field(1.2e-3, gt=0)
     """The report warns if the measured delay of the right camera differs from the calibration's by
-    more than this, in seconds, and by more than `delay_sigmas` (docs/stress.md). [own]"""
+    more than this, in seconds, and by more than `delay_sigmas` (docs/research/stress.md). [own]"""
     delay_sigmas: float = Field(5.0, gt=0)
-    """The difference must also exceed this many standard deviations of the measured delay. [own]"""
+    """That difference must also exceed this many standard deviations of the measured delay.
+    [own]"""
 
 
 class DepthConfig(Section):
@@ -54,7 +54,7 @@ class DepthConfig(Section):
     """The depth of a pixel is unknown if it is above this, in metres. [own]"""
     edge_radius: float = Field(4.0, ge=0)
     """A keypoint gets a depth only if the depths within this radius agree, in pixels at octave 0.
-    The radius is that of FAST's circle and one pixel more. [own]"""
+    It is one pixel more than the radius of FAST's circle. [own]"""
     edge_ratio: float = Field(0.07, gt=0)
     """A keypoint lies on a depth edge, and gets no depth, if the range of the depths around it is
-    above this share of the nearest. [own]"""
+    above this share of the nearest depth. [own]"""

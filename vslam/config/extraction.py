@@ -1,4 +1,4 @@
-"""Thresholds of feature extraction, in images of any light."""
+"""Thresholds of feature extraction and of the treatment of weak images."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class OrbConfig(Section):
 
 
 class WeakImageConfig(Section):
-    """Images with much noise or little contrast (docs/stress.md)."""
+    """Images with much noise or little contrast (docs/research/stress.md)."""
 
     noise_from: float = Field(5.0, ge=0)
     """Images are blurred if the standard deviation of their noise is at least this, in grey levels.
@@ -40,23 +40,23 @@ class WeakImageConfig(Section):
     """A median filter is applied if more than this share of the pixels stand out from both
     neighbours. [own]"""
     few_features: float = Field(0.5, ge=0, le=1)
-    """Contrast is measured only in images that give fewer features than this share of
+    """Contrast is measured only in images that yield fewer features than this share of
     `orb.n_features`. [own]"""
     low_contrast: float = Field(6.0, ge=0)
-    """Contrast is raised if it is below this, in grey levels; 0 never raises it. Contrast is the
-    standard deviation of the grey values in blocks of 16 x 16 pixels, of which the median over the
-    image counts. [own]"""
+    """Contrast is raised if it is below this, in grey levels; 0 never raises it. The contrast of an
+    image is the median, over its blocks of 16 x 16 pixels, of the standard deviation of their grey
+    values. [own]"""
     least_detail: float = Field(0.25, ge=0)
     """An image is out of focus, and its contrast is not raised, if its mean absolute second
     difference is below this share of its contrast. Sharp images have 0.4 and more. [own]"""
     raised_contrast: float = Field(12.0, gt=0)
-    """Standard deviation that contrast is raised to, in grey levels. KITTI has this on a bright
-    day. [own]"""
+    """Standard deviation that contrast is raised to, in grey levels. KITTI's images have it on a
+    bright day. [own]"""
     contrast_window: int = Field(33, ge=3)
     """Side of the window in which contrast is raised, in pixels. [own]"""
     flat_share: float = Field(0.25, gt=0, le=1)
-    """Flat parts are raised only as much as if their contrast were this share of the median over
-    the image. [own]"""
+    """Bounds the gain in flat parts of the image: their contrast counts as at least this share of
+    the median over the image. [own]"""
     least_contrast: float = Field(0.15, gt=0)
-    """Lower bound of that contrast of flat parts, in grey levels: what rounding alone leaves.
-    [own]"""
+    """The contrast of flat parts also counts as at least this, in grey levels, which is what
+    rounding alone causes. [own]"""

@@ -24,7 +24,7 @@ class InitializationConfig(Section):
     draws: int = Field(300, ge=1)
     """Number of RANSAC draws for each of the two models. ORB-SLAM uses 200. [OS1 IV, own]"""
     homography_share: float = Field(0.45, gt=0, lt=1)
-    """The homography is taken if its share of the sum of both scores is above this; otherwise the
+    """The homography is chosen if its share of the sum of both scores is above this; otherwise the
     fundamental matrix is. [OS1 IV, printed]"""
     max_error: float = Field(2.0, gt=0)
     """Upper bound of the reprojection error of an inlier, in pixels at octave 0.
@@ -36,8 +36,8 @@ class InitializationConfig(Section):
     min_point_share: float = Field(0.7, gt=0, le=1)
     """Share of the inliers of the model that must lie in front of both cameras. [OS1 IV, own]"""
     max_rival_share: float = Field(0.7, gt=0, le=1)
-    """The motion is ambiguous, and refused, if the second-best one explains more than this share of
-    the points of the best. [OS1 IV, customary]"""
+    """The motion is ambiguous, and refused, if the second-best motion explains more than this share
+    of the points that the best one explains. [OS1 IV, customary]"""
     min_landmarks: int = Field(100, ge=8)
     """Number of landmarks that must remain after the first bundle adjustment.
     [OS1 IV, customary]"""

@@ -41,10 +41,10 @@ class MappingConfig(Section):
     """A keyframe is culled if more than this share of its landmarks is redundant, that is, seen by
     three other keyframes as well. [OS1 VI-E, printed]"""
     min_shared: int = Field(15, ge=1)
-    """Number of shared landmarks from which two keyframes are joined by a covisibility edge.
+    """Two keyframes are joined by a covisibility edge if they share at least this many landmarks.
     [OS1 III-D, printed]"""
     max_ba_keyframes: int = Field(60, ge=2)
     """Upper bound of the number of free keyframes in local bundle adjustment. [OS1 VI-D, own]"""
     ba_iterations: int = Field(10, ge=1)
-    """Upper bound of the iterations of local bundle adjustment. A first pass, before the outliers
-    are removed, has half as many. [OS1 VI-D, customary]"""
+    """Upper bound of the number of iterations of local bundle adjustment. The first pass, before
+    the outliers are removed, has half as many. [OS1 VI-D, customary]"""

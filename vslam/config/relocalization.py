@@ -1,4 +1,4 @@
-"""Thresholds of finding a lost camera in the map."""
+"""Thresholds of relocalisation: finding a lost camera in the map."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from vslam.config.section import Section
 
 
 class RelocalizationConfig(Section):
-    """Finding a lost camera [OS1, V-C]."""
+    """Relocalisation of a lost camera [OS1, V-C]."""
 
     match_distance: int = Field(50, ge=0, le=256)
     """Upper bound of the descriptor distance of a match, in bits. [OS1 V-C, customary]"""
@@ -26,21 +26,21 @@ class RelocalizationConfig(Section):
     first_window: float = Field(8.0, gt=0)
     """Search radius of the first guided search, in pixels at octave 0. [OS1 V-C, own]"""
     min_inliers: int = Field(50, ge=6)
-    """Number of inliers from which a frame counts as found. [OS1 V-C, customary]"""
+    """A frame counts as found if it has at least this many inliers. [OS1 V-C, customary]"""
     min_elsewhere: int = Field(15, ge=0)
     """Number of inliers that must lie outside the third of the image with the most inliers.
     [own]"""
     max_candidates: int = Field(5, ge=1)
-    """Upper bound of the places that are tried for a lost frame. [own]"""
+    """Upper bound of the number of places that are tried for a lost frame. [own]"""
     doubtful_gap: float = Field(1.5, gt=1)
-    """A frame comes after a gap if the time since the last tracked frame is above this, in usual
-    intervals between frames. [own]"""
+    """A frame comes after a gap if the time since the last tracked frame is above this multiple of
+    the usual interval between frames. [own]"""
     doubtful_share: float = Field(0.5, ge=0, le=1)
     """A frame is in doubt if it tracks less than this share of the landmarks of the reference
     keyframe and also comes after a gap, could not be predicted, or tracks less than this share of
-    what the previous frame tracked. It is then looked for in the whole map. [own]"""
+    what the previous frame tracked. It is then searched for in the whole map. [own]"""
     better: float = Field(1.5, ge=1)
-    """A frame in doubt is moved to where it is found if it has more than this many times as many
-    inliers there. [own]"""
+    """A frame in doubt is moved to the place where it was found if it has more than this many times
+    as many inliers there. [own]"""
     neighbours: int = Field(20, ge=1)
     """Number of keyframes around the place whose landmarks are searched for. [own]"""

@@ -12,8 +12,8 @@ class Section(BaseModel):
     (``use_attribute_docstrings``), but that would take 0.1 s at the start of every run.
 
     A docstring ends with the source of the value in brackets: [own], or the paper and section of
-    the rule and what the value is: printed there, customary in the programs of the ORB-SLAM family,
-    or our own.
+    the rule and the status of the value: printed there, customary in the programs of the ORB-SLAM
+    family, or our own.
 
     OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017.
     ZS: Zhou and Sun, Sci Rep 15, 7644 (2025).

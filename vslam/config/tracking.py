@@ -66,7 +66,7 @@ class TrackingConfig(Section):
 
 
 class AlignmentConfig(Section):
-    """Matches to a fraction of a pixel (Forster et al., ICRA 2014, III-B)."""
+    """Alignment of matches to sub-pixel accuracy (Forster et al., ICRA 2014, III-B)."""
 
     iterations: int = Field(7, ge=1)
     """Upper bound of the number of Gauss-Newton iterations. [own]"""
@@ -75,6 +75,6 @@ class AlignmentConfig(Section):
     min_correlation: float = Field(0.85, gt=0, le=1)
     """Lower bound of the normalised cross-correlation of an aligned patch with the image. [own]"""
     certainty: int = Field(4, ge=1, le=255)
-    """Factor by which the variance of an aligned match is smaller than that of a keypoint. [own]"""
+    """Ratio of the variance of a keypoint's position to that of an aligned match. [own]"""
     keyframes: int = Field(5, ge=1)
-    """Patches of this many of the newest keyframes are kept. [own]"""
+    """Patches are kept for this many of the newest keyframes. [own]"""

@@ -26,7 +26,7 @@ class VerificationConfig(Section):
     max_draws: int = Field(600, ge=1)
     """Upper bound of the number of RANSAC draws. [OS1 VII-B, own]"""
     confidence: float = Field(0.99, gt=0, lt=1)
-    """Probability with which RANSAC shall draw at least one sample without outliers.
+    """Probability with which RANSAC must draw at least one sample without outliers.
     [OS1 VII-B, own]"""
     min_consensus: int = Field(15, ge=6)
     """Number of inliers that RANSAC must find. [OS1 VII-B, own]"""
@@ -59,23 +59,25 @@ class LearnedMatchingConfig(Section):
     """Places matched by the network's local descriptors, where ORB fails."""
 
     max_candidates: int = Field(2, ge=1)
-    """Upper bound of the candidates that are tried for a keyframe or a lost frame. [own]"""
+    """Upper bound of the number of candidates that are tried for a keyframe or a lost frame.
+    [own]"""
     rated: int = Field(5, ge=0)
-    """Where the detector has not rated its candidates by local descriptors, at most this many of
-    them are rated afterwards. [own]"""
+    """If the detector has not rated its candidates by local descriptors, at most this many of them
+    are rated before verification. [own]"""
     views: int = Field(2, ge=1)
-    """Upper bound of the keyframes of the place that are matched. [own]"""
+    """Upper bound of the number of keyframes of a place that are matched. [own]"""
     most_shared: float = Field(0.4, gt=0, le=1)
     """The network does not process a keyframe that shares at least this share of its landmarks with
     a keyframe whose image is kept. [own]"""
     min_alike: float = Field(0.35, ge=0, le=1)
-    """Likeness of two images from which an attempt is worth its time. [own]"""
+    """Two images are matched only if their similarity by local descriptors is at least this.
+    [own]"""
     rest: int = Field(8, ge=0)
-    """Number of keyframes after a failed attempt for which only places that look more alike
+    """For this many keyframes after a failed attempt, only places that are more similar
     (`more_alike`) are tried. [own]"""
     more_alike: float = Field(1.1, ge=1)
-    """Factor by which a place must look more alike than that of the failed attempt to be tried
-    during this rest. [own]"""
+    """A place is tried during this rest only if its similarity is at least this many times that of
+    the failed attempt. [own]"""
     min_share: float = Field(0.1, ge=0, le=1)
     """Share of the coarse cells that one homography must explain. [own]"""
     coarse_alike: float = Field(0.3, ge=-1, le=1)
@@ -83,21 +85,21 @@ class LearnedMatchingConfig(Section):
     alike: float = Field(0.5, ge=-1, le=1)
     """Lower bound of the cosine of two fine descriptors that match. [own]"""
     reach: int = Field(5, ge=1)
-    """Distance to each side of a coarse match over which the fine match is searched, in fine cells.
-    [own]"""
+    """The fine match is searched for up to this far to each side of the coarse match, in fine
+    cells. [own]"""
     guided_reach: int = Field(3, ge=1)
-    """Distance to each side of a projected landmark over which it is searched, in fine cells.
+    """A landmark is searched for up to this far to each side of its projection, in fine cells.
     [own]"""
     sigma: float = Field(1.5, gt=0)
     """Standard deviation of the position of a match, in pixels of the network's image. [own]"""
     max_draws: int = Field(1000, ge=1)
     """Upper bound of the number of RANSAC draws. [own]"""
     confidence: float = Field(0.99, gt=0, lt=1)
-    """Probability with which RANSAC shall draw at least one sample without outliers. [own]"""
+    """Probability with which RANSAC must draw at least one sample without outliers. [own]"""
     min_consensus: int = Field(40, ge=4)
     """Number of inliers that RANSAC must find. [own]"""
     min_consensus_ratio: float = Field(0.15, ge=0, le=1)
-    """RANSAC must also find this share of the landmarks looked for as inliers. [own]"""
+    """Share of the landmarks searched for that RANSAC must find as inliers. [own]"""
     min_inliers: int = Field(80, ge=6)
     """Number of inliers that must remain after guided search. [own]"""
     min_elsewhere: int = Field(40, ge=0)
@@ -106,21 +108,21 @@ class LearnedMatchingConfig(Section):
     min_seen_ratio: float = Field(0.3, ge=0, le=1)
     """Share of the landmarks of each side that the other side must see. [own]"""
     fuse_pixels: float = Field(2.0, gt=0)
-    """Upper bound of the distance from a projected landmark to the keypoint that is to observe it,
-    in pixels at octave 0. [own]"""
+    """Upper bound of the distance between a projected landmark and the keypoint that will observe
+    it, in pixels at octave 0. [own]"""
     verified_memory: int = Field(10, ge=1)
-    """Replaces `consistency.verified_memory` if it is greater, where images are kept: fewer
-    keyframes have one. [own]"""
+    """Replaces `consistency.verified_memory`, if it is greater, where the images of keyframes are
+    kept, since not every keyframe has one. [own]"""
 
 
 class ConsistencyConfig(Section):
     """What makes verified candidates a loop [OS1, VII-A]."""
 
     min_keyframes: int = Field(2, ge=1)
-    """Number of keyframes in a row that must resemble the place. OS1 asks for 3.
+    """Number of consecutive keyframes that must resemble the place. OS1 requires 3.
     [OS1 VII-A, own]"""
     max_gap: int = Field(1, ge=0)
-    """Number of keyframes in between that need not resemble it. OS1 allows none.
+    """Number of keyframes in between that may fail to resemble it. OS1 allows none.
     [OS1 VII-A, own]"""
     min_shared: int = Field(30, ge=1)
     """A keyframe belongs to the group of a candidate if they share at least this many landmarks.
@@ -128,7 +130,7 @@ class ConsistencyConfig(Section):
     min_verified: int = Field(2, ge=1)
     """Number of verified keyframes that must agree. [own]"""
     verified_memory: int = Field(5, ge=1)
-    """Number of keyframes for which a verified loop counts. [own]"""
+    """A verified loop is remembered for this many keyframes. [own]"""
     max_apart: float = Field(0.5, gt=0)
     """Upper bound of the distance between loops that agree, in metres. [own]"""
     max_turn: float = Field(1.0, gt=0)

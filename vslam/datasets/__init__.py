@@ -1,4 +1,4 @@
-"""Data sets: each reader checks its input once and then hands out calibrated, timed frames."""
+"""Readers of data sets: each checks its input once and then hands out calibrated, timed frames."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from collections.abc import Sequence as Several
 from pathlib import Path
 
 from vslam import plugins
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import Stream
+from vslam.datasets.frames import Source
 from vslam.errors import InputError, did_you_mean
 
 _FIRST = "00"  # KITTI's, and the town rendered after it
@@ -27,23 +26,22 @@ def open_sequence(
     calib: Several[Path | str] = (),
     depth_scale: float | None = None,
     on_render: Callable[[int, int], None] | None = None,
-) -> Sequence:
+) -> Source:
     """Open a sequence and check the frames that ``start``, ``every``, ``max_frames`` select.
 
-    Without a ``name`` it is 00 of KITTI and of the rendered towns, and of EuRoC and TUM the one at
-    ``root``, which must be the only one.
-
-    With ``monocular`` the left camera is read alone. ``calib`` names calibration files
-    (docs/cameras.md) to be used instead of the data set's own; images are rectified by them.
-    ``depth_scale``, what depth images count in a metre, is for RGB-D data alone.
-
-    A reader of another package (docs/plugins.md) is named as a data set is.
-
-    A synthetic sequence has no ``root``: it is rendered into the user's cache on first use, and
-    ``on_render`` is told the frames done and in all.
+    Args:
+        dataset: one of `known_datasets`.
+        root: folder of the data set; rendered towns ignore it, since they are rendered into the
+            user's cache on first use.
+        name: name of the sequence; None opens 00 of KITTI and of the rendered towns, and the only
+            sequence at ``root`` of EuRoC and TUM.
+        monocular: read the left camera alone.
+        calib: calibration files (docs/howto/cameras.md), which replace the data set's own.
+        depth_scale: how many units of the depth images make a metre, for RGB-D data alone.
+        on_render: called with the number of frames that are rendered and the number of all.
 
     Raises:
-        InputError: unknown data set, a broken package, or bad input as the reader says.
+        InputError: the data set is unknown, a package is broken, or as the reader says.
     """
     if dataset == "kitti":
         from vslam.datasets.kitti import open_kitti, open_kitti_images
@@ -59,7 +57,7 @@ def open_sequence(
         images = open_kitti_images(
             root, name, start=start, every=every, max_frames=max_frames, monocular=monocular
         )
-        return rectified(images, read_calibration(calib, images.size))
+        return rectified(images, read_calibration(calib, images.sizes[0]))
     if dataset == "euroc":
         from vslam.datasets.euroc import open_euroc
 
@@ -102,10 +100,10 @@ def open_sequence(
         dataset, root, name, start=start, every=every, max_frames=max_frames, monocular=monocular,
         calib=calib,
     )  # fmt: skip
-    if isinstance(source, Stream):
+    if not source.seekable:
         raise InputError(
-            f"--dataset {dataset}: a stream, whose length nobody knows, which only 'vslam run', "
-            "'vslam doctor' and 'vslam bench' read."
+            f"--dataset {dataset}: a stream, which cannot seek; open it with "
+            "vslam.datasets.sources.open_source."
         )
     return source
 
@@ -120,8 +118,8 @@ def open_plugin_source(
     max_frames: int | None,
     monocular: bool,
     calib: Several[Path | str],
-) -> Sequence | Stream:
-    """What a reader of another package opens.
+) -> Source:
+    """Open the source that a reader of another package offers.
 
     Raises:
         InputError: unknown data set, a broken package, or bad input as the reader says.
@@ -149,5 +147,5 @@ def open_plugin_source(
 
 
 def known_datasets() -> tuple[str, ...]:
-    """All that `open_sequence` knows: vslam's own and those of other packages."""
+    """Data sets that `open_sequence` reads: vslam's own and those of other packages."""
     return (*DATASETS, *plugins.find_plugins(plugins.READERS))

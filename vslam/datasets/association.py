@@ -1,4 +1,4 @@
-"""Which images belong together, by their times."""
+"""Association of images by their times."""
 
 from __future__ import annotations
 

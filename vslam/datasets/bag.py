@@ -20,30 +20,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.calibration.formats import read_ros
 from vslam.calibration.models import Calibration
-from vslam.camera import ImageMap
+from vslam.camera import DepthImage, Image, ImageMap
 from vslam.datasets.bag_messages import (
     CAMERA_INFO_TYPE,
     IMAGE_TYPES,
     Message,
     camera_info,
+    colour_of,
     depth_of,
     grey_of,
     is_depth,
     stamp_of,
 )
+from vslam.datasets.frames import Images, RawSource, Size, TimedFrame
 from vslam.datasets.image_files import size_text
-from vslam.datasets.sequence import DepthImage, Image
-from vslam.datasets.stream import TimedFrame
 from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 
 Bag = Any  # rosbags.highlevel.AnyReader
 
 _MOST_METADATA = 1_000_000  # bytes; a hundred topics make 100,000
 _TOLERANCE_NS = 5_000_000
-_DEPTH_TOLERANCE_NS = 20_000_000  # Kinects take them in turn; as TUM's associate.py
+_DEPTH_TOLERANCE_NS = 20_000_000  # Kinects take image and depth in turn; as TUM's associate.py
 _NEEDED = {
     "mono": "an image topic",
     "stereo": "two image topics",
@@ -52,60 +53,17 @@ _NEEDED = {
 _MOST_WAITING = 32  # images of one side that wait for a partner
 
 
-@dataclass(frozen=True)
-class BagStream:
-    """See `vslam.datasets.stream.RawStream`.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BagSource(RawSource):
+    """The images of a bag.
 
     Attributes:
-        topics: of the left images, and of the right ones or the depth.
-        depth: whether the second topic has the depth of the first one's pixels.
-        depth_scale: what depth counts in a metre, None as its encoding says.
+        path: the bag's file or folder.
+        topics: the topic of the left images, and that of the right images or the depth.
     """
 
     path: Path
     topics: tuple[str, ...]
-    sizes: tuple[tuple[int, int], ...]
-    n_expected: int | None
-    depth: bool = False
-    depth_scale: float | None = None
-
-    @property
-    def dataset(self) -> str:
-        return "bag"
-
-    @property
-    def name(self) -> str:
-        return self.path.stem
-
-    @property
-    def live(self) -> bool:
-        return False
-
-    def frames(self) -> Iterator[TimedFrame]:
-        """See `vslam.datasets.stream.RawStream.frames`."""
-        with _opened(self.path) as bag:
-            messages = _messages(bag, self.path, self.topics)
-            for together in _together(messages, self.topics, _tolerance(self.depth)):
-                yield TimedFrame(stamp_of(together[0]) / 10**9, partial(self._read, together))
-
-    def _read(
-        self, messages: tuple[Message, ...], image_map: ImageMap
-    ) -> tuple[Image, Image | DepthImage | None]:
-        kinds = (False, self.depth)
-        sides = zip(messages, self.topics, self.sizes, kinds, strict=False)
-        left, *second = image_map(self._of_size, list(sides))
-        return np.asarray(left, np.uint8), second[0] if second else None
-
-    def _of_size(self, side: tuple[Message, str, tuple[int, int], bool]) -> Image | DepthImage:
-        message, topic, size, depth = side
-        image = _decoded(self.path, topic, message, depth, self.depth_scale)
-        if image.shape[::-1] != size:
-            raise UnreadableImageError(
-                self.path,
-                f"{topic}: {size_text(image.shape)} pixels where the first image has "
-                f"{size_text(size[::-1])}.",
-            )
-        return image
 
 
 def open_bag(
@@ -114,16 +72,17 @@ def open_bag(
     topics: tuple[str, ...] = (),
     sensor: str | None = None,
     depth_scale: float | None = None,
-) -> BagStream:
+) -> BagSource:
     """Open a bag and read its first frame.
 
     Args:
         path: ``.bag``, ``.mcap`` or ``.db3``, or the folder of a ROS 2 bag.
-        topics: of the left images and of the right ones or the depth; without any, the only image
-            topics there are, a right one in the order of their names.
-        sensor: ``stereo`` or ``rgbd``; ``mono``, and of two topics given the first one is taken;
-            None for what the topics hold.
-        depth_scale: what depth counts in a metre, None as its encoding says.
+        topics: the topic of the left images and that of the right images or the depth. If empty,
+            the bag must have just the image topics that are needed; left and right are told by the
+            order of their names.
+        sensor: ``stereo``, ``rgbd`` or ``mono``, which reads the first of two topics; None decides
+            by what the topics hold.
+        depth_scale: how many units of the depth images make a metre; None follows their encoding.
 
     Raises:
         InputError: rosbags is not installed, no bag, cut off, topics missing, or images that have
@@ -156,28 +115,67 @@ def open_bag(
                 f"of {size_text(images[0].shape)} in {chosen[0]}; name a topic of depth that is "
                 "registered to the images."
             )
-        return BagStream(
+        sizes = tuple((image.shape[1], image.shape[0]) for image in images)
+        return BagSource(
+            dataset="bag",
+            name=path.stem,
             path=path,
             topics=chosen,
-            sizes=tuple((image.shape[1], image.shape[0]) for image in images),
+            sizes=sizes[:1] if depth else sizes,
+            play=partial(_play, path, chosen, sizes, depth, depth_scale),
             n_expected=_count(bag, chosen),
             depth=depth,
-            depth_scale=depth_scale,
         )
 
 
-def find_calibration(stream: BagStream) -> Calibration | None:
-    """By the ``camera_info`` beside the image topics, as ROS's drivers name it.
+def _play(
+    path: Path, topics: tuple[str, ...], sizes: tuple[Size, ...], depth: bool, scale: float | None
+) -> Iterator[TimedFrame]:
+    def read(messages: tuple[Message, ...], image_map: ImageMap) -> Images:
+        sides = zip(messages, topics, sizes, (False, depth), strict=False)
+        left, *second = image_map(of_size, list(sides))
+        return np.asarray(left, np.uint8), second[0] if second else None
 
-    None where one is missing or has no focal length, as drivers of uncalibrated cameras fill it.
+    def of_size(side: tuple[Message, str, Size, bool]) -> Image | DepthImage:
+        message, topic, size, is_depth = side
+        image = _decoded(path, topic, message, is_depth, scale)
+        if image.shape[::-1] != size:
+            raise UnreadableImageError(
+                path,
+                f"{topic}: {size_text(image.shape)} pixels where the first image has "
+                f"{size_text(size[::-1])}.",
+            )
+        return image
+
+    with _opened(path) as bag:
+        messages = _messages(bag, path, topics)
+        for together in _together(messages, topics, _tolerance(depth)):
+            yield TimedFrame(
+                stamp_of(together[0]) / 10**9,
+                partial(read, together),
+                colour=partial(_in_colour, path, topics[0], together[0]),
+            )
+
+
+def _in_colour(path: Path, topic: str, message: Message) -> NDArray[np.uint8]:
+    try:
+        return colour_of(message)
+    except ValueError as error:
+        raise UnreadableImageError(path, f"{topic}: {error}.") from error
+
+
+def find_calibration(source: BagSource) -> Calibration | None:
+    """Read the calibration from the ``camera_info`` topics beside the image topics.
+
+    None if a topic is missing or has no focal length, as drivers of uncalibrated cameras write it.
 
     Raises:
         InputError: a ``camera_info`` cannot be read, or is no calibration.
     """
-    path = stream.path
+    path = source.path
     documents = []
     with _opened(path) as bag:
-        for topic in stream.topics[: 1 if stream.depth else None]:
+        for topic in source.topics[: 1 if source.depth else None]:
             namespace, _, image = topic.removesuffix("/compressed").rpartition("/")
             info = f"{namespace}/camera_info"
             if not any(c.topic == info and c.msgtype == CAMERA_INFO_TYPE for c in bag.connections):
@@ -209,7 +207,7 @@ def _opened(path: Path) -> Iterator[Bag]:
         _check_metadata(path / "metadata.yaml")
         bag = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
         bag.open()
-    except Exception as error:  # of a damaged file rosbags and its parsers raise all sorts
+    except Exception as error:  # rosbags and its parsers raise many kinds for a damaged file
         raise InputError(
             f"{path}: cannot be read as a bag ({_reason(error)}); if its recording was cut off, "
             "repair it with 'rosbag reindex', 'ros2 bag reindex' or 'mcap recover'."
@@ -221,7 +219,7 @@ def _opened(path: Path) -> Iterator[Bag]:
 
 
 def _check_metadata(file: Path) -> None:
-    """rosbags needs 30 microseconds and 300 bytes of memory for a byte of this file.
+    """Refuse a large file: rosbags needs 30 microseconds and 300 bytes of memory for each byte.
 
     Raises:
         ValueError: it is too large.
@@ -231,10 +229,10 @@ def _check_metadata(file: Path) -> None:
 
 
 def _messages(bag: Bag, path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, Message]]:
-    """Messages of these topics with the name of theirs, in the order of their recording.
+    """Messages of these topics, each with its topic, in the order of their recording.
 
     Raises:
-        BrokenSourceError: behind the last good one of a damaged bag.
+        BrokenSourceError: after the last good message of a damaged bag.
     """
     connections = [c for c in bag.connections if c.topic in topics]
     try:
@@ -257,8 +255,8 @@ def _tolerance(depth: bool) -> int:
 def _together(
     messages: Iterator[tuple[str, Message]], topics: tuple[str, ...], tolerance: int
 ) -> Iterator[tuple[Message, ...]]:
-    """Messages of one time, one of each topic: the first two there are, unless one of them has a
-    nearer one coming."""
+    """Tuples of one message from each topic whose stamps agree; a message waits if a later one of
+    the other topic is nearer in time."""
     if len(topics) == 1:
         yield from ((message,) for _, message in messages)
         return
@@ -316,7 +314,7 @@ def _choose_topics(
 
 
 def _count(bag: Bag, topics: tuple[str, ...]) -> int | None:
-    """About how many frames there are, None where ``metadata.yaml`` says no number."""
+    """The approximate number of frames; None if ``metadata.yaml`` does not state it."""
     try:
         n = min(bag.topics[topic].msgcount for topic in topics)
     except TypeError:

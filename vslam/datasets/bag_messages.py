@@ -1,4 +1,4 @@
-"""Images and calibrations out of ROS messages.
+"""Images and calibrations from ROS messages.
 
 Fields and encodings: ``sensor_msgs/Image``, ``CompressedImage``, ``CameraInfo`` and
 ``sensor_msgs/image_encodings.hpp`` of ROS.
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.calibration.documents import Document
-from vslam.datasets.sequence import DepthImage, Image
+from vslam.camera import DepthImage, Image
 
 Message = Any  # classes that rosbags makes out of the bag's definitions
 
@@ -22,29 +22,50 @@ _DEPTH_ENCODINGS = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
-# Channels, and the OpenCV conversion to grey by name.
+# Channels, and what OpenCV calls their colours.
 _ENCODINGS: dict[str, tuple[int, str | None]] = {
     "mono": (1, None),
-    "bgr": (3, "COLOR_BGR2GRAY"),
-    "rgb": (3, "COLOR_RGB2GRAY"),
-    "bgra": (4, "COLOR_BGRA2GRAY"),
-    "rgba": (4, "COLOR_RGBA2GRAY"),
-    "bayer_rggb": (1, "COLOR_BayerRGGB2GRAY"),
-    "bayer_bggr": (1, "COLOR_BayerBGGR2GRAY"),
-    "bayer_gbrg": (1, "COLOR_BayerGBRG2GRAY"),
-    "bayer_grbg": (1, "COLOR_BayerGRBG2GRAY"),
+    "bgr": (3, "BGR"),
+    "rgb": (3, "RGB"),
+    "bgra": (4, "BGRA"),
+    "rgba": (4, "RGBA"),
+    "bayer_rggb": (1, "BayerRGGB"),
+    "bayer_bggr": (1, "BayerBGGR"),
+    "bayer_gbrg": (1, "BayerGBRG"),
+    "bayer_grbg": (1, "BayerGRBG"),
 }
 _SAME = {"8UC1": "mono8", "16UC1": "mono16", "8UC3": "bgr8", "8UC4": "bgra8"}
 
 
 def stamp_of(message: Message) -> int:
-    """Nanoseconds of the header's stamp, 0 where nobody has set it."""
+    """Nanoseconds of the header's stamp, 0 if it was not set."""
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 def grey_of(message: Message) -> Image:
-    """``(H, W)`` uint8 image of an ``Image`` or ``CompressedImage``, of 16 bits the upper eight.
+    """``(H, W)`` uint8 image of an ``Image`` or ``CompressedImage``; the upper eight of 16 bits.
+
+    Raises:
+        ValueError: with the reason why it cannot be decoded.
+    """
+    return _decoded(message, "GRAY")
+
+
+def colour_of(message: Message) -> NDArray[np.uint8]:
+    """As `grey_of`; ``(H, W, 3)`` red, green, blue if the message has colours.
+
+    Raises:
+        ValueError: as `grey_of`.
+    """
+    return _decoded(message, "RGB")
+
+
+def _decoded(message: Message, wanted: str) -> NDArray[np.uint8]:
+    """An image of a message.
+
+    Args:
+        wanted: ``GRAY``, or ``RGB``, which a grey message ignores.
 
     Raises:
         ValueError: with the reason why it cannot be decoded.
@@ -56,28 +77,30 @@ def grey_of(message: Message) -> Image:
     if not hasattr(message, "encoding"):
         try:
             data = np.asarray(message.data, np.uint8).tobytes()
-            image = decode_with_opencv(data, cv2.IMREAD_GRAYSCALE)
+            grey = wanted == "GRAY"
+            image = decode_with_opencv(data, cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_ANYCOLOR)
         except cv2.error:
             image = None
         if image is None:
             raise ValueError(f"a compressed image of format '{message.format}' cannot be decoded")
-        return np.asarray(image, np.uint8)
+        return np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
     encoding = _SAME.get(message.encoding, message.encoding)
     name, bits = (encoding[:-2], 16) if encoding.endswith("16") else (encoding[:-1], 8)
     if name not in _ENCODINGS or not encoding.endswith(str(bits)):
         known = ", ".join(f"{known}8" for known in _ENCODINGS)
         raise ValueError(f"encoding '{message.encoding}' is unknown; known are {known}")
-    channels, conversion = _ENCODINGS[name]
+    channels, colours = _ENCODINGS[name]
     image = _pixels(message, channels, bits)
     if bits == 16:
         image = (image.astype(np.uint16) >> 8).astype(np.uint8)
-    if conversion is not None:
-        image = cv2.cvtColor(image, getattr(cv2, conversion))
+    if colours not in (None, wanted):
+        image = cv2.cvtColor(image, getattr(cv2, f"COLOR_{colours}2{wanted}"))
     return np.ascontiguousarray(image, np.uint8)
 
 
 def is_depth(message: Message, topic: str) -> bool:
-    """Whether an image message holds depth: 16 bits are grey values but in topics named so."""
+    """Whether an image message holds depth. 16-bit images are grey values unless the topic's name
+    contains ``depth``."""
     if not hasattr(message, "encoding"):
         return _COMPRESSED_DEPTH in message.format
     steps = message.encoding == "16UC1" and "depth" in topic.lower()
@@ -89,8 +112,8 @@ def depth_of(message: Message, scale: float | None) -> DepthImage:
     image_transport's plugin ``compressed_depth``.
 
     Args:
-        scale: what the image counts in a metre; None: as REP 118 says, 1000 with 16 bits and 1
-            with 32.
+        scale: how many units of the image make a metre; None follows REP 118: 1000 for 16 bits, 1
+            for 32 bits.
 
     Raises:
         ValueError: with the reason why it cannot be decoded.
@@ -106,8 +129,8 @@ def depth_of(message: Message, scale: float | None) -> DepthImage:
 
 
 def _compressed_depth(message: Message, scale: float | None) -> DepthImage:
-    """Of 16 bits the PNG holds the steps; of 32 bits their inverse, by two numbers of the header
-    (``compressed_depth_image_transport``, ``ConfigHeader``)."""
+    """With 16 bits the PNG holds the depth; with 32 bits it holds the inverse depth, scaled by two
+    numbers of the header (``compressed_depth_image_transport``, ``ConfigHeader``)."""
     import cv2
 
     from vslam.datasets.png import decode_with_opencv
@@ -148,15 +171,15 @@ def _pixels(message: Message, channels: int, bits: int, kind: str = "u") -> NDAr
 
 
 def camera_info(message: Message, source: str, rectified: bool) -> Document | None:
-    """A ``CameraInfo`` as `vslam.calibration.formats.read_ros` takes it.
+    """A ``CameraInfo`` as input of `vslam.calibration.formats.read_ros`.
 
-    None of an uncalibrated camera: its K is all zero, as the definition of ``CameraInfo`` says.
+    None for an uncalibrated camera, whose K is all zero by the definition of ``CameraInfo``.
 
     Args:
-        source: bag and topic, for messages.
-        rectified: the images are those that the projection matrix is of.
+        source: bag and topic, named in error messages.
+        rectified: whether the images are rectified, so that the projection matrix applies.
     """
-    # ROS 1 has K, D, R and P, ROS 2 small letters.
+    # ROS 1 writes K, D, R and P, ROS 2 uses small letters.
     K, D, R, P = (
         np.asarray(getattr(message, name, getattr(message, name.lower(), None)), np.float64)
         for name in "KDRP"

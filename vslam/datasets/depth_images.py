@@ -1,87 +1,70 @@
-"""Images with the depth of their pixels, as files, and how depth is counted."""
+"""Files of images with the depth of their pixels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence as Several
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.calibration.models import Calibration
-from vslam.camera import Camera, DepthImage, Image, ImageMap
+from vslam.camera import Camera, ImageMap
+from vslam.datasets.frames import Images, RawSource, stored_frames
 from vslam.datasets.image_files import (
     check_not_empty,
-    read_grey,
+    image_size,
+    read_colour,
     read_grey_of_size,
     size_text,
 )
 from vslam.errors import UnreadableImageError
 
-# Of a Kinect: its projector stands so far from its camera (ORB-SLAM2, section III-A).
+# Distance in metres from a Kinect's projector to its camera (ORB-SLAM2, section III-A).
 _VIRTUAL_BASELINE = 0.08
 
 
-@dataclass(frozen=True)
-class DepthFiles:
-    """The selected frames as the camera took them; see `vslam.datasets.rectified.RawSequence`.
+def depth_files(
+    dataset: str,
+    name: str,
+    timestamps: NDArray[np.float64],
+    ground_truth: NDArray[np.float64] | None,
+    colour: Several[Path],
+    depth: Several[Path],
+    depth_scale: float,
+) -> RawSource:
+    """A source of colour images with the depth of their pixels, after a look at every file and the
+    first frame.
 
-    Attributes:
-        dataset: kind of source, ``tum`` for example.
-        name: of the folder.
+    Args:
         timestamps: ``(N,)`` float64 seconds of the colour images.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, or None.
-        colour, depth: N image files each; depth is empty for the colour images alone.
-        size: width and height of the images.
-        depth_scale: what depth images count in a metre.
-    """
-
-    dataset: str
-    name: str
-    timestamps: NDArray[np.float64]
-    ground_truth: NDArray[np.float64] | None
-    colour: tuple[Path, ...]
-    depth: tuple[Path, ...]
-    size: tuple[int, int]
-    depth_scale: float
-
-    def __len__(self) -> int:
-        return len(self.colour)
-
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, DepthImage | None]:
-        """Grey image ``(H, W)`` uint8 and depth ``(H, W)`` float32 metres, None without depth.
-
-        Raises:
-            UnreadableImageError: a file is missing, damaged, of another size, or the depth not of
-                16 bits.
-        """
-        left = read_grey_of_size(self.colour[index], *self.size)
-        if not self.depth:
-            return left, None
-        steps = _read_steps(self.depth[index], *self.size)
-        return left, steps * np.float32(1.0 / self.depth_scale)
-
-
-def checked_depth_files(files: DepthFiles) -> DepthFiles:
-    """The same, after a look at every file and the first frame.
+        colour, depth: N image files each.
+        depth_scale: how many units of the depth images make a metre.
 
     Raises:
-        UnreadableImageError: a file is empty, or the first frame as `DepthFiles.read`.
+        UnreadableImageError: a file is empty, or the first frame cannot be decoded, has two sizes,
+            or depth that is not of 16 bits.
     """
-    for path in (*files.colour, *files.depth):
+    for path in (*colour, *depth):
         check_not_empty(path)
-    files.read(0)
-    return files
+    size = image_size(colour[0])
 
+    def read(index: int, image_map: ImageMap) -> Images:
+        left = read_grey_of_size(colour[index], *size)
+        return left, _read_steps(depth[index], *size) * np.float32(1.0 / depth_scale)
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height.
-
-    Raises:
-        UnreadableImageError: missing or damaged.
-    """
-    height, width = read_grey(path).shape
-    return width, height
+    source = RawSource(
+        dataset=dataset,
+        name=name,
+        sizes=(size,),
+        depth=True,
+        stored=stored_frames(timestamps, read, colour, read_colour),
+        ground_truth=ground_truth,
+    )
+    source.read(0)
+    return source
 
 
 def with_depth(camera: Camera, calibration: Calibration) -> Camera:

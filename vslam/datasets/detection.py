@@ -1,4 +1,4 @@
-"""Which kind of source somebody means, from what is there."""
+"""Detection of the kind of a source from its files."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 
 
 def _within(folder: Path) -> tuple[Path, ...]:
-    """A folder and those in it: a data set may hold several sequences."""
+    """A folder and the folders in it: a data set may hold several sequences."""
     return (folder, *(path for path in folder.glob("*") if path.is_dir()))
 
 
-# In this order: the folders of data sets hold images, too.
+# The order matters, because the folders of data sets hold images, too.
 _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
     (
         "kitti",
@@ -91,11 +91,11 @@ def _kind_of(path: Path) -> str | None:
 
 
 def _nearest(path: Path) -> str:
-    """Where somebody may be a level too high or too low."""
+    """A hint for a folder that is one level too high or too low."""
     if path.resolve().name == "sequences":
         return f", but {path.resolve().parent} looks like KITTI's (name that)"
     for inside in sorted(path.glob("*")):
-        with suppress(OSError):  # a folder of somebody else's
+        with suppress(OSError):  # a folder that this user may not read
             if inside.is_dir() and (kind := _kind_of(inside)) is not None:
                 return f", but {inside} is one of {kind} (name that)"
     return ""

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
+from vslam.datasets.frames import Source
 from vslam.datasets.ground_truth import poses_at
 from vslam.datasets.image_files import checked_files, find_sequence, select_frames
 from vslam.datasets.rectified import rectified
-from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError
 from vslam.trajectory import Trajectory
 
@@ -36,21 +36,20 @@ def open_euroc(
     max_frames: int | None = None,
     monocular: bool = False,
     calib: Several[Path | str] = (),
-) -> Sequence:
+) -> Source:
     """Open a sequence; its images are rectified as they are read.
 
-    A frame is a left image with the right one of the same time, or the nearest within 5 ms; left
-    images without are left out. The ground truth is interpolated. Where it does not cover all
-    selected frames there is none, and the log says which ones it covers.
+    A frame is a left image with the nearest right image within 5 ms; left images without a partner
+    are left out. The ground truth is interpolated, see `vslam.datasets.ground_truth.poses_at`.
 
     Args:
         root: the sequence's folder, or one with several.
-        name: of the sequence in it; None for the folder itself, or the only one in it.
+        name: name of the sequence in it; None for the folder itself, or the only one in it.
         start: first frame, counted over the pairs.
         every: take every N-th frame.
-        max_frames: at most so many, None for all.
+        max_frames: largest number of frames, None for all.
         monocular: read the left camera alone.
-        calib: files to be used instead of the cameras' ``sensor.yaml``.
+        calib: calibration files, which replace the cameras' ``sensor.yaml``.
 
     Raises:
         InputError: data missing or malformed, no pairs, calibration unusable.

@@ -1,4 +1,4 @@
-"""Ground truth measured at times of its own, at the times of frames."""
+"""Interpolation of ground truth at the times of frames."""
 
 from __future__ import annotations
 

@@ -1,56 +1,20 @@
-"""What readers of image files share: which folder, which files and frames, and grey images."""
+"""Code that readers of image files share: finding folders and files, and decoding them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from collections.abc import Sequence as Several
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import ImageMap
-from vslam.datasets.sequence import Image
+from vslam.camera import Image, ImageMap
+from vslam.datasets.frames import Images, RawSource, Size, stored_frames
 from vslam.errors import InputError, UnreadableImageError
 from vslam.untrusted import MOST_PIXELS, require_utf8
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
-
-
-@dataclass(frozen=True)
-class ImageFiles:
-    """The selected frames as the cameras took them; see `vslam.datasets.rectified.RawSequence`.
-
-    Attributes:
-        dataset: kind of source, ``euroc`` for example.
-        name: of the folder.
-        timestamps: ``(N,)`` float64 seconds.
-        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera, or None.
-        left, right: N image files each; right is empty for the left camera alone.
-        sizes: width and height of the images of each side.
-    """
-
-    dataset: str
-    name: str
-    timestamps: NDArray[np.float64]
-    ground_truth: NDArray[np.float64] | None
-    left: tuple[Path, ...]
-    right: tuple[Path, ...]
-    sizes: tuple[tuple[int, int], ...]
-
-    def __len__(self) -> int:
-        return len(self.left)
-
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
-        """Left and right image; see `vslam.datasets.sequence.Sequence.read`."""
-        files = [side[index] for side in (self.left, self.right) if side]
-        left, *right = image_map(self._read, list(zip(files, self.sizes, strict=True)))
-        return left, right[0] if right else None
-
-    def _read(self, file: tuple[Path, tuple[int, int]]) -> Image:
-        path, (width, height) = file
-        return read_grey_of_size(path, width, height)
 
 
 def checked_files(
@@ -59,28 +23,62 @@ def checked_files(
     timestamps: NDArray[np.float64],
     ground_truth: NDArray[np.float64] | None,
     sides: Several[tuple[Path, ...]],
-) -> ImageFiles:
-    """`ImageFiles` of one side or two, after a look at every file and the first images.
+) -> RawSource:
+    """A source of image files, after a look at every file and the first images.
+
+    Args:
+        timestamps: ``(N,)`` float64 seconds.
+        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera, or None.
+        sides: N files each of the left and the right camera, or of the left one alone.
 
     Raises:
         UnreadableImageError: a file is empty, or the first frame cannot be decoded.
     """
     for path in (path for side in sides for path in side):
         check_not_empty(path)
-    shapes = [read_grey(side[0]).shape for side in sides]
-    return ImageFiles(
+    sizes = tuple(image_size(side[0]) for side in sides)
+
+    def read(index: int, image_map: ImageMap) -> Images:
+        return read_files([side[index] for side in sides], sizes, image_map)
+
+    return RawSource(
         dataset=dataset,
         name=name,
-        timestamps=timestamps,
+        sizes=sizes,
+        stored=stored_frames(timestamps, read, sides[0], read_colour),
         ground_truth=ground_truth,
-        left=sides[0],
-        right=sides[1] if len(sides) == 2 else (),
-        sizes=tuple((width, height) for height, width in shapes),
     )
 
 
+def read_files(
+    files: Several[Path], sizes: Several[Size], image_map: ImageMap
+) -> tuple[Image, Image | None]:
+    """Left and right image, None for the right one if there is a single file.
+
+    Raises:
+        UnreadableImageError: a file is missing, damaged or not of its size.
+    """
+    left, *right = image_map(_read_file, list(zip(files, sizes, strict=True)))
+    return left, right[0] if right else None
+
+
+def _read_file(file: tuple[Path, Size]) -> Image:
+    path, (width, height) = file
+    return read_grey_of_size(path, width, height)
+
+
+def image_size(path: Path) -> Size:
+    """Width and height.
+
+    Raises:
+        UnreadableImageError: missing or damaged.
+    """
+    height, width = read_grey(path).shape
+    return width, height
+
+
 def list_images(folder: Path) -> dict[str, Path]:
-    """Image files of a folder by stem, in the order of their names; empty without the folder.
+    """Image files of a folder by stem, in the order of their names; empty if there is no folder.
 
     Raises:
         InputError: the name of one is not UTF-8.
@@ -94,15 +92,15 @@ def list_images(folder: Path) -> dict[str, Path]:
 
 
 def is_image(path: Path) -> bool:
-    """Whether a file is named as an image."""
+    """Whether a file has the name of an image."""
     return path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
 
 
 def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bool]) -> Path | None:
-    """Folder of a sequence: one in ``root``, or ``root`` itself; None where there is none at all.
+    """Folder of a sequence: one in ``root``, or ``root`` itself; None if there is no sequence.
 
     Args:
-        name: of the folder; None for ``root`` itself, or the only one in it.
+        name: name of the folder; None for ``root`` itself, or the only sequence in it.
 
     Raises:
         InputError: no sequence of this name, or several and no name.
@@ -129,7 +127,7 @@ def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bo
 def select_frames(
     source: Path, n: int, start: int, every: int, max_frames: int | None
 ) -> NDArray[np.int64]:
-    """Numbers of the frames that ``start``, ``every`` and ``max_frames`` select of n > 0.
+    """Numbers of the frames that ``start``, ``every`` and ``max_frames`` select from n > 0 frames.
 
     Raises:
         InputError: options out of range, or a start beyond the last frame of ``source``.
@@ -156,8 +154,8 @@ def check_not_empty(path: Path) -> None:
 
 
 def read_grey(path: Path) -> Image:
-    """Decode an image file: ``(H, W)`` uint8, colour weighed to grey (ITU-R BT.601), of 16 bits
-    the upper eight.
+    """Decode an image file: ``(H, W)`` uint8. Colours become grey by ITU-R BT.601; of 16 bits, the
+    upper eight are used.
 
     Raises:
         UnreadableImageError: missing, damaged or larger than `MOST_PIXELS`.
@@ -177,11 +175,28 @@ def read_grey(path: Path) -> Image:
                 path, f"larger than {MOST_PIXELS / 1e6:.0f} million pixels; scale it down."
             ) from error
         decoded = None
-    except (OSError, ValueError):  # ValueError: a time file may name a path that none can be
+    except (OSError, ValueError):  # ValueError: a list of images may name an impossible path
         decoded = None
     if decoded is None:
         raise UnreadableImageError(path, "cannot be decoded; download the file again.")
     return np.asarray(decoded, np.uint8)
+
+
+def read_colour(path: Path) -> NDArray[np.uint8]:
+    """Decode an image file: ``(H, W, 3)`` uint8 red, green, blue, or ``(H, W)`` if it is grey.
+
+    Raises:
+        UnreadableImageError: as `read_grey`.
+    """
+    import cv2
+
+    from vslam.datasets.png import decode_with_opencv
+
+    grey = read_grey(path)  # refuses what cannot be decoded
+    decoded = decode_with_opencv(path.read_bytes(), cv2.IMREAD_ANYCOLOR)
+    if decoded is None or decoded.ndim == 2:
+        return grey
+    return np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def read_grey_of_size(path: Path, width: int, height: int) -> Image:

@@ -1,4 +1,4 @@
-"""Folders of images: one of a single camera, two of a stereo pair or of images with their depth.
+"""Folders of images: one folder for a single camera, two for a stereo pair or images with depth.
 
 A pair is two folders beside each other (`PAIRS` and `DEPTH_PAIRS` of names), or one named with
 ``--right`` or ``--depth``. Its images belong together by their names, or by their order where no
@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.association import associate
-from vslam.datasets.depth_images import DepthFiles, checked_depth_files, image_size
-from vslam.datasets.image_files import ImageFiles, checked_files, list_images, select_frames
+from vslam.datasets.depth_images import depth_files
+from vslam.datasets.frames import RawSource
+from vslam.datasets.image_files import checked_files, image_size, list_images, select_frames
 from vslam.errors import InputError
 from vslam.trajectory import read_table
 
@@ -38,29 +39,30 @@ PAIRS = (
     ("cam0/data", "cam1/data"),
 )
 DEPTH_PAIRS = (("rgb", "depth"), ("color", "depth"), ("colour", "depth"), ("image", "depth"))
-_SLOWEST_S = 10.0  # between images: nothing could be tracked
+_SLOWEST_S = 10.0  # between images; nothing could be tracked
 _NEAR_S = 0.02  # as TUM's associate.py
 _TIME_FILES = ("times.txt", "timestamps.txt")
 _EXIF = 0x8769  # tags of EXIF 2.32
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL = 0x9003, 0x9291
-# The year 2001 in seconds: a whole number below is a counter; above, its size tells the unit.
+# The year 2001 in seconds: smaller whole numbers are counters; the size of larger ones tells the
+# unit.
 _FIRST_TIME = 1e9
 _UNITS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3), (_FIRST_TIME, 1))
 
 
 def has_images(folder: Path) -> bool:
-    """Whether a folder holds images, or a pair of folders with some."""
+    """Whether a folder holds images, or a pair of folders with images."""
     inside = (folder / left for left, _ in PAIRS + DEPTH_PAIRS)
     return any(list_images(place) for place in (folder, *inside))
 
 
 @dataclass(frozen=True)
 class ImageFolders:
-    """Files of a folder or of a pair of folders, in order and in time.
+    """Files of a folder or of a pair of folders, in the order of their times.
 
     Attributes:
-        name: of the folder.
-        sides: N image files each: left and right ones, images and depth, or those of one camera.
+        name: name of the folder.
+        sides: N image files each: left and right images, images and depth, or one camera's images.
         depth: whether the second side is the depth of the first one.
         size: width and height of the first image.
     """
@@ -71,30 +73,25 @@ class ImageFolders:
     depth: bool
     size: tuple[int, int]
 
-    def images(self) -> ImageFiles:
-        """As a sequence of one camera or of a stereo pair.
+    def source(self, depth_scale: float | None) -> RawSource:
+        """The images as a source.
+
+        Args:
+            depth_scale: how many units of the depth images make a metre; needed only for these.
 
         Raises:
+            InputError: there are depth images and no scale.
             UnreadableImageError: a file is empty, or the first frame cannot be decoded.
         """
-        return checked_files("images", self.name, self.timestamps, None, self.sides)
-
-    def with_depth(self, scale: float | None) -> DepthFiles:
-        """As a sequence of images with depth, which counts ``scale`` in a metre.
-
-        Raises:
-            InputError: there is no scale.
-            UnreadableImageError: a file is empty, or the first frame cannot be decoded.
-        """
+        if not self.depth:
+            return checked_files("images", self.name, self.timestamps, None, self.sides)
         colour, depth = self.sides
-        if scale is None:
+        if depth_scale is None:
             raise InputError(
                 f"{depth[0].parent}: what depth images count in a metre is not known; give "
                 "--depth-scale, 1000 for millimetres, or depth_scale in the calibration."
             )
-        return checked_depth_files(
-            DepthFiles("images", self.name, self.timestamps, None, colour, depth, self.size, scale)
-        )
+        return depth_files("images", self.name, self.timestamps, None, colour, depth, depth_scale)
 
 
 def open_images(
@@ -111,11 +108,12 @@ def open_images(
     """Find the files of a folder of images, or of a pair of folders.
 
     Args:
-        folder: of the images, or of both folders of a pair.
-        right: folder of the right images where ``folder`` has the left ones.
-        depth: folder of the depth images, likewise.
-        fps: frames a second, in place of time stamps.
-        sensor: ``stereo``, ``rgbd``, or ``mono`` for the left images alone; None for what there is.
+        folder: folder of the images, or the folder that holds both folders of a pair.
+        right: folder of the right images if ``folder`` holds the left ones.
+        depth: folder of the depth images if ``folder`` holds the images.
+        fps: frames per second, instead of time stamps.
+        sensor: ``stereo``, ``rgbd``, or ``mono`` for the left images alone; None reads what is
+            there.
 
     Raises:
         InputError: no images, no second ones, sides that do not match, or no usable times.
@@ -175,7 +173,7 @@ def _find_sides(
 
 
 def _near_miss(folder: Path) -> str:
-    """What somebody may have overlooked who names one side of a pair, or has only one."""
+    """A hint for a user who names one side of a pair, or has only one side."""
     above = folder.resolve().parent
     for names in PAIRS + DEPTH_PAIRS:
         if all(list_images(above / name) for name in names) and folder.resolve().name in names:
@@ -188,8 +186,8 @@ def _near_miss(folder: Path) -> str:
 
 
 def _sorted_images(folder: Path) -> dict[str, Path]:
-    """By stem: in the order of time where all names are times, else of the words and numbers in
-    the names, 2 before 10."""
+    """Images by stem: in the order of time if all names are times, else in that of the words and
+    numbers in the names, 2 before 10."""
     images = list_images(folder)
     if not images:
         raise InputError(f"{folder}: no images in this folder; name another.")
@@ -206,7 +204,7 @@ def _sorted_images(folder: Path) -> dict[str, Path]:
 def _matched(
     sides: list[dict[str, Path]], folders: list[Path], *, by_time: bool
 ) -> list[list[Path]]:
-    """The files of each side in order, as many of one as of the other."""
+    """The files of each side in order, equally many on both sides."""
     first, *rest = sides
     for other in rest:
         if first.keys() == other.keys():
@@ -222,7 +220,7 @@ def _matched(
 
 
 def _near_in_time(first: dict[str, Path], second: dict[str, Path]) -> list[list[Path]] | None:
-    """Files of both sides whose names are times near each other, None where names are no times."""
+    """Files of both sides whose names are times near each other; None if names are not times."""
     files = [list(side.values()) for side in (first, second)]
     times = [[_time_of_name(path) for path in side] for side in files]
     if any(time is None for side in times for time in side):
@@ -269,7 +267,7 @@ def _times_of_file(path: Path, n: int) -> NDArray[np.float64]:
 
 
 def _time_of_name(path: Path) -> float | None:
-    """Seconds since 1970, None where the name is no time."""
+    """Seconds since 1970; None if the name is not a time."""
     if re.fullmatch(r"\d+\.\d+", path.stem):
         return float(path.stem)
     if path.stem.isdecimal():
@@ -281,7 +279,7 @@ def _time_of_name(path: Path) -> float | None:
 
 
 def _time_of_exif(path: Path) -> float | None:
-    """Seconds since 1970 by the camera's clock, None without EXIF."""
+    """Seconds since 1970 by the camera's clock; None without EXIF."""
     from PIL import Image as PillowImage
 
     try:
@@ -289,6 +287,6 @@ def _time_of_exif(path: Path) -> float | None:
             tags = image.getexif().get_ifd(_EXIF)
         day = datetime.strptime(str(tags[_DATE_TIME_ORIGINAL]), "%Y:%m:%d %H:%M:%S")
         fraction = float(f"0.{str(tags.get(_SUB_SEC_TIME_ORIGINAL, 0)).strip()}")
-    except Exception:  # Pillow raises a dozen kinds, for huge images one of its own
+    except Exception:  # Pillow raises a dozen kinds of errors
         return None
     return day.replace(tzinfo=UTC).timestamp() + fraction

@@ -7,76 +7,18 @@ root/poses/NN.txt                                ground truth, for 00 to 10
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, ImageMap
-from vslam.datasets.image_files import (
-    check_not_empty,
-    list_images,
-    read_grey,
-    read_grey_of_size,
-    select_frames,
-    size_text,
-)
-from vslam.datasets.sequence import Image
+from vslam.camera import Camera
+from vslam.datasets.frames import RawSource, Source
+from vslam.datasets.image_files import checked_files, list_images, select_frames
 from vslam.errors import InputError, UnreadableImageError
 from vslam.trajectory import read_kitti_poses, read_table
 
 _HOME = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php"
-
-
-@dataclass(frozen=True)
-class KittiImages:
-    """The selected frames of one sequence; see `vslam.datasets.rectified.RawSequence`.
-
-    Attributes:
-        name: ``00`` for example.
-        size: width and height of the images.
-        timestamps: ``(N,)`` float64 seconds since the first frame of the whole sequence.
-        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` or None; the world is the first left camera
-            of the whole sequence.
-        left, right: N image files each, of equal stems; right is empty for the left camera alone.
-    """
-
-    name: str
-    size: tuple[int, int]
-    timestamps: NDArray[np.float64]
-    ground_truth: NDArray[np.float64] | None
-    left: tuple[Path, ...]
-    right: tuple[Path, ...]
-
-    @property
-    def dataset(self) -> str:
-        return "kitti"
-
-    def __len__(self) -> int:
-        return len(self.left)
-
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
-        """Left and right image ``(H, W)`` uint8 of one frame, None for the right one where the left
-        camera is read alone. Safe to call from several threads.
-
-        Raises:
-            UnreadableImageError: a file is missing, damaged or not of the size of the others.
-        """
-        files = [side[index] for side in (self.left, self.right) if side]
-        left, *right = image_map(self._read, files)
-        return left, right[0] if right else None
-
-    def _read(self, path: Path) -> Image:
-        return read_grey_of_size(path, *self.size)
-
-
-@dataclass(frozen=True)
-class KittiSequence(KittiImages):
-    """See :class:`vslam.datasets.sequence.Sequence`; ``camera`` is from P0 and P1 of the sequence's
-    own ``calib.txt``."""
-
-    camera: Camera
 
 
 def open_kitti(
@@ -87,7 +29,7 @@ def open_kitti(
     every: int = 1,
     max_frames: int | None = None,
     monocular: bool = False,
-) -> KittiSequence:
+) -> Source:
     """Open a sequence with its own calibration; see `open_kitti_images`.
 
     Raises:
@@ -98,9 +40,15 @@ def open_kitti(
         root, name, start=start, every=every, max_frames=max_frames, monocular=monocular
     )
     folder = _find_sequence(_find_root(root), name)
-    width, height = images.size
-    camera = read_calibration(folder / "calib.txt", width=width, height=height)
-    return KittiSequence(**vars(images), camera=camera.left_camera() if monocular else camera)
+    width, height = images.sizes[0]
+    camera = read_calibration(folder / "calib.txt", width=width, height=height, monocular=monocular)
+    return Source(
+        dataset=images.dataset,
+        name=name,
+        camera=camera,
+        stored=images.stored,
+        ground_truth=images.ground_truth,
+    )
 
 
 def open_kitti_images(
@@ -111,8 +59,8 @@ def open_kitti_images(
     every: int = 1,
     max_frames: int | None = None,
     monocular: bool = False,
-) -> KittiImages:
-    """Open the images of a sequence, not its calibration; only the selected frames must be
+) -> RawSource:
+    """Open the images of a sequence without its calibration; only the selected frames must be
     complete.
 
     Frame k belongs to row k of ``times.txt`` and of the poses. Where those files have more rows
@@ -122,11 +70,11 @@ def open_kitti_images(
     Args:
         root: folder that holds ``sequences`` (or ``dataset/sequences``, as KITTI's archives unpack)
             and, optionally, ``poses``.
-        name: ``00`` for example.
+        name: name of the sequence, for example ``00``.
         start: first frame, counted over the images present.
         every: take every N-th frame.
-        max_frames: at most so many, None for all.
-        monocular: read the left camera alone; the right one's images need not be there.
+        max_frames: largest number of frames, None for all.
+        monocular: read the left camera alone; the right camera's images need not exist.
 
     Raises:
         InputError: data missing, images unequal or empty, times or poses unusable.
@@ -134,38 +82,31 @@ def open_kitti_images(
     """
     base = _find_root(root)
     folder = _find_sequence(base, name)
-    sides = [list_images(folder / f"image_{side}") for side in range(1 if monocular else 2)]
-    stems = sorted(set().union(*sides), key=_by_number)
+    listed = [list_images(folder / f"image_{side}") for side in range(1 if monocular else 2)]
+    stems = sorted(set().union(*listed), key=_by_number)
     if not stems:
         raise InputError(
             f"{folder}: no images in image_0 and image_1; "
             f"download the grayscale images (22 GB) from {_HOME}."
         )
     chosen = select_frames(folder, len(stems), start, every, max_frames)
-    rows = _check_frames(folder, sides, [stems[k] for k in chosen])
-    left, *right = zip(*rows, strict=True)
-
-    sizes = [read_grey(path).shape for path in rows[0]]
-    if not monocular and sizes[0] != sizes[1]:
-        raise UnreadableImageError(
-            rows[0][1],
-            f"{size_text(sizes[1])} pixels but the left image has {size_text(sizes[0])}; "
-            "use the rectified images of both cameras.",
-        )
+    sides = _check_frames(folder, listed, [stems[k] for k in chosen])
     times = _read_times(folder / "times.txt")
     frames = _row_numbers(folder / "times.txt", stems, len(times))[chosen]
-    return KittiImages(
-        name=name,
-        size=(sizes[0][1], sizes[0][0]),
-        timestamps=times[frames],
-        ground_truth=_read_ground_truth(base / "poses" / f"{name}.txt", stems, len(times), chosen),
-        left=left,
-        right=() if monocular else right[0],
-    )
+    truth = _read_ground_truth(base / "poses" / f"{name}.txt", stems, len(times), chosen)
+    images = checked_files("kitti", name, times[frames], truth, sides)
+    left, *right = (f"{width}x{height}" for width, height in images.sizes)
+    if right and right[0] != left:
+        raise UnreadableImageError(
+            sides[1][0],
+            f"{right[0]} pixels but the left image has {left}; use the rectified images of both "
+            "cameras.",
+        )
+    return images
 
 
 def list_kitti(root: Path | str) -> list[tuple[str, int, int]]:
-    """Name and numbers of left and right images of each sequence below ``root``.
+    """The name of each sequence in ``root``, and its numbers of left and right images.
 
     Raises:
         InputError: no KITTI data there.
@@ -176,12 +117,15 @@ def list_kitti(root: Path | str) -> list[tuple[str, int, int]]:
     ]
 
 
-def read_calibration(path: Path | str, *, width: int, height: int) -> Camera:
+def read_calibration(
+    path: Path | str, *, width: int, height: int, monocular: bool = False
+) -> Camera:
     """Read P0 and P1 of ``calib.txt``, with or without the ``P0:`` at the beginning of the line.
 
     Args:
         path: file to read.
-        width, height: image size in pixels, which the file does not say.
+        width, height: image size in pixels, which the file does not state.
+        monocular: read P0 alone; P1 need not be there.
 
     Raises:
         InputError: missing or malformed file, NaN, or numbers that no rectified pair can have.
@@ -192,23 +136,26 @@ def read_calibration(path: Path | str, *, width: int, height: int) -> Camera:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: the calibration is missing or unreadable; {fix}.") from error
     keyed = {words[0].rstrip(":"): words[1:] for words in lines if words[0].endswith(":")}
+    names = ["P0"] if monocular else ["P0", "P1"]
     try:
-        pair = [keyed["P0"], keyed["P1"]] if keyed else lines[:2]
-        P0, P1 = np.array(pair, dtype=np.float64).reshape(2, 3, 4)
+        rows = [keyed[name] for name in names] if keyed else lines[: len(names)]
+        P = np.array(rows, dtype=np.float64).reshape(len(names), 3, 4)
     except (KeyError, ValueError) as error:
-        raise InputError(f"{path}: P0 and P1 are not two rows of 12 numbers; {fix}.") from error
-    if not np.isfinite([P0, P1]).all():
-        raise InputError(f"{path}: P0 or P1 holds NaN or infinity; {fix}.")
-    fx, fy, cx, cy = P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2]
-    if not np.allclose(P0[:, :3], P1[:, :3]) or fx <= 0 or fy <= 0:
+        wanted = "P0 is not a row" if monocular else "P0 and P1 are not two rows"
+        raise InputError(f"{path}: {wanted} of 12 numbers; {fix}.") from error
+    if not np.isfinite(P).all():
+        raise InputError(f"{path}: {' or '.join(names)} holds NaN or infinity; {fix}.")
+    fx, fy, cx, cy = P[0, 0, 0], P[0, 1, 1], P[0, 0, 2], P[0, 1, 2]
+    if fx <= 0 or fy <= 0 or not np.allclose(P[0, :, :3], P[-1, :, :3]):
         raise InputError(
             f"{path}: P0 and P1 do not share one positive focal length and centre, so the pair is "
             f"not rectified; {fix}."
         )
-    baseline = (P0[0, 3] - P1[0, 3]) / fx
-    if baseline <= 0:
+    baseline = (P[0, 0, 3] - P[-1, 0, 3]) / fx
+    if baseline <= 0 and not monocular:
         raise InputError(
-            f"{path}: the baseline of P0 and P1 is {baseline:.3f} m but must be positive; {fix}."
+            f"{path}: the baseline of P0 and P1 is {baseline:.3f} m but must be positive; {fix}, "
+            "or run on the left camera alone with --sensor mono."
         )
     if not (0 < cx < width and 0 < cy < height):
         raise InputError(
@@ -246,6 +193,7 @@ def _by_number(stem: str) -> tuple[int, str]:
 def _check_frames(
     folder: Path, sides: list[dict[str, Path]], stems: list[str]
 ) -> list[tuple[Path, ...]]:
+    """The files of these stems on each side."""
     for side, images in enumerate(sides):
         if not images:
             instead = ", or run on the left camera alone with --sensor mono" if side else ""
@@ -264,10 +212,7 @@ def _check_frames(
             f"{folder}: unequal counts, {len(sides[0])} left and {len(sides[1])} right images of "
             f"which {len(sides[0].keys() & sides[1].keys())} frames have both; {fix}."
         )
-    frames = [tuple(side[stem] for side in sides) for stem in stems]
-    for path in (path for frame in frames for path in frame):
-        check_not_empty(path)
-    return frames
+    return [tuple(side[stem] for stem in stems) for side in sides]
 
 
 def _read_times(path: Path) -> NDArray[np.float64]:
@@ -281,7 +226,7 @@ def _read_times(path: Path) -> NDArray[np.float64]:
 
 
 def _row_numbers(path: Path, stems: list[str], n_rows: int) -> NDArray[np.int64]:
-    """Row of ``times.txt`` or of the poses for every image."""
+    """The row of ``times.txt`` or of the poses that belongs to each image."""
     fix = "take the file of this sequence from KITTI's archives"
     if n_rows < len(stems):
         raise InputError(f"{path}: only {n_rows} rows for {len(stems)} images; {fix}.")

@@ -1,78 +1,34 @@
-"""Cameras that film now: a device of this machine, or a URL, of one camera or a pair side by side.
+"""Live cameras: a device of this machine, or a URL, of one camera or a pair side by side.
 
-Time stamps are those of the machine's monotonic clock at the arrival of the image.
+Time stamps are those of the machine's monotonic clock when an image arrives.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from vslam.datasets.capture import Capture, open_capture, read_sides, sizes_of
-from vslam.datasets.stream import TimedFrame
+from vslam.datasets.frames import RawSource, TimedFrame
 from vslam.errors import BrokenSourceError, InputError
 
 _TIMEOUT_MS = 10_000
 _DEVICES = Path("/dev")
 
 
-@dataclass(frozen=True)
-class CameraStream:
-    """See `vslam.datasets.stream.RawStream`; its frames can be had once.
+def open_camera(device: str, *, side_by_side: bool = False, monocular: bool = False) -> RawSource:
+    """Open a camera and take a first image; its frames can be had once.
 
-    Attributes:
-        name: the device's number, or host and path of the URL: never user and password.
-        side_by_side: each frame holds the left image and, right of it, the right one.
-        monocular: the left images alone.
-    """
-
-    name: str
-    capture: Capture
-    sizes: tuple[tuple[int, int], ...]
-    side_by_side: bool
-    monocular: bool
-
-    @property
-    def dataset(self) -> str:
-        return "camera"
-
-    @property
-    def live(self) -> bool:
-        return True
-
-    @property
-    def n_expected(self) -> int | None:
-        return None
-
-    def frames(self) -> Iterator[TimedFrame]:
-        """See `vslam.datasets.stream.RawStream.frames`."""
-        n = 0
-        try:
-            while True:
-                decoded, image = self.capture.read()
-                if not decoded:
-                    break
-                sides = partial(read_sides, image, self.side_by_side, self.monocular)
-                yield TimedFrame(time.monotonic(), sides)
-                n += 1
-        finally:
-            self.capture.release()
-        raise BrokenSourceError(
-            f"camera {self.name}: no image came after {n}; look at its cable or network."
-        )
-
-
-def open_camera(
-    device: str, *, side_by_side: bool = False, monocular: bool = False
-) -> CameraStream:
-    """Open a camera and take a first image.
+    The source is named by the device's number, or by host and path of the URL: never by user and
+    password.
 
     Args:
         device: a number, or a URL.
+        side_by_side: each frame holds the left image and, right of it, the right one.
+        monocular: read the left images alone.
 
     Raises:
         InputError: there is no such device, it is busy, it gives no image, or one image a frame
@@ -91,8 +47,29 @@ def open_camera(
         raise InputError(
             f"camera {name}: gives no image; end other programs that use it, or name another."
         )
-    return CameraStream(
-        name, capture, sizes_of(image, side_by_side, monocular), side_by_side, monocular
+    return RawSource(
+        dataset="camera",
+        name=name,
+        sizes=sizes_of(image, side_by_side, monocular),
+        play=partial(_play, capture, name, side_by_side, monocular),
+        live=True,
+    )
+
+
+def _play(capture: Capture, name: str, side_by_side: bool, monocular: bool) -> Iterator[TimedFrame]:
+    n = 0
+    try:
+        while True:
+            decoded, image = capture.read()
+            if not decoded:
+                break
+            sides = partial(read_sides, image, side_by_side, monocular)
+            yield TimedFrame(time.monotonic(), sides)
+            n += 1
+    finally:
+        capture.release()
+    raise BrokenSourceError(
+        f"camera {name}: no image came after {n}; look at its cable or network."
     )
 
 

@@ -1,4 +1,4 @@
-"""Perturbations of other packages (docs/plugins.md), checked at every image."""
+"""Perturbations of other packages (docs/howto/plugins.md), checked at every image."""
 
 from __future__ import annotations
 

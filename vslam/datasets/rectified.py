@@ -1,122 +1,57 @@
-"""Sequences of images as the cameras took them, rectified on the way in."""
+"""Images as the cameras took them, rectified as they are decoded."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from collections.abc import Sequence as Several
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.calibration.models import Calibration
 from vslam.calibration.rectification import Rectification, rectify
-from vslam.camera import Camera, ImageMap
+from vslam.camera import DepthImage, Image, ImageMap
 from vslam.datasets.depth_images import with_depth
-from vslam.datasets.sequence import DepthImage, Image, Sequence
+from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame
 from vslam.errors import InputError
 
-
-class RawSequence(Protocol):
-    """A `Sequence` without its camera: the images need not be rectified.
-
-    Attributes:
-        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera as it is, or None.
-    """
-
-    @property
-    def dataset(self) -> str: ...
-    @property
-    def name(self) -> str: ...
-    @property
-    def timestamps(self) -> NDArray[np.float64]: ...
-    @property
-    def ground_truth(self) -> NDArray[np.float64] | None: ...
-
-    def __len__(self) -> int: ...
-
-    def read(
-        self, index: int, image_map: ImageMap = map
-    ) -> tuple[Image, Image | DepthImage | None]:
-        """As `Sequence.read`, all images of one side of one size."""
-        ...
+_CUT = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}  # columns and rows cut off
 
 
-@dataclass(frozen=True)
-class RectifiedSequence:
-    """See `rectified`."""
+def rectified(raw: RawSource, calibration: Calibration) -> Source:
+    """A source whose images are rectified as they are read; the maps are computed once.
 
-    raw: RawSequence
-    rectification: Rectification  # its camera is that of the depth, too
-
-    @property
-    def dataset(self) -> str:
-        return self.raw.dataset
-
-    @property
-    def name(self) -> str:
-        return self.raw.name
-
-    @property
-    def camera(self) -> Camera:
-        return self.rectification.camera
-
-    @property
-    def timestamps(self) -> NDArray[np.float64]:
-        return self.raw.timestamps
-
-    @property
-    def ground_truth(self) -> NDArray[np.float64] | None:
-        """Of the rectified left camera, which is turned but not moved."""
-        if self.raw.ground_truth is None:
-            return None
-        T_wc = self.raw.ground_truth.copy()
-        T_wc[:, :3, :3] = T_wc[:, :3, :3] @ self.rectification.R_left_rectified
-        return T_wc
-
-    def __len__(self) -> int:
-        return len(self.raw)
-
-    def read(
-        self, index: int, image_map: ImageMap = map
-    ) -> tuple[Image, Image | DepthImage | None]:
-        """Rectified left and second image; see `Sequence.read`."""
-        return rectify_images(self.rectification, *self.raw.read(index, image_map), image_map)
-
-
-def rectified(raw: RawSequence, calibration: Calibration, *, depth: bool = False) -> Sequence:
-    """A sequence whose images are rectified as they are read, the maps computed once.
-
-    Where the images are rectified already they are handed on as they are.
-
-    Args:
-        depth: the second images are the depth of the first ones' pixels.
+    Images that are rectified already are handed on unchanged.
 
     Raises:
-        InputError: the images are not of the calibrated size, there is no calibration of the
-            right one, or as `vslam.calibration.rectification.rectify`.
-        UnreadableImageError: the first frame cannot be read.
+        InputError: the images are not of the calibrated size, the calibration of the right camera
+            is missing, or as `vslam.calibration.rectification.rectify`.
     """
-    sizes = [(image.shape[1], image.shape[0]) for image in raw.read(0) if image is not None]
-    return RectifiedSequence(raw, rectification_for(calibration, sizes, depth=depth))
+    if raw.depth:  # depth has its pixels where the left image has them
+        alone = _rectification_for(calibration, raw.sizes[:1])
+        rectification = replace(alone, camera=with_depth(alone.camera, calibration))
+    else:
+        rectification = _rectification_for(calibration, raw.sizes)
+    frame = partial(_rectified_frame, rectification)
+    T_wc = raw.ground_truth
+    if T_wc is not None:  # the rectified left camera is turned but not moved
+        T_wc = T_wc.copy()
+        T_wc[:, :3, :3] = T_wc[:, :3, :3] @ rectification.R_left_rectified
+    return Source(
+        dataset=raw.dataset,
+        name=raw.name,
+        camera=rectification.camera,
+        stored=tuple(map(frame, raw.stored)),
+        play=None if raw.seekable else lambda: map(frame, raw.frames()),
+        n_expected=raw.n_expected,
+        live=raw.live,
+        ground_truth=T_wc,
+    )
 
 
-def rectification_for(
-    calibration: Calibration, sizes: Several[tuple[int, int]], *, depth: bool = False
-) -> Rectification:
-    """The rectification of images of one camera or two, by width and height of each one's.
-
-    Args:
-        depth: see `rectified`; depth has its pixels where the left image has them.
-
-    Raises:
-        InputError: see `rectified`.
-    """
-    if depth:
-        alone = rectification_for(calibration, sizes[:1])
-        return replace(alone, camera=with_depth(alone.camera, calibration))
+def _rectification_for(calibration: Calibration, sizes: Several[Size]) -> Rectification:
     if len(sizes) == 1 and calibration.right is not None:
         calibration = calibration.left_alone()
     if len(sizes) == 2 and calibration.right is None:
@@ -127,8 +62,14 @@ def rectification_for(
     models = [model for model in (calibration.left, calibration.right) if model is not None]
     for model, (width, height) in zip(models, sizes, strict=True):
         if (model.width, model.height) != (width, height):
+            cut = model.width - width, model.height - height
             fix = "take the calibration of these images"
-            if (2 * model.width, model.height) == (width, height):
+            if max(cut) == 1 and min(cut) >= 0:
+                fix = (
+                    f"an encoder seems to have cut off the last {_CUT[cut]}; write this size into "
+                    "the calibration, whose other numbers stay the same"
+                )
+            elif (2 * model.width, model.height) == (width, height):
                 fix = "say --side-by-side if each holds both of a stereo pair"
             raise InputError(
                 f"{calibration.source}: made for {model.width}x{model.height} pixels but the "
@@ -137,14 +78,16 @@ def rectification_for(
     return rectify(calibration)
 
 
-def rectify_images(
-    rectification: Rectification,
-    left: Image,
-    second: Image | DepthImage | None,
-    image_map: ImageMap = map,
-) -> tuple[Image, Image | DepthImage | None]:
-    """Both images rectified, or the left one where there is no second one; depth by
-    the nearest pixel."""
+def _rectified_frame(rectification: Rectification, frame: TimedFrame) -> TimedFrame:
+    file = frame.file if rectification.identity else None
+    colour = None if frame.colour is None else partial(_read_colour, rectification, frame.colour)
+    return replace(frame, read=partial(_read, rectification, frame), file=file, colour=colour)
+
+
+def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) -> Images:
+    """Both images rectified, or the left one if there is no second one; depth by the nearest
+    pixel."""
+    left, second = frame.read(image_map)
     left_side: Callable[[], Image | DepthImage] = partial(rectification.left, left)
     if second is None:
         return np.asarray(left_side(), np.uint8), None
@@ -155,6 +98,12 @@ def rectify_images(
         second_side = partial(rectification.right, np.asarray(second, np.uint8))
     first, other = image_map(_call, [left_side, second_side])
     return np.asarray(first, np.uint8), other
+
+
+def _read_colour(
+    rectification: Rectification, colour: Callable[[], NDArray[np.uint8]]
+) -> NDArray[np.uint8]:
+    return np.asarray(rectification.left(colour()), np.uint8)
 
 
 def _call(function: Callable[[], Image | DepthImage]) -> Image | DepthImage:

@@ -2,8 +2,8 @@
 
 FOLDER/rgb.txt, depth.txt    a time in seconds and an image file a line
 FOLDER/groundtruth.txt       optional: t tx ty tz qx qy qz qw
-FOLDER/calibration.yaml      optional: the camera (docs/cameras.md); without it one of TUM's three,
-                             by "freiburg1", "freiburg2" or "freiburg3" in the folder's name
+FOLDER/calibration.yaml      optional: the camera (docs/howto/cameras.md); without it one of TUM's
+                             three, by "freiburg1", "freiburg2" or "freiburg3" in the folder's name
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration, CameraModel
 from vslam.datasets.association import associate
-from vslam.datasets.depth_images import DepthFiles, checked_depth_files, image_size
+from vslam.datasets.depth_images import depth_files
+from vslam.datasets.frames import Source
 from vslam.datasets.ground_truth import poses_at
-from vslam.datasets.image_files import find_sequence, select_frames
+from vslam.datasets.image_files import checked_files, find_sequence, image_size, select_frames
 from vslam.datasets.rectified import rectified
-from vslam.datasets.sequence import Sequence
 from vslam.errors import InputError
 from vslam.trajectory import read_trajectory
 
@@ -51,7 +51,7 @@ def open_tum(
     monocular: bool = False,
     calib: Several[Path | str] = (),
     depth_scale: float | None = None,
-) -> Sequence:
+) -> Source:
     """Open a sequence; its images are undistorted as they are read.
 
     A frame is a colour image with the depth image nearest in time, within 20 ms; each is used
@@ -60,13 +60,14 @@ def open_tum(
 
     Args:
         root: the sequence's folder, or one with several.
-        name: of the sequence in it; None for the folder itself, or the only one in it.
+        name: name of the sequence in it; None for the folder itself, or the only one in it.
         start: first frame, counted over the pairs.
         every: take every N-th frame.
-        max_frames: at most so many, None for all.
-        monocular: read the colour images alone; there need be no depth.
-        calib: file to be used instead of the folder's, or of TUM's cameras.
-        depth_scale: what depth images count in a metre; None: as the calibration says, or 5000.
+        max_frames: largest number of frames, None for all.
+        monocular: read the colour images alone; depth images need not exist.
+        calib: calibration file, which replaces the folder's own and those of TUM's cameras.
+        depth_scale: how many units of the depth images make a metre; None takes the calibration's
+            value, or 5000.
 
     Raises:
         InputError: data missing or malformed, no pairs, calibration or ground truth unusable.
@@ -81,9 +82,9 @@ def open_tum(
         )
     times, colour_files = _read_list(folder / "rgb.txt")
     frames = partners = np.arange(len(times))
-    depth_files: list[Path] = []
+    files_of_depth: list[Path] = []
     if not monocular:
-        depth_times, depth_files = _read_list(folder / "depth.txt")
+        depth_times, files_of_depth = _read_list(folder / "depth.txt")
         frames, partners = associate(times, depth_times, _NEAR_S)
         if not len(frames):
             raise InputError(
@@ -93,21 +94,18 @@ def open_tum(
     chosen = select_frames(folder, len(frames), start, every, max_frames)
     times = times[frames[chosen]]
     colour = tuple(colour_files[k] for k in frames[chosen])
-    depth = () if monocular else tuple(depth_files[k] for k in partners[chosen])
-    size = image_size(colour[0])
-    calibration = _calibration(folder, calib, size)
-    truth = folder / "groundtruth.txt"
-    raw = DepthFiles(
-        dataset="tum",
-        name=folder.resolve().name,
-        timestamps=times,
-        ground_truth=(poses_at(truth, read_trajectory(truth), times) if truth.is_file() else None),
-        colour=colour,
-        depth=depth,
-        size=size,
-        depth_scale=depth_scale or calibration.depth_scale or _DEPTH_SCALE,
+    calibration = _calibration(folder, calib, image_size(colour[0]))
+    found, truth_file = folder.resolve().name, folder / "groundtruth.txt"
+    truth = (
+        poses_at(truth_file, read_trajectory(truth_file), times) if truth_file.is_file() else None
     )
-    return rectified(checked_depth_files(raw), calibration, depth=not monocular)
+    if monocular:
+        raw = checked_files("tum", found, times, truth, [colour])
+    else:
+        depth = tuple(files_of_depth[k] for k in partners[chosen])
+        scale = depth_scale or calibration.depth_scale or _DEPTH_SCALE
+        raw = depth_files("tum", found, times, truth, colour, depth, scale)
+    return rectified(raw, calibration)
 
 
 def is_tum(folder: Path) -> bool:

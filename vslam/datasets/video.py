@@ -2,64 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
 
-from vslam.datasets.capture import Capture, open_capture, read_sides, sizes_of
-from vslam.datasets.sequence import Image
-from vslam.datasets.stream import TimedFrame
+from vslam.camera import Image
+from vslam.datasets.capture import Capture, left_in_colour, open_capture, read_sides, sizes_of
+from vslam.datasets.frames import RawSource, TimedFrame
 from vslam.errors import BrokenSourceError, InputError
 from vslam.untrusted import MOST_PIXELS
 
+_log = logging.getLogger(__name__)
+
 _CONVERT = "convert the video, with ffmpeg -i VIDEO -c:v libx264 -crf 12 NEW.mp4 for example"
+_SAME_RATE = 0.02  # 30 and 29.97 frames per second are the same
 _MISSING_SHARE = 0.05  # what the end may lack of the frames that the file speaks of: it estimates
-
-
-@dataclass(frozen=True)
-class VideoStream:
-    """See `vslam.datasets.stream.RawStream`.
-
-    Attributes:
-        fps: frames a second, in place of the file's time stamps; None for these.
-        side_by_side: each frame holds the left image and, right of it, the right one.
-        monocular: the left images alone.
-    """
-
-    path: Path
-    sizes: tuple[tuple[int, int], ...]
-    n_expected: int | None
-    fps: float | None
-    side_by_side: bool
-    monocular: bool
-
-    @property
-    def dataset(self) -> str:
-        return "video"
-
-    @property
-    def name(self) -> str:
-        return self.path.stem
-
-    @property
-    def live(self) -> bool:
-        return False
-
-    def frames(self) -> Iterator[TimedFrame]:
-        """See `vslam.datasets.stream.RawStream.frames`."""
-        n = 0
-        for timestamp, image in _images(_open(self.path)):
-            timestamp = timestamp if self.fps is None else n / self.fps
-            sides = partial(read_sides, image, self.side_by_side, self.monocular)
-            yield TimedFrame(timestamp, sides)
-            n += 1
-        if self.n_expected is not None and n + 1 < (1.0 - _MISSING_SHARE) * self.n_expected:
-            raise BrokenSourceError(
-                f"{self.path}: the video breaks off after {n} of about {self.n_expected} frames; "
-                "copy it again."
-            )
 
 
 def open_video(
@@ -68,8 +27,13 @@ def open_video(
     fps: float | None = None,
     side_by_side: bool = False,
     monocular: bool = False,
-) -> VideoStream:
+) -> RawSource:
     """Open a video and decode its first frames.
+
+    Args:
+        fps: frames per second, instead of the file's time stamps; None uses these.
+        side_by_side: each frame holds the left image and, right of it, the right one.
+        monocular: read the left images alone.
 
     Raises:
         InputError: no such file, no decoder for it, no time stamps and no ``fps``, or one image a
@@ -83,15 +47,40 @@ def open_video(
     path = Path(path)
     capture = _open(path)
     _check_size(path, capture)
-    n = _count(capture)
+    n, own = _count(capture), _own_rate(capture)
     first = list(islice(_images(capture), 2))
     if not first:
         raise InputError(f"{path}: holds no image that can be decoded; {_CONVERT}.")
     times = [timestamp for timestamp, _ in first]
     if fps is None and len(times) == 2 and times[1] <= times[0]:
         raise InputError(f"{path}: the video has no time stamps; give --fps.")
-    sizes = sizes_of(first[0][1], side_by_side, monocular)
-    return VideoStream(path, sizes, n, fps, side_by_side, monocular)
+    if fps is not None and len(times) == 2 and times[1] > times[0]:
+        _compare_rates(path, fps, own)
+    return RawSource(
+        dataset="video",
+        name=path.stem,
+        sizes=sizes_of(first[0][1], side_by_side, monocular),
+        play=partial(_play, path, n, fps, side_by_side, monocular),
+        n_expected=n,
+    )
+
+
+def _play(
+    path: Path, n_expected: int | None, fps: float | None, side_by_side: bool, monocular: bool
+) -> Iterator[TimedFrame]:
+    n = 0
+    for timestamp, image in _images(_open(path)):
+        timestamp = timestamp if fps is None else n / fps
+        yield TimedFrame(
+            timestamp,
+            partial(read_sides, image, side_by_side, monocular),
+            colour=partial(left_in_colour, image, side_by_side),
+        )
+        n += 1
+    if n_expected is not None and n + 1 < (1.0 - _MISSING_SHARE) * n_expected:
+        raise BrokenSourceError(
+            f"{path}: the video breaks off after {n} of about {n_expected} frames; copy it again."
+        )
 
 
 def _open(path: Path) -> Capture:
@@ -124,6 +113,24 @@ def _count(capture: Capture) -> int | None:
 
     n = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     return n if n > 0 else None
+
+
+def _own_rate(capture: Capture) -> float:
+    """Frames per second by the file, 0 if it does not say."""
+    import cv2
+
+    return float(capture.get(cv2.CAP_PROP_FPS))
+
+
+def _compare_rates(path: Path, fps: float, own: float) -> None:
+    if own > 0 and abs(fps - own) > _SAME_RATE * own:
+        _log.warning(
+            "%s: --fps %g contradicts the %.4g frames per second of the video itself; leave it "
+            "out unless those are wrong.",
+            path,
+            fps,
+            own,
+        )
 
 
 def _images(capture: Capture) -> Iterator[tuple[float, Image]]:

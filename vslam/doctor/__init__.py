@@ -1,1 +1,1 @@
-"""What to look at before a run: images, calibration and times, each with a verdict and a fix."""
+"""Checks of images, calibration and timestamps before a run, each with a verdict and a fix."""

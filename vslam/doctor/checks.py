@@ -1,6 +1,7 @@
-"""The checks, as functions of images, matches and times. Thresholds are named at the top.
+"""The checks, as functions of images, matches and timestamps.
 
-One file because each check is a few lines, and their thresholds are read together.
+They share one file because each is a few lines and their thresholds are easier to compare in one
+place.
 """
 
 from __future__ import annotations
@@ -12,9 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
+from vslam.camera import Camera, Image
 from vslam.config import OrbConfig
-from vslam.datasets.sequence import Image
 from vslam.doctor.findings import Finding, judge
 from vslam.doctor.focal_length import FocalFit
 from vslam.doctor.matching import Matches, count_views
@@ -23,42 +23,43 @@ from vslam.frontend.orb import extract
 Times = NDArray[np.float64]
 Depth = NDArray[Any]  # numbers, 0 or NaN where missing
 
-# Matches are looked for in the same rows, to 2 px; KITTI's own rectification is off by 0.3 to 0.5.
+# A run searches for stereo matches within 2 rows; KITTI's rectification is off by 0.3 to 0.5 px.
 ROWS_PX = 0.8
-IN_FRONT = 0.9  # share of matches with positive disparity; distant ones scatter about zero
-EXPOSURE = 0.25  # of the brightness; the window of the stereo match is compared grey by grey
-LAG_GAIN_PX = 0.25  # another lag must make rows better by so much, and by the factor below
+IN_FRONT = 0.9  # share of matches with positive disparity; distant points scatter about zero
+EXPOSURE = 0.25  # relative difference in brightness; stereo matching compares grey values
+LAG_GAIN_PX = 0.25  # another lag must reduce the row error by this much, and to this fraction:
 LAG_FACTOR = 0.6
-FEATURES = 0.5  # of those asked for
-# Contrast of pixels with their neighbours, to that with their wider surroundings: KITTI 0.43, TUM
-# 0.25, EuRoC 0.27; at most 0.17 after a Gaussian blur of 1.5 px.
+FEATURES = 0.5  # share of the requested features
+# Contrast of pixels with their neighbours, relative to the contrast with a wider neighbourhood:
+# KITTI 0.43, TUM 0.25, EuRoC 0.27; at most 0.17 after a Gaussian blur of 1.5 px.
 SHARP = 0.18
-JITTER = 0.2  # of the interval, standard deviation
-GAP = 1.75  # of the interval: a frame is missing
-GAPS = 0.05  # share of intervals, and two standard deviations more: few intervals scatter
-LONG_GAP = 3.5  # of the interval: two or more frames are missing in a row
+JITTER = 0.2  # standard deviation, as a share of the interval
+GAP = 1.75  # a longer step, in intervals, means that a frame is missing
+GAPS = 0.05  # share of intervals with gaps; two standard deviations are added, since few scatter
+LONG_GAP = 3.5  # a longer step, in intervals, means that two or more frames are missing in a row
 DEPTH_PX = 4.0  # depth edges of structured light are off by 2 to 3 px
-DEPTH_SHARE = 0.3
-# Depth is off only where the fit has one clear peak elsewhere. Heights above the median, to that of
-# the best: in nine windows of TUM fr1/desk at least 0.67 near shift 0 or one more peak of 0.85;
-# with its depth moved by 20 px, 0.25 to 0.66 and mostly 0.65 to 0.77.
+DEPTH_SHARE = 0.3  # of the pixels must have a depth
+# Depth is misregistered only if the fit has one clear peak away from shift 0. Heights are above the
+# median, relative to the highest peak. In nine windows of TUM fr1/desk the height near shift 0 is
+# at least 0.67, or the second peak has 0.85; with depth moved by 20 px, the height near 0 is 0.25
+# to 0.66 and the second peak mostly has 0.65 to 0.77.
 DEPTH_AT_ZERO = 0.6
 DEPTH_SECOND = 0.8
-_ANOTHER_PX = 8.0  # what lies so far from the best is another peak
-DEPTH_VIEWS = 2  # that do not share half of what they show: one scene may fit elsewhere by chance
-NEAREST_M, FARTHEST_M = 0.01, 3.0  # that the cameras of a pair stand apart on what drives or flies
+_ANOTHER_PX = 8.0  # a peak at this distance from the highest is a second one
+DEPTH_VIEWS = 2  # views with less than half in common; a single scene may fit elsewhere by chance
+NEAREST_M, FARTHEST_M = 0.01, 3.0  # plausible baselines of a stereo pair on a vehicle
 # Motion fits 0.975 to 1.026 of the right focal length (KITTI 00 0.98, three parts of fr1/desk, six
-# rendered drives), and 0.89 to 0.93 of one that is 10 % too long.
+# rendered drives), and 0.89 to 0.93 of a focal length that is 10 % too long.
 FOCAL = 0.05
 FOCAL_SIGMA = 0.01  # straight roads give 0.05 and more
-TURNED = 2.0  # degrees: straight roads have up to 1.6 from frame to fourth frame
-NEAREST_DEPTH_M, FARTHEST_DEPTH_M = 0.05, 100.0  # that half of the depths of a sensor lie between
-_BORDER = 2  # px; a best so near the end of the search may lie behind it
-_REACH = 16, 48  # px that depth edges are looked for, down and across: sensors lie side by side
+TURNED = 2.0  # degrees; straight roads have up to 1.6 between a frame and the fourth after it
+NEAREST_DEPTH_M, FARTHEST_DEPTH_M = 0.05, 100.0  # plausible median depths of a sensor
+_BORDER = 2  # px; a peak this near the end of the search range may lie beyond it
+_REACH = 16, 48  # px, search range down and across, where the two sensors lie side by side
 
 
 def check_rectification(matches: Matches) -> Finding:
-    """Median distance of matching rows."""
+    """Check the median row difference of matches."""
     rows = float(np.median(np.abs(matches.left[:, 1] - matches.right[:, 1])))
     return judge(
         "rectification",
@@ -69,14 +70,14 @@ def check_rectification(matches: Matches) -> Finding:
 
 
 def check_sides(matches: Matches) -> Finding:
-    """Sign of the disparity."""
+    """Check the sign of the disparity."""
     disparity = matches.left[:, 0] - matches.right[:, 0]
     in_front = float(np.mean(disparity > -ROWS_PX))
     middle = float(np.median(disparity))
-    measured = f"median disparity {middle:.1f} px, {100 * in_front:.0f} % not behind infinity"
+    measured = f"median disparity {middle:.1f} px, {100 * in_front:.0f} % not negative"
     if float(np.median(np.abs(disparity))) < 0.1:
         return Finding(
-            "sides", "fault", measured, "both sides show the same image: name the right camera's"
+            "sides", "fault", measured, "both sides show the same image: give the right camera's"
         )
     return judge(
         "sides",
@@ -84,16 +85,16 @@ def check_sides(matches: Matches) -> Finding:
         measured,
         "left and right are swapped, or the baseline has the wrong sign: exchange the cameras"
         if middle < 0
-        else "many matches lie behind infinity: the cameras are turned outwards; calibrate again",
+        else "many disparities are negative: the cameras are turned outwards; calibrate again",
     )
 
 
 def check_scale(camera: Camera, matches: Matches | None) -> Finding:
-    """What the calibration says of lengths and angles, for people to compare with what they see: no
-    image shows a wrong baseline. One of another unit is told by its size.
+    """Report the field of view, the baseline and the median depth, for the user to compare with the
+    scene, since images do not reveal a wrong baseline; only one in a wrong unit is a fault.
 
     Args:
-        matches: of the pair, None of a single camera or of one with depth.
+        matches: matches of the stereo pair; None for a monocular or RGB-D camera.
     """
     angles = (
         2 * np.degrees(np.arctan(size / (2 * focal)))
@@ -117,26 +118,26 @@ def check_scale(camera: Camera, matches: Matches | None) -> Finding:
 
 
 def check_focal_length(fit: FocalFit | None, camera: Camera) -> Finding:
-    """Whether turns of the camera fit the calibration's focal length.
+    """Check whether the camera's rotations fit the calibration's focal length.
 
     Args:
-        fit: None where too few frames have points in common.
+        fit: None if too few frames have points in common.
     """
     if fit is None:
         return Finding("focal length", "unknown", "too few frames have points in common")
     if fit.turned < TURNED or fit.sigma > FOCAL_SIGMA:
-        return Finding("focal length", "unknown", "the camera hardly turns in the frames looked at")
+        return Finding("focal length", "unknown", "the camera hardly turns in the frames examined")
     return judge(
         "focal length",
         abs(np.log(fit.factor)) > FOCAL,
         f"turns of up to {fit.turned:.0f} degrees fit {fit.factor * camera.fx:.0f} px, the "
         f"calibration says {camera.fx:.0f}",
-        "the calibration is of another zoom, size or crop of the images: calibrate again",
+        "the calibration belongs to another zoom, size or crop of the images: calibrate again",
     )
 
 
 def check_exposure(pairs: Sequence[tuple[Image, Image]], several: Sequence[Matches]) -> Finding:
-    """Brightness of the same points in both images."""
+    """Compare the brightness of the same points in both images."""
     ratios = []
     for (left, right), matches in zip(pairs, several, strict=True):
         greys = [
@@ -154,14 +155,15 @@ def check_exposure(pairs: Sequence[tuple[Image, Image]], several: Sequence[Match
 
 
 def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, int]:
-    """Where a right image later or earlier fits better, the sides are not of one time.
+    """Check whether an earlier or later right image fits better, because the two cameras are not
+    synchronised.
 
     Args:
-        rows_of_lag: median vertical error (px) by how many frames later the right image is; empty
-            where no frame has matches at all of them.
+        rows_of_lag: median vertical error (px) for each number of frames by which the right image
+            is later; empty if no frame has matches at all of them.
 
     Returns:
-        The finding, and the best lag: 0 where the camera hardly moves.
+        The finding, and the best lag, which is 0 if the camera hardly moves.
     """
     if not rows_of_lag:
         return Finding("synchronisation", "unknown", "too few frames with matches"), 0
@@ -184,39 +186,39 @@ def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, in
 
 
 def check_features(images: Sequence[Image], config: OrbConfig) -> Finding:
-    """Number of features per image."""
+    """Check the number of features per image."""
     counts = [len(extract(image, config).xy) for image in images]
     middle = int(np.median(counts))
     return judge(
         "features",
         middle < FEATURES * config.n_features,
-        f"median {middle}, least {min(counts)} of {config.n_features} asked for",
+        f"median {middle}, least {min(counts)} of {config.n_features} requested features",
         "too little texture or light: more light, longer exposure, or a lower threshold "
-        "(docs/thresholds.md)",
+        "(docs/reference/thresholds.md)",
     )
 
 
 def check_sharpness(images: Sequence[Image]) -> Finding:
-    """Contrast of pixels with their neighbours, as a share of that with wider surroundings."""
+    """Check the contrast of pixels with their neighbours relative to a wider neighbourhood."""
     shares = [sharpness(image) for image in images]
     middle = float(np.median(shares))
     return judge(
         "sharpness",
         middle < SHARP,
         f"median {middle:.2f}, least {min(shares):.2f}; below {SHARP} features blur",
-        "focus the lens, clean it, or expose shorter",
+        "focus the lens, clean it, or use a shorter exposure",
     )
 
 
 def sharpness(image: Image) -> float:
-    """0 for an image without fine contrast, about 1 for white noise."""
+    """Sharpness of an image: 0 without fine contrast, about 1 for white noise."""
     grey = image.astype(np.float32)
     fine, wide = (grey - cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1.0, 4.0))
     return float(np.std(fine) / max(float(np.std(wide)), 1e-6))
 
 
 def check_times(timestamps: Times) -> list[Finding]:
-    """Order, gaps and jitter of time stamps (s), which need not increase."""
+    """Check order, gaps and jitter of timestamps (s), which need not increase."""
     steps = np.diff(timestamps)
     if len(steps) < 3:
         return [Finding("times", "unknown", f"{len(timestamps)} frames are too few")]
@@ -247,30 +249,30 @@ def check_times(timestamps: Times) -> list[Finding]:
         "jitter",
         jitter > JITTER,
         f"standard deviation {100 * jitter:.1f} % of the interval of {1e3 * interval:.1f} ms",
-        "take the time of the exposure from the camera, not that of the arrival",
+        "use the camera's time of exposure instead of the time of arrival",
     )
     return [order, gap, steady]
 
 
 def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Finding]:
-    """Whether depth belongs to the images' pixels.
+    """Check whether depth is registered to the images.
 
-    Edges of depth are edges of the image: the shift at which they fit best is 0 where the depth is
-    registered.
+    Depth edges coincide with image edges, so the shift at which they fit best is 0 for registered
+    depth.
     """
     depths = [np.nan_to_num(depth.astype(np.float32)) for depth in depths]
     share = float(np.mean([np.mean(depth > 0) for depth in depths]))
     middle = float(np.median(np.concatenate([d[d > 0].ravel() for d in depths]))) if share else 0.0
     measured = f"{100 * share:.0f} % of the pixels have a depth"
     if share and not NEAREST_DEPTH_M <= middle <= FARTHEST_DEPTH_M:
-        unit = "the depth factor is wrong: --depth-scale says what depth images count in a metre"
+        unit = "the depth factor is wrong: give the value of one metre with --depth-scale"
         half = f"{measured}, half of them nearer than {middle:.3g} m"
         return [Finding("depth", "fault", half, unit)]
     there = judge(
         "depth",
         share < DEPTH_SHARE,
         f"{measured}, half of them nearer than {middle:.3g} m",
-        "the sensor sees little within its range: check the depth factor, or move closer",
+        "few points lie within the sensor's range: check the depth factor, or move closer",
     )
     fit = np.sum([_edge_fit(*pair) for pair in zip(images, depths, strict=True)], axis=0)
     contrast = float((fit.max() - np.median(fit)) / max(float(np.std(fit)), 1e-12))
@@ -280,8 +282,8 @@ def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Findin
 
 
 def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding:
-    """A fault where the best shift is a clear one (no ridge, no second peak, no end of a search)
-    and more than one view has been seen."""
+    """Report a fault only if the best shift is a single clear peak inside the search range and more
+    than one view was examined."""
     reach = np.array(_REACH)
     best = np.array(np.unravel_index(np.argmax(fit), fit.shape)) - reach
     shifts = np.moveaxis(np.indices(fit.shape), 0, -1) - reach
@@ -306,7 +308,7 @@ def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding
 
 
 def _edge_fit(image: Image, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Mean edge strength of the image at the edges of depth, by shift of these."""
+    """Mean edge strength of the image at the depth edges, for each shift of the depth."""
     down, across = _REACH
     grey = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
     strength = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
@@ -319,7 +321,7 @@ def _edge_fit(image: Image, depth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def depth_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """``(H, W)``: pixels whose depth (0 where missing) jumps by a tenth."""
+    """``(H, W)`` bool: pixels where the depth (0 if missing) jumps by more than a tenth."""
     with np.errstate(divide="ignore", invalid="ignore"):
         log = np.where(depth > 0, np.log(depth), np.nan)
         jump = np.zeros(depth.shape, bool)

@@ -1,4 +1,4 @@
-"""Look a sequence over: a few frames spread over it, and all its times."""
+"""Examining a sequence: all its timestamps, and a few frames spread over it."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
+from vslam.camera import Camera, DepthImage, Image
 from vslam.config import OrbConfig
-from vslam.datasets.sequence import DepthImage, Image, Sequence
+from vslam.datasets.frames import Source
 from vslam.doctor import checks
 from vslam.doctor.findings import Finding, judge
 from vslam.doctor.focal_length import Moved, fit_focal_length
 from vslam.doctor.matching import Matches, joined, match_images
 from vslam.errors import UnreadableImageError
 
-_FRAMES = 8  # looked at, spread over the sequence
-_LAGS = range(-2, 3)  # frames that the right side may be early or late
-_TURNS, _LATER = 16, 4  # pairs of frames looked at for the focal length; frames between them
-_FEWEST, _MOST = 30, 200  # points that they must have in common, and that are taken of these
+_FRAMES = 8  # examined frames, spread over the sequence
+_LAGS = range(-2, 3)  # frames by which the right image may be late
+_TURNS, _LATER = 16, 4  # pairs of frames for the focal length; distance of a pair in frames
+_FEWEST, _MOST = 30, 200  # least number of common points of such a pair; most that are used
 _PICTURES = 2
 _LEAST_DISPARITY = 1.0  # px
 _DRAWN = 60  # matches in a picture
@@ -29,7 +29,7 @@ _GREEN, _RED, _BLUE = (80, 200, 60), (60, 60, 230), (230, 150, 50)  # BGR
 
 @dataclass(frozen=True)
 class Picture:
-    """``image``: ``(H, W, 3)`` uint8, BGR."""
+    """A picture of the page: ``image`` is ``(H, W, 3)`` uint8, BGR."""
 
     caption: str
     image: Image
@@ -37,7 +37,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found, in the order of the checks, and pictures that show it."""
+    """The findings in the order of the checks, and pictures that illustrate them."""
 
     findings: list[Finding]
     pictures: list[Picture] = field(default_factory=list)
@@ -48,10 +48,10 @@ class Diagnosis:
         return [finding for finding in self.findings if finding.verdict == "fault"]
 
 
-def examine(sequence: Sequence, config: OrbConfig) -> Diagnosis:
-    """Run all checks that the sequence allows: stereo, depth or one camera.
+def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
+    """Run all checks that apply to the sequence: stereo, RGB-D or monocular.
 
-    Images are those that a run would see: rectified ones.
+    The images are rectified, as in a run.
     """
     frames = np.unique(np.linspace(0, len(sequence) - 1, _FRAMES).round().astype(int)).tolist()
     read: dict[int, tuple[Image, Image | DepthImage | None]] = {}
@@ -65,7 +65,7 @@ def examine(sequence: Sequence, config: OrbConfig) -> Diagnosis:
         judge(
             "images",
             bool(problems),
-            f"{len(frames) - len(problems)} of {len(frames)} frames looked at can be read"
+            f"{len(frames) - len(problems)} of {len(frames)} examined frames can be read"
             + "".join(f"; {problem.rstrip('.')}" for problem in problems[:1]),
             "replace the damaged files",
         )
@@ -102,8 +102,8 @@ class _Pair:
         return float(np.median(np.abs(self.matches.left[:, 1] - self.matches.right[:, 1])))
 
 
-def _pairs(sequence: Sequence, lefts: dict[int, Image], lag: int) -> list[_Pair]:
-    """Left images with the right ones so many frames later, where both can be read."""
+def _pairs(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
+    """Pairs of left images and the right images ``lag`` frames later, if both can be read."""
     found = []
     for frame, left in lefts.items():
         try:
@@ -117,20 +117,20 @@ def _pairs(sequence: Sequence, lefts: dict[int, Image], lag: int) -> list[_Pair]
 
 
 def _examine_stereo(
-    sequence: Sequence, lefts: dict[int, Image], *, blind: bool
+    sequence: Source, lefts: dict[int, Image], *, blind: bool
 ) -> tuple[list[Finding], list[Picture]]:
-    inner = dict(list(lefts.items())[1:-1:2])  # with frames before and behind
+    inner = dict(list(lefts.items())[1:-1:2])  # these have frames before and after them
     by_lag = {lag: _pairs(sequence, inner if lag else lefts, lag) for lag in _LAGS}
     pairs = by_lag[0]
     if not any(len(pair.matches) for pair in pairs):
-        fix = "the two sides show nothing in common: check that they are one pair's, and calibrated"
+        fix = "the two images have no common view: check that they form a pair and are calibrated"
         measured = "no pair of images has 12 matches"
         finding = Finding("stereo", "fault", measured, fix)
         if blind:
             finding = Finding("stereo", "unknown", f"{measured}; they have few features")
         return [finding], [_stereo_picture(pair) for pair in pairs[:1]]
     synchronised, lag = checks.check_synchronisation(_rows_by_lag(by_lag))
-    pairs = by_lag[lag]  # what else is wrong shows at the right time only
+    pairs = by_lag[lag]  # the other checks need synchronised images
     matches = joined([pair.matches for pair in pairs])
     findings = [
         synchronised,
@@ -146,8 +146,8 @@ def _examine_stereo(
     return findings, [_stereo_picture(pair) for pair in shown]
 
 
-def _examine_focal_length(sequence: Sequence, found: list[Finding]) -> list[Finding]:
-    """Nothing where the second images have a fault, which would be blamed on the focal length."""
+def _examine_focal_length(sequence: Source, found: list[Finding]) -> list[Finding]:
+    """Check the focal length, unless another fault of the images would distort the result."""
     if any(finding.verdict == "fault" for finding in found):
         return []
     last = len(sequence) - 1 - _LATER
@@ -157,9 +157,9 @@ def _examine_focal_length(sequence: Sequence, found: list[Finding]) -> list[Find
     return [checks.check_focal_length(fit, sequence.camera)]
 
 
-def _moved(sequence: Sequence, frame: int) -> Moved | None:
-    """Points of a frame with their disparity, and where they are a few frames later; None where
-    there are too few, or an image cannot be read."""
+def _moved(sequence: Source, frame: int) -> Moved | None:
+    """Points of a frame with their disparities and their positions a few frames later; None if
+    there are too few points or an image cannot be read."""
     try:
         left, second = sequence.read(frame)
         later, _ = sequence.read(frame + _LATER)
@@ -180,7 +180,7 @@ def _moved(sequence: Sequence, frame: int) -> Moved | None:
 def _disparities(
     xy: NDArray[np.float32], left: Image, second: Image | DepthImage, camera: Camera
 ) -> NDArray[np.float64]:
-    """Of keypoints of the left image; 0 where the pair or the depth has none."""
+    """``(N,)`` disparities of ``(N, 2)`` keypoints of the left image; 0 without match or depth."""
     if second.dtype != np.uint8:
         x, y = np.rint(xy).astype(int).T
         depth = np.asarray(second, np.float64)[y, x]
@@ -196,7 +196,7 @@ def _disparities(
 
 
 def _rows_by_lag(by_lag: dict[int, list[_Pair]]) -> dict[int, float]:
-    """Median vertical error by lag, over the frames that have matches at all of them."""
+    """Median vertical error for each lag, over the frames that have matches at all lags."""
     rows = {
         lag: {pair.frame: pair.rows for pair in pairs if len(pair.matches)}
         for lag, pairs in by_lag.items()
@@ -210,7 +210,7 @@ def _rows_by_lag(by_lag: dict[int, list[_Pair]]) -> dict[int, float]:
 
 
 def _stereo_picture(pair: _Pair) -> Picture:
-    """Both images beside each other with the rows, and matches in green where rows agree."""
+    """Both images side by side, with rows, and with matches in green if their rows agree."""
     left, right, matches = pair.left, pair.right, pair.matches
     height = max(left.shape[0], right.shape[0])
     canvas = np.zeros((height, left.shape[1] + right.shape[1]), np.uint8)
@@ -229,15 +229,15 @@ def _stereo_picture(pair: _Pair) -> Picture:
         cv2.line(drawn, a, b, color, 1, cv2.LINE_AA)
     other = f" with the right image of frame {pair.frame + pair.lag}" if pair.lag else ""
     caption = (
-        f"Frame {pair.frame}{other}: rows in blue; matches in green where their rows agree to "
-        f"{checks.ROWS_PX} px, else in red. In a rectified pair all are level."
+        f"Frame {pair.frame}{other}: rows in blue; matches in green if their rows agree to "
+        f"{checks.ROWS_PX} px, otherwise in red. In a rectified pair all matches are horizontal."
     )
     return Picture(caption, np.asarray(drawn, np.uint8))
 
 
 def _depth_picture(image: Image, depth: checks.Depth) -> Picture:
-    """Edges of depth over the image."""
+    """Depth edges drawn over the image."""
     drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     drawn[checks.depth_edges(np.nan_to_num(depth.astype(np.float32)))] = _RED
-    caption = "Edges of depth in red over the image: registered depth has them on the objects."
+    caption = "Depth edges in red over the image; registered depth has them at the objects' edges."
     return Picture(caption, np.asarray(drawn, np.uint8))

@@ -1,4 +1,4 @@
-"""What a check says."""
+"""The result of a check."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ class Finding:
     """The result of one check.
 
     Attributes:
-        check: what was looked at.
-        verdict: ``unknown`` where the images do not tell.
-        measured: what was found, with units.
-        fix: what to do; empty where all is well.
+        check: name of the check.
+        verdict: ``unknown`` if the images are not conclusive.
+        measured: the measurement, with units.
+        fix: what to do; empty unless there is a fault.
     """
 
     check: str
@@ -26,5 +26,5 @@ class Finding:
 
 
 def judge(check: str, wrong: bool, measured: str, fix: str) -> Finding:
-    """``good`` or ``fault``; the fix is for faults only."""
+    """A ``fault`` with its fix, or ``good``."""
     return Finding(check, "fault", measured, fix) if wrong else Finding(check, "good", measured)

@@ -1,9 +1,9 @@
-"""The focal length that the motion of the camera fits.
+"""Estimating the focal length from the motion of the camera.
 
-A pair with a wrong focal length sees a world that is stretched along its axis. While the camera
-only moves on, nothing contradicts that; when it turns about another axis, the stretched world would
-have to bend. So the focal length is searched that leaves the least error of reprojection, with the
-best pose of each frame for each focal length.
+With a wrong focal length, a stereo pair reconstructs a scene that is stretched along the optical
+axis. A pure translation is consistent with such a scene, but a rotation about another axis is not.
+The estimate is the focal length with the least reprojection error, where the pose of each frame is
+optimised for each focal length.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from vslam.camera import Camera
 Vectors = NDArray[np.float64]
 
 _PIXEL, _DISPARITY = 0.35, 0.3  # px, standard deviations of matches refined by optical flow
-_CAUCHY = 5.0  # squared errors that weigh half, in variances: 95 % of two dimensions are below 6
+_CAUCHY = 5.0  # variances at which a squared error has half its weight; 95 % of inliers are below 6
 _ITERATIONS = 12
-_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)  # searched at first
-_SECTIONS = 12  # of the bracket, golden ones: to 1e-3
-_STEP = 0.02  # of the logarithm, for the curvature at the best
+_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)  # coarse search
+_SECTIONS = 12  # golden sections of the bracket, which leave 1e-3
+_STEP = 0.02  # of the logarithm, for the curvature at the minimum
 
 
 @dataclass(frozen=True)
 class Moved:
-    """Points of a frame that a later one sees, too.
+    """Points that two frames see.
 
     Attributes:
-        before, after: ``(N, 2)`` pixels in both left images.
-        disparity: ``(N,)`` in the first frame, pixels.
+        before, after: ``(N, 2)`` pixels in the left images of the first and the second frame.
+        disparity: ``(N,)`` pixels, in the first frame.
     """
 
     before: Vectors
@@ -43,9 +43,14 @@ class Moved:
 
 @dataclass(frozen=True)
 class FocalFit:
-    """``factor`` times the focal length of the calibration fits best; ``sigma`` is the standard
-    deviation of its logarithm, ``turned`` the largest turn about an axis across the view
-    (degrees) of frames whose points agree with it."""
+    """The focal length that fits best.
+
+    Attributes:
+        factor: this focal length divided by that of the calibration.
+        sigma: standard deviation of the logarithm of ``factor``.
+        turned: largest rotation (degrees) about an axis across the view, among the frames whose
+            points agree with ``factor``.
+    """
 
     factor: float
     sigma: float
@@ -53,11 +58,12 @@ class FocalFit:
 
 
 def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
-    """The factor between half and twice that motion fits best.
+    """Find the factor between 0.5 and 2 that fits the motion best.
 
     Args:
-        several: at least one, each of at least three points.
-        camera: of the pair, or with depth: its disparities are those of its virtual baseline.
+        several: at least one pair of frames, each with at least three points.
+        camera: the stereo or RGB-D camera; the disparities of the latter are those of its virtual
+            baseline.
     """
     poses = [np.zeros(6) for _ in several]
 
@@ -74,7 +80,7 @@ def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
     around = cost(log + _STEP), cost(log - _STEP)
     least = cost(log)
     curvature = (sum(around) - 2.0 * least) / _STEP**2
-    variance = least / (2.0 * sum(len(moved.before) for moved in several))  # of a unit of cost
+    variance = least / (2.0 * sum(len(moved.before) for moved in several))  # scales the cost
     turned = [
         float(np.linalg.norm(pose[:2]))
         for moved, pose in zip(several, poses, strict=True)
@@ -88,7 +94,7 @@ def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
 
 
 def _least(cost: Callable[[float], float], low: float, high: float) -> float:
-    """Where a function with one minimum between is least, by the golden section."""
+    """Minimise a function with one minimum between ``low`` and ``high`` by golden sections."""
     golden = (np.sqrt(5.0) - 1.0) / 2.0
     x = [high - golden * (high - low), low + golden * (high - low)]
     y = [cost(x[0]), cost(x[1])]
@@ -107,7 +113,7 @@ def _least(cost: Callable[[float], float], low: float, high: float) -> float:
 def _best_pose(
     moved: Moved, camera: Camera, factor: float, start: Vectors
 ) -> tuple[Vectors, float]:
-    """Rotation vector and translation by Gauss-Newton under Cauchy's loss, and that loss."""
+    """``(6,)`` rotation vector and translation by Gauss-Newton with Cauchy's loss, and the loss."""
     pose = start
     for _ in range(_ITERATIONS):
         error, variance, points = _errors(moved, camera, factor, pose)
@@ -125,7 +131,7 @@ def _best_pose(
 
 
 def _fits(moved: Moved, camera: Camera, factor: float, pose: Vectors) -> bool:
-    """Whether a pose was found that most points agree with."""
+    """Whether most points agree with a pose."""
     error, variance, _ = _errors(moved, camera, factor, pose)
     return float(np.median((error**2).sum(axis=1) / variance)) < _CAUCHY
 
@@ -133,8 +139,8 @@ def _fits(moved: Moved, camera: Camera, factor: float, pose: Vectors) -> bool:
 def _errors(
     moved: Moved, camera: Camera, factor: float, pose: Vectors
 ) -> tuple[Vectors, Vectors, Vectors]:
-    """``(N, 2)`` errors of reprojection, their ``(N,)`` variance, ``(N, 3)`` points as the later
-    frame sees them. Far points are known badly, which shows where the camera moves."""
+    """``(N, 2)`` reprojection errors, their ``(N,)`` variances, and ``(N, 3)`` points in the later
+    frame. The variance includes the uncertainty of the points' depth."""
     seen, points = _project(moved.before, moved.disparity, camera, factor, pose)
     nearer, _ = _project(moved.before, moved.disparity + _DISPARITY, camera, factor, pose)
     return moved.after - seen, _PIXEL**2 + ((nearer - seen) ** 2).sum(axis=1), points
@@ -147,12 +153,12 @@ def _project(
     z = f[0] * camera.baseline / disparity
     points = np.column_stack([(xy - centre) / f * z[:, None], z])
     points = points @ cv2.Rodrigues(pose[:3])[0].T + pose[3:]
-    ahead = np.maximum(points[:, 2:], 1e-3 * camera.baseline)  # what passes behind errs much
+    ahead = np.maximum(points[:, 2:], 1e-3 * camera.baseline)  # points behind get large errors
     return points[:, :2] / ahead * f + centre, points
 
 
 def _jacobian(points: Vectors, camera: Camera, factor: float, pose: Vectors) -> Vectors:
-    """``(N, 2, 6)``: pixels by a turn and a shift of the points."""
+    """``(N, 2, 6)`` derivative of the pixels by a rotation and a translation of the points."""
     x, y, z = points.T
     z = np.maximum(z, 1e-3 * camera.baseline)
     none = np.zeros_like(z)

@@ -1,7 +1,7 @@
-"""Matches between two images that presume nothing of how the cameras stand.
+"""Matches between two images without assumptions about the cameras' poses.
 
-A run looks for the right image's features in the left one's rows only; whoever wants to know
-whether that is right must look everywhere.
+A run searches for stereo matches only in the same rows; checking the rectification requires a
+search in the whole image.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.sequence import Image
+from vslam.camera import Image
 
 _FEATURES = 2000
-_MAX_DISTANCE = 64  # bits of 256, as ORB-SLAM2's TH_LOW is 50
+_MAX_DISTANCE = 64  # bits of 256; ORB-SLAM2's TH_LOW is 50
 _EPIPOLAR_PX = 1.5
-_REFINED_PX = 3.0  # a keypoint of a coarse octave is off by so much
+_REFINED_PX = 3.0  # largest error of a keypoint in a coarse octave
 _WINDOW = (15, 15)
 _MIN_MATCHES = 12
-_ANOTHER_VIEW = 0.25  # of the width: what is matched has moved so far
+_ANOTHER_VIEW = 0.25  # of the image width; matches of another view have moved at least this far
 
 
 @dataclass(frozen=True)
 class Matches:
-    """``left`` and ``right``: ``(N, 2)`` float32 pixels of the same points, to a tenth of one."""
+    """``left`` and ``right``: ``(N, 2)`` float32 pixels of the same points, to about 0.1 px."""
 
     left: NDArray[np.float32]
     right: NDArray[np.float32]
@@ -36,7 +36,8 @@ class Matches:
 
 
 def match_images(left: Image, right: Image) -> Matches:
-    """ORB matches that obey one epipolar geometry, refined by optical flow; none below twelve."""
+    """ORB matches that satisfy one epipolar geometry, refined by optical flow; none if there are
+    fewer than twelve."""
     orb = cv2.ORB.create(_FEATURES)
     kp_left, d_left = orb.detectAndCompute(left, None)
     kp_right, d_right = orb.detectAndCompute(right, None)
@@ -65,7 +66,7 @@ def match_images(left: Image, right: Image) -> Matches:
 
 
 def count_views(images: Sequence[Image]) -> int:
-    """How many images, taken in order, show another view than all that were counted before."""
+    """Number of images, in order, whose view differs from all views counted before."""
     views: list[Image] = []
     for image in images:
         if not any(_one_view(image, view) for view in views):
@@ -80,7 +81,7 @@ def _one_view(image: Image, other: Image) -> bool:
 
 
 def joined(several: list[Matches]) -> Matches:
-    """All matches of several pairs; at least one pair."""
+    """All matches of several pairs (at least one)."""
     return Matches(
         np.concatenate([matches.left for matches in several]),
         np.concatenate([matches.right for matches in several]),
@@ -88,7 +89,7 @@ def joined(several: list[Matches]) -> Matches:
 
 
 def _like(image: Image, model: Image) -> Image:
-    """An image in the brightness and contrast of another one, which optical flow presumes."""
+    """An image with the brightness and contrast of another one, as optical flow assumes."""
     gain = float(model.std()) / max(float(image.std()), 1.0)
     shifted = (image.astype(np.float32) - image.mean()) * gain + model.mean()
     return np.clip(np.rint(shifted), 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Why a run tracked nothing: what can be seen in a few of its frames."""
+"""Explaining why a run tracked nothing, from a few of its frames."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from itertools import islice
 
 import numpy as np
 
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import Stream, is_live, timed_frames
+from vslam.datasets.frames import Source
 from vslam.doctor.checks import check_sides
 from vslam.doctor.matching import joined, match_images
 from vslam.errors import InputError
@@ -15,11 +14,12 @@ from vslam.features import TrackingState
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 
-_FRAMES = 3  # that are looked at: each shows the sign of hundreds of disparities
+_FRAMES = 3  # examined frames; each shows the sign of hundreds of disparities
 
 
 def why_nothing_was_tracked(outcome: RunOutcome, options: RunOptions) -> str | None:
-    """In one sentence why no frame of a run was tracked, and what to do; None if one was."""
+    """One sentence that explains why no frame of a run was tracked and what to do; None if a frame
+    was tracked."""
     tracked = {TrackingState.OK, TrackingState.WEAK}
     n = len(outcome.tracks)
     if n == 0 or any(track.state in tracked for track in outcome.tracks):
@@ -28,8 +28,8 @@ def why_nothing_was_tracked(outcome: RunOutcome, options: RunOptions) -> str | N
     if len(outcome.skipped) == n:
         return f"{said}: no image could be read ({outcome.skipped[0].rstrip('.')})"
     if options.localize:
-        return f"{said}: the map of {options.map_file} shows no place that was seen in them"
-    if outcome.sequence.camera.sensor == "stereo" and not is_live(outcome.sequence):
+        return f"{said}: none of them was recognised in the map {options.map_file}"
+    if outcome.sequence.camera.sensor == "stereo" and not outcome.sequence.live:
         middle = _median_disparity_behind_infinity(outcome.sequence)
         if middle is not None:
             how = how_to_swap(outcome.settings.dataset, options)
@@ -38,17 +38,17 @@ def why_nothing_was_tracked(outcome: RunOutcome, options: RunOptions) -> str | N
                 f"were swapped; {how}"
             )
     if outcome.settings.perturb != "none":
-        return f"{said} under --perturb {outcome.settings.perturb}; a weaker one leaves more to see"
+        return f"{said} under --perturb {outcome.settings.perturb}; a weaker one may work"
     if outcome.sequence.camera.monocular:
-        return f"{said}: one camera must move sideways past what it sees; vslam doctor looks closer"
+        return f"{said}: one camera must move sideways to begin a map; vslam doctor checks the rest"
     return f"{said}: vslam doctor says what is wrong with images, calibration or times"
 
 
-def _median_disparity_behind_infinity(source: Sequence | Stream) -> float | None:
-    """Median disparity of a few frames, in pixels; None where it is not that of swapped sides."""
+def _median_disparity_behind_infinity(source: Source) -> float | None:
+    """Median disparity of a few frames in pixels if the sides seem to be swapped, else None."""
     found = []
     try:
-        for frame in islice(timed_frames(source), _FRAMES):
+        for frame in islice(source.frames(), _FRAMES):
             left, right = frame.read(map)
             found.append(match_images(left, np.asarray(right, np.uint8)))
     except InputError:  # a damaged image; those before it will do
@@ -62,7 +62,7 @@ def _median_disparity_behind_infinity(source: Sequence | Stream) -> float | None
 
 
 def how_to_swap(dataset: str, options: RunOptions) -> str:
-    """What to type for the sides the other way round, or what to exchange where no option does."""
+    """Options that swap the two sides, or what to exchange if no option does."""
     if dataset == "images" and options.right is not None:
         return f"exchange them: --data {options.right} --right {options.data}"
     if dataset == "images":

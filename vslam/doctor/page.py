@@ -1,41 +1,44 @@
-"""The page of an examination: a table of findings, and pictures."""
+"""The page of a diagnosis: a table of findings, and pictures."""
 
 from __future__ import annotations
 
-import base64
 from pathlib import Path
 
 import cv2
 
 from vslam.doctor.examine import Diagnosis, Picture
 from vslam.errors import ResultsError
-from vslam.report.page import Row, Table, render_page
+from vslam.report.page import Figure, Page, Row, Section, Table
+from vslam.report.render import html
 
 HEAD = ("check", "verdict", "measured", "fix")
 
 
 def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
-    """Write the page, self-contained HTML.
+    """Write the page as self-contained HTML.
 
     Raises:
         ResultsError: the file cannot be written.
     """
     rows: list[Row] = [(f.check, f.verdict, f.measured, f.fix) for f in diagnosis.findings]
-    page = render_page(
-        "doctor.html.jinja",
-        title=title,
-        table=Table("Findings", HEAD, rows, HEAD),
-        faults=len(diagnosis.faults),
-        pictures=[(_jpeg(picture), picture.caption) for picture in diagnosis.pictures],
+    faults = len(diagnosis.faults)
+    figures = [
+        Figure(f"picture-{k}", picture.caption, _jpeg(picture))
+        for k, picture in enumerate(diagnosis.pictures)
+    ]
+    page = Page(
+        title,
+        [f"{faults or 'no'} fault{'' if faults == 1 else 's'}"],
+        [Section("Findings", [Table(HEAD, rows, HEAD)]), Section("", figures)],
     )
     try:
-        path.write_text(page, encoding="utf-8")
+        path.write_text(html(page), encoding="utf-8")
     except OSError as error:
         raise ResultsError(
             f"{path}: cannot be written ({error.strerror}); name another file with --out."
         ) from error
 
 
-def _jpeg(picture: Picture) -> str:
+def _jpeg(picture: Picture) -> bytes:
     data = cv2.imencode(".jpg", picture.image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
-    return base64.b64encode(data.tobytes()).decode()
+    return bytes(data.tobytes())

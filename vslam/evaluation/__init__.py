@@ -1,1 +1,1 @@
-"""How good a run is: its trajectory, and its loops."""
+"""Evaluation of trajectories and loops against a ground truth."""

@@ -1,7 +1,7 @@
-"""Loops against the ground truth: where the camera came back, and whether that was noticed.
+"""Evaluation of loops: where the camera revisited a place, and whether a loop was closed there.
 
-ATE alone cannot tell: a missed loop costs nothing where there was no drift, and a wrong one may
-bend the map where few frames are. Here each loop and each return is judged by itself.
+ATE alone does not show this: a missed loop costs nothing without drift, and a wrong one may distort
+a part of the map with few frames. Here each loop and each revisit is judged by itself.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from vslam.geometry import inverses
 from vslam.loops import LoopEdge
 from vslam.run.outcome import RunOutcome, ground_truth_of
 
-_SAMPLE_M = 1.0  # the path is looked at once a metre, so that standing still costs nothing
-_UNIT_FRAMES = 20  # each way, to tell the unit of a monocular map
-_MAX_STEP_M = 20.0  # between two frames farther apart nobody knows where the path went
+_SAMPLE_M = 1.0  # the path is sampled once a metre, so that a standing camera adds no samples
+_UNIT_FRAMES = 20  # before and after a frame, to estimate the unit of a monocular map
+_MAX_STEP_M = 20.0  # between two frames farther apart the path is unknown
 
 Indices = NDArray[np.int64]
 Poses = NDArray[np.float64]
@@ -27,17 +27,18 @@ Poses = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LoopLimits:
-    """What counts as a revisit, and as a right loop.
+    """The definitions of a revisit and of a right loop.
 
     Attributes:
-        min_length_m: shorter stretches are not expected to be found.
+        min_length_m: shorter revisits do not count.
         max_lateral_m: distance from the earlier path; the next lane is 3 to 4 m away.
-        max_heading_deg: between the optical axes; a place seen from behind is another picture.
-        min_seconds, min_path_m: time and way since the earlier passage.
-        max_interruption_m: revisits with less between them are one stretch: tracking does not
-            let go of the old map so soon.
-        max_translation_m, max_rotation_deg: error of a right loop's relative pose. Well above the
-            error of KITTI's ground truth between two passages, well below a row of houses.
+        max_heading_deg: angle between the optical axes; from behind, a place looks different.
+        min_seconds, min_path_m: time and path length since the earlier passage.
+        max_interruption_m: revisits with a shorter gap between them count as one stretch, because
+            tracking continues in the old map over such a gap.
+        max_translation_m, max_rotation_deg: largest error of a right loop's relative pose. They are
+            well above the error of KITTI's ground truth between two passages and well below the
+            distance of similar houses in a row.
     """
 
     min_length_m: float = 20.0
@@ -52,12 +53,12 @@ class LoopLimits:
 
 @dataclass(frozen=True)
 class Revisits:
-    """M stretches of the path on which the camera is where it was before, in order.
+    """M stretches of the path, in order, on which the camera revisits places.
 
     Attributes:
         first, last: ``(M,)`` first and last frame of each stretch.
         first_match, last_match: ``(M,)`` the earlier frames nearest to those two.
-        length_m: ``(M,)`` way from first to last.
+        length_m: ``(M,)`` path length from first to last.
     """
 
     first: Indices
@@ -72,14 +73,15 @@ class Revisits:
 
 @dataclass(frozen=True)
 class LoopEvaluation:
-    """Loops and revisits set against each other.
+    """The assessment of loops and revisits.
 
     Attributes:
         revisits: M stretches.
-        loop_frame: ``(M,)`` query frame of the first right loop closed on each, -1 if missed.
-        right: for each edge, rejected ones too, whether its relative pose is the true one; None
-            where that cannot be said: no pose, or frames without ground truth.
-        n_wrong: accepted edges that are not right.
+        loop_frame: ``(M,)`` query frame of the first right loop closed on each stretch, -1 if it
+            was missed.
+        right: for each edge, including rejected ones, whether its relative pose is right; None if
+            it has no pose or its frames have no ground truth.
+        n_wrong: number of accepted edges that are not right.
     """
 
     revisits: Revisits
@@ -89,12 +91,13 @@ class LoopEvaluation:
 
     @property
     def n_found(self) -> int:
-        """Stretches with a right loop; once the old map is found, tracking holds on to it."""
+        """Number of stretches with a right loop. One loop per stretch is enough, because tracking
+        then continues in the old map."""
         return int(np.count_nonzero(self.loop_frame >= 0))
 
     @property
     def n_missed(self) -> int:
-        """Stretches without a right loop."""
+        """Number of stretches without a right loop."""
         return len(self.revisits) - self.n_found
 
 
@@ -102,8 +105,8 @@ _DEFAULT_LIMITS = LoopLimits()
 
 
 def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
-    """Judge the loops of a run over the frames that it has done; None unless all of them have a
-    ground truth: a path with holes does not say where it was driven twice."""
+    """Judge the loops of a run over its frames so far; None unless all of them have ground truth,
+    because revisits cannot be found on a path with gaps."""
     truth = ground_truth_of(outcome.sequence)
     if truth is None or not len(outcome.trajectory):
         return None
@@ -120,9 +123,15 @@ def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
 
 
 def metres_per_unit(T_wc: Poses, T_wc_true: Poses) -> NDArray[np.float64]:
-    """What a monocular map's unit was when each frame was tracked, ``(N,)``: the median ratio of
-    true and estimated steps from frame to frame, over the 41 frames around it; 1 where nothing
-    moved."""
+    """``(N,)`` metres per unit of a monocular map when each frame was tracked.
+
+    It is the median ratio of true and estimated steps between consecutive frames, over the 41
+    frames around it; 1 if the camera did not move.
+
+    Args:
+        T_wc: ``(N, 4, 4)`` poses as tracked.
+        T_wc_true: ``(N, 4, 4)`` ground truth.
+    """
     true, estimated = (
         np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) for T in (T_wc_true, T_wc)
     )
@@ -147,11 +156,11 @@ def _in_metres(edge: LoopEdge, metres: float) -> LoopEdge:
 def revisits(
     T_wc: Poses, timestamps: NDArray[np.float64], limits: LoopLimits = _DEFAULT_LIMITS
 ) -> Revisits:
-    """Find the stretches on which the camera drives where it drove before, in that direction.
+    """Find the stretches on which the camera drives where it drove before, in the same direction.
 
-    A frame is back when the path driven at least ``min_seconds`` and ``min_path_m`` before runs
-    past it within ``max_lateral_m`` and, there, within ``max_heading_deg`` of its axis. The path
-    between frames is straight.
+    A frame is a revisit if the path driven at least ``min_seconds`` and ``min_path_m`` earlier
+    passes within ``max_lateral_m`` of it and has, there, a heading within ``max_heading_deg`` of
+    its own. The path between two frames is assumed to be straight.
 
     Args:
         T_wc: ``(N, 4, 4)`` ground truth.
@@ -191,21 +200,21 @@ def judge_loops(
     timestamps: NDArray[np.float64],
     limits: LoopLimits = _DEFAULT_LIMITS,
 ) -> LoopEvaluation:
-    """Say of each edge whether it is right, and of each revisit whether a loop found it.
+    """Determine whether each edge is right, and whether each revisit was found by a loop.
 
-    An edge is right when ``T_query_match`` is the ground truth's within the limits. It finds a
-    stretch when it is right, accepted, reaches back to an earlier passage (not to the frames just
-    before) and its query lies on the stretch, or within ``max_interruption_m`` of it: the camera
-    sees the place a little longer than it is there.
+    An edge is right if ``T_query_match`` agrees with the ground truth within the limits. It finds a
+    stretch if it is right and accepted, its match belongs to an earlier passage (not to the frames
+    just before), and its query lies on the stretch or within ``max_interruption_m`` of it, since
+    the camera sees a place for a little longer than it is there.
 
     Args:
         edges: E loops, accepted or not.
-        frames: ``(K,)`` frame of each keyframe that the edges name, -1 for one of another drive.
+        frames: ``(K,)`` frame of each keyframe that the edges name, -1 if it is of another drive.
         T_wc: ``(N, 4, 4)`` ground truth of the frames.
         timestamps: ``(N,)`` seconds.
     """
     found = revisits(T_wc, timestamps, limits)
-    right = tuple(_is_right(edge, frames, T_wc, limits) for edge in edges)
+    right = tuple(is_right_loop(edge, frames, T_wc, limits) for edge in edges)
     loop_frame = np.full(len(found), -1, np.int64)
     path = path_length(T_wc)
     slack = limits.max_interruption_m
@@ -226,7 +235,11 @@ def judge_loops(
     return LoopEvaluation(found, loop_frame, right, n_wrong)
 
 
-def _is_right(edge: LoopEdge, frames: Indices, T_wc: Poses, limits: LoopLimits) -> bool | None:
+def is_right_loop(
+    edge: LoopEdge, frames: Indices, T_wc: Poses, limits: LoopLimits = _DEFAULT_LIMITS
+) -> bool | None:
+    """Whether the relative pose of one loop is the true one, as :func:`judge_loops` says; None
+    where that cannot be told."""
     if edge.T_query_match is None or edge.query < 0:
         return None
     query, match = frames[edge.query], frames[edge.match]
@@ -245,7 +258,7 @@ def _is_right(edge: LoopEdge, frames: Indices, T_wc: Poses, limits: LoopLimits) 
 def _earlier_passage(
     T_wc: Poses, timestamps: NDArray[np.float64], path: NDArray[np.float64], limits: LoopLimits
 ) -> Indices:
-    """``(S,)`` for each sample the nearest one of an earlier passage, -1 without one."""
+    """``(S,)`` for each sample, the nearest sample of an earlier passage, or -1."""
     from scipy.spatial import cKDTree
 
     position, axis = T_wc[:, :3, 3], T_wc[:, :3, 2]
@@ -254,7 +267,7 @@ def _earlier_passage(
     forward[length > _MAX_STEP_M] = 0.0
     length[length > _MAX_STEP_M] = 0.0
 
-    # The nearest point of a step lies beside it, or at an end: no farther than this from its start.
+    # A step that passes a sample within max_lateral_m starts at most this far from the sample.
     radius = float(np.hypot(limits.max_lateral_m, length.max()))
     pairs = cKDTree(position).query_pairs(radius, output_type="ndarray")
     start, query = pairs[:, 0], pairs[:, 1]

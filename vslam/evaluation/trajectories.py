@@ -1,7 +1,7 @@
-"""How good a trajectory is: ATE, RPE and KITTI's drift, in the definitions that papers use.
+"""Errors of a trajectory: ATE, RPE and KITTI's drift, as papers define them.
 
-ATE and RPE come from evo (Grupp, 2017), so that anyone can repeat them with its command line; this
-is the only module that imports it.
+ATE and RPE are computed by evo (Grupp, 2017), whose command line reproduces them; this is the only
+module that imports it.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ class Evaluation:
     """Errors of an estimate against the ground truth over N matched frames.
 
     Attributes:
-        frames: N, the frames compared.
-        alignment: ``se3``, ``sim3`` or ``none``: what was fitted before comparing.
+        frames: N, number of compared frames.
+        alignment: ``se3``, ``sim3`` or ``none``, the transformation fitted before the comparison.
         timestamps: ``(N,)`` seconds, of the estimate.
-        ate_rmse_m, ate_mean_m, ate_max_m: of ``errors_m``.
+        ate_rmse_m, ate_mean_m, ate_max_m: RMSE, mean and maximum of ``errors_m``.
         errors_m: ``(N,)`` distance of each aligned position from the ground truth.
         T_wc_aligned: ``(N, 4, 4)`` the estimate, aligned to the ground truth.
-        distances_m: ``(N,)`` length of the path along the ground truth.
+        distances_m: ``(N,)`` path length along the ground truth up to each frame.
         rpe_m, rpe_deg: RMSE of the motion from one frame to the next.
         t_rel_percent, r_rel_deg_per_100m: KITTI's drift over 100 to 800 m, None on paths shorter
             than 100 m.
@@ -55,7 +55,7 @@ class Evaluation:
     r_rel_deg_per_100m: float | None
 
     def summary(self) -> dict[str, float | int | str | None]:
-        """The numbers without the arrays, for JSON."""
+        """The fields that are not arrays, for JSON."""
         return {
             name: value for name, value in vars(self).items() if not isinstance(value, np.ndarray)
         }
@@ -66,13 +66,15 @@ def evaluate_trajectory(
 ) -> Evaluation:
     """Compare an estimate with the ground truth, aligned by ``se3``, ``sim3`` or not (``none``).
 
-    Equally long trajectories with the same times are compared frame by frame, others by time: each
-    pose with the nearest one at most 10 ms away; ``Evaluation.frames`` says how many had one.
-    ATE: RMSE of positions after alignment (Umeyama, TPAMI 1991; without scale for ``se3``) [Sturm
-    et al., IROS 2012]. RPE: over one frame. KITTI drift: see :func:`kitti_drift`.
+    Equally long trajectories with the same timestamps are compared frame by frame. Otherwise each
+    pose is compared with the one nearest in time, at most 10 ms away; ``Evaluation.frames`` is the
+    number of such pairs. ATE is the RMSE of positions after alignment (Umeyama, TPAMI 1991; without
+    scale for ``se3``) [Sturm et al., IROS 2012]. RPE is computed over one frame, KITTI's drift by
+    :func:`kitti_drift`.
 
     Raises:
-        InputError: unknown alignment, no frames in common, or too little motion to align.
+        InputError: the alignment is unknown, the trajectories have no common frames, or there is
+            too little motion to align them.
     """
     from evo import EvoException
     from evo.core.metrics import APE, RPE, PoseRelation
@@ -98,7 +100,7 @@ def evaluate_trajectory(
     except EvoException as error:
         raise InputError(
             f"--align {alignment}: {len(estimate)} frames with too little motion to compare; "
-            "alignment takes three that are not on one line, --align none takes two."
+            "alignment needs three positions that are not on one line, --align none needs two."
         ) from error
 
     T_wc_aligned = np.array(aligned.poses_se3)
@@ -133,15 +135,17 @@ def kitti_drift(
 ) -> tuple[float, float] | None:
     """Average drift over 100, 200 ... 800 m, as the KITTI development kit defines it.
 
-    From every tenth frame, each length ends at the first frame beyond it along the ground truth;
-    the error of the motion in between is divided by the length [Geiger et al., CVPR 2012].
+    A segment of each length starts at every tenth frame and ends at the first frame beyond that
+    length along the ground truth. The error of the motion over a segment is divided by its length
+    [Geiger et al., CVPR 2012].
 
     Args:
         T_wc: ``(N, 4, 4)`` estimate.
-        T_wc_ground_truth: ``(N, 4, 4)`` of the same frames.
+        T_wc_ground_truth: ``(N, 4, 4)`` ground truth of the same frames.
 
     Returns:
-        ``t_rel`` in percent and ``r_rel`` in degrees per 100 m, None on a path below 100 m.
+        ``t_rel`` in percent and ``r_rel`` in degrees per 100 m; None if the path is shorter than
+        100 m.
     """
     distances = path_length(T_wc_ground_truth)
     starts = np.arange(0, len(distances), _STEP_FRAMES)
@@ -163,14 +167,15 @@ def kitti_drift(
 def read_pair(
     estimate: Path | str, ground_truth: Path | str, times: Path | str | None = None
 ) -> tuple[Trajectory, Trajectory]:
-    """Read an estimate and its ground truth, each in either format.
+    """Read an estimate and its ground truth, each in KITTI's or TUM's format.
 
     Args:
-        estimate, ground_truth: KITTI or TUM files.
-        times: seconds, one a line, of every KITTI file among them (``times.txt``).
+        estimate, ground_truth: the two files.
+        times: file with the seconds of the frames, one on each line (``times.txt``), for those of
+            the two that are KITTI files.
 
     Raises:
-        InputError: a malformed file, or a KITTI file that cannot be matched without times.
+        InputError: a file is malformed, or a KITTI file cannot be matched without times.
     """
     timestamps = None if times is None else read_table(times, (1,), "a time in seconds")[:, 0]
     formats = {trajectory_format(estimate), trajectory_format(ground_truth)}
@@ -182,7 +187,7 @@ def read_pair(
     pair = read_trajectory(estimate, timestamps), read_trajectory(ground_truth, timestamps)
     if timestamps is None and formats == {"kitti"} and len(pair[0]) != len(pair[1]):
         raise InputError(
-            f"{estimate}: {len(pair[0])} poses but {len(pair[1])} in {ground_truth}; take "
+            f"{estimate}: {len(pair[0])} poses but {len(pair[1])} in {ground_truth}; use "
             "ground_truth_kitti.txt of the run folder, or the run's TUM file and --times."
         )
     return pair
@@ -191,7 +196,7 @@ def read_pair(
 def evo_command(
     estimate: Path | str, ground_truth: Path | str, alignment: str, format_: Literal["kitti", "tum"]
 ) -> str:
-    """The ``evo_ape`` command line that reproduces the ATE of two files of one format."""
+    """The ``evo_ape`` command line that reproduces the ATE of two files of the same format."""
     files = shlex.join([str(ground_truth), str(estimate)])
     return f"evo_ape {format_} {files}{_EVO_FLAGS[alignment]}"
 
@@ -211,7 +216,8 @@ def _associate(estimate: Trajectory, ground_truth: Trajectory) -> tuple[Trajecto
     if not mine:
         raise InputError(
             f"none of the {len(estimate)} poses lies within {1000 * MAX_TIME_DIFFERENCE_S:.0f} ms "
-            f"of the ground truth's {len(ground_truth)}; compare files of one sequence and clock."
+            f"of the ground truth's {len(ground_truth)}; compare files of the same sequence and "
+            "clock."
         )
     return estimate.select(np.array(mine)), ground_truth.select(np.array(true))
 

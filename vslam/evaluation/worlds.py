@@ -1,7 +1,7 @@
-"""Where a map lies in the world of its ground truth, and the error of what is localised in it.
+"""The place of a map in the world of its ground truth, and the error of localising in the map.
 
-A trajectory is aligned with its ground truth before it is compared. What is localised in a map has
-a place already: it is that of the map, and so is its error.
+A trajectory is usually aligned with its ground truth before it is compared. Frames localised in a
+map are instead moved by the alignment of the map, so that their error includes that of the map.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ from vslam.run.outcome import RunOutcome, matched_ground_truth
 
 
 def name_of_world(outcome: RunOutcome) -> str:
-    """Of the ground truth: drives of one route in other light, or among other cars, share it."""
+    """Name of the world of a run's ground truth; rendered drives of one route share it, whatever
+    their light and traffic."""
     return f"{outcome.settings.dataset} {outcome.sequence.name.partition('+')[0]}"
 
 
 def world_of(outcome: RunOutcome, evaluation: Evaluation) -> World:
-    """Where a map lies, by the alignment of the trajectory that it was made with."""
+    """The place of a map, from the alignment of the trajectory that it was built with."""
     truth = matched_ground_truth(outcome)
     assert truth is not None
     kept = np.isin(outcome.trajectory.timestamps, truth.timestamps)
@@ -29,8 +30,8 @@ def world_of(outcome: RunOutcome, evaluation: Evaluation) -> World:
 
 
 def error_in_map(outcome: RunOutcome) -> float | None:
-    """RMSE (m) of the frames placed in the map that a run went on in, moved as the map was; None
-    where that does not lie in the world of the run's ground truth."""
+    """RMSE (m) of the frames that were localised in the map in which a run began; None if the map's
+    place in the world of the run's ground truth is unknown."""
     world, truth = outcome.world, matched_ground_truth(outcome)
     if world is None or truth is None or outcome.in_map is None:
         return None
@@ -43,7 +44,7 @@ def error_in_map(outcome: RunOutcome) -> float | None:
 
 
 def _similarity(T_wc: Matrix, aligned: Matrix) -> Matrix:
-    """The similarity that takes poses to the aligned ones."""
+    """``(4, 4)`` similarity that maps ``(N, 4, 4)`` poses to the aligned ones."""
     spread, aligned_spread = (
         np.linalg.norm(T[:, :3, 3] - T[:, :3, 3].mean(axis=0)) for T in (T_wc, aligned)
     )

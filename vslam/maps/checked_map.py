@@ -1,4 +1,4 @@
-"""A map of arrays that may hold anything: all that kernels rely on is checked here."""
+"""Building a map from the arrays of a file, after checking everything that kernels rely on."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from vslam.maps.checkpoint import ARRAYS as CHECKPOINT_ARRAYS
 from vslam.maps.checkpoint import checked_checkpoint
 from vslam.maps.stored_map import StoredMap, World, observations
 
-# These follow from the list of observations by landmark that the file has instead, and from
-# keyframe_first_row.
+# The file has a list of observations by landmark instead; with keyframe_first_row it determines
+# these columns.
 _NOT_IN_FILE = ("head", "n_observations", "keyframe", "landmark", "next_row")
-# The columns of the map, and what they are called in the file.
+# The columns of the map and their names in the file.
 FILE_NAMES = {
     name: f"{prefix}_{name.removeprefix(f'{prefix}_')}"
     for prefix, fields in (
@@ -51,7 +51,7 @@ def _kind(name: str, in_file: str) -> tuple[type, tuple[str | int, ...]]:
 
 
 # K keyframes, L landmarks, R keypoints, O observations, E loops, F frames of the last drive.
-# A number more than one of them: where each begins, and where the last one ends.
+# K+1 and L+1 are CSR offsets, one more than the items.
 ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "scales": (np.float64, ("levels",)),
     **{in_file: _kind(name, in_file) for name, in_file in FILE_NAMES.items()},
@@ -70,15 +70,15 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "frame_unit_scale": (np.float64, ("F",)),
 }
 _MAY_BE_NAN = {"row_u_right"}
-_MOST = 1e12  # metres, pixels, seconds: products of a few of them are finite, too
+_MOST = 1e12  # metres, pixels or seconds; products of a few such numbers are finite too
 _ROTATION_TOLERANCE = 1e-6
-_MOST_PIXELS = 1e6  # of a side of an image, and of a focal length
+_MOST_PIXELS = 1e6  # width, height and focal length of a camera
 _MAX_OFFSET = 100.0  # pixels
 _MAX_SESSION = 2**31  # it must fit into a column of the map
 
 
 class DamagedMapError(Exception):
-    """What is wrong with the arrays of a file."""
+    """The arrays of a file do not describe a map."""
 
 
 def _scalars(entry: dict[str, Any]) -> Scalars:
@@ -91,11 +91,11 @@ def _scalars(entry: dict[str, Any]) -> Scalars:
 
 
 def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
-    """The map of a file, of which both may hold anything.
+    """Build the map of a file from its arrays and its header, neither of which is trusted.
 
     Raises:
-        DamagedMapError, KeyError, TypeError, ValueError, AttributeError: in a few words what is
-            wrong with them.
+        DamagedMapError, KeyError, TypeError, ValueError, AttributeError: the file is damaged; the
+            message says in a few words where.
     """
     sizes = _check_shapes(data)
     map_ = _build_map(data, sizes)
@@ -108,13 +108,14 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
         )
     else:
         a = map_.arrays
-        _require(bool(a.keyframe_alive.all() and a.landmark_alive.all()), "what died is in it")
-        _require(bool((np.diff(a.first_keyframe) >= 0).all()), "order of landmarks")
+        living = bool(a.keyframe_alive.all() and a.landmark_alive.all())
+        _require(living, "a culled keyframe or landmark without a checkpoint")
+        _require(bool((np.diff(a.first_keyframe) >= 0).all()), "the order of the landmarks")
     detector, n = header["detector"], sizes["K"]
     tables = {str(name): _per_keyframe(data, f"detector_{name}", n) for name in detector["tables"]}
     images = _per_keyframe(data, "image", n) if header["images"] else None
     if images is not None and (images.values.dtype != np.uint8 or images.values.ndim != 1):
-        raise DamagedMapError("images are no files")
+        raise DamagedMapError("the images are not files")
     world = header["world"]
     return StoredMap(
         map=map_,
@@ -130,7 +131,7 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
 
 
 def _check_shapes(data: dict[str, NDArray]) -> dict[str, int]:
-    """What K, L, R ... are; every array is there, of its type and of these sizes, and finite."""
+    """Check that every array exists, is finite and has its type and shape; returns K, L, R, ..."""
     sizes: dict[str, int] = {}
     for name, (dtype, shape) in ARRAYS.items():
         array = data[name]
@@ -179,7 +180,7 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
     first, rows = data["landmark_first_observation"], data["observation_row"]
     _check_first("landmark_first_observation", first, sizes["O"])
     alive = data["landmark_alive"]
-    _require(bool(((np.diff(first) > 0) == alive).all()), "a landmark that nothing observes")
+    _require(bool(((np.diff(first) > 0) == alive).all()), "a living landmark without observations")
     _check_merges(data["landmark_merged_into"], alive)
     _check_ids("observation_row", rows, n_rows)
     _require(_all_differ(rows), "a keypoint that observes two landmarks")
@@ -189,19 +190,20 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
     pairs = np.repeat(np.arange(n_landmarks, dtype=np.int64), np.diff(first)) * n + keyframe[rows]
     _require(_all_differ(pairs), "a keyframe that observes a landmark twice")
     living = data["keyframe_alive"]
-    _require(bool(living[keyframe[rows]].all()), "a keyframe that was culled observes something")
-    _require(bool(living[parent[parent >= 0]].all() and living[parent < 0].all()), "family tree")
+    _require(bool(living[keyframe[rows]].all()), "a culled keyframe with observations")
+    rooted = bool(living[parent[parent >= 0]].all() and living[parent < 0].all())
+    _require(rooted, "a culled keyframe as a parent")
     columns = {name: data[in_file] for name, in_file in FILE_NAMES.items()}
     columns |= observations(rows, first, data["row_u_right"]) | {"keyframe": keyframe}
     return Map(scales).with_columns(columns)
 
 
 def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> None:
-    """That following merges ends: where it is followed, it leads to one that lives or to none."""
+    """Check that following ``merged_into`` always ends, at a living landmark or at none."""
     n = len(merged_into)
     _check_ids("landmark_merged_into", merged_into, n, least=NONE)
     _require(bool((merged_into[alive] == NONE).all()), "a living landmark that was merged")
-    # By twice as many steps each time.
+    # Pointer doubling: each round follows twice as many merges as the one before.
     reached = np.append(np.where(merged_into >= 0, merged_into, n), n)
     for _ in range(n.bit_length()):
         reached = reached[reached]
@@ -254,10 +256,10 @@ def _per_keyframe(data: dict[str, NDArray], name: str, n: int) -> PerKeyframe:
 
 
 def camera_of(header: dict[str, Any]) -> Camera:
-    """The camera of a map file.
+    """The camera in the header of a map file.
 
     Raises:
-        DamagedMapError, KeyError, TypeError, ValueError: as ``checked_map``.
+        DamagedMapError, KeyError, TypeError, ValueError: the header is damaged.
     """
     try:
         camera = Camera(**header["camera"])
@@ -290,4 +292,4 @@ def _check_rigid(name: str, T: NDArray[np.float64]) -> None:
     R = T[:, :3, :3]
     error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0)
     last = np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0)
-    _require(bool(error < _ROTATION_TOLERANCE and last == 0.0), f"{name} is no rigid motion")
+    _require(bool(error < _ROTATION_TOLERANCE and last == 0.0), f"{name} is not a rigid motion")

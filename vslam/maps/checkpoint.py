@@ -1,4 +1,4 @@
-"""How a map file holds what SLAM remembers between two frames (``vslam.states.Checkpoint``)."""
+"""The representation of a checkpoint (``vslam.states.Checkpoint``) in a map file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from vslam.states import (
     VerifierState,
 )
 
-# N features of the last frame tracked; M keyframes with patches, R rows in all.
+# N features of the last tracked frame; M keyframes with patches, which have R rows in total.
 ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "xy": (np.float32, ("N", 2)),
     "octave": (np.uint8, ("N",)),
@@ -41,7 +41,7 @@ _OF_MAPPER = ("reference", "last_frame", "last_timestamp")
 
 
 def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
-    """Those of ``ARRAYS``."""
+    """The arrays of a checkpoint, named as in ``ARRAYS``."""
     tracker, patches = checkpoint.tracker, checkpoint.mapper.patches
     none = KeyframePatches(-1, np.empty((0, PATCH_PIXELS), np.uint8), np.empty((0, 2), np.float32))
     return {
@@ -54,7 +54,7 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
 
 
 def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
-    """All else of a checkpoint, for JSON, which keeps every bit of a number."""
+    """The rest of a checkpoint as a JSON object; JSON preserves float64 exactly."""
     tracker, closing = checkpoint.tracker, checkpoint.closing
     consistency = closing.consistency
     return {
@@ -70,7 +70,8 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
             "places": [[sorted(one.keyframes), one.length, one.age] for one in consistency.places],
             "verified": [[turn, loop_entry(edge)] for turn, edge in consistency.verified],
             "turn": consistency.turn,
-            **asdict(closing.verifier),
+            "resting_until": closing.verifier.resting_until,
+            "in_vain": closing.verifier.failed_alike,
             "followed": closing.followed,
         },
     }
@@ -79,14 +80,15 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
 def checked_checkpoint(
     arrays: dict[str, NDArray], entry: dict[str, Any], map_: Map, n_frames: int
 ) -> Checkpoint:
-    """The checkpoint of a file, which may hold anything.
+    """Build the checkpoint of a file from untrusted arrays and an untrusted entry.
 
     Args:
-        map_: of the same file, checked.
-        n_frames: of the drive so far.
+        map_: the map of the same file, which has been checked.
+        n_frames: number of frames of the drive so far.
 
     Raises:
-        KeyError, TypeError, ValueError, OverflowError: in a few words what is wrong with it.
+        KeyError, TypeError, ValueError, OverflowError: the checkpoint is damaged; the message says
+            in a few words where.
     """
     sizes = {
         "N": len(arrays["landmark"]),
@@ -104,7 +106,7 @@ def checked_checkpoint(
     tracker, mapper, policy = (dict(entry[name]) for name in ("tracker", "mapper", "policy"))
     T_cw, twist = tracker.pop("T_cw"), tracker.pop("twist")
     landmark, reference = arrays["landmark"], _count(mapper["reference"])
-    # A drive that has begun in the map of another one, and made no keyframe yet, has -1 and -inf.
+    # These are -1 and -inf while a drive in a stored map has not inserted a keyframe yet.
     last_frame, last_timestamp = _count(mapper["last_frame"], -1), mapper["last_timestamp"]
     sound = (
         ((landmark >= -1) & (landmark < map_.n_landmarks)).all()
@@ -144,7 +146,7 @@ def checked_checkpoint(
 
 def _count(value: Any, least: int = 0) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value < _MOST_FRAMES:
-        raise ValueError(f"{value!r:.40} is no count")
+        raise ValueError(f"{value!r:.40} is not a count")
     return value
 
 
@@ -176,7 +178,7 @@ def _patches_of(
         raise ValueError("a keyframe with patches is out of range")
     last = np.cumsum(first_row[keyframes + 1] - first_row[keyframes])
     if len(shift) != (last[-1] if len(last) else 0) or not np.isfinite(shift).all():
-        raise ValueError("the patches are not those of their keyframes")
+        raise ValueError("the patches do not match their keyframes")
     parts = (np.split(arrays[name], last[:-1]) for name in ("patch_pixels", "patch_shift"))
     return tuple(map(KeyframePatches, keyframes.tolist(), *parts)) if len(last) else ()
 
@@ -185,17 +187,17 @@ def _closing_of(entry: dict[str, Any], n_keyframes: int) -> ClosingState:
     verified = tuple((_count(turn), loop_of(edge)) for turn, edge in entry["verified"])
     for _, edge in verified:
         if max(_count(edge.query), _count(edge.match)) >= n_keyframes:
-            raise ValueError("a loop that waits is out of range")
+            raise ValueError("a verified loop is out of range")
         _pose(edge.T_query_match)
         if _number(edge.scale) <= 1 / _MOST:
-            raise ValueError("a loop that waits has no scale")
+            raise ValueError("the scale of a verified loop is out of range")
         _number(edge.score), _count(edge.n_matches), _count(edge.n_inliers)
     places = tuple(
         ResembledPlace(frozenset(map(_count, keyframes)), _count(length), _count(age))
         for keyframes, length, age in entry["places"]
     )
     if max((k for place in places for k in place.keyframes), default=-1) >= n_keyframes:
-        raise ValueError("a place that was resembled is out of range")
+        raise ValueError("a resembled place is out of range")
     return ClosingState(
         ConsistencyState(places, verified, _count(entry["turn"])),
         VerifierState(_count(entry["resting_until"]), _number(entry["in_vain"])),

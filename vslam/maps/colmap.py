@@ -1,8 +1,8 @@
 """COLMAP's sparse model, text or binary (https://colmap.github.io/format.html).
 
-COLMAP's poses are ``T_cw`` with x right, y down, z forward, as here, but it counts pixels from the
-corner of the image: the centre of the upper left pixel is (0.5, 0.5). Without files of rigs and
-frames, every image is its own frame.
+COLMAP's poses are ``T_cw`` with x right, y down, z forward, as here, but its pixel coordinates
+begin at the corner of the image: the centre of the upper left pixel is (0.5, 0.5). Since no files
+of rigs and frames are written, every image is a frame of its own.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _TRACK = np.dtype([("image", "<u4"), ("point2d", "<u4")])
 
 
 class _Image(NamedTuple):
-    """``pose`` is ``(7,)`` qw qx qy qz tx ty tz of ``T_cw``; ``points`` are of ``_POINT2D``."""
+    """``pose``: ``(7,)`` qw qx qy qz tx ty tz of ``T_cw``; ``points`` has the type ``_POINT2D``."""
 
     id: int
     pose: NDArray[np.float64]
@@ -34,7 +34,7 @@ class _Image(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """``error`` is the mean reprojection error, pixels; ``track`` is of ``_TRACK``."""
+    """``error`` is the mean reprojection error in pixels; ``track`` has the type ``_TRACK``."""
 
     id: int
     xyz: NDArray[np.float64]
@@ -51,13 +51,13 @@ def save_colmap(
     *,
     text: bool = False,
 ) -> None:
-    """Write ``cameras``, ``images`` and ``points3D``, ``.bin`` or with ``text`` ``.txt``.
+    """Write ``cameras``, ``images`` and ``points3D`` as ``.bin``, or with ``text`` as ``.txt``.
 
     Only keypoints that observe a landmark are written.
 
     Args:
-        folder: an existing folder, ``sparse/0`` of a project by COLMAP's custom.
-        names: of the image of each keyframe.
+        folder: an existing folder, usually ``sparse/0`` of a COLMAP project.
+        names: name of each keyframe's image.
         colours: ``(L, 3)`` RGB of each landmark.
 
     Raises:
@@ -98,7 +98,7 @@ def _parameters(camera: Camera) -> tuple[float, float, float, float]:
 
 
 def _write_binary(folder: Path, camera: Camera, images: list[_Image], points: list[_Point]) -> None:
-    """All little endian; layout as in COLMAP's ``reconstruction_io_binary.cc``."""
+    """Write little-endian files as COLMAP's ``reconstruction_io_binary.cc`` does."""
     (folder / "cameras.bin").write_bytes(
         struct.pack("<QIi2Q", 1, _CAMERA_ID, _PINHOLE, camera.width, camera.height)
         + struct.pack("<4d", *_parameters(camera))
@@ -137,5 +137,5 @@ def _write_text(folder: Path, camera: Camera, images: list[_Image], points: list
 
 
 def _words(values: tuple[float, ...] | list[float]) -> str:
-    """Numbers with as many digits as give the same number back."""
+    """Numbers with enough digits to be read back exactly."""
     return " ".join(map(repr, values))

@@ -1,4 +1,4 @@
-"""Which keyframes of a map lie in a part of it. Their height does not count."""
+"""Selection of the keyframes in a part of a map, by their x and z; the height is ignored."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from vslam.map import Map
 
 
 def in_box(map_: Map, box: Sequence[float]) -> NDArray[np.int64]:
-    """Living keyframes between two x and two z, ascending."""
+    """Ids of the living keyframes in ``box`` (two x and two z, metres), ascending."""
     keyframes, xz = _places(map_)
     low, high = np.array(box).reshape(2, 2).T
     return keyframes[((xz >= low) & (xz <= high)).all(axis=1)]
 
 
 def near_point(map_: Map, point: Sequence[float], within: float) -> NDArray[np.int64]:
-    """Living keyframes within a distance of an x and z, ascending."""
+    """Ids of the living keyframes within a distance (metres) of a point (x and z), ascending."""
     keyframes, xz = _places(map_)
     return keyframes[np.linalg.norm(xz - point, axis=1) <= within]
 
@@ -27,8 +27,8 @@ def near_point(map_: Map, point: Sequence[float], within: float) -> NDArray[np.i
 def near_frames(
     map_: Map, drive: int, first: float, last: float, within: float
 ) -> NDArray[np.int64]:
-    """Living keyframes within a distance of those that frames of a drive, ``first`` to ``last``,
-    were; ascending."""
+    """Ids of the living keyframes within a distance (metres) of the keyframes that were made from
+    the frames ``first`` to ``last`` of a drive, ascending."""
     from scipy.spatial import cKDTree
 
     keyframes, xz = _places(map_)

@@ -16,17 +16,17 @@ def save_g2o(
     T_i_j: NDArray[np.float64],
     sigmas: NDArray[np.float64],
 ) -> None:
-    """Write ``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT`` lines: x y z qx qy qz qw each, an edge with
-    the upper triangle of its information, row by row, translation first.
+    """Write ``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT`` lines, each with x y z qx qy qz qw. An edge
+    also has the upper triangle of its information matrix, row by row, translation first.
 
     The information of rotations is per square radian, as GTSAM, Ceres' examples and SE-Sync read
-    it. g2o itself measures rotations by qx qy qz, half as large for small angles, and so gives
-    them a quarter of the weight.
+    it. g2o itself measures rotations by qx qy qz, which are half as large for small angles, and so
+    gives them a quarter of the weight.
 
     Args:
-        ids: ``(N,)`` of the vertices.
+        ids: ``(N,)`` ids of the vertices.
         T_wc: ``(N, 4, 4)`` their poses.
-        edges: ``(E, 2)`` positions i, j in ``ids``.
+        edges: ``(E, 2)`` ends i and j of each edge, as positions in ``ids``.
         T_i_j: ``(E, 4, 4)`` measured pose of j in the frame of i.
         sigmas: ``(E, 2)`` standard deviations, translation (m) and rotation (rad), of each axis.
 
@@ -48,10 +48,10 @@ def save_g2o(
 
 
 def _poses(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``(N, 7)`` x y z qx qy qz qw, qw not negative."""
+    """``(N, 7)`` x y z qx qy qz qw with qw >= 0."""
     from scipy.spatial.transform import Rotation
 
-    if not len(T):  # of none, SciPy makes no quaternions
+    if not len(T):  # SciPy refuses an empty array
         return np.empty((0, 7))
     return np.column_stack(
         [T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)]

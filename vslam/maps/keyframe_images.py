@@ -1,8 +1,8 @@
-"""The images of keyframes as files, and the colours that landmarks have in them."""
+"""The images of keyframes as files, and the colours of landmarks in these images."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -10,39 +10,43 @@ from numpy.typing import NDArray
 
 from vslam.maps.reconstruction import Reconstruction
 
+_LUMA = np.array([299, 587, 114])  # ITU-R BT.601, in thousandths
 
-def saved_images(
-    images: Iterable[NDArray[np.uint8]], paths: Iterable[Path]
-) -> Iterator[NDArray[np.uint8]]:
-    """Write each image to its path as PNG, and yield it.
+
+def save_image(image: NDArray[np.uint8], path: Path) -> None:
+    """Write an image as PNG.
+
+    Args:
+        image: ``(H, W)`` grey or ``(H, W, 3)`` red, green, blue.
 
     Raises:
-        OSError: a file cannot be written.
+        OSError: the file cannot be written.
     """
     import cv2
 
-    for image, path in zip(images, paths, strict=True):
-        _, encoded = cv2.imencode(".png", image)
-        path.write_bytes(encoded.tobytes())
-        yield image
+    if image.ndim == 3:
+        image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), np.uint8)
+    _, encoded = cv2.imencode(".png", image)
+    path.write_bytes(encoded.tobytes())
 
 
 def landmark_colours(
     reconstruction: Reconstruction, images: Iterable[NDArray[np.uint8]]
 ) -> NDArray[np.uint8]:
-    """``(L, 3)`` RGB of each landmark: the median over its observations, of the pixel observed.
+    """``(L, 3)`` uint8 RGB of each landmark, from the observation of median brightness.
 
     Args:
-        images: ``(H, W)`` grey image of each keyframe, in order.
+        images: ``(H, W)`` grey or ``(H, W, 3)`` red, green, blue image of each keyframe, in order.
     """
     r = reconstruction
-    grey = np.empty(len(r.xy), np.uint8)
+    colours = np.empty((len(r.xy), 3), np.uint8)
     for keyframe, image in zip(range(len(r.frames)), images, strict=True):
         seen = r.observations_of(keyframe)
         x, y = np.rint(r.xy[seen]).astype(np.int64).T
-        grey[seen] = image[y.clip(0, image.shape[0] - 1), x.clip(0, image.shape[1] - 1)]
-    order = np.lexsort((grey, r.landmark))
+        pixels = image[y.clip(0, image.shape[0] - 1), x.clip(0, image.shape[1] - 1)]
+        colours[seen] = pixels.reshape(len(pixels), -1)
+    order = np.lexsort((colours @ _LUMA, r.landmark))
     counts = np.bincount(r.landmark, minlength=len(r.xyz))
-    # Of an even number the lower one of both in the middle: a grey that was seen.
+    # The lower median, which is a colour that was observed.
     middle = order[np.cumsum(counts) - counts + (counts - 1) // 2]
-    return np.repeat(grey[middle, None], 3, axis=1)
+    return colours[middle]

@@ -1,8 +1,9 @@
-"""A folder of data for nerfstudio (https://docs.nerf.studio/quickstart/data_conventions.html).
+"""A data set for nerfstudio (https://docs.nerf.studio/quickstart/data_conventions.html).
 
 Cameras look along -z with y up (OpenGL), ``transform_matrix`` is camera to world, and the world's z
-axis points up. Pixels count from the corner of the image, as in COLMAP: nerfstudio's rays go
-through ``column + 0.5`` (``Cameras.get_image_coords``), whatever its documentation says of (0, 0).
+axis points up. Pixel coordinates begin at the corner of the image, as in COLMAP: nerfstudio's rays
+go through ``column + 0.5`` (``Cameras.get_image_coords``), although its documentation suggests
+(0, 0).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from vslam.maps.ply import save_ply
 from vslam.maps.reconstruction import PIXEL_CENTRE, Reconstruction
 
 POINTS = "sparse_pc.ply"
-# The axes of nerfstudio's world: right, forward, up, as the first camera sees them.
+# The axes of nerfstudio's world point right, forward and up as seen from the first camera.
 T_SAVED_WORLD = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
@@ -32,11 +33,11 @@ def save_nerfstudio(
 ) -> None:
     """Write ``transforms.json`` and the landmarks as ``sparse_pc.ply``.
 
-    ``applied_transform`` is what maps vslam's world to the one that both files are in.
+    ``applied_transform`` maps vslam's world to the world of both files.
 
     Args:
         folder: an existing folder.
-        names: of the image of each keyframe, relative to the folder.
+        names: path of each keyframe's image, relative to the folder.
         colours: ``(L, 3)`` RGB of each landmark.
 
     Raises:

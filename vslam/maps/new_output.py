@@ -1,4 +1,4 @@
-"""Files and folders that are there as a whole or not at all."""
+"""Output files and folders that are either complete or absent."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from vslam.errors import InputError, ResultsError
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Yield an empty folder that becomes ``path`` at the end, or is removed after an error.
+    """Yield an empty folder that is renamed to ``path`` at the end, or removed after an error.
 
     Raises:
-        InputError: there is something at ``path`` already, other than an empty folder.
-        ResultsError: it cannot be written, on a full disk for example.
+        InputError: ``path`` exists already and is not an empty folder.
+        ResultsError: it cannot be written, for example because the disk is full.
     """
     free = path.is_dir() and not path.is_symlink() and not any(path.iterdir())
     if not free:
@@ -35,12 +35,12 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Yield the name of a file to write; it becomes ``path`` at the end, or is removed after an
-    error.
+    """Yield the path of a file to write, which is renamed to ``path`` at the end, or removed after
+    an error.
 
     Raises:
-        InputError: there is something at ``path`` already.
-        ResultsError: it cannot be written, on a full disk for example.
+        InputError: ``path`` exists already.
+        ResultsError: it cannot be written, for example because the disk is full.
     """
     _refuse_existing(path)
     part = _beside(path)
@@ -55,11 +55,11 @@ def new_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replaced_file(path: Path) -> Iterator[BinaryIO]:
-    """Yield a file to write; at the end it is on the disk and takes the place of ``path``, in one
-    step. After an error ``path`` is what it was.
+    """Yield a file to write, which atomically replaces ``path`` at the end, synced to the disk.
+    After an error ``path`` is unchanged.
 
     Raises:
-        OSError: it cannot be written, on a full disk for example.
+        OSError: it cannot be written, for example because the disk is full.
     """
     part = _beside(path)
     try:
@@ -70,7 +70,7 @@ def replaced_file(path: Path) -> Iterator[BinaryIO]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
-    if os.name == "posix":  # else after a power cut the name may be the old one's
+    if os.name == "posix":  # without this sync, a power cut may undo the renaming
         folder = os.open(path.absolute().parent, os.O_RDONLY)
         try:
             os.fsync(folder)
@@ -79,15 +79,15 @@ def replaced_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def require_place(path: Path, option: str) -> None:
-    """Refuse what cannot be written, before hours of work for it.
+    """Check before long work that a file can be written to ``path``, the value of ``option``.
 
     Raises:
-        InputError: ``path``, the value of an option, is a folder or lies in none.
+        InputError: ``path`` is a folder, or its parent folder does not exist.
     """
     if path.is_dir():
         raise InputError(f"{option} {path}: is a folder; name a file.")
     if not path.absolute().parent.is_dir():
-        raise InputError(f"{option} {path}: there is no folder {path.parent}; make it first.")
+        raise InputError(f"{option} {path}: there is no folder {path.parent}; create it first.")
 
 
 def _refuse_existing(path: Path) -> None:
@@ -96,7 +96,7 @@ def _refuse_existing(path: Path) -> None:
 
 
 def _beside(path: Path) -> Path:
-    """A hidden name on the same file system, so that renaming is one step."""
+    """A hidden path on the same file system, so that renaming is atomic."""
     path = path.absolute()
     return path.with_name(f".{path.name}.{os.getpid()}.part")
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 def save_ply(
     path: Path | str, xyz: NDArray[np.float64], colours: NDArray[np.uint8] | None = None
 ) -> None:
-    """Write ``(N, 3)`` points (world, metres) as binary PLY, with ``(N, 3)`` RGB ``colours``."""
+    """Write ``(N, 3)`` points (world, metres) as binary PLY, with ``(N, 3)`` uint8 RGB colours."""
     fields = [("xyz", "<f4", 3)]
     properties = [f"property float {axis}\n" for axis in "xyz"]
     if colours is not None:

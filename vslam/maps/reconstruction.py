@@ -1,4 +1,4 @@
-"""A map as other programs know it: posed images, points and what each image saw of them."""
+"""A map as other programs represent it: posed images, points and their observations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from vslam.camera import Camera
 from vslam.geometry import inverses
 from vslam.map import Map
 
-# Of the upper left pixel, where pixels are counted from the corner of the image. Here it is 0.
+# Centre of the upper left pixel in formats whose pixel coordinates begin at the image corner; in
+# vslam it is 0.
 PIXEL_CENTRE = 0.5
 
 
@@ -22,12 +23,12 @@ class Reconstruction:
     K keyframes, L landmarks, N observations. Right cameras are left out.
 
     Attributes:
-        camera: of all keyframes; the centre of the upper left pixel is (0, 0), as in OpenCV.
-        frames: ``(K,)`` int64, the frame of the run that each keyframe was.
+        camera: camera of all keyframes; the centre of the upper left pixel is (0, 0), as in OpenCV.
+        frames: ``(K,)`` int64, index of the frame that became each keyframe.
         timestamps: ``(K,)`` float64 seconds.
-        T_cw: ``(K, 4, 4)`` float64.
-        xyz: ``(L, 3)`` float64, world, each observed at least once.
-        keyframe, landmark: ``(N,)`` int64, by keyframe in ascending order.
+        T_cw: ``(K, 4, 4)`` float64 poses.
+        xyz: ``(L, 3)`` float64 positions in the world; each landmark is observed at least once.
+        keyframe, landmark: ``(N,)`` int64 ends of each observation, in ascending keyframe order.
         xy: ``(N, 2)`` float64 pixels, where the keyframe observes the landmark.
     """
 
@@ -46,19 +47,19 @@ class Reconstruction:
         return inverses(self.T_cw)
 
     def observations_of(self, keyframe: int) -> slice:
-        """Where the observations of a keyframe are in ``landmark`` and ``xy``."""
+        """The observations of a keyframe, as a slice of ``landmark`` and ``xy``."""
         first, last = np.searchsorted(self.keyframe, [keyframe, keyframe + 1])
         return slice(int(first), int(last))
 
     def reprojection_errors(self) -> NDArray[np.float64]:
-        """``(N,)`` pixels from each observation to the projection of its landmark."""
+        """``(N,)`` distance in pixels from each observation to the projection of its landmark."""
         T_cw = self.T_cw[self.keyframe]
         p_c = np.einsum("nij,nj->ni", T_cw[:, :3, :3], self.xyz[self.landmark]) + T_cw[:, :3, 3]
         return np.linalg.norm(self.camera.project(p_c)[:, :2] - self.xy, axis=1)
 
 
 def reconstruction_of(map_: Map, camera: Camera) -> Reconstruction:
-    """The living part of a map; landmarks that no keyframe observes are left out."""
+    """The living keyframes of a map and the landmarks that they observe."""
     a = map_.arrays
     keyframes = map_.living_keyframes()
     rows = np.flatnonzero(a.landmark[: map_.n_rows] >= 0)

@@ -1,7 +1,7 @@
-"""The map on disk: an ``.npz`` that is written as a whole or not at all, and trusted in nothing.
+"""The map on disk: an ``.npz`` file that is written atomically and checked when it is read.
 
-Arrays are not compressed: most of a map are descriptors, in which nothing repeats, and a map is to
-be there in a second.
+Arrays are not compressed: a map consists mostly of descriptors, which do not compress, and should
+load within a second.
 """
 
 from __future__ import annotations
@@ -33,16 +33,21 @@ _FOREIGN = "not a map of vslam; name a map.npz, or the folder of a run"
 
 
 def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) -> None:
-    """Write a map, in place of what is there: what lives of it; all, if it has a checkpoint and is
-    to be ``resumable``.
+    """Write a map; an existing file is replaced.
 
-    The file is complete or, after an error or a power cut, what it was before. Its ``header`` is
-    JSON (schema, camera, detector, drives, versions); the arrays are those of ``ARRAYS``, and
-    ``detector_NAME_first``, ``detector_NAME_values`` and ``image_first``, ``image_values`` by
-    keyframe. Observations are listed by landmark, in the order of the map's chains.
+    After an error or a power cut the file is as it was before. Its ``header`` is JSON (schema,
+    camera, detector, drives, versions); the arrays are those of ``ARRAYS``, and, by keyframe,
+    ``detector_NAME_first``, ``detector_NAME_values``, ``image_first`` and ``image_values``.
+    Observations are listed by landmark, in the order of the map's chains.
+
+    Args:
+        path: the file.
+        stored: the map.
+        resumable: also write the checkpoint, if there is one, with culled keyframes and landmarks;
+            otherwise only living ones are written.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     whole = resumable and stored.checkpoint is not None
     arrays = _as_arrays(stored if whole else stored.compact(copy=False))
@@ -51,17 +56,17 @@ def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) ->
 
 
 def load_map(path: Path | str) -> StoredMap:
-    """Read a map, and check all that kernels rely on. It is compact.
+    """Read a map, check everything that kernels rely on, and make it compact.
 
     Raises:
-        InputError: no such file, no map, damaged, or of another schema.
+        InputError: the file is missing, not a map, damaged, or of another schema.
     """
     stored = load_checkpoint(path)
     return stored if stored.checkpoint is None else stored.compact()
 
 
 def load_checkpoint(path: Path | str) -> StoredMap:
-    """``load_map``, but one that was written with a checkpoint comes as it was then.
+    """Read a map like ``load_map``, but leave one with a checkpoint as it was written.
 
     Raises:
         InputError: as ``load_map``.
@@ -143,13 +148,13 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
 
 
 def map_file_of(path: Path | str) -> Path:
-    """The map of the folder of a run; a file as it is."""
+    """The map file in the folder of a run; any other path is returned unchanged."""
     path = Path(path)
     return path / "map.npz" if path.is_dir() else path
 
 
 def made_with(path: Path | str) -> tuple[Camera, str]:
-    """The camera and the name of the detector that a map was made with, its arrays unread.
+    """The camera and the detector's name that a map was made with; its arrays are not read.
 
     Raises:
         InputError: as ``load_map``.
@@ -167,7 +172,7 @@ def _read(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """An archive of arrays, and its header if it is a map of this schema."""
+    """Open a map file of this schema; yields the archive and the header."""
     try:
         require_memory(path, "a map of vslam")
         with np.load(path, allow_pickle=False) as file:
@@ -193,6 +198,6 @@ def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
     except BadZipFile as error:
         raise InputError(f"{path}: {_FOREIGN}, or the file is damaged ({error}).") from error
     except (*ARCHIVE_ERRORS, TypeError, AttributeError, MemoryError) as error:
-        # np.load tells of pickles and of what is no npz by ValueError, zipfile of encryption by
-        # RuntimeError; a plain array is no archive.
+        # np.load raises ValueError for pickles and for files that are not npz, zipfile raises
+        # RuntimeError for encryption, and a plain array has no ``files``.
         raise InputError(f"{path}: {_FOREIGN}.") from error

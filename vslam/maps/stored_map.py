@@ -1,4 +1,4 @@
-"""A map with all that is needed to go on in it, and without what died on the way."""
+"""A map with everything that is needed to continue in it, usually without dead entries."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from vslam.states import Checkpoint
 
 @dataclass(frozen=True)
 class World:
-    """Where the world of a map lies in that of a ground truth.
+    """The place of a map in the world of a ground truth.
 
     Attributes:
-        name: of the data set and sequence that the ground truth is of.
-        S_truth_world: ``(4, 4)`` motion of the trajectory of the first drive onto its ground truth,
-            a similarity for a monocular map.
+        name: data set and sequence of the ground truth.
+        S_truth_world: ``(4, 4)`` maps the map's world to that of the ground truth, so that the
+            first drive is aligned with it: a rigid motion, or a similarity for a monocular map.
     """
 
     name: str
@@ -41,20 +41,21 @@ class World:
 
 @dataclass(frozen=True)
 class StoredMap:
-    """What a map file holds.
+    """The content of a map file.
 
     Attributes:
         map: keyframes, landmarks and observations.
-        camera: of all keyframes.
-        loops: those that were closed, in the units of today; without features and landmarks.
-        detector: what the loop detector knows of the keyframes.
-        images: JPEG files of the keyframes that learned descriptors may ask for, uint8; None
-            without such a detector.
-        frames: of the last drive, None if they are not kept.
-        drives: what the images of each drive were, "kitti 06" for example.
-        world: where the map lies, None where there is no ground truth.
-        checkpoint: with which the last drive goes on to the byte; then the map has what died,
-            too, numbered as ever. None where there is none, or the map is compact.
+        camera: camera of all keyframes.
+        loops: closed loops in the map's present units, without features and landmarks.
+        detector: what the loop detector has stored about the keyframes.
+        images: JPEG files (uint8) of the keyframes that learned descriptors may need; None without
+            learned descriptors.
+        frames: frame poses of the last drive; None if they are not kept.
+        drives: source of the images of each drive, such as "kitti 06".
+        world: the map's place in the world of a ground truth; None without ground truth.
+        checkpoint: state from which the last drive continues with identical results; the map then
+            includes dead keyframes and landmarks under their old ids. None if the map is compact or
+            there was no checkpoint.
     """
 
     map: Map
@@ -68,23 +69,24 @@ class StoredMap:
     checkpoint: Checkpoint | None = None
 
     def compact(self, *, copy: bool = True) -> StoredMap:
-        """A copy with the living keyframes and landmarks alone, numbered without gaps.
+        """A copy with only the living keyframes and landmarks, numbered without gaps.
 
-        What was placed by a culled keyframe is placed by the living one that took its place.
-        Landmarks come in the order of the first keyframe that lives.
+        Poses relative to a culled keyframe become relative to its parent. Landmarks are ordered by
+        the first living keyframe that observes them.
 
         Args:
-            copy: False: of keypoints, three quarters of a map, a view where all are kept.
+            copy: False returns views of the keypoint arrays, three quarters of a map, if all
+                keypoints are kept.
         """
         return self.select(self.map.living_keyframes(), copy=copy)
 
     def select(self, keyframes: NDArray[np.int64], *, copy: bool = True) -> StoredMap:
-        """``compact`` with some of the living keyframes only, and the landmarks that they see.
+        """Like ``compact``, but with only some living keyframes and the landmarks that they see.
 
         Args:
-            keyframes: ``(K,)`` ascending ids of living keyframes. Frames are dropped unless these
-                are all.
-            copy: as ``compact``.
+            keyframes: ``(K,)`` ascending ids of living keyframes. Frame poses are dropped unless
+                all living keyframes are selected.
+            copy: as in ``compact``.
         """
         map_ = self.map
         whole = len(keyframes) == np.count_nonzero(map_.arrays.keyframe_alive[: map_.n_keyframes])
@@ -109,10 +111,10 @@ class StoredMap:
 
 
 def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> Map:
-    """A copy with some of the living keyframes only, ``(K,)`` ascending ids, and the landmarks that
-    they see, numbered without gaps.
+    """A copy with only some living keyframes, ``(K,)`` ascending ids, and the landmarks that they
+    see, numbered without gaps.
 
-    The parent of a keyframe is its nearest ancestor among them, or else the first of them.
+    The parent of a keyframe is its nearest selected ancestor, or else the first selected keyframe.
     """
     a, n = map_.arrays, len(keyframes)
     new_id = np.full(map_.n_keyframes, NONE, np.int64)
@@ -122,7 +124,8 @@ def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> M
     first, rows = gather_observations(a, living.astype(np.int32), new_id)
     count = np.diff(first)
     anchor = new_id[a.first_keyframe[living]]
-    # Without the keyframe that saw it first, a landmark goes with the first of those that see it.
+    # If the first keyframe of a landmark is not selected, the earliest selected observer replaces
+    # it.
     earliest = np.full(len(living), n, np.int64)
     np.minimum.at(earliest, np.repeat(np.arange(len(living)), count), new_id[a.keyframe[rows]])
     anchor = np.where(anchor >= 0, anchor, earliest)
@@ -167,12 +170,13 @@ def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> M
 def observations(
     rows: NDArray[np.int64], first: NDArray[np.int64], u_right: NDArray[np.float32]
 ) -> dict[str, NDArray]:
-    """The fields of ``Arrays`` that tell which row observes what.
+    """The columns of ``Arrays`` that represent observations.
 
     Args:
-        rows: ``(O,)`` those of each landmark, one landmark after the other, none twice.
-        first: ``(L + 1,)`` where those of each landmark begin; one that died has none.
-        u_right: ``(R,)`` of all rows.
+        rows: ``(O,)`` rows that observe each landmark, one landmark after the other; each row
+            occurs once.
+        first: ``(L + 1,)`` offsets of each landmark in ``rows``; a dead landmark has no rows.
+        u_right: ``(R,)`` right columns of all rows.
     """
     count = np.diff(first)
     landmark, next_row = (np.full(len(u_right), NONE, np.int32) for _ in range(2))
@@ -196,7 +200,7 @@ def observations(
 
 
 def appended(one: StoredMap, other: StoredMap) -> StoredMap:
-    """Two compact maps as one, the second a sub-map of which nobody knows where it lies."""
+    """Append a compact map to another one, as a sub-map at an unknown place."""
     a, b = one.map, other.map
     n, drives = a.n_keyframes, a.scalars.session + 1
     shift = {
@@ -239,7 +243,7 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
 def _family(
     map_: Map, keyframes: NDArray[np.int64], new_id: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """``parent`` and ``restart`` of the keyframes that are kept."""
+    """``parent`` and ``restart`` of the selected keyframes."""
     n, parents = len(keyframes), map_.parents.tolist()
     parent = np.full(n, NONE, np.int64)
     for k, keyframe in enumerate(keyframes.tolist()):
@@ -249,8 +253,8 @@ def _family(
         if ancestor >= 0:
             parent[k] = new_id[ancestor]
 
-    # A sub-map begins at the first keyframe that is kept from its beginning on: edges of the
-    # spanning tree that lead past it are weak.
+    # A sub-map begins at its first selected keyframe; edges of the spanning tree across it are
+    # weak.
     restart = np.zeros(n, np.uint8)
     begins = np.array(map_.restarts, np.int64)
     position = np.searchsorted(keyframes, begins)
@@ -265,14 +269,14 @@ def _family(
 
 
 def _moved(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> FrameTable:
-    """Frames placed by living keyframes, numbered anew."""
+    """Frame poses relative to living keyframes, under their new ids."""
     reference = frames.reference.copy()
     T_c_reference, unit = frames.T_c_reference.copy(), frames.unit_scale.copy()
     table = map_.keyframes
     for i, keyframe in enumerate(frames.reference.tolist()):
         if not map_.n_keyframes or map_.arrays.keyframe_alive[keyframe]:
             continue
-        # As FramePoses.pose places it today.
+        # The same pose as FramePoses.pose returns now.
         T_c_reference[i, :3, 3] *= table.unit_scale[keyframe] / unit[i]
         T_c_reference[i] = orthonormalised(T_c_reference[i] @ table.T_c_parent[keyframe])
         reference[i] = table.parent[keyframe]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vslam.loopclosure.registry import about
-from vslam.report.page import Row, Table
+from vslam.report.page import Row, Section, Table, number
 from vslam.report.schema import ReportJson
 
 _FIGURES = (
@@ -20,20 +20,20 @@ _FIGURES = (
 )
 _NOTE = (
     "All detectors saw the same frames. The time is that of tracking and mapping: images are read "
-    "and features extracted once for all. It is wall time on cores that all of them share, and the "
-    "first one waits longest; to compare costs, time runs of their own."
+    "and features are extracted once for all detectors. It is wall time on cores that the "
+    "detectors share, and the first one waits longest; to compare costs, time separate runs."
 )
 
 
-def detector_table(report: ReportJson) -> Table:
-    """A row for each detector, the run's own first; no rows where there was no comparison.
+def detector_section(report: ReportJson) -> Section:
+    """A row for each detector, the run's own first; empty where there was no comparison.
 
-    Figures that none of them has are left out. The loops closed are counted only where there is no
-    ground truth to say which revisits were found.
+    Figures that no detector has are left out. The loops closed are counted only where there is no
+    ground truth that tells which revisits were found.
     """
     detectors = report.detectors
     if not detectors:
-        return Table("Detectors", ("detector",), [], note=left_out(report))
+        return Section("Detectors", [left_out(report)])
     known = {
         name for _, name, _ in _FIGURES if any(getattr(one, name) is not None for one in detectors)
     }
@@ -45,24 +45,20 @@ def detector_table(report: ReportJson) -> Table:
     rows: list[Row] = [
         (
             one.detector,
-            *(_cell(getattr(one, name), form) for _, name, form in figures),
+            *(number(getattr(one, name), form) for _, name, form in figures),
             *(one.interrupted or "no" for _ in ended),
         )
         for one in detectors
     ]
     names = "; ".join(f"{one.detector}: {about(one.detector)}" for one in detectors)
-    return Table("Detectors", head, rows, ("detector", *ended), f"{names}. {_NOTE}")
+    return Section("Detectors", [Table(head, rows, ("detector", *ended), f"{names}. {_NOTE}")])
 
 
 def left_out(report: ReportJson) -> str:
-    """Why there is no comparison though one was asked for; empty otherwise."""
+    """Why there is no comparison although one was requested; empty otherwise."""
     if report.detectors or not report.compare:
         return ""
     return (
-        f"The comparison with {', '.join(report.compare)} was left out, since the run was resumed: "
+        f"The comparison with {', '.join(report.compare)} was left out: the run was resumed, and "
         "only the map of its own detector had been saved."
     )
-
-
-def _cell(value: float | None, form: str) -> str:
-    return "n/a" if value is None else form.format(value)

@@ -1,21 +1,23 @@
-"""How a figure of the report looks: colours, style, and its two files.
+"""The look of all figures of reports: colours, style, and their two files.
 
 Every figure is drawn once in light colours and saved twice: as PNG, and as SVG whose neutral
-colours are CSS variables, so that the HTML report follows the reader's light or dark theme.
+colours are CSS variables, so that the HTML page follows the reader's light or dark theme.
 """
 
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import matplotlib as mpl
+from matplotlib import style
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from vslam.features import TrackingState
+from vslam.report import page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,15 +63,7 @@ STYLE = {
 WIDTH, LOW, SQUARE = 5.6, 3.0, 6.6
 DOTS_PER_INCH = 160
 
-
-@dataclass(frozen=True)
-class ReportFigure:
-    """One figure: ``svg`` begins at its ``<svg`` tag and takes its neutrals from CSS variables."""
-
-    name: str
-    caption: str
-    png: bytes
-    svg: str
+Drawing = tuple[str, str, Figure]  # name, caption and figure
 
 
 def new_figure(title: str, x_label: str, y_label: str, height: float) -> tuple[Figure, Axes]:
@@ -90,6 +84,13 @@ def add_legend(figure: Figure, axes: Axes) -> None:
     figure.legend(loc="outside lower center", ncols=columns, columnspacing=1.2)
 
 
+def finish_map(figure: Figure, axes: Axes) -> None:
+    """Show both axes at equal scale, with a margin and a legend."""
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+    add_legend(figure, axes)
+
+
 def plain_ticks(axis: Axis) -> None:
     """Label a logarithmic axis with plain numbers: 1, 2, 5, 10, ..."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
@@ -97,7 +98,14 @@ def plain_ticks(axis: Axis) -> None:
     axis.set_major_formatter("{x:g}")
 
 
-def save(name: str, caption: str, figure: Figure) -> ReportFigure:
+def draw(drawings: Iterable[Drawing]) -> list[page.Figure]:
+    """Save drawings; where an iterator makes them, it does so in the style of reports."""
+    # after_reset shuts out a matplotlibrc of the user: equal runs give equal figures.
+    with style.context(STYLE, after_reset=True):
+        return [save(*drawing) for drawing in drawings]
+
+
+def save(name: str, caption: str, figure: Figure) -> page.Figure:
     """Save as PNG and SVG; equal figures give equal bytes."""
     png, svg = io.BytesIO(), io.StringIO()
     figure.set_dpi(DOTS_PER_INCH)
@@ -113,4 +121,4 @@ def save(name: str, caption: str, figure: Figure) -> ReportFigure:
     text = text[text.index("<svg") :]
     for color, variable in _THEME.items():
         text = text.replace(color, f"var(--{variable})")
-    return ReportFigure(name, caption, png.getvalue(), text)
+    return page.Figure(name, caption, png.getvalue(), text)

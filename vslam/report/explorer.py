@@ -1,26 +1,46 @@
-"""What the page's explorer shows: pose, state and error of every frame, images of some keyframes.
+"""The explorer of a page: pose, state and error of every frame, images of some keyframes.
 
 A frame takes 47 bytes of the page, an image with its keypoints about 10,000.
 
-The program is ``explorer.js``, written by hand: a library that draws (Plotly: 4.7 MB) would be
-larger than all else in the page.
+The program is ``explorer.js``, written by hand: a plotting library (Plotly: 4.7 MB) would be larger
+than everything else in the page.
 """
 
 from __future__ import annotations
 
 from base64 import b64encode
 from collections.abc import Collection
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.evaluation.trajectories import Evaluation
+from vslam.report.page import Markup, Section
+from vslam.report.render import fill_template
 from vslam.run.outcome import RunOutcome
 from vslam.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from vslam.run.moments import Moment
+
+
+def explorer(
+    outcome: RunOutcome,
+    evaluation: Evaluation | None,
+    ground_truth: Trajectory | None,
+    moments: Collection[Moment],
+) -> list[Section]:
+    """The section of the page with the explorer; empty for fewer than two frames. See
+    :func:`explorer_data`."""
+    data = explorer_data(outcome, evaluation, ground_truth, moments)
+    if data is None:
+        return []
+    program = files("vslam.report").joinpath("explorer.js").read_text("utf-8")
+    with_error = evaluation is not None
+    markup = fill_template("explorer.html.jinja", data=data, program=program, with_error=with_error)
+    return [Section("Explorer", [Markup(markup)])]
 
 
 def explorer_data(
@@ -29,7 +49,7 @@ def explorer_data(
     ground_truth: Trajectory | None,
     moments: Collection[Moment],
 ) -> dict[str, Any] | None:
-    """Numbers and images for ``explorer.js``, as JSON takes them; None without two frames.
+    """Numbers and images for ``explorer.js``, ready for JSON; None for fewer than two frames.
 
     ``floats`` holds seconds, metres, the heading in degrees (0 looks along z, 90 along x) and the
     error, NaN where there is none.
@@ -82,5 +102,5 @@ def _shown(moment: Moment) -> dict[str, Any]:
 
 
 def _packed(values: NDArray[Any], kind: str) -> str:
-    """Base64 of an array: a third of the bytes of its numbers in JSON, and NaN can be said."""
+    """Base64 of an array: a third of the bytes of its numbers in JSON, and it can hold NaN."""
     return b64encode(values.astype(kind).tobytes()).decode()

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib import style
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from vslam.evaluation.loops import LoopEvaluation
 from vslam.evaluation.trajectories import Evaluation
 from vslam.features import TrackingState
+from vslam.report import page
 from vslam.report.drawing import (
     AMBER,
     BLUE,
@@ -24,12 +24,11 @@ from vslam.report.drawing import (
     MUTED,
     RED,
     STATE_COLORS,
-    STYLE,
     VIOLET,
-    ReportFigure,
+    Drawing,
     add_legend,
+    draw,
     new_figure,
-    save,
 )
 from vslam.report.summary import stage_names
 from vslam.report.trajectory_figures import loop_closing, top_view
@@ -48,7 +47,7 @@ def draw_figures(
     evaluation: Evaluation | None,
     ground_truth: Trajectory | None,
     verdict: LoopEvaluation | None,
-) -> list[ReportFigure]:
+) -> list[page.Figure]:
     """Draw all figures that this run has data for, in the order of the report.
 
     Args:
@@ -57,56 +56,51 @@ def draw_figures(
         ground_truth: of the same frames, or None.
         verdict: of ``outcome.loops``, or None.
     """
-    # after_reset shuts out a matplotlibrc of the user: equal runs give equal figures.
-    with style.context(STYLE, after_reset=True):
-        return [
-            save(name, caption, figure)
-            for name, caption, figure in _draw(outcome, evaluation, ground_truth, verdict)
-        ]
+    return draw(_drawings(outcome, evaluation, ground_truth, verdict))
 
 
-def _draw(
+def _drawings(
     outcome: RunOutcome,
     evaluation: Evaluation | None,
     ground_truth: Trajectory | None,
     verdict: LoopEvaluation | None,
-) -> Iterator[tuple[str, str, Figure]]:
+) -> Iterator[Drawing]:
     if len(outcome.trajectory):
         caption = "Seen from above, at equal scale; z points ahead of the first camera."
         if evaluation is not None and evaluation.alignment != "none":
             caption += f" Estimate after {evaluation.alignment.upper()} alignment."
         if outcome.compared:
-            caption += " Dashed: the detectors compared, each after an alignment of its own."
+            caption += " Dashed: the detectors compared, each after its own alignment."
         yield "top_view", caption, top_view(outcome, evaluation, ground_truth, verdict)
     if outcome.corrections:
         caption = (
-            "Keyframes just before the first loop was closed and at the end. Dashed: each loop, "
-            "from where its keyframes stood before its own correction: what they lie apart is the "
-            "drift that it took away."
+            "Keyframes just before the first loop was closed, and at the end. Dashed: each loop, "
+            "between the positions of its two keyframes before its correction; their distance is "
+            "the drift that the correction removed."
         )
         yield "loop_closing", caption, loop_closing(outcome, evaluation, ground_truth)
     if evaluation is not None:
         yield (
             "error_along_path",
-            "Distance of each position from the ground truth, along the way travelled.",
+            "Distance of each position from the ground truth, along the path travelled.",
             _error_along_path(outcome, evaluation),
         )
-        yield "error_histogram", "How many frames have which error.", _error_histogram(evaluation)
+        yield "error_histogram", "Number of frames by error.", _error_histogram(evaluation)
     if outcome.tracks:
         yield (
             "tracked_points",
-            "Landmarks that survived pose optimisation, of those matched, of the stereo features.",
+            "Stereo features, those that were matched to landmarks, and inliers of the pose.",
             _tracked_points(outcome),
         )
     if stage_names(outcome.tracks):
         yield (
             "stage_times",
-            "Wall time of each stage, stacked; averaged over a few frames on long runs.",
+            "Wall time of each stage, stacked; long runs show averages over a few frames.",
             _stage_times(outcome),
         )
         yield (
             "stage_distribution",
-            "Box: half of the frames that go through the stage; whiskers: 90 %.",
+            "Boxes hold half of the frames that go through a stage, whiskers 90 %.",
             _stage_distribution(outcome),
         )
 

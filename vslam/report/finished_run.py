@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
-from pydantic import ValidationError
 
 from vslam.backend.pose_graph import PoseGraph, essential_graph
 from vslam.camera import Camera, same_camera
 from vslam.config import Config, load_config
-from vslam.datasets import known_datasets, open_sequence
-from vslam.datasets.sequence import Sequence
+from vslam.datasets.frames import Source, TimedFrame, frames_at
+from vslam.datasets.sources import open_source
 from vslam.errors import InputError
 from vslam.loops import LoopEdge
 from vslam.map import Map
 from vslam.maps.storage import load_map
 from vslam.report.schema import ReportJson
+from vslam.run.options import read_options
+
+_SAME_TIME_S = 1e-6
+_WITHOUT_IMAGES = "export g2o, euroc or ply --no-colours, which need none"
 
 
 @dataclass(frozen=True)
@@ -57,70 +57,67 @@ def read_report(folder: Path | str) -> ReportJson:
     Raises:
         InputError: it is missing, damaged or of another version.
     """
-    path = Path(folder) / "report.json"
-    try:
-        content = json.loads(path.read_bytes())
-        return ReportJson.model_validate(content)
-    except ValidationError as error:
-        known = ReportJson.model_fields["schema_version"].default
-        schema = content.get("schema_version") if isinstance(content, dict) else None
-        raise InputError(
-            f"{path}: report schema {schema}, this version reads {known}; run again with it."
-        ) from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: missing or damaged; name the folder of a run.") from error
+    return ReportJson.read(Path(folder) / "report.json")
 
 
 def open_images(
-    run: FinishedRun, root: Path, on_render: Callable[[int, int], None] | None = None
-) -> Sequence:
-    """Open the sequence of a run as far as its last keyframe; ``map.frames`` count its frames.
+    run: FinishedRun,
+    data: str | None = None,
+    on_render: Callable[[int, int], None] | None = None,
+) -> Source:
+    """Open the images of a run again, as its ``run.json`` says.
 
     Args:
-        root: of the data set; runs do not say where their images were. Where the run was made with
-            ``--calib``, its calibration files are read again.
+        data: where they are now, if that is another place.
         on_render: as in :func:`vslam.datasets.open_sequence`.
 
     Raises:
-        InputError: the images are not there, not those of the run, or of no data set.
+        InputError: the images are not there, not by the run's camera, or of a live camera.
     """
-    report = run.report
     if set(run.map.sessions) != {run.map.scalars.session}:  # the report is of the last drive
         raise InputError(
             f"{run.folder}: the map is of several drives, whose images cannot be opened together; "
-            "export g2o, euroc or ply --no-colours, which need none."
+            f"{_WITHOUT_IMAGES}."
         )
-    if report.dataset not in known_datasets():
+    options = read_options(run.folder)
+    if run.report.dataset == "camera":
         raise InputError(
-            f"{run.folder}: images of {report.dataset} cannot be opened again, only those of "
-            f"{', '.join(known_datasets())}; export g2o, euroc or ply --no-colours, which need "
-            "none."
+            f"{run.folder}: what a camera has shown cannot be seen again; {_WITHOUT_IMAGES}."
         )
-    sequence = open_sequence(
-        report.dataset,
-        root,
-        report.sequence,
-        start=report.start,
-        every=report.every,
-        max_frames=int(run.map.frames.max()) + 1,
-        monocular=report.sensor == "mono",
-        calib=report.calib,
-        on_render=on_render,
+    moved = {"dataset": run.report.dataset} | ({} if data is None else {"data": data})
+    source = open_source(options.model_copy(update=moved), on_render)
+    if not same_camera(run.camera, source.camera):
+        raise _other_images(run)
+    return source
+
+
+def keyframe_frames(run: FinishedRun, source: Source) -> Iterator[TimedFrame]:
+    """The frames of a run's keyframes, in the order of its map.
+
+    Raises:
+        InputError: the times are not those of the run.
+    """
+    frames = frames_at(source, run.map.frames.tolist())
+    n = 0
+    for frame, time in zip(frames, run.map.timestamps.tolist(), strict=False):
+        if abs(frame.timestamp - time) > _SAME_TIME_S:
+            raise _other_images(run)
+        yield frame
+        n += 1
+    if n < len(run.map.frames):
+        raise _other_images(run)
+
+
+def _other_images(run: FinishedRun) -> InputError:
+    return InputError(
+        f"{run.report.dataset} {run.report.sequence}: times or camera are not those of "
+        f"{run.folder}; name the data that the run was made on with --data."
     )
-    same = len(sequence) > run.map.frames.max() and np.allclose(
-        sequence.timestamps[run.map.frames], run.map.timestamps, rtol=0.0, atol=1e-6
-    )
-    if not same or not same_camera(run.camera, sequence.camera):
-        raise InputError(
-            f"{report.dataset} {report.sequence}: times or camera are not those of {run.folder}; "
-            "name the data that the run was made on with --data."
-        )
-    return sequence
 
 
 def pose_graph(run: FinishedRun) -> PoseGraph:
-    """The essential graph of a run's final map with its loops as they were measured, weighed as by
-    the run.
+    """The essential graph of a run's final map with its loops as they were measured, with the
+    weights of the run.
 
     Raises:
         InputError: the run's thresholds cannot be read.

@@ -25,8 +25,7 @@ from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_trut
 from vslam.trajectory import write_kitti, write_tum
 
 if TYPE_CHECKING:
-    from vslam.report.figures import ReportFigure
-    from vslam.report.seen_loops import SeenLoop
+    from vslam.report.page import Figure
     from vslam.run.loop_pictures import LoopPicture
     from vslam.run.moments import Moment
 
@@ -77,20 +76,21 @@ def write_results(
     ply: bool = False,
     map_file: Path | None = None,
 ) -> ReportJson:
-    """Evaluate a run, in any state of completion, and write all that is known of it.
+    """Evaluate a run, in any state of completion, and write all results.
 
-    What is worth most comes first, and what fails costs itself alone: trajectories
+    The most valuable files are written first, and one that fails does not affect the others:
+    trajectories
     (``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``, ``keyframes.tum``,
-    ``trajectory_causal.tum`` with poses as they were given at the time,
+    ``trajectory_causal.tum`` with the poses as they were given at the time,
     ``trajectory_<detector>.tum`` of each detector compared), maps (``map.npz``, ``map.ply``),
-    numbers (``frames.csv``, ``config.json``, read by ``--config``, and ``report.json``), and what
-    people read (``figures/*.png``, ``report.md`` and ``report.html``, one file that makes no
+    numbers (``frames.csv``, ``config.json``, read by ``--config``, and ``report.json``), and pages
+    for people (``figures/*.png``, ``report.md`` and ``report.html``, one file that makes no
     network request).
 
     Args:
         folder: an existing folder; what is written replaces files of an earlier report.
         outcome: the run; it may be interrupted, all lost, or without a single frame.
-        pages: write what people read, too: Markdown, HTML and figures.
+        pages: whether to write the pages for people: Markdown, HTML and figures.
         ply: write the landmarks as ``map.ply``, too.
         moments: images of keyframes for the HTML page.
         pictures: of closed loops; some are written as ``figures/loop-<frame>-<frame>.jpg``.
@@ -106,7 +106,7 @@ def write_results(
         verdict = evaluate_loops(outcome)
         command = _evo_command(folder, outcome, evaluation)
         report = summarize(outcome, evaluation, verdict, command, remark)
-        file.write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
+        file.write_text(report.to_json(), encoding="utf-8")
     if pages and report is not None:
         _write_pages(written, report, outcome, evaluation, verdict, moments, pictures)
     written.require_all()
@@ -115,7 +115,7 @@ def write_results(
 
 
 class Results:
-    """The results of a run: each is tried, and what cannot be written whole is removed."""
+    """The results of a run: each is attempted, and an incomplete file is removed."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -123,7 +123,7 @@ class Results:
 
     @contextlib.contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Something that may fail without harm to the other results, whatever it raises."""
+        """A part that may fail, whatever it raises, without affecting the other results."""
         try:
             yield
         except Exception as error:
@@ -178,7 +178,7 @@ def _write_data(
     with written.file("keyframes.tum") as file:
         write_tum(file, outcome.keyframes)
     with written.file("trajectory_causal.tum") as file:
-        write_tum(file, causal_trajectory(outcome))
+        write_tum(file, causal_trajectory(outcome.tracks))
     for other in outcome.compared:
         with written.file(f"trajectory_{_safe(other.settings.detector)}.tum") as file:
             write_tum(file, other.trajectory)
@@ -209,8 +209,8 @@ def _config_text(outcome: RunOutcome) -> str:
 
 
 def write_trajectories(written: Results, outcome: RunOutcome) -> None:
-    """Write the final trajectory in both formats and the ground truth of the same frames; in TUM's
-    alone, which has times, where not all of them have one."""
+    """Write the final trajectory in both formats, and the ground truth of the same frames. Where it
+    is missing for some frames, it is written in the TUM format alone, which has times."""
     with written.file("trajectory_kitti.txt") as file:
         write_kitti(file, outcome.trajectory.T_wc)
     with written.file("trajectory.tum") as file:
@@ -229,7 +229,7 @@ def write_trajectories(written: Results, outcome: RunOutcome) -> None:
 
 
 def _evo_command(folder: Path, outcome: RunOutcome, evaluation: Evaluation | None) -> str | None:
-    """What repeats the evaluation with evo."""
+    """The command that repeats the evaluation with evo."""
     if evaluation is None:
         return None
     if evaluation.frames == len(outcome.trajectory):
@@ -248,27 +248,28 @@ def _write_pages(
     moments: Collection[Moment],
     pictures: Collection[LoopPicture],
 ) -> None:
-    """Figures, and the pages that show them, without those that could not be drawn."""
-    from vslam.report.explorer import explorer_data
+    """Write the figures, and the pages with those that could be drawn."""
+    from vslam.report.explorer import explorer
     from vslam.report.figures import draw_figures
-    from vslam.report.render import render_html, render_markdown
+    from vslam.report.render import html, markdown
+    from vslam.report.run_page import run_page
     from vslam.report.seen_loops import seen_loops
 
-    figures: list[ReportFigure] = []
-    seen: list[SeenLoop] = []
+    truth = matched_ground_truth(outcome)
+    figures: list[Figure] = []
+    seen: list[Figure] = []
     with written.file("figures") as file:
-        figures = draw_figures(outcome, evaluation, matched_ground_truth(outcome), verdict)
+        drawn = draw_figures(outcome, evaluation, truth, verdict)
+        figures = [replace(figure, file=f"figures/{figure.name}.png") for figure in drawn]
         seen = seen_loops(report, pictures)
         file.mkdir(exist_ok=True)
-        for figure in figures:
-            (file / f"{figure.name}.png").write_bytes(figure.png)
-        for loop in seen:
-            (file / loop.name).write_bytes(loop.jpeg)
+        for figure in (*figures, *seen):
+            (written.folder / figure.file).write_bytes(figure.image)
     recordings = sorted(path.name for path in written.folder.glob("recording*.rrd"))
     with written.file("report.md") as file:
-        file.write_text(render_markdown(report, seen, recordings), encoding="utf-8")
+        page = run_page(report, figures, seen, recordings)
+        file.write_text(markdown(page), encoding="utf-8")
     with written.file("report.html") as file:
-        explorer = explorer_data(outcome, evaluation, matched_ground_truth(outcome), moments)
-        config = _config_text(outcome)
-        page = render_html(report, config, figures, explorer, seen, recordings)
-        file.write_text(page, encoding="utf-8")
+        sections = explorer(outcome, evaluation, truth, moments)
+        page = run_page(report, figures, seen, recordings, sections, _config_text(outcome))
+        file.write_text(html(page), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""``frames.csv``: what tracking says of every frame, for scripts and spreadsheets."""
+"""``frames.csv``: the result of tracking for every frame, for scripts and spreadsheets."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _COUNTS = ("n_features", "n_stereo", "n_matches", "n_inliers")
 
 
 def write_frames(path: Path, tracks: list[TrackResult]) -> None:
-    """Write a row a frame: time (s), state, counts, keyframe or not, milliseconds of each stage.
+    """Write a row per frame: time (s), state, counts, keyframe or not, milliseconds of each stage.
 
-    A stage that a frame did not go through is empty.
+    The cell of a stage that a frame did not go through is empty.
     """
     stages = stage_names(tracks)
     with path.open("w", newline="", encoding="utf-8") as file:

@@ -1,28 +1,24 @@
-"""The tables of a report that tell of loops, short even where hundreds were rejected."""
+"""The tables of loops, which stay short even where hundreds of candidates were rejected."""
 
 from __future__ import annotations
 
 import re
 from collections import defaultdict
 
-from vslam.report.page import Row, Table
+from vslam.report.page import Row, Section, Table, number
 from vslam.report.schema import LoopEntry, ReportJson
 
 _MAX_CLOSED = 60
 _MAX_REJECTED = 12
 
 
-def loop_tables(report: ReportJson) -> list[Table]:
-    """Revisits, closed loops, why others were rejected, which came near."""
+def loop_sections(report: ReportJson) -> list[Section]:
+    """Revisits, closed loops, why candidates were rejected, and which of them came near."""
     return [
-        table
-        for table in (
-            _revisits(report),
-            _closed(report),
-            _reasons(report),
-            _nearly(report),
-        )
-        if table.rows
+        Section("Revisits", [_revisits(report)], wide=False),
+        Section("Loops closed", [_closed(report)], wide=False),
+        Section("Loops rejected", [_reasons(report)], wide=False),
+        Section("Rejected with the most inliers", [_nearly(report)], folded=True, wide=False),
     ]
 
 
@@ -36,26 +32,31 @@ def _revisits(report: ReportJson) -> Table:
         )
         for r in report.revisits
     ]
-    note = "By the ground truth: frames on which the camera drives along an earlier stretch again."
-    return Table("Revisits", ("frames", "again", "length", "loop"), rows, ("loop",), note)
+    note = "According to the ground truth: frames where the camera drives an earlier stretch again."
+    return Table(("frames", "again", "length", "loop"), rows, ("loop",), note)
 
 
 def _closed(report: ReportJson) -> Table:
     closed = [loop for loop in report.loops if loop.accepted]
     closed.sort(key=lambda loop: loop.right is not False)  # wrong ones first, else as they came
     rows: list[Row] = [
-        (*_evidence(loop), _right(loop), _metres(loop.moved_m), _seconds(loop.correction_s))
+        (
+            *_evidence(loop),
+            _right(loop),
+            number(loop.moved_m, "{:.2f} m"),
+            number(loop.correction_s, "{:.2f} s"),
+        )
         for loop in closed[:_MAX_CLOSED]
     ]
     head = (*_EVIDENCE, "pose", "moved", "time")
     note = (
         "Proposed by: the detectors that found the place. Verified by: the descriptors whose "
         "matches give the relative pose, ORB's or those that the network learned. Pose: compared "
-        "with the ground truth. Moved: the farthest that the correction moved a keyframe."
+        "with the ground truth. Moved: the largest distance that the correction moved a keyframe."
     )
     if len(closed) > _MAX_CLOSED:
         note += f" {len(closed) - _MAX_CLOSED} more are in report.json."
-    return Table("Loops closed", head, rows, ("pose",), note)
+    return Table(head, rows, ("pose",), note)
 
 
 def _reasons(report: ReportJson) -> Table:
@@ -70,7 +71,7 @@ def _reasons(report: ReportJson) -> Table:
     ]
     head = ("reason", "candidates", "most inliers", "pose right")
     note = f"{report.loops_rejected} candidates; each of them is in report.json."
-    return Table("Loops rejected", head, rows, ("reason",), note)
+    return Table(head, rows, ("reason",), note)
 
 
 def _nearly(report: ReportJson) -> Table:
@@ -80,7 +81,7 @@ def _nearly(report: ReportJson) -> Table:
         (*_evidence(loop), _right(loop), loop.reason) for loop in rejected[:_MAX_REJECTED]
     ]
     head = (*_EVIDENCE, "pose", "reason")
-    return Table("Rejected with the most inliers", head, rows, ("pose", "reason"), folded=True)
+    return Table(head, rows, ("pose", "reason"))
 
 
 _EVIDENCE = ("frame", "earlier", "proposed by", "score", "verified by", "matches", "inliers")
@@ -96,7 +97,7 @@ def _evidence(loop: LoopEntry) -> Row:
 
 
 def _without_numbers(reason: str) -> str:
-    """Reasons that differ in their figures only are one reason."""
+    """Reasons that differ only in their numbers count as one."""
     return re.sub(r"\d+(\.\d+)?", "N", reason)
 
 
@@ -107,11 +108,3 @@ def _right(loop: LoopEntry) -> str:
 def _share_right(loops: list[LoopEntry]) -> str:
     judged = [loop.right for loop in loops if loop.right is not None]
     return f"{sum(judged)} of {len(judged)}" if judged else "n/a"
-
-
-def _metres(value: float | None) -> str:
-    return "n/a" if value is None else f"{value:.2f} m"
-
-
-def _seconds(value: float | None) -> str:
-    return "n/a" if value is None else f"{value:.2f} s"

@@ -6,14 +6,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, StringConstraints
+from pydantic import StringConstraints
+
+from vslam.report.document import Document, Record
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class StageTime(_Model):
+class StageTime(Record):
     """Milliseconds of one stage over the frames that went through it."""
 
     mean: float
@@ -22,15 +20,15 @@ class StageTime(_Model):
     p99: float = 0.0
 
 
-class LoopEntry(_Model):
+class LoopEntry(Record):
     """One loop candidate, accepted or not, in frames of this run.
 
     ``query_frame`` is None for a frame that was not in the map, ``match_frame`` for one of an
-    earlier drive. ``right`` says whether the relative pose found is the ground truth's, None where
-    that cannot be said. ``moved_m`` is the farthest way that the correction moved a keyframe,
-    ``correction_s`` its time; None if rejected. ``matched_by`` names the descriptors that the
-    relative pose comes from, ``orb`` or ``learned``, ``proposed_by`` the detector that found the
-    candidate, or several joined by ``+``.
+    earlier drive. ``right`` says whether the relative pose agrees with the ground truth, None where
+    that is unknown. ``moved_m`` is the largest distance that the correction moved a keyframe,
+    ``correction_s`` the time it took; None if rejected. ``matched_by`` names the descriptors that
+    the relative pose comes from, ``orb`` or ``learned``, ``proposed_by`` the detector that found
+    the candidate, or several joined by ``+``.
     """
 
     query_frame: int | None
@@ -47,8 +45,8 @@ class LoopEntry(_Model):
     correction_s: float | None
 
 
-class RevisitEntry(_Model):
-    """A stretch of frames that leads along an earlier one, by the ground truth.
+class RevisitEntry(Record):
+    """Frames where the camera drives along an earlier stretch, according to the ground truth.
 
     ``loop_frame`` is the first frame with a right loop that was closed on it, None if missed.
     """
@@ -61,19 +59,21 @@ class RevisitEntry(_Model):
     loop_frame: int | None
 
 
-class DetectorFigures(_Model):
-    """One of the detectors that were compared on the same frames; None where a figure cannot be
-    given, as in ``ReportJson``.
+class Measures(Record):
+    """What is measured of a run, and of each detector that is compared with it.
 
-    ``seconds`` is the wall time of the detector's own steps: tracking, waiting for its mapping, and
-    completing the map at the end. Reading images and extracting features, which all detectors
-    share, is not in it. ``interrupted`` says why its run ended early.
+    Errors are None without ground truth, and KITTI's drift also on paths shorter than 100 m.
+    ``causal_ate_rmse_m`` is of the poses as they were given at the time
+    (``trajectory_causal.tum``), after their own alignment. ``loops_closed`` counts candidates,
+    ``loops_wrong`` those of them that are wrong; ``loops_found`` and ``loops_missed`` count
+    stretches where the camera revisits a place. The last three are None without ground truth.
+    ``interrupted`` says why the run ended early.
     """
 
-    detector: str
     lost_frames: int
+    interrupted: str | None
     ate_rmse_m: float | None
-    causal_ate_rmse_m: float | None
+    causal_ate_rmse_m: float | None = None
     rpe_m: float | None
     rpe_deg: float | None
     t_rel_percent: float | None
@@ -82,20 +82,30 @@ class DetectorFigures(_Model):
     loops_found: int | None
     loops_missed: int | None
     loops_wrong: int | None
+
+
+class DetectorFigures(Measures):
+    """One of the detectors that were compared on the same frames.
+
+    ``seconds`` is the wall time of the detector's own steps: tracking, waiting for its mapping, and
+    completing the map at the end. It excludes reading images and extracting features, which all
+    detectors share.
+    """
+
+    detector: str
     seconds: float
-    interrupted: str | None
 
 
-class MapFigures(_Model):
-    """How a run found itself in the map that it went on in.
+class MapFigures(Record):
+    """How a run was localised in the map that it continued.
 
-    ``in_map_percent`` of the frames are placed in it at the end, ``weak_percent`` of the frames
-    only by few inliers (WEAK), which count. ``first_fix_s`` is the time from
-    the first frame to the first that was found in it, None if none was. The camera was looked for
-    in the whole map at ``sought`` frames and found at ``found`` of them. ``error_m`` is the RMSE of
-    the positions of those frames, each as the map says, with the alignment that the drives of the
-    map had: what is wrong with the place of the whole counts. None where the map does not lie in
-    the world of the ground truth.
+    ``in_map_percent`` of the frames are placed in the map at the end; these include
+    ``weak_percent``, which have few inliers (WEAK). ``first_fix_s`` is the time from the first
+    frame to the first one that was found in the map, None if none was. The whole map was searched
+    at ``sought`` frames, successfully at ``found`` of them. ``error_m`` is the RMSE of the
+    positions of the frames in the map after the alignment of the drives that made the map, so that
+    an error in the place of the whole run counts; None where the map does not lie in the world of
+    the ground truth.
     """
 
     in_map_percent: float
@@ -106,7 +116,7 @@ class MapFigures(_Model):
     error_m: float | None
 
 
-class Machine(_Model):
+class Machine(Record):
     """Where the times were measured; ``cores`` counts those that the process may use."""
 
     cpu: str
@@ -115,45 +125,33 @@ class Machine(_Model):
     platform: str
 
 
-class ReportJson(_Model):
+class ReportJson(Measures, Document):
     """One run in numbers.
 
-    Errors are None without ground truth, and KITTI's drift also on paths shorter than 100 m;
-    ``evaluation_remark`` says why there are none, or of how many frames they are.
-    ``causal_ate_rmse_m`` is of the poses as they were given at the time
-    (``trajectory_causal.tum``), after an alignment of their own.
-    ``warnings`` are sentences on faults of the rig that the run has shown.
+    ``evaluation_remark`` says why there are no errors, or of how many frames they are.
+    ``warnings`` are sentences about faults of the rig that the run has shown.
     ``detectors`` has a row for each detector, the run's own first, where others were run beside it
-    (``--compare``): speed, CPU time and memory are then of all together. It is empty in a run that
-    was resumed, since the maps of the others are not saved.
-    ``frames`` counts the frames done; of them ``skipped_frames`` had an unreadable image and
-    ``dropped_frames`` were overtaken by a newer one in a real-time run, whose ``latency_ms`` is
-    from the time of an image to its pose (None in any other run).
-    ``loops_closed`` and ``loops_rejected`` count candidates, ``loops_wrong`` the closed ones that
-    are wrong; ``loops_found`` and ``loops_missed`` count the ``revisit_stretches``. The last four
-    are None without ground truth. See :mod:`vslam.evaluation.loops`.
+    (``--compare``): speed, CPU time and memory are then those of all together. It is empty in a run
+    that was resumed, since the maps of the others are not saved.
+    ``frames`` counts the frames that were processed; of them ``skipped_frames`` had an unreadable
+    image and ``dropped_frames`` were overtaken by a newer one in a real-time run, whose
+    ``latency_ms`` is from the time of an image to its pose (None in any other run).
+    ``loops_rejected`` counts candidates; ``loops_found`` and ``loops_missed`` add up to
+    ``revisit_stretches``. See :mod:`vslam.evaluation.loops`.
     """
 
     schema_version: int = 5
 
-    lost_frames: int
     weak_frames: int
     skipped_frames: int
     skipped_messages: list[str]
     dropped_frames: int = 0
     frames: int
-    interrupted: str | None
     warnings: tuple[str, ...] = ()
 
     alignment: Annotated[str, StringConstraints(pattern="^(se3|sim3|none)$")] | None
-    ate_rmse_m: float | None
-    causal_ate_rmse_m: float | None = None
     ate_mean_m: float | None = None
     ate_max_m: float | None = None
-    rpe_m: float | None
-    rpe_deg: float | None
-    t_rel_percent: float | None
-    r_rel_deg_per_100m: float | None
     evo_command: str | None
     evaluation_remark: str | None = None
 
@@ -167,15 +165,11 @@ class ReportJson(_Model):
     keyframes: int
     landmarks: int
     submaps: int
-    loops_closed: int
     loops_rejected: int
-    loops_found: int | None
-    loops_missed: int | None
-    loops_wrong: int | None
     revisit_stretches: int | None
     revisits: list[RevisitEntry]
     loops: list[LoopEntry]
-    detectors: list[DetectorFigures] = []
+    detectors: tuple[DetectorFigures, ...] = ()
     in_map: MapFigures | None = None
 
     dataset: str

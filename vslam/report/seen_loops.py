@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from base64 import b64encode
 from collections.abc import Collection
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from vslam.report.page import Figure
 from vslam.report.schema import LoopEntry, ReportJson
 
 if TYPE_CHECKING:
@@ -16,33 +15,13 @@ _MOST = 6  # loops in pictures: about 0.5 MB of the page
 _DESCRIPTORS = {"orb": "ORB descriptors", "learned": "learned descriptors"}
 
 
-@dataclass(frozen=True)
-class SeenLoop:
-    """A closed loop in a picture.
-
-    Attributes:
-        name: of its file in the folder of figures.
-        caption: what the picture shows.
-        jpeg: both images side by side, with the matches.
-    """
-
-    name: str
-    caption: str
-    jpeg: bytes
-
-    @property
-    def address(self) -> str:
-        """The picture as a ``data:`` address, for a page that loads nothing."""
-        return f"data:image/jpeg;base64,{b64encode(self.jpeg).decode()}"
-
-
-def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[SeenLoop]:
+def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Figure]:
     """Draw the closed loops that a reader should see: wrong ones first, then those that learned
-    descriptors verified, else in their order.
+    descriptors verified, otherwise in their order.
 
     Args:
         report: of the run.
-        pictures: of its closed loops, as far as both images are kept.
+        pictures: of those of its closed loops of which both images are kept.
     """
     closed = {(loop.query_frame, loop.match_frame): loop for loop in report.loops if loop.accepted}
     of_loop = [(closed.get((one.query_frame, one.match_frame)), one) for one in pictures]
@@ -53,17 +32,14 @@ def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Se
 
     shown.sort(key=lambda one: (one[0].right is not False, one[0].matched_by != "learned"))
     return [
-        SeenLoop(
-            f"loop-{picture.query_frame}-{picture.match_frame}.jpg",
-            _caption(loop),
-            draw_picture(picture),
-        )
+        Figure(name, _caption(loop), draw_picture(picture), file=f"figures/{name}")
         for loop, picture in shown[:_MOST]
+        if (name := f"loop-{picture.query_frame}-{picture.match_frame}.jpg")
     ]
 
 
-def seen_note(report: ReportJson, seen: Collection[SeenLoop]) -> str:
-    """What the pictures show, and of how many loops there is none."""
+def seen_note(report: ReportJson, seen: Collection[Figure]) -> str:
+    """What the pictures show, and how many of the closed loops have one."""
     note = "Lines join what both images show; at most 60 matches are drawn."
     if len(seen) < report.loops_closed:
         note += f" {len(seen)} of the {report.loops_closed} closed loops are shown."

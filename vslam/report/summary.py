@@ -6,6 +6,7 @@ import platform
 from collections import Counter
 from dataclasses import asdict
 from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,25 +51,16 @@ def summarize(
     options = asdict(outcome.settings)
     del options["config"]
     loops = _loops(outcome, verdict)
-    closed = sum(loop.accepted for loop in loops)
     return ReportJson(
-        lost_frames=states[TrackingState.LOST],
         weak_frames=states[TrackingState.WEAK],
         skipped_frames=len(outcome.skipped),
         skipped_messages=outcome.skipped,
         dropped_frames=states[TrackingState.DROPPED],
         frames=frames,
-        interrupted=outcome.interrupted,
         warnings=tuple(outcome.warnings),
         alignment=evaluation.alignment if evaluation else None,
-        ate_rmse_m=evaluation.ate_rmse_m if evaluation else None,
-        causal_ate_rmse_m=causal_ate(outcome),
         ate_mean_m=evaluation.ate_mean_m if evaluation else None,
         ate_max_m=evaluation.ate_max_m if evaluation else None,
-        rpe_m=evaluation.rpe_m if evaluation else None,
-        rpe_deg=evaluation.rpe_deg if evaluation else None,
-        t_rel_percent=evaluation.t_rel_percent if evaluation else None,
-        r_rel_deg_per_100m=evaluation.r_rel_deg_per_100m if evaluation else None,
         evo_command=evo_command,
         evaluation_remark=remark,
         fps=done / outcome.wall_s if outcome.wall_s > 0 else 0.0,
@@ -80,11 +72,7 @@ def summarize(
         keyframes=outcome.n_keyframes,
         landmarks=outcome.n_landmarks,
         submaps=outcome.n_submaps,
-        loops_closed=closed,
-        loops_rejected=len(loops) - closed,
-        loops_found=verdict.n_found if verdict else None,
-        loops_missed=verdict.n_missed if verdict else None,
-        loops_wrong=verdict.n_wrong if verdict else None,
+        loops_rejected=sum(not loop.accepted for loop in loops),
         revisit_stretches=len(verdict.revisits) if verdict else None,
         revisits=_revisits(verdict) if verdict else [],
         loops=loops,
@@ -93,15 +81,18 @@ def summarize(
         machine=this_machine(),
         versions=versions(),
         created=datetime.now(UTC).replace(microsecond=0),
+        **_measures(outcome, evaluation, verdict),
         **options,
     )
 
 
 def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
-    """Errors of a run's final trajectory, or None, and why they are not of all frames."""
+    """Errors of a run's final trajectory, or None, and why some frames are not evaluated."""
     ground_truth = matched_ground_truth(outcome)
     if ground_truth is None:
         return None, "no ground truth"
+    if not outcome.tracks:
+        return None, "no frames"
     try:
         alignment = outcome.settings.alignment
         found = evaluate_trajectory(outcome.trajectory, ground_truth, alignment)
@@ -113,15 +104,32 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
 
 
 def causal_ate(outcome: RunOutcome) -> float | None:
-    """ATE of the poses as they were given at the time, None where it cannot be said."""
+    """ATE of the poses as they were given at the time, None where it cannot be computed."""
     ground_truth = matched_ground_truth(outcome)
     if ground_truth is None or not outcome.tracks:
         return None
     try:
-        given = causal_trajectory(outcome)
+        given = causal_trajectory(outcome.tracks)
         return evaluate_trajectory(given, ground_truth, outcome.settings.alignment).ate_rmse_m
     except InputError:
         return None
+
+
+def _measures(
+    outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
+) -> dict[str, Any]:
+    """The fields of :class:`vslam.report.schema.Measures`."""
+    errors = ("ate_rmse_m", "rpe_m", "rpe_deg", "t_rel_percent", "r_rel_deg_per_100m")
+    return {
+        "lost_frames": sum(track.state == TrackingState.LOST for track in outcome.tracks),
+        "interrupted": outcome.interrupted,
+        **{name: getattr(evaluation, name, None) for name in errors},
+        "causal_ate_rmse_m": causal_ate(outcome),
+        "loops_closed": sum(edge.accepted for edge in outcome.loops),
+        "loops_found": verdict.n_found if verdict else None,
+        "loops_missed": verdict.n_missed if verdict else None,
+        "loops_wrong": verdict.n_wrong if verdict else None,
+    }
 
 
 def _detectors(
@@ -130,32 +138,12 @@ def _detectors(
     """A row for each detector if there was a comparison, the run's own first."""
     if not outcome.compared:
         return []
-    others = [
-        _detector_figures(other, evaluate_run(other)[0], evaluate_loops(other))
-        for other in outcome.compared
+    judged = [(outcome, evaluation, verdict)]
+    judged += [(other, evaluate_run(other)[0], evaluate_loops(other)) for other in outcome.compared]
+    return [
+        DetectorFigures(detector=one[0].settings.detector, seconds=one[0].step_s, **_measures(*one))
+        for one in judged
     ]
-    return [_detector_figures(outcome, evaluation, verdict), *others]
-
-
-def _detector_figures(
-    outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
-) -> DetectorFigures:
-    return DetectorFigures(
-        detector=outcome.settings.detector,
-        lost_frames=sum(track.state == TrackingState.LOST for track in outcome.tracks),
-        ate_rmse_m=evaluation.ate_rmse_m if evaluation else None,
-        causal_ate_rmse_m=causal_ate(outcome),
-        rpe_m=evaluation.rpe_m if evaluation else None,
-        rpe_deg=evaluation.rpe_deg if evaluation else None,
-        t_rel_percent=evaluation.t_rel_percent if evaluation else None,
-        r_rel_deg_per_100m=evaluation.r_rel_deg_per_100m if evaluation else None,
-        loops_closed=sum(edge.accepted for edge in outcome.loops),
-        loops_found=verdict.n_found if verdict else None,
-        loops_missed=verdict.n_missed if verdict else None,
-        loops_wrong=verdict.n_wrong if verdict else None,
-        seconds=outcome.step_s,
-        interrupted=outcome.interrupted,
-    )
 
 
 def _figures_in_map(outcome: RunOutcome) -> MapFigures | None:
@@ -210,7 +198,7 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
 
 
 def _frame(frames: NDArray[np.int64], keyframe: int) -> int | None:
-    """The frame of this run that a keyframe was; None for none, and for those of earlier drives."""
+    """The frame of this run that became a keyframe; None for none and for earlier drives."""
     return int(frames[keyframe]) if keyframe >= 0 and frames[keyframe] >= 0 else None
 
 

@@ -23,7 +23,7 @@ from vslam.report.drawing import (
     SQUARE,
     STATE_COLORS,
     VIOLET,
-    add_legend,
+    finish_map,
     new_figure,
 )
 from vslam.report.summary import evaluate_run
@@ -94,9 +94,7 @@ def top_view(
             lines = _lines(_at_frames(outcome, path, frames.ravel()).reshape(-1, 2, 3))
             label = f"{name} ({len(chosen)})"
             axes.plot(*lines, "o-", color=color, linewidth=1.2, markersize=4, label=label, zorder=5)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.06)
-    add_legend(figure, axes)
+    finish_map(figure, axes)
     return figure
 
 
@@ -136,9 +134,7 @@ def loop_closing(
         lines = _lines(_aligned(outcome, evaluation, np.concatenate(ends)).reshape(-1, 2, 3))
         label = f"loop, before ({len(ends)})"
         axes.plot(*lines, "o--", color=GREEN, linewidth=1.2, markersize=4, label=label, zorder=5)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.06)
-    add_legend(figure, axes)
+    finish_map(figure, axes)
     return figure
 
 

@@ -1,14 +1,14 @@
-"""The options of ``vslam run`` that a run depends on, kept in its folder to be resumed with."""
+"""The options of ``vslam run``, saved in the folder of the run so that it can be resumed."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from vslam.config import Config
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import Stream, is_live
+from vslam.datasets.frames import Source
+from vslam.datasets.sources import SourceOptions
 from vslam.errors import InputError
 from vslam.loopclosure.registry import DEFAULT_DETECTOR
 from vslam.run.outcome import RunSettings
@@ -16,31 +16,15 @@ from vslam.run.outcome import RunSettings
 OPTIONS = "run.json"
 
 
-class RunOptions(BaseModel):
-    """As the command line has them; paths are absolute in a file."""
+class RunOptions(SourceOptions):
+    """The options as given on the command line; in the file, paths are absolute."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    data: str
-    dataset: str | None = None
-    seq: str | None = None
-    calib: tuple[Path, ...] = ()
-    right: Path | None = None
-    depth: Path | None = None
-    fps: float | None = None
-    side_by_side: bool = False
-    topics: str = ""
-    depth_scale: float | None = None
     perturb: str = "none"
-    start: int = 0
-    every: int = 1
-    max_frames: int | None = None
     seed: int = 0
     threads: int = 1
     detector: str = DEFAULT_DETECTOR
     weights: Path | None = None
     local_weights: Path | None = None
-    sensor: str | None = None
     thresholds: Config = Config()
     map_file: Path | None = None
     localize: bool = False
@@ -49,17 +33,14 @@ class RunOptions(BaseModel):
     autosave: float = 60.0
 
 
-def settings_of(
-    options: RunOptions, dataset: str, source: Sequence | Stream, perturb: str
-) -> RunSettings:
-    """What a run of a source with these options tells of itself.
+def settings_of(options: RunOptions, source: Source, perturb: str) -> RunSettings:
+    """The settings that the report shows for a run of a source with these options.
 
     Args:
-        dataset: what kind of source it is.
-        perturb: name of the perturbation, laws with their strengths.
+        perturb: name of the perturbation: its laws with their strengths.
     """
     return RunSettings(
-        dataset=dataset,
+        dataset=source.dataset,
         sequence=source.name,
         perturb=perturb,
         detector=options.detector,
@@ -72,7 +53,7 @@ def settings_of(
         config=options.thresholds,
         weights=options.weights,
         local_weights=options.local_weights,
-        realtime=options.realtime or is_live(source),
+        realtime=options.realtime or source.live,
         calib=options.calib,
         map=options.map_file,
         localize=options.localize,
@@ -92,37 +73,47 @@ def write_options(folder: Path, options: RunOptions) -> None:
         for name in ("right", "depth", "weights", "local_weights", "map_file")
         if (path := getattr(options, name)) is not None
     }
-    absolute["data"] = str(data.resolve()) if data.exists() else options.data
+    if options.data and data.exists():
+        absolute["data"] = str(data.resolve())
     absolute["calib"] = tuple(path.resolve() for path in options.calib)
     text = options.model_copy(update=absolute).model_dump_json(indent=2)
     try:
         (folder / OPTIONS).write_text(text + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(
-            f"{folder / OPTIONS}: cannot be written ({error.strerror}); name a folder with some "
-            "space with --out."
+            f"{folder / OPTIONS}: cannot be written ({error.strerror}); name a writable folder with "
+            "free space with --out."
         ) from error
 
 
-def read_options(folder: Path) -> RunOptions:
-    """Read ``run.json`` of the folder of a run that is to be resumed.
+def resumed_options(folder: Path) -> RunOptions:
+    """The options of a run that is to be resumed.
 
     Raises:
-        InputError: there is none, or it is damaged, or the folder holds a link: the run would write
-            to wherever it leads.
+        InputError: as `read_options`, or the folder contains a symbolic link, through which the
+            run would write outside the folder.
     """
     for path in folder.rglob("*"):
         if path.is_symlink():
             raise InputError(
-                f"{path}: this is a link, and a resumed run writes into its own folder only; put "
-                "the file itself there."
+                f"{path}: this is a link, but a resumed run writes only into its own folder; "
+                "replace the link by the file."
             )
+    return read_options(folder)
+
+
+def read_options(folder: Path) -> RunOptions:
+    """Read ``run.json`` of the folder of a run.
+
+    Raises:
+        InputError: there is none, or it is damaged.
+    """
     path = folder / OPTIONS
     try:
         return RunOptions.model_validate_json(path.read_bytes())
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); name the folder of a run with --resume."
+            f"{path}: cannot be read ({error.strerror}); name the folder of a run."
         ) from error
     except ValidationError as error:
-        raise InputError(f"{path}: damaged, or of another version; run again.") from error
+        raise InputError(f"{path}: damaged or from another version; start a new run.") from error

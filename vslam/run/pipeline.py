@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, same_camera
+from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation import Perturbation, perturbed
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import Stream, TimedFrame, is_live, timed_frames
 from vslam.errors import BrokenSourceError, InputError
 from vslam.features import TrackingState, TrackResult
 from vslam.frontend.sides import Sides
@@ -27,20 +27,22 @@ from vslam.loops import LoopCorrection, LoopEdge
 from vslam.machine import give_back_memory, peak_memory_mb, process_age
 from vslam.map import Map
 from vslam.maps.storage import made_with
+from vslam.plugins import reason
 from vslam.run.autosave import NO_AUTOSAVE, Autosave, Unfinished
-from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
+from vslam.run.outcome import RunOutcome, RunSettings, causal_trajectory, ground_truth_of
 from vslam.run.preparation import PreparedFrame, in_their_time
 from vslam.run.progress import Progress, TrackLog, in_frames
 from vslam.run.realtime import Played
 from vslam.run.recorder import Recorder
 from vslam.run.rig import delay_warnings, measure_rig, residual_warnings, rig_warnings
 from vslam.slam import Slam
+from vslam.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
 
 
 def run_sequence(
-    sequence: Sequence | Stream,
+    sequence: Source,
     perturbation: Perturbation,
     settings: RunSettings,
     recorder: Recorder,
@@ -55,7 +57,8 @@ def run_sequence(
     A frame that cannot be read is skipped: it gets a predicted pose, counts as lost and is listed
     in the outcome. One that is dropped in a real-time run gets an interpolated pose. Ctrl-C ends
     the run after the current frame, a source that breaks off after its last good one, a detector of
-    another package where it fails; all done so far is kept.
+    another package, and any other part, where it fails; all done so far is kept. If mapping failed,
+    the map is incomplete: the outcome then has no map, and its poses are those of tracking.
 
     The detectors of ``settings.compare`` run beside the main one. Images are read and features
     extracted once; each detector has a map of its own, of which only trajectory, frames and loops
@@ -69,7 +72,8 @@ def run_sequence(
         slam: what ``begin`` gave for the same settings, if that was called before.
 
     Raises:
-        InputError: the images are not those that the resumed run began with; as ``begin``.
+        InputError: before the first frame: the images are not those that the resumed run began
+            with, or cannot be read; as ``begin``.
     """
     cv2.setNumThreads(1)  # the pool uses the cores
     slam = slam or begin(sequence.camera, settings, None if resume is None else resume.map)
@@ -80,38 +84,48 @@ def run_sequence(
     n_told = 0  # loops that the recorder knows of
     broken: list[str] = []
     with _stop_on_interrupt() as interrupted:
-        frames = perturbed(_until_broken(timed_frames(sequence), broken), perturbation)
+        frames = perturbed(_until_broken(sequence.frames(), broken), perturbation)
         frames = _following(frames, main.before.tracks.timestamps)
-        for played in in_their_time(frames, slam.context, settings, live=is_live(sequence)):
-            result = main.step(played)
-            if (frame := played.made) is not None and frame.problem and not frame.dropped:
-                _log.warning("frame %d skipped: %s", result.index, frame.problem)
-            autosave.frame(result)
-            if result.state != TrackingState.DROPPED:
-                n_told = _show(recorder, slam, result, played, n_told)
-            on_frame(result)
-            autosave.offer(slam, main.so_far)
-            for other in others:
-                if other.problem is None:
-                    other.step(played)
-            if main.problem:
-                broken.append(main.problem)
-                break
-            if interrupted.is_set():
-                if not is_live(sequence):  # a camera has no other end
-                    broken.append("Ctrl-C")
-                break
-        main.finish()
+        try:
+            for played in in_their_time(frames, slam.context, settings, live=sequence.live):
+                result = main.step(played)
+                if (frame := played.made) is not None and frame.problem and not frame.dropped:
+                    _log.warning("frame %d skipped: %s", result.index, frame.problem)
+                autosave.frame(result)
+                if result.state != TrackingState.DROPPED:
+                    n_told = _show(recorder, slam, result, played, n_told)
+                on_frame(result)
+                autosave.offer(slam, main.so_far)
+                for other in others:
+                    if other.problem is None:
+                        with other.keeping_what_is_done(f"frame {result.index}"):
+                            other.step(played)
+                if main.problem:
+                    break
+                if interrupted.is_set():
+                    if not sequence.live:  # a camera has no other end
+                        broken.append("Ctrl-C")
+                    break
+        except Exception as error:  # whatever it is, what is done is kept
+            if isinstance(error, InputError) and not main.has_begun:
+                raise
+            main.fail(f"frame {len(main.tracks)}", error)
+        for one in (main, *others):
+            with one.keeping_what_is_done("completing the map"):
+                one.finish()
         if not broken and main.problem:
             broken.append(main.problem)
-        autosave.close(slam, main.so_far, whole=not broken)
-        for other in others:
-            other.finish()
+        with main.keeping_what_is_done("saving the map"):
+            autosave.close(slam, main.so_far, resumable=bool(broken) and main.has_map)
     seconds = main.seconds()
     give_back_memory()  # results need room: a map is copied before it is written
-    _tell_loops(recorder, slam, n_told)
-    recorder.finish(slam.trajectory(), slam.map)
-    ended = broken[0] if broken else None
+    with main.keeping_what_is_done("the final trajectory"):
+        if main.has_map:
+            _tell_loops(recorder, slam, n_told)
+            recorder.finish(main.trajectory(), slam.map)
+        else:
+            recorder.finish(causal_trajectory(main.tracks), None)
+    ended = broken[0] if broken else main.problem
     beside = [_outcome(sequence, other, seconds, other.problem or ended) for other in others]
     compared = tuple(replace(one, map=None, stored=None) for one in beside)  # maps are large
     return replace(_outcome(sequence, main, seconds, ended), compared=compared)
@@ -139,13 +153,50 @@ class _Run:
         self.latency_ms = list(before.latency_ms)
         self.startup_s = process_age()
         self.step_s = 0.0
+        self._failure: str | None = None
         self._log = TrackLog(before.tracks)
         self._wall, self._cpu = time.perf_counter(), time.process_time()
 
     @property
     def problem(self) -> str | None:
-        """What failed in the detector, if it is of another package."""
-        return problem_of(self.slam.detector)
+        """What failed, in a few words, so that the run ends; None if nothing did."""
+        return self._failure or problem_of(self.slam.detector)
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether a frame was done since the run began or was resumed."""
+        return len(self.tracks) > len(self.before.tracks)
+
+    @property
+    def has_map(self) -> bool:
+        """Whether the map is complete, once the run is finished."""
+        try:
+            self.slam.map  # noqa: B018
+        except RuntimeError:
+            return False
+        return True
+
+    def fail(self, what: str, error: Exception) -> None:
+        """Note what ended the run; what follows from it is not noted."""
+        if self._failure is not None:
+            return
+        if sys.flags.dev_mode:
+            _log.warning("the run ends here", exc_info=error)
+        why = str(error).rstrip(".") if isinstance(error, InputError) else reason(error)
+        self._failure = f"{what} failed, {why}"
+
+    @contextmanager
+    def keeping_what_is_done(self, what: str) -> Iterator[None]:
+        """Let an exception end this run alone, so that all done before is kept."""
+        try:
+            yield
+        except Exception as error:
+            self.fail(what, error)
+
+    def trajectory(self) -> Trajectory:
+        """Pose of each frame done, as the map is now."""
+        # A frame that failed after it was placed is no frame of the run.
+        return self.slam.trajectory().select(np.arange(len(self.tracks)))
 
     def step(self, played: Played[PreparedFrame]) -> TrackResult:
         """Track a frame that was prepared, or pass over one that was dropped or cannot be read."""
@@ -234,48 +285,74 @@ def _following(frames: Iterator[TimedFrame], before: NDArray[np.float64]) -> Ite
 
 
 def _outcome(
-    sequence: Sequence | Stream,
+    sequence: Source,
     run: _Run,
     seconds: tuple[float, float],
     interrupted: str | None,
 ) -> RunOutcome:
     """All that is known at the end; ``seconds`` of wall and CPU time of all frames."""
-    slam, settings = run.slam, run.settings
-    loops, corrections, keyframe_frames = _with_earlier(run.before, slam)
-    residuals = measure_rig(slam.map, sequence.camera)
-    drive = f"{settings.dataset} {sequence.name}"
-    return RunOutcome(
-        settings=settings,
+    keyframes = [track for track in run.tracks if track.is_keyframe]
+    outcome = RunOutcome(
+        settings=run.settings,
         sequence=sequence,
-        trajectory=slam.trajectory(),
-        keyframes=slam.keyframe_trajectory(),
+        trajectory=causal_trajectory(run.tracks),
+        keyframes=causal_trajectory(keyframes),
         tracks=run.tracks,
         skipped=run.skipped,
-        warnings=[
-            *rig_warnings(run.sides),
-            *(
-                delay_warnings(slam.rig.delay, sequence.camera)
-                or residual_warnings(residuals, sequence.camera)
-            ),
-        ],
+        warnings=["there is no map of this run, and its poses are those of tracking"],
         wall_s=seconds[0],
         cpu_s=seconds[1],
         step_s=run.step_s,
         startup_s=run.startup_s,
         peak_memory_mb=peak_memory_mb(),
         latency_ms=run.latency_ms,
+        n_keyframes=len(keyframes),
+        n_landmarks=0,
+        world=run.slam.world,
+        interrupted=interrupted,
+    )
+    if run.has_map:
+        with run.keeping_what_is_done("collecting the results"):
+            return _with_map(outcome, run)
+    return replace(outcome, interrupted=interrupted or run.problem)
+
+
+def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
+    """An outcome with all that only a complete map tells."""
+    slam, settings, camera = run.slam, run.settings, outcome.sequence.camera
+    loops, corrections, keyframe_frames = _with_earlier(run.before, slam)
+    return replace(
+        outcome,
+        trajectory=run.trajectory(),
+        keyframes=slam.keyframe_trajectory(),
+        warnings=[
+            *slam.problems,
+            *rig_warnings(run.sides),
+            *_map_warnings(slam, camera),
+        ],
         n_keyframes=len(slam.map.living_keyframes()),
         n_landmarks=len(slam.map.living_landmarks()),
         map=slam.map,
-        stored=None if settings.localize else slam.stored_map(drive),
-        world=slam.world,
-        in_map=None if settings.map is None else slam.in_map(),
+        stored=None
+        if settings.localize
+        else slam.stored_map(f"{settings.dataset} {outcome.sequence.name}"),
+        in_map=None if settings.map is None else slam.in_map()[: len(run.tracks)],
         loops=loops,
         corrections=corrections,
         keyframe_frames=keyframe_frames,
         n_submaps=len({0, *slam.map.restarts}) if slam.map.n_keyframes else 0,
-        interrupted=interrupted,
     )
+
+
+def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
+    """Faults of the rig that the map shows."""
+    try:
+        residuals = measure_rig(slam.map, camera)
+        return delay_warnings(slam.rig.delay, camera) or residual_warnings(residuals, camera)
+    except Exception as error:  # a check must not cost what is checked
+        problem = f"the rig could not be checked ({reason(error)})"
+        _log.warning(problem)
+        return [problem]
 
 
 def _with_earlier(
@@ -349,6 +426,10 @@ def _until_broken(frames: Iterator[TimedFrame], broken: list[str]) -> Iterator[T
         yield from frames
     except BrokenSourceError as error:
         broken.append(str(error).rstrip("."))
+    except InputError:
+        raise
+    except Exception as error:  # the frames before it are still to be tracked
+        broken.append(f"reading the images failed, {reason(error)}")
 
 
 def _tell_loops(recorder: Recorder, slam: Slam, n_told: int) -> int:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import DepthImage, Image, ImageMap
-from vslam.datasets.stream import TimedFrame
+from vslam.datasets.frames import TimedFrame
 from vslam.errors import DroppedFrameError, UnreadableImageError
 from vslam.features import Extracted, Side
 from vslam.frontend.extraction import extract_features

@@ -21,7 +21,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec, Protocol
+from typing import Any, Concatenate, ParamSpec
 
 import cv2
 import numpy as np
@@ -33,6 +33,7 @@ from vslam.features import Features, TrackingState, TrackResult
 from vslam.geometry import inverses
 from vslam.loops import LoopEdge
 from vslam.map import Map
+from vslam.plugins import reason
 from vslam.run.loop_pictures import LoopPicture, draw_picture
 from vslam.trajectory import Trajectory
 
@@ -73,8 +74,11 @@ _FILE_PACE = _Pace(50, 25, 10)
 _VIEWER_PACE = _Pace(5, 5, 2)  # nothing is kept for long there
 
 
-class Recorder(Protocol):
-    """What the pipeline tells of a run. No method raises because a recording cannot be written."""
+class Recorder:
+    """What the pipeline tells of a run; this one records nothing (``--no-record``).
+
+    No method raises because a recording cannot be written.
+    """
 
     def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
         """Log what does not change; once, before the first frame.
@@ -114,40 +118,23 @@ class Recorder(Protocol):
             map_: after their correction.
         """
 
-    def finish(self, trajectory: Trajectory, map_: Map) -> None:
-        """Log the final trajectory and map, write all that is pending and close the file."""
+    def finish(self, trajectory: Trajectory, map_: Map | None) -> None:
+        """Log the final trajectory and the map, if there is one, write all that is pending and
+        close the file."""
 
 
-class NullRecorder:
-    """Records nothing (``--no-record``)."""
+class SeveralRecorders(Recorder):
+    """Tells each of several recorders. One that ends does not end the others; one that raises is
+    told no more, and a warning is logged."""
 
-    def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None: ...
-    def frame(self, result: TrackResult, T_wc: NDArray[np.float64]) -> None: ...
-    def keyframe(
-        self,
-        result: TrackResult,
-        image: NDArray[np.uint8],
-        features: Features,
-        tracked: NDArray[np.bool_],
-    ) -> None: ...
-    def map(self, map_: Map) -> None: ...
-    def loops(self, edges: Collection[LoopEdge], map_: Map) -> None: ...
-    def finish(self, trajectory: Trajectory, map_: Map) -> None: ...
-
-
-@dataclass(frozen=True)
-class SeveralRecorders:
-    """Tells each of several recorders; one that ends does not end the others."""
-
-    recorders: tuple[Recorder, ...]
+    def __init__(self, recorders: Sequence[Recorder]) -> None:
+        self.recorders = list(recorders)
 
     def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
-        for recorder in self.recorders:
-            recorder.begin(camera, ground_truth)
+        self._tell(lambda one: one.begin(camera, ground_truth))
 
     def frame(self, result: TrackResult, T_wc: NDArray[np.float64]) -> None:
-        for recorder in self.recorders:
-            recorder.frame(result, T_wc)
+        self._tell(lambda one: one.frame(result, T_wc))
 
     def keyframe(
         self,
@@ -156,20 +143,25 @@ class SeveralRecorders:
         features: Features,
         tracked: NDArray[np.bool_],
     ) -> None:
-        for recorder in self.recorders:
-            recorder.keyframe(result, image, features, tracked)
+        self._tell(lambda one: one.keyframe(result, image, features, tracked))
 
     def map(self, map_: Map) -> None:
-        for recorder in self.recorders:
-            recorder.map(map_)
+        self._tell(lambda one: one.map(map_))
 
     def loops(self, edges: Collection[LoopEdge], map_: Map) -> None:
-        for recorder in self.recorders:
-            recorder.loops(edges, map_)
+        self._tell(lambda one: one.loops(edges, map_))
 
-    def finish(self, trajectory: Trajectory, map_: Map) -> None:
-        for recorder in self.recorders:
-            recorder.finish(trajectory, map_)
+    def finish(self, trajectory: Trajectory, map_: Map | None) -> None:
+        self._tell(lambda one: one.finish(trajectory, map_))
+
+    def _tell(self, call: Callable[[Recorder], None]) -> None:
+        for recorder in self.recorders.copy():
+            try:
+                call(recorder)
+            except Exception as error:
+                self.recorders.remove(recorder)
+                name = type(recorder).__name__
+                _log.warning("%s failed (%s); the run goes on without.", name, reason(error))
 
 
 @dataclass(frozen=True)
@@ -269,13 +261,13 @@ def _guarded(
             return
         try:
             method(self, *args, **kwargs)
-        except (OSError, RuntimeError, cv2.error) as error:
+        except Exception as error:  # no memory, a full disk, a viewer that was closed
             self._abandon(error)
 
     return call
 
 
-class RerunRecorder:
+class RerunRecorder(Recorder):
     """Writes a ``.rrd`` file, or shows the same live.
 
     Timelines: ``frame`` (number) and ``time`` (seconds).
@@ -429,8 +421,9 @@ class RerunRecorder:
         self._log_pictures()
 
     @_guarded
-    def finish(self, trajectory: Trajectory, map_: Map) -> None:
-        self._log_map(map_, map_.n_landmarks)
+    def finish(self, trajectory: Trajectory, map_: Map | None) -> None:
+        if map_ is not None:
+            self._log_map(map_, map_.n_landmarks)
         self._recording.log("world/trajectory", _path(trajectory.T_wc, _BLUE), static=True)
         self._close()
 
@@ -505,7 +498,7 @@ class RerunRecorder:
     def _abandon(self, error: Exception) -> None:
         import rerun as rr
 
-        _log.warning("%s: recording ends here (%s).", self._name, error)
+        _log.warning("%s: recording ends here (%s).", self._name, reason(error))
         # rerun 0.41 waits without a limit for its dead writer when a stream is deleted and at the
         # end of the process. A stream that never dies and no hook at the end avoid both.
         rr.unregister_shutdown()

@@ -23,7 +23,7 @@ _ROUNDS = 10
 _LEAST_IMAGE_SPEED = 50.0  # pixels a second, deviation: a rig that stands still shows no delay
 _LONGEST_GAP_S = 2.0  # between keyframes; over a longer one their motion is not known
 # Of sound rigs 0.15 ms and 0.11 pixels at most, of one 10 ms late 1.1 ms, of one turned by 2 arc
-# minutes 0.29 pixels (docs/stress.md): bundle adjustment hides a part of both.
+# minutes 0.29 pixels (docs/research/stress.md): bundle adjustment hides a part of both.
 _SUSPECT_DELAY_S, _SUSPECT_OFFSET_PX = 0.4e-3, 0.2
 
 
@@ -113,7 +113,7 @@ def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
         f"The sides are not synchronised: by the rows of stereo matches, the {side} one is "
         f"{1e3 * abs(delay.seconds):.1f} ms late{instead}. Trigger both by one signal, or write "
         f"right_delay: {delay.seconds:.4f} (seconds) into the file that --calib names and run "
-        "again, see docs/cameras.md."
+        "again, see docs/howto/cameras.md."
     ]
 
 

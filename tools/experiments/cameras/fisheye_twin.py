@@ -10,72 +10,50 @@ without resampling: of the size of the fisheye images, about the route's own pri
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from vslam.camera import Camera, ImageMap
+from vslam.camera import ImageMap
 from vslam.config import Config
 from vslam.datasets.euroc import open_euroc
-from vslam.datasets.kitti import KittiSequence, open_kitti
+from vslam.datasets.frames import Images, Source, TimedFrame
+from vslam.datasets.kitti import open_kitti
 from vslam.datasets.perturbation import Perturbation
-from vslam.datasets.sequence import Image, Sequence
 from vslam.datasets.synthetic import built_in_route
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.run.outcome import RunSettings, matched_ground_truth
 from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import NullRecorder
+from vslam.run.recorder import Recorder
 
 
-@dataclass(frozen=True)
-class Cut:
-    """A part of each image of a rectified sequence; see `vslam.datasets.sequence.Sequence`."""
-
-    whole: KittiSequence
-    camera: Camera
-    x: int
-    y: int
-    dataset: str = "cut"
-    name: str = "cut"
-
-    @property
-    def timestamps(self) -> NDArray[np.float64]:
-        return self.whole.timestamps
-
-    @property
-    def ground_truth(self) -> NDArray[np.float64] | None:
-        return self.whole.ground_truth
-
-    def __len__(self) -> int:
-        return len(self.whole)
-
-    def read(self, index: int, image_map: ImageMap = map) -> tuple[Image, Image | None]:
-        """Left and right part."""
-        down = slice(self.y, self.y + self.camera.height)
-        across = slice(self.x, self.x + self.camera.width)
-        left, right = self.whole.read(index, image_map)
-        return left[down, across].copy(), None if right is None else right[down, across].copy()
-
-
-def twin(folder: Path, route: str) -> Cut:
-    """The rectified sequence of the same pixels as a folder of `vslam synth --fisheye`."""
+def twin(folder: Path, route: str) -> Source:
+    """The part of each image of the rectified sequence that shows the same pixels as a folder of
+    `vslam synth --fisheye`."""
     (root,) = (folder / "pinhole").iterdir()
     whole = open_kitti(root, route)
     own = built_in_route(route).camera
     x, y = round(whole.camera.cx - own.cx), round(whole.camera.cy - own.cy)
+    part = slice(y, y + own.height), slice(x, x + own.width)
+
+    def cut(frame: TimedFrame) -> TimedFrame:
+        def read(image_map: ImageMap) -> Images:
+            left, right = frame.read(image_map)
+            return left[part].copy(), None if right is None else right[part].copy()
+
+        return TimedFrame(frame.timestamp, read)
+
     camera = replace(own, cx=whole.camera.cx - x, cy=whole.camera.cy - y)
-    return Cut(whole, camera, x, y)
+    stored = tuple(map(cut, whole.stored))
+    return replace(whole, dataset="cut", name="cut", camera=camera, stored=stored)
 
 
-def ate(sequence: Sequence) -> float:
+def ate(sequence: Source) -> float:
     """ATE (m) of a run without loop closing."""
     settings = RunSettings(
         dataset=sequence.dataset, sequence=sequence.name, perturb="none", detector="none",
         sensor="stereo", seed=0, threads=2, start=0, every=1, max_frames=None, config=Config(),
     )  # fmt: skip
-    outcome = run_sequence(sequence, Perturbation("none"), settings, NullRecorder())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     truth = matched_ground_truth(outcome)
     assert truth is not None
     return evaluate_trajectory(outcome.trajectory, truth).ate_rmse_m

@@ -6,9 +6,9 @@ ground truth go on. With ``--lights N`` lap k is driven in light k mod N, the wa
 of that seed, light 0 being as rendered. ``--incidents`` mixes in what happens to a camera: frames
 dropped, black images, and cuts to another place of the route, most of them to another light, too.
 
-    python tools/experiments/lifelong/laps.py --laps 20 --out docs/lifelong/laps.csv
+    python tools/experiments/lifelong/laps.py --laps 20 --out docs/research/lifelong/laps.csv
     python tools/experiments/lifelong/laps.py --laps 60 --lights 4 --incidents \
-        --figure docs/lifelong/soak.svg
+        --figure docs/research/lifelong/soak.svg
 
 A frame in a light is prepared once; the milliseconds are of tracking and mapping it. Ctrl-C ends
 after the lap under way, and what is done so far is written.
@@ -23,7 +23,6 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,17 +30,14 @@ from numpy.typing import NDArray
 
 from vslam.config import Config, load_config
 from vslam.datasets import open_sequence
+from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import parse_perturbation, perturbed
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import TimedFrame
 from vslam.errors import InputError
-from vslam.evaluation.loops import LoopLimits
+from vslam.evaluation.loops import is_right_loop
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frontend.tracking import TrackingContext
-from vslam.geometry import inverse, se3_log
 from vslam.loopclosure.registry import create_detector
-from vslam.loops import LoopEdge
 from vslam.machine import available_cores
 from vslam.run.preparation import prepared_frames
 from vslam.run.warmup import compile_kernels
@@ -146,7 +142,7 @@ def plan_laps(seam: tuple[int, int], laps: int, lights: int, seed: int | None = 
 class PreparedRoute:
     """Features of the frames of a route in each light, extracted when they are first wanted."""
 
-    def __init__(self, route: Sequence, context: TrackingContext, threads: int, seed: int) -> None:
+    def __init__(self, route: Source, context: TrackingContext, threads: int, seed: int) -> None:
         self._route, self._context, self._threads, self._seed = route, context, threads, seed
         self._lights: dict[int, list[Extracted]] = {}
 
@@ -160,25 +156,10 @@ class PreparedRoute:
 
     def _prepare(self, light: int) -> Iterator[Extracted]:
         spec = LIGHT if light else "none"
-        frames = (
-            TimedFrame(float(time), partial(self._route.read, index))
-            for index, time in enumerate(self._route.timestamps)
-        )
-        changed = perturbed(frames, parse_perturbation(spec, self._seed + light))
+        changed = perturbed(self._route.frames(), parse_perturbation(spec, self._seed + light))
         for _, prepared in prepared_frames(changed, self._context, self._threads):
             assert prepared.extracted is not None, prepared.problem
             yield prepared.extracted
-
-
-def is_right(edge: LoopEdge, frames: NDArray[np.int64], T_wc: NDArray[np.float64]) -> bool:
-    """Whether a loop's relative pose is that of the ground truth ``(N, 4, 4)`` of the frames."""
-    assert edge.T_query_match is not None
-    T_match_query = inverse(T_wc[frames[edge.match]]) @ T_wc[frames[edge.query]]
-    error, limits = se3_log(edge.T_query_match @ T_match_query), LoopLimits()
-    return bool(
-        np.linalg.norm(error[:3]) <= limits.max_translation_m
-        and np.degrees(np.linalg.norm(error[3:])) <= limits.max_rotation_deg
-    )
 
 
 def resident_mb() -> float:
@@ -217,7 +198,7 @@ class Drive:
             len(slam.map.living_keyframes()),
             len(slam.map.living_landmarks()),
             len(loops),
-            sum(not is_right(edge, frames, truth.T_wc) for edge in loops),
+            sum(not is_right_loop(edge, frames, truth.T_wc) for edge in loops),
             int(np.count_nonzero(~tracked[first:])),
             f"{error.ate_rmse_m:.4f}",
             f"{1e3 * cpu_s / len(results):.1f}",

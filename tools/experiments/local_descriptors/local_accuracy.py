@@ -5,7 +5,7 @@ of the truth, and the error of the pose that P3P and its refinement make of them
 the first view are ORB's in both cases. Writes a CSV table.
 
     python tools/experiments/local_descriptors/local_accuracy.py --pairs 24 \
-        --out docs/loops/local_descriptors.csv
+        --out docs/research/loops/local_descriptors.csv
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from training.render_matches import moved
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "training"))
+
+from render_matches import moved
 
 from vslam.camera import Camera
 from vslam.config import Config

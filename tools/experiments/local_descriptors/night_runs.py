@@ -1,5 +1,5 @@
-"""Write docs/loops/night_runs.csv: short loops that are hard to close, with every detector's
-candidates verified by ORB, by learned descriptors, or by both.
+"""Write docs/research/loops/night_runs.csv: short loops that are hard to close, with every
+detector's candidates verified by ORB, by learned descriptors, or by both.
 
     vslam synth block --seed 501 --change 1    # and so on, with other seeds and drives
     python tools/experiments/local_descriptors/night_runs.py --runs FOLDER --seeds 501-516
@@ -25,7 +25,7 @@ from vslam.datasets.synthetic import parse_drive
 from vslam.datasets.synthetic.store import cache_folder, folder_name, list_stored
 from vslam.report.schema import ReportJson
 
-OUT = Path(__file__).parents[3] / "docs" / "loops" / "night_runs.csv"
+OUT = Path(__file__).parents[3] / "docs" / "research" / "loops" / "night_runs.csv"
 DRIVES = ("block+change:1", "lane+change:0.9", "block+aliased")
 DETECTORS = ("both", "bow", "capsule")  # the first one is the run's, the others are compared
 VERIFIED_BY = ("usual", "both", "orb", "learned")  # of verification.descriptors

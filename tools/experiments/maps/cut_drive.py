@@ -23,8 +23,8 @@ import numpy as np
 from merge_drives import lit_frames, parts
 
 from vslam.datasets import open_sequence
+from vslam.datasets.synthetic.store import calibration_text
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.lab.stress.external import calibration_text
 from vslam.trajectory import Trajectory, read_kitti_poses, write_kitti
 
 FRAME_S, CUT_S = 0.1, 1.0

@@ -13,16 +13,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import combinations, pairwise
 
 import numpy as np
 
 from vslam.config import Config
 from vslam.datasets import open_sequence
+from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation import parse_perturbation, perturbed
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import TimedFrame, timed_frames
-from vslam.evaluation.loops import LoopLimits
+from vslam.evaluation.loops import LoopLimits, is_right_loop
 from vslam.evaluation.trajectories import evaluate_trajectory, path_length
 from vslam.geometry import inverses
 from vslam.loopclosure.registry import detector_with_images
@@ -71,13 +71,13 @@ def memory(detector: str):
     return detector_with_images(detector, Config())
 
 
-def lit_frames(sequence: Sequence, frames: range, perturb: str, seed: int) -> Iterator[TimedFrame]:
+def lit_frames(sequence: Source, frames: range, perturb: str, seed: int) -> Iterator[TimedFrame]:
     """Some frames of a sequence, in a light of their own."""
-    some = (frame for k, frame in enumerate(timed_frames(sequence)) if k in frames)
+    some = (frame for k, frame in enumerate(sequence.frames()) if k in frames)
     return perturbed(some, parse_perturbation(perturb, seed))
 
 
-def drive(sequence: Sequence, frames: range, detector: str, perturb: str, seed: int) -> StoredMap:
+def drive(sequence: Source, frames: range, detector: str, perturb: str, seed: int) -> StoredMap:
     made, images = memory(detector)
     slam = Slam(sequence.camera, Config(), made, images=images)
     lit = lit_frames(sequence, frames, perturb, seed)
@@ -133,13 +133,8 @@ def true_meetings(drives) -> set[tuple[int, int]]:
 
 
 def is_right(loop: LoopEdge, map_: Map, order: list[int], truth) -> bool:
-    T_wq, T_wm = (truth[order[map_.sessions[k]]][map_.frames[k]] for k in (loop.query, loop.match))
-    error = loop.T_query_match @ inverses(T_wm[None])[0] @ T_wq
-    angle = np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1))
-    return bool(
-        np.linalg.norm(error[:3, 3]) <= LIMITS.max_translation_m
-        and np.degrees(angle) <= LIMITS.max_rotation_deg
-    )
+    ends = [truth[order[map_.sessions[k]]][map_.frames[k]] for k in (loop.query, loop.match)]
+    return is_right_loop(replace(loop, query=0, match=1), np.arange(2), np.stack(ends)) is True
 
 
 def ate(map_: Map, T_true: np.ndarray) -> float:

@@ -1,7 +1,7 @@
 r"""Where the scale of a stereo drive goes wrong: errors of disparity and motion, and an offset.
 
     python tools/experiments/motorway/motorway.py errors 01 --frames 10:200:8 \
-        --csv docs/motorway.csv
+        --csv docs/research/motorway.csv
     python tools/experiments/motorway/motorway.py offset runs/latest
 
 ``errors`` extracts features of a rendered route and compares, with its exact depth and poses, the
@@ -23,7 +23,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scale_probe import scale_of, true_positions
 
 from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.global_mapping import take_snapshot
@@ -39,6 +38,7 @@ from vslam.frontend.orb import extract
 from vslam.frontend.stereo import match_stereo
 from vslam.geometry import inverse, inverses
 from vslam.maps.storage import load_map
+from vslam.trajectory import read_kitti_poses
 
 ZOOMS = (1.0, 1.07, 1.14, 1.22, 1.35)  # depth before over depth after
 WINDOW = 4.0  # px of the octave around the true place, in which a match is looked for
@@ -185,11 +185,26 @@ def offset(folder: Path) -> None:
         scale = "-"
         if known:
             centres = inverses(solved.T_cw)[:, :3, 3]
-            scale = f"{scale_of(centres, true_positions(folder, times))[0]:.4f}"
+            scale = f"{scale_of(centres, true_positions(folder, times)):.4f}"
         print(f"| {shift:+.2f} | {solved.cost:.1f} | {scale} |", flush=True)
         costs.append(solved.cost)
     bend, slope, _ = np.polyfit(OFFSETS, costs, 2)
     print(f"\nbest {-0.5 * slope / bend:+.3f} px, sigma {1.0 / np.sqrt(2.0 * bend):.3f} px")
+
+
+def scale_of(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
+    """Scale of Umeyama's alignment of ``(N, 3)`` positions."""
+    a, b = estimate - estimate.mean(axis=0), truth - truth.mean(axis=0)
+    U, _, Vt = np.linalg.svd(b.T @ a)
+    turned = a @ (U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt).T
+    return float((b * turned).sum() / (a * a).sum())
+
+
+def true_positions(folder: Path, timestamps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of keyframes, by their times."""
+    times = np.loadtxt(folder / "trajectory.tum")[:, 0]
+    frames = np.abs(times[None] - timestamps[:, None]).argmin(axis=1)
+    return read_kitti_poses(folder / "ground_truth_kitti.txt")[frames, :3, 3]
 
 
 def main() -> None:

@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scale_probe import in_cameras
 
 from vslam.backend.bundle_adjustment import BundleProblem
 from vslam.backend.global_bundle_adjustment import adjust_globally
@@ -92,6 +91,13 @@ def variance_components(
     redundancy = (1.0 - lever[counted]).sum(axis=0)
     found = np.sqrt((error[counted] ** 2).sum(axis=0) / redundancy)
     return adjusted, found, int(counted.sum())
+
+
+def in_cameras(problem: BundleProblem) -> NDArray[np.float64]:
+    """``(O, 3)`` the point of each observation in its camera."""
+    point = np.repeat(np.arange(len(problem.points)), np.diff(problem.first))
+    T = problem.T_cw[problem.camera]
+    return np.einsum("nij,nj->ni", T[:, :3, :3], problem.points[point]) + T[:, :3, 3]
 
 
 def main() -> None:

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from vslam.config import Config
 from vslam.datasets import open_sequence
-from vslam.datasets.stream import timed_frames
 from vslam.evaluation.trajectories import evaluate_trajectory, path_length
 from vslam.geometry import Matrix
 from vslam.run.preparation import prepared_frames
@@ -47,7 +46,7 @@ def main() -> None:
     for factor in options.factors:
         fx, fy = sequence.camera.fx * factor, sequence.camera.fy * factor
         slam = Slam(replace(sequence.camera, fx=fx, fy=fy), Config())
-        for timestamp, prepared in prepared_frames(timed_frames(sequence), slam.context, 2):
+        for timestamp, prepared in prepared_frames(sequence.frames(), slam.context, 2):
             slam.step_features(prepared.extracted, timestamp)
         slam.finish()
         estimate = slam.trajectory()

@@ -1,7 +1,7 @@
-"""Write Table 6 of the paper and its companions, for all networks of docs/rivals.md.
+"""Write Table 6 of the paper and its companions, for all networks of docs/research/rivals.md.
 
 python tools/experiments/rivals/rivals_table.py --trained DIR --data SOURCE [--data SOURCE ...]
-        [--page docs/rivals.md] [--section NAME] [--ways NAMES] [--retime]
+        [--page docs/research/rivals.md] [--section NAME] [--ways NAMES] [--retime]
 
 DIR is what tools/training/train_rivals.py wrote, SOURCE as of ``vslam loops bench``. Measured are,
 as that command does, descriptors alone: of the networks that were shown the same images, of those
@@ -34,11 +34,11 @@ from vslam.datasets.synthetic import store
 from vslam.errors import InputError
 from vslam.lab.loopbench.conditions import parse_conditions
 from vslam.lab.loopbench.cost import cost
+from vslam.lab.loopbench.curves import draw_curves
 from vslam.lab.loopbench.detectors import DetectorSet
 from vslam.lab.loopbench.kept import digest, keep_conditions
 from vslam.lab.loopbench.measure import measure
 from vslam.lab.loopbench.registry import comparable_scorer
-from vslam.lab.loopbench.report import draw
 from vslam.lab.loopbench.schema import LoopsJson, Score
 from vslam.lab.loopbench.sets import open_set
 from vslam.loopclosure.siamese.inference import OnnxNetwork, open_network
@@ -54,11 +54,11 @@ from vslam.report.drawing import (
     RED,
     STYLE,
     VIOLET,
-    ReportFigure,
     new_figure,
     save,
 )
-from vslam.report.page import markdown_table
+from vslam.report.page import Figure
+from vslam.report.render import markdown_table
 from vslam.report.summary import this_machine
 
 CONDITIONS = ("light", "viewpoint", "occlusion")
@@ -86,16 +86,16 @@ _DASHES = ("-", "--")  # of the first six networks, of the rest
 Row = tuple[str, ...]
 
 
-def main() -> None:
+def main(words: list[str] | None = None) -> None:
     """Parse the command line, run what is missing and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--trained", type=Path, required=True, help="folder with rivals.csv")
     parser.add_argument("--data", action="append", required=True, help="images to test on")
-    parser.add_argument("--page", type=Path, default=Path("docs/rivals.md"))
+    parser.add_argument("--page", type=Path, default=Path("docs/research/rivals.md"))
     parser.add_argument("--section", default="tables", help="of the page, to be written")
     parser.add_argument("--ways", default=",".join(WAYS), help="what the section shows")
     parser.add_argument("--retime", action="store_true", help="measure all times again")
-    args = parser.parse_args()
+    args = parser.parse_args(words)
 
     training, bench = read_training(args.trained / "rivals.csv"), args.trained / "bench"
     ways = args.ways.split(",")
@@ -119,7 +119,7 @@ def main() -> None:
     if args.section != "tables":
         folder = folder / args.section
     folder.mkdir(parents=True, exist_ok=True)
-    figures = draw(reports["images"]) if "images" in reports else []
+    figures = draw_curves(reports["images"]) if "images" in reports else []
     if (args.trained / "progress.csv").exists():
         progress = read_training(args.trained / "progress.csv")
         figures.append(draw_progress(progress))
@@ -127,7 +127,7 @@ def main() -> None:
     images = []
     for figure in figures:
         file = folder / f"{figure.name}.png"
-        file.write_bytes(figure.png)
+        file.write_bytes(figure.image)
         images.append(f"![{figure.caption}]({file.relative_to(args.page.parent)})")
     write_csv(folder / "table6.csv", table_6(reports, digits=4))
     write_csv(folder / "conditions.csv", every_score(reports))
@@ -149,7 +149,7 @@ def table_of(rows: list[dict[str, str]]) -> list[Row]:
     return [tuple(rows[0]), *(tuple(row.values()) for row in rows)]
 
 
-def draw_progress(progress: list[dict[str, str]]) -> ReportFigure:
+def draw_progress(progress: list[dict[str, str]]) -> Figure:
     """Validation AP over the images shown, of the networks that were shown the same."""
     rows = [row for row in progress if row["way"] == "images" and row["network"] not in PAIR[1:]]
     with style.context(STYLE, after_reset=True):

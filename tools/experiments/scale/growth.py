@@ -1,6 +1,7 @@
 """How cost and memory grow with the keyframes of a map, by simulation.
 
-    python tools/experiments/scale/growth.py --write docs/scale.md --figure docs/scale.svg
+    python tools/experiments/scale/growth.py --write docs/research/scale.md \
+        --figure docs/research/scale.svg
 
 A town of streets that cross, each driven once: a keyframe every 5 m has 2,000 features, of which
 560 see landmarks, 140 of them new (565 and 132 in the rendered town along KITTI 05); at a crossing
@@ -43,7 +44,7 @@ FEATURES, NEW, AHEAD = 2000, 140, 3  # landmarks made by a keyframe, keyframes t
 SHARED = 40  # landmarks of a keyframe at a crossing that the other street sees
 REPEATS = 30
 BEGIN, END = "<!-- growth -->\n", "<!-- /growth -->\n"
-FIGURES = Path("docs/scale.json")
+FIGURES = Path("docs/research/scale.json")
 SIZES = (1250, 2500, 5000, 10000, 20000, 50000)
 
 

@@ -1,6 +1,6 @@
 """Print boundaries of two systems side by side, from the ``boundaries.csv`` of ``vslam stress``.
 
-python tools/experiments/stress/boundary_table.py docs/stress/kitti00.csv bow orbslam3
+python tools/experiments/stress/boundary_table.py docs/research/stress/kitti00.csv bow orbslam3
 """
 
 from __future__ import annotations

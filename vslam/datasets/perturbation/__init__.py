@@ -1,4 +1,6 @@
-"""Seeded perturbations of a sequence (docs/stress.md): light, weather, glass, sensor, stereo rig.
+"""Seeded perturbations of a sequence: light, weather, glass, sensor, stereo rig.
+
+docs/howto/stress.md lists them with their units.
 
 With v a grey value, s the strength, t seconds since the first frame, k the frame and n a standard
 normal number. Laws without a unit have strength 1 unless ``law:s`` says otherwise:
@@ -46,7 +48,7 @@ Each law rounds and clips to 8 bits, is the same for both cameras (noise, night,
 and drops on the glass are drawn for each; the last six lines are faults of one side) and draws from
 its own random stream: it does the same alone and in company, and what it does to frame k depends on
 the seed, k and the time of k only, not on the frames asked for before. Laws of other packages
-(docs/plugins.md) are held to that, too. Walks live on a fixed grid
+(docs/howto/plugins.md) are held to that, too. Walks live on a fixed grid
 in time, so that dropping frames does not change the light. They are drawn as far as frames have
 come: a stream may go on without end.
 """

@@ -15,10 +15,10 @@ _NEAREST_M = 3.0  # sets the range of disparities that are looked for
 def dense_depths(
     camera: Camera, left: Image, second: Image | DepthImage | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Depth along z of each pixel of both images, infinite where nothing is near: the sky.
+    """Depth along z of each pixel of both images; infinite where nothing is near, as in the sky.
 
     Args:
-        camera: of the images.
+        camera: calibration of the images.
         left: ``(H, W)`` uint8.
         second: the right image: both are matched (SGBM; Hirschmueller, PAMI 2008). Or the depth of
             the left one's pixels, which is taken as it is, 0 as infinite.

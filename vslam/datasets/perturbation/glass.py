@@ -1,4 +1,4 @@
-"""Laws of the lens and of what lies on the glass before it."""
+"""Laws of the lens and of dirt on the glass in front of it."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _vignetting(stops: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def _dirt(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """Blobs, other ones on each side, that stay for the whole drive."""
+    """Blobs that differ between the sides and stay for the whole drive."""
     opacity = [_blobs(percent / 100.0, [*stream, side], scene) for side in range(2)]
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
@@ -80,7 +80,7 @@ def _blobs(share: float, seed: list[int], scene: Scene) -> NDArray[np.float32]:
 
 
 def _flare(greys: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """A sun that keeps its place in the image, the same on both sides: it is far away."""
+    """A sun that keeps its place in the image, the same on both sides because it is far away."""
     camera = scene.camera
     rng = np.random.default_rng(stream)
     sun = np.array([rng.uniform(0.15, 0.85) * camera.width, rng.uniform(0.05, 0.3) * camera.height])

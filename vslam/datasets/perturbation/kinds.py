@@ -1,4 +1,4 @@
-"""What a law is: of one image, or of a pair of images and the scene that they show."""
+"""Types of laws: laws of one image, and laws of a pair of images and the scene that they show."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, DepthImage, Image
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import Stream
+from vslam.datasets.frames import Source
 from vslam.errors import InputError
 
 RandomStream = tuple[int, int]
-"""Seed, and what tells laws of one seed apart; with more numbers behind it, seed of a generator."""
+"""The user's seed and a number of the law's own; with further numbers, the seed of a generator."""
 
 Law = Callable[[int, float, int, Image], Image]
 """``(frame, t, side, image) -> image`` of the same shape; t is in seconds since the first frame,
@@ -25,14 +24,14 @@ side 0 is left, 1 is right."""
 
 @dataclass(frozen=True)
 class Pair:
-    """The images of one frame on their way through the laws.
+    """The images of one frame, which one law hands to the next.
 
     Attributes:
-        index: of the frame.
+        index: number of the frame.
         t: seconds since the first frame.
         left: ``(H, W)`` uint8.
         second: the right image, a depth image (float32), or None.
-        clean: both as they were read.
+        clean: both images as they were read.
     """
 
     index: int
@@ -43,7 +42,7 @@ class Pair:
 
     @property
     def right(self) -> Image | None:
-        """The right image, None where there is none."""
+        """The right image, or None."""
         if self.second is None or self.second.dtype != np.uint8:
             return None
         return np.asarray(self.second, np.uint8)
@@ -54,14 +53,13 @@ PairLaw = Callable[[Pair], Pair]
 
 @dataclass(frozen=True)
 class Scene:
-    """What is known beside one frame's images.
+    """What a law may know of the source besides one frame's images.
 
     Attributes:
-        camera: as the data has it.
-        times: ``(N,)`` seconds since the first frame; None of a stream, whose frames are not known
-            beforehand.
+        camera: calibration of the source.
+        times: ``(N,)`` seconds since the first frame; None for a source that cannot seek.
         T_wc: ``(N, 4, 4)`` true poses, NaN where unknown; None without any.
-        read: the images of any frame; None of a stream.
+        read: reads the images of any frame; None for a source that cannot seek.
     """
 
     camera: Camera
@@ -70,11 +68,11 @@ class Scene:
     read: Callable[[int], tuple[Image, Image | DepthImage | None]] | None = None
 
     @classmethod
-    def of(cls, source: Sequence | Stream) -> Scene:
-        """What a source knows."""
-        if isinstance(source, Stream):
+    def of(cls, source: Source) -> Scene:
+        """The scene of a source."""
+        if not source.seekable:
             return cls(source.camera)
-        times = np.asarray(source.timestamps, np.float64)
+        times = source.timestamps
         return cls(source.camera, times - times[:1], source.ground_truth, source.read)
 
 
@@ -88,10 +86,10 @@ _LACKING: dict[Need, str] = {
 
 
 def check_need(law: str, need: Need, scene: Scene) -> None:
-    """Refuse a law that the data cannot serve.
+    """Refuse a law that needs data which the source does not have.
 
     Raises:
-        InputError: the data lack what it needs.
+        InputError: the source lacks what the law needs.
     """
     has = {
         "right": scene.camera.sensor == "stereo",
@@ -104,7 +102,7 @@ def check_need(law: str, need: Need, scene: Scene) -> None:
 
 @dataclass(frozen=True)
 class SceneLaw:
-    """A law that is complete once it knows its scene."""
+    """A law that needs a scene before it can be applied."""
 
     name: str
     needs: tuple[Need, ...]
@@ -126,21 +124,20 @@ class SceneLaw:
 
 @dataclass(frozen=True)
 class LawKind:
-    """A law of which only the strength is open.
+    """A kind of law, which a strength and a seed complete.
 
     Attributes:
         make: ``(strength, stream) -> Law`` or ``(strength, stream, scene) -> PairLaw``, the latter
             if ``of_scene``.
-        unit: of the strength.
-        default: strength where none is given.
-        weakest, strongest: between them ``vslam stress`` searches; visibility is strongest where
-            it is small.
-        least, most: what is allowed.
-        logarithmic: strengths are told apart by ratio, not by difference.
+        unit: unit of the strength.
+        default: strength if none is given.
+        weakest, strongest: ``vslam stress`` searches between them; a small visibility is strong.
+        least, most: allowed range of strengths.
+        logarithmic: strengths differ by ratio, not by difference.
         drawn: whether the images depend on the seed.
-        needs: what the data must have.
+        needs: what the source must have.
         sides: ``both``, or ``one`` for a fault of the stereo rig.
-        about: the law in a few words.
+        about: a description in a few words.
     """
 
     make: Callable[..., Law | PairLaw]
@@ -168,7 +165,7 @@ class LawKind:
 
 
 def each_side(law: Law) -> PairLaw:
-    """Apply a law of one image to the images of both sides; depth has its own light."""
+    """Apply a law of one image to both sides; a depth image stays as it is."""
 
     def applied(pair: Pair) -> Pair:
         left = law(pair.index, pair.t, 0, pair.left)
@@ -180,5 +177,5 @@ def each_side(law: Law) -> PairLaw:
 
 
 def to_8_bits(values: NDArray[Any]) -> Image:
-    """Rounded and clipped."""
+    """Round and clip values to uint8."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)

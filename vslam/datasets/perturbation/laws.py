@@ -1,4 +1,4 @@
-"""Perturbations: what ``--perturb`` says, applied to the frames of a source."""
+"""Parsing of ``--perturb``, and its application to the frames of a source."""
 
 from __future__ import annotations
 
@@ -11,28 +11,26 @@ from zlib import crc32
 import numpy as np
 
 from vslam.camera import DepthImage, Image, ImageMap
+from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation.kinds import LawKind, Pair, PairLaw, Scene, SceneLaw
 from vslam.datasets.perturbation.registry import LAWS, all_laws
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import Stream, TimedFrame
 from vslam.errors import DroppedFrameError, InputError, did_you_mean
 
 
 @dataclass(frozen=True)
 class Perturbation:
-    """Laws applied one after the other; without any, the images pass unchanged.
+    """Laws that are applied one after the other; without laws, the images pass unchanged.
 
     Attributes:
         name: canonical spelling, ``none`` or ``brightness:1.5,blur:0.5`` for example.
-        laws: see the package.
+        laws: see the package's docstring.
     """
 
     name: str
     laws: tuple[PairLaw | SceneLaw, ...] = ()
 
-    def bound_to(self, source: Sequence | Stream) -> Perturbation:
-        """The same for the frames of one source: laws that look at depth, poses or other frames
-        find them there.
+    def bound_to(self, source: Source) -> Perturbation:
+        """The same perturbation for one source: some laws need its depth, poses or other frames.
 
         Raises:
             InputError: the source lacks what a law needs.
@@ -47,7 +45,7 @@ class Perturbation:
         self, index: int, t: float, left: Image, second: Image | DepthImage | None
     ) -> tuple[Image, Image | DepthImage | None]:
         """Perturb both ``(H, W)`` uint8 images of frame ``index``, ``t`` seconds after the first
-        one; safe in several threads. A depth image stays as it is: it has its own light.
+        one; safe in several threads. A depth image stays as it is: its sensor has its own light.
 
         The left one becomes the same whatever the second one is, save under fog, whose depth comes
         from both.
@@ -66,7 +64,7 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
 
     Args:
         spec: ``law[:strength]``, several joined by commas, applied in this order; ``none`` or
-            nothing for the identity.
+            the empty string for no perturbation.
         seed: not negative; equal seeds give equal images.
 
     Raises:
@@ -101,7 +99,7 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
 
 
 def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Iterator[TimedFrame]:
-    """The same frames, perturbed as they are read; the first one's time is 0 to the laws."""
+    """The same frames, perturbed as they are read; the laws count time from the first frame."""
     begin = None
     for index, frame in enumerate(frames):
         begin = frame.timestamp if begin is None else begin
@@ -116,9 +114,18 @@ def _read_perturbed(
 
 
 def contact_sheet(
-    sequence: Sequence, perturbation: Perturbation, indices: Collection[int]
+    sequence: Source,
+    perturbation: Perturbation,
+    indices: Collection[int],
+    start: int = 0,
+    every: int = 1,
 ) -> Image:
     """A grey image with a row for each frame: left image as it is, both images perturbed.
+
+    Args:
+        indices: frames of the sequence.
+        start, every: how the sequence was selected; rows are labelled by the numbers that its
+            frames had before.
 
     Raises:
         InputError: the sequence lacks what a law needs.
@@ -127,12 +134,12 @@ def contact_sheet(
     perturbation = perturbation.bound_to(sequence)
     rows = []
     for index in indices:
-        label = f"frame {index}, {sequence.timestamps[index]:.1f} s"
+        label = f"frame {start + every * index}, {sequence.timestamps[index]:.1f} s"
         rows.append(_row(sequence, perturbation, index, label, width=480))
     return np.vstack(rows)
 
 
-def sheet_of_laws(sequence: Sequence, specs: Collection[str], index: int, seed: int) -> Image:
+def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: int) -> Image:
     """A grey image with a row for each perturbation: a frame as it is, both its images perturbed.
     The rows stand in two columns where there are several.
 
@@ -152,7 +159,7 @@ def sheet_of_laws(sequence: Sequence, specs: Collection[str], index: int, seed: 
     return np.hstack([np.vstack(rows[:half]), np.vstack(rows[half:])])
 
 
-def laws_for(sequence: Sequence | Stream) -> tuple[list[str], dict[str, str]]:
+def laws_for(sequence: Source) -> tuple[list[str], dict[str, str]]:
     """Names of the laws that a source has the data for, and of the others why they do not apply."""
     fit, unfit = [], {}
     for name in all_laws():
@@ -165,9 +172,7 @@ def laws_for(sequence: Sequence | Stream) -> tuple[list[str], dict[str, str]]:
     return fit, unfit
 
 
-def _row(
-    sequence: Sequence, perturbation: Perturbation, index: int, label: str, width: int
-) -> Image:
+def _row(sequence: Source, perturbation: Perturbation, index: int, label: str, width: int) -> Image:
     import cv2
 
     t = float(sequence.timestamps[index] - sequence.timestamps[0])

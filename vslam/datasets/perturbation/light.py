@@ -1,4 +1,4 @@
-"""Laws of the light and of how the camera answers it."""
+"""Laws of the light and of the camera's response to it."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def _exposure(seconds: float, stream: RandomStream) -> Law:
 
 
 def _night(stops: float, stream: RandomStream) -> Law:
-    """Electrons are counted: Poisson, then read noise; exposure and gain stay as by day."""
+    """Photon noise (Poisson) and read noise in electrons; exposure and gain stay as by day."""
     electrons = FULL_WELL / 255.0
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
@@ -87,7 +87,7 @@ def _night(stops: float, stream: RandomStream) -> Law:
             return image
         rng = np.random.Generator(np.random.SFC64([*stream, frame, side]))
         mean = image * np.float32(electrons * 2.0**-stops)
-        # Poisson of variance m as a normal number: exact enough, for read noise is added.
+        # A normal number of variance m approximates Poisson well enough, since read noise is added.
         noise = rng.standard_normal(image.shape, dtype=np.float32)
         counted = mean + noise * np.sqrt(mean + np.float32(READ_NOISE**2))
         return to_8_bits(counted / np.float32(electrons))

@@ -1,4 +1,4 @@
-"""Laws of motion: blur while the shutter is open, by the true angular rate where it is known."""
+"""Laws of motion: blur while the shutter is open, by the true angular rate if it is known."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ _SHRINK = 2
 
 
 def optical_flow(first: Image, second: Image) -> NDArray[np.float32]:
-    """``(H, W, 2)`` pixels that each pixel of ``first`` has moved by in ``second``: dense inverse
-    search (Kroeger et al., ECCV 2016) at half size."""
+    """``(H, W, 2)`` displacement in pixels of each pixel of ``first`` in ``second``, by dense
+    inverse search (Kroeger et al., ECCV 2016) at half size."""
     import cv2
 
     height, width = first.shape
@@ -28,7 +28,7 @@ def optical_flow(first: Image, second: Image) -> NDArray[np.float32]:
 
 
 def neighbours(scene: Scene, frame: int) -> tuple[int, int]:
-    """The frames before and behind, the frame itself at an end."""
+    """The frames before and after a frame; at an end, the frame itself."""
     assert scene.times is not None
     return max(0, frame - 1), min(len(scene.times) - 1, frame + 1)
 
@@ -58,7 +58,7 @@ def image_velocity(scene: Scene, frame: int) -> NDArray[np.float64]:
 
 
 def forward_speed(scene: Scene, frame: int) -> float:
-    """Metres a second ahead, 0 where nothing is known of it."""
+    """Speed ahead in metres per second, 0 if it is unknown."""
     if scene.times is None or scene.T_wc is None:
         return 0.0
     before, behind = neighbours(scene, frame)

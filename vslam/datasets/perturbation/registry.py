@@ -19,11 +19,11 @@ LAWS: dict[str, LawKind] = {
     **{name: sensor.KINDS[name] for name in ("shot", "impulse", "bits")},
     **stereo.KINDS,
 }
-"""vslam's own, in the order of the documents."""
+"""vslam's own laws, in the order of the documentation."""
 
 
 def all_laws() -> dict[str, LawKind]:
-    """These, then those of other packages (docs/plugins.md), of strengths from 0 to 10."""
+    """vslam's laws, then those of other packages (docs/howto/plugins.md), of strengths 0 to 10."""
     others = {
         name: LawKind(make, "x", 1.0, 0.1, 10.0, "of another package", logarithmic=True)
         for name, make in plugin_laws().items()
@@ -33,7 +33,7 @@ def all_laws() -> dict[str, LawKind]:
 
 
 def law_kind(name: str) -> LawKind:
-    """The law of that name.
+    """The law of a name.
 
     Raises:
         KeyError: there is none.

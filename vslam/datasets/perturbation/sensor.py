@@ -1,4 +1,4 @@
-"""Laws of the sensor and of what happens to the image behind it."""
+"""Laws of the sensor, of compression and of transmission."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _drop(percent: float, stream: RandomStream) -> Law:
 
 
 def _outage(seconds: float, stream: RandomStream) -> Law:
-    """One outage in every ten seconds, somewhere in them, not in the first second of the run."""
+    """One outage somewhere in every ten seconds, but not in the first second of the run."""
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
         block = int(t // 10.0)

@@ -1,4 +1,4 @@
-"""Faults of a stereo rig: what one side does and the other does not."""
+"""Faults of a stereo rig, which affect one side and not the other."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _gain(stops: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def _desync(ms: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """The right image as it is so much later: moved along the optical flow to the next frame."""
+    """The right image as it would be later: moved along the optical flow to the next frame."""
     assert scene.times is not None
     assert scene.read is not None
     times, read = scene.times, scene.read

@@ -1,4 +1,4 @@
-"""Random numbers by their place in time: walks without end that do not depend on who asks first."""
+"""Random numbers by their place in time: endless walks that do not depend on the order of reads."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _JUMP_WIDENING = 1.5
 def ou_walk(
     deviation: float, rng: np.random.Generator, jumps: Iterable[float] = ()
 ) -> Iterator[float]:
-    """An Ornstein-Uhlenbeck walk of time constant 2 s, exact on a grid of 10 ms, without end.
+    """An endless Ornstein-Uhlenbeck walk with a time constant of 2 s, exact on a grid of 10 ms.
 
     Args:
         deviation: stationary standard deviation; the walk begins in the stationary state.
-        rng: source of its normal numbers, one for each step.
+        rng: generates its normal numbers, one for each step.
         jumps: times in seconds, increasing, at which the walk is drawn anew, 1.5 times as wide.
     """
     decay = exp(-STEP_S / _TIME_CONSTANT_S)
@@ -41,7 +41,7 @@ def ou_walk(
 
 
 class Drawn:
-    """Random numbers by their place in a stream, drawn up to the last one asked for; safe in
+    """Random numbers by their place in a stream, drawn when they are first asked for; safe in
     several threads."""
 
     def __init__(self, numbers: Iterator[float]) -> None:
@@ -62,7 +62,7 @@ def on_grid(t: float) -> int:
 
 
 def jump_times(rng: np.random.Generator, per_second: float = _JUMPS_PER_S) -> Iterator[float]:
-    """Times of a Poisson process, in seconds, without end."""
+    """Endless times of a Poisson process, in seconds."""
     time = 0.0
     while True:
         time += rng.exponential(1.0 / per_second)

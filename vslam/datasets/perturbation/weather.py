@@ -1,4 +1,4 @@
-"""Laws of the weather: fog by distance, rain before the camera and on the glass.
+"""Laws of the weather: fog by distance, rain in front of the camera and on the glass.
 
 Grey values are taken as proportional to luminance, as KITTI's cameras give them.
 """

@@ -1,10 +1,11 @@
-"""Rendered towns in KITTI format: long drives with exact ground truth, and nothing to download."""
+"""Rendered towns in KITTI's format: long drives with exact ground truth, without a download."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from vslam.datasets.kitti import KittiSequence, open_kitti
+from vslam.datasets.frames import Source
+from vslam.datasets.kitti import open_kitti
 from vslam.datasets.synthetic.routes import (
     DRIVES,
     ROUTES,
@@ -20,7 +21,6 @@ __all__ = [
     "DRIVES",
     "ROUTES",
     "Route",
-    "SyntheticSequence",
     "Variation",
     "built_in_route",
     "cache_folder",
@@ -31,21 +31,13 @@ __all__ = [
 ]
 
 
-class SyntheticSequence(KittiSequence):
-    """A rendered sequence, read from its KITTI tree."""
-
-    @property
-    def dataset(self) -> str:
-        return "synthetic"
-
-
 def parse_drive(name: str) -> tuple[str, Variation]:
-    """``05+change:0.5+moving:6+aliased+seed:1`` -> the route's name and the town's variation.
+    """Split ``05+change:0.5+moving:6+aliased+seed:1`` into the route's name and the variation.
 
-    A name of `DRIVES` stands for its route and town, to which further parts may be added.
+    A name in `DRIVES` stands for its route and variation, to which further parts may be added.
 
     Raises:
-        InputError: a part that is none of these.
+        InputError: a part of the name is not understood.
     """
     first, plus, further = name.partition("+")
     route, *parts = (DRIVES.get(first, first) + plus + further).split("+")
@@ -65,8 +57,8 @@ def parse_drive(name: str) -> tuple[str, Variation]:
                 raise ValueError
     except ValueError:
         raise InputError(
-            f"--seq {name}: '{part}' is not understood; write ROUTE, +change:0 to 1, +moving:CARS, "
-            "+seed:N or +aliased behind it."
+            f"--seq {name}: '{part}' is not understood; after the route only +change:0 to 1, "
+            "+moving:CARS, +seed:N and +aliased are allowed."
         ) from None
     return route, town
 
@@ -81,15 +73,17 @@ def open_synthetic(
     monocular: bool = False,
     threads: int = 2,
     on_frame: OnFrame | None = None,
-) -> SyntheticSequence:
-    """Open a built-in route, rendered first where the cache lacks it.
+) -> Source:
+    """Open a built-in route; frames that are not in the cache are rendered first.
 
     Args:
-        name: as `parse_drive` takes it.
-        variation: of the town, if not by the name.
+        name: the route and variation, as for `parse_drive`.
+        variation: replaces the variation in the name.
+        start, every, max_frames, monocular: as for `open_kitti`.
+        threads, on_frame: as for `render_sequence`.
 
     Raises:
-        InputError: unknown route or town, or as `render_sequence` and `open_kitti`.
+        InputError: the route or the variation is unknown, or as `render_sequence` and `open_kitti`.
     """
     route_name, town = parse_drive(name)
     route = built_in_route(route_name)
@@ -105,4 +99,4 @@ def open_synthetic(
     found = open_kitti(
         root, route_name, start=start, every=every, max_frames=max_frames, monocular=monocular
     )
-    return SyntheticSequence(**vars(replace(found, name=name)))
+    return replace(found, dataset="synthetic", name=name)

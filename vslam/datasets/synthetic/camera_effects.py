@@ -1,4 +1,7 @@
-"""From light to bytes: what lens and sensor add. Deterministic by seed, frame and side."""
+"""Lens and sensor of the rendered camera: blur, vignetting, response and noise.
+
+The result depends only on the radiance and on seed, frame and side.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,11 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 
-SHUTTER = 0.004  # s
-_BLUR = 0.55  # px, deviation of the lens
-_VIGNETTE = 0.22  # light lost in the corners
-_READ_NOISE, _SHOT_NOISE = 0.9, 0.022  # grey levels; grey levels squared for each grey level
-_KNEE, _ROLL = 170.0, 0.5  # grey where the response bends, and its slope from there to saturation
+SHUTTER = 0.004  # s, exposure time by day
+_BLUR = 0.55  # px, standard deviation of the lens blur
+_VIGNETTE = 0.22  # share of the light lost in the corners
+_READ_NOISE, _SHOT_NOISE = 0.9, 0.022  # standard deviation (grey levels); variance per grey level
+_KNEE, _ROLL = 170.0, 0.5  # grey level at which the response bends, and its slope above
 
 
 def sensor_image(
@@ -23,14 +26,14 @@ def sensor_image(
     night: float,
     key: tuple[int, int, int],
 ) -> NDArray[np.uint8]:
-    """What the camera writes.
+    """Turn radiance into the ``(H, W)`` uint8 image of the camera.
 
     Args:
-        radiance: ``(H, W)`` from `render.View.image`.
-        camera: for the scale of motion blur.
-        yaw_rate: rad/s.
-        night: 0 to 1; longer exposure and more gain.
-        key: seed, frame, side.
+        radiance: ``(H, W)`` float32, from `render.RenderedView.image`.
+        camera: its focal length scales the motion blur.
+        yaw_rate: rad/s, causes motion blur.
+        night: 0 to 1, lengthens the exposure and raises the gain.
+        key: seed, frame and side, which determine the noise.
     """
     image = radiance
     streak = abs(yaw_rate) * SHUTTER * (1 + 2 * night) * camera.fx
@@ -50,7 +53,7 @@ def sensor_image(
 
 
 def _streak(length: float) -> NDArray[np.float32]:
-    """Box of ``length`` pixels about its middle, the ends weighted by the part they cover."""
+    """Box filter ``length`` pixels wide, whose outer pixels are weighted by their covered part."""
     half = int(np.ceil(length / 2 + 0.5))
     at = np.arange(-half, half + 1)
     weight = np.clip(length / 2 + 0.5 - np.abs(at), 0, 1)

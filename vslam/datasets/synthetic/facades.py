@@ -12,14 +12,14 @@ from vslam.datasets.synthetic.textures import Grey, Rng, letters, noise, write
 
 @dataclass(frozen=True)
 class FacadeStyle:
-    """What the four sides of a house have in common.
+    """The common properties of the four sides of a house.
 
     Attributes:
         wall, frame, glass: grey of wall, window frames and panes.
-        brick: courses of brick instead of plaster.
-        storey, pitch: metres from window to window, upwards and sideways.
+        brick: bricks instead of plaster.
+        storey, pitch: vertical and horizontal distance of windows in metres.
         window: ``(width, height)`` metres.
-        shutters, balconies, shop, bands: what the front has.
+        shutters, balconies, shop, bands: whether the house has these.
     """
 
     wall: float
@@ -36,7 +36,7 @@ class FacadeStyle:
 
 
 def random_style(rng: Rng, *, town: bool) -> FacadeStyle:
-    """A style; a town has shops, a suburb shutters."""
+    """Draw a style; houses in a town may have shops, and houses in a suburb more often shutters."""
     brick = bool(rng.random() < 0.22)
     low, high = (70, 125) if brick else (185, 238) if rng.random() < 0.6 else (120, 180)
     return FacadeStyle(
@@ -60,10 +60,11 @@ def facade(
     """Paint one side of a house.
 
     Args:
-        rng: decides what is built.
-        lived: decides what its people change from day to day: blinds, curtains, lights.
+        rng: random generator of everything that is built.
+        lived: random generator of what residents change from day to day: blinds, curtains, lights.
+        style: of the house.
         size: width and height in metres.
-        front: with doors and shop; else a side with fewer windows.
+        front: whether it is the front, with doors and shop, or a side with fewer windows.
 
     Returns:
         Albedo ``(H, W)``, 0 to 255, and the windows lit at night ``(H, W)``, 0 to 1.
@@ -113,7 +114,7 @@ def facade(
 
 
 def _texels(metres: float) -> int:
-    """Power of two that gives about 2.5 cm a texel."""
+    """Number of texels, a power of two, for about 2.5 cm per texel."""
     return int(np.clip(2 ** round(np.log2(metres / 0.025)), 64, 512))
 
 
@@ -131,7 +132,7 @@ def _lay_bricks(rng: Rng, image: Grey, px: float, py: float) -> None:
 
 @dataclass(frozen=True)
 class _Painter:
-    """Draws on ``image`` in metres; ``px``, ``py``: texels a metre."""
+    """Draws on ``image`` in metres; ``px`` and ``py`` are texels per metre."""
 
     rng: Rng
     image: Grey
@@ -155,7 +156,7 @@ class _Painter:
         w, h = style.window
         w, h = w * float(self.rng.uniform(0.9, 1.1)), h * float(self.rng.uniform(0.93, 1.07))
         x0, x1, y1 = x - w / 2, x + w / 2, y + h
-        self.scale(x0 - 0.08, y - 0.05, x1 + 0.16, y1 + 0.2, 0.8)  # what the reveal shades
+        self.scale(x0 - 0.08, y - 0.05, x1 + 0.16, y1 + 0.2, 0.8)  # shadow of the reveal
         self.box(x0 - 0.06, y - 0.06, x1 + 0.06, y1 + 0.06, style.frame)
         self._pane(lived, x0, y, x1, y1, style.glass, lights)
         parts = int(self.rng.integers(1, 4))
@@ -217,7 +218,7 @@ class _Painter:
         self.box(x + w + 0.3, height - 1.6, x + w + 0.55, height - 1.25, 50.0)
 
     def _goods(self, pane: Grey) -> None:
-        """What stands in a shop window, and the street that it mirrors."""
+        """Draw the goods in a shop window, and a reflection of the street."""
         height, width = pane.shape
         for _ in range(int(self.rng.integers(4, 12))):
             w, h = (max(2, int(n * self.rng.uniform(0.06, 0.3))) for n in (width, height))

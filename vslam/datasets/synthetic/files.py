@@ -1,4 +1,4 @@
-"""Files of a rendered sequence: written whole or not at all, by one process at a time, checked."""
+"""Files of a rendered sequence, which are written atomically, by one process, with checksums."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from numpy.typing import NDArray
 from vslam.errors import InputError
 from vslam.lock_file import locked
 
-_IMAGE_BYTES, _DEPTH_BYTES = 450_000, 330_000  # of one file, generous
-_RESERVE = 200_000_000  # bytes left free
-_SAMPLED = 5  # frames whose checksum a quick look compares
+_IMAGE_BYTES, _DEPTH_BYTES = 450_000, 330_000  # generous estimates of the size of one file
+_RESERVE = 200_000_000  # bytes that must stay free
+_SAMPLED = 5  # frames whose checksums a quick check compares
 
 
 def frame_files(folder: Path, frame: int, depth: bool) -> list[Path]:
-    """Left, right and, with ``depth``, depth image of a frame."""
+    """Paths of the left and right image of a frame and, with ``depth``, of its depth image."""
     names = ("image_0", "image_1", *(("depth_0",) if depth else ()))
     return [folder / name / f"{frame:06d}.png" for name in names]
 
 
 def checksum(paths: Collection[Path]) -> str:
-    """64 bits of the SHA-256 of the files' contents, one after the other."""
+    """The first 64 bits, in hexadecimal, of the SHA-256 of the files' concatenated contents."""
     digest = hashlib.sha256()
     for path in paths:
         digest.update(path.read_bytes())
@@ -37,7 +37,7 @@ def checksum(paths: Collection[Path]) -> str:
 
 
 def size(paths: Collection[Path]) -> int:
-    """Bytes of all the files; -1 if one is missing."""
+    """Total size of the files in bytes; -1 if one is missing."""
     try:
         return sum(path.stat().st_size for path in paths)
     except FileNotFoundError:
@@ -48,9 +48,9 @@ def damaged_frames(folder: Path, manifest: dict[str, Any], *, thorough: bool) ->
     """Frames whose files differ from the manifest of a complete sequence.
 
     Args:
-        folder: of the sequence.
-        manifest: its ``checksums`` and ``sizes``, one a frame.
-        thorough: compare every checksum, not only all sizes and a few checksums.
+        folder: folder of the sequence.
+        manifest: its ``checksums`` and ``sizes``, one for each frame.
+        thorough: compare all checksums instead of all sizes and a few checksums.
     """
     sums, depth = manifest["checksums"], bool(manifest["depth"])
     sizes = manifest.get("sizes") or [None] * len(sums)
@@ -67,14 +67,14 @@ def damaged_frames(folder: Path, manifest: dict[str, Any], *, thorough: bool) ->
 
 
 def write(path: Path, data: bytes) -> None:
-    """Whole or not at all."""
+    """Write a file atomically."""
     part = path.with_name(f".{path.name}.{os.getpid()}")
     part.write_bytes(data)
     os.replace(part, path)
 
 
 def write_png(path: Path, image: NDArray[Any], level: int) -> None:
-    """Write a PNG whole or not at all."""
+    """Write a PNG atomically; ``level`` is its compression level."""
     data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, level])[1]
     write(path, data.tobytes())
 
@@ -83,14 +83,18 @@ def lock_of(folder: Path) -> AbstractContextManager[None]:
     """Keep other processes from writing to a sequence's folder.
 
     Raises:
-        InputError: another living process writes to it.
+        InputError: another running process writes to it.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     return locked(folder.with_name(f".{folder.name}.lock"), folder, "is rendering it")
 
 
 def check_disk(cache: Path, frames: int, depth: bool) -> None:
-    """Refuse, with what it needs, to render ``frames`` pairs of images onto a disk too small."""
+    """Check that the disk has enough space for ``frames`` pairs of images.
+
+    Raises:
+        InputError: it has not; the message says how much is needed.
+    """
     needed = frames * (2 * _IMAGE_BYTES + (_DEPTH_BYTES if depth else 0))
     there = cache
     while not there.exists() and there != there.parent:
@@ -106,7 +110,7 @@ def check_disk(cache: Path, frames: int, depth: bool) -> None:
 
 @contextmanager
 def writing(cache: Path) -> Iterator[None]:
-    """Turn what the file system refuses into one sentence."""
+    """Turn an error of the file system into an `InputError`."""
     try:
         yield
     except OSError as error:

@@ -1,7 +1,7 @@
-"""A rendered drive as an unrectified fisheye pair would have taken it, with its calibration.
+"""A rendered drive as seen by an unrectified fisheye pair, with its calibration.
 
-The town is rendered by a rectified pinhole pair that sees enough; its images are warped into two
-equidistant cameras, each with lens, rotation and noise of its own.
+The town is rendered for a rectified pinhole pair with a sufficient field of view. The images are
+warped into two equidistant cameras that differ in lens and rotation.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from vslam.datasets.synthetic.routes import RATE, Route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import OnFrame, render_sequence
 
-# Of each side: focal length to that of the pinhole camera, principal point off the middle (px),
-# k1 to k4, and rotation from the rectified camera (rad).
+# For each side: focal length relative to that of the pinhole camera, offset of the principal point
+# from the image centre (px), k1 to k4, and rotation vector from the rectified camera (rad).
 _SIDES = (
     (0.970, (6.3, -3.1), (0.012, -0.006, 0.002, -0.0004), (0.011, -0.014, 0.009)),
     (0.962, (-4.7, 5.2), (0.009, -0.004, 0.001, -0.0002), (-0.008, 0.013, -0.012)),
@@ -36,12 +36,13 @@ Warp = Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
 
 @dataclass(frozen=True)
 class FisheyeRig:
-    """A pair that stands where a rectified pair stands.
+    """A fisheye pair at the place of a rectified pair.
 
     Attributes:
         models: left and right camera.
-        R_own_rectified: of each, ``(3, 3)`` float64.
-        T_left_right: ``(4, 4)`` float64.
+        R_own_rectified: for each camera, ``(3, 3)`` float64, maps directions of the rectified
+            camera to its own.
+        T_left_right: ``(4, 4)`` float64, maps points of the right camera to the left one.
     """
 
     models: tuple[CameraModel, CameraModel]
@@ -50,7 +51,7 @@ class FisheyeRig:
 
 
 def fisheye_rig(camera: Camera) -> FisheyeRig:
-    """The fisheye pair in the place of a rectified one."""
+    """The fisheye pair at the place of a rectified one."""
     models, rotations = [], []
     for scale, (dx, dy), distortion, turn in _SIDES:
         focal = scale * camera.fx
@@ -65,7 +66,7 @@ def fisheye_rig(camera: Camera) -> FisheyeRig:
 
 
 def wide_camera(camera: Camera) -> Camera:
-    """The rectified pair of the same focal length that sees all that the fisheye pair sees."""
+    """The smallest rectified pair of the same focal length that covers the fisheye pair's view."""
     rig = fisheye_rig(camera)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for model, R_own_rectified in zip(rig.models, rig.R_own_rectified, strict=True):
@@ -88,11 +89,11 @@ def render_fisheye(
 ) -> Path:
     """Write a drive in EuRoC's layout, with the calibration in its format and in Kalibr's.
 
-    The rendered pinhole images stay in ``folder/pinhole``, from where another call goes on.
+    The rendered pinhole images stay in ``folder/pinhole``, so that another call can continue.
 
     Args:
-        route, variation, until, threads, on_frame: as `render_sequence` takes them.
-        folder: for ``mav0``, ``camchain.yaml`` and ``pinhole``.
+        route, variation, until, threads, on_frame: as for `render_sequence`.
+        folder: where ``mav0``, ``camchain.yaml`` and ``pinhole`` are written.
 
     Returns:
         ``folder``.
@@ -130,7 +131,7 @@ def render_fisheye(
 
 
 def _seen_at(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray[np.float32]:
-    """``(H, W, 2)`` pixels of the rectified pinhole image that the pixels of a camera see."""
+    """``(H, W, 2)`` float32, the rectified pinhole pixel that each pixel of a camera sees."""
     u, v = np.meshgrid(np.arange(model.width), np.arange(model.height))
     own = unproject(model, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
     at = camera.project(own @ R_own_rectified)[:, :2]

@@ -1,4 +1,4 @@
-"""The ground: a mesh over the terrain, painted tile by tile, no two tiles alike."""
+"""The ground: a mesh over the terrain with a texture of its own for each tile."""
 
 from __future__ import annotations
 
@@ -18,21 +18,22 @@ from vslam.kernels import kernel
 from vslam.machine import available_cores
 
 TILE = 12.8  # m
-_FINE, _COARSE = 512, 64  # texels of a tile with and without road
-_REACH = 75.0  # m from a road to the end of the ground
+_FINE, _COARSE = 512, 64  # texels along a side of a tile, with and without a road
+_REACH = 75.0  # m, the ground ends at this distance from the roads
 
 
 @dataclass(frozen=True)
 class RoadStyle:
-    """Cross-section of a road; widths in metres from its middle.
+    """Cross-section of a road; widths are in metres from its middle line.
 
     Attributes:
         lane: half width of the carriageway.
         parking: outer edge of the parking bays.
         walk: outer edge of the pavement; grass begins there.
-        dash, gap: metres of lane mark and of the gap after it; no marks if ``dash`` is 0.
-        edge_line: solid line at the edge of the carriageway.
-        wear: how patched and cracked the asphalt is, 0 to 1.
+        dash, gap: length of a lane mark and of the gap after it in metres; no marks if ``dash`` is
+            0.
+        edge_line: whether there is a solid line at the edge of the carriageway.
+        wear: amount of patches and cracks in the asphalt, 0 to 1.
     """
 
     lane: float
@@ -45,11 +46,11 @@ class RoadStyle:
 
 
 class _RoadArrays(NamedTuple):
-    """M samples of the middle lines of all roads and their cross-section, as `_paint` sees them.
+    """M samples of the middle lines of all roads and their cross-section, as passed to `_paint`.
 
     ``xz`` (M, 2) f8, ``heading``, ``along`` (M,) f8, ``junction`` (M,) bool: see `terrain.Roads`;
     ``marks`` (M, 10) f8: see `_road_marks`; ``lane``, ``parking``, ``walk``, ``dash`` f8,
-    ``edge_line`` bool: see `RoadStyle`; ``period`` f8 metres of a lane mark with its gap.
+    ``edge_line`` bool: see `RoadStyle`; ``period`` f8 metres from one lane mark to the next.
     """
 
     xz: NDArray[np.float64]
@@ -66,10 +67,10 @@ class _RoadArrays(NamedTuple):
 
 
 class _TileGrid(NamedTuple):
-    """Where a tile lies.
+    """Position and resolution of a tile.
 
-    ``x``, ``z`` f8 corner in metres; ``texel`` f8 metres that a texel covers; ``nearest`` (N, N) i8
-    nearest sample of the roads at the nodes of a coarse mesh; ``mesh`` f8 metres between nodes.
+    ``x``, ``z`` f8 corner in metres; ``texel`` f8 metres per texel; ``nearest`` (N, N) i8 nearest
+    sample of the roads at the nodes of a coarse mesh; ``mesh`` f8 metres between nodes.
     """
 
     x: float
@@ -82,7 +83,7 @@ class _TileGrid(NamedTuple):
 def make_ground(
     rng: Rng, atlas: AtlasBuilder, roads: Roads, terrain: Terrain, style: RoadStyle
 ) -> Surfaces:
-    """Tiles within reach of the roads, the nearer ones finely painted."""
+    """The tiles near the roads; those on the roads have finer textures."""
     tree = cKDTree(roads.xz)
     low = np.floor((roads.xz.min(axis=0) - _REACH) / TILE).astype(int)
     high = np.ceil((roads.xz.max(axis=0) + _REACH) / TILE).astype(int)
@@ -160,8 +161,9 @@ def _tile(x: float, z: float, terrain: Terrain, texture: int, fine: int) -> Surf
 
 
 def _road_marks(rng: Rng, roads: Roads, style: RoadStyle) -> NDArray[np.float64]:
-    """``(M, 10)`` what lies on the road at each sample of its middle line: two cracks, a cross
-    crack, a patch (from, to, tone), a manhole (along, across) and shades of asphalt and walk."""
+    """``(M, 10)`` marks on the road at each sample of its middle line: two cracks (lateral position
+    each), a cross crack, a patch (from, to, tone), a manhole (along, across), and the tones of
+    asphalt and pavement."""
     n = len(roads.xz)
     marks = np.full((n, 10), np.nan)
     for k in range(2):
@@ -190,7 +192,7 @@ def _road_marks(rng: Rng, roads: Roads, style: RoadStyle) -> NDArray[np.float64]
 
 @kernel
 def _hash(a, b):
-    """A number in [0, 1) for a pair of integers."""
+    """A pseudo-random number in [0, 1) from a pair of integers."""
     h = (np.uint64(a) * np.uint64(0x9E3779B97F4A7C15)) ^ (
         np.uint64(b) * np.uint64(0xC2B2AE3D27D4EB4F)
     )
@@ -202,10 +204,10 @@ def _hash(a, b):
 
 @kernel
 def _paint(image, tile, road, grain):
-    """Write the albedo of a tile.
+    """Compute the albedo of a tile.
 
     Args:
-        image: ``(S, S)`` float32, written.
+        image: ``(S, S)`` float32, output.
         tile, road: `_TileGrid`, `_RoadArrays`.
         grain: ``(2, 1024, 1024)`` float32 coarse and fine noise.
     """
@@ -223,7 +225,7 @@ def _paint(image, tile, road, grain):
                 min(int((z - z0) / mesh + 0.5), len(nearest) - 1),
                 min(int((x - x0) / mesh + 0.5), len(nearest) - 1),
             ]
-            # The mesh is coarser than the samples: walk to the nearest one.
+            # The mesh is coarser than the samples, so continue to the nearest sample.
             fs, fc = math.sin(heading[i]), math.cos(heading[i])
             ahead = (x - xz[i, 0]) * fs + (z - xz[i, 1]) * fc
             j = min(max(i + round(ahead / 0.25), 0), len(xz) - 1)
@@ -241,7 +243,7 @@ def _paint(image, tile, road, grain):
             edge = off + 0.02 * fine
             if edge < lane:
                 grey = 66.0 * marks[i, 8] * (1.0 + 0.05 * wide + 0.06 * fine)
-                # Tyres polish their tracks.
+                # The wheel tracks are darker.
                 track = abs(abs(lateral) - 0.45 * lane) - 0.75
                 grey *= 1.0 - 0.06 * math.exp(-8.0 * track * track)
                 if marks[i, 3] < lateral < marks[i, 4]:
@@ -282,7 +284,7 @@ def _paint(image, tile, road, grain):
                 if (s / size) % 1.0 < 0.05 or ((off - parking) / size) % 1.0 < 0.05:
                     grey *= 0.66
             else:
-                # Gardens, drives and paths alternate behind the pavement.
+                # Gardens, driveways and paths alternate behind the pavement.
                 lot = math.floor(s / 5.0)
                 kind = _hash(lot, 7 if side > 0.0 else 8)
                 grey = 58.0 * (1.0 + 0.25 * wide + 0.3 * fine)

@@ -1,4 +1,4 @@
-"""Houses along the streets, and where a view would else be open."""
+"""Houses along the streets, and at the ends of sight lines that would otherwise be open."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vslam.datasets.synthetic.textures import Rng
 
 
 def _house(site: Site, xz: Float, heading: float, size: tuple[float, float, float]) -> None:
-    """A house whose front stands at ``xz`` and looks back along ``heading``."""
+    """Build a house whose front stands at ``xz`` and faces against ``heading``."""
     seed, number = site.variation.seed, site.next_thing
     key = number % ALIASES if site.variation.aliased else number
     rng = np.random.default_rng([seed, 3, key])
@@ -61,7 +61,7 @@ def _size(site: Site, rng: Rng) -> tuple[float, float, float]:
 
 
 def line_with_houses(site: Site) -> None:
-    """Fronts along both sides of every road."""
+    """Build houses along both sides of every road."""
     roads, rng, town = site.roads, site.rng, site.route.land == "town"
     for side in (-1.0, 1.0):
         at, setback = 0, site.style.walk + (2.0 if town else 6.0)
@@ -84,7 +84,7 @@ def line_with_houses(site: Site) -> None:
 
 
 def close_sight_lines(site: Site) -> None:
-    """Where a street opens on nothing, a house stands in the view."""
+    """Build houses that end every open line of sight along the route."""
     rng = site.rng
     last = np.array([-1e9, -1e9])
     for T in site.route.T_wc:

@@ -1,4 +1,4 @@
-"""What the kernels of the renderer read and write: scene, light and camera as plain arrays."""
+"""Scene, light and camera as plain arrays, in the form that the renderer's kernels take."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.synthetic.scene import Atlas, Surfaces
+from vslam.datasets.synthetic.scene import Surfaces
 
 
 class SurfaceArrays(NamedTuple):
-    """Q surfaces as kernels see them; `scene.Surfaces` says what each field means.
+    """Q surfaces in the form for kernels; `scene.Surfaces` documents the fields.
 
     ``origin``, ``edge_s``, ``edge_t`` (Q, 3) f8; ``uv`` (Q, 6) f8; ``texture``, ``detail`` (Q,) i4;
     ``detail_size``, ``gain`` (Q,) f8; ``triangle`` (Q,) bool; ``layer``, ``material`` (Q,) u1.
@@ -34,25 +34,8 @@ class SurfaceArrays(NamedTuple):
         return cls(*(getattr(surfaces, name) for name in cls._fields))
 
 
-class AtlasArrays(NamedTuple):
-    """T textures with L levels as kernels see them; `scene.Atlas` says what each field means.
-
-    ``texels``, ``alpha`` (N,) u1; ``offset``, ``alpha_offset`` (T, L) i8; ``log_size`` (T, 2) i8.
-    """
-
-    texels: NDArray[np.uint8]
-    alpha: NDArray[np.uint8]
-    offset: NDArray[np.int64]
-    alpha_offset: NDArray[np.int64]
-    log_size: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, atlas: Atlas) -> AtlasArrays:
-        return cls(*(getattr(atlas, name) for name in cls._fields))
-
-
 class LightValues(NamedTuple):
-    """Sun, sky and air as kernels see them, all f8; `render.Light` says what each field means.
+    """Sun, sky and air in the form for kernels, all f8; `render.Light` documents the fields.
 
     ``sun_x``, ``sun_y``, ``sun_z``: unit vector towards the sun, world.
     """
@@ -70,7 +53,7 @@ class LightValues(NamedTuple):
 
 
 class PosedCamera(NamedTuple):
-    """A camera at a place, as kernels see it.
+    """A camera with its pose in the form for kernels.
 
     ``T_wc`` (4, 4) f8; ``fx``, ``fy``, ``cx``, ``cy`` f8 pixels; ``height``, ``width`` i8 pixels.
     """
@@ -85,11 +68,11 @@ class PosedCamera(NamedTuple):
 
 
 class SampleBand(NamedTuple):
-    """The samples of some rows of an image, h rows of w samples.
+    """The samples of a band of image rows, h rows of w samples.
 
-    ``first_row`` i8 first of these rows in the image, in pixels; ``samples`` i8 samples a pixel in
-    each direction; ``inverse_depth`` (h, w) f4 1/z of the nearest surface, 0 without one; ``seen``
-    (h, w) i4 its row in the result of `find_visible`, -1 without one.
+    ``first_row`` i8 first row of the band, in pixels; ``samples`` i8 samples per pixel in each
+    direction; ``inverse_depth`` (h, w) f4 1/z of the nearest surface, 0 if there is none; ``seen``
+    (h, w) i4 the surface's row in the result of `find_visible`, -1 if there is none.
     """
 
     first_row: int

@@ -23,13 +23,13 @@ from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import OnFrame
 from vslam.datasets.synthetic.town import Town, build_town
 
-_HEIGHT = 0.25  # largest change, m
-_EXPOSURE = 0.25  # deviation of the logarithm of the second view's exposure by the first's
-_APART = 40.0  # m between different places,
-_SIGHT, _STREET = 160.0, 25.0  # and where one lies so far ahead of the other in the same street
+_HEIGHT = 0.25  # m, largest change of the camera's height
+_EXPOSURE = 0.25  # standard deviation of the log of the ratio of the two exposures
+_APART = 40.0  # m, least distance of different places;
+_SIGHT, _STREET = 160.0, 25.0  # m, that in the same street: along it, and across it
 _TOGETHER, _LATER, _ALIGNED = 4.0, 60, 30.0  # m, frames, degrees: another pass through a place
-_ALIKE = 5  # a look-alike is drawn from so many of the most similar places
-_PLACES, _SMALL = 160, 8  # places that are compared, in views so many times smaller
+_ALIKE = 5  # a look-alike is one of this many most similar places
+_PLACES, _SMALL = 160, 8  # number of places that are compared; factor by which views are reduced
 KINDS = ("shift", "alike", "pass", "random")
 _COLUMNS = ("a", "b", "same", "kind", "frame_a", "frame_b", "when_a", "when_b", "distance_m",
             "lateral_m", "heading_deg", "height_m", "exposure_ratio",
@@ -40,11 +40,11 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Moves:
-    """How the second view of a pair is moved; ranges to draw from, lowest and highest.
+    """Ranges (lowest, highest) of the random motion of the second view of a pair.
 
     Attributes:
-        lateral: metres to the right, negative to the left, where the other lane is (3.2 m).
-        heading: degrees of turn, to either side.
+        lateral: metres to the right; negative is to the left, where the other lane is (3.2 m).
+        heading: degrees of rotation, to either side.
     """
 
     lateral: tuple[float, float] = (-1.4, 1.4)
@@ -62,32 +62,33 @@ def render_pairs(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> None:
-    """Render ``count`` pairs, with all kinds half of one place and half of two.
+    """Render ``count`` labelled pairs; with all kinds, half of them show the same place twice.
 
-    ``folder/pairs.csv`` has a row for each: both images, ``same`` (1 or 0), the kind, the frame of
-    the drive that each view was taken from, the moment of each as a frame (what stands there and
-    how it is lit), how the second view differs: metres between the frames' places, metres to the
-    side, degrees and metres up that were added, and the ratio of the exposures; and where both
-    cameras stand: x and z in metres, and degrees from z towards x. The kinds:
+    ``folder/pairs.csv`` has one row for each pair: the two images; ``same`` (1 or 0); the kind; the
+    frame of the drive from which each view was taken; for each view the frame that determines which
+    objects exist and how they are lit; the difference of the second view: metres between the two
+    frames, and the added lateral shift (m), rotation (degrees) and height (m); the ratio of the
+    exposures; and the pose of each camera: x and z in metres, and yaw in degrees from z towards x.
+    The kinds are:
 
-    - ``shift``: the same frame, moved to the side, turned, raised;
-    - ``pass``: another pass through the place, where the drive has one, shifted likewise;
-    - ``alike``: another place, one of those that look most like the first in a small blurred view;
+    - ``shift``: the same frame, moved to the side, turned and raised;
+    - ``pass``: another pass through the place, if the drive has one, moved likewise;
+    - ``alike``: another place that is among the most similar ones in a small blurred view;
     - ``random``: any other place.
 
     Args:
-        route: drive to take places from.
-        variation: of the town; ``aliased`` makes different places look most alike, ``change``
-            puts days between the views of one place.
-        folder: to write to.
+        route: drive from which places are taken.
+        variation: of the town; ``aliased`` makes different places more similar, ``change`` makes
+            the views of one place differ as if days lay between them.
+        folder: output folder.
         count: number of pairs.
-        moves: of the second views.
-        kinds: which are rendered, in turn.
-        threads: of the renderer.
-        on_frame: called with pairs done and in all.
+        moves: motion of the second views.
+        kinds: the kinds to render, in turn.
+        threads: number of threads of the renderer.
+        on_frame: called with the number of finished pairs and ``count``.
 
     Raises:
-        InputError: the folder cannot be written or the disk is too small.
+        InputError: the folder cannot be written, or the disk is too small.
     """
     check_disk(folder, count, depth=False)
     rng = np.random.default_rng([variation.seed, 20])
@@ -153,7 +154,7 @@ def _view(
 
 
 def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
-    """For each frame the frames of other passes that stand and look about alike."""
+    """For each frame, the frames of other passes with about the same position and direction."""
     xz, ahead = T_wc[:, [0, 2], 3], T_wc[:, :3, 2]
     again = []
     for k, near in enumerate(cKDTree(xz).query_ball_point(xz, _TOGETHER)):
@@ -164,7 +165,8 @@ def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
 
 
 def _different(T_wc: Float, others: Float) -> NDArray[np.bool_]:
-    """Which of ``others`` ``(N, 4, 4)`` stand elsewhere and do not look along the same street."""
+    """``(N,)`` bool: which of the ``(N, 4, 4)`` poses ``others`` show another place than ``T_wc``,
+    not just a view along the same street."""
     away = (others[:, :3, 3] - T_wc[:3, 3])[:, [0, 2]]
     ahead = T_wc[[0, 2], 2] / np.linalg.norm(T_wc[[0, 2], 2])
     aside = np.abs(away @ np.array([ahead[1], -ahead[0]]))
@@ -177,9 +179,9 @@ def _different(T_wc: Float, others: Float) -> NDArray[np.bool_]:
 
 
 def _look_alikes(route: Route, town: Town, passes: Passes, threads: int) -> NDArray[np.int64]:
-    """``(P, 2)`` frames of different places that look alike, several for each of many places.
+    """``(P, 2)`` pairs of frames that show different but similar places, several for each place.
 
-    Alike are small, blurred views, brightness and contrast set aside, with a high correlation.
+    The similarity of two places is the correlation of small, blurred, normalised views.
     """
     chosen = np.unique(np.linspace(0, len(route.T_wc) - 1, _PLACES).astype(int))
     camera = route.camera

@@ -1,4 +1,4 @@
-"""The textures that a whole town shares."""
+"""The textures that are shared by a whole town."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vslam.datasets.synthetic.textures import Rng
 
 @dataclass(frozen=True)
 class Palette:
-    """Numbers of textures in the atlas; ``signs`` are pairs of front and back."""
+    """Texture numbers in the atlas; ``signs`` has a pair of front and back for each sign."""
 
     sky: int
     twigs: list[int]
@@ -35,7 +35,7 @@ class Palette:
 
 
 def make_palette(rng: Rng, atlas: AtlasBuilder, pool: int) -> Palette:
-    """Paint the textures; ``pool``: how many of what varies most."""
+    """Paint the textures; ``pool`` is the number of variants of the most varied ones."""
     add = atlas.add
     return Palette(
         sky=add(textures.sky(rng)),
@@ -65,7 +65,7 @@ def _sign(rng: Rng, atlas: AtlasBuilder) -> tuple[int, int]:
 
 
 def _kerb(rng: Rng) -> textures.Grey:
-    """Kerb stones, 4 m of them, each a metre long."""
+    """Kerb stones, each a metre long; the texture covers 4 m."""
     tone = np.repeat(rng.uniform(135, 175, 4), 128)[None, :]
     grey = tone * (1.0 + 0.09 * textures.noise(rng, 32, 512, 8.0, 3))
     grey[:, ::128] = grey[:, 1::128] = 60.0

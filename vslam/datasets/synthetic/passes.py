@@ -1,4 +1,4 @@
-"""A town in time: what stands and moves in it at a frame, and how it is lit."""
+"""The state of a town at each frame: standing and moving objects, and light."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from vslam.datasets.synthetic.shadows import (
 from vslam.datasets.synthetic.site import AFTER, BEFORE, Variation
 from vslam.datasets.synthetic.town import Town
 
-_NEAR, _LEFT = 60.0, 75.0  # m: a place was passed, and has been left again
-_AGAIN, _STRETCH = 60, 15  # frames: a place is passed again after so many, for so many
-_CASTS = 8  # shadow maps kept
-_CLOUD = 12.0  # frames that a cloud hides the sun while it moves between two passes
+_NEAR, _LEFT = 60.0, 75.0  # m: a place is passed within the first, and left beyond the second
+_AGAIN, _STRETCH = 60, 15  # frames: least time until a revisit; least length of a revisit
+_CASTS = 8  # number of shadow maps that are kept
+_CLOUD = 12.0  # frames for which a cloud hides the sun while it moves between two passes
 _CAR_REACH = np.array([1.1, 2.7])  # half width and length of the largest car, m
 
 
 @dataclass(frozen=True)
 class Moment:
-    """All that the renderer needs of one frame; ``night`` 0 to 1 raises the sensor's gain."""
+    """The scene of one frame; ``night``, 0 to 1, raises the gain of the sensor."""
 
     surfaces: Surfaces
     shadows: ShadowMap
@@ -42,7 +42,7 @@ class Moment:
 
 
 class Passes:
-    """Hands out moments; safe to call from several threads."""
+    """Computes the moments of a drive; may be called from several threads."""
 
     def __init__(self, route: Route, town: Town, variation: Variation) -> None:
         self._route, self._town, self._variation = route, town, variation
@@ -53,7 +53,7 @@ class Passes:
         self._pools = lamp_pools(town.lamps)
 
     def at(self, frame: int) -> Moment:
-        """The town at frame number ``frame`` of the route."""
+        """The town at the frame ``frame`` of the route."""
         number = int(np.searchsorted(self._starts, frame, side="right")) - 1
         light, night = self._light(frame, number)
         standing = self._standing(frame)
@@ -79,8 +79,8 @@ class Passes:
         return surfaces.select((surfaces.thing < 0) | present[surfaces.thing])
 
     def _light(self, frame: int, number: int) -> tuple[Light, float]:
-        """The sun stands still during a pass and moves to the next behind a cloud; night falls
-        slowly over the whole drive."""
+        """Light and night (0 to 1) at a frame of pass ``number``. The sun stands still during a
+        pass and moves behind a cloud between two; night falls slowly over the whole drive."""
         seed, change = self._variation.seed, self._variation.change
         rng = np.random.default_rng([seed, 11])
         azimuth, rise = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(33, 46))
@@ -107,7 +107,7 @@ class Passes:
         return light, night
 
     def _cars(self, frame: int) -> list[Surfaces]:
-        """The first car drives ahead, the others come towards the camera on the other lane."""
+        """The first car drives ahead of the camera, the others approach it on the other lane."""
         T_wc = self._route.T_wc
         here, cars = T_wc[frame], []
         for k, model in enumerate(self._town.moving):
@@ -129,7 +129,7 @@ class Passes:
 
 
 def _switch_frames(place: NDArray[np.float64], cameras: NDArray[np.float64]) -> NDArray[np.int64]:
-    """``(T,)`` the frame at which each place has been left for the first time."""
+    """``(T,)`` the frame at which each place is left for the first time."""
     switch = np.full(len(place), np.iinfo(np.int64).max)
     for k, xz in enumerate(place):
         distance = np.hypot(*(cameras - xz).T)
@@ -142,7 +142,7 @@ def _switch_frames(place: NDArray[np.float64], cameras: NDArray[np.float64]) -> 
 
 
 def pass_starts(T_wc: NDArray[np.float64]) -> list[int]:
-    """Frames at which the drive ``(N, 4, 4)`` comes to streets that it knows, after frame 0."""
+    """Frame 0, and the frames at which the drive ``(N, 4, 4)`` returns to streets that it knows."""
     xz = T_wc[:, [0, 2], 3]
     tree = cKDTree(xz)
     known = np.array([

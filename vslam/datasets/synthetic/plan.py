@@ -1,4 +1,4 @@
-"""The plan of a town: which ground is taken, and what one sees along a street."""
+"""The plan of a town: occupied ground and open lines of sight."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 
 from vslam.datasets.synthetic.terrain import Roads
 
-CLEARANCE = 2.5  # m around every camera position that stay free
+CLEARANCE = 2.5  # m around every camera position that are kept free
 _CELL = 0.5  # m
-_BORDER = 150.0  # m around the roads
+_BORDER = 150.0  # m of plan around the roads
 
 Float = NDArray[np.float64]
 
@@ -25,10 +25,10 @@ def rectangle(middle: Float, heading: float, width: float, depth: float) -> Floa
 
 
 class Plan:
-    """A raster of the town: taken ground, sight lines and distances from roads."""
+    """A raster of the town with occupied ground, sight lines and distances from roads."""
 
     def __init__(self, roads: Roads, cameras: Float) -> None:
-        """``cameras``: ``(N, 2)`` float64 x and z of every camera position of every pass."""
+        """``cameras``: ``(N, 2)`` float64 x and z of all possible camera positions."""
         self._low = roads.xz.min(axis=0) - _BORDER
         columns, rows = np.ceil((roads.xz.max(axis=0) + _BORDER - self._low) / _CELL).astype(int)
         self._taken = np.zeros((rows, columns), np.uint8)
@@ -48,8 +48,9 @@ class Plan:
         return np.minimum(np.maximum(cells, 0, out=cells), self._limit, out=cells)
 
     def claim(self, corners: Float, *, road: float, tall: bool = False) -> bool:
-        """Take the ground of a convex polygon ``(K, 2)`` if it is free, ``road`` metres from the
-        middle of any road and clear of every camera; ``tall`` closes a sight line."""
+        """Occupy the ground of a convex polygon ``(K, 2)`` if it is free, at least ``road`` metres
+        from the middle of every road, and clear of every camera; returns whether it was occupied.
+        ``tall`` objects block lines of sight."""
         cells = self._cell(corners)
         low, high = cells.min(axis=0), cells.max(axis=0) + 1
         window = (slice(low[1], high[1]), slice(low[0], high[0]))
@@ -68,7 +69,7 @@ class Plan:
         return True
 
     def _near_camera(self, corners: Float) -> bool:
-        """Whether a camera stands nearer than `CLEARANCE` to a convex polygon."""
+        """Whether a camera position is nearer than `CLEARANCE` to a convex polygon."""
         middle = corners.mean(axis=0)
         reach = np.linalg.norm(corners - middle, axis=1).max() + CLEARANCE
         polygon = corners.astype(np.float32)[:, None]
@@ -78,12 +79,13 @@ class Plan:
         )
 
     def road_distance(self, xz: Float) -> NDArray[np.float32]:
-        """Metres from ``(N, 2)`` places to the middle of the nearest road."""
+        """``(N,)`` metres from ``(N, 2)`` places to the middle of the nearest road."""
         c, r = self._cell(xz).T
         return self._road[r, c]
 
     def open_ray(self, start: Float, heading: float, reach: float) -> Float | None:
-        """Places ``(K, 2)`` each metre along a line of sight that nothing tall closes, or None."""
+        """Places ``(K, 2)``, one per metre, along a line of sight; None if something tall blocks
+        it."""
         distance = np.arange(2.0, reach, 1.0)[:, None]
         line = start + distance * np.array([np.sin(heading), np.cos(heading)])
         c, r = self._cell(line).T

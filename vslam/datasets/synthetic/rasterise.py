@@ -1,4 +1,4 @@
-"""Which surface each sample of an image sees: projection, culling and the z-buffer."""
+"""Projection, culling and z-buffer, which determine the surface that each image sample sees."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from vslam.kernels import borrowed, inline, kernel
 
 NEAR = 0.2  # m
 FAR = 400.0  # m
-LAYER_STEP = 1e-3  # relative gain in depth of one layer over another in the same plane
-_SEAM = 1e-6  # overlap of neighbours, in parts of an edge, so that no sample falls between them
+LAYER_STEP = 1e-3  # relative depth by which a layer is drawn in front of the next lower one
+_SEAM = 1e-6  # overlap of neighbours as a fraction of an edge, so that no sample is missed between
 
 # Columns of a row of ``find_visible``: three affine functions of the pixel (u, v) for s/z, t/z and
 # 1/z, two for the texture coordinates over z, then the rest.
@@ -24,8 +24,8 @@ NUMBER, DETAIL_U, DETAIL_V, DETAIL, AMBIENT, SUN, GLOW, KEY, COLUMNS = range(19,
 class _Span(NamedTuple):
     """Neighbouring samples of one row that lie on one surface.
 
-    ``begin``, ``end`` i8 numbers of the samples, ``end`` excluded; ``v`` f8 row in pixels; sample
-    ``i`` lies at column ``shift + step i`` in pixels (f8), and has 1/z = ``value + slope i`` (f8).
+    ``begin``, ``end`` i8 range of the samples, without ``end``; ``v`` f8 row in pixels. Sample
+    ``i`` lies at column ``shift + step i`` in pixels (f8) and has 1/z = ``value + slope i`` (f8).
     """
 
     begin: int
@@ -38,8 +38,8 @@ class _Span(NamedTuple):
 
 
 class _AlphaMap(NamedTuple):
-    """Alpha of one texture: ``alpha`` (N,) u1 of all textures; ``offset`` (L,) i8 where its levels
-    begin; ``log_size`` (2,) i8 binary logarithms of width and height of level 0."""
+    """Alpha of one texture: ``alpha`` (N,) u1 of all textures; ``offset`` (L,) i8 start of each of
+    its levels; ``log_size`` (2,) i8 binary logarithms of width and height of level 0."""
 
     alpha: NDArray[np.uint8]
     offset: NDArray[np.int64]
@@ -51,7 +51,7 @@ def find_visible(surfaces, atlas, camera, light):
     """Project the surfaces that a camera may see, nearest first.
 
     Args:
-        surfaces, atlas, camera, light: `SurfaceArrays`, `AtlasArrays`, `PosedCamera`,
+        surfaces, atlas, camera, light: `SurfaceArrays`, `scene.Atlas`, `PosedCamera`,
             `LightValues`.
 
     Returns:
@@ -72,7 +72,7 @@ def find_visible(surfaces, atlas, camera, light):
     corner = np.empty((4, 3))
     left, right = (-1.0 - cx) / fx, (width - cx) / fx
     for q in range(len(origin)):
-        # Camera coordinates by hand: three-vectors are too short for a matrix product.
+        # Written out by coordinates, since three-vectors are too short for a matrix product.
         ox, oy, oz = origin[q, 0] - T_wc[0, 3], origin[q, 1] - T_wc[1, 3], origin[q, 2] - T_wc[2, 3]
         sx, sy, sz = edge_s[q, 0], edge_s[q, 1], edge_s[q, 2]
         tx, ty, tz = edge_t[q, 0], edge_t[q, 1], edge_t[q, 2]
@@ -136,7 +136,7 @@ def find_visible(surfaces, atlas, camera, light):
         row[NUMBER] = number
         row[DETAIL] = detail[q]
         if detail[q] >= 0:
-            # Texels of the fine texture for one texel of the first, along u and v.
+            # Texels of the detail texture per texel of the base texture, along u and v.
             span_u = max(abs(uv[q, 1]), abs(uv[q, 2]), 1e-9)
             length_s = math.sqrt(sx * sx + sy * sy + sz * sz)
             length_t = math.sqrt(tx * tx + ty * ty + tz * tz)
@@ -165,7 +165,7 @@ def find_visible(surfaces, atlas, camera, light):
 
 @inline
 def _turn(T_wc, x, y, z):
-    """World direction to camera direction."""
+    """Rotate a world direction into the camera frame."""
     return (
         T_wc[0, 0] * x + T_wc[1, 0] * y + T_wc[2, 0] * z,
         T_wc[0, 1] * x + T_wc[1, 1] * y + T_wc[2, 1] * z,
@@ -207,7 +207,7 @@ def rasterise(visible, atlas, band):
 
     Args:
         visible: from `find_visible`.
-        atlas: `AtlasArrays`.
+        atlas: `scene.Atlas`.
         band: `SampleBand`; ``inverse_depth`` and ``seen`` are updated.
     """
     visible, alpha = borrowed(visible), borrowed(atlas.alpha)
@@ -270,13 +270,13 @@ def rasterise(visible, atlas, band):
                     inverse_depth[j, begin:end],
                     seen[j, begin:end],
                 )
-    held[0, 0] = 0.0  # it must live until here
+    held[0, 0] = 0.0  # keeps the array alive while ``bound`` is in use
 
 
 @kernel
 def _fill(value, slope, number, begin, inverse_depth, seen):
-    """Draw surface ``number`` on a part of a row that begins with sample ``begin``; its 1/z at
-    sample ``i`` of the whole row is ``value + slope i``."""
+    """Draw surface ``number`` on the part of a row that begins at sample ``begin``; 1/z of sample
+    ``i`` of the row is ``value + slope i``."""
     value += slope * begin
     for i in range(np.uintp(len(seen))):
         near = np.float32(value + slope * np.float64(np.int32(i)))
@@ -288,10 +288,10 @@ def _fill(value, slope, number, begin, inverse_depth, seen):
 
 @kernel
 def _fill_cut_out(q, number, span, mask, inverse_depth, seen):
-    """As `_fill` where the alpha of the texture is at least one half.
+    """Like `_fill`, but only where the alpha of the texture is at least one half.
 
     Args:
-        q, number: a surface: its row of `find_visible` and the number of this row.
+        q, number: a row of the result of `find_visible`, and its number.
         span, mask: `_Span`, `_AlphaMap`.
         inverse_depth, seen: one row of the `SampleBand`, updated.
     """
@@ -301,7 +301,7 @@ def _fill_cut_out(q, number, span, mask, inverse_depth, seen):
     u_slope, v_slope = q[TEXTURE] * step, q[TEXTURE + 3] * step
     u_value = q[TEXTURE] * shift + q[TEXTURE + 1] * v + q[TEXTURE + 2]
     v_value = q[TEXTURE + 3] * shift + q[TEXTURE + 4] * v + q[TEXTURE + 5]
-    # One level for the whole row of a cut-out: it is small or far.
+    # A cut-out is small or far away, so that one level is enough for its row.
     middle = 0.5 * (begin + end)
     z = 1.0 / (value + slope * middle)
     a, b = (u_value + u_slope * middle) * z, (v_value + v_slope * middle) * z
@@ -321,7 +321,7 @@ def _fill_cut_out(q, number, span, mask, inverse_depth, seen):
         z = 1.0 / inverse
         x = (u_value + u_slope * i) * z * scale - 0.5
         y = (v_value + v_slope * i) * z * scale - 0.5
-        if level > 0:  # texels smaller than samples: take the nearest
+        if level > 0:  # texels are smaller than samples, so the nearest one is enough
             c0, r0 = math.floor(x + 0.5) & mask_u, math.floor(y + 0.5) & mask_v
             if alpha[np.uintp(at + (r0 << row_log) + c0)] < 128:
                 continue

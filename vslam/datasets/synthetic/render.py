@@ -1,10 +1,10 @@
 """The renderer: exact perspective of flat textured surfaces, in Numba, without GPU.
 
 A point of a surface is ``origin + s edge_s + t edge_t = z r`` with the ray ``r = K^-1 (u, v, 1)``,
-so ``(s, t, 1) / z = [edge_s edge_t origin]^-1 r``: three functions affine in the pixel. The inside
-of a surface on an image row is therefore one interval, and depth and texture coordinates are exact
-at every pixel; nothing is ever snapped to a vertex. Visibility is found on a grid twice as fine as
-the pixels, and a pixel is shaded once for each surface that its four samples see.
+so ``(s, t, 1) / z = [edge_s edge_t origin]^-1 r``, which are three affine functions of the pixel.
+Therefore a surface covers a single interval of each image row, and depth and texture coordinates
+are exact at every pixel. Visibility is determined on a grid twice as fine as the pixels, and a
+pixel is shaded once for each surface that its four samples see.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.datasets.synthetic.kernel_arrays import (
-    AtlasArrays,
     LightValues,
     PosedCamera,
     SampleBand,
@@ -30,25 +29,25 @@ from vslam.datasets.synthetic.scene import Atlas, Surfaces
 from vslam.datasets.synthetic.shade import shade
 from vslam.datasets.synthetic.shadows import NO_LAMPS, LampPools, ShadowMap
 
-SAMPLES = 2  # visibility samples a pixel, in each direction
-_BANDS = 2  # bands of rows of an image, the unit of work of a thread
+SAMPLES = 2  # visibility samples per pixel in each direction
+_BANDS = 2  # bands of rows per image, each of which is a job for a thread
 
 Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Light:
-    """Sun, sky and air of a moment.
+    """Sun, sky and air at a moment.
 
     Attributes:
-        sun: ``(3,)`` unit vector towards the sun, world.
-        direct: irradiance of the sun on a surface that faces it; 1 is a clear noon.
-        ambient: irradiance from the sky on a horizontal surface.
+        sun: ``(3,)`` float64 unit vector towards the sun, world.
+        direct: irradiance of the sun on a surface that faces it; 1 at a clear noon.
+        ambient: irradiance of the sky on a horizontal surface.
         glow: brightness of lamps and lit windows.
-        haze: grey of the air, 0 to 255.
-        visibility: metres at which a contrast falls to 1/e.
-        exposure: factor from radiance to grey levels.
-        headlight: brightness of the car's own lamps 10 m ahead.
+        haze: grey level of the air, 0 to 255.
+        visibility: distance in metres at which contrast falls to 1/e.
+        exposure: grey levels per unit of radiance.
+        headlight: brightness of the car's own headlights 10 m ahead.
     """
 
     sun: NDArray[np.float64]
@@ -61,27 +60,27 @@ class Light:
     headlight: float = 0.0
 
     def values(self) -> LightValues:
-        """The form that the kernels take."""
+        """The light in the form for kernels."""
         sky = (self.direct, self.ambient, self.glow)
         air = (self.haze, self.visibility, self.exposure)
         return LightValues(*(float(x) for x in (*self.sun, *sky, *air, self.headlight)))
 
 
 class RenderedView(NamedTuple):
-    """What a camera sees: ``image`` ``(H, W)`` float32 grey before the sensor (0 to 255 and above)
-    and ``depth`` ``(H, W)`` float32 metres along z, 0 where there is sky."""
+    """A rendered view: ``image`` ``(H, W)`` float32 grey levels before the sensor (0 to above 255)
+    and ``depth`` ``(H, W)`` float32 metres along z, 0 in the sky."""
 
     image: Float32
     depth: Float32
 
 
 class Renderer:
-    """Draws stereo pairs. The bytes do not depend on the number of threads."""
+    """Renders views of a town; the result does not depend on the number of threads."""
 
     def __init__(self, camera: Camera, atlas: Atlas, sky: int, threads: int = 1) -> None:
-        """``sky``: number of the panorama texture; see `textures.sky`."""
+        """``sky`` is the number of the panorama texture; see `textures.sky`."""
         self._camera = camera
-        self._atlas = AtlasArrays.of(atlas)
+        self._atlas = atlas
         self._sky = sky
         self._pool = ThreadPoolExecutor(threads)
 
@@ -110,7 +109,7 @@ class Renderer:
         T_wc: Iterable[NDArray[np.float64]],
         pools: LampPools = NO_LAMPS,
     ) -> list[RenderedView]:
-        """A view from each of the poses ``(4, 4)``."""
+        """A view from each of the ``(4, 4)`` poses ``T_wc``."""
         prepared = [
             self._pool.submit(self._prepare, surfaces, shadows, light, T, pools) for T in T_wc
         ]
@@ -150,7 +149,7 @@ class Renderer:
             rasterise(visible, self._atlas, samples)
             shade(visible, samples, self._atlas, self._sky, values, shadows, pools, camera, view)
 
-        # Defaults bind the loop's values.
+        # The defaults bind the present values of the loop variables.
         return (
             view,
             [

@@ -25,18 +25,20 @@ def render_rgbd(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> Path:
-    """Render a route, or what is missing of it, into a folder and return the folder.
+    """Render a route, or its missing frames, into a folder and return the folder.
 
-    ``out/stereo`` has the same drive as a KITTI tree. The left image is the colour one; the depth,
-    which sees as far as the town goes, is in centimetres, 0 where there is sky. The virtual
-    baseline of ``calibration.yaml`` is that of the rendered pair, so that both sensors are as sure
-    of far points.
+    ``out/stereo`` has the same drive as a KITTI tree. The left image serves as colour image. Depth
+    has no maximum range; it is in centimetres, 0 in the sky. The virtual baseline in
+    ``calibration.yaml`` is the baseline of the rendered pair, so that far points are as uncertain
+    as with stereo.
 
     Args:
-        until: write the frames before this one only.
+        route, variation, threads, on_frame: as for `render_sequence`.
+        out: output folder.
+        until: write only the frames before this one.
 
     Raises:
-        InputError: as `render_sequence`; the folder cannot be written.
+        InputError: as `render_sequence`, or the folder cannot be written.
     """
     root = render_sequence(
         route,

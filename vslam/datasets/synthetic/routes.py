@@ -1,4 +1,4 @@
-"""Where the camera drives: the built-in routes, and routes along given poses."""
+"""The routes of the camera: built-in ones, and routes along given poses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CAMERA_HEIGHT = 1.65  # m
 RATE = 10.0  # frames a second
 _MAX_STEP = 5.0  # m between frames
 _LANE = 1.6  # m from the middle of the road to the middle of a lane
-_CAMERAS = {  # as in KITTI's three recording periods: 00-02, 03, 04-12
+_CAMERAS = {  # as in KITTI's three recording periods
     "00-02": Camera(718.856, 718.856, 607.1928, 185.2157, 0.53716, 1241, 376),
     "03": Camera(721.5377, 721.5377, 609.5593, 172.854, 0.53715, 1242, 375),
     "04-12": Camera(707.0912, 707.0912, 601.8873, 183.1104, 0.53715, 1226, 370),
@@ -32,12 +32,13 @@ class Route:
     """A drive.
 
     Attributes:
-        name: ``demo`` for example.
-        about: what it is for, in a few words.
+        name: such as ``demo``.
+        about: description in a few words.
         land: ``town``, ``suburb`` or ``motorway``.
         camera: the stereo rig.
-        T_wc: ``(N, 4, 4)`` float64 left camera to the town's world (y = 0 is the datum).
-        roads, terrain: what the drive runs on.
+        T_wc: ``(N, 4, 4)`` float64 left camera to the town's world, in which heights are measured
+            from y = 0.
+        roads, terrain: the roads and the ground of the drive.
     """
 
     name: str
@@ -68,7 +69,8 @@ class Route:
 
 @dataclass(frozen=True)
 class _Leg:
-    """Corner points ``(x, z)`` in metres with the lane from there on: 1 right, -1 left."""
+    """A polyline of corner points ``(x, z)`` in metres, with the lane from each corner on: 1 is the
+    right one, -1 the left one."""
 
     corners: tuple[tuple[float, float], ...]
     lanes: tuple[float, ...] = ()
@@ -132,7 +134,7 @@ _BUILT_IN = {
 }  # fmt: skip
 
 ROUTES = {name: route.about for name, route in _BUILT_IN.items()}
-# Drives with a name of their own: a route in one town. datasets.md says how the town was chosen.
+# Named drives, each a route with a variation; datasets.md explains how the town was chosen.
 DRIVES = {"night": "lane+change:1+seed:1"}
 
 
@@ -169,20 +171,19 @@ def built_in_route(name: str) -> Route:
 
 
 def route_of_poses(T_wc: Float, name: str, calibration: str = "00-02") -> Route:
-    """A route along given poses, KITTI's for example.
+    """Build a route along given poses, for example KITTI's.
 
     The heights of all passes over a place are averaged, so that each road has one height; heading,
-    pitch and roll stay as given. The poses are those of ``ground_truth``, not the given ones.
+    pitch and roll stay as given. ``Route.ground_truth`` has the poses with these heights.
 
     Args:
         T_wc: ``(N, 4, 4)`` float64, y down.
-        name: of the route.
-        calibration: one of `CALIBRATIONS`: the KITTI sequences whose camera to use; poses do not
-            tell.
+        name: name of the route.
+        calibration: one of `CALIBRATIONS`, the KITTI sequences whose camera is used.
 
     Raises:
-        InputError: unknown calibration, NaN, fewer than 20 poses, less than 20 m, or a jump of
-            more than 5 m.
+        InputError: the calibration is unknown, a pose is not finite, there are fewer than 20 poses
+            or 20 m, or two poses are more than 5 m apart.
     """
     if calibration not in CALIBRATIONS:
         raise InputError(
@@ -219,7 +220,7 @@ def route_of_poses(T_wc: Float, name: str, calibration: str = "00-02") -> Route:
 
 
 def _round_corners(leg: _Leg) -> tuple[Float, Float]:
-    """Middle line each 0.25 m with arcs at the corners, and the lane at each point."""
+    """Samples of the middle line every 0.25 m, with arcs at the corners, and the lane at each."""
     corners = np.array(leg.corners, np.float64)
     lanes = np.array(leg.lanes or (1.0,) * len(corners))
     points, lane = [corners[0][None]], [lanes[:1]]
@@ -257,7 +258,7 @@ def _round_corners(leg: _Leg) -> tuple[Float, Float]:
 
 
 def _smooth(values: Float, window: int) -> Float:
-    """Moving average twice over; the ends keep their place."""
+    """Apply a moving average twice; the ends stay in place."""
     half = window // 2
     for _ in range(2):
         first, last = values[:1], values[-1:]
@@ -275,7 +276,7 @@ def _headings(line: Float) -> Float:
 
 
 def _drive(path: Float, speed: float) -> Float:
-    """Places ``(N, 2)`` at 10 Hz along a path ``(K, 2)``, slower in bends."""
+    """Positions ``(N, 2)`` at 10 Hz along a path ``(K, 2)``, slower in bends."""
     along = np.cumsum(np.r_[0, np.linalg.norm(np.diff(path, axis=0), axis=1)])
     keep = np.r_[True, np.diff(along) > 1e-9]
     along, path = along[keep], path[keep]
@@ -290,7 +291,7 @@ def _drive(path: Float, speed: float) -> Float:
 
 
 def _poses(xz: Float, terrain: Terrain) -> Float:
-    """Camera poses over the terrain: heading and pitch along the way, a little sway."""
+    """Camera poses over the terrain: heading and pitch follow the path, with a slight sway."""
     up = terrain.height(xz)
     smooth = _smooth(np.column_stack([xz, up]), 7)
     step = np.gradient(smooth, axis=0)
@@ -312,7 +313,7 @@ def _poses(xz: Float, terrain: Terrain) -> Float:
 
 
 def _waves(xz: Float, seed: int) -> Float:
-    """Hills of unit height."""
+    """Heights of hills with unit amplitude at ``(N, 2)`` places."""
     rng = np.random.default_rng(seed)
     total = np.zeros(len(xz))
     for k in range(4):
@@ -333,7 +334,7 @@ def _terrain(xz: Float, height: Callable[[Float], Float]) -> Terrain:
 
 
 def _heights_of(xz: Float, up: Float) -> Callable[[Float], Float]:
-    """Smooth heights through the given ones, averaged where they disagree."""
+    """A smooth height function through the given heights, averaged where passes disagree."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(xz)
@@ -341,7 +342,7 @@ def _heights_of(xz: Float, up: Float) -> Callable[[Float], Float]:
 
     def height(at: Float) -> Float:
         distance, near = tree.query(at, k=min(24, len(xz)))
-        # Beyond the road the land keeps its height.
+        # Away from the road the ground keeps the road's height.
         scale = np.maximum(distance[:, :1], 8.0)
         weight = np.exp(-0.5 * ((distance - distance[:, :1]) / scale) ** 2)
         total: Float = (averaged[near] * weight).sum(axis=1) / weight.sum(axis=1)

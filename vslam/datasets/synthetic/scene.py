@@ -1,8 +1,9 @@
-"""What the renderer draws: flat textured surfaces and the mipmaps they are painted with."""
+"""The scene of the renderer: flat textured surfaces, and their textures with mipmaps."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -10,8 +11,8 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
-# How a surface answers light: an opaque wall has a lit and a dark side, foliage lets light
-# through, a screen (lamp, lit window) shines by itself.
+# How a surface reacts to light: an opaque one has a lit and a dark side, foliage lets light
+# through, and a screen (a lamp or lit window) emits light.
 OPAQUE, FOLIAGE, SCREEN = 0, 1, 2
 
 
@@ -23,12 +24,12 @@ class Surfaces:
         origin, edge_s, edge_t: ``(Q, 3)`` float64 metres, world (x right, y down, z forward).
         uv: ``(Q, 6)`` float64 ``u0 us ut v0 vs vt``: the texture coordinates
             ``u = u0 + us s + ut t`` and v alike, where 1 is the width or height of the texture.
-        texture: ``(Q,)`` int32 into the atlas; one with alpha makes a cut-out.
-        detail: ``(Q,)`` int32 fine texture that multiplies the first, -1 for none.
+        texture: ``(Q,)`` int32 number in the atlas; a texture with alpha makes a cut-out.
+        detail: ``(Q,)`` int32 fine texture that multiplies the base texture, -1 for none.
         detail_size: ``(Q,)`` float64 metres that one repeat of the fine texture covers.
         gain: ``(Q,)`` float64 factor on the albedo.
         triangle: ``(Q,)`` bool, keep only ``s + t <= 1``.
-        layer: ``(Q,)`` uint8; of two surfaces in one plane the higher layer is seen.
+        layer: ``(Q,)`` uint8; of two surfaces in one plane the higher layer is visible.
         material: ``(Q,)`` uint8 ``OPAQUE``, ``FOLIAGE`` or ``SCREEN``.
         thing: ``(Q,)`` int32 number of the object that the surface is a part of, -1 for ground.
     """
@@ -85,7 +86,7 @@ def patches(
     material: int = OPAQUE,
     thing: int = -1,
 ) -> Surfaces:
-    """Surfaces that share all but place and texture coordinates; arrays as in `Surfaces`."""
+    """Surfaces that differ only in position and texture coordinates; arrays as in `Surfaces`."""
     arrays = [np.asarray(x, np.float64) for x in (origin, edge_s, edge_t)]
     n = max(len(x) if x.ndim == 2 else 1 for x in arrays)
     o, s, t = (_rows(x, n) for x in arrays)
@@ -106,21 +107,20 @@ def patches(
 
 
 def _rows(values: Float, n: int) -> Float:
-    """``(n, K)`` from ``(K,)`` or as many rows: faster than NumPy's own broadcasting."""
+    """Broadcast ``(K,)`` or ``(n, K)`` to a copy ``(n, K)``, faster than NumPy does."""
     rows = np.empty((n, values.shape[-1]))
     rows[:] = values
     return rows
 
 
-@dataclass(frozen=True)
-class Atlas:
-    """T textures with their mipmaps, flat, so that a kernel takes them as four arrays.
+class Atlas(NamedTuple):
+    """T textures with their mipmaps in flat arrays for kernels.
 
     Attributes:
-        texels: uint8 grey of all levels of all textures.
-        alpha: uint8, opaque from 128 on, of the textures that have alpha.
-        offset: ``(T, L)`` int64 where a level begins in ``texels``.
-        alpha_offset: ``(T, L)`` int64 likewise in ``alpha``; -1 for an opaque texture.
+        texels: uint8 grey levels of all mipmap levels of all textures.
+        alpha: uint8 alpha of the textures that have it; 128 and more is opaque.
+        offset: ``(T, L)`` int64 start of each level in ``texels``.
+        alpha_offset: ``(T, L)`` int64 start of each level in ``alpha``; -1 for an opaque texture.
         log_size: ``(T, 2)`` int64 binary logarithms of width and height of level 0.
     """
 
@@ -132,7 +132,7 @@ class Atlas:
 
 
 class AtlasBuilder:
-    """Collects textures and hands out their numbers."""
+    """Collects textures and numbers them."""
 
     def __init__(self) -> None:
         self._grey: list[list[NDArray[np.uint8]]] = []

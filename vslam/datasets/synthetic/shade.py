@@ -1,4 +1,4 @@
-"""The grey of each pixel: trilinear texture, sun, shadow, haze and sky."""
+"""Shading of pixels: trilinear texture, sun, shadow, haze and sky."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.synthetic.kernel_arrays import AtlasArrays, PosedCamera
+from vslam.datasets.synthetic.kernel_arrays import PosedCamera
 from vslam.datasets.synthetic.rasterise import (
     AMBIENT,
     DETAIL,
@@ -19,25 +19,27 @@ from vslam.datasets.synthetic.rasterise import (
     SUN,
     TEXTURE,
 )
+from vslam.datasets.synthetic.scene import Atlas
 from vslam.datasets.synthetic.shadows import LampPools, ShadowMap
 from vslam.kernels import borrowed, inline, kernel
 
-_SCALE = 0.5 ** np.arange(24)  # of the levels of a mipmap
-_TWO_TAPS = 1.25  # ratio of the sides of a pixel's footprint from which it is sampled twice
-_DETAIL_ENDS = 12.0  # texels of the fine texture in a pixel that leave nothing of its contrast
-_SKY_HAZE = 185.0  # haze under which the panorama shows its own grey
+_SCALE = 0.5 ** np.arange(24)  # scale of each mipmap level
+_TWO_TAPS = 1.25  # a pixel is sampled twice if the aspect ratio of its footprint is above this
+_DETAIL_ENDS = 12.0  # texels of the detail texture per pixel at which its contrast vanishes
+_SKY_HAZE = 185.0  # haze at which the panorama keeps its own grey levels
 SKY_RISE = 1.0  # tangent of the elevation at the upper edge of the sky's panorama
-SKY_FALL = 0.1  # and of the depression at its lower edge
-_GLARE, _GLARE_WIDTH = 120.0, 0.10  # grey that the sky gains towards the sun; 1 - cos of its half
-_POOL_GAIN = 2.5  # brightness under a street lamp by that of a lit window
-_SHADE_BIAS = 0.35  # m that an occluder must rise above a point to shade it
+SKY_FALL = 0.1  # tangent of the depression at its lower edge
+_GLARE, _GLARE_WIDTH = 120.0, 0.10  # grey levels added at the sun; 1 - cos(angle) of a quarter
+_POOL_GAIN = 2.5  # brightness under a street lamp relative to a lit window
+_SHADE_BIAS = 0.35  # m, an occluder must be this much higher than a point to shade it
 
 
 class _PixelRun(NamedTuple):
     """Neighbouring pixels of one row that see one surface.
 
-    ``start``, ``end`` i8 columns, ``end`` excluded; ``x``, ``y`` f8 where the first pixel is
-    sampled, the others likewise; ``weight`` f8 part of each pixel that the surface covers.
+    ``start``, ``end`` i8 range of columns, without ``end``; ``x``, ``y`` f8 position at which the
+    first pixel is sampled, the others with the same offset; ``weight`` f8 fraction of each pixel
+    that the surface covers.
     """
 
     start: int
@@ -48,11 +50,11 @@ class _PixelRun(NamedTuple):
 
 
 class _RowBuffers(NamedTuple):
-    """What is known of one row of W pixels so far.
+    """Working memory for one row of W pixels.
 
-    ``total`` (W,) f8 radiance; ``nearest`` (W,) f8 greatest 1/z. Of the present run: ``texel``
-    (6, W) f8 depth, s, t, half the distance of two samples of the texture in s and t, albedo;
-    ``size`` (W,) f4 texels that a pixel covers; ``bits`` (W,) i4 the same memory seen as integers.
+    ``total`` (W,) f8 radiance so far; ``nearest`` (W,) f8 greatest 1/z so far. For the present run:
+    ``texel`` (6, W) f8 depth, s, t, half the distance of two texture samples in s and in t, albedo;
+    ``size`` (W,) f4 texels per pixel; ``bits`` (W,) i4 the same memory as integers.
     """
 
     total: NDArray[np.float64]
@@ -64,7 +66,7 @@ class _RowBuffers(NamedTuple):
 
 @inline
 def _bilinear(texels, at, log_w, log_h, level, u, v):
-    """Texture at ``(u, v)``, given in texels of level 0; it repeats endlessly."""
+    """Bilinear sample of a repeating texture at ``(u, v)``, in texels of level 0."""
     scale = _SCALE[level]
     x = u * scale - 0.5
     y = v * scale - 0.5
@@ -76,7 +78,7 @@ def _bilinear(texels, at, log_w, log_h, level, u, v):
     c0, r0 = int(x0), int(y0)
     c1, r1 = (c0 + 1) & mask_u, at + (((r0 + 1) & mask_v) << row_log)
     c0, r0 = c0 & mask_u, at + ((r0 & mask_v) << row_log)
-    # Unsigned indices: no check for those that count from the end.
+    # Unsigned indices spare the check for negative ones.
     a, b = np.float32(texels[np.uintp(r0 + c0)]), np.float32(texels[np.uintp(r0 + c1)])
     c, d = np.float32(texels[np.uintp(r1 + c0)]), np.float32(texels[np.uintp(r1 + c1)])
     upper = a + (b - a) * fx
@@ -85,15 +87,15 @@ def _bilinear(texels, at, log_w, log_h, level, u, v):
 
 @inline
 def _log2(bits):
-    """Integer part and, linear between powers of two, the fraction of the logarithm of a float32
-    given by its bits."""
+    """Binary logarithm of a float32, given by its bits: the integer part and the fraction, which
+    is interpolated linearly between powers of two."""
     return (int(bits) >> 23) - 127, np.float32(int(bits) & 0x7FFFFF) * np.float32(1.0 / 0x800000)
 
 
 @inline
 def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
-    """Texture ``number`` at ``(u, v)`` averaged over about as many texels of level 0 as the float32
-    of these ``bits`` says. Levels blend over the middle half of an octave."""
+    """Texture ``number`` at ``(u, v)``, averaged over about as many texels of level 0 as the
+    float32 with these ``bits``. Levels are blended over the middle half of an octave."""
     low, part = _log2(bits)
     top = max(log_w, log_h)
     part = (part - np.float32(0.25)) * np.float32(2.0)
@@ -101,7 +103,7 @@ def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
         low, part = 0, np.float32(0.0)
     if low >= top:
         low, part = top, np.float32(0.0)
-    # One return only: with several, Numba counts the references of the arrays at each call.
+    # With more than one return, Numba would count the arrays' references at each call.
     row = np.uintp(number)
     high = low
     if part >= 1.0:
@@ -117,8 +119,8 @@ def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
 
 @inline
 def _sky(atlas, number, light, x, y, z, bits):
-    """Panorama in the world direction ``(x, y, z)`` with the glow of the sky about the sun;
-    ``bits``: texels that a pixel covers, as a float32's bits."""
+    """Grey level of the panorama in the world direction ``(x, y, z)``, with the glare around the
+    sun; ``bits`` are those of the float32 number of texels per pixel."""
     texels, offset, log_size = atlas.texels, atlas.offset, atlas.log_size
     log_w, log_h = log_size[number, 0], log_size[number, 1]
     square = x * x + z * z
@@ -133,7 +135,7 @@ def _sky(atlas, number, light, x, y, z, bits):
 
 @inline
 def _lit(shadow, frame, light, slope, x, y, z):
-    """Part of the sun that reaches a world point: 0 in shadow to 1, soft at the edge."""
+    """Fraction of the sunlight that reaches a world point: 0 in shadow to 1, with a soft edge."""
     up = -y
     a = (x - light.sun_x * slope * up - frame[0]) / frame[2] - 0.5
     b = (z - light.sun_z * slope * up - frame[1]) / frame[2] - 0.5
@@ -176,22 +178,22 @@ def _pool(pools, frame, x, y, z):
 
 @kernel
 def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
-    """Fill the rows of a view that belong to a band of samples.
+    """Shade the rows of a view that belong to a band of samples.
 
-    Pixels whose samples all see one surface are shaded in runs, the others once for each surface.
+    Pixels whose samples all see one surface are shaded in runs, others once for each surface.
 
     Args:
         visible: from `rasterise.find_visible`.
         band: `kernel_arrays.SampleBand`, from `rasterise.rasterise`.
-        atlas, light, camera: `kernel_arrays.AtlasArrays`, `LightValues`, `PosedCamera`.
+        atlas, light, camera: `scene.Atlas`, `LightValues`, `PosedCamera`.
         sky: number of the sky's panorama in the atlas.
         shadows, pools: `shadows.ShadowMap`, `shadows.LampPools`.
-        view: `render.RenderedView`, written.
+        view: `render.RenderedView`, output.
     """
     visible, seen = borrowed(visible), borrowed(band.seen)
     first_row, samples = band.first_row, band.samples
     image, depth = view.image, view.depth
-    atlas = AtlasArrays(
+    atlas = Atlas(
         borrowed(atlas.texels), borrowed(atlas.alpha), borrowed(atlas.offset),
         borrowed(atlas.alpha_offset), borrowed(atlas.log_size))  # fmt: skip
     shadows = ShadowMap(borrowed(shadows.height_cm), borrowed(shadows.frame))
@@ -239,14 +241,14 @@ def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
         for u in range(width):
             image[v, u] = total[u] * light.exposure
             depth[v, u] = 1.0 / nearest[u] if nearest[u] > 0.0 else 0.0
-    # What is borrowed above must live until here.
+    # This keeps the arrays alive that are borrowed above.
     held[0, 0] = held_number[0] + held_rows[0, 0] + held_size[0]
 
 
 @inline
 def _kinds(seen, row, column, samples, number, weight, shift_u, shift_v):
-    """The different surfaces that the samples of a pixel see, how many samples see each, and the
-    sum of their shifts from the pixel's centre."""
+    """Collect the different surfaces that the samples of a pixel see, with the number of samples
+    and the sum of their offsets from the pixel's centre; returns the number of surfaces."""
     kinds = 0
     step = 1.0 / samples
     for a in range(samples):
@@ -276,7 +278,7 @@ def _alike(seen, row, column, samples, first):
 
 @inline
 def _sky_run(run, atlas, sky, light, camera, buffers):
-    """As `_shade_run`, for the sky."""
+    """Like `_shade_run`, for the sky."""
     start, end, x0, y, weight = run.start, run.end, run.x, run.y, run.weight
     log_size, T_wc = atlas.log_size, camera.T_wc
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
@@ -307,12 +309,12 @@ def _shade_run(run, visible, number, atlas, light, shadows, pools, camera, buffe
     shadow, frame, pool, pool_frame = shadows.height_cm, shadows.frame, pools.light, pools.frame
     ry = (y - cy) / fy
     count = end - start
-    # Direction of the ray: base + x step.
+    # The direction of the ray of pixel i is base + i step.
     step_x, step_y, step_z = T_wc[0, 0] / fx, T_wc[1, 0] / fx, T_wc[2, 0] / fx
     base_x = T_wc[0, 1] * ry + T_wc[0, 2] + (x0 - cx) * step_x
     base_y = T_wc[1, 1] * ry + T_wc[1, 2] + (x0 - cx) * step_y
     base_z = T_wc[2, 1] * ry + T_wc[2, 2] + (x0 - cx) * step_z
-    n = np.uintp(number)  # no row view: counting its references costs more than the arithmetic
+    n = np.uintp(number)  # counting the references of a row view would cost more than this indexing
     au, av = visible[n, TEXTURE], visible[n, TEXTURE + 3]
     bu, bv = visible[n, TEXTURE + 1], visible[n, TEXTURE + 4]
     inverse_0 = visible[n, 6] * x0 + visible[n, 7] * y + visible[n, 8]
@@ -341,7 +343,7 @@ def _shade_run(run, visible, number, atlas, light, shadows, pools, camera, buffe
         taps = 2 if ds != 0.0 or dt != 0.0 else 1
         albedo = np.float32(0.0)
         for tap in range(taps):
-            f = taps - 1 - 2 * tap  # 0, or 1 and -1
+            f = taps - 1 - 2 * tap  # 0 for one tap, 1 and -1 for two
             albedo += _trilinear(
                 texels, offset, texture, log_w, log_h, bits[i], s + f * ds, t + f * dt
             )

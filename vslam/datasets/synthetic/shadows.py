@@ -1,4 +1,4 @@
-"""Cast shadows: the highest occluder on each ray of the sun."""
+"""Cast shadows, as a map of the highest occluder on each sun ray, and light of street lamps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.synthetic.kernel_arrays import AtlasArrays, SurfaceArrays
+from vslam.datasets.synthetic.kernel_arrays import SurfaceArrays
 from vslam.datasets.synthetic.scene import Atlas, Surfaces
 from vslam.kernels import kernel
 
@@ -18,13 +18,13 @@ _POOL_CELL, _POOL_REACH = 0.5, 16.0  # m
 
 
 class ShadowMap(NamedTuple):
-    """All points of one sun ray share a cell: the point where the ray meets height 0.
+    """The highest occluder on each sun ray; the cell of a ray is where it meets height 0.
 
     Attributes:
-        height_cm: ``(R, C)`` uint16 height above the datum ``frame[3]`` of the highest occluder
-            on the ray in centimetres, 0 for none; rows along z, columns along x.
-        frame: ``(4,)`` float64 x and z of the corner of cell (0, 0), size of a cell and height of
-            the datum, metres.
+        height_cm: ``(R, C)`` uint16 height of the highest occluder above ``frame[3]`` in
+            centimetres, 0 for none; rows along z, columns along x.
+        frame: ``(4,)`` float64 x and z of the corner of cell (0, 0), cell size and reference
+            height, metres.
     """
 
     height_cm: NDArray[np.uint16]
@@ -32,11 +32,11 @@ class ShadowMap(NamedTuple):
 
 
 class LampPools(NamedTuple):
-    """Light that street lamps cast, whatever the height: a lamp's cone is taken as a cylinder.
+    """Light of the street lamps, independent of height: a lamp's cone is treated as a cylinder.
 
     Attributes:
         light: ``(R, C)`` float32, 1 under a lamp; rows along z, columns along x.
-        frame: ``(3,)`` float64 x and z of node (0, 0) and the distance of nodes, metres.
+        frame: ``(3,)`` float64 x and z of node (0, 0) and the distance between nodes, metres.
     """
 
     light: NDArray[np.float32]
@@ -47,7 +47,7 @@ NO_LAMPS = LampPools(np.zeros((1, 1), np.float32), np.array([0.0, 0.0, 1.0]))
 
 
 def lamp_pools(lamps: NDArray[np.float64]) -> LampPools:
-    """Pools of light about the lamps ``(L, 2)`` (x, z)."""
+    """The light of street lamps at ``(L, 2)`` places (x, z)."""
     if len(lamps) == 0:
         return NO_LAMPS
     low = np.floor(lamps.min(axis=0) - _POOL_REACH)
@@ -59,14 +59,17 @@ def lamp_pools(lamps: NDArray[np.float64]) -> LampPools:
         window = slice(max(r - reach, 0), r + reach + 1), slice(max(c - reach, 0), c + reach + 1)
         y, x = np.mgrid[window]
         away = (x * _POOL_CELL + low[0] - xz[0]) ** 2 + (y * _POOL_CELL + low[1] - xz[1]) ** 2
-        # A lamp six metres up, by the law of the inverse square and two cosines; 0 at the border.
+        # A lamp 6 m above the ground: inverse square law and two cosines, 0 at the border.
         fall = (1.0 + away / 36.0) ** -2 - (1.0 + _POOL_REACH**2 / 36.0) ** -2
         light[window] += np.maximum(fall, 0.0).astype(np.float32)
     return LampPools(light, np.array([low[0], low[1], _POOL_CELL]))
 
 
 def cast_shadows(surfaces: Surfaces, atlas: Atlas, sun: NDArray[np.float64]) -> ShadowMap:
-    """Shadows of all surfaces but the ground (``thing`` -1) in light from ``sun`` ``(3,)``."""
+    """Shadows of all surfaces except the ground (``thing`` -1).
+
+    ``sun`` is a ``(3,)`` unit vector towards the sun.
+    """
     casts = surfaces.select(surfaces.thing >= 0)
     if len(casts) == 0:
         return ShadowMap(np.zeros((1, 1), np.uint16), np.array([0.0, 0.0, 1.0, 0.0]))
@@ -84,17 +87,17 @@ def cast_shadows(surfaces: Surfaces, atlas: Atlas, sun: NDArray[np.float64]) -> 
     columns, rows = np.ceil((high - low) / cell).astype(int) + 1
     frame = np.array([low[0], low[1], cell, float(up.min()) - 1.0])
     shadows = ShadowMap(np.zeros((rows, columns), np.uint16), frame)
-    _cast(SurfaceArrays.of(casts), AtlasArrays.of(atlas), slope, shadows)
+    _cast(SurfaceArrays.of(casts), atlas, slope, shadows)
     return shadows
 
 
 @kernel
 def _cast(surfaces, atlas, slope, shadows):
-    """Raise the heights of a shadow map to those of all occluders.
+    """Raise the heights of a shadow map to those of the occluders.
 
     Args:
-        surfaces, atlas: `SurfaceArrays` of the occluders, `AtlasArrays`.
-        slope: ``(2,)`` float64 metres that a ray of the sun moves along x and z for one metre up.
+        surfaces, atlas: `SurfaceArrays` of the occluders, `scene.Atlas`.
+        slope: ``(2,)`` float64 metres along x and z that a sun ray travels per metre of height.
         shadows: `ShadowMap`, updated.
     """
     origin, edge_s, edge_t = surfaces.origin, surfaces.edge_s, surfaces.edge_t

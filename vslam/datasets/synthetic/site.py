@@ -1,4 +1,4 @@
-"""A town under construction: what its builders share."""
+"""A town under construction, which is shared by all functions that add to it."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from vslam.datasets.synthetic.textures import Rng
 
 Float = NDArray[np.float64]
 
-# When an object stands there: always, until its place is left for the first time, or from then on.
+# When an object exists: always, until its place is left for the first time, or from then on.
 ALWAYS, BEFORE, AFTER = 0, 1, 2
-ALIASES = 4  # houses, trees and cars that --aliased deals
+ALIASES = 4  # number of different houses, trees and cars with --aliased
 
 
 @dataclass(frozen=True)
 class Variation:
-    """What the caller may vary.
+    """The variation of a town.
 
     Attributes:
-        seed: of everything.
-        aliased: deal a few houses, trees and cars again and again.
-        change: how much differs when a place is passed again, 0 to 1.
-        moving: number of cars that drive about.
+        seed: seed of all random numbers.
+        aliased: repeat a few houses, trees and cars, so that different places look alike.
+        change: how much a place has changed when it is passed again, 0 to 1.
+        moving: number of moving cars.
     """
 
     seed: int = 0
@@ -42,19 +42,19 @@ class Variation:
 
 @dataclass(frozen=True)
 class Site:
-    """What stands so far, and what is needed to add to it.
+    """The town so far, and everything that is needed to add to it.
 
     Attributes:
-        route, variation: what to build.
-        roads: of the route, with side streets.
+        route, variation: what is built.
+        roads: the route's roads with side streets.
         style: cross-section of the roads.
-        plan: ground that is taken.
+        plan: occupied ground.
         atlas, palette: textures.
-        rng: for what need not be the same in another variation.
+        rng: random generator for everything that may differ between variations.
+        cameras: ``(N, 2)`` x and z of all possible camera positions.
+        lamps: x and z of the street lamps.
         parts: surfaces of each thing, in the route's world.
-        place, when: of each thing; see `town.Town`.
-        cameras: ``(N, 2)`` x and z of all places where a camera may stand.
-        lamps: x and z of street lamps.
+        place, when: for each thing; see `town.Town`.
     """
 
     route: Route
@@ -73,16 +73,16 @@ class Site:
 
     @property
     def next_thing(self) -> int:
-        """Number that the surfaces of the next thing must carry."""
+        """The ``thing`` number for the surfaces of the next thing."""
         return len(self.place)
 
     def stand(self, model: Surfaces, xz: Float, heading: float, when: int = ALWAYS) -> None:
-        """Put a model, whose surfaces carry `next_thing`, on the ground."""
+        """Place a model on the ground; its surfaces must have the number `next_thing`."""
         up = float(self.route.terrain.height(xz[None])[0])
         self.parts.append(model.moved(solids.turn(heading), np.array([xz[0], -up, xz[1]])))
         self.place.append(xz)
         self.when.append(when)
 
     def changes(self, rng: Rng, rate: float) -> bool:
-        """Draw whether a thing differs when its place is passed again."""
+        """Draw whether a thing has changed when its place is passed again."""
         return bool(rng.random() < rate * self.variation.change)

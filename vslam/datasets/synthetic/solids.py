@@ -1,7 +1,7 @@
 """Houses, trees and street furniture as flat surfaces.
 
-All stand at the origin of their own frame: x right, y down with the ground at 0, z away from the
-viewer, so that the front lies in z = 0 or faces -z.
+Each has a frame of its own with x right, y down, z away from the viewer, and the ground at y = 0;
+its front lies in the plane z = 0 or faces -z.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from vslam.datasets.synthetic.scene import FOLIAGE, SCREEN, Surfaces, join, patches
 from vslam.datasets.synthetic.textures import Rng
 
-FOUNDATION = 1.2  # m that walls reach below the ground, for slopes
+FOUNDATION = 1.2  # m that walls extend below the ground, for slopes
 
 Vector = tuple[float, ...] | NDArray[np.float64]
 
 
 def turn(heading: float) -> NDArray[np.float64]:
-    """Rotation ``(3, 3)`` that takes z to ``heading`` (radians, 0 along +z, towards +x)."""
+    """Rotation ``(3, 3)`` of the z axis to ``heading`` (radians from +z towards +x)."""
     c, s = np.cos(heading), np.sin(heading)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
@@ -29,7 +29,7 @@ def box(
     low: Vector, high: Vector, texture: int, *, thing: int, repeat: float = 0.0, gain: float = 1.0,
     material: int = 0,
 ) -> Surfaces:  # fmt: skip
-    """Sides and top of an upright box; ``repeat``: metres a texture covers, 0 stretches it."""
+    """Sides and top of an upright box; a texture covers ``repeat`` metres, or a whole side if 0."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     w, h, d = x1 - x0, y1 - y0, z1 - z0
     origin = [[x0, y0, z0], [x1, y0, z0], [x1, y0, z1], [x0, y0, z1], [x0, y0, z1]]
@@ -52,8 +52,8 @@ def walls(
 
     Args:
         size: metres.
-        textures: of the four sides; the lowest texels belong to the ground line.
-        lights: of the lit windows over them, -1 for none.
+        textures: textures of the four sides, whose lower edge is at the ground.
+        lights: textures of their lit windows, -1 for none.
         fine: detail texture.
         thing: number of the house.
     """
@@ -119,7 +119,7 @@ def roof(
 def tree(
     rng: Rng, twigs: list[int], bark: int, *, height: float, thing: int, conifer: bool = False
 ) -> Surfaces:
-    """Trunk and a crown of see-through twigs."""
+    """A tree: a trunk, and a crown of twigs with alpha."""
     radius = float(rng.uniform(0.018, 0.028)) * height
     clear = height * (0.12 if conifer else float(rng.uniform(0.28, 0.4)))
     parts = [_trunk(radius, clear + 0.25 * height, bark, thing)]
@@ -148,7 +148,7 @@ def tree(
 
 
 def bush(rng: Rng, twigs: list[int], *, height: float, thing: int) -> Surfaces:
-    """Twigs from the ground on."""
+    """A bush of twigs down to the ground."""
     cards = int(rng.integers(4, 8))
     middle = np.column_stack([
         rng.normal(0, 0.3 * height, cards), rng.uniform(-0.75, -0.4, cards) * height,
@@ -184,7 +184,7 @@ def _cards(
     rng: Rng, middle: NDArray[np.float64], size: NDArray[np.float64], twigs: list[int],
     thing: int, gain: float,
 ) -> Surfaces:  # fmt: skip
-    """Square twigs at ``middle`` ``(N, 3)`` with sides ``size`` ``(N,)``, turned at random."""
+    """Square twigs at ``(N, 3)`` positions with sides of ``(N,)`` metres, rotated at random."""
     n = len(middle)
     heading, tilt, roll = rng.uniform((0, -0.6, 0), (2 * np.pi, 0.6, 6.3), (n, 3)).T[:, :, None]
     zero = np.zeros_like(heading)
@@ -221,7 +221,7 @@ def hedge(rng: Rng, length: float, height: float, texture: int, top: int, thing:
 def panel(
     length: float, height: float, texture: int, thing: int, *, depth: float = 0.0
 ) -> Surfaces:
-    """A fence, or a wall if it has depth, along x; the texture covers 4 m of it."""
+    """A fence along x, or a wall if it has depth; the texture covers 4 m."""
     if depth > 0:
         return box((-length / 2, -height, 0), (length / 2, 0.4, depth), texture, thing=thing,
                    repeat=4.0)  # fmt: skip
@@ -243,7 +243,7 @@ def lamp_post(height: float, arm: float, metal: int, screen: int, thing: int) ->
 def sign_post(
     rng: Rng, height: float, metal: int, faces: list[tuple[int, int]], thing: int
 ) -> Surfaces:
-    """Signs on a pole, facing -z; ``faces``: textures of the front and the back of each."""
+    """Signs on a pole that face -z; ``faces`` has the textures of the front and back of each."""
     parts = [box((-0.035, -height, -0.035), (0.035, 0.3, 0.035), metal, thing=thing)]
     top = -height
     for face in faces:

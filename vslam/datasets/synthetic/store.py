@@ -1,4 +1,4 @@
-"""Rendered sequences on disk: a KITTI tree in the user's cache, complete or resumable."""
+"""Rendered sequences on disk, as KITTI trees in the user's cache that can be resumed."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.town import build_town
 from vslam.trajectory import write_kitti
 
-VERSION = 2  # raise it whenever the same seed gives other bytes
-DEPTH_SCALE = 100.0  # 16-bit depth counts centimetres
+VERSION = 2  # raise it whenever the same seed gives different images
+DEPTH_SCALE = 100.0  # 16-bit depth images are in centimetres
 _RECORD = "manifest.json"
 
 _log = logging.getLogger(__name__)
@@ -47,7 +47,7 @@ OnFrame = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Stored:
-    """One rendered sequence: ``root`` is its KITTI tree, ``name`` the sequence in it."""
+    """One rendered sequence: its KITTI tree ``root``, its ``name`` there, and its size in bytes."""
 
     root: Path
     name: str
@@ -57,14 +57,14 @@ class Stored:
 
 
 def cache_folder() -> Path:
-    """Where rendered sequences live; ``$VSLAM_CACHE`` moves it."""
+    """The folder of rendered sequences, in ``$VSLAM_CACHE`` if that is set."""
     from platformdirs import user_cache_path
 
     return Path(os.environ.get("VSLAM_CACHE") or user_cache_path("vslam")) / "synthetic"
 
 
 def folder_name(variation: Variation) -> str:
-    """Sequences of one variation share a KITTI tree of this name."""
+    """The name of the KITTI tree that all sequences of one variation share."""
     name = f"v{VERSION}-seed{variation.seed}"
     name += "-aliased" if variation.aliased else ""
     name += f"-moving{variation.moving}" if variation.moving else ""
@@ -72,7 +72,7 @@ def folder_name(variation: Variation) -> str:
 
 
 def list_stored(cache: Path) -> list[Stored]:
-    """Every sequence below a cache folder, complete or not."""
+    """All sequences in a cache folder, complete or not."""
     found = []
     for record in sorted(cache.glob(f"*/sequences/*/{_RECORD}")):
         manifest = _read_record(record.parent)
@@ -91,17 +91,17 @@ def list_stored(cache: Path) -> list[Stored]:
 
 
 def place_folder(cache: Path) -> Path:
-    """Where pairs of views lie that benchmarks of loop detectors rendered."""
+    """The folder of the views that benchmarks of loop detectors have rendered."""
     return cache / f"v{VERSION}-places"
 
 
 def place_folders(cache: Path) -> list[Path]:
-    """Those of all versions."""
+    """The `place_folder` of each version that exists."""
     return sorted(cache.glob("v*-places"))
 
 
 def clean(cache: Path, name: str | None = None) -> int:
-    """Remove one route's sequences of all variations, or everything; return the bytes freed."""
+    """Remove one route's sequences of all variations, or everything; returns the freed bytes."""
     freed = 0
     for places in place_folders(cache) if name is None else []:
         freed += sum(p.stat().st_size for p in places.rglob("*") if p.is_file())
@@ -125,22 +125,22 @@ def render_sequence(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> Path:
-    """Render a route, or what is missing of it, and return the KITTI tree that holds it.
+    """Render a route, or its missing frames, and return the KITTI tree that holds it.
+
+    Damaged frames are rendered again, with a warning in the log.
 
     Args:
         route: drive to render.
         variation: of the town.
-        cache: folder for the trees; see `cache_folder`.
-        depth: write ``depth_0``, 16-bit PNG in centimetres of the left camera, too.
-        until: render the frames before this one only; a later call goes on from there.
-        verify: compare the checksum of every frame. Without it the sizes of all files and the
-            checksums of a few frames are compared. Damaged frames are rendered again, with a
-            warning in the log.
-        threads: frames in work at a time; the bytes do not depend on it.
-        on_frame: called with frames done and in all.
+        cache: folder of the trees; see `cache_folder`.
+        depth: also write ``depth_0``, the depth of the left camera as 16-bit PNG in centimetres.
+        until: render only the frames before this one; a later call can continue from there.
+        verify: compare the checksums of all frames instead of all sizes and a few checksums.
+        threads: number of frames rendered at a time; the images do not depend on it.
+        on_frame: called with the number of finished frames and of all frames.
 
     Raises:
-        InputError: the folder cannot be written, the disk is too small or another process is
+        InputError: the folder cannot be written, the disk is too small, or another process is
             rendering the sequence.
     """
     root = cache / folder_name(variation)
@@ -165,7 +165,7 @@ def render_sequence(
             (folder / name).mkdir(parents=True, exist_ok=True)
         write(folder / _RECORD, json.dumps(wanted).encode())
         write(folder / "times.txt", "".join(f"{t:.6e}\n" for t in route.timestamps).encode())
-        write(folder / "calib.txt", _calibration(route.camera).encode())
+        write(folder / "calib.txt", calibration_text(route.camera).encode())
         (root / "poses").mkdir(exist_ok=True)
         write_kitti(root / "poses" / f"{route.name}.txt", route.ground_truth)
         for k in missing:
@@ -182,12 +182,12 @@ def render_sequence(
 
 
 def _matching_record(folder: Path, wanted: dict[str, Any], camera: Camera) -> dict[str, Any] | None:
-    """The manifest of a folder, if it is one of what is wanted."""
+    """The manifest of a folder if it describes the wanted sequence, else None."""
     found = _read_record(folder)
     if found is None or any(found.get(key) != value for key, value in wanted.items()):
         return None
     try:
-        same = (folder / "calib.txt").read_text() == _calibration(camera)
+        same = (folder / "calib.txt").read_text() == calibration_text(camera)
     except FileNotFoundError:
         same = True
     return found if same else None
@@ -271,7 +271,8 @@ def _read_record(folder: Path) -> dict[str, Any] | None:
         return None
 
 
-def _calibration(camera: Camera) -> str:
+def calibration_text(camera: Camera) -> str:
+    """``calib.txt`` of KITTI, for cameras that are grey."""
     lines = []
     for side in range(4):
         shift = -camera.bf if side % 2 else 0.0

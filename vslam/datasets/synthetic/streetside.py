@@ -16,7 +16,7 @@ _KERB = (0.15, 0.12)  # width and height of kerb stones, m
 
 
 def plant(site: Site, xz: Float, height: float) -> None:
-    """A tree at ``xz``, if there is room."""
+    """Plant a tree at ``xz`` if there is room."""
     rng = np.random.default_rng([site.variation.seed, 7, site.next_thing])
     if not site.plan.claim(rectangle(xz, 0.0, 1.6, 1.6), road=site.style.lane + 1.0):
         return
@@ -38,7 +38,7 @@ def plant(site: Site, xz: Float, height: float) -> None:
 
 
 def _pruned(site: Site, model: Surfaces, xz: Float) -> Surfaces | None:
-    """Without twigs that hang into the free space around the cameras; None if few remain."""
+    """The model without twigs in the free space around the cameras; None if few would remain."""
     near = float(np.min(np.linalg.norm(site.cameras - xz, axis=1)))
     middle = model.origin + 0.5 * (model.edge_s + model.edge_t)
     size = np.linalg.norm(model.edge_s, axis=1) + np.linalg.norm(model.edge_t, axis=1)
@@ -49,8 +49,8 @@ def _pruned(site: Site, model: Surfaces, xz: Float) -> Surfaces | None:
 
 
 def lay_kerbs(site: Site) -> None:
-    """Raised kerb stones between carriageway and pavement, broken where a road joins and where the
-    drive cuts a corner."""
+    """Lay raised kerb stones between carriageway and pavement, with gaps where a road joins and
+    where the drive cuts a corner."""
     roads, edge, step = site.roads, site.style.parking, 8
     tree, cameras = cKDTree(roads.xz), cKDTree(site.cameras)
     first = np.arange(0, len(roads.xz) - step, step)
@@ -74,7 +74,7 @@ def _on_ground(site: Site, xz: Float, height: float) -> Float:
 
 
 def fill_behind(site: Site) -> None:
-    """Big trees between and behind the houses."""
+    """Plant big trees between and behind the houses."""
     rng, roads = site.rng, site.roads
     for at in range(0, len(roads.xz), 14):
         for side in (-1.0, 1.0):
@@ -84,7 +84,7 @@ def fill_behind(site: Site) -> None:
 
 
 def furnish(site: Site) -> None:
-    """Cars, hedges, trees, posts and shrubs along the streets."""
+    """Add cars, hedges, trees, posts and shrubs along the streets."""
     roads, style, rng = site.roads, site.style, site.rng
     town = site.route.land == "town"
     for side in (-1.0, 1.0):
@@ -115,11 +115,11 @@ def _park(site: Site, xz: Float, out: Float, style: RoadStyle) -> None:
         key = site.next_thing % ALIASES if site.variation.aliased else site.next_thing
         car = make_car(np.random.default_rng([site.variation.seed, 10, key]), site.atlas,
                        site.next_thing)  # fmt: skip
-        site.stand(car.surfaces, near, heading, when)
+        site.stand(car, near, heading, when)
 
 
 def _screen(site: Site, xz: Float, out: Float, style: RoadStyle) -> None:
-    """Hedge, fence, wall or placard at the inner edge of the pavement."""
+    """Add a hedge, fence, wall or poster at the inner edge of the pavement."""
     rng, thing = site.rng, site.next_thing
     length = float(rng.uniform(3.0, 6.4))
     heading = float(np.arctan2(out[0], out[1]))
@@ -197,7 +197,7 @@ def _post(site: Site, xz: Float, out: Float, style: RoadStyle) -> None:
 
 
 def line_motorway(site: Site) -> None:
-    """Rails, barriers, posts, gantry signs, embankment trees."""
+    """Add rails, posts, barriers, trees and signs along a motorway."""
     roads, rng, style = site.roads, site.rng, site.style
     for side in (-1.0, 1.0):
         for at in range(0, len(roads.xz) - 16, 16):

@@ -1,4 +1,4 @@
-"""Where the roads run and how high the land is: what a route and its town share."""
+"""Roads and heights of the ground, which a route and its town share."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Terrain:
-    """Heights on a square grid, bilinear between: one height for each place, whoever passes.
+    """Heights on a square grid with bilinear interpolation.
 
     Attributes:
         corner: ``(2,)`` float64 x and z of node (0, 0), metres.
@@ -26,7 +26,7 @@ class Terrain:
     up: Float
 
     def height(self, xz: Float) -> Float:
-        """Height above y = 0 at ``(N, 2)`` places; beyond the grid that of its border."""
+        """``(N,)`` metres above y = 0 at ``(N, 2)`` places; the grid's border extends outwards."""
         at = (np.asarray(xz, np.float64) - self.corner) / self.cell
         limit = np.array(self.up.shape[::-1]) - 1.001
         at = np.clip(at, 0.0, limit)
@@ -45,7 +45,7 @@ class Roads:
         xz: ``(M, 2)`` float64 metres.
         heading: ``(M,)`` float64 radians, 0 along +z, positive towards +x.
         along: ``(M,)`` float64 metres since the beginning of the route.
-        junction: ``(M,)`` bool, another road crosses or joins here: no lane marks.
+        junction: ``(M,)`` bool, whether another road crosses or joins here.
     """
 
     xz: Float
@@ -63,11 +63,12 @@ class Roads:
 
 
 def roads_of(lines: list[Float], *, same_road: float = 3.0) -> Roads:
-    """Roads along polylines ``(K, 2)`` that the route drives, each stretch of road once.
+    """The roads along polylines ``(K, 2)``, with each stretch of road only once.
 
     Args:
-        lines: middle of the road under every metre of the route, in driving order.
-        same_road: a later stretch this close (m) and parallel to an earlier one is the same road.
+        lines: middle lines of the driven roads (m), in driving order.
+        same_road: a later stretch counts as the same road as an earlier one if it is parallel and
+            at most this far (m) from it.
     """
     from scipy.spatial import cKDTree
 

@@ -1,4 +1,4 @@
-"""Procedural textures of what grows, rolls and hangs in a street: albedo 0 to 255, row 0 on top."""
+"""Procedural textures of plants, fences, walls, signs and sky: albedo 0 to 255, row 0 on top."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ _LETTERS = np.array(list("ABCDEFGHIKLMNOPRSTUVWZ0123456789"))
 
 
 def noise(rng: Rng, height: int, width: int, cell: float, octaves: int = 4) -> Grey:
-    """Band-limited noise ``(height, width)`` of zero mean and unit deviation that tiles.
+    """Tileable band-limited noise ``(height, width)`` float32 of zero mean and unit variance.
 
     Args:
-        cell: texels of the coarsest grid's mesh; each octave halves it at 0.7 of the contrast.
+        cell: mesh of the coarsest grid in texels; each octave has half the mesh and 0.7 of the
+            contrast of the one before.
     """
     total = np.zeros((1, 1), np.float32)
     for octave in range(octaves):
@@ -32,7 +33,7 @@ def noise(rng: Rng, height: int, width: int, cell: float, octaves: int = 4) -> G
 
 
 def _stretch(grid: Grey, height: int, width: int) -> Grey:
-    """Linear interpolation on a torus."""
+    """Enlarge a grid by bilinear interpolation with periodic borders."""
     if grid.shape == (height, width):
         return grid
     border = 1
@@ -44,17 +45,17 @@ def _stretch(grid: Grey, height: int, width: int) -> Grey:
 
 
 def detail(rng: Rng, contrast: float, cell: float = 8.0, size: int = 256) -> Grey:
-    """A fine texture of mean 128 that multiplies another; see `scene.Surfaces.detail`."""
+    """A detail texture of mean 128, which multiplies another one; see `scene.Surfaces.detail`."""
     return np.clip(128.0 * (1.0 + contrast * noise(rng, size, size, cell, 4)), 8, 255)
 
 
 def letters(rng: Rng, low: int = 3, high: int = 9) -> str:
-    """A word that means nothing."""
+    """A random word."""
     return "".join(rng.choice(_LETTERS, int(rng.integers(low, high))))
 
 
 def write(image: Grey, rng: Rng, text: str, box: tuple[int, int, int, int], grey: float) -> None:
-    """Draw ``text`` as large as it fits into ``box`` (x0, y0, x1, y1) texels."""
+    """Draw ``text`` as large as ``box`` (x0, y0, x1, y1, in texels) allows."""
     x0, y0, x1, y1 = box
     font: Any = _FONTS[int(rng.integers(len(_FONTS)))]
     thickness = 1 + (y1 - y0 > 24)
@@ -64,7 +65,7 @@ def write(image: Grey, rng: Rng, text: str, box: tuple[int, int, int, int], grey
         return
     x = int((x0 + x1 - width * scale) / 2)
     y = int((y0 + y1 + height * scale) / 2)
-    ink = np.zeros(image.shape, np.uint8)  # OpenCV 5 writes on bytes only
+    ink = np.zeros(image.shape, np.uint8)  # OpenCV 5 draws text only on uint8
     cv2.putText(ink, text, (x, y), font, scale, 255, thickness, cv2.LINE_AA)
     image += (grey - image) * (ink / np.float32(255.0))
 
@@ -102,7 +103,7 @@ def sign(rng: Rng, size: int = 128) -> tuple[Grey, Grey]:
 
 
 def foliage(rng: Rng, size: int = 256, density: float = 1.0) -> tuple[Grey, Grey]:
-    """A twig with leaves, see-through, that fades towards the border."""
+    """A twig with leaves and its alpha, sparser towards the border."""
     grey = np.full((size, size), 28.0, np.float32)
     alpha = np.zeros((size, size), np.float32)
     for _ in range(10):
@@ -118,7 +119,7 @@ def foliage(rng: Rng, size: int = 256, density: float = 1.0) -> tuple[Grey, Grey
 
 
 def hedge(rng: Rng, width: int = 512, height: int = 128) -> tuple[Grey, Grey]:
-    """A clipped hedge: dense leaves and an uneven upper edge."""
+    """A clipped hedge with dense leaves and an uneven upper edge, and its alpha."""
     grey = np.full((height, width), 20.0, np.float32)
     alpha = np.zeros((height, width), np.float32)
     edge = (0.07 + 0.02 * noise(rng, 1, width, 24.0, 4)[0]) * height
@@ -158,7 +159,7 @@ def bark(rng: Rng, size: int = 128) -> Grey:
 
 
 def fence(rng: Rng) -> tuple[Grey, Grey]:
-    """Pickets or bars with gaps, 4 m of it."""
+    """A fence of pickets or bars, 4 m long, and its alpha."""
     height, width = 64, 256
     grey = np.full((height, width), float(rng.uniform(50, 190)), np.float32)
     grey += 12 * noise(rng, height, width, 16.0)
@@ -174,7 +175,7 @@ def fence(rng: Rng) -> tuple[Grey, Grey]:
 
 
 def garden_wall(rng: Rng) -> Grey:
-    """Coursed stone or rendered wall, 4 m by 1 m."""
+    """A wall of coursed stone or plaster, 4 m by 1 m."""
     height, width = 128, 512
     grey = np.full((height, width), float(rng.uniform(80, 170)), np.float32)
     if rng.random() < 0.6:
@@ -192,7 +193,7 @@ def garden_wall(rng: Rng) -> Grey:
 
 
 def poster(rng: Rng, size: int = 128) -> Grey:
-    """A placard: blocks, a picture and words."""
+    """A poster with rectangles, circles and words."""
     image = np.full((size, size), float(rng.uniform(120, 235)), np.float32)
     for _ in range(int(rng.integers(3, 7))):
         x0, y0 = rng.integers(0, size - 20, 2)
@@ -210,10 +211,10 @@ def poster(rng: Rng, size: int = 128) -> Grey:
 
 
 def sky(rng: Rng, *, treeline: bool = True) -> Grey:
-    """Panorama of clouds over a far treeline; u is the heading, v falls with elevation."""
+    """Panorama of clouds over a far treeline; u is the heading, and v decreases with elevation."""
     height, width = 512, 2048
     rise = np.linspace(SKY_RISE, -SKY_FALL, height, dtype=np.float32)[:, None]
-    zenith = float(rng.uniform(70, 125))  # a clear sky is dark to a camera without colour
+    zenith = float(rng.uniform(70, 125))  # a clear sky is dark in a grey image
     image = zenith + 75.0 * np.exp(-rise / 0.25) * np.ones((1, width), np.float32)
     clouds = noise(rng, height, width, 300.0, 6)
     clouds = clouds + 0.5 * noise(rng, height, width, 90.0, 5)

@@ -1,4 +1,4 @@
-"""Grow a town along a route. What stands where depends on the seed alone."""
+"""Building a town along a route; its layout depends only on route and variation."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _ROADS = {
 
 @dataclass(frozen=True)
 class Town:
-    """Surfaces of all variants, and what the T things they belong to are.
+    """A town: surfaces of T things, in all their variants before and after a change.
 
     Attributes:
-        surfaces: in the route's world.
+        surfaces: all surfaces, in the route's world.
         atlas: their textures.
         sky: number of the sky's panorama in the atlas.
         place: ``(T, 2)`` float64 x and z of each thing.
@@ -49,7 +49,7 @@ class Town:
 
 
 def build_town(route: Route, variation: Variation, aside: tuple[float, ...] = (0.0,)) -> Town:
-    """The town of a route, with room for cameras so many metres ``aside`` (right) of it."""
+    """Build the town of a route, with room for cameras that are ``aside`` metres to its right."""
     rng = np.random.default_rng([variation.seed, 1])
     atlas = AtlasBuilder()
     motorway = route.land == "motorway"
@@ -77,7 +77,7 @@ def build_town(route: Route, variation: Variation, aside: tuple[float, ...] = (0
         streetside.furnish(site)
         streetside.lay_kerbs(site)
     rng = np.random.default_rng([variation.seed, 9])
-    moving = tuple(make_car(rng, atlas, 0).surfaces for _ in range(variation.moving))
+    moving = tuple(make_car(rng, atlas, 0) for _ in range(variation.moving))
     return Town(
         join([ground, *site.parts]),
         atlas.build(),
@@ -90,7 +90,7 @@ def build_town(route: Route, variation: Variation, aside: tuple[float, ...] = (0
 
 
 def _with_side_streets(roads: Roads, seed: int) -> Roads:
-    """The roads of the route and stubs that leave them."""
+    """The roads of the route, and short side streets that branch off."""
     rng = np.random.default_rng([seed, 2])
     tree, stubs = cKDTree(roads.xz), []
     at = int(rng.integers(120, 240))

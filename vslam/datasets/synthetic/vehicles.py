@@ -1,8 +1,6 @@
-"""Parked and moving cars: an outline, extruded, with painted sides."""
+"""Parked and moving cars: extruded outlines with painted sides."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -11,8 +9,8 @@ from numpy.typing import NDArray
 from vslam.datasets.synthetic.scene import AtlasBuilder, Surfaces, join, patches
 from vslam.datasets.synthetic.textures import Grey, Rng, letters, noise, write
 
-# Outlines from the front bumper over the roof to the rear: (part of the length, part of the
-# height); the third number tells what covers the strip that begins there: paint or glass.
+# Outlines from the front bumper over the roof to the rear, as fractions of length and height; the
+# third number tells whether the strip that begins there is paint (0) or glass (1).
 _OUTLINES = {
     "hatchback": ((0.0, 0.16, 0), (0.0, 0.42, 0), (0.05, 0.52, 0), (0.27, 0.62, 1),
                   (0.45, 0.97, 0), (0.62, 1.0, 0), (0.86, 0.93, 1), (0.97, 0.62, 0),
@@ -31,22 +29,15 @@ _SIZES = {  # length, width, height in metres
     "van": (4.9, 1.92, 1.95),
 }
 
-_BELT, _ROOF = 0.6, 0.78  # height of the belt line; width of the roof, in parts of the whole
-_TAPER_AT, _TAPER = (0.0, 0.12, 0.9, 1.0), (0.84, 1.0, 1.0, 0.9)  # of the width along the length
+_BELT, _ROOF = 0.6, 0.78  # height of the belt line and width of the roof, as fractions
+_TAPER_AT, _TAPER = (0.0, 0.12, 0.9, 1.0), (0.84, 1.0, 1.0, 0.9)  # width along the length
 
 Float = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Car:
-    """A car at the origin: forward is +z, wheels on y = 0, and its half length and width in m."""
-
-    surfaces: Surfaces
-    half: tuple[float, float]
-
-
-def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Car:
-    """A car of its own shape, colour and plate."""
+def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Surfaces:
+    """A car with random shape, colour and number plate, at the origin with +z forward and wheels on
+    y = 0."""
     kind = str(rng.choice(list(_OUTLINES), p=[0.4, 0.24, 0.24, 0.12]))
     length, width, height = (float(x * rng.uniform(0.94, 1.06)) for x in _SIZES[kind])
     outline = np.array([(x, y) for x, y, _ in _OUTLINES[kind]])
@@ -95,7 +86,7 @@ def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Car:
         gain=0.2,
         thing=thing,
     )
-    return Car(join([*parts, shade]), (length / 2, width / 2))
+    return join([*parts, shade])
 
 
 def _trapezium(
@@ -111,8 +102,8 @@ def _trapezium(
 
 
 def _sides(size: tuple[float, float, float], texture: int, thing: int) -> list[Surfaces]:
-    """Both sides of ``(length, width, height)``: a lower part that bends in at both ends, and a
-    cabin that leans in."""
+    """Both sides of a car of ``(length, width, height)``: a lower part that tapers at both ends,
+    and a cabin that leans inwards."""
     length, width, height = size
     parts = []
     for sign in (-1.0, 1.0):
@@ -138,13 +129,13 @@ def _paint_side(
     at = (outline * [width - 1, -(height - 1)] + [0, height - 1]).round().astype(np.int32)
     grey = np.full((height, width), paint, np.float32)
     grey *= np.linspace(1.15, 0.75, height, dtype=np.float32)[:, None]
-    # The bulge under the belt mirrors the sky, the sill the street.
+    # The bulge below the belt line reflects the sky, the sill reflects the street.
     at_row = np.linspace(0, 1, height, dtype=np.float32)[:, None]
     grey += 35.0 * np.exp(-(((at_row - 0.5) / 0.06) ** 2)) - 12.0 * (at_row > 0.68)
     grey = np.clip(grey, 6, 250)
     alpha = np.zeros((height, width), np.float32)
     cv2.fillPoly(alpha, [at], 255.0)
-    # Side windows: the outline above the belt line, shrunk.
+    # Side windows are the eroded outline above the belt line.
     belt = int(height * 0.40)
     cabin = np.zeros((height, width), np.uint8)
     cv2.fillPoly(cabin, [at], 255)
@@ -165,7 +156,7 @@ def _paint_side(
     cv2.rectangle(grey, (0, int(0.45 * height)), (22, int(0.55 * height)), 205.0, -1)
     cv2.rectangle(grey, (width - 16, int(0.42 * height)), (width, int(0.6 * height)), 85.0, -1)
     grey[int(0.87 * height) :] = 26.0
-    # Wheels reach the ground; they are ellipses because a texel is not square.
+    # Wheels reach the ground; they are ellipses because texels are not square.
     for x in (int(width * 0.185), int(width * 0.80)):
         centre, rim = (x, height - 29), float(rng.uniform(90, 190))
         axes = np.array([37, 28])
@@ -215,7 +206,7 @@ def _paint_strip(rng: Rng, paint: float) -> Grey:
 
 
 def _paint_glass(rng: Rng) -> Grey:
-    """A pane that mirrors a bright sky above and dark houses below."""
+    """A pane that reflects a bright sky above and dark houses below."""
     slope = np.linspace(1, 0, 64, dtype=np.float32)[:, None]
     edge = float(rng.uniform(0.3, 0.7)) + 0.12 * noise(rng, 1, 64, 24.0, 3)
     grey = 18.0 + 14.0 * slope + 70.0 * slope * (slope > edge)

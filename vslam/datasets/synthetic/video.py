@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 
 from vslam.camera import Camera
-from vslam.datasets.sequence import Sequence
+from vslam.datasets.frames import Source
 from vslam.errors import InputError
 
 
-def write_side_by_side(sequence: Sequence, path: Path) -> Path:
-    """Write the images without loss (codec FFV1) and, beside them, vslam's calibration file.
+def write_side_by_side(sequence: Source, path: Path) -> Path:
+    """Write the images losslessly (codec FFV1), and vslam's calibration file beside them.
 
     Args:
-        sequence: a stereo one; the video has its mean frame rate.
-        path: of the video, ``.mkv`` for example.
+        sequence: a stereo sequence; the video gets its mean frame rate.
+        path: path of the video, for example with the suffix ``.mkv``.
 
     Returns:
-        The calibration file, of the same name with ``.yaml``.
+        The calibration file, which has the same name with ``.yaml``.
 
     Raises:
         InputError: a file cannot be written.
@@ -46,7 +46,7 @@ def write_side_by_side(sequence: Sequence, path: Path) -> Path:
         for index in range(len(sequence)):
             left, right = sequence.read(index)
             if right is None:
-                raise InputError(f"{path}: a video side by side needs a stereo sequence.")
+                raise InputError(f"{path}: a side-by-side video needs a stereo sequence.")
             writer.write(np.hstack([left, right]))
     finally:
         writer.release()

@@ -1,4 +1,4 @@
-"""The left camera at some frames of a drive: what a test of loop detectors needs of a long one."""
+"""Left images of some frames of a long drive, for tests of loop detectors."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ def render_views(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> None:
-    """Render the left images of some frames into a KITTI tree, or what is missing of them there.
+    """Render the left images of some frames into a KITTI tree, unless they exist there.
 
-    The bytes are those of `render_sequence`. Poses and times are those of the whole drive; the
-    file of poses is written last, so that it is there once all images are.
+    The images are identical to those of `render_sequence`. Poses and times are those of the whole
+    drive; the file of poses is written last, so that it exists only if all images do.
 
     Args:
-        route: drive to take frames of.
+        route: drive from which frames are taken.
         variation: of the town.
-        root: of the tree, for this route and variation alone.
-        frames: numbers, ascending.
-        threads: of the renderer.
-        on_frame: called with frames done and in all.
+        root: the tree, which is used only for this route and variation.
+        frames: frame numbers, ascending.
+        threads: number of threads of the renderer.
+        on_frame: called with the number of finished frames and of all frames.
 
     Raises:
-        InputError: the folder cannot be written or the disk is too small.
+        InputError: the folder cannot be written, or the disk is too small.
     """
     folder = root / "sequences" / route.name
     files = {k: frame_files(folder, k, depth=False)[0] for k in frames}

@@ -154,14 +154,9 @@ def draws(perturb: str) -> bool:
 def read_report(folder: Path) -> ReportJson | None:
     """The report of a run folder, None if there is none or it is of another schema."""
     try:
-        report = ReportJson.model_validate_json((folder / "report.json").read_bytes())
-    except (OSError, ValueError):
+        return ReportJson.read(folder / "report.json")
+    except InputError:
         return None
-    return (
-        report
-        if report.schema_version == ReportJson.model_fields["schema_version"].default
-        else None
-    )
 
 
 def tracked_nothing(folder: Path) -> bool:

@@ -6,56 +6,45 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from matplotlib import style
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from vslam.errors import ResultsError
+from vslam.lab.loopbench.curves import draw_curves
 from vslam.lab.loopbench.measure import MIN_MATCHES, MIN_SHARE
-from vslam.lab.loopbench.report_online import draw_online, online_tables, online_words
+from vslam.lab.loopbench.report_online import online_tables, online_words
 from vslam.lab.loopbench.schema import LoopsJson, Score
 from vslam.lab.loopbench.sequences import LENGTH
-from vslam.report.drawing import (
-    AMBER,
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    RED,
-    STYLE,
-    VIOLET,
-    ReportFigure,
-    save,
-)
-from vslam.report.page import Table, markdown_table, render_page
+from vslam.report.page import Bullets, Page, Pairs, Section, Table
+from vslam.report.render import html, markdown, write_files
 
 MEAN = "mean of all"
-_COLORS = [GREY, BLUE, VIOLET, AMBER, GREEN, RED]
-_DASHES = ["-", "--", ":"]  # of the first six detectors, of the next six, of the rest
 _ABOUT_AP = (
-    "Average precision over all pairs of a query and a gallery image whose relation is known, "
-    "descriptors alone. Last column: AP of the detector minus that of the first, with the 95 % "
-    "interval of a bootstrap over the queries; * where it does not hold 0."
+    "Average precision, by the descriptors alone, over all pairs of a query and a gallery image "
+    "whose relation is known. Last columns: AP of a detector minus that of the first, with the "
+    "95 % interval of a bootstrap over the queries; * where the interval excludes 0."
 )
-_ABOUT_RECALL = "Highest recall without one wrong pair; at a recall of 70 %, the precision."
+_ABOUT_RECALL = "The highest recall without a wrong pair, and the precision at a recall of 70 %."
 _ABOUT_VERIFIED = (
-    "Of the queries that have a place to find: share whose best image shows it, and shares where "
-    f"also at least {MIN_MATCHES} ORB matches obey one epipolar geometry, where matches of learned "
-    f"local descriptors that obey one homography cover {100 * MIN_SHARE:.0f} % of the image, and "
-    "where one of both is so."
+    "Share of the queries with a place to find whose best image shows it; then the shares where "
+    f"in addition at least {MIN_MATCHES} ORB matches obey one epipolar geometry, where matches of "
+    f"learned local descriptors that obey one homography cover {100 * MIN_SHARE:.0f} % of the "
+    "image, and where at least one of the two tests passes."
 )
 _ABOUT_SEQUENCES = (
-    "Share of queries whose best image shows their place: by its score, and by the scores of a "
+    "Share of the queries whose best image shows their place, by single scores and by scores of a "
     f"sequence of {LENGTH} queries (SeqSLAM). Images without order have no sequences."
 )
-_ABOUT_WRONG = "Queries whose best image shows another place and passes those tests, too."
-_ABOUT_ACCURACY = "Balanced: mean of the shares of true and of false pairs judged rightly by p."
+_ABOUT_WRONG = (
+    "Number of queries whose best image shows another place and still passes those tests."
+)
+_ABOUT_ACCURACY = (
+    "Balanced accuracy: the mean of the shares of true and of false pairs that p classifies "
+    "correctly."
+)
 _ABOUT_ACCEPTED = (
-    "Of the pairs with p of at least 0.9; where there are none, precision counts as 1."
+    "Over the pairs with p of at least 0.9; where there are none, precision counts as 1."
 )
 _ABOUT_COST = (
-    "Each in a process of its own, one thread, medians. An image: what is needed beyond the ORB "
-    "features that tracking has anyway. Parameters of bow: weights of its words."
+    "Medians, each detector in its own process with one thread. Image: what is needed beyond the "
+    "ORB features that tracking extracts anyway. Parameters of bow: weights of its words."
 )
 
 
@@ -65,39 +54,28 @@ def write_report(report: LoopsJson, out: Path) -> None:
     Raises:
         ResultsError: a file cannot be written.
     """
-    page = render_page(
-        "loops.html.jinja",
-        report=report,
-        title=title(report),
-        words=words(report),
-        tables=tables(report),
-        made=_made(report),
-        figures=draw(report),
+    page = loops_page(report)
+    files = {"loops.json": report.to_json(), "loops.md": markdown(page), "loops.html": html(page)}
+    write_files(out, files)
+
+
+def loops_page(report: LoopsJson) -> Page:
+    """The page of a comparison."""
+    return Page(
+        title(report),
+        (f"vslam {report.versions.get('vslam', '')}", f"{report.created:%Y-%m-%d %H:%M %Z}"),
+        (
+            Section("Who wins where", [Bullets(words(report))]),
+            Section("", draw_curves(report), wide=False),
+            *tables(report),
+            Section("Made", [Pairs(_made(report))]),
+        ),
     )
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "loops.json").write_text(report.model_dump_json(indent=1) + "\n", encoding="utf-8")
-        (out / "loops.md").write_text(markdown(report), encoding="utf-8")
-        (out / "loops.html").write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise ResultsError(
-            f"{out}: the report cannot be written ({error.strerror}); name another folder."
-        ) from error
 
 
 def title(report: LoopsJson) -> str:
     """What was compared, in one line."""
     return f"Loop detectors: {', '.join(_detectors(report))}"
-
-
-def markdown(report: LoopsJson) -> str:
-    """Markdown whose tables are aligned, to be read in a terminal."""
-    lines = [f"# {title(report)}", "", "## Who wins where", ""]
-    lines += [*(f"- {sentence}" for sentence in words(report)), ""]
-    for table in tables(report):
-        lines += [f"## {table.title}", "", *markdown_table(table.head, table.rows), ""]
-        lines += [table.note, ""] if table.note else []
-    return "\n".join([*lines, "## Made", "", *markdown_table(("", ""), _made(report)), ""])
 
 
 def words(report: LoopsJson) -> list[str]:
@@ -121,33 +99,16 @@ def words(report: LoopsJson) -> list[str]:
     return sentences
 
 
-def tables(report: LoopsJson) -> list[Table]:
+def tables(report: LoopsJson) -> list[Section]:
     """Every table of the report."""
     if not report.cells:
         return online_tables(report.online)
     names = _detectors(report)
-    texts = ("images", "condition")
+    head = ("images", "condition", *names, *_gain_heads(report))
     found = [
-        Table("Average precision", (*texts, *names, *_gain_heads(report)), _ap_rows(report), texts,
-              _ABOUT_AP),
-        _table(report, "Recall at 100 % precision, precision at 70 % recall",
-               lambda c: f"{c.figures['recall_at_100_precision']:.3f}, "
-               f"{c.figures['precision_at_70_recall']:.3f}", _ABOUT_RECALL),
-        _table(report, "Best image right, also verified by ORB, learned descriptors, one of both",
-               lambda c: ", ".join(f"{share:.3f}" for share in
-                                   (c.first_right, *(v.right for v in c.verified.values()))),
-               _ABOUT_VERIFIED),
-        _table(report, "Best image right, over a sequence",
-               lambda c: f"{c.first_right:.3f}, " +
-               ("-" if c.sequence_right is None else f"{c.sequence_right:.3f}"), _ABOUT_SEQUENCES),
-        _table(report, "Wrong images verified by ORB, learned descriptors, one of both",
-               lambda c: ", ".join(str(v.wrong) for v in c.verified.values()), _ABOUT_WRONG),
-        _table(report, "Largest F1", lambda c: f"{c.figures['max_f1']:.3f}", ""),
-        _table(report, "Accuracy at p = 0.5, 0.9", _accuracies, _ABOUT_ACCURACY),
-        _table(report, "Precision, recall at p = 0.9",
-               lambda c: "-" if c.accepted is None else
-               f"{c.accepted[0]:.3f}, {c.accepted[1]:.3f}", _ABOUT_ACCEPTED),
-    ]  # fmt: skip
+        Section("Average precision", [Table(head, _ap_rows(report), head[:2], _ABOUT_AP)]),
+        *(_table(report, title, shown, note) for title, shown, note in _TABLES),
+    ]
     if report.costs:
         heads = [f"query of {n} (ms)" for n in report.costs[0].query_ms]
         rows = [
@@ -157,12 +118,45 @@ def tables(report: LoopsJson) -> list[Table]:
             for c in report.costs
         ]  # fmt: skip
         head = ("detector", "load (s)", "image (ms)", *heads, "parameters (M)", "memory (MB)")
-        found.append(Table("Cost", head, rows, ("detector",), _ABOUT_COST))
+        found.append(Section("Cost", [Table(head, rows, ("detector",), _ABOUT_COST)]))
     return found
+
+
+def _accepted(score: Score) -> str:
+    return "-" if score.accepted is None else ", ".join(f"{share:.3f}" for share in score.accepted)
+
+
+def _sequence(score: Score) -> str:
+    found = score.sequence_right
+    return f"{score.first_right:.3f}, {'-' if found is None else f'{found:.3f}'}"
+
+
+def _operating_points(score: Score) -> str:
+    names = ("recall_at_100_precision", "precision_at_70_recall")
+    return ", ".join(f"{score.figures[name]:.3f}" for name in names)
+
+
+def _verified(score: Score) -> str:
+    shares = (score.first_right, *(v.right for v in score.verified.values()))
+    return ", ".join(f"{share:.3f}" for share in shares)
 
 
 def _accuracies(score: Score) -> str:
     return ", ".join("-" if a is None else f"{a:.3f}" for a in score.accuracy.values())
+
+
+# Title, cell and note of the tables with a column for each detector.
+_TABLES: list[tuple[str, Callable[[Score], str], str]] = [
+    ("Recall at 100 % precision, precision at 70 % recall", _operating_points, _ABOUT_RECALL),
+    ("Best image right, also verified by ORB, learned descriptors, one of both", _verified,
+     _ABOUT_VERIFIED),
+    ("Best image right, over a sequence", _sequence, _ABOUT_SEQUENCES),
+    ("Wrong images verified by ORB, learned descriptors, one of both",
+     lambda score: ", ".join(str(v.wrong) for v in score.verified.values()), _ABOUT_WRONG),
+    ("Largest F1", lambda score: f"{score.figures['max_f1']:.3f}", ""),
+    ("Accuracy at p = 0.5, 0.9", _accuracies, _ABOUT_ACCURACY),
+    ("Precision, recall at p = 0.9", _accepted, _ABOUT_ACCEPTED),
+]  # fmt: skip
 
 
 def _gain_heads(report: LoopsJson) -> list[str]:
@@ -194,7 +188,7 @@ def _ap_rows(report: LoopsJson) -> list[tuple[str, ...]]:
     return rows
 
 
-def _table(report: LoopsJson, name: str, shown: Callable[[Score], str], note: str) -> Table:
+def _table(report: LoopsJson, name: str, shown: Callable[[Score], str], note: str) -> Section:
     names = _detectors(report)
     cells = {(c.data, c.condition, c.detector): shown(c) for c in report.cells}
     rows = [
@@ -203,7 +197,8 @@ def _table(report: LoopsJson, name: str, shown: Callable[[Score], str], note: st
         for data in _data(report)
         if (data, condition, names[0]) in cells
     ]
-    return Table(name, ("images", "condition", *names), rows, ("images", "condition"), note)
+    table = Table(("images", "condition", *names), rows, ("images", "condition"), note)
+    return Section(name, [table])
 
 
 def _detectors(report: LoopsJson) -> list[str]:
@@ -226,46 +221,3 @@ def _made(report: LoopsJson) -> list[tuple[str, str]]:
         ("seed", str(report.seed)),
         ("created", f"{report.created:%Y-%m-%d %H:%M:%S %Z}"),
     ]
-
-
-def draw(report: LoopsJson) -> list[ReportFigure]:
-    """Precision-recall curves: a figure for each set of images, a panel for each condition; one
-    figure for all drives."""
-    figures = []
-    with style.context(STYLE, after_reset=True):
-        if report.online:
-            figures.append(draw_online(report.online, _COLORS))
-        for number, data in enumerate(_data(report)):
-            cells = [c for c in report.cells if c.data == data]
-            figure = _curves(cells, _detectors(report), data)
-            caption = (
-                f"Precision against recall on {data}, descriptors alone; a panel for each "
-                "condition."
-            )
-            figures.append(save(f"precision_recall_{number}", caption, figure))
-    return figures
-
-
-def _curves(scores: list[Score], detectors: list[str], data: str) -> Figure:
-    conditions = list(dict.fromkeys(c.condition for c in scores))
-    columns = 2 if len(conditions) == 4 else min(3, len(conditions))
-    rows = -(-len(conditions) // columns)
-    figure = Figure(figsize=(6.6, 0.7 + 1.9 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(data, x=0.01, ha="left", color=INK)
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    for axes in grid.flat[len(conditions) :]:
-        axes.set_axis_off()
-    for axes, condition in zip(grid.flat, conditions, strict=False):
-        axes.set_title(condition, fontsize=9, color=INK)
-        for score in (s for s in scores if s.condition == condition):
-            dash, color = divmod(detectors.index(score.detector), len(_COLORS))
-            axes.plot(score.curve.recall, score.curve.precision, label=score.detector,
-                      color=_COLORS[color], linestyle=_DASHES[dash % len(_DASHES)])  # fmt: skip
-        axes.set(xlim=(0, 1), ylim=(0, 1.02))
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)))
-    for axes in grid[-1, : (len(conditions) - 1) % columns + 1]:
-        axes.set_xlabel("recall", fontsize=9.5)
-    figure.supylabel("precision", fontsize=9.5)
-    return figure

@@ -5,21 +5,17 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from vslam.report.document import Document, Record
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Curve(_Model):
+class Curve(Record):
     """Precision and recall from the lowest threshold on, thinned out."""
 
     precision: list[float]
     recall: list[float]
 
 
-class Verified(_Model):
+class Verified(Record):
     """``right``: share of the queries that have a place in the gallery whose best image shows it
     and passes verification; ``wrong``: queries whose best image shows another place and passes."""
 
@@ -27,7 +23,7 @@ class Verified(_Model):
     wrong: int
 
 
-class Score(_Model):
+class Score(Record):
     """One detector on one set of images under one condition.
 
     ``figures`` are those of :func:`vslam.loopclosure.precision_recall.summary`, of descriptors
@@ -52,7 +48,7 @@ class Score(_Model):
     curve: Curve
 
 
-class DecisionCurve(_Model):
+class DecisionCurve(Record):
     """Precision and recall over images at thresholds on the score, ascending, thinned out."""
 
     threshold: list[float]
@@ -60,7 +56,7 @@ class DecisionCurve(_Model):
     recall: list[float]
 
 
-class OnlineScore(_Model):
+class OnlineScore(Record):
     """One detector on one drive, one decision an image (:mod:`vslam.lab.loopbench.online`).
 
     ``window``: the youngest images, which are not searched. ``verified_by``: ``nothing``, ``orb``,
@@ -88,7 +84,7 @@ class OnlineScore(_Model):
     curve: DecisionCurve
 
 
-class Gain(_Model):
+class Gain(Record):
     """AP of ``second`` minus that of ``first``, with the 95 % interval over the queries."""
 
     data: str
@@ -100,7 +96,7 @@ class Gain(_Model):
     high: float
 
 
-class Cost(_Model):
+class Cost(Record):
     """Of one detector in a process of its own, one thread; medians.
 
     ``image_ms``: what is needed of an image beyond the ORB features that tracking has anyway;
@@ -115,8 +111,8 @@ class Cost(_Model):
     memory_mb: float
 
 
-class LoopsJson(_Model):
-    """``kind`` tells this file from those of runs.
+class LoopsJson(Document):
+    """``kind`` distinguishes this file from those of runs.
 
     ``cells``, ``gains`` and ``costs`` are of the protocol retrieval, ``online`` of the other one.
     """
@@ -126,7 +122,7 @@ class LoopsJson(_Model):
 
     seed: int
     cells: list[Score]
-    online: list[OnlineScore] = []
+    online: tuple[OnlineScore, ...] = ()
     gains: list[Gain]
     costs: list[Cost]
 

@@ -24,32 +24,25 @@ def write_overview(
         runs: folders of runs, or folders that hold such at any depth.
         trajectories: ``NAME[@SEQUENCE[@PERTURB]]=FILE``, of other systems.
         out: made if it is not there.
-        baseline: system that the others are set against; None for the simplest.
+        baseline: the system that the others are compared with; None for the simplest.
 
     Raises:
         InputError: no finished run, a trajectory that cannot be read or placed, or no run of the
             baseline.
         ResultsError: a file cannot be written.
     """
-    from vslam.errors import ResultsError
     from vslam.lab.overview.collect import collect
     from vslam.lab.overview.figures import draw_overview
-    from vslam.lab.overview.render import render_csv, render_html, render_markdown
+    from vslam.lab.overview.render import overview_page, render_csv
     from vslam.lab.overview.summary import summarize
+    from vslam.report.render import html, markdown, write_files
 
     found = collect(runs, trajectories)
     report = summarize(found, baseline)
     figures = draw_overview(report, found)
-    report = report.model_copy(update={"notes": found.notes})  # with those of the drawing
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        json = report.model_dump_json(indent=2) + "\n"
-        (out / "report.json").write_text(json, encoding="utf-8")
-        (out / "table.csv").write_text(render_csv(report), encoding="utf-8")
-        (out / "report.md").write_text(render_markdown(report), encoding="utf-8")
-        (out / "report.html").write_text(render_html(report, figures), encoding="utf-8")
-    except OSError as error:
-        raise ResultsError(
-            f"{out}: the report cannot be written ({error.strerror}); name another folder."
-        ) from error
+    notes = list(dict.fromkeys((*report.notes, *found.notes)))  # drawing adds some
+    report = report.model_copy(update={"notes": notes})
+    page = overview_page(report, figures)
+    files = {"report.json": report.to_json(), "table.csv": render_csv(report)}
+    write_files(out, {**files, "report.md": markdown(page), "report.html": html(page)})
     return report

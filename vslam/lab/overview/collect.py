@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.lab.overview.schema import MEASURES, Drive, RunEntry
+from vslam.lab.overview.schema import MEASURES, Drive, OverviewJson, RunEntry
 from vslam.report.schema import ReportJson
 from vslam.run.outcome import alignment_of
 from vslam.trajectory import Trajectory, read_trajectory
@@ -22,7 +19,7 @@ MONOCULAR = ", mono"  # ends the name of a monocular system
 
 @dataclass(frozen=True)
 class Found:
-    """Runs in the order found, notes about what was left out, and files of trajectories.
+    """Runs in the order found, notes on what was left out, and files of trajectories.
 
     Attributes:
         estimate: the trajectory of each run by its ``source``.
@@ -38,7 +35,7 @@ class Found:
 def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
     """Read every run below ``folders`` and evaluate ``trajectories`` on the same sequences.
 
-    Interrupted runs and reports that this version cannot read are left out, with a note.
+    Interrupted runs and reports that this version cannot read are left out with a note.
 
     Raises:
         InputError: a folder is not there, none holds a finished run, or a trajectory cannot be
@@ -46,14 +43,15 @@ def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
     """
     found = Found([], [])
     configs: dict[str, Path] = {}
-    for folder in _run_folders(folders):
+    for folder in run_folders(folders):
+        require_utf8(folder)
         report = _read(folder, found.notes)
         if report is None:
             continue
         try:
             entry = _entry(report, folder)
         except InputError as error:
-            found.notes.append(f"{folder} is left out: {error}")
+            found.notes.append(f"left out: {folder}: {error}")
             continue
         found.runs.append(entry)
         found.estimate[entry.source] = folder / "trajectory.tum"
@@ -95,13 +93,17 @@ def read_aligned(found: Found, run: RunEntry) -> tuple[Trajectory, Trajectory | 
     return Trajectory(estimate.timestamps[: evaluation.frames], evaluation.T_wc_aligned), truth
 
 
-def _run_folders(folders: Collection[Path]) -> list[Path]:
+def run_folders(folders: Collection[Path]) -> list[Path]:
+    """Folders that hold a ``report.json``, at any depth; hidden ones are left out.
+
+    Raises:
+        InputError: no such folder.
+    """
     found: dict[Path, Path] = {}
     for folder in folders:
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder; name folders of runs.")
         for path in sorted(folder.rglob("report.json")):
-            require_utf8(path)
             if not any(part.startswith(".") for part in path.relative_to(folder).parts):
                 found.setdefault(path.parent.resolve(), path.parent)
     return list(found.values())
@@ -110,22 +112,24 @@ def _run_folders(folders: Collection[Path]) -> list[Path]:
 def _read(folder: Path, notes: list[str]) -> ReportJson | None:
     path = folder / "report.json"
     try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
-        notes.append(f"{path} is damaged and left out")
-        return None
-    if isinstance(content, dict) and content.get("kind") == "overview":
-        return None
-    try:
-        report = ReportJson.model_validate(content)
-    except ValidationError:
-        version = content.get("schema_version") if isinstance(content, dict) else None
-        notes.append(f"{path} is of another version of vslam (schema {version}) and left out")
+        report = ReportJson.read(path)
+    except InputError as error:
+        if not _is_overview(path):
+            notes.append(f"left out: {error}")
         return None
     if report.interrupted:
-        notes.append(f"{folder} was interrupted ({report.interrupted}) and left out")
+        notes.append(f"left out: {folder} was interrupted ({report.interrupted})")
         return None
     return report
+
+
+def _is_overview(path: Path) -> bool:
+    """Whether a file is a report of many runs, which is not a run."""
+    try:
+        OverviewJson.read(path)
+    except InputError:
+        return False
+    return True
 
 
 def _entry(report: ReportJson, folder: Path) -> RunEntry:
@@ -214,8 +218,8 @@ def _add_external(text: str, found: Found) -> None:
 
 
 def _alignment_of_external(system: str, drive: Drive, found: Found) -> str:
-    """That of vslam's runs of the same place. Where some of them are monocular and some are not,
-    a name that ends as those of monocular runs do decides."""
+    """The alignment of vslam's runs of the same place. Where only some of them are monocular, the
+    ending of the name decides."""
     there = {run.alignment for run in found.runs if run.drive.place == drive.place}
     if len(there) == 1:
         return there.pop()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib import style
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -15,6 +15,7 @@ from vslam.errors import InputError
 from vslam.lab.overview.collect import Found, read_aligned
 from vslam.lab.overview.schema import Drive, OverviewJson, Row, RunEntry
 from vslam.lab.overview.summary import strengths, systems
+from vslam.report import page
 from vslam.report.drawing import (
     AMBER,
     BLUE,
@@ -24,13 +25,13 @@ from vslam.report.drawing import (
     LOW,
     RED,
     SQUARE,
-    STYLE,
     VIOLET,
-    ReportFigure,
+    Drawing,
     add_legend,
+    draw,
+    finish_map,
     new_figure,
     plain_ticks,
-    save,
 )
 
 if TYPE_CHECKING:
@@ -40,26 +41,21 @@ _COLORS = [AMBER, BLUE, GREEN, VIOLET, RED, "#06b6d4", "#ec4899", "#84cc16"]
 _MIN_STRENGTHS = 2  # not counting none
 _DASHES = ["-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1))]  # where lines cover each other
 
-Drawing = tuple[str, str, Figure]
 Looks = Mapping[str, tuple[str, Any]]  # colour and dashes of each system
 
 
-def draw_overview(report: OverviewJson, found: Found) -> list[ReportFigure]:
+def draw_overview(report: OverviewJson, found: Found) -> list[page.Figure]:
     """Draw all that there is data for, in the order of the report."""
     looks = {
         name: (_COLORS[k % len(_COLORS)], _DASHES[k % len(_DASHES)])
         for k, name in enumerate(systems(report.rows))
     }
-    with style.context(STYLE, after_reset=True):
-        return [
-            save(_identifier(name), caption, figure)
-            for drawings in (
-                _errors(report.rows, looks),
-                _curves(report.rows, looks),
-                _paths(report, found, looks),
-            )
-            for name, caption, figure in drawings
-        ]
+    drawings = chain(
+        _errors(report.rows, looks),
+        _curves(report.rows, looks),
+        _paths(report, found, looks),
+    )
+    return draw((_identifier(name), caption, figure) for name, caption, figure in drawings)
 
 
 def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
@@ -85,7 +81,7 @@ def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
         add_legend(figure, axes)
         yield (
             f"ate-{perturb}",
-            "Medians over runs; lines from the least to the greatest. Logarithmic.",
+            "Medians over runs, with lines from the smallest to the largest value; logarithmic.",
             figure,
         )
 
@@ -112,8 +108,8 @@ def _curves(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
                 continue
             yield (
                 f"strength-{law}-{place.dataset}-{place.place}",
-                "Medians over runs, shaded from the least to the greatest. Strength 0: the images "
-                "as they are.",
+                "Medians over runs, shaded from the smallest to the largest value. Strength 0: the "
+                "images as they are.",
                 _curve(f"{place.place}: {law}", mine, strength, looks),
             )
 
@@ -158,12 +154,10 @@ def _paths(report: OverviewJson, found: Found, looks: Looks) -> Iterator[Drawing
         rows = [row for row in report.rows if row.drive == drive]
         if not _draw_paths(axes, rows, found, looks):
             continue
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.margins(0.06)
-        add_legend(figure, axes)
+        finish_map(figure, axes)
         yield (
             f"path-{drive.dataset}-{drive.place}-{drive.perturb}",
-            "From above, aligned to the ground truth; of each system the run with the median ATE.",
+            "Seen from above, aligned to the ground truth; each system by its run of median ATE.",
             figure,
         )
 

@@ -1,46 +1,54 @@
-"""The report of many runs as Markdown, HTML and CSV: the same rows in the same order."""
+"""The page of many runs, and its rows as CSV."""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Collection
-from typing import TYPE_CHECKING
 
 from vslam.lab.overview.schema import DECIMALS, MEASURES, Measure, OverviewJson, RunEntry, Spread
 from vslam.lab.overview.summary import ALPHA
 from vslam.lab.overview.versus import median_text, versus
-from vslam.report.page import Table, markdown_table, render_page
-
-if TYPE_CHECKING:
-    from vslam.report.drawing import ReportFigure
+from vslam.report.page import Bullets, Figure, Page, Pairs, Section, Table, number
+from vslam.report.render import csv_text
 
 _OTHER = ("loops_found", "loops_missed", "loops_wrong", "fps")
 _ABOUT_ERRORS = (
-    "Medians over runs, in brackets the least and the greatest. ATE after the alignment named, of "
-    "every frame, lost ones included: SE3 without scale, Sim3 with scale for monocular runs, which "
-    "have none; causal ATE is of the poses as they were given at the time. Systems with different "
-    "alignments are not compared. RPE from one frame to the next."
+    "Medians over runs, with the smallest and the largest value in brackets. The ATE counts every "
+    "frame, lost ones included, after the alignment named: SE3 keeps the scale; Sim3, for "
+    "monocular runs, fits it. The causal ATE is that of the poses as they were estimated at the "
+    "time. Systems with different alignments are not compared. The RPE is from one frame to the "
+    "next."
 )
 _ABOUT_OTHERS = (
-    "Loops by the ground truth. fps of the frame loop: runs made side by side have fewer."
+    "Loops are judged by the ground truth. fps is that of the frame loop; runs that share a "
+    "machine are slower."
 )
 ALIGNMENTS = {"se3": "SE3", "sim3": "Sim3"}
 _TESTED = (
-    "Pairs are sequences, each with the median of its runs: runs of one sequence are not "
-    "independent. Over all conditions, a sequence counts once, with the mean of its medians. "
-    f"Two-sided, level {ALPHA:g}, not corrected for the number of tests."
+    "Wilcoxon's signed-rank test on sequences, each with the median of its runs, because runs of "
+    "one sequence are not independent. Over all conditions a sequence counts once, with the mean "
+    f"of its medians. Two-sided, level {ALPHA:g}, not corrected for the number of tests."
 )
 
 
-def tables(report: OverviewJson) -> list[Table]:
-    """Every table of the report."""
-    found = [*versus(report), _compared(report), *_results(report), _runs(report)]
-    return [table for table in found if table.rows]
+def overview_page(report: OverviewJson, figures: Collection[Figure]) -> Page:
+    """The page of many runs."""
+    return Page(
+        title(report),
+        (f"vslam {report.versions.get('vslam', '')}", f"{report.created:%Y-%m-%d %H:%M %Z}"),
+        (
+            *versus(report),
+            _compared(report),
+            *_results(report),
+            Section("", [*figures], wide=False),
+            Section("Notes", [Bullets(report.notes)]),
+            _runs(report),
+            Section("Made", [Pairs(_made(report))]),
+        ),
+    )
 
 
 def title(report: OverviewJson) -> str:
-    """What the report is of, in one line."""
+    """The systems and the number of runs, in one line."""
     places = len({(row.drive.dataset, row.drive.place) for row in report.rows})
     return (
         f"{', '.join(report.systems)}: {len(report.runs)} runs on {places} "
@@ -48,38 +56,13 @@ def title(report: OverviewJson) -> str:
     )
 
 
-def render_markdown(report: OverviewJson) -> str:
-    """Markdown whose tables are aligned, to be read in a terminal."""
-    lines = [f"# {title(report)}", ""]
-    for table in tables(report):
-        lines += [f"## {table.title}", "", *markdown_table(table.head, table.rows), ""]
-        lines += [table.note, ""] if table.note else []
-        lines += [*(f"- {point}" for point in table.points), ""] if table.points else []
-    if report.notes:
-        lines += ["## Notes", "", *(f"- {note}" for note in report.notes), ""]
-    lines += ["## Made", "", *markdown_table(("", ""), _made(report)), ""]
-    return "\n".join(lines)
-
-
-def render_html(report: OverviewJson, figures: Collection[ReportFigure]) -> str:
-    """One self-contained page: style, figures and numbers are inside, nothing is loaded."""
-    return render_page(
-        "overview.html.jinja",
-        report=report,
-        title=title(report),
-        tables=tables(report),
-        made=_made(report),
-        figures=figures,
-    )
-
-
 def render_csv(report: OverviewJson) -> str:
     """A line for each row; of each measure the median, the least and the greatest."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     names = [name for name, *_ in MEASURES]
     head = ["dataset", "sequence", "excerpt", "perturb", "system", "alignment", "runs", "frames"]
-    writer.writerow([*head, *(f"{n}{end}" for n in names for end in ("", "_least", "_greatest"))])
+    lines: list[list[object]] = [
+        [*head, *(f"{n}{end}" for n in names for end in ("", "_least", "_greatest"))]
+    ]
     for row in report.rows:
         cells: list[object] = [*row.drive.model_dump().values(), row.system, row.alignment]
         cells += [row.runs, row.frames]
@@ -87,15 +70,15 @@ def render_csv(report: OverviewJson) -> str:
             spread = row.measures[name]
             found = (spread.median, spread.least, spread.greatest) if spread else ("", "", "")
             cells += found
-        writer.writerow(cells)
-    return text.getvalue()
+        lines.append(cells)
+    return csv_text(lines)
 
 
-def _results(report: OverviewJson) -> list[Table]:
-    """Two tables of the same rows: one would be too wide to read."""
+def _results(report: OverviewJson) -> list[Section]:
+    """Two tables of the same rows, because one would be too wide to read."""
     texts = ("sequence", "perturbation", "system")
 
-    def table(name: str, measures: Collection[Measure], note: str, *, aligned: bool) -> Table:
+    def table(name: str, measures: Collection[Measure], note: str, *, aligned: bool) -> Section:
         columns = ["alignment"] if aligned else []
         columns += [f"{title} ({unit})" if unit else title for _, title, unit, *_ in measures]
         rows: list[tuple[str, ...]] = [
@@ -109,7 +92,7 @@ def _results(report: OverviewJson) -> list[Table]:
             )
             for row in report.rows
         ]
-        return Table(name, (*texts, "runs", *columns), rows, texts, note)
+        return Section(name, [Table((*texts, "runs", *columns), rows, texts, note)])
 
     errors = [measure for measure in MEASURES if measure[0] not in _OTHER]
     others = [measure for measure in MEASURES if measure[0] in _OTHER]
@@ -119,7 +102,7 @@ def _results(report: OverviewJson) -> list[Table]:
     ]
 
 
-def _compared(report: OverviewJson) -> Table:
+def _compared(report: OverviewJson) -> Section:
     texts = ("systems", "perturbation", "error", "winner")
     head = ("systems", "perturbation", "error", "better", "worse", "same", "median (m)", "p")
     titles = {name: title for name, title, *_ in MEASURES}
@@ -137,10 +120,10 @@ def _compared(report: OverviewJson) -> Table:
         )
         for c in report.comparisons
     ]
-    return Table("Differences", (*head, "winner"), rows, texts, _TESTED)
+    return Section("Differences", [Table((*head, "winner"), rows, texts, _TESTED)])
 
 
-def _runs(report: OverviewJson) -> Table:
+def _runs(report: OverviewJson) -> Section:
     head = ("sequence", "perturbation", "system", "seed", "frames", "ATE (m)", "run")
     rows: list[tuple[str, ...]] = [
         (
@@ -149,13 +132,13 @@ def _runs(report: OverviewJson) -> Table:
             run.system,
             _seed(run),
             str(run.frames),
-            _figure(run, "ate_rmse_m", 3),
+            number(run.measures["ate_rmse_m"], "{:.3f}"),
             run.source,
         )
         for run in report.runs
     ]
     texts = ("sequence", "perturbation", "system", "run")
-    return Table("Runs", head, rows, texts, folded=True)
+    return Section("Runs", [Table(head, rows, texts)], folded=True)
 
 
 def _made(report: OverviewJson) -> list[tuple[str, str]]:
@@ -179,8 +162,3 @@ def _seed(run: RunEntry) -> str:
     if run.seed is None:
         return "-"
     return f"{run.seed}, town {run.town}" if run.town else str(run.seed)
-
-
-def _figure(run: RunEntry, name: str, decimals: int) -> str:
-    value = run.measures[name]
-    return "n/a" if value is None else f"{value:.{decimals}f}"

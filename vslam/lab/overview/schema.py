@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from vslam.report.document import Document, Record
 
 Measure = tuple[str, str, str, int]
 # Name in the JSON, title, unit, decimals.
@@ -25,12 +25,8 @@ DECIMALS = {name: decimals for name, _, _, decimals in MEASURES}
 ALL = "all"  # in the place of a perturbation: over all of them
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Drive(_Model):
-    """Images that systems are compared on, but for the seeds of what was drawn.
+class Drive(Record):
+    """Images on which systems are compared; drives that differ only in a seed are one.
 
     ``excerpt`` is empty for a whole sequence.
     """
@@ -42,16 +38,16 @@ class Drive(_Model):
 
     @property
     def place(self) -> str:
-        """The sequence, without what was done to its images."""
+        """The sequence without its perturbation."""
         return f"{self.sequence}, {self.excerpt}" if self.excerpt else self.sequence
 
 
-class RunEntry(_Model):
-    """One run. ``measures`` has the names of ``MEASURES``; None where a run has no such figure.
+class RunEntry(Record):
+    """One run. ``measures`` has the names of ``MEASURES``; None where a run has no such value.
 
     ``system`` is the loop detector, or the name of another system; ``source`` the folder of the
     run or the file of the trajectory; ``seed`` is None for other systems. ``town`` is the seed of
-    a rendered town: one drive in other towns is that drive again, as with another ``seed``.
+    a rendered town: the same route in another town counts as the same drive with another seed.
     ``alignment`` is what was fitted before errors were computed: ``se3``, or ``sim3`` for a
     monocular run, whose scale is arbitrary.
     """
@@ -67,8 +63,8 @@ class RunEntry(_Model):
     machine: str | None
 
 
-class Spread(_Model):
-    """Of the ``n`` runs that have the figure."""
+class Spread(Record):
+    """Median and extremes over the ``n`` runs that have a value."""
 
     n: int
     median: float
@@ -76,9 +72,9 @@ class Spread(_Model):
     greatest: float
 
 
-class Row(_Model):
-    """All runs of one system on one drive; None for a measure that no run has. ``alignment`` is
-    that of its runs."""
+class Row(Record):
+    """All runs of one system on one drive, which share an ``alignment``; None for a measure that no
+    run has."""
 
     drive: Drive
     system: str
@@ -88,7 +84,7 @@ class Row(_Model):
     measures: dict[str, Spread | None]
 
 
-class Pair(_Model):
+class Pair(Record):
     """Medians of two systems on one drive, and ``difference``, the second minus the first."""
 
     drive: Drive
@@ -97,14 +93,14 @@ class Pair(_Model):
     difference: float
 
 
-class Comparison(_Model):
+class Comparison(Record):
     """Two systems under one perturbation, paired by sequence.
 
     ``perturb`` is ``all`` for a comparison over all perturbations: a sequence then counts once,
     with its mean over the perturbations under which both systems have run on it. ``p_value`` is
     two-sided, of Wilcoxon's signed-rank test on the differences that are not ties; None where there
-    are too few for it to say anything. ``winner`` is the system that has the smaller errors by that
-    test, None where the test does not tell.
+    are too few of them for the test. ``winner`` is the system with the smaller errors by that test,
+    None where the test does not decide.
     """
 
     measure: str
@@ -121,9 +117,9 @@ class Comparison(_Model):
     words: str
 
 
-class OverviewJson(_Model):
-    """``kind`` tells this file from the ``report.json`` of one run. ``systems`` are in the order in
-    which they are compared, the baseline first."""
+class OverviewJson(Document):
+    """``kind`` distinguishes this file from the ``report.json`` of one run. ``systems`` are in the
+    order in which they are compared, the baseline first."""
 
     kind: Literal["overview"] = "overview"
     schema_version: int = 3

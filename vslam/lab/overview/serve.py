@@ -1,12 +1,12 @@
 """A page of all runs in some folders, on this machine alone: ``vslam report --serve``.
 
-Only reports that were found are served, by number: no path of a request reaches the disk. Requests
-for another host's name are refused, so that no page of the web can read reports through the
-browser (DNS rebinding).
+Only reports that were found are served, by number: no path of a request is ever opened. Requests
+with another host name are refused, so that no page on the web can read reports through the browser
+(DNS rebinding).
 
-A report may come from a stranger and hold any script. It is sandboxed: its scripts run in an origin
-of their own and reach neither other reports nor the network. A ``report.html`` or ``report.json``
-that is a link out of its folder is not read.
+A report may come from a stranger and contain any script. It is sandboxed: its scripts run in an
+origin of their own and reach neither other reports nor the network. A ``report.html`` or
+``report.json`` that is a link out of its folder is not read.
 """
 
 from __future__ import annotations
@@ -15,13 +15,15 @@ import http.server
 import re
 import threading
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 from vslam.errors import InputError
+from vslam.lab.overview.collect import run_folders
 from vslam.report.finished_run import read_report
-from vslam.report.page import render_page
+from vslam.report.page import number
+from vslam.report.render import fill_template
 from vslam.report.schema import ReportJson
 from vslam.untrusted import require_utf8
 
@@ -34,43 +36,24 @@ _REPORT_POLICY = (
     "style-src 'unsafe-inline'; img-src data:"
 )
 _NUMBER = re.compile("[0-9]{1,9}")
+_REPORT = re.compile("/run/([0-9]{1,9})")
 
 
-@dataclass(frozen=True)
-class ListedRun:
-    """A run as the page lists it; ``page`` is None where it was made with ``--no-report``."""
-
-    name: str
-    report: ReportJson
-    page: Path | None
-
-
-def list_runs(folders: Collection[Path]) -> list[ListedRun]:
-    """All runs in some folders, the newest first; what cannot be read is left out.
+def list_runs(folders: Collection[Path]) -> list[tuple[Path, ReportJson]]:
+    """Folders of all runs and their reports, the newest first; what cannot be read is left out.
 
     Raises:
         InputError: no such folder, or no run in any of them.
     """
-    found: dict[Path, ListedRun] = {}
-    for folder in folders:
-        if not folder.is_dir():
-            raise InputError(f"{folder}: no such folder; name folders of runs.")
-        for path in sorted(folder.rglob("report.json")):
-            place = path.parent.resolve()
-            parts = path.parent.relative_to(folder).parts
-            hidden = any(part.startswith(".") for part in parts)
-            if place in found or hidden or not _is_own(place / path.name):
-                continue
-            try:
-                require_utf8(place)
-                report = read_report(path.parent)
-            except InputError:
-                continue
-            page = place / "report.html"
-            found[place] = ListedRun(place.name, report, page if _is_own(page) else None)
+    found: list[tuple[Path, ReportJson]] = []
+    for folder in map(Path.resolve, run_folders(folders)):
+        with suppress(InputError):
+            require_utf8(folder)
+            if _is_own(folder / "report.json"):
+                found.append((folder, read_report(folder)))
     if not found:
         raise InputError(f"{', '.join(map(str, folders))}: no run here; name folders of runs.")
-    return sorted(found.values(), key=lambda run: (run.report.created, run.name), reverse=True)
+    return sorted(found, key=lambda run: (run[1].created, run[0].name), reverse=True)
 
 
 def _is_own(path: Path) -> bool:
@@ -81,9 +64,10 @@ def _is_own(path: Path) -> bool:
 def make_server(folders: Sequence[Path], port: int = 0) -> http.server.ThreadingHTTPServer:
     """A server on the loopback interface, to be started by its ``serve_forever``.
 
-    The folders are read anew whenever the list is asked for.
+    The folders are read again whenever the list is requested.
 
     Args:
+        folders: folders of runs, or folders that hold such at any depth.
         port: 0 for any that is free.
 
     Raises:
@@ -98,12 +82,14 @@ def make_server(folders: Sequence[Path], port: int = 0) -> http.server.Threading
             is_ours = self.path == "/" or self.path.startswith("/compare?")
             body = text.encode()
             self.send_response(status)
-            self.send_header("Content-Type", "text/html; charset=utf-8")
-            self.send_header("Content-Length", str(len(body)))
-            policy = _LISTS_POLICY if is_ours else _REPORT_POLICY
-            self.send_header("Content-Security-Policy", policy)
-            self.send_header("X-Content-Type-Options", "nosniff")
-            self.send_header("Cache-Control", "no-store")
+            for name, value in {
+                "Content-Type": "text/html; charset=utf-8",
+                "Content-Length": str(len(body)),
+                "Content-Security-Policy": _LISTS_POLICY if is_ours else _REPORT_POLICY,
+                "X-Content-Type-Options": "nosniff",
+                "Cache-Control": "no-store",
+            }.items():
+                self.send_header(name, value)
             self.end_headers()
             self.wfile.write(body)
 
@@ -119,13 +105,12 @@ def make_server(folders: Sequence[Path], port: int = 0) -> http.server.Threading
 
 
 class _Pages:
-    """What is answered; runs keep their number as long as the server lives."""
+    """What is answered; a page keeps its number, its place in ``_known``, as long as the server
+    lives."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         self._folders = folders
-        self._numbers: dict[Path, int] = {}
-        self._pages: list[Path] = []
-        self._names: list[str] = []
+        self._known: list[Path] = []
         self._lock = threading.Lock()  # each request has its own thread
         self._list()
 
@@ -133,63 +118,54 @@ class _Pages:
         """Status and page for a path with its query."""
         try:
             url = urlsplit(request)
-        except ValueError:
-            return 400, "bad request"
-        if url.path == "/":
-            try:
+            if url.path == "/":
                 with self._lock:
                     return 200, self._list()
-            except InputError:
-                return 404, "the runs are gone"
-        kind, _, number = url.path.strip("/").partition("/")
-        if kind == "run" and _NUMBER.fullmatch(number):
-            return self._run(int(number))
+        except ValueError:
+            return 400, "bad request"
+        except InputError:
+            return 404, "the runs are gone"
+        if found := _REPORT.fullmatch(url.path):
+            return self._report(int(found[1]))
         if url.path == "/compare":
             chosen = [int(n) for n in parse_qs(url.query).get("run", []) if _NUMBER.fullmatch(n)]
-            known = [n for n in dict.fromkeys(chosen) if n < len(self._names)][:_MOST_BESIDE]
-            if len(known) > 1:
-                beside = [(n, self._names[n]) for n in known]
-                return 200, render_page("compare.html.jinja", runs=beside)
-            return 400, render_page("compare.html.jinja", runs=[])
+            known = [n for n in dict.fromkeys(chosen) if n < len(self._known)][:_MOST_BESIDE]
+            beside = [(n, self._known[n].parent.name) for n in known] if len(known) > 1 else []
+            return 200 if beside else 400, fill_template("compare.html.jinja", runs=beside)
         return 404, "not found"
 
-    def _run(self, number: int) -> tuple[int, str]:
-        if number >= len(self._pages) or not _is_own(self._pages[number]):
+    def _report(self, number: int) -> tuple[int, str]:
+        if number >= len(self._known) or not _is_own(self._known[number]):
             return 404, "not found"
         try:
-            return 200, self._pages[number].read_text("utf-8")
+            return 200, self._known[number].read_text("utf-8")
         except (OSError, UnicodeDecodeError):
             return 404, "the report is gone"
 
     def _list(self) -> str:
         rows = []
-        for run in list_runs(self._folders):
-            number = None
-            if run.page is not None:
-                if run.page not in self._numbers:
-                    self._numbers[run.page] = len(self._pages)
-                    self._pages.append(run.page)
-                    self._names.append(run.name)
-                number = self._numbers[run.page]
-            rows.append((number, run.name, _cells(run.report)))
-        return render_page("runs.html.jinja", head=_HEAD, rows=rows, most=_MOST_BESIDE)
+        for folder, report in list_runs(self._folders):
+            page, number = folder / "report.html", None
+            if _is_own(page):
+                if page not in self._known:
+                    self._known.append(page)
+                number = self._known.index(page)
+            rows.append((number, folder.name, _cells(report)))
+        return fill_template("runs.html.jinja", head=_HEAD, rows=rows, most=_MOST_BESIDE)
 
 
 _HEAD = ("data", "perturb", "detector", "frames", "lost", "ATE (m)", "loops", "wrong", "fps")
 
 
 def _cells(report: ReportJson) -> tuple[str, ...]:
-    ate = "n/a" if report.ate_rmse_m is None else f"{report.ate_rmse_m:.3f}"
-    frames = f"{report.frames}{' (interrupted)' if report.interrupted else ''}"
-    wrong = "n/a" if report.loops_wrong is None else str(report.loops_wrong)
     return (
         f"{report.dataset} {report.sequence}, {report.sensor}",
         report.perturb,
         report.detector,
-        frames,
+        f"{report.frames}{' (interrupted)' if report.interrupted else ''}",
         str(report.lost_frames),
-        ate,
+        number(report.ate_rmse_m, "{:.3f}"),
         str(report.loops_closed),
-        wrong,
+        number(report.loops_wrong),
         f"{report.fps:.1f}",
     )

@@ -1,8 +1,8 @@
 """From runs to rows, and from rows to who wins where.
 
-A system's figure on a drive is the median over its runs. Two systems are compared under one
-perturbation and over all of them, and what is paired are *sequences*: runs of one sequence are not
-independent, and counting each of them would make the test believe in more than it has seen.
+A system is represented on a drive by the median over its runs. Two systems are compared under one
+perturbation and over all of them, paired by *sequence*: runs of one sequence are not independent,
+and counting each of them would overstate the evidence.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _KNOWN = ("none", "bow", *NETWORKS, "both")
 
 
 class Shown(NamedTuple):
-    """How a compared error is written: ``scale`` times the metres of the measure."""
+    """How a compared error is printed: the metres of the measure times ``scale``."""
 
     title: str
     unit: str
@@ -50,11 +50,11 @@ COMPARED = {"ate_rmse_m": Shown("ATE", "m", 1.0, 3), "rpe_m": Shown("RPE", "mm",
 
 
 def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
-    """All that the report says.
+    """Reduce runs to what the report holds.
 
     Args:
         found: the runs.
-        baseline: system that the others are set against; None for the simplest.
+        baseline: the system that the others are compared with; None for the simplest.
 
     Raises:
         InputError: no run of the baseline.
@@ -262,7 +262,7 @@ def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
             f"Too few sequences differ ({untied}) for Wilcoxon's test, which takes {least_pairs()} "
             f"to reach p < {ALPHA:g}: no claim about others."
         )
-    chance = "unlikely by chance" if found.winner else "chance alone may do this"
+    chance = "unlikely to be chance" if found.winner else "may be chance"
     return text + f"Wilcoxon's signed-rank test on {untied}: p = {found.p_value:.3g}, {chance}."
 
 

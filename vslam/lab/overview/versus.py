@@ -6,17 +6,17 @@ from collections.abc import Iterator
 
 from vslam.lab.overview.schema import Drive, OverviewJson, Row, Spread
 from vslam.lab.overview.summary import COMPARED, is_tie
-from vslam.report.page import Table
+from vslam.report.page import Bullets, Section, Table
 
 _TEXTS = ("sequence", "perturbation")
 _LOOPS = ("loops_found", "loops_missed", "loops_wrong")
-_NOTE = "Medians over runs. Lost: frames. Loops: found / missed / wrong."
+_NOTE = "Medians over runs. Lost: number of lost frames. Loops: found / missed / wrong."
 
 Key = tuple[Drive, str]
 
 
-def versus(report: OverviewJson) -> list[Table]:
-    """A table for each system with its baseline; ``points`` say who wins over all.
+def versus(report: OverviewJson) -> list[Section]:
+    """A table for each system with its baseline, and sentences on which of them wins over all.
 
     The baseline of a system is the first one that has run on the same drive and was aligned in the
     same way. A system without such a partner stands alone.
@@ -29,9 +29,9 @@ def versus(report: OverviewJson) -> list[Table]:
     found = []
     for name in report.systems:
         if name in opponents:
-            found.append(_table(report, rows, (opponents[name], name)))
+            found.append(_section(report, rows, (opponents[name], name)))
         elif name not in paired:
-            found.append(_table(report, rows, (name,)))
+            found.append(_section(report, rows, (name,)))
     return found
 
 
@@ -51,7 +51,9 @@ def _pairs(names: list[str], rows: dict[str, dict[Key, Row]]) -> Iterator[tuple[
                 break
 
 
-def _table(report: OverviewJson, rows: dict[str, dict[Key, Row]], names: tuple[str, ...]) -> Table:
+def _section(
+    report: OverviewJson, rows: dict[str, dict[Key, Row]], names: tuple[str, ...]
+) -> Section:
     pair = len(names) == 2
     head = [*_TEXTS, *(f"lost, {name}" for name in names)]
     for shown in COMPARED.values():
@@ -61,9 +63,9 @@ def _table(report: OverviewJson, rows: dict[str, dict[Key, Row]], names: tuple[s
     order = {(row.drive, row.alignment): None for row in report.rows if row.system in names}
     lines = [_line(key, [rows[name].get(key) for name in names]) for key in order]
     note = f"{_NOTE} Differences: {names[1]} minus {names[0]}." if pair else _NOTE
-    points = tuple(_points(report, rows, names))
+    points = Bullets(tuple(_points(report, rows, names)))
     title = f"{names[1]} against {names[0]}" if pair else names[0]
-    return Table(title, tuple(head), lines, _TEXTS, note, points=points)
+    return Section(title, (Table(tuple(head), lines, _TEXTS, note), points))
 
 
 def _line(key: Key, rows: list[Row | None]) -> tuple[str, ...]:
@@ -92,8 +94,8 @@ def _difference(first: Spread | None, second: Spread | None, measure: str) -> st
 def _points(
     report: OverviewJson, rows: dict[str, dict[Key, Row]], names: tuple[str, ...]
 ) -> Iterator[str]:
-    """What the runs on the drives that all of ``names`` share add up to, lost frames first, then
-    the comparisons of two systems."""
+    """Totals over the runs on the drives that all of ``names`` share, lost frames first, then the
+    comparisons of two systems."""
     shared = set.intersection(*(set(rows[name]) for name in names))
     runs = {
         name: [

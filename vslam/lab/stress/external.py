@@ -21,10 +21,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
+from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import Perturbation, perturbed
-from vslam.datasets.sequence import Sequence
-from vslam.datasets.stream import timed_frames
+from vslam.datasets.synthetic.store import calibration_text
 from vslam.errors import DroppedFrameError, InputError, ResultsError
 from vslam.features import TrackingState, TrackResult
 from vslam.report.folder import write_results
@@ -65,12 +64,12 @@ def check_template(name: str, template: str) -> None:
         ) from error
     if "{folder}" not in template or "{out}" not in template:
         raise InputError(
-            f"--system {name}={template}: must hold {{folder}} and {{out}}, see docs/stress.md."
+            f"--system {name}={template}: must hold {{folder}} and {{out}} (docs/howto/stress.md)."
         )
 
 
 def run_external(
-    sequence: Sequence,
+    sequence: Source,
     perturbation: Perturbation,
     settings: RunSettings,
     template: str,
@@ -95,11 +94,11 @@ def run_external(
     report = report.model_copy(
         update={"loops_found": None, "loops_missed": None, "loops_wrong": None}
     )
-    (folder / "report.json").write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    (folder / "report.json").write_text(report.to_json(), encoding="utf-8")
     return report
 
 
-def export_kitti(sequence: Sequence, perturbation: Perturbation, folder: Path) -> NDArray[np.int64]:
+def export_kitti(sequence: Source, perturbation: Perturbation, folder: Path) -> NDArray[np.int64]:
     """Write the frames as the perturbation leaves them; returns which frames there are."""
     import cv2
 
@@ -107,7 +106,7 @@ def export_kitti(sequence: Sequence, perturbation: Perturbation, folder: Path) -
     kept: list[int] = []
     for name in ("image_0", "image_1"):
         (folder / name).mkdir(parents=True)
-    frames = perturbed(timed_frames(sequence), perturbation.bound_to(sequence))
+    frames = perturbed(sequence.frames(), perturbation.bound_to(sequence))
     for index, frame in enumerate(frames):
         try:
             images = frame.read(map)
@@ -123,28 +122,6 @@ def export_kitti(sequence: Sequence, perturbation: Perturbation, folder: Path) -
     (folder / "times.txt").write_text("".join(f"{t:.9e}\n" for t in times))
     (folder / "calib.txt").write_text(calibration_text(sequence.camera))
     return np.array(kept, np.int64)
-
-
-def calibration_text(camera: Camera) -> str:
-    """``calib.txt`` of KITTI, for cameras that are grey."""
-    lines = []
-    for k in range(4):
-        row = [
-            camera.fx,
-            0,
-            camera.cx,
-            -camera.bf * (k % 2),
-            0,
-            camera.fy,
-            camera.cy,
-            0,
-            0,
-            0,
-            1,
-            0,
-        ]
-        lines.append(f"P{k}: " + " ".join(f"{x:.12e}" for x in row))
-    return "\n".join(lines) + "\n"
 
 
 def _call(template: str, sequence: Path, out: Path) -> None:
@@ -172,7 +149,7 @@ def _call(template: str, sequence: Path, out: Path) -> None:
 
 
 def _outcome(
-    sequence: Sequence, settings: RunSettings, kept: NDArray[np.int64], out: Path, wall: float
+    sequence: Source, settings: RunSettings, kept: NDArray[np.int64], out: Path, wall: float
 ) -> RunOutcome:
     if not (out / "trajectory.txt").is_file():
         raise InputError(f"{settings.detector}: no trajectory.txt in {{out}}.")

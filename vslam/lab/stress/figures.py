@@ -4,23 +4,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from matplotlib import style
 from matplotlib.ticker import MaxNLocator
 
 from vslam.datasets.perturbation import law_kind
+from vslam.report import page
 from vslam.report.drawing import (
     AMBER,
     BLUE,
     GREEN,
     LOW,
     RED,
-    STYLE,
     VIOLET,
-    ReportFigure,
     add_legend,
+    draw,
     new_figure,
     plain_ticks,
-    save,
 )
 
 if TYPE_CHECKING:
@@ -37,19 +35,18 @@ _PANELS = (
 )
 
 
-def draw_curves(report: StressJson) -> list[ReportFigure]:
+def draw_curves(report: StressJson) -> list[page.Figure]:
     """A figure for each sequence and law, strongest to the right."""
     systems = list(dict.fromkeys(entry.system for entry in report.boundaries))
     colors = {name: _COLORS[k % len(_COLORS)] for k, name in enumerate(systems)}
     by: dict[tuple[str, str], list[BoundaryEntry]] = {}
     for entry in report.boundaries:
         by.setdefault((entry.sequence, entry.law), []).append(entry)
-    caption = "A line for each seed; crosses are runs that failed. Strongest to the right."
-    with style.context(STYLE, after_reset=True):
-        return [
-            save(f"{sequence}-{law}", caption, _curves(sequence, law, entries, colors))
-            for (sequence, law), entries in by.items()
-        ]
+    caption = "One line for each seed; crosses are runs that failed. The strongest is on the right."
+    return draw(
+        (f"{sequence}-{law}", caption, _curves(sequence, law, entries, colors))
+        for (sequence, law), entries in by.items()
+    )
 
 
 def _curves(

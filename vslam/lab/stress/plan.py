@@ -81,6 +81,7 @@ class Plan:
         repeated: those systems that differ from run to run: they get all seeds under every law.
         preset: ``kitti-c`` for fixed severities, or None.
         sensor: ``mono`` for the left camera alone, None for all that the data has.
+        calib: calibration files.
         baseline: the system that errors of a preset are set against.
     """
 
@@ -96,11 +97,21 @@ class Plan:
     repeated: tuple[str, ...] = ()
     preset: str | None = None
     sensor: str | None = None
+    calib: tuple[str, ...] = ()
 
     def clean_cells(self) -> list[Cell]:
         """Each system on the images as they are."""
         return [
-            Cell(self.dataset, sequence, "none", system, 0, self.max_frames, sensor=self.sensor)
+            Cell(
+                self.dataset,
+                sequence,
+                "none",
+                system,
+                0,
+                self.max_frames,
+                sensor=self.sensor,
+                calib=self.calib,
+            )
             for sequence in self.sequences
             for system in self.systems
         ]

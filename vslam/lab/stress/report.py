@@ -1,37 +1,35 @@
 """The report of a stress test: ``stress.json``, ``boundaries.csv``, ``report.md``, ``report.html``,
-``boundaries.png``."""
+``boundaries.jpg``."""
 
 from __future__ import annotations
 
-import base64
-import csv
-import io
 import statistics
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from vslam.camera import Image
+from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import law_kind, sheet_of_laws
-from vslam.datasets.sequence import Sequence
-from vslam.errors import InputError, ResultsError
+from vslam.errors import InputError
 from vslam.lab.stress.figures import draw_curves
 from vslam.lab.stress.schema import BoundaryEntry, StressJson
 from vslam.lab.stress.summary import mean_error
-from vslam.report.page import Row, Table, markdown_table, render_page
+from vslam.report.page import Bullets, Figure, Page, Row, Section, Table, number
+from vslam.report.render import csv_text, html, markdown, write_files
 
 _ABOUT = (
-    "Weakest strength that fails by bisection, median over seeds, in brackets the least and the "
-    "greatest; > where the strongest strength holds. Behind it the reason of one seed."
+    "The weakest strength at which a run fails, found by bisection: the median over seeds, with "
+    "the smallest and the largest in brackets; > means that even the strongest one holds. It is "
+    "followed by the reason of one seed."
 )
 _NOT_MONOTONE = (
-    "Bisection believes that what holds at one strength holds at all weaker ones. These failed "
-    "although a stronger one held."
+    "Bisection assumes that a system that holds at one strength holds at all weaker ones. These "
+    "runs failed although a stronger one held."
 )
 
 
-def write_report(out: Path, report: StressJson, sequences: Mapping[str, Sequence]) -> None:
+def write_report(out: Path, report: StressJson, sequences: Mapping[str, Source]) -> None:
     """Write all files of the report.
 
     Args:
@@ -43,45 +41,33 @@ def write_report(out: Path, report: StressJson, sequences: Mapping[str, Sequence
         ResultsError: a file cannot be written.
     """
     sheet = _sheet(report, sequences)
-    try:
-        (out / "stress.json").write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
-        if report.boundaries:
-            (out / "boundaries.csv").write_text(render_csv(report), encoding="utf-8")
-        (out / "report.md").write_text(render_markdown(report), encoding="utf-8")
-        if sheet is not None:
-            (out / "boundaries.png").write_bytes(_encoded(sheet, ".png"))
-        (out / "report.html").write_text(render_html(report, sheet), encoding="utf-8")
-    except OSError as error:
-        raise ResultsError(
-            f"{out}: the report cannot be written ({error.strerror}); free some space and give "
-            "the same command again: finished runs are kept."
-        ) from error
+    page = stress_page(report, draw_curves(report), sheet)
+    write_files(
+        out,
+        {
+            "stress.json": report.to_json(),
+            **({"boundaries.csv": render_csv(report)} if report.boundaries else {}),
+            **{figure.file: figure.image for figure in sheet},
+            "report.md": markdown(page),
+            "report.html": html(page),
+        },
+        "free some space and give the same command again: finished runs are kept",
+    )
 
 
 def render_csv(report: StressJson) -> str:
     """A line for each search."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     names = ("dataset", "sequence", "law", "unit", "system", "seed", "holds_to", "fails_at")
-    writer.writerow([*names, "reason", "also_failed", "runs"])
+    lines: list[list[object]] = [[*names, "reason", "also_failed", "runs"]]
     for entry in report.boundaries:
-        cells = [getattr(entry, name) for name in names]
         also = " ".join(f"{value:g}" for value in entry.also_failed)
-        writer.writerow(
-            ["" if cell is None else cell for cell in cells]
-            + [entry.reason, also, len(entry.tested)]
-        )
-    return text.getvalue()
-
-
-def tables(report: StressJson) -> list[Table]:
-    """Every table of the report."""
-    found = [*_boundaries(report), _preset(report), _not_monotone(report), _clean(report)]
-    return [table for table in (*found, _runs(report)) if table.rows]
+        cells = [getattr(entry, name) for name in names]
+        lines.append([*cells, entry.reason, also, len(entry.tested)])
+    return csv_text(lines)
 
 
 def title(report: StressJson) -> str:
-    """What the report is of, in one line."""
+    """The systems and sequences, in one line."""
     systems = list(dict.fromkeys(entry.system for entry in report.clean))
     places = list(dict.fromkeys(f"{entry.dataset} {entry.sequence}" for entry in report.clean))
     excerpt = f", {report.max_frames} frames" if report.max_frames else ""
@@ -89,38 +75,28 @@ def title(report: StressJson) -> str:
     return f"Where {does} {', '.join(systems)} break? {', '.join(places)}{excerpt}"
 
 
-def render_markdown(report: StressJson) -> str:
-    """Markdown whose tables are aligned, to be read in a terminal."""
-    lines = [f"# {title(report)}", "", report.criterion, ""]
-    for table in tables(report):
-        lines += [f"## {table.title}", "", *markdown_table(table.head, table.rows), ""]
-        lines += [table.note, ""] if table.note else []
-    if report.notes:
-        lines += ["## Notes", "", *(f"- {note}" for note in report.notes), ""]
-    return "\n".join(lines)
-
-
-def render_boundaries(report: StressJson) -> str:
-    """What the command line prints."""
-    found = [*_boundaries(report), _preset(report)]
-    return "\n".join(
-        "\n".join([table.title, "", *markdown_table(table.head, table.rows), ""])
-        for table in found
-        if table.rows
+def stress_page(
+    report: StressJson, figures: Collection[Figure] = (), sheet: Collection[Figure] = ()
+) -> Page:
+    """The page of a stress test, with its curves and its images at the boundaries."""
+    return Page(
+        title(report),
+        [report.criterion],
+        (
+            *boundary_sections(report),
+            Section("Weaker and failed", [_not_monotone(report)]),
+            Section("Images as they are", [_clean(report)]),
+            Section("Images at the boundaries", [*sheet]),
+            Section("", [*figures], wide=False),
+            Section("Notes", [Bullets(report.notes)]),
+            Section("Runs", [_runs(report)], folded=True),
+        ),
     )
 
 
-def render_html(report: StressJson, sheet: Image | None) -> str:
-    """One self-contained page."""
-    picture = None if sheet is None else base64.b64encode(_encoded(sheet, ".jpg")).decode()
-    return render_page(
-        "stress.html.jinja",
-        report=report,
-        title=title(report),
-        tables=tables(report),
-        figures=draw_curves(report),
-        sheet=picture,
-    )
+def boundary_sections(report: StressJson) -> list[Section]:
+    """Where each system fails, and the errors by corruption: what the command line prints."""
+    return [*_boundaries(report), *_preset(report)]
 
 
 def groups(report: StressJson) -> dict[tuple[str, str, str], list[BoundaryEntry]]:
@@ -145,7 +121,7 @@ def cell(entries: Collection[BoundaryEntry]) -> str:
     return f"{sign}{middle:g}{spread}" + (f", {reasons[0]}" if reasons and not sign else "")
 
 
-def _boundaries(report: StressJson) -> list[Table]:
+def _boundaries(report: StressJson) -> list[Section]:
     systems = list(dict.fromkeys(entry.system for entry in report.boundaries))
     by = groups(report)
     found = []
@@ -157,13 +133,14 @@ def _boundaries(report: StressJson) -> list[Table]:
             if any(cells):
                 rows.append((law, unit, f"{law_kind(law).strongest:g}", *cells))
         head = ("law", "unit", "strongest", *systems)
-        found.append(Table(f"Boundaries, {sequence}", head, rows, ("law", "unit"), _ABOUT))
+        table = Table(head, rows, ("law", "unit"), _ABOUT)
+        found.append(Section(f"Boundaries, {sequence}", [table]))
     return found
 
 
-def _preset(report: StressJson) -> Table:
+def _preset(report: StressJson) -> list[Section]:
     if not report.corruptions:
-        return Table("", (), [])
+        return []
     systems = list(report.corruptions[0].ate_sum_m)
     rows: list[Row] = []
     for entry in report.corruptions:
@@ -174,14 +151,16 @@ def _preset(report: StressJson) -> Table:
         rows.append((entry.sequence, entry.corruption, *cells, entry.note))
     means = [mean_error(report.corruptions, system) for system in systems]
     rows.append(("", "mean", *("" if m is None else f"{m:.0f} %" for m in means), ""))
-    return Table(
-        f"Corruption error against {report.baseline}, preset {report.preset}",
+    table = Table(
         ("sequence", "corruption", *systems, "law"),
         rows,
         ("sequence", "corruption", "law"),
-        "ATE summed over the five severities, in percent of the baseline's; in brackets the mean "
-        "share of lost frames. The mean is over corruptions that have a law and an ATE of each.",
+        "ATE summed over the five severities, in percent of the baseline's, with the mean share of "
+        "lost frames in brackets. The mean is over the corruptions that have a law and an ATE for "
+        "each system.",
     )
+    title = f"Corruption error against {report.baseline}, preset {report.preset}"
+    return [Section(title, [table])]
 
 
 def _not_monotone(report: StressJson) -> Table:
@@ -195,7 +174,7 @@ def _not_monotone(report: StressJson) -> Table:
         if entry.also_failed
     ]  # fmt: skip
     head = ("sequence", "law", "system", "seed", "also failed at", "held at")
-    return Table("Weaker and failed", head, rows, head[:3], _NOT_MONOTONE)
+    return Table(head, rows, head[:3], _NOT_MONOTONE)
 
 
 def _clean(report: StressJson) -> Table:
@@ -204,15 +183,15 @@ def _clean(report: StressJson) -> Table:
             entry.sequence,
             entry.system,
             f"{entry.lost_frames} of {entry.frames}",
-            _number(entry.ate_rmse_m),
-            _number(entry.causal_ate_rmse_m),
-            _number(entry.ate_limit_m),
+            number(entry.ate_rmse_m, "{:.3f}"),
+            number(entry.causal_ate_rmse_m, "{:.3f}"),
+            number(entry.ate_limit_m, "{:.3f}"),
             "" if entry.loops_found is None else str(entry.loops_found),
         )
         for entry in report.clean
     ]
     head = ("sequence", "system", "lost", "ATE (m)", "causal (m)", "limit (m)", "revisits found")
-    return Table("Images as they are", head, rows, head[:2])
+    return Table(head, rows, head[:2])
 
 
 def _runs(report: StressJson) -> Table:
@@ -224,8 +203,8 @@ def _runs(report: StressJson) -> Table:
             str(entry.seed),
             f"{test.strength:g}",
             "" if test.lost_percent is None else f"{test.lost_percent:.1f}",
-            _number(test.ate_rmse_m),
-            _number(test.causal_ate_rmse_m),
+            number(test.ate_rmse_m, "{:.3f}"),
+            number(test.causal_ate_rmse_m, "{:.3f}"),
             test.verdict or "held",
         )
         for entry in report.boundaries
@@ -235,14 +214,10 @@ def _runs(report: StressJson) -> Table:
         "sequence", "law", "system", "seed", "strength", "lost (%)", "ATE (m)", "causal (m)",
         "verdict",
     )  # fmt: skip
-    return Table("Runs", head, rows, (*head[:3], "verdict"), folded=True)
+    return Table(head, rows, (*head[:3], "verdict"))
 
 
-def _number(value: float | None) -> str:
-    return "n/a" if value is None else f"{value:.3f}"
-
-
-def _sheet(report: StressJson, sequences: Mapping[str, Sequence]) -> Image | None:
+def _sheet(report: StressJson, sequences: Mapping[str, Source]) -> list[Figure]:
     """A frame in the middle of the first sequence under each law, at the weakest strength at which
     the first system failed, or at the strongest of all."""
     specs: dict[str, str] = {}
@@ -252,14 +227,13 @@ def _sheet(report: StressJson, sequences: Mapping[str, Sequence]) -> Image | Non
             strength = law_kind(entry.law).strongest if entry.fails_at is None else entry.fails_at
             specs[entry.law] = f"{entry.law}:{strength:g}"
     if first is None or not specs:
-        return None
+        return []
     try:
-        return sheet_of_laws(sequences[first], list(specs.values()), len(sequences[first]) // 2, 0)
+        image = sheet_of_laws(sequences[first], list(specs.values()), len(sequences[first]) // 2, 0)
     except InputError:  # the images went away while it ran: the numbers are worth more
-        return None
-
-
-def _encoded(image: Image, suffix: str) -> bytes:
+        return []
     import cv2
 
-    return bytes(np.asarray(cv2.imencode(suffix, image)[1]).tobytes())
+    data = bytes(np.asarray(cv2.imencode(".jpg", image)[1]).tobytes())
+    caption = "For each law the image as it is, and both sides at the boundary."
+    return [Figure("boundaries", caption, data, file="boundaries.jpg")]

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+from vslam.report.document import Document, Record
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Tested(_Model):
+class Tested(Record):
     """One run at one strength; ``verdict`` says why it failed, empty if it held."""
 
     strength: float
@@ -20,7 +16,7 @@ class Tested(_Model):
     loops_closed: int | None = None
 
 
-class BoundaryEntry(_Model):
+class BoundaryEntry(Record):
     """One search: see :class:`vslam.lab.stress.search.Boundary`."""
 
     dataset: str
@@ -36,8 +32,8 @@ class BoundaryEntry(_Model):
     tested: list[Tested]
 
 
-class CleanEntry(_Model):
-    """The run of a system on the images as they are, which limits are taken from."""
+class CleanEntry(Record):
+    """The run of a system on unperturbed images, from which the limits are derived."""
 
     dataset: str
     sequence: str
@@ -50,7 +46,7 @@ class CleanEntry(_Model):
     loops_found: int | None
 
 
-class CorruptionEntry(_Model):
+class CorruptionEntry(Record):
     """One corruption of a preset: ATE summed over severities, medians over seeds, by system, and
     that in percent of the baseline's; None without a law, or without an ATE."""
 
@@ -63,7 +59,7 @@ class CorruptionEntry(_Model):
     lost_percent: dict[str, float | None]
 
 
-class StressJson(_Model):
+class StressJson(Document):
     """A stress test."""
 
     kind: str = "stress"
@@ -76,4 +72,4 @@ class StressJson(_Model):
     boundaries: list[BoundaryEntry]
     preset: str | None = None
     baseline: str | None = None
-    corruptions: list[CorruptionEntry] = []
+    corruptions: tuple[CorruptionEntry, ...] = ()

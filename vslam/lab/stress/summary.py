@@ -18,7 +18,7 @@ from vslam.report.schema import ReportJson
 def summarise(
     plan: Plan, searches: Collection[Search], reports: Reports, notes: list[str]
 ) -> StressJson:
-    """All that is known, of searches that have ended; ``notes`` are added to."""
+    """Reduce the searches that have ended to the report, and add to ``notes``."""
     clean = plan.clean_cells()
     failed = [(cell, found) for cell in clean if isinstance(found := reports(cell), str)]
     notes = [*notes, *(f"{cell.name} is left out, it fails on clean images: {why}"
@@ -42,7 +42,7 @@ def summarise(
 def clean_entries(
     cells: Collection[Cell], reports: Reports, criterion: Criterion
 ) -> list[CleanEntry]:
-    """The clean runs that there are."""
+    """The clean runs that are finished."""
     return [
         CleanEntry(
             dataset=cell.dataset,
@@ -61,7 +61,7 @@ def clean_entries(
 
 
 def boundary_entry(search: Search, reports: Reports) -> BoundaryEntry:
-    """What a search that has ended has found."""
+    """The result of a search that has ended."""
     found, kind = search.boundary, law_kind(search.law)
     return BoundaryEntry(
         dataset=search.clean.dataset,
@@ -95,7 +95,7 @@ def _tested(strength: float, verdict: str, report: ReportJson | str | None) -> T
 
 
 def lost_percent(report: ReportJson) -> float:
-    """Of the frames that came."""
+    """Lost frames in percent of those that were not dropped."""
     return 100.0 * report.lost_frames / max(1, report.frames - report.dropped_frames)
 
 
@@ -132,7 +132,7 @@ def _corruption(
                 and isinstance(report := reports(cell), ReportJson)
             ]
             known = [report.ate_rmse_m for report in found if report.ate_rmse_m is not None]
-            # Without its failed seeds a system that breaks would look better than one that holds.
+            # Without its failed seeds, a system that breaks would look better than one that holds.
             all_known = bool(known) and len(known) == len(found)
             ates.append(statistics.median(known) if all_known else None)
             losses += [lost_percent(report) for report in found]

@@ -1,0 +1,81 @@
+r"""Let every part of a run fail once, and write down what the run says and leaves.
+
+The points and the judgement are those of the tests (tests/faults.py): this tool takes all of them,
+with every fault.
+
+    python tools/experiments/lifelong/inject_faults.py --out docs/research/lifelong/faults.csv
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import random
+import shutil
+import sys
+import tempfile
+from collections.abc import Collection
+from dataclasses import astuple, fields
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads would not be in a fork
+sys.path.insert(0, str(Path(__file__).parents[3] / "tests"))
+from faults import FAULTS, POINTS, Row, inject, load_everything, run_in_fork, write_ring
+
+
+def inject_all(
+    work: Path, points: Collection[str], faults: Collection[str], seed: int, *, once: bool
+) -> list[Row]:
+    """Inject faults at each of the points that are named, and print what became of each.
+
+    Args:
+        work: an empty folder.
+        once: one of the faults at each point, drawn from the seed, instead of all.
+    """
+    load_everything()
+    rows = []
+    write_ring(root := work / "kitti")
+    words = ["run", "--data", str(root), "--quiet", "--no-record", "--no-report"]
+    code = run_in_fork([*words, "--out", str(work / "whole")], work / "log", lambda: None)
+    if code != 0:
+        sys.exit(f"the run that is not disturbed fails: {(work / 'log').read_text()}")
+    whole = (work / "whole" / "latest" / "trajectory.tum").read_bytes()
+    for point in POINTS:
+        if point.name not in points:
+            continue
+        drawn = random.Random(f"{seed} {point.function}").choice(sorted(faults))
+        for fault in [drawn] if once else faults:
+            folder = work / f"{len(rows)}"
+            folder.mkdir()
+            row = inject(root, folder, point, fault, seed, whole)
+            print(*astuple(row), sep="\t", flush=True)
+            rows.append(row)
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--points", nargs="+", default=[point.name for point in POINTS])
+    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=list(FAULTS))
+    parser.add_argument("--once", action="store_true", help="one fault a point, drawn by the seed")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="CSV table of all injections")
+    options = parser.parse_args()
+    work = Path(tempfile.mkdtemp())  # a TemporaryDirectory would go when a fork ends
+    try:
+        rows = inject_all(work, options.points, options.faults, options.seed, once=options.once)
+    finally:
+        shutil.rmtree(work)
+    if options.out is not None:
+        with options.out.open("w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file, lineterminator="\n")
+            table.writerow(field.name for field in fields(Row))
+            table.writerows(map(astuple, rows))
+    bad = [row for row in rows if row.wrong]
+    print(f"{len(rows)} injections, {len(bad)} handled badly", flush=True)
+    sys.exit(1 if bad else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,274 @@
+"""vslam and ORB-SLAM3 (pyorbslam3) as processes, what they cost and how good they are, and changed
+drives to run them over: shared by the scripts that compare them.
+
+Wall time, CPU time and peak memory are the kernel's figures for the whole process: start,
+vocabulary, files written and all. Errors come from vslam.evaluation.trajectories for both, on the
+trajectory files that they wrote.
+
+ORB-SLAM3 is run by a script that takes VOCABULARY SEQUENCE_FOLDER OUT --frames N, writes a pose a
+frame to OUT in KITTI's format and prints a JSON object with frames, fps, cpu_ms_per_frame and
+lost. A monocular run gives it ``--mono --rate 20`` (it loses its way when images come faster than
+its mapping), and it writes its keyframes in TUM's format: its ATE is that of its keyframes alone.
+Loops are found, missed and wrong by the ground truth for vslam (vslam.evaluation.loops); of
+ORB-SLAM3 only the closed ones are known: ``loops`` of that object, or the lines that ORB-SLAM3
+prints for them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+VSLAM = str(Path(sys.executable).with_name("vslam"))
+PACKAGE = "pyorbslam3"
+LOOP_MESSAGE = "*Loop detected"  # printed once for each loop that it closes
+
+
+class Case(NamedTuple):
+    """Frames to run on: ``frames`` of a sequence in KITTI's format, from the first one."""
+
+    title: str
+    data: Path
+    seq: str
+    frames: int
+
+
+class OrbSlam3(NamedTuple):
+    """The interpreter that has pyorbslam3, the script that runs it, and its vocabulary."""
+
+    python: Path
+    script: Path
+    vocabulary: Path
+
+
+class Process(NamedTuple):
+    """A process that has ended: its output and the kernel's account of it and its children;
+    ``held`` is the memory it held at times since its start, as (s, MB)."""
+
+    output: str
+    wall_s: float
+    cpu_s: float
+    memory_mb: float
+    held: list[tuple[float, float]]
+
+
+class Run(NamedTuple):
+    """One run: what the system reports of itself (``frames``, ``fps`` and ``cpu_ms_per_frame`` of
+    the frame loop, and more), its lost frames, its loops closed, missed and wrong (None where it
+    does not say), and its trajectory, in KITTI's format or, with times, in TUM's."""
+
+    process: Process
+    report: dict[str, Any]
+    lost: int
+    loops: tuple[int | None, int | None, int | None]
+    trajectory: str
+
+
+def measure(command: list[str], folder: Path) -> Process:
+    """Run a command to its end and account for it. Nothing heavy may be imported before: the
+    peak memory of a child starts at that of its parent."""
+    log = folder / "output.txt"
+    # Modules are compiled once, as when pip installs them.
+    environment = {key: os.environ[key] for key in os.environ if key != "PYTHONDONTWRITEBYTECODE"}
+    start = time.perf_counter()
+    with log.open("wb") as output:
+        child = subprocess.Popen(
+            command, cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT
+        )
+        ended, held = threading.Event(), []
+        watch = threading.Thread(target=sample_memory, args=(child.pid, ended, start, held))
+        watch.start()
+        try:
+            _, status, usage = os.wait4(child.pid, 0)
+            wall = time.perf_counter() - start
+        finally:  # Ctrl-C, too
+            ended.set()
+            watch.join()
+        child.returncode = os.waitstatus_to_exitcode(status)
+    text = log.read_text(errors="replace")
+    if child.returncode:
+        sys.exit(f"{text}\n{' '.join(command)}: exit code {child.returncode}")
+    return Process(text, wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, held)
+
+
+def sample_memory(
+    pid: int, ended: threading.Event, start: float, held: list[tuple[float, float]]
+) -> None:
+    """Note twice a second what a process holds."""
+    while not ended.wait(0.5):
+        with suppress(OSError):
+            status = Path(f"/proc/{pid}/status").read_text()
+            kilobytes = [line.split()[1] for line in status.splitlines() if "VmRSS" in line]
+            held += [(time.perf_counter() - start, int(kb) / 1024) for kb in kilobytes]
+
+
+def run_vslam(case: Case, folder: Path, *words: str) -> Run:
+    """Run vslam, with more ``words`` on its command line."""
+    command = [VSLAM, "run", "--data", str(case.data), "--seq", case.seq, "--no-record", "--quiet"]
+    command += ["--max-frames", str(case.frames), "--out", "runs"]
+    process = measure([*command, *words], folder)
+    results = folder / "runs" / "latest"
+    report = json.loads((results / "report.json").read_text())
+    trajectory = (results / "trajectory_kitti.txt").read_text()
+    loops = report["loops_closed"], report["loops_missed"], report["loops_wrong"]
+    return Run(process, report, report["lost_frames"], loops, trajectory)
+
+
+def run_orbslam3(case: Case, system: OrbSlam3, folder: Path, sensor: str = "stereo") -> Run:
+    command = [str(system.python), str(system.script), str(system.vocabulary)]
+    command += [str(case.data / "sequences" / case.seq), "out.txt", "--frames", str(case.frames)]
+    command += ["--mono", "--rate", "20"] if sensor == "mono" else []
+    process = measure(command, folder)
+    said = next(line for line in reversed(process.output.splitlines()) if line.startswith("{"))
+    report = json.loads(said)
+    loops = report.get("loops", process.output.count(LOOP_MESSAGE))
+    trajectory = (folder / "out.txt").read_text()
+    return Run(process, report, report["lost"], (loops, None, None), trajectory)
+
+
+def figures(run: Run, case: Case, sensor: str = "stereo") -> dict[str, float]:
+    """Every measure of one run; NaN where it has no value, as t_rel on a path below 100 m."""
+    from vslam.datasets import open_sequence
+    from vslam.errors import InputError
+    from vslam.evaluation.trajectories import evaluate_trajectory
+    from vslam.trajectory import Trajectory, read_trajectory
+
+    process, frames = run.process, run.report["frames"]
+    found = {
+        "process_fps": frames / process.wall_s,
+        "loop_fps": run.report["fps"],
+        "process_cpu_ms": 1e3 * process.cpu_s / frames,
+        "loop_cpu_ms": run.report["cpu_ms_per_frame"],
+        "memory_mb": process.memory_mb,
+        "lost": float(run.lost),
+    }
+    nan = float("nan")
+    for name, count in zip(("closed", "missed", "wrong"), run.loops, strict=True):
+        found[f"loops_{name}"] = nan if count is None else float(count)
+    found |= dict.fromkeys(("ate_m", "rpe_m", "t_rel"), nan)
+    sequence = open_sequence("kitti", case.data, case.seq, max_frames=case.frames)
+    if sequence.ground_truth is None:
+        return found
+    with tempfile.NamedTemporaryFile("w") as file:
+        file.write(run.trajectory)
+        file.flush()
+        try:
+            estimate = read_trajectory(Path(file.name), sequence.timestamps)
+        except InputError:  # too few poses: which belongs to which frame is not known
+            return found
+    truth = Trajectory(sequence.timestamps, sequence.ground_truth)
+    if sensor == "mono":  # without a unit, and of ORB-SLAM3 keyframes alone
+        return found | {"ate_m": evaluate_trajectory(estimate, truth, "sim3").ate_rmse_m}
+    errors = evaluate_trajectory(estimate, truth)
+    t_rel = errors.t_rel_percent
+    found |= {"ate_m": errors.ate_rmse_m, "rpe_m": errors.rpe_m}
+    return found | {"t_rel": nan if t_rel is None else t_rel}
+
+
+def spread(values: list[float], form: str) -> str:
+    """Median (least - greatest), the median alone where they are the same as printed."""
+    low, high = format(min(values), form), format(max(values), form)
+    median = format(statistics.median(values), form)
+    return median if low == high else f"{median} ({low} - {high})"
+
+
+def setting(report: dict[str, Any], system: OrbSlam3 | None, repeats: int) -> str:
+    """Machine, versions and the number of runs, as one paragraph, from a report of vslam."""
+    ask = f"from importlib.metadata import version; print(version('{PACKAGE}'))"
+    version = ""
+    if system is not None:
+        said = subprocess.run([system.python, "-c", ask], capture_output=True, text=True)
+        version = f"; {PACKAGE} {said.stdout.strip() or '(version unknown)'}"
+    machine = report["machine"]
+    ours = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
+    return (
+        f"Median (least - greatest) of {repeats} runs each, alternating, "
+        f"{time.strftime('%Y-%m-%d')}. "
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. {ours}{version}."
+    )
+
+
+@contextmanager
+def changed_drive(
+    source: Path, name: str, frames: Sequence[int], law: str, black: Collection[int] = ()
+) -> Iterator[Path]:
+    """A KITTI tree, in a temporary folder, with some ``frames`` of the sequence ``name`` of the
+    tree ``source``, perturbed by a ``law`` of ``vslam run --perturb`` with seed 0, or ``black``."""
+    import cv2
+    import numpy as np
+
+    from vslam.datasets import open_sequence
+    from vslam.datasets.perturbation import parse_perturbation
+
+    sequence = open_sequence("kitti", source, name)
+    perturbation = parse_perturbation(law, 0).bound_to(sequence)
+    with tempfile.TemporaryDirectory(prefix="vslam-drive-") as scratch:
+        root = Path(scratch)
+        folder = root / "sequences" / name
+        sides = [folder / "image_0", folder / "image_1"]
+        for made in (*sides, root / "poses"):
+            made.mkdir(parents=True)
+        calibration = source / "sequences" / name / "calib.txt"
+        (folder / "calib.txt").write_bytes(calibration.read_bytes())
+        for file in (Path("sequences", name, "times.txt"), Path("poses", f"{name}.txt")):
+            lines = (source / file).read_text().splitlines()
+            (root / file).write_text("".join(f"{lines[k]}\n" for k in frames))
+
+        def write(number: int) -> None:
+            k = frames[number]
+            t = float(sequence.timestamps[k] - sequence.timestamps[0])
+            images = perturbation.apply(k, t, *sequence.read(k))
+            for side, image in zip(sides, images, strict=True):
+                image = np.zeros_like(image) if k in black else image
+                path = side / f"{number:06d}.png"
+                cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(write, range(len(frames))))
+        yield root
+
+
+def run_over(
+    data: Path, name: str, system: OrbSlam3 | None, *words: str, sensor: str = "stereo"
+) -> tuple[Run, dict[str, float]]:
+    """Run ORB-SLAM3, or vslam with more ``words`` for None, over all frames of a drive."""
+    case = Case(name, data, name, len(list((data / "sequences" / name / "image_0").iterdir())))
+    with tempfile.TemporaryDirectory(prefix="vslam-table-") as scratch:
+        folder = Path(scratch)
+        if system is None:
+            run = run_vslam(case, folder, "--sensor", sensor, *words)
+        else:
+            run = run_orbslam3(case, system, folder, sensor)
+        return run, figures(run, case, sensor)
+
+
+def add_orbslam3_options(parser: argparse.ArgumentParser) -> None:
+    """Where ORB-SLAM3 is; without these it is left out."""
+    for name in ("orbslam3-python", "orbslam3-script", "vocabulary"):
+        # Runs have working folders of their own. A link to the interpreter is what makes an
+        # environment: it is not followed.
+        parser.add_argument(f"--{name}", type=lambda text: Path(text).absolute())
+
+
+def orbslam3_of(options: argparse.Namespace) -> OrbSlam3 | None:
+    """What :func:`add_orbslam3_options` was given; None without any of it."""
+    given = (options.orbslam3_python, options.orbslam3_script, options.vocabulary)
+    if not any(given):
+        return None
+    if missing := [path for path in given if path is None or not path.exists()]:
+        sys.exit(
+            f"ORB-SLAM3 needs --orbslam3-python, --orbslam3-script and --vocabulary: {missing[0]}"
+        )
+    return OrbSlam3(*given)

@@ -1,0 +1,287 @@
+"""Sources of frames: what a reader opens, and what a run takes its images from.
+
+Every source hands out its frames in the order of their times. Images in files can also be read in
+any order; a video, a bag or a camera cannot seek. Readers return a `RawSource` if the images need
+to be rectified (`vslam.datasets.rectified`), and a `Source` if they do not.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from collections.abc import Sequence as Several
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import islice
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Camera, DepthImage, Image, ImageMap
+from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
+
+Images = tuple[Image, Image | DepthImage | None]
+Size = tuple[int, int]
+
+_log = logging.getLogger(__name__)
+
+_FIRST_FRAMES = 120  # some seconds; a pair of 752x480 takes 0.7 MB
+
+
+@dataclass(frozen=True)
+class TimedFrame:
+    """A frame that is yet to be decoded.
+
+    Attributes:
+        timestamp: seconds.
+        read: decodes the left and the second image; safe to call in any thread. The left one is
+            ``(H, W)`` uint8. The second one is the right image, likewise; or the depth of the left
+            image's pixels, ``(H, W)`` float32 metres, 0 where unknown; or None (monocular). Its
+            argument decides how the images are decoded, both at once for example. Raises
+            UnreadableImageError if a file is damaged or not of the calibration's size.
+        file: the left image's file, if its pixels need no rectification; else None.
+        colour: decodes the left image as it was taken, ``(H, W, 3)`` uint8 red, green, blue, or
+            ``(H, W)`` if it is grey; None for a source without colours. Raises as ``read``.
+    """
+
+    timestamp: float
+    read: Callable[[ImageMap], Images]
+    file: Path | None = None
+    colour: Callable[[], NDArray[np.uint8]] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Frames:
+    """See `Source`."""
+
+    dataset: str
+    name: str
+    stored: tuple[TimedFrame, ...] = ()
+    play: Callable[[], Iterator[TimedFrame]] | None = None
+    n_expected: int | None = None
+    live: bool = False
+    ground_truth: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.seekable:
+            return
+        object.__setattr__(self, "n_expected", len(self.stored))
+        times = self.timestamps
+        if not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+            raise InputError(f"{self.name}: the times of its frames do not increase; repair them.")
+        if self.ground_truth is not None and self.ground_truth.shape != (len(times), 4, 4):
+            raise ValueError(f"ground_truth must be of shape ({len(times)}, 4, 4)")
+
+    @property
+    def seekable(self) -> bool:
+        """Whether the frames are stored and can be read in any order."""
+        return self.play is None
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """All frames in order, from the first one on at every call, unless the source is live.
+
+        No images are held in memory but those of the frame that is handed out.
+
+        Raises:
+            BrokenSourceError: after the last good frame of a file cut off or a device unplugged.
+            InputError: the stream ends before the first selected frame.
+        """
+        return iter(self.stored) if self.play is None else self.play()
+
+    @cached_property
+    def timestamps(self) -> NDArray[np.float64]:
+        """``(N,)`` float64 seconds, strictly increasing.
+
+        Raises:
+            TypeError: the source cannot seek.
+        """
+        return np.array([frame.timestamp for frame in self._stored()], np.float64)
+
+    def __len__(self) -> int:
+        return len(self._stored())
+
+    def read(self, index: int, image_map: ImageMap = map) -> Images:
+        """Left and second image of one frame; see `TimedFrame`.
+
+        Raises:
+            UnreadableImageError: a file is damaged or not of the calibration's size.
+            TypeError: the source cannot seek.
+        """
+        return self._stored()[index].read(image_map)
+
+    def _stored(self) -> tuple[TimedFrame, ...]:
+        if not self.seekable:
+            raise TypeError(f"{self.name}: the frames of a stream come one by one, in order")
+        return self.stored
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Source(_Frames):
+    """Rectified stereo images, left images alone, or images with depth.
+
+    Attributes:
+        dataset: kind of source, ``kitti`` or ``video`` for example.
+        name: name of the sequence, file or device.
+        camera: calibration; ``camera.sensor`` tells what the frames hold.
+        stored: N frames that can be read in any order; see `stored_frames`.
+        play: yields the frames of a stream, which cannot seek; None if they are stored.
+        n_expected: the number of frames, approximate for a stream, or None if unknown.
+        live: frames come at their own times and do not wait: a camera, not a file.
+        ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose, or None.
+
+    Raises:
+        InputError: the times of stored frames do not increase.
+        ValueError: the ground truth has another shape.
+    """
+
+    camera: Camera
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RawSource(_Frames):
+    """Images as the cameras took them; see `Source` for the other attributes.
+
+    Attributes:
+        sizes: width and height of each camera's images; only the first camera's if the second
+            images are its depth.
+        depth: whether the second images are the depth of the first ones' pixels.
+        ground_truth: poses of the left camera before rectification.
+    """
+
+    sizes: tuple[Size, ...]
+    depth: bool = False
+
+
+_AnySource = TypeVar("_AnySource", Source, RawSource)
+
+
+def stored_frames(
+    timestamps: NDArray[np.float64],
+    read: Callable[[int, ImageMap], Images],
+    files: Several[Path] | None = None,
+    colour: Callable[[Path], NDArray[np.uint8]] | None = None,
+) -> tuple[TimedFrame, ...]:
+    """Frames that one function reads by their index.
+
+    Args:
+        timestamps: ``(N,)`` float64 seconds, increasing.
+        read: decodes the frame of an index, see `TimedFrame`.
+        files: of the left images.
+        colour: decodes one of these, see `TimedFrame`.
+    """
+    frames = [TimedFrame(time, partial(read, k)) for k, time in enumerate(timestamps.tolist())]
+    if files is None:
+        return tuple(frames)
+    return tuple(
+        replace(frame, file=file, colour=None if colour is None else partial(colour, file))
+        for frame, file in zip(frames, files, strict=True)
+    )
+
+
+def selected(
+    source: _AnySource, *, start: int = 0, every: int = 1, max_frames: int | None = None
+) -> _AnySource:
+    """Every N-th frame of a source from a first one on, with increasing times.
+
+    Raises:
+        InputError: options out of range, or a start beyond the last frame.
+    """
+    if start < 0 or every < 1 or (max_frames is not None and max_frames < 1):
+        raise InputError("--start must be at least 0, --every and --max-frames at least 1.")
+    whole = source.n_expected
+    if whole is not None and start >= whole:
+        about = "" if source.seekable else "about "
+        raise InputError(
+            f"--start {start}: {source.name} has {about}{whole} frames; choose a smaller one."
+        )
+    chosen = slice(start, None if max_frames is None else start + every * max_frames, every)
+    if source.seekable:
+        truth = source.ground_truth
+        truth = None if truth is None else truth[chosen]
+        return replace(source, stored=source.stored[chosen], ground_truth=truth)
+    n = max_frames if whole is None else len(range(*chosen.indices(whole)))
+    return replace(source, n_expected=n, play=partial(_play_selected, source, chosen))
+
+
+def _play_selected(source: Source | RawSource, chosen: slice) -> Iterator[TimedFrame]:
+    frame = None
+    frames = _increasing(source.frames(), source.name)
+    for frame in islice(frames, chosen.start, chosen.stop, chosen.step):
+        yield frame
+    if frame is None:
+        raise InputError(
+            f"--start {chosen.start}: {source.name} has no frame there; choose a smaller one."
+        )
+
+
+def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]:
+    """Leave out frames that are not later than the one before them, with a warning each."""
+    last = None
+    for frame in frames:
+        if last is not None and frame.timestamp <= last:
+            _log.warning(
+                "%s: a frame of %.6f s is left out, it comes after one of %.6f s",
+                name,
+                frame.timestamp,
+                last,
+            )
+            continue
+        last = frame.timestamp
+        yield frame
+
+
+def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:
+    """Some frames of a source; a stream is played as far as the last of them.
+
+    Fewer frames come from a source that ends before.
+
+    Args:
+        indices: of the frames, increasing.
+    """
+    if source.seekable:
+        yield from (source.stored[k] for k in indices if k < len(source))
+        return
+    wanted = set(indices)
+    played = islice(source.frames(), max(wanted, default=-1) + 1)
+    yield from (frame for k, frame in enumerate(played) if k in wanted)
+
+
+def first_frames(source: Source) -> Source:
+    """The first frames of a stream in memory, where they can be read in any order; a source that
+    can seek is returned as it is.
+
+    A frame that cannot be decoded raises its UnreadableImageError whenever it is read.
+
+    Raises:
+        InputError: there is no frame.
+    """
+    if source.seekable:
+        return source
+    frames = []
+    problem = "there are no frames in it"
+    try:
+        for frame in islice(source.frames(), _FIRST_FRAMES):
+            frames.append(_held(frame))
+    except BrokenSourceError as error:
+        problem = str(error).rstrip(".")
+    if not frames:
+        raise InputError(f"{source.name}: {problem}; name another source.")
+    return replace(source, stored=tuple(frames), play=None, live=False)
+
+
+def _held(frame: TimedFrame) -> TimedFrame:
+    """A frame decoded now, or the error that decoding it raised."""
+    images: Images | UnreadableImageError
+    try:
+        images = frame.read(map)
+    except UnreadableImageError as error:
+        images = error
+
+    def read(image_map: ImageMap) -> Images:
+        if isinstance(images, UnreadableImageError):
+            raise images
+        return images
+
+    return replace(frame, read=read)

@@ -1,0 +1,81 @@
+"""Precision against recall: a figure for each set of images, and one for all drives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from vslam.lab.loopbench.schema import Curve, DecisionCurve, LoopsJson
+from vslam.report import page
+from vslam.report.drawing import AMBER, BLUE, GREEN, GREY, INK, RED, VIOLET, Drawing, draw
+
+_COLORS = [GREY, BLUE, VIOLET, AMBER, GREEN, RED]
+_DASHES = ["-", "--", ":"]  # of the first six detectors, of the next six, of the rest
+_VERIFIED = {"nothing": "-", "both": ":"}
+
+# Panel, curve, entry of the legend or nothing, colour and dashes.
+Line = tuple[str, Curve | DecisionCurve, str, str, str]
+
+
+def draw_curves(report: LoopsJson) -> list[page.Figure]:
+    """Draw all that there is data for; each figure has a panel for each condition or drive."""
+    return draw(_drawings(report))
+
+
+def _drawings(report: LoopsJson) -> Iterator[Drawing]:
+    if online := report.online:
+        drives, names = _in_order(s.data for s in online), _in_order(s.detector for s in online)
+        caption = (
+            "Precision and recall over images, along the decision threshold, a panel for each "
+            "drive; dotted: decisions verified by ORB or learned descriptors."
+        )
+        lines: Iterable[Line] = (
+            (score.data, score.curve, score.detector if score.verified_by == "nothing" else "",
+             _COLORS[names.index(score.detector) % len(_COLORS)], _VERIFIED[score.verified_by])
+            for score in online
+            if score.verified_by in _VERIFIED
+        )  # fmt: skip
+        yield "online", caption, _panels("", drives, lines, min(2, len(drives)))
+    names = _in_order(score.detector for score in report.cells)
+    for number, data in enumerate(_in_order(score.data for score in report.cells)):
+        scores = [score for score in report.cells if score.data == data]
+        conditions = _in_order(score.condition for score in scores)
+        columns = 2 if len(conditions) == 4 else min(3, len(conditions))
+        caption = (
+            f"Precision against recall on {data}, descriptors alone; a panel for each condition."
+        )
+        lines = []
+        for score in scores:
+            dash, color = divmod(names.index(score.detector), len(_COLORS))
+            look = _COLORS[color], _DASHES[dash % len(_DASHES)]
+            lines.append((score.condition, score.curve, score.detector, *look))
+        yield f"precision_recall_{number}", caption, _panels(data, conditions, lines, columns)
+
+
+def _panels(title: str, names: list[str], lines: Iterable[Line], columns: int) -> Figure:
+    rows = -(-len(names) // columns)
+    figure = Figure(figsize=(6.6, 0.7 + 2.1 * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    if title:
+        figure.suptitle(title, x=0.01, ha="left", color=INK)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for axes in grid.flat[len(names) :]:
+        axes.set_axis_off()
+    panels = dict(zip(names, grid.flat, strict=False))
+    for name, axes in panels.items():
+        axes.set_title(name, fontsize=9, color=INK)
+        axes.set(xlim=(0, 1), ylim=(0, 1.02))
+    for name, curve, label, color, dashes in lines:
+        panels[name].plot(curve.recall, curve.precision, dashes, color=color, label=label)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)))
+    for axes in grid[-1, : (len(names) - 1) % columns + 1]:
+        axes.set_xlabel("recall", fontsize=9.5)
+    figure.supylabel("precision", fontsize=9.5)
+    return figure
+
+
+def _in_order(names: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(names))

@@ -1,0 +1,255 @@
+"""The page of one run: the numbers of ``report.json``, lost frames first."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from html import escape
+
+from vslam.evaluation.loops import LoopLimits
+from vslam.loopclosure.registry import about
+from vslam.report.detector_table import detector_section
+from vslam.report.loop_tables import loop_sections
+from vslam.report.page import (
+    Alert,
+    Bullets,
+    Code,
+    Figure,
+    Markup,
+    Page,
+    Pairs,
+    Part,
+    Row,
+    Section,
+    Table,
+    Tile,
+    Tiles,
+)
+from vslam.report.schema import ReportJson
+from vslam.report.seen_loops import seen_note
+
+_ALIGNMENTS = {
+    "se3": "SE3 alignment, no scale",
+    "sim3": "Sim3 alignment",
+    "none": "not aligned",
+}
+_MANY_LOST = 0.1  # share of the frames
+
+
+def headlines(report: ReportJson) -> list[Tile]:
+    """The summary. Lost frames come first: the ATE of a run that was lost half of the time says
+    little."""
+    lost, mono = report.lost_frames, report.sensor == "mono"
+    share = f"{100.0 * lost / report.frames:.1f} % of" if lost else "of"
+    alignment = _ALIGNMENTS[report.alignment] if report.alignment else ""
+    spread = ""
+    if report.ate_mean_m is not None:
+        largest = _number(report.ate_max_m, "m")
+        spread = f"mean {_number(report.ate_mean_m, 'm')}, maximum {largest}"
+    evaluated = "; ".join(filter(None, (alignment, spread, report.evaluation_remark)))
+    rotation = _number(report.rpe_deg, "°")
+    return [
+        Tile(
+            "Lost frames",
+            str(lost),
+            f"{share} {report.frames}; {report.weak_frames} weak, {report.skipped_frames} skipped",
+            "bad" if lost else "good",
+        ),
+        *_in_map(report),
+        *([Tile("Scale", "arbitrary", "as of any single camera")] if mono else []),
+        Tile("ATE RMSE", _number(report.ate_rmse_m, "m"), evaluated),
+        Tile(
+            "Causal ATE", _number(report.causal_ate_rmse_m, "m"), "poses as estimated at the time"
+        ),
+        Tile("RPE", _number(report.rpe_m, "m"), f"per frame; rotation {rotation}"),
+        Tile("t_rel", _number(report.t_rel_percent, "%"), "KITTI drift over 100-800 m"),
+        Tile("r_rel", _number(report.r_rel_deg_per_100m, "°"), "per 100 m"),
+        Tile(
+            "Speed",
+            f"{report.fps:.1f} fps",
+            f"{report.threads} thread{'s' * (report.threads != 1)}{_together(report)}",
+        ),
+        *_latency(report),
+        Tile(
+            "CPU",
+            f"{report.cpu_ms_per_frame:.1f} ms",
+            f"per frame, of all threads{_together(report)}; start-up {report.startup_s:.1f} s",
+        ),
+        Tile("Memory", f"{report.peak_memory_mb:.0f} MB", f"at its peak{_together(report)}"),
+        Tile("Map", f"{report.landmarks:,}", _map_note(report)),
+        _loops(report),
+    ]
+
+
+def _together(report: ReportJson) -> str:
+    """A remark on speed and memory where several detectors were run."""
+    return f", all {len(report.detectors)} detectors together" if report.detectors else ""
+
+
+def advice(report: ReportJson) -> str:
+    """What to do after a run that lost many frames; empty after others."""
+    if report.lost_frames <= _MANY_LOST * report.frames:
+        return ""
+    return "Many frames were lost: vslam doctor checks images, calibration and time stamps."
+
+
+def _in_map(report: ReportJson) -> list[Tile]:
+    if (found := report.in_map) is None:
+        return []
+    fix = "no fix" if found.first_fix_s is None else f"first fix after {found.first_fix_s:.2f} s"
+    times = f"found at {found.found} of {found.sought} attempts"
+    error = _number(found.error_m, "m")
+    weak = f", {found.weak_percent:.1f} % by few inliers" if found.weak_percent else ""
+    note = f"of the frames{weak}; {fix}, {times}"
+    return [
+        Tile("In the map", f"{found.in_map_percent:.1f} %", note),
+        Tile("Error in the map", error, "RMSE of these frames, with the map's own alignment"),
+    ]
+
+
+def _latency(report: ReportJson) -> list[Tile]:
+    """In a real-time run, dropped frames are a fault of the machine: they colour the tile."""
+    if report.latency_ms is None:
+        return []
+    ms, dropped = report.latency_ms, report.dropped_frames
+    note = f"median from image to pose; p95 {ms.p95:.0f}, p99 {ms.p99:.0f}; {dropped} dropped"
+    return [Tile("Latency", f"{ms.median:.0f} ms", note, "bad" if dropped else "good")]
+
+
+def _map_note(report: ReportJson) -> str:
+    submaps = f", {report.submaps} sub-maps" if report.submaps > 1 else ""
+    return f"landmarks, {report.keyframes:,} keyframes{submaps}"
+
+
+def _loops(report: ReportJson) -> Tile:
+    notes = []
+    if report.revisit_stretches is not None:
+        notes += [
+            _revisits(report),
+            f"{report.loops_missed} missed",
+            f"{report.loops_wrong} wrong",
+        ]
+    if report.detector == "none":
+        return Tile("Loops", "off", "no detector; " + ", ".join(notes[:1]) if notes else "")
+    notes.append(f"{report.loops_rejected} candidates rejected")
+    tone = "bad" if report.loops_wrong else ""
+    return Tile("Loops", f"{report.loops_closed} closed", ", ".join(notes), tone)
+
+
+def _revisits(report: ReportJson) -> str:
+    """How many stretches were found again. A right loop on a stretch that is too short to count is
+    mentioned."""
+    if report.revisit_stretches:
+        return f"{report.loops_found} of {report.revisit_stretches} revisits found"
+    none = f"no revisit of {LoopLimits().min_length_m:.0f} m or more to be found"
+    right = sum(loop.accepted and loop.right is True for loop in report.loops)
+    return f"{none} ({right} right on shorter ones)" if right else none
+
+
+def run_page(
+    report: ReportJson,
+    figures: Collection[Figure] = (),
+    seen: Collection[Figure] = (),
+    recordings: Collection[str] = (),
+    explorer: Collection[Section] = (),
+    config: str = "",
+) -> Page:
+    """The page of a run.
+
+    Args:
+        report: the numbers.
+        figures: drawn by :func:`vslam.report.figures.draw_figures`.
+        seen: pictures of closed loops, of :func:`vslam.report.seen_loops.seen_loops`.
+        recordings: names of those beside the page.
+        explorer: of :func:`vslam.report.explorer.explorer`.
+        config: text of ``config.json``, which the HTML page shows as it is.
+    """
+    interrupted = f"Interrupted: {report.interrupted}."
+    alerts = [Alert(interrupted, f"The numbers are of the {report.frames} frames done.")]
+    if not report.interrupted:
+        alerts = []
+    alerts += [Alert(f"Warning: {warning}") for warning in report.warnings]
+    alerts += [Alert("", advice(report))] if advice(report) else []
+    stages = Table(("stage", "mean", "median", "p95", "p99"), stage_rows(report), ("stage",))
+    pictures: list[Part] = [seen_note(report, seen), *seen] if seen else []
+    replay = Code("\n".join(f"rerun {name}" for name in recordings))
+    evo = Code(report.evo_command or "")
+    return Page(
+        f"{report.dataset} {report.sequence}",
+        (
+            f"vslam {report.versions.get('vslam', '')}",
+            report.sensor,
+            f"detector {report.detector} ({about(report.detector)})",
+            f"perturb {report.perturb}",
+            f"seed {report.seed}",
+            f"{report.created:%Y-%m-%d %H:%M %Z}",
+        ),
+        (
+            Section("", (*alerts, Tiles(headlines(report)))),
+            detector_section(report),
+            Section("Loops seen", pictures),
+            Section(
+                f"Skipped frames: {report.skipped_frames}",
+                [Bullets(report.skipped_messages)],
+                folded=True,
+            ),
+            *explorer,
+            Section("", [*figures], wide=False),
+            Section("Time per stage (ms)", [stages], wide=False),
+            *loop_sections(report),
+            Section(
+                "Reproduce the ATE",
+                ["From the folder that vslam was run in:", evo] if report.evo_command else [],
+                wide=False,
+            ),
+            Section(
+                "Replay",
+                ["In the folder of this report:", replay] if recordings else [],
+                wide=False,
+            ),
+            Section("Run", [Pairs(option_rows(report))], wide=False),
+            Section("Machine", [Pairs(machine_rows(report))], wide=False),
+            Section("Configuration", [Markup(f"<pre>{escape(config)}</pre>")], folded=True),
+        ),
+    )
+
+
+def stage_rows(report: ReportJson) -> list[Row]:
+    """Stage, mean, median, 95th and 99th percentile in milliseconds."""
+    return [
+        (name, f"{ms.mean:.2f}", f"{ms.median:.2f}", f"{ms.p95:.2f}", f"{ms.p99:.2f}")
+        for name, ms in report.stage_ms.items()
+    ]
+
+
+def option_rows(report: ReportJson) -> list[tuple[str, str]]:
+    """The options of the run, as they would be typed."""
+    names = ("dataset", "sequence", "perturb", "detector", "sensor", "seed", "threads", "start")
+    options = [(name, str(getattr(report, name))) for name in (*names, "every")]
+    limit = "all" if report.max_frames is None else str(report.max_frames)
+    weights = [("weights", str(report.weights))] if report.weights else []
+    if report.local_weights:
+        weights += [("local-weights", str(report.local_weights))]
+    realtime = [("realtime", "yes")] if report.realtime else []
+    compare = [("compare", ", ".join(report.compare))] if report.compare else []
+    calib = [("calib", str(path)) for path in report.calib]
+    return [*options, ("max-frames", limit), *weights, *realtime, *calib, *compare]
+
+
+def machine_rows(report: ReportJson) -> list[tuple[str, str]]:
+    """Where and with what the run was made."""
+    machine = report.machine
+    packages = {name: text for name, text in report.versions.items() if name != "python"}
+    return [
+        ("CPU", f"{machine.cpu}, {machine.cores} cores"),
+        ("platform", machine.platform),
+        ("Python", machine.python),
+        ("packages", ", ".join(f"{name} {text}" for name, text in packages.items())),
+        ("created", f"{report.created:%Y-%m-%d %H:%M:%S %Z}"),
+    ]
+
+
+def _number(value: float | None, unit: str) -> str:
+    if value is None:
+        return "n/a"
+    decimals = 1 if value >= 100 else 2 if value >= 10 else 3 if value >= 0.1 else 4
+    return f"{value:.{decimals}f}{unit if unit == '°' else ' ' + unit}"

@@ -265,9 +265,8 @@ def test_a_full_disk_is_told_once_and_the_run_goes_on(
         outcome = drive(kitti_tree, tmp_path)
     assert outcome.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
     told = [record.message for record in caplog.records]
-    assert told == [
-        f"{tmp_path / MAP}: cannot be written (No space left on device); the run continues without it."
-    ]
+    reason = "cannot be written (No space left on device); the run continues without it."
+    assert told == [f"{tmp_path / MAP}: {reason}"]
 
 
 def some_progress() -> Progress:

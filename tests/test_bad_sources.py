@@ -92,7 +92,7 @@ def test_a_useless_camera_info_is_not_read_where_there_is_a_calibration(
 def test_a_stream_that_ends_before_its_first_frame(folder, side_by_side, realtime):
     whole = open_from("video", folder / "pair.mkv", side_by_side)
     source = selected(replace(whole, n_expected=None), start=FRAMES)
-    with pytest.raises(InputError, match=f"--start {FRAMES}: pair has no frame there"):
+    with pytest.raises(InputError, match=f"--start {FRAMES}: pair has no such frame"):
         run_source(source, realtime=realtime)
 
 
@@ -180,7 +180,7 @@ def test_videos(folder, tmp_path, side_by_side):
     refused("--side-by-side .* or run with --sensor mono", "video", path, SourceOptions())
     refused("no such file", "video", tmp_path / "none.mp4", side_by_side)
     (tmp_path / "text.mp4").write_text("this is no video")
-    refused("codec that FFmpeg in OpenCV does not know", "video", tmp_path / "text.mp4",
+    refused("in a codec unknown to OpenCV", "video", tmp_path / "text.mp4",
             side_by_side)  # fmt: skip
 
 

@@ -167,7 +167,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--data .", ["the folder is empty", "--data"]),
         ("nowhere", ["nowhere", "no such file or folder", "--data"]),
         ("nowhere --data .", ["nowhere: --data says what to read, too"]),
-        ("--data ..", ["no data set that is known", "sequences", "mav0", "rgb.txt"]),
+        ("--data ..", ["no known data set", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
         ("--dataset kitti --topics /a,/b", ["--topics", "only for --dataset bag"]),

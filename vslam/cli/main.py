@@ -45,7 +45,13 @@ _GROUPS: tuple[ModuleType, ...] = (
 
 
 class _Command(TyperCommand):
-    """A command that says of a misspelt choice which one may be meant."""
+    """A command with our own help, which suggests a name for a misspelt choice."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """See ``TyperCommand.format_help``."""
+        from vslam.cli.help import show_help
+
+        show_help(self, ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """See ``TyperCommand.parse_args``."""

@@ -44,7 +44,7 @@ def show_help(command: Any, context: Any) -> None:
         table.add_column(width=width, style="bold cyan", no_wrap=True)
         table.add_column(overflow="fold")
         for parameter in parameters:
-            table.add_row(_name(parameter), _described(parameter))
+            table.add_row(Text(_name(parameter)), _described(parameter))
         console.print(Panel(table, title=title, title_align="left", border_style="dim"))
     if command.epilog:
         console.print(Padding(Text.from_markup(command.epilog.strip()), (1, 1)))

@@ -53,7 +53,8 @@ def show_help(command: Any, context: Any) -> None:
 def _name(parameter: Any) -> str:
     """``--record/--no-record``, ``--map FILE`` or ``RUN``."""
     if parameter.param_type_name == "argument":
-        return str(parameter.metavar or parameter.name.upper())
+        name = parameter.metavar or parameter.name.upper()
+        return f"{name}..." if parameter.nargs != 1 else str(name)
     names = "/".join((*parameter.opts, *parameter.secondary_opts))
     return f"{names} {parameter.metavar}" if parameter.metavar else names
 

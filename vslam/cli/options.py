@@ -97,6 +97,16 @@ Threads = Annotated[
         rich_help_panel=EXECUTION,
     ),
 ]
+AllThreads = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="Threads; they do not change the result.",
+        show_default="all cores",
+        rich_help_panel=EXECUTION,
+    ),
+]
 ThreadsOfRun = Annotated[
     int | None,
     typer.Option(

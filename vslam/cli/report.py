@@ -26,7 +26,7 @@ def register(app: typer.Typer) -> None:
 def report(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="FOLDER...", help="Folders of runs, at any depth."),
+        typer.Argument(metavar="FOLDER", help="Folders of runs, at any depth."),
     ],
     trajectory: Annotated[
         list[str] | None,

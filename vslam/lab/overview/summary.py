@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from itertools import combinations
 from typing import NamedTuple
 
-from vslam.errors import InputError
+from vslam.errors import InputError, did_you_mean
 from vslam.lab.overview.collect import MONOCULAR, Found
 from vslam.lab.overview.schema import (
     ALL,
@@ -61,7 +61,10 @@ def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
     """
     names = systems(found.runs, baseline)
     if baseline not in (None, names[0].removesuffix(MONOCULAR)):
-        raise InputError(f"--baseline {baseline}: no run of it; choose from {', '.join(names)}.")
+        meant = did_you_mean(baseline, names)
+        raise InputError(
+            f"--baseline {baseline}: no run of it{meant}; choose from {', '.join(names)}."
+        )
     rows = make_rows(found.runs)
     laws = list(dict.fromkeys(row.drive.perturb for row in rows))
     compared: list[Comparison] = []

@@ -63,7 +63,8 @@ def evaluate_files(
     else:
         rows.append(("t_rel", f"{evaluation.t_rel_percent:.3f} %"))
         rows.append(("r_rel", f"{evaluation.r_rel_deg_per_100m:.3f} deg/100 m"))
-    # evo compares files of one format only.
-    if (format_ := trajectory_format(gt)) == trajectory_format(estimate):
+    # evo compares files of one format, and no straight lines.
+    format_ = trajectory_format(gt)
+    if format_ == trajectory_format(estimate) and not evaluation.on_one_line:
         rows.append(("reproduce", evo_command(estimate, gt, align, format_)))
     print_rows(rows)

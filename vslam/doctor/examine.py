@@ -68,7 +68,8 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
             f"{len(frames) - len(problems)} of {len(frames)} examined frames can be read"
             + "".join(f"; {problem.rstrip('.')}" for problem in problems[:1]),
             "replace the damaged files",
-        )
+        ),
+        checks.check_calibration(sequence.camera),
     ]
     lefts = {frame: left for frame, (left, _) in read.items()}
     if lefts:

@@ -356,7 +356,9 @@ def test_the_command_turns_bad_input_into_a_finding(kitti_tree, tmp_path):
     assert done.exit_code == 1
     assert "made for 640x480 pixels but the images have 480x160" in done.output
     assert "fix: take the calibration of these images" in done.output
-    assert "made for 640x480" in page.read_text()
+    text = page.read_text()
+    banner = text.index('role="alert"')
+    assert banner < text.index("made for 640x480") < text.index("Fix: take the calibration")
 
 
 @pytest.mark.slow

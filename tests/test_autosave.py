@@ -266,7 +266,8 @@ def test_a_full_disk_is_told_once_and_the_run_goes_on(
     assert outcome.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
     told = [record.message for record in caplog.records]
     assert told == [
-        f"{tmp_path / MAP}: cannot be written (No space left on device); the run goes on without."
+        f"{tmp_path / MAP}: cannot be written (No space left on device); "
+        "the run continues without it."
     ]
 
 
@@ -406,7 +407,8 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
 def test_a_resumed_run_writes_to_no_place_that_its_folder_names(kitti_tree, tmp_path):
     options = {"data": str(kitti_tree), "save_map": str(tmp_path / "elsewhere.npz")}
     (tmp_path / "run.json").write_text(json.dumps(options))
-    with pytest.raises(InputError, match=r"run\.json: damaged, or of another version; run again"):
+    refused = r"run\.json: damaged or from another version; start a new run"
+    with pytest.raises(InputError, match=refused):
         read_options(tmp_path)
 
 

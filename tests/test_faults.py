@@ -33,6 +33,7 @@ CORE = ("vslam.frontend.tracker.", "vslam.modes.", "vslam.mapping.", "vslam.shar
         "vslam.closing.", "vslam.loopclosure.verification.", "ring.")  # fmt: skip
 
 
+@pytest.mark.slow
 def test_what_fails_in_a_run_costs_itself_alone(tmp_path):
     """In a process of its own, which forks: this one may have threads."""
     table = tmp_path / "faults.csv"

@@ -270,6 +270,7 @@ def test_flat_images_keep_their_height():
         CapsuleShape(middle=0.9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "network",
     [small_network(**WIDE), lite_network(), small_network(**WIDE, half_angle=30.0, middle=0.9)],

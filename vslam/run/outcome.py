@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vslam.config import Config
 from vslam.datasets.frames import Source
-from vslam.features import TrackResult
+from vslam.features import TrackingState, TrackResult
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.map import Map
 from vslam.maps.stored_map import StoredMap, World
@@ -71,7 +71,7 @@ class RunOutcome:
         peak_memory_mb: peak memory of the process.
         n_landmarks, n_keyframes: size of the final map.
         map: the final map; None for a trajectory from another system or after mapping failed.
-        world: geographic position of the map that the run continued, if known.
+        world: place of the continued map in the world of a ground truth, if known.
         in_map: ``(N,)`` bool, frames localised at the end in the map that the run continued; None
             for a run that started a new map.
         stored: the map with all data needed to continue it; None if the run only localised in it.
@@ -110,6 +110,12 @@ class RunOutcome:
     interrupted: str | None = None
     step_s: float = 0.0
     compared: tuple[RunOutcome, ...] = ()
+
+    @property
+    def n_tracked(self) -> int:
+        """The number of frames whose pose was found in their images."""
+        found = (TrackingState.OK, TrackingState.WEAK)
+        return sum(track.state in found for track in self.tracks)
 
 
 def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:

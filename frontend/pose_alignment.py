@@ -20,7 +20,7 @@ from vslam.kernels import inner_kernel, kernel
 WINDOW = 4  # pixels along each side
 PIXELS = WINDOW * WINDOW
 ITERATIONS = 10
-MIN_WINDOWS = 20
+MIN_WINDOWS, MAX_WINDOWS = 20, 256
 MIN_CORRELATION = 0.6  # of all windows with the image; lower where the motion was not found
 STILL = 0.02  # pixels of the level; a smaller turn ends the iteration
 STILL_M = 0.005  # and a smaller shift, in the unit of the map
@@ -84,7 +84,8 @@ def align_pose(
     Returns:
         ``(4, 4)`` pose ``T_cw``: the predicted one if the windows do not agree with the image.
     """
-    points = np.ascontiguousarray(xyz @ T_before[:3, :3].T + T_before[:3, 3])
+    every = -(-len(xyz) // MAX_WINDOWS) or 1
+    points = np.ascontiguousarray(xyz[::every] @ T_before[:3, :3].T + T_before[:3, 3])
     T, correlation = T_cw @ inverse(T_before), 0.0
     for level, (height, width) in enumerate(now.shapes.tolist()):
         T, correlation = _align(
@@ -116,10 +117,12 @@ def _align(image, before, points, T_start, intrinsics, wide, high):
     n = len(points)
     template = np.empty((n, PIXELS), np.float32)
     jacobian = np.empty((n, PIXELS, 6), np.float32)
+    hessian = np.empty((n, 6, 6), np.float32)
     used = np.empty(n, np.int64)
     m = 0
     for i in range(n):
         if _draw_template(before, points[i], intrinsics, wide, high, template[m], jacobian[m]):
+            _square(jacobian[m], hessian[m])
             used[m] = i
             m += 1
     T = T_start.copy()
@@ -142,7 +145,7 @@ def _align(image, before, points, T_start, intrinsics, wide, high):
             return T_start, 0.0
         contrast = product / energy
         correlation = product / np.sqrt(energy * square)
-        step = _step(seen, template, jacobian, error, m, contrast)
+        step = _step(seen, template, jacobian, hessian, error, m, contrast)
         T = compose(T, se3_exp(-step))
         turn = max(abs(step[3]), abs(step[4]), abs(step[5])) * intrinsics[0] / wide
         if turn < STILL and max(abs(step[0]), abs(step[1]), abs(step[2])) < STILL_M:
@@ -236,7 +239,18 @@ def _read_window(image, T, p, intrinsics, wide, high, seen):
 
 
 @inner_kernel
-def _step(seen, template, jacobian, error, m, contrast):
+def _square(jacobian, hessian):
+    """Normal matrix of one window, its lower half."""
+    for j in range(6):
+        for t in range(j + 1):
+            total = np.float32(0.0)
+            for k in range(PIXELS):
+                total += jacobian[k, j] * jacobian[k, t]
+            hessian[j, t] = total
+
+
+@inner_kernel
+def _step(seen, template, jacobian, hessian, error, m, contrast):
     """``(6,)`` motion of the windows that explains what is seen; ``error`` is negative for windows
     outside the image."""
     inside = 0
@@ -258,13 +272,13 @@ def _step(seen, template, jacobian, error, m, contrast):
         if error[i] < 0.0:
             continue
         weight = 1.0 if error[i] <= limit else limit / error[i]
-        for k in range(PIXELS):
-            difference = weight * (scale * seen[i, k] - template[i, k])
-            for j in range(6):
-                b[j] += jacobian[i, k, j] * difference
-                part = weight * jacobian[i, k, j]
-                for t in range(j + 1):
-                    H[j, t] += part * jacobian[i, k, t]
+        for j in range(6):
+            product = np.float32(0.0)
+            for k in range(PIXELS):
+                product += jacobian[i, k, j] * (scale * seen[i, k] - template[i, k])
+            b[j] += weight * product
+            for t in range(j + 1):
+                H[j, t] += weight * hessian[i, j, t]
     for j in range(6):
         H[j, j] *= 1.0 + 1e-6
         for t in range(j):

@@ -84,7 +84,7 @@ def test_both_cameras_at_once_are_prepared_to_the_same_bytes(kitti_tree, monocul
         for frame in islice(perturbed(sequence.frames(), law), 3):
             one = prepare_frame(frame, context)
             other = prepare_frame(frame, context, at_once)
-            assert one.image.tobytes() == other.image.tobytes()
+            assert one.images.image.tobytes() == other.images.image.tobytes()
             pixels = [prepared.images.extracted.pyramid.pixels for prepared in (one, other)]
             assert np.array_equal(*pixels)
             rows = [prepared.images.extracted.row_offset for prepared in (one, other)]

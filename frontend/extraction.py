@@ -57,7 +57,7 @@ class FrameImages:
         """``(H, W)`` uint8 that the features are extracted from."""
         if self.extracted.side == Side.LEFT:
             return self.left
-        return np.asarray(self._second, np.uint8)
+        return np.array(self._second, np.uint8)  # a copy: the right image is the caller's
 
 
 def extract_features(

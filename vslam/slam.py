@@ -185,7 +185,6 @@ class Slam:
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         check_images(left, second, self.context.camera)
-        second = None if second is None else np.array(second)
         return self.step_images(FrameImages(np.array(left), second, self.context), timestamp)
 
     def step_images(

@@ -363,7 +363,7 @@ def test_bench_counts_failures_and_ends_with_1(bench, stub: Path):
     code, out, err = bench()
     assert code == 1
     assert "failed: kitti-00-brightness1-bow-seed1: images of the moon" in err
-    assert "5 of 6 cells finished, 1 failed; the same command continues" in out
+    assert "5 of 6 cells finished, 1 failed; repeat the command to continue" in out
     (stub / "fail-00-brightness:1-bow-1").unlink()
     assert bench()[0] == 0
     assert len(started(stub)) == 7

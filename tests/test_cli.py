@@ -630,7 +630,7 @@ def test_info(call, root):
         assert package in out
     code, out, _ = call("info", "--data", "nowhere")
     assert code == 0
-    assert "nowhere: no KITTI odometry data" in out
+    assert "nowhere: holds no KITTI odometry data" in out
 
 
 def test_two_opencv_wheels_are_noticed():

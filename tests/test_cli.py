@@ -453,7 +453,7 @@ def with_detector(pipeline) -> SimpleNamespace:
 def test_summary_counts_loops(call, root, with_detector):
     code, out, err = call("run", "--data", root, "--max-frames", 10, "--detector", "bow")
     assert code == 0, err
-    assert re.search("Loops +1 closed .* 0 missed, 0 wrong, 2 candidates rejected\n", out)
+    assert re.search("Loops +1 closed .* no revisit .*, 0 wrong, 2 candidates rejected\n", out)
     assert re.search("Map +99 +landmarks, .* 2 sub-maps", out)
     assert "detector bow (the bag of words)" in out
     assert "detectors together" not in out

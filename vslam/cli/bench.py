@@ -39,8 +39,8 @@ _UNKNOWN_LENGTH = 1000  # frames of a stream of unknown length, to estimate the 
 _FIRST_SEQUENCES = "00-05"
 _EXAMPLES = """
 [b]Examples[/b]
-  vslam bench                        KITTI 00-05 in $KITTI_ROOT
-  vslam bench --dataset synthetic    the same routes through rendered towns
+  vslam bench                        (KITTI 00-05 in $KITTI_ROOT)
+  vslam bench --dataset synthetic    (the same routes in rendered towns)
   vslam bench --seqs 00,05-07 --perturb brightness:1.5+blur:0.5 --jobs 4
   vslam bench --dataset synthetic --seqs demo --detectors bow,capsule,both
   vslam bench --data drive.mp4 --side-by-side --calib stereo.yaml --seeds 1

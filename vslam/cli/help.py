@@ -41,8 +41,8 @@ def show_help(command: Any, context: Any) -> None:
             panels.setdefault(title, []).append((_name(parameter), _described(parameter)))
     for name, one in getattr(command, "commands", {}).items():
         if not one.hidden:
-            about = " ".join(one.help.split("\n\n")[0].split())
-            panels.setdefault("Commands", []).append((name, Text.from_markup(about)))
+            summary = " ".join(one.help.split("\n\n")[0].split())
+            panels.setdefault("Commands", []).append((name, Text.from_markup(summary)))
     width = max((len(name) for rows in panels.values() for name, _ in rows), default=0)
     for title, rows in panels.items():
         table = Table.grid(padding=(0, 2))

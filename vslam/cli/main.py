@@ -95,9 +95,9 @@ def application(groups: Collection[ModuleType]) -> typer.Typer:
     )
     for group in groups:
         group.register(made)
-    for group in made.registered_groups:
-        group.cls = _Group
-    for commands in (made, *(group.typer_instance for group in made.registered_groups)):
+    for several in made.registered_groups:
+        several.cls = _Group
+    for commands in (made, *(several.typer_instance for several in made.registered_groups)):
         for command in commands.registered_commands if commands else ():
             command.cls = _Command
     made.callback(invoke_without_command=True)(version)

@@ -558,7 +558,7 @@ _PROBE = """<!doctype html><link rel="icon" href="data:,"><body>
 const page = document.getElementById("page");
 page.onload = () => {
   const inner = page.contentDocument;
-  const boxes = [...inner.querySelectorAll("figure svg")].map(x => x.getBoundingClientRect());
+  const boxes = [...inner.querySelectorAll("figure")].map(x => x.getBoundingClientRect());
   document.getElementById("found").textContent = "FOUND" + JSON.stringify({
     shown: inner.documentElement.clientWidth,
     needed: inner.documentElement.scrollWidth,

@@ -549,7 +549,7 @@ FIGURES = {
 def test_html_has_every_figure_and_loads_nothing(written):
     html = (written[1] / "report.html").read_text()
     assert set(re.findall('<figure class="card ([^"]*)"', html)) == FIGURES
-    assert html.count("<table>") == 6
+    assert html.count("<table>") == 7
     assert not re.search("<(script|iframe|object|embed|img)", html)
 
 

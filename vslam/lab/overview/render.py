@@ -31,8 +31,8 @@ _TESTED = (
     "Better, worse, same: sequences on which the first system named has smaller, larger or equal "
     "errors. p is that of Wilcoxon's signed-rank test on sequences, each with the median of its "
     "runs, because runs of one sequence are not independent. Over all conditions a sequence counts "
-    f"once, with the mean of its medians. Two-sided, level {ALPHA:g}, not corrected for the number of tests. "
-    "Comparisons in which all sequences tie are left out."
+    f"once, with the mean of its medians. Two-sided, level {ALPHA:g}, not corrected for the "
+    "number of tests. Comparisons in which all sequences tie are left out."
 )
 
 

@@ -335,7 +335,7 @@ def test_the_command_looks_at_the_beginning_of_a_video(corridor, tmp_path, monke
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        ("--sensor rgbd", "--sensor rgbd: 00 is of sensor stereo"),
+        ("--sensor rgbd", "--sensor rgbd: 00 has the sensor stereo"),
         ("--depth-scale 9", "--depth-scale: only for --dataset tum or images or bag, not kitti"),
         ("--dataset images --seq 00", "--seq 00: only for data sets, not images"),
     ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import subprocess
 import sys
 from contextlib import suppress
@@ -31,6 +32,17 @@ SOME = [  # of each kind; the tool takes all of them
 ]
 CORE = ("vslam.frontend.tracker.", "vslam.modes.", "vslam.mapping.", "vslam.shared_map.",
         "vslam.closing.", "vslam.loopclosure.verification.", "ring.")  # fmt: skip
+
+
+def test_every_point_names_a_function_that_exists():
+    for point in POINTS:
+        module, _, name = point.function.rpartition(".")
+        try:
+            owner = importlib.import_module(module)
+        except ModuleNotFoundError:  # a method
+            module, _, owner_name = module.rpartition(".")
+            owner = getattr(importlib.import_module(module), owner_name)
+        assert callable(getattr(owner, name)), point.name
 
 
 @pytest.mark.slow

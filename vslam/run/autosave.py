@@ -55,7 +55,7 @@ def lock_run(folder: Path) -> Iterator[None]:
     """
     with ExitStack() as lock:
         with suppress(OSError):
-            lock.enter_context(locked(folder / LOCK, folder, "runs here still"))
+            lock.enter_context(locked(folder / LOCK, folder, "is still running here"))
         yield
 
 

@@ -81,8 +81,8 @@ def write_options(folder: Path, options: RunOptions) -> None:
         (folder / OPTIONS).write_text(text + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(
-            f"{folder / OPTIONS}: cannot be written ({error.strerror}); name a writable folder with "
-            "free space with --out."
+            f"{folder / OPTIONS}: cannot be written ({error.strerror}); use --out to name a folder "
+            "on a disk with free space."
         ) from error
 
 

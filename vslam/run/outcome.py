@@ -71,7 +71,7 @@ class RunOutcome:
         peak_memory_mb: peak memory of the process.
         n_landmarks, n_keyframes: size of the final map.
         map: the final map; None for a trajectory from another system or after mapping failed.
-        world: geographic position of the map that the run continued, if known.
+        world: place of the continued map in the world of a ground truth, if known.
         in_map: ``(N,)`` bool, frames localised at the end in the map that the run continued; None
             for a run that started a new map.
         stored: the map with all data needed to continue it; None if the run only localised in it.

@@ -239,7 +239,7 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
 
 
 def compile_recognition() -> None:
-    """Compile loop detection, verification and relocalisation; a keyframe meets itself."""
+    """Compile detection, verification and relocalisation by comparing a keyframe with itself."""
     config = Config()
     map_, features = map_synthetic(1)
     verify(map_, LoopCandidate(0, 0, 1.0), CAMERA, config.verification)

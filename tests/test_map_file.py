@@ -304,7 +304,7 @@ def test_foreign_files_are_refused(tmp_path):
 
 def test_other_schemas_are_named(file, tmp_path):
     newer = as_header(header_of(file) | {"schema": 8})
-    assert "schema 8, this version reads 6" in refusal(
+    assert "schema 8, this version reads 7" in refusal(
         changed(file, tmp_path / "n.npz", header=newer)
     )
     old = tmp_path / "old.npz"

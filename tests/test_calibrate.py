@@ -227,7 +227,7 @@ def test_doubtful_calibration_is_judged_in_plain_words():
     fit = fit_camera(CHECKERBOARD, same, (384, 288), "pinhole")
     result = Calibrated(CHECKERBOARD, Calibration(fit.model), (fit,), None, (3, 3))
     faults = {f.check: f.measured for f in findings_of(result) if f.verdict == "fault"}
-    assert faults["views"] == "3 views are too few"
+    assert faults["views"] == "3 views, too few"
     assert faults["tilt"] == "2 views are tilted by more than 15 degrees"
     assert faults["coverage"].startswith("corners in ")
 

@@ -27,6 +27,7 @@ _FEWEST_TAGS = 4
 _TAGS = "APRILTAG_36h11"
 _BORDERS = (2, 1)  # bits of black around a tag: Kalibr prints 2, most other programs 1
 _FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "ARUCO_ORIGINAL", _TAGS)
+_SEARCHED_PX = 960  # longer side of the image that a checkerboard is searched in
 _REACH_PX = (2, 6)  # of the refinement, to each side
 
 
@@ -152,13 +153,17 @@ def same_order(board: Board, left: Corners, right: Corners) -> Corners:
 def _checkerboard_finder(board: Board) -> Finder:
     import cv2
 
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
-
     def find(image: Image) -> Corners | None:
-        found, xy = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=flags)
+        times = max(1.0, max(image.shape) / _SEARCHED_PX)
+        if times > 1.0:
+            image = cv2.resize(image, None, None, 1 / times, 1 / times, cv2.INTER_AREA)
+        found, xy = cv2.findChessboardCornersSB(
+            image, (board.columns, board.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE
+        )
         if not found:
             return None
-        return Corners(np.arange(len(xy)), np.asarray(xy, np.float64).reshape(-1, 2))
+        whole = (xy.reshape(-1, 2).astype(np.float64) + 0.5) * times - 0.5
+        return Corners(np.arange(len(xy)), whole)
 
     return find
 
@@ -166,14 +171,13 @@ def _checkerboard_finder(board: Board) -> Finder:
 def _charuco(board: Board) -> Any:
     import cv2
 
-    size = (board.columns, board.rows)
-    try:
-        markers = _dictionary(board.dictionary)
-        return cv2.aruco.CharucoBoard(size, board.square, board.marker, markers)
-    except cv2.error as error:
+    size, markers = (board.columns, board.rows), _dictionary(board.dictionary)
+    if len(markers.bytesList) < board.columns * board.rows // 2:
         raise InputError(
-            f"--dictionary {board.dictionary}: too few markers for a {board}; name a larger one."
-        ) from error
+            f"--dictionary {board.dictionary}: too few markers for {size[0]}x{size[1]} squares; "
+            "name a larger one."
+        )
+    return cv2.aruco.CharucoBoard(size, board.square, board.marker, markers)
 
 
 def _charuco_finder(board: Board) -> Finder:
@@ -184,23 +188,18 @@ def _charuco_finder(board: Board) -> Finder:
         layout = _charuco(board)
         layout.setLegacyPattern(legacy)
         detectors.append(cv2.aruco.CharucoDetector(layout))
+    points = board_points(board)
 
     def find(image: Image) -> Corners | None:
         for detector in detectors[: 1 + (board.rows % 2 == 0)]:
             xy, ids, _, _ = detector.detectBoard(image)
             if ids is not None and len(ids) >= _FEWEST_CORNERS:
-                corners = Corners(ids.ravel().astype(np.int64), xy.reshape(-1, 2).astype(float))
-                if not _in_a_row(board, corners):
-                    return corners
+                ids = ids.ravel().astype(np.int64)
+                if np.ptp(points[ids, :2], axis=0).all():  # corners in a row fix no pose
+                    return Corners(ids, xy.reshape(-1, 2).astype(np.float64))
         return None
 
     return find
-
-
-def _in_a_row(board: Board, corners: Corners) -> bool:
-    """Whether all corners lie on one line, which fixes no pose."""
-    points = board_points(board)[corners.ids]
-    return bool(np.linalg.matrix_rank(points - points[0], tol=1e-9) < 2)
 
 
 def _aprilgrid_finder(board: Board) -> Finder:
@@ -300,18 +299,15 @@ def seen_instead(board: Board, images: Iterable[Image]) -> str:
         columns, rows = sizes.most_common(1)[0][0]
         return f"a board of {columns}x{rows} inner corners is seen: give --size {columns}x{rows}"
     wanted = _TAGS if board.kind == "aprilgrid" else board.dictionary
-    family = wanted.rpartition("_")[0]
     seen: Counter[str] = Counter()
-    highest = 0
     for image in images:
-        for name in (wanted, *(name for name in _FAMILIES if name.rpartition("_")[0] != family)):
+        for name in _FAMILIES:
             ids = cv2.aruco.ArucoDetector(_dictionary(name)).detectMarkers(image)[1]
-            if ids is not None and len(ids) >= _FEWEST_TAGS:
-                seen[name] += len(ids)
-                highest = max(highest, int(ids.max())) if name == wanted else highest
-    if not seen:
+            seen[name] += 0 if ids is None else len(ids)
+    name, n = seen.most_common(1)[0]
+    if n < _FEWEST_TAGS:
         return ""
-    name = seen.most_common(1)[0][0]
-    if name != wanted:
-        return f"markers of {name} are seen: give --dictionary {name}"
-    return f"its markers are seen, up to number {highest}: check --size, --square and --marker"
+    if name.rpartition("_")[0] == wanted.rpartition("_")[0]:
+        return "its markers are seen: check --size, --square and --marker"
+    of_board = "aprilgrid" if name == _TAGS else f"charuco --dictionary {name}"
+    return f"markers of {name} are seen: give --board {of_board}"

@@ -23,9 +23,10 @@ _TILT, _FEW_TILTED = 15.0, 3  # degrees; a board that is never tilted fixes no f
 _CELLS = (8, 6)  # of the image, across and down
 _COVERED = 0.6  # share of the cells; corners hardly reach the outermost pixels
 _LARGE_PX = 1.0  # RMS; half a pixel is usual for a video
+_APART_PX = 2.0  # RMS, between the cameras
 _BENT = 2.0  # residuals in the outer half of the corners over those in the inner half
 _MOST_DROPPED = 0.25
-_ARROW = 60.0  # times which residuals are drawn
+_ARROW = 0.02  # of the image width: length of an arrow of the RMS error
 
 
 @dataclass(frozen=True)
@@ -49,21 +50,14 @@ class Calibrated:
 
 def findings_of(result: Calibrated) -> list[Finding]:
     """The verdicts, for each camera and then for the pair."""
-    found = []
-    for side, fit in _sides(result):
-        found += [
-            _views(side, fit), _tilt(side, fit), _coverage(side, fit), _residuals(side, fit),
-            _lens(side, fit),
-        ]  # fmt: skip
+    found = [finding for side, fit in _sides(result) for finding in _camera(side, fit)]
     if result.pair is not None:
         n, error = len(result.pair.names), _total(result.pair.errors)
+        fix = "trigger both cameras together, or hold the board still"
         found += [
-            _dropped("pairs", n, result.pair.dropped, f"{n} pairs, {error:.2f} px RMS"),
-            judge(
-                "synchronisation", error > 2 * _LARGE_PX, f"{error:.2f} px between the cameras",
-                "trigger both cameras together, or hold the board still",
-            ),
-        ]  # fmt: skip
+            _kept("pairs", n, result.pair.dropped),
+            judge("synchronisation", error > _APART_PX, f"{error:.2f} px between the cameras", fix),
+        ]
     try:
         rectify(result.calibration)
     except InputError as error:
@@ -85,8 +79,16 @@ def write_page(result: Calibrated, findings: Sequence[Finding], text: str, path:
     for side, fit in _sides(result):
         m = fit.model
         tiles += [
-            Tile(f"{side}focal length", f"{m.fx:.2f}, {m.fy:.2f} px", f"{m.width}x{m.height}"),
-            Tile(f"{side}error", f"{_total(fit.errors):.3f} px", f"RMS of {len(fit.views)} views"),
+            Tile(
+                f"{side}focal length".capitalize(),
+                f"{m.fx:.2f}, {m.fy:.2f} px",
+                f"{m.width}x{m.height}",
+            ),
+            Tile(
+                f"{side}error".capitalize(),
+                f"{_total(fit.errors):.3f} px",
+                f"RMS of {len(fit.views)} views",
+            ),
         ]
     if result.calibration.T_left_right is not None:
         baseline = float(np.linalg.norm(result.calibration.T_left_right[:3, 3]))
@@ -99,7 +101,7 @@ def write_page(result: Calibrated, findings: Sequence[Finding], text: str, path:
         [
             Section("", [Tiles(tiles)]),
             Section("Verdicts", [Table(head, rows, head)]),
-            Section("", draw(_drawings(result))),
+            Section("", draw(_drawings(result)), wide=False),
             Section("Calibration file", [Code(text)]),
         ],
     )
@@ -115,72 +117,63 @@ def _total(errors: Array) -> float:
     return float(np.sqrt((errors**2).mean()))
 
 
-def _dropped(check: str, n: int, dropped: Sequence[tuple[str, float]], measured: str) -> Finding:
+def _camera(side: str, fit: CameraFit) -> list[Finding]:
+    m, n, error = fit.model, len(fit.views), _total(fit.errors)
+    views = _kept(f"{side}views", n, fit.dropped)
+    if n < _FEW_VIEWS:
+        fix = f"film the board in at least {_FEW_VIEWS} different places and directions"
+        views = Finding(views.check, "fault", f"{views.measured}, too few", fix)
+    cosines = np.abs(fit.T_camera_board[:, 2, 2]).clip(0.0, 1.0)
+    tilted = int((np.degrees(np.arccos(cosines)) > _TILT).sum())
+    xy = np.concatenate([view.corners.xy for view in fit.views])
+    share, emptiest = _coverage(xy / (m.width, m.height))
+    # Of a model that does not fit, residuals grow towards the border.
+    residuals, far = np.concatenate(fit.residuals), np.linalg.norm(xy - (m.cx, m.cy), axis=1)
+    outer = far > np.median(far)
+    ratio = rms(residuals[outer]) / rms(residuals[~outer])
+    other = "pinhole" if m.lens == "fisheye" else "fisheye"
+    return [
+        views,
+        judge(
+            f"{side}tilt", tilted < _FEW_TILTED,
+            f"{tilted} views are tilted by more than {_TILT:.0f} degrees",
+            "tilt the board: without that, focal length and distance cannot be told apart",
+        ),
+        judge(
+            f"{side}coverage", share < _COVERED, f"corners in {share:.0%} of the image",
+            f"film the board everywhere, above all at the {emptiest} of the image",
+        ),
+        judge(
+            f"{side}residuals", error > _LARGE_PX, f"{error:.3f} px RMS",
+            "check that the board is flat, sharp and still, and its columns and rows",
+        ),
+        judge(
+            f"{side}lens", ratio > _BENT,
+            f"{m.lens}; residuals in the outer half are {ratio:.1f} times those in the inner half",
+            f"try --lens {other}",
+        ),
+    ]  # fmt: skip
+
+
+def _kept(check: str, n: int, dropped: Sequence[tuple[str, float]]) -> Finding:
+    measured = f"{n} {check.split()[-1]}"
     if dropped:
         named = ", ".join(f"{name} ({error:.1f} px)" for name, error in dropped)
         measured += f"; dropped because they do not fit: {named}"
-    return judge(
-        check, len(dropped) > _MOST_DROPPED * (n + len(dropped)), measured,
-        "keep the board flat and still, and film it in good light",
-    )  # fmt: skip
+    fix = "keep the board flat and still, and film it in good light"
+    return judge(check, len(dropped) > _MOST_DROPPED * (n + len(dropped)), measured, fix)
 
 
-def _views(side: str, fit: CameraFit) -> Finding:
-    n = len(fit.views)
-    if n < _FEW_VIEWS:
-        fix = f"film the board in at least {_FEW_VIEWS} different places and directions"
-        return Finding(f"{side}views", "fault", f"{n} views are too few", fix)
-    return _dropped(f"{side}views", n, fit.dropped, f"{n} views")
+def _coverage(at: Array) -> tuple[float, str]:
+    """The share of the image that corners cover, and where they cover least.
 
-
-def _tilt(side: str, fit: CameraFit) -> Finding:
-    cosine = np.abs(fit.T_camera_board[:, 2, 2])
-    n = int((np.degrees(np.arccos(cosine.clip(0, 1))) > _TILT).sum())
-    return judge(
-        f"{side}tilt", n < _FEW_TILTED, f"{n} views are tilted by more than {_TILT:.0f} degrees",
-        "tilt the board: without that, focal length and distance cannot be told apart",
-    )  # fmt: skip
-
-
-def _coverage(side: str, fit: CameraFit) -> Finding:
-    size = (fit.model.width, fit.model.height)
+    Args:
+        at: ``(N, 2)``, from 0 to 1.
+    """
     cells = np.zeros(_CELLS, bool)
-    at = (np.concatenate([view.corners.xy for view in fit.views]) / size * _CELLS).astype(int)
-    cells[tuple(at.clip(0, np.subtract(_CELLS, 1)).T)] = True
-    share = cells.mean()
-    thirds = [np.array_split(part, 3, axis=1) for part in np.array_split(cells, 3, axis=0)]
-    shares = {
-        f"{row} {column}".replace("middle middle", "middle"): thirds[x][y].mean()
-        for x, column in enumerate(("left", "middle", "right"))
-        for y, row in enumerate(("upper", "middle", "lower"))
-    }
-    return judge(
-        f"{side}coverage", share < _COVERED, f"corners in {share:.0%} of the image",
-        f"film the board everywhere, above all {min(shares, key=shares.__getitem__)}",
-    )  # fmt: skip
-
-
-def _residuals(side: str, fit: CameraFit) -> Finding:
-    error = _total(fit.errors)
-    return judge(
-        f"{side}residuals", error > _LARGE_PX, f"{error:.3f} px RMS",
-        "check that the board is flat, sharp and still, and that its columns and rows are right",
-    )  # fmt: skip
-
-
-def _lens(side: str, fit: CameraFit) -> Finding:
-    """Whether the residuals grow towards the border, as those of a model that does not fit do."""
-    m = fit.model
-    xy = np.concatenate([view.corners.xy for view in fit.views])
-    far = np.linalg.norm(xy - (m.cx, m.cy), axis=1)
-    residuals = np.concatenate(fit.residuals)
-    outer = far > np.median(far)
-    ratio = rms(residuals[outer]) / max(rms(residuals[~outer]), 1e-9)
-    other = "pinhole" if m.lens == "fisheye" else "fisheye"
-    return judge(
-        f"{side}lens", ratio > _BENT, f"{m.lens}; residuals outside are {ratio:.1f} times those "
-        "inside", f"try --lens {other}",
-    )  # fmt: skip
+    cells[tuple((at * _CELLS).astype(int).clip(0, np.subtract(_CELLS, 1)).T)] = True
+    parts = {"left": cells[:2], "right": cells[-2:], "top": cells[:, :2], "bottom": cells[:, -2:]}
+    return float(cells.mean()), min(parts, key=lambda name: float(parts[name].mean()))
 
 
 def _drawings(result: Calibrated) -> Iterator[Drawing]:
@@ -188,15 +181,15 @@ def _drawings(result: Calibrated) -> Iterator[Drawing]:
         m, name = fit.model, side.strip() or "camera"
         figure, axes = new_figure(f"Corners and residuals: {name}", "x (px)", "y (px)", LOW + 0.8)
         xy = np.concatenate([view.corners.xy for view in fit.views])
-        residuals = np.concatenate(fit.residuals)
+        times = _ARROW * m.width / _total(fit.errors)
         axes.quiver(
-            *xy.T, *(_ARROW * residuals.T), angles="xy", scale_units="xy", scale=1, color=BLUE,
-            width=0.002,
+            *xy.T, *(times * np.concatenate(fit.residuals).T), angles="xy", scale_units="xy",
+            scale=1, color=BLUE, width=0.002,
         )  # fmt: skip
         axes.set(xlim=(0, m.width), ylim=(m.height, 0), aspect="equal")
         yield (
             f"corners-{name}",
-            f"Every corner of all views with its residual, enlarged {_ARROW:.0f} times. Arrows "
+            f"Every corner of all views with its residual, enlarged {times:.0f} times. Arrows "
             "should point anywhere, and corners should fill the image.",
             figure,
         )

@@ -265,9 +265,8 @@ def test_a_full_disk_is_told_once_and_the_run_goes_on(
         outcome = drive(kitti_tree, tmp_path)
     assert outcome.trajectory.T_wc.tobytes() == undisturbed.trajectory.T_wc.tobytes()
     told = [record.message for record in caplog.records]
-    assert told == [
-        f"{tmp_path / MAP}: cannot be written (No space left on device); the run goes on without."
-    ]
+    reason = "cannot be written (No space left on device); the run continues without it."
+    assert told == [f"{tmp_path / MAP}: {reason}"]
 
 
 def some_progress() -> Progress:
@@ -381,7 +380,7 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
         busy = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
     assert busy.returncode == 2
     assert busy.stderr == (
-        f"error: {folder}: another process runs here still; wait until it is done.\n"
+        f"error: {folder}: another process is still running here; wait until it is done.\n"
     )
     (folder / LOCK).touch()  # killed
     elsewhere = tmp_path / "elsewhere.txt"
@@ -406,7 +405,9 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
 def test_a_resumed_run_writes_to_no_place_that_its_folder_names(kitti_tree, tmp_path):
     options = {"data": str(kitti_tree), "save_map": str(tmp_path / "elsewhere.npz")}
     (tmp_path / "run.json").write_text(json.dumps(options))
-    with pytest.raises(InputError, match=r"run\.json: damaged, or of another version; run again"):
+    with pytest.raises(
+        InputError, match=r"run\.json: damaged or from another version; start a new run"
+    ):
         read_options(tmp_path)
 
 

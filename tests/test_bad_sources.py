@@ -1,4 +1,4 @@
-"""What cannot be read is refused in one sentence; what breaks off keeps the frames before."""
+"""Unreadable sources are refused in one sentence; a source that ends early keeps its frames."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_a_useless_camera_info_is_not_read_where_there_is_a_calibration(
 def test_a_stream_that_ends_before_its_first_frame(folder, side_by_side, realtime):
     whole = open_from("video", folder / "pair.mkv", side_by_side)
     source = selected(replace(whole, n_expected=None), start=FRAMES)
-    with pytest.raises(InputError, match=f"--start {FRAMES}: pair has no frame there"):
+    with pytest.raises(InputError, match=f"--start {FRAMES}: pair has no such frame"):
         run_source(source, realtime=realtime)
 
 
@@ -143,7 +143,7 @@ def test_calibrations(folder):
 
     sizes = "made for 240x80 pixels but the images have 480x160"
     refused(f"other.yaml: {sizes}", "video", path, options("other.yaml"))
-    wide = "made for 480x160 pixels but the images have 960x160; say --side-by-side"
+    wide = "made for 480x160 pixels but the images have 960x160; use --side-by-side"
     refused(wide, "video", path, SourceOptions(calib=(folder / "mono.yaml",)), sensor="mono")
     refused(sizes, "images", folder / "images", SourceOptions(calib=(folder / "other.yaml",)))
     refused("right camera is missing", "video", path, options("mono.yaml"))
@@ -170,8 +170,8 @@ def test_a_rate_that_contradicts_the_video_is_said(folder, side_by_side, caplog)
     open_from("video", **given, fps=25.0)
     (said,) = caplog.messages
     assert said == (
-        f"{folder / 'pair.mkv'}: --fps 25 contradicts the 10 frames per second of the video itself;"
-        " leave it out unless those are wrong."
+        f"{folder / 'pair.mkv'}: --fps 25 contradicts the video's own 10 frames per second;"
+        " leave the option out unless the video is wrong."
     )
 
 
@@ -180,7 +180,7 @@ def test_videos(folder, tmp_path, side_by_side):
     refused("--side-by-side .* or run with --sensor mono", "video", path, SourceOptions())
     refused("no such file", "video", tmp_path / "none.mp4", side_by_side)
     (tmp_path / "text.mp4").write_text("this is no video")
-    refused("codec that FFmpeg in OpenCV does not know", "video", tmp_path / "text.mp4",
+    refused("in a codec unknown to OpenCV", "video", tmp_path / "text.mp4",
             side_by_side)  # fmt: skip
 
 
@@ -196,7 +196,7 @@ def test_a_video_cut_off_keeps_the_frames_before(folder, tmp_path, side_by_side)
     (tmp_path / "cut.mkv").write_bytes(data[: int(0.6 * len(data))])
     outcome = run_source(open_from("video", tmp_path / "cut.mkv", side_by_side))
     assert 4 <= len(outcome.trajectory) <= 8
-    assert "breaks off after" in outcome.interrupted
+    assert "the video ends after" in outcome.interrupted
     assert not outcome.interrupted.endswith(".")
 
 
@@ -233,7 +233,7 @@ def test_folders_of_images(folder, corridor, tmp_path):
     times.write_text("0.0\n0.1\n")
     refused("times.txt: 2 times for 3 images", "images", tmp_path, options)
     times.write_text("0\n100\n200\n")
-    refused("100 s from image to image, as if .* milliseconds", "images", tmp_path, options)
+    refused("the images are 100 s apart, as if .* milliseconds", "images", tmp_path, options)
     times.write_text("0.0\n0.2\n0.1\n")
     refused("left/2.png: its time is not later", "images", tmp_path, options)
     refused("no such folder", "images", tmp_path / "none", options)
@@ -251,7 +251,7 @@ def test_cameras(folder, tmp_path, monkeypatch, side_by_side):
     refused("--side-by-side .* or run with --sensor mono", "camera", "77", SourceOptions())
     (tmp_path / "video77").touch()
     monkeypatch.setattr(live_camera, "_DEVICES", tmp_path)
-    refused("the device is busy, or no camera; end other", "camera", "77", side_by_side)
+    refused("the device is busy or not a camera; end other", "camera", "77", side_by_side)
     refused("no such device; there are 77", "camera", "76", side_by_side)
 
 
@@ -270,8 +270,8 @@ def test_options_of_other_sources(dataset, options, part):
 
 def test_options_of_a_second_image_with_the_left_camera_alone():
     nowhere, scale = SourceOptions(right=Path("r")), SourceOptions(depth_scale=1000.0)
-    refused("--right: of no use with --sensor mono", "images", "nowhere", nowhere, sensor="mono")
-    refused("--depth-scale: of no use with --sensor", "tum", "nowhere", scale, sensor="mono")
+    refused("--right: contradicts --sensor mono", "images", "nowhere", nowhere, sensor="mono")
+    refused("--depth-scale: contradicts --sensor", "tum", "nowhere", scale, sensor="mono")
 
 
 def test_another_sensor(folder, kitti_tree):
@@ -280,7 +280,7 @@ def test_another_sensor(folder, kitti_tree):
     refused("rgb and depth, .* with --depth", "images", images, options, sensor="rgbd")
     refused("rgbd needs an image topic and one of depth; image topics are /cam0", "bag",
             folder / "ros1.bag", options, sensor="rgbd")  # fmt: skip
-    with pytest.raises(InputError, match="--sensor rgbd: 00 is of sensor stereo"):
+    with pytest.raises(InputError, match="--sensor rgbd: 00 has the sensor stereo"):
         open_from("kitti", kitti_tree, SourceOptions(), sensor="rgbd")
 
 

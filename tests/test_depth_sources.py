@@ -131,11 +131,11 @@ def test_topics_of_bags_with_depth(corridor, depths, calib, tmp_path):
     assert not opened(bag, calib, topics=COLOUR, sensor="mono").camera.depth
     assert opened(bag, calib, topics=f"{COLOUR},{DEPTH}").camera.depth
     refused("choose with --topics COLOUR,DEPTH; image topics are", bag, calib, sensor="rgbd")
-    refused(f"{DEPTH} holds depth; name the images first", bag, calib, topics=f"{DEPTH},{COLOUR}")
+    refused(f"{DEPTH} holds depth; name the topic", bag, calib, topics=f"{DEPTH},{COLOUR}")
     refused("encoding 'mono8' is no depth; known are 16UC1", bag, calib,
             topics=f"{COLOUR},/infra/image_raw", sensor="rgbd")  # fmt: skip
     other = write_bag(tmp_path / "s.bag", "ros1", {**two, DEPTH: small}, STAMPS[:2])
-    refused("depth of 480x80 pixels in .* images of 480x160 in .* registered", other, calib)
+    refused("has 480x80 pixels but the .* have 480x160; .* registered", other, calib)
     alone = write_bag(tmp_path / "d.bag", "ros1", {DEPTH: depths[:2]}, STAMPS[:2])
     refused("stereo needs two image topics; image topics are /camera/aligned", alone, calib)
 
@@ -164,16 +164,16 @@ def test_a_scale_out_of_the_calibration(folders, corridor, depths, tmp_path):
 
 
 def test_bad_folders_with_depth(corridor, depths, calib, folders, tmp_path):
-    refused("what depth images count in a metre is not known; give --depth-scale", folders, calib,
+    refused("the unit of the depth images is unknown; give --depth-scale", folders, calib,
             fps=10.0)  # fmt: skip
     options = {"fps": 10.0, "depth_scale": 1000.0}
     both = {"right": folders / "rgb", "depth": folders / "depth"}
-    refused("--depth .*: of no use with --right", folders / "rgb", calib, **both, **options)
+    refused("--depth .*: contradicts --right", folders / "rgb", calib, **both, **options)
     write_images(tmp_path, {"rgb": corridor.left[:3]}, NAMES[:3])
     write_images(tmp_path, {"depth": depths[:2]}, NAMES[:2])
     refused("2 images but 3 in .* 2 on one side only", tmp_path, calib, **options)
     write_images(tmp_path, {"depth": [depths[0][:80], *depths[1:3]]}, NAMES[:3])
-    refused("depth of 480x80 pixels but the colour image has 480x160", tmp_path, calib, **options)
+    refused("depth has 480x80 pixels but the colour image has 480x160", tmp_path, calib, **options)
     grey = cv2.convertScaleAbs(depths[0], alpha=0.01)
     write_images(tmp_path, {"depth": [grey, *depths[1:3]]}, NAMES[:3])
     refused("depth of 8 bits and 1 channels", tmp_path, calib, **options)

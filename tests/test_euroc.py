@@ -112,7 +112,7 @@ def test_the_folder_of_another_sequence_is_refused(root, inner):
 
 def test_one_of_several_sequences_must_be_named(root):
     (root / "V9_02").symlink_to(root / "V9_01")
-    with pytest.raises(InputError, match="several sequences; choose --seq of V9_01, V9_02"):
+    with pytest.raises(InputError, match="several sequences; choose one with --seq: V9_01, V9_02"):
         open_euroc(root)
 
 
@@ -138,7 +138,7 @@ def test_frames_without_a_partner_are_left_out(root, corridor):
 def test_no_partners_at_all(root):
     path = root / "V9_01/mav0/cam1/data.csv"
     path.write_text(path.read_text().replace("14037", "15037"))
-    refused(root, "none of its 6 images is of the time of one")
+    refused(root, "none of its 6 images has the time of an image")
 
 
 def test_ground_truth_of_some_frames(root, corridor, caplog):
@@ -209,8 +209,8 @@ def test_damaged_files(root, file, text, words):
 
 
 def test_missing_data_and_images(root):
-    refused(root / "none", "no data in EuRoC's layout here", "--data")
-    with pytest.raises(InputError, match="choose --seq of V9_01"):
+    refused(root / "none", "holds no data in EuRoC's layout", "--data")
+    with pytest.raises(InputError, match="choose one with --seq: V9_01"):
         open_euroc(root, "V9_02")
     images = sorted((root / "V9_01/mav0/cam1/data").iterdir())
     images[2].write_bytes(b"no image")

@@ -78,7 +78,7 @@ def test_a_rate_that_varies(beside, options, tmp_path):
 def test_a_file_cut_off_has_no_index(beside, options, tmp_path):
     data = write_h264(tmp_path / "a.mp4", beside, np.arange(FRAMES) / 10).read_bytes()
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) * 3 // 5])
-    with pytest.raises(InputError, match=r"cut.mp4: no video, cut off, or of a codec"):
+    with pytest.raises(InputError, match=r"cut.mp4: not a video, truncated, or in a codec"):
         opened(tmp_path / "cut.mp4", options)
 
 
@@ -114,5 +114,5 @@ def test_sound_alone(options, tmp_path):
         frame.sample_rate, frame.pts = 44100, 0
         file.mux(stream.encode(frame))
         file.mux(stream.encode())
-    with pytest.raises(InputError, match="no video, cut off, or of a codec"):
+    with pytest.raises(InputError, match="not a video, truncated, or in a codec"):
         opened(tmp_path / "sound.mp4", options)

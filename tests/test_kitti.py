@@ -124,7 +124,7 @@ def test_excerpt_is_matched_by_number_to_longer_times_and_poses(root):
     np.testing.assert_allclose(sequence.timestamps, [0.2, 0.3, 0.4, 0.5])
     np.testing.assert_array_equal(sequence.ground_truth[:, 2, 3], [2, 3, 4, 5])
     np.savetxt(root / "sequences/00/times.txt", 0.1 * np.arange(5))
-    refused(root, "times.txt: 5 rows, none for image 000005")
+    refused(root, "times.txt: has 5 rows but none for image 000005")
 
 
 def test_no_ground_truth(root):

@@ -342,7 +342,7 @@ def test_a_drive_is_measured_before_and_after_verification_and_reported(tmp_path
         (["--protocol", "online", "--detectors", "magic"], "--detectors magic: unknown"),
         (["--protocol", "online", "--data", "town:demo"], "--protocol online takes drives"),
         (["--window", "30s"], "--window: is of --protocol online"),
-        (["--detectors", "ibow"], "--detectors ibow: its words grow with a drive"),
+        (["--detectors", "ibow"], "--detectors ibow: learns during a drive"),
         (["--detectors", "thumbnail", "--weights", "thumbnail=x"], "the detector thumbnail has"),
     ],
 )

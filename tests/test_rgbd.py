@@ -231,7 +231,7 @@ def test_sequences_are_found_by_name(tree):
         assert open_tum(root).name == open_tum(root, "corridor").name == "corridor"
     with pytest.raises(InputError, match=r"--seq desk: .* is the sequence corridor itself"):
         open_tum(tree, "desk")
-    with pytest.raises(InputError, match="desk: no such sequence; choose --seq of corridor"):
+    with pytest.raises(InputError, match="desk: no such sequence; choose one with --seq: corridor"):
         open_tum(tree.parent, "desk")
 
 

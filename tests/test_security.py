@@ -154,7 +154,7 @@ def test_images_of_absurd_size_are_refused_by_their_header(tmp_path: Path, width
         [sys.executable, "-c", script, str(tmp_path / "a.png")], capture_output=True, text=True
     )
     said, peak = done.stdout.splitlines()
-    assert f"larger than {MOST_PIXELS / 1e6:.0f} million pixels" in said
+    assert f"has more than {MOST_PIXELS / 1e6:.0f} million pixels" in said
     assert int(peak) < 400  # MB
 
 

@@ -101,7 +101,7 @@ def test_the_first_frames_of_a_stream_stay_in_memory():
     with pytest.raises(UnreadableImageError, match="damaged"):
         kept.read(2)
     assert first_frames(stored()).timestamps.tolist() == stored().timestamps.tolist()
-    with pytest.raises(InputError, match="x: there are no frames in it"):
+    with pytest.raises(InputError, match="x: it has no frames"):
         first_frames(replace(streamed(), play=lambda: iter(())))
 
 

@@ -1,4 +1,4 @@
-"""Readers of data sets: each checks its input once and then hands out calibrated, timed frames."""
+"""Readers of data sets: each checks its input once and then provides calibrated, timed frames."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def open_sequence(
             sequence at ``root`` of EuRoC and TUM.
         monocular: read the left camera alone.
         calib: calibration files (docs/howto/cameras.md), which replace the data set's own.
-        depth_scale: how many units of the depth images make a metre, for RGB-D data alone.
-        on_render: called with the number of frames that are rendered and the number of all.
+        depth_scale: units of the depth images per metre, for RGB-D data alone.
+        on_render: called with the number of frames rendered so far and the total number.
 
     Raises:
         InputError: the data set is unknown, a package is broken, or as the reader says.
@@ -102,7 +102,7 @@ def open_sequence(
     )  # fmt: skip
     if not source.seekable:
         raise InputError(
-            f"--dataset {dataset}: a stream, which cannot seek; open it with "
+            f"--dataset {dataset}: this is a stream, which cannot seek; open it with "
             "vslam.datasets.sources.open_source."
         )
     return source

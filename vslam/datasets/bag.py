@@ -1,11 +1,9 @@
 """Bags of ROS 1 and ROS 2 and MCAP files, read by the library rosbags.
 
-Images are those of ``sensor_msgs/Image`` and ``CompressedImage``, their times the stamps in their
-headers. Images of two topics belong together when their stamps lie within 5 ms, an image and its
-depth within 20 ms, and none is nearer; others are left out. Where the bag holds the
-``camera_info`` of its image topics, that is their calibration.
-
-One file because it is the only one that knows rosbags' readers.
+Images are ``sensor_msgs/Image`` or ``CompressedImage`` messages, timed by the stamps in their
+headers. The images of two topics that are nearest in time form a pair if their stamps differ by at
+most 5 ms, or 20 ms for an image and its depth; images without a partner are left out. The
+calibration is the ``camera_info`` of the image topics, if the bag has it.
 """
 
 from __future__ import annotations
@@ -44,7 +42,7 @@ Bag = Any  # rosbags.highlevel.AnyReader
 
 _MOST_METADATA = 1_000_000  # bytes; a hundred topics make 100,000
 _TOLERANCE_NS = 5_000_000
-_DEPTH_TOLERANCE_NS = 20_000_000  # Kinects take image and depth in turn; as TUM's associate.py
+_DEPTH_TOLERANCE_NS = 20_000_000  # as in TUM's associate.py; a Kinect alternates image and depth
 _NEEDED = {
     "mono": "an image topic",
     "stereo": "two image topics",
@@ -78,15 +76,14 @@ def open_bag(
     Args:
         path: ``.bag``, ``.mcap`` or ``.db3``, or the folder of a ROS 2 bag.
         topics: the topic of the left images and that of the right images or the depth. If empty,
-            the bag must have just the image topics that are needed; left and right are told by the
-            order of their names.
+            the bag must have exactly the needed image topics; the first by name is the left one.
         sensor: ``stereo``, ``rgbd`` or ``mono``, which reads the first of two topics; None decides
-            by what the topics hold.
-        depth_scale: how many units of the depth images make a metre; None follows their encoding.
+            by the content of the topics.
+        depth_scale: units of the depth images per metre; None follows their encoding.
 
     Raises:
-        InputError: rosbags is not installed, no bag, cut off, topics missing, or images that have
-            no stamps, cannot be decoded or do not belong together.
+        InputError: rosbags is not installed, the bag is missing or truncated, topics are missing,
+            or the images have no stamps, cannot be decoded or form no pairs.
     """
     path = Path(path)
     if not path.exists():
@@ -97,7 +94,7 @@ def open_bag(
         begin = list(islice(_together(_messages(bag, path, chosen), chosen, tolerance), 2))
         if not begin:
             raise InputError(
-                f"{path}: {' and '.join(chosen)} have no images of one time (within "
+                f"{path}: {' and '.join(chosen)} have no images of the same time (within "
                 f"{tolerance / 1e6:g} ms); name topics of one camera with --topics."
             )
         if all(stamp_of(messages[0]) == 0 for messages in begin):
@@ -111,9 +108,9 @@ def open_bag(
         ]
         if depth and images[0].shape != images[1].shape:
             raise InputError(
-                f"{path}: depth of {size_text(images[1].shape)} pixels in {chosen[1]} but images "
-                f"of {size_text(images[0].shape)} in {chosen[0]}; name a topic of depth that is "
-                "registered to the images."
+                f"{path}: the depth in {chosen[1]} has {size_text(images[1].shape)} pixels but the "
+                f"images in {chosen[0]} have {size_text(images[0].shape)}; name a topic of depth "
+                "that is registered to the images."
             )
         sizes = tuple((image.shape[1], image.shape[0]) for image in images)
         return BagSource(
@@ -209,7 +206,7 @@ def _opened(path: Path) -> Iterator[Bag]:
         bag.open()
     except Exception as error:  # rosbags and its parsers raise many kinds for a damaged file
         raise InputError(
-            f"{path}: cannot be read as a bag ({_reason(error)}); if its recording was cut off, "
+            f"{path}: cannot be read as a bag ({_reason(error)}); if the recording was cut off, "
             "repair it with 'rosbag reindex', 'ros2 bag reindex' or 'mcap recover'."
         ) from error
     try:
@@ -255,8 +252,8 @@ def _tolerance(depth: bool) -> int:
 def _together(
     messages: Iterator[tuple[str, Message]], topics: tuple[str, ...], tolerance: int
 ) -> Iterator[tuple[Message, ...]]:
-    """Tuples of one message from each topic whose stamps agree; a message waits if a later one of
-    the other topic is nearer in time."""
+    """Tuples of one message from each topic whose stamps agree. A message is paired only after
+    all messages of the other topic that may be nearer in time have been read."""
     if len(topics) == 1:
         yield from ((message,) for _, message in messages)
         return
@@ -282,7 +279,7 @@ def _together(
 def _choose_topics(
     path: Path, bag: Bag, topics: tuple[str, ...], sensor: str | None
 ) -> tuple[tuple[str, ...], bool]:
-    """Topics of the left images and of the second ones, and whether these are depth."""
+    """The topics of the first and second images, and whether the second ones are depth."""
     there = sorted({c.topic for c in bag.connections if c.msgtype in IMAGE_TYPES})
     listed = f"image topics are {', '.join(there)}" if there else "there are no image topics"
     for topic in topics:
@@ -302,12 +299,13 @@ def _choose_topics(
             raise InputError(f"{path}: choose with --topics {wanted}; {listed}.")
     if not n <= len(topics) <= 2:
         raise InputError(
-            f"--topics {','.join(topics)}: name the topic of the left images and that of the "
-            "right ones or of the depth, or run with --sensor mono."
+            f"--topics {','.join(topics)}: name the topic of the left images and the topic of the "
+            "right images or of the depth, or run with --sensor mono."
         )
     if topics[0] in with_depth:
         raise InputError(
-            f"--topics {','.join(topics)}: {topics[0]} holds depth; name the images first."
+            f"--topics {','.join(topics)}: {topics[0]} holds depth; name the topic of the images "
+            "first."
         )
     depth = n == 2 and (sensor == "rgbd" or (sensor is None and topics[1] in with_depth))
     return topics[:n], depth

@@ -1,7 +1,7 @@
-"""How much a compressed chunk of a bag may unpack to: rosbags itself sets no limit.
+"""Limits on the decompressed size of bags, because rosbags itself sets none.
 
-A few kilobytes can speak of gigabytes. rosbags unpacks with functions that it looks up in tables of
-its modules; these are replaced by ones that stop.
+A few kilobytes can decompress to gigabytes. rosbags looks its decompression functions up in tables
+of its modules; these entries are replaced by functions that stop at a limit.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from types import SimpleNamespace
 from typing import Any, Protocol
 
 MOST_BYTES = 2**29
-"""Of a chunk or a message: an image of `vslam.untrusted.MOST_PIXELS` with four bytes a pixel.
-Recorders write chunks of 0.8 to 4 MB."""
+"""Limit of a chunk or a message: an image of `vslam.untrusted.MOST_PIXELS` with four bytes a
+pixel. Recorders write chunks of 0.8 to 4 MB."""
 
-_FREE_BYTES = 2**30  # of the disk, left by a bag that is unpacked as a whole
+_FREE_BYTES = 2**30  # of disk space that must remain when a whole bag is decompressed
 _log = logging.getLogger(__name__)
 
 
@@ -30,7 +30,7 @@ class _Decompressor(Protocol):
 
 
 def limit_bags() -> None:
-    """Let rosbags refuse chunks, messages and files beyond the limits; the second call is idle."""
+    """Let rosbags refuse chunks, messages and files beyond the limits. Later calls do nothing."""
     import lz4.frame
     from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import reader, storage_mcap
@@ -59,10 +59,10 @@ def limit_bags() -> None:
 
 
 def unpack(make: Callable[[], _Decompressor], data: bytes, most: int) -> bytes:
-    """All frames of compressed data, one behind the other.
+    """Decompress data that consists of one or more compressed frames.
 
     Raises:
-        ValueError: more than ``most`` bytes, or cut off.
+        ValueError: the result exceeds ``most`` bytes, or the data is truncated.
     """
     parts: list[bytes] = []
     room = most
@@ -83,12 +83,12 @@ def _limited(make: Callable[[], _Decompressor]) -> Callable[[bytes], bytes]:
 
 
 def _limited_by_size(make: Callable[[], _Decompressor]) -> Callable[[bytes, int], bytes]:
-    """Of chunks that say how large they are; another size is refused by rosbags."""
+    """For chunks that state their size; rosbags checks it."""
     return lambda data, size: unpack(make, data, min(size, MOST_BYTES))
 
 
 class _LimitedFile:
-    """A compressed file that rosbags unpacks into a temporary folder."""
+    """A compressed file that rosbags decompresses into a temporary folder."""
 
     def __init__(self, file: Any) -> None:
         self._file = file

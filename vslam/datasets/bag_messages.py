@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from vslam.calibration.documents import Document
 from vslam.camera import DepthImage, Image
 
-Message = Any  # classes that rosbags makes out of the bag's definitions
+Message = Any  # classes that rosbags generates from the bag's message definitions
 
-_COMPRESSED_DEPTH = "compressedDepth"  # of image_transport: a header of 12 bytes, then a PNG
-_MILLIMETRES = 1000.0  # of 16-bit depth; that of 32 bits is in metres (REP 118)
+_COMPRESSED_DEPTH = "compressedDepth"  # image_transport's format: a 12-byte header, then a PNG
+_MILLIMETRES = 1000.0  # units of 16-bit depth per metre; 32-bit depth is in metres (REP 118)
 _DEPTH_ENCODINGS = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
-# Channels, and what OpenCV calls their colours.
+# Number of channels, and their order in the names of OpenCV.
 _ENCODINGS: dict[str, tuple[int, str | None]] = {
     "mono": (1, None),
     "bgr": (3, "BGR"),
@@ -44,10 +44,10 @@ def stamp_of(message: Message) -> int:
 
 
 def grey_of(message: Message) -> Image:
-    """``(H, W)`` uint8 image of an ``Image`` or ``CompressedImage``; the upper eight of 16 bits.
+    """``(H, W)`` uint8 image of an ``Image`` or ``CompressedImage``; of 16 bits, the upper eight.
 
     Raises:
-        ValueError: with the reason why it cannot be decoded.
+        ValueError: it cannot be decoded; the message gives the reason.
     """
     return _decoded(message, "GRAY")
 
@@ -68,7 +68,7 @@ def _decoded(message: Message, wanted: str) -> NDArray[np.uint8]:
         wanted: ``GRAY``, or ``RGB``, which a grey message ignores.
 
     Raises:
-        ValueError: with the reason why it cannot be decoded.
+        ValueError: as `grey_of`.
     """
     import cv2
 
@@ -112,11 +112,10 @@ def depth_of(message: Message, scale: float | None) -> DepthImage:
     image_transport's plugin ``compressed_depth``.
 
     Args:
-        scale: how many units of the image make a metre; None follows REP 118: 1000 for 16 bits, 1
-            for 32 bits.
+        scale: units of the image per metre; None follows REP 118: 1000 for 16 bits, 1 for 32 bits.
 
     Raises:
-        ValueError: with the reason why it cannot be decoded.
+        ValueError: as `grey_of`.
     """
     if not hasattr(message, "encoding"):
         return _compressed_depth(message, scale)
@@ -163,7 +162,9 @@ def _pixels(message: Message, channels: int, bits: int, kind: str = "u") -> NDAr
     data = np.asarray(message.data, np.uint8)
     row = width * channels * bits // 8
     if step < row or data.size < height * step or not row * height:
-        raise ValueError(f"{data.size} bytes are no image of {width}x{height} {message.encoding}")
+        raise ValueError(
+            f"{data.size} bytes do not fit an image of {width}x{height} {message.encoding}"
+        )
     rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row])
     order = ">" if message.is_bigendian else "<"
     pixels = rows.view(f"{order}{kind}{bits // 8}")

@@ -1,4 +1,4 @@
-"""Files of images with the depth of their pixels."""
+"""Colour images with depth images, as files."""
 
 from __future__ import annotations
 
@@ -34,18 +34,17 @@ def depth_files(
     depth: Several[Path],
     depth_scale: float,
 ) -> RawSource:
-    """A source of colour images with the depth of their pixels, after a look at every file and the
-    first frame.
+    """Check all files, decode the first frame and make a source of colour and depth images.
 
     Args:
         timestamps: ``(N,)`` float64 seconds of the colour images.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, or None.
         colour, depth: N image files each.
-        depth_scale: how many units of the depth images make a metre.
+        depth_scale: units of the depth images per metre.
 
     Raises:
-        UnreadableImageError: a file is empty, or the first frame cannot be decoded, has two sizes,
-            or depth that is not of 16 bits.
+        UnreadableImageError: a file is empty, the first frame cannot be decoded, its two images
+            differ in size, or its depth does not have 16 bits.
     """
     for path in (*colour, *depth):
         check_not_empty(path)
@@ -68,7 +67,7 @@ def depth_files(
 
 
 def with_depth(camera: Camera, calibration: Calibration) -> Camera:
-    """The camera of images with depth, with the calibration's virtual baseline or a Kinect's."""
+    """Give an RGB-D camera the calibration's virtual baseline, or that of a Kinect."""
     baseline = calibration.virtual_baseline or _VIRTUAL_BASELINE
     return replace(camera, baseline=baseline, depth=True)
 
@@ -88,13 +87,13 @@ def _read_steps(path: Path, width: int, height: int) -> NDArray[np.uint16]:
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise UnreadableImageError(
             path,
-            f"depth of {8 * image.dtype.itemsize} bits and {channels} channels; it must be one "
-            "channel of 16 bits, so take the original.",
+            f"depth of {8 * image.dtype.itemsize} bits and {channels} channels, but it must be one "
+            "channel of 16 bits; take the original.",
         )
     if image.shape != (height, width):
         raise UnreadableImageError(
             path,
-            f"depth of {size_text(image.shape)} pixels but the colour image has {width}x{height}; "
+            f"depth has {size_text(image.shape)} pixels but the colour image has {width}x{height}; "
             "take depth that is registered to the colour images.",
         )
     return np.asarray(image, np.uint16)

@@ -19,7 +19,7 @@ _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 
 
 def _within(folder: Path) -> tuple[Path, ...]:
-    """A folder and the folders in it: a data set may hold several sequences."""
+    """A folder and its subfolders, because a data set may hold several sequences."""
     return (folder, *(path for path in folder.glob("*") if path.is_dir()))
 
 
@@ -54,13 +54,13 @@ def detect_dataset(data: str) -> str:
     """The ``--dataset`` that a folder, a file, the number of a device or a URL belongs to.
 
     Raises:
-        InputError: nothing there, or nothing known.
+        InputError: nothing exists there, or its kind is not recognised.
     """
     if _URL.match(data):
         return "camera"
     path = Path(data)
     if path.is_file() and is_image(path):
-        raise InputError(f"{data}: one image; name the folder that it is in with --data.")
+        raise InputError(f"{data}: a single image; name its folder with --data.")
     if path.is_file() and path.suffix.lower() in _ARCHIVES:
         raise InputError(f"{data}: an archive; unpack it and name the folder with --data.")
     if path.is_file() and path.suffix.lower() in _TEXTS:
@@ -75,13 +75,13 @@ def detect_dataset(data: str) -> str:
             return kind
         looked = "; ".join(f"{what} ({kind})" for kind, what, _ in _KINDS)
         raise InputError(
-            f"{data}: no data set that is known{_nearest(path)}; name its kind with --dataset; "
-            f"looked for {looked}."
+            f"{data}: no known data set{_nearest(path)}; name its kind with --dataset. Looked for "
+            f"{looked}."
         )
     if data.isdecimal():
         return "camera"
     raise InputError(
-        f"{data}: no such file or folder; name with --data a data set, a folder of images, a "
+        f"{data}: no such file or folder; with --data, name a data set, a folder of images, a "
         "video, a bag, the number of a camera or a URL."
     )
 
@@ -97,5 +97,5 @@ def _nearest(path: Path) -> str:
     for inside in sorted(path.glob("*")):
         with suppress(OSError):  # a folder that this user may not read
             if inside.is_dir() and (kind := _kind_of(inside)) is not None:
-                return f", but {inside} is one of {kind} (name that)"
+                return f", but {inside} looks like {kind} (name that)"
     return ""

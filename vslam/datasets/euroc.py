@@ -23,7 +23,7 @@ from vslam.errors import InputError
 from vslam.trajectory import Trajectory
 
 _HOME = "https://projects.asl.ethz.ch/datasets/euroc-mav/"
-_SAME_NS = 5_000_000  # both cameras are triggered together; a pair's stamps may differ by so much
+_SAME_NS = 5_000_000  # largest difference of stamps in a pair; both cameras are triggered together
 _POSE_COLUMNS = 8  # time, position, quaternion; velocities and biases may follow
 
 
@@ -43,8 +43,8 @@ def open_euroc(
     are left out. The ground truth is interpolated, see `vslam.datasets.ground_truth.poses_at`.
 
     Args:
-        root: the sequence's folder, or one with several.
-        name: name of the sequence in it; None for the folder itself, or the only one in it.
+        root: folder of the sequence, or of several sequences.
+        name: name of the sequence in ``root``; None for ``root`` itself, or its only sequence.
         start: first frame, counted over the pairs.
         every: take every N-th frame.
         max_frames: largest number of frames, None for all.
@@ -52,7 +52,8 @@ def open_euroc(
         calib: calibration files, which replace the cameras' ``sensor.yaml``.
 
     Raises:
-        InputError: data missing or malformed, no pairs, calibration unusable.
+        InputError: data is missing or malformed, there are no pairs, or the calibration is
+            unusable.
         UnreadableImageError: the first pair cannot be decoded.
     """
     base, found, stamps, files = _select(root, name, start, every, max_frames, monocular)
@@ -106,12 +107,12 @@ def _select(
 
 def _find(root: Path, name: str | None) -> tuple[Path, str]:
     """Folder with ``cam0``, and the sequence's name."""
-    if root.resolve().name == "mav0":  # the sequence's name is that of the folder around it
+    if root.resolve().name == "mav0":  # the parent folder has the name of the sequence
         root = root.resolve().parent
     folder = find_sequence(root, name, is_euroc)
     if folder is None:
         raise InputError(
-            f"{root}: no data in EuRoC's layout here (no mav0/cam0/data.csv); download a sequence "
+            f"{root}: holds no data in EuRoC's layout (no mav0/cam0/data.csv); download a sequence "
             f"in ASL format from {_HOME}, unpack it and name its folder with --data."
         )
     base = folder / "mav0" if (folder / "mav0").is_dir() else folder
@@ -150,7 +151,7 @@ def _read_list(camera: Path) -> tuple[NDArray[np.int64], list[str]]:
 
 
 def _is_time(stamp: str) -> bool:
-    """Whether a text is a number of nanoseconds that 64 bits hold."""
+    """Whether a text is a number of nanoseconds that fits into 64 bits."""
     return stamp.isdecimal() and len(stamp) <= 19 and int(stamp) <= np.iinfo(np.int64).max
 
 
@@ -168,7 +169,7 @@ def _pair(
     near = abs(right[nearest] - left) <= _SAME_NS
     if not near.any():
         raise InputError(
-            f"{cameras[1]}: none of its {len(right)} images is of the time of one in "
+            f"{cameras[1]}: none of its {len(right)} images has the time of an image in "
             f"{cameras[0]}; take both cameras of one sequence."
         )
     return np.column_stack([rows, nearest])[near]

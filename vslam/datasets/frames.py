@@ -1,8 +1,8 @@
-"""Sources of frames: what a reader opens, and what a run takes its images from.
+"""Sources of frames, which readers open and from which a run takes its images.
 
-Every source hands out its frames in the order of their times. Images in files can also be read in
-any order; a video, a bag or a camera cannot seek. Readers return a `RawSource` if the images need
-to be rectified (`vslam.datasets.rectified`), and a `Source` if they do not.
+Every source yields its frames in the order of their times. Images in files can also be read in any
+order; a video, a bag or a camera cannot seek. Readers return a `RawSource` if the images need to be
+rectified (`vslam.datasets.rectified`), and a `Source` if they do not.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Size = tuple[int, int]
 
 _log = logging.getLogger(__name__)
 
-_FIRST_FRAMES = 120  # some seconds; a pair of 752x480 takes 0.7 MB
+_FIRST_FRAMES = 120  # a few seconds; a pair of 752x480 takes 0.7 MB
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class TimedFrame:
 
     Attributes:
         timestamp: seconds.
-        read: decodes the left and the second image; safe to call in any thread. The left one is
-            ``(H, W)`` uint8. The second one is the right image, likewise; or the depth of the left
-            image's pixels, ``(H, W)`` float32 metres, 0 where unknown; or None (monocular). Its
-            argument decides how the images are decoded, both at once for example. Raises
-            UnreadableImageError if a file is damaged or not of the calibration's size.
+        read: decodes the left and the second image; safe to call in any thread. The left image is
+            ``(H, W)`` uint8. The second one is the right image, ``(H, W)`` uint8; or the depth of
+            the left image's pixels, ``(H, W)`` float32 metres, 0 if unknown; or None (monocular).
+            The argument is a map function over both images, which may decode them in parallel.
+            Raises UnreadableImageError if a file is damaged or not of the calibration's size.
         file: the left image's file, if its pixels need no rectification; else None.
         colour: decodes the left image as it was taken, ``(H, W, 3)`` uint8 red, green, blue, or
             ``(H, W)`` if it is grey; None for a source without colours. Raises as ``read``.
@@ -80,12 +80,12 @@ class _Frames:
         return self.play is None
 
     def frames(self) -> Iterator[TimedFrame]:
-        """All frames in order, from the first one on at every call, unless the source is live.
+        """All frames in order; every call starts at the first one, unless the source is live.
 
-        No images are held in memory but those of the frame that is handed out.
+        Only the images of the current frame are held in memory.
 
         Raises:
-            BrokenSourceError: after the last good frame of a file cut off or a device unplugged.
+            BrokenSourceError: after the last good frame of a truncated file or unplugged device.
             InputError: the stream ends before the first selected frame.
         """
         return iter(self.stored) if self.play is None else self.play()
@@ -124,16 +124,16 @@ class Source(_Frames):
     Attributes:
         dataset: kind of source, ``kitti`` or ``video`` for example.
         name: name of the sequence, file or device.
-        camera: calibration; ``camera.sensor`` tells what the frames hold.
+        camera: calibration; ``camera.sensor`` is the kind of images in the frames.
         stored: N frames that can be read in any order; see `stored_frames`.
         play: yields the frames of a stream, which cannot seek; None if they are stored.
         n_expected: the number of frames, approximate for a stream, or None if unknown.
-        live: frames come at their own times and do not wait: a camera, not a file.
+        live: frames arrive in real time and are lost if they are not read, as from a camera.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose, or None.
 
     Raises:
         InputError: the times of stored frames do not increase.
-        ValueError: the ground truth has another shape.
+        ValueError: the ground truth has the wrong shape.
     """
 
     camera: Camera
@@ -144,9 +144,8 @@ class RawSource(_Frames):
     """Images as the cameras took them; see `Source` for the other attributes.
 
     Attributes:
-        sizes: width and height of each camera's images; only the first camera's if the second
-            images are its depth.
-        depth: whether the second images are the depth of the first ones' pixels.
+        sizes: width and height of each camera's images; one entry if the second images are depth.
+        depth: whether the second images are the depth of the first images' pixels.
         ground_truth: poses of the left camera before rectification.
     """
 
@@ -168,8 +167,8 @@ def stored_frames(
     Args:
         timestamps: ``(N,)`` float64 seconds, increasing.
         read: decodes the frame of an index, see `TimedFrame`.
-        files: of the left images.
-        colour: decodes one of these, see `TimedFrame`.
+        files: the files of the left images.
+        colour: decodes a file in colour, see `TimedFrame`.
     """
     frames = [TimedFrame(time, partial(read, k)) for k, time in enumerate(timestamps.tolist())]
     if files is None:
@@ -183,7 +182,7 @@ def stored_frames(
 def selected(
     source: _AnySource, *, start: int = 0, every: int = 1, max_frames: int | None = None
 ) -> _AnySource:
-    """Every N-th frame of a source from a first one on, with increasing times.
+    """Select every N-th frame of a source from frame ``start`` on.
 
     Raises:
         InputError: options out of range, or a start beyond the last frame.
@@ -194,7 +193,7 @@ def selected(
     if whole is not None and start >= whole:
         about = "" if source.seekable else "about "
         raise InputError(
-            f"--start {start}: {source.name} has {about}{whole} frames; choose a smaller one."
+            f"--start {start}: {source.name} has {about}{whole} frames; choose a smaller number."
         )
     chosen = slice(start, None if max_frames is None else start + every * max_frames, every)
     if source.seekable:
@@ -212,17 +211,17 @@ def _play_selected(source: Source | RawSource, chosen: slice) -> Iterator[TimedF
         yield frame
     if frame is None:
         raise InputError(
-            f"--start {chosen.start}: {source.name} has no frame there; choose a smaller one."
+            f"--start {chosen.start}: {source.name} has no such frame; choose a smaller number."
         )
 
 
 def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]:
-    """Leave out frames that are not later than the one before them, with a warning each."""
+    """Leave out frames that are not later than their predecessor, with a warning for each."""
     last = None
     for frame in frames:
         if last is not None and frame.timestamp <= last:
             _log.warning(
-                "%s: a frame of %.6f s is left out, it comes after one of %.6f s",
+                "%s: the frame at %.6f s is left out because it comes after the one at %.6f s",
                 name,
                 frame.timestamp,
                 last,
@@ -233,12 +232,11 @@ def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]
 
 
 def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:
-    """Some frames of a source; a stream is played as far as the last of them.
-
-    Fewer frames come from a source that ends before.
+    """Yield selected frames of a source; a stream is played up to the last of them. There are
+    fewer frames if the source ends early.
 
     Args:
-        indices: of the frames, increasing.
+        indices: indices of the frames, increasing.
     """
     if source.seekable:
         yield from (source.stored[k] for k in indices if k < len(source))
@@ -249,8 +247,8 @@ def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:
 
 
 def first_frames(source: Source) -> Source:
-    """The first frames of a stream in memory, where they can be read in any order; a source that
-    can seek is returned as it is.
+    """Load the first frames of a stream into memory, so that they can be read in any order. A
+    source that can seek is returned unchanged.
 
     A frame that cannot be decoded raises its UnreadableImageError whenever it is read.
 
@@ -260,7 +258,7 @@ def first_frames(source: Source) -> Source:
     if source.seekable:
         return source
     frames = []
-    problem = "there are no frames in it"
+    problem = "it has no frames"
     try:
         for frame in islice(source.frames(), _FIRST_FRAMES):
             frames.append(_held(frame))
@@ -272,7 +270,7 @@ def first_frames(source: Source) -> Source:
 
 
 def _held(frame: TimedFrame) -> TimedFrame:
-    """A frame decoded now, or the error that decoding it raised."""
+    """Decode a frame now; keep the images, or the error that decoding raised."""
     images: Images | UnreadableImageError
     try:
         images = frame.read(map)

@@ -12,8 +12,8 @@ from vslam.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
 
-# TUM measures at 100 Hz, EuRoC at 200 Hz, vehicles at 10 Hz. At an acceleration of 2 m/s^2 a
-# straight line is off by 6 mm in the middle of the gap.
+# Ground truth comes at 100 Hz (TUM), 200 Hz (EuRoC) or 10 Hz (vehicles). At an acceleration of
+# 2 m/s^2, linear interpolation is off by 6 mm in the middle of this gap.
 _MAX_GAP_S = 0.15
 
 
@@ -23,12 +23,12 @@ def poses_at(
     """Interpolated poses: positions linearly, rotations along the shortest arc.
 
     Args:
-        source: file, for the log.
+        source: file to name in the log.
         times: ``(N,)`` seconds of frames.
 
     Returns:
         ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames outside the measured time or in a gap of more
-        than 0.15 s; None where that is all of them, which the log says.
+        than 0.15 s. None, with a warning, if no frame has a pose.
     """
     from scipy.spatial.transform import Rotation, Slerp
 

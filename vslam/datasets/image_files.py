@@ -1,4 +1,4 @@
-"""Code that readers of image files share: finding folders and files, and decoding them."""
+"""Shared code of readers of image files: finding folders and files, and decoding images."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def checked_files(
     ground_truth: NDArray[np.float64] | None,
     sides: Several[tuple[Path, ...]],
 ) -> RawSource:
-    """A source of image files, after a look at every file and the first images.
+    """Check all files, decode the first images and make a source of image files.
 
     Args:
         timestamps: ``(N,)`` float64 seconds.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera, or None.
-        sides: N files each of the left and the right camera, or of the left one alone.
+        sides: N files of the left camera and N of the right one, or those of the left one alone.
 
     Raises:
         UnreadableImageError: a file is empty, or the first frame cannot be decoded.
@@ -53,10 +53,10 @@ def checked_files(
 def read_files(
     files: Several[Path], sizes: Several[Size], image_map: ImageMap
 ) -> tuple[Image, Image | None]:
-    """Left and right image, None for the right one if there is a single file.
+    """Left and right image; the right one is None if there is only one file.
 
     Raises:
-        UnreadableImageError: a file is missing, damaged or not of its size.
+        UnreadableImageError: a file is missing, damaged or of another size.
     """
     left, *right = image_map(_read_file, list(zip(files, sizes, strict=True)))
     return left, right[0] if right else None
@@ -81,7 +81,7 @@ def list_images(folder: Path) -> dict[str, Path]:
     """Image files of a folder by stem, in the order of their names; empty if there is no folder.
 
     Raises:
-        InputError: the name of one is not UTF-8.
+        InputError: a file name is not UTF-8.
     """
     if not folder.is_dir():
         return {}
@@ -92,7 +92,7 @@ def list_images(folder: Path) -> dict[str, Path]:
 
 
 def is_image(path: Path) -> bool:
-    """Whether a file has the name of an image."""
+    """Whether a file has the suffix of an image format."""
     return path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
 
 
@@ -111,8 +111,8 @@ def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bo
         own = root.resolve().name
         if name not in (None, own):
             raise InputError(
-                f"--seq {name}: {root} is the sequence {own} itself; leave it out, or name another "
-                "folder with --data."
+                f"--seq {name}: {root} is itself the sequence {own}; leave the option out, or name "
+                "another folder with --data."
             )
         return root
     inside = sorted(p.name for p in root.iterdir() if is_sequence(p)) if root.is_dir() else []
@@ -120,7 +120,7 @@ def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bo
         return root / inside[0]
     if inside:
         wrong = f"{root}: several sequences" if name is None else f"{root / name}: no such sequence"
-        raise InputError(f"{wrong}; choose --seq of {', '.join(inside)}.")
+        raise InputError(f"{wrong}; choose one with --seq: {', '.join(inside)}.")
     return None
 
 
@@ -154,8 +154,8 @@ def check_not_empty(path: Path) -> None:
 
 
 def read_grey(path: Path) -> Image:
-    """Decode an image file: ``(H, W)`` uint8. Colours become grey by ITU-R BT.601; of 16 bits, the
-    upper eight are used.
+    """Decode an image file: ``(H, W)`` uint8. Colours are converted to grey by ITU-R BT.601; of
+    16 bits, the upper eight are used.
 
     Raises:
         UnreadableImageError: missing, damaged or larger than `MOST_PIXELS`.
@@ -172,10 +172,10 @@ def read_grey(path: Path) -> Image:
     except cv2.error as error:
         if "MAX_IMAGE" in str(error):
             raise UnreadableImageError(
-                path, f"larger than {MOST_PIXELS / 1e6:.0f} million pixels; scale it down."
+                path, f"has more than {MOST_PIXELS / 1e6:.0f} million pixels; scale it down."
             ) from error
         decoded = None
-    except (OSError, ValueError):  # ValueError: a list of images may name an impossible path
+    except (OSError, ValueError):  # ValueError: the path has a zero byte
         decoded = None
     if decoded is None:
         raise UnreadableImageError(path, "cannot be decoded; download the file again.")
@@ -200,7 +200,7 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
 
 
 def read_grey_of_size(path: Path, width: int, height: int) -> Image:
-    """`read_grey`, for an image that must have the size of the first one.
+    """As `read_grey`, and check that the image has the size of the first one.
 
     Raises:
         UnreadableImageError: missing, damaged or of another size.
@@ -216,5 +216,5 @@ def read_grey_of_size(path: Path, width: int, height: int) -> Image:
 
 
 def size_text(shape: tuple[int, ...]) -> str:
-    """``(H, W)`` as people write it: ``WxH``."""
+    """A shape ``(H, W)`` as the text ``WxH``."""
     return f"{shape[1]}x{shape[0]}"

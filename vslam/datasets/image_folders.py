@@ -1,15 +1,15 @@
 """Folders of images: one folder for a single camera, two for a stereo pair or images with depth.
 
-A pair is two folders beside each other (`PAIRS` and `DEPTH_PAIRS` of names), or one named with
-``--right`` or ``--depth``. Its images belong together by their names, or by their order where no
-name is on both sides and both have equally many; images and depth whose names are times (not the
-same ones), by these, within 20 ms. Times are taken from the first of these that is there:
+A pair is two folders beside each other, named as in `PAIRS` or `DEPTH_PAIRS`, or given by
+``--right`` or ``--depth``. Its images are paired by name. If no name occurs on both sides and both
+have the same number of images, they are paired by order; images and depth images whose names are
+different times are paired by time, within 20 ms. Times come from the first available of these:
 
 1. ``--fps``;
-2. ``times.txt`` or ``timestamps.txt``, in the folder of the images or the one above: a time in
-   seconds a line, for every image;
-3. names that are times since 1970: whole seconds, or ms, us or ns, told by their size, or seconds
-   with a point; smaller numbers are counters;
+2. ``times.txt`` or ``timestamps.txt``, in the folder of the images or its parent, with one line
+   per image: its time in seconds;
+3. file names that are times since 1970: seconds with a decimal point, or whole s, ms, us or ns,
+   distinguished by their magnitude; smaller numbers are counters;
 4. ``DateTimeOriginal`` with ``SubSecTimeOriginal`` in the images' EXIF.
 """
 
@@ -39,13 +39,13 @@ PAIRS = (
     ("cam0/data", "cam1/data"),
 )
 DEPTH_PAIRS = (("rgb", "depth"), ("color", "depth"), ("colour", "depth"), ("image", "depth"))
-_SLOWEST_S = 10.0  # between images; nothing could be tracked
+_SLOWEST_S = 10.0  # between images; at a longer interval, tracking is impossible
 _NEAR_S = 0.02  # as TUM's associate.py
 _TIME_FILES = ("times.txt", "timestamps.txt")
 _EXIF = 0x8769  # tags of EXIF 2.32
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL = 0x9003, 0x9291
-# The year 2001 in seconds: smaller whole numbers are counters; the size of larger ones tells the
-# unit.
+# The year 2001 in seconds. Smaller whole numbers are counters; the magnitude of larger ones
+# determines their unit.
 _FIRST_TIME = 1e9
 _UNITS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3), (_FIRST_TIME, 1))
 
@@ -77,10 +77,10 @@ class ImageFolders:
         """The images as a source.
 
         Args:
-            depth_scale: how many units of the depth images make a metre; needed only for these.
+                depth_scale: units of the depth images per metre; needed only for depth images.
 
         Raises:
-            InputError: there are depth images and no scale.
+            InputError: there are depth images but no scale.
             UnreadableImageError: a file is empty, or the first frame cannot be decoded.
         """
         if not self.depth:
@@ -88,8 +88,8 @@ class ImageFolders:
         colour, depth = self.sides
         if depth_scale is None:
             raise InputError(
-                f"{depth[0].parent}: what depth images count in a metre is not known; give "
-                "--depth-scale, 1000 for millimetres, or depth_scale in the calibration."
+                f"{depth[0].parent}: the unit of the depth images is unknown; give --depth-scale, "
+                "1000 for millimetres, or depth_scale in the calibration."
             )
         return depth_files("images", self.name, self.timestamps, None, colour, depth, depth_scale)
 
@@ -112,11 +112,12 @@ def open_images(
         right: folder of the right images if ``folder`` holds the left ones.
         depth: folder of the depth images if ``folder`` holds the images.
         fps: frames per second, instead of time stamps.
-        sensor: ``stereo``, ``rgbd``, or ``mono`` for the left images alone; None reads what is
-            there.
+        sensor: ``stereo``, ``rgbd``, or ``mono`` for the left images alone; None reads all images
+            that are found.
 
     Raises:
-        InputError: no images, no second ones, sides that do not match, or no usable times.
+        InputError: there are no images or no second images, the sides do not match, or there are
+            no usable times.
         UnreadableImageError: the first image cannot be decoded.
     """
     folder = Path(folder)
@@ -144,7 +145,7 @@ def _find_sides(
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; name a folder of images with --data.")
     if right is not None and depth is not None:
-        raise InputError(f"--depth {depth}: of no use with --right; leave one of them out.")
+        raise InputError(f"--depth {depth}: contradicts --right; leave one of them out.")
     if right is not None or depth is not None:
         return [
             folder,
@@ -186,8 +187,8 @@ def _near_miss(folder: Path) -> str:
 
 
 def _sorted_images(folder: Path) -> dict[str, Path]:
-    """Images by stem: in the order of time if all names are times, else in that of the words and
-    numbers in the names, 2 before 10."""
+    """Images by stem: in the order of time if all names are times, else in natural order, which
+    puts 2 before 10."""
     images = list_images(folder)
     if not images:
         raise InputError(f"{folder}: no images in this folder; name another.")
@@ -204,7 +205,7 @@ def _sorted_images(folder: Path) -> dict[str, Path]:
 def _matched(
     sides: list[dict[str, Path]], folders: list[Path], *, by_time: bool
 ) -> list[list[Path]]:
-    """The files of each side in order, equally many on both sides."""
+    """The files of each side in order, the same number on both sides."""
     first, *rest = sides
     for other in rest:
         if first.keys() == other.keys():
@@ -229,8 +230,8 @@ def _near_in_time(first: dict[str, Path], second: dict[str, Path]) -> list[list[
     pairs = associate(colour, depth, _NEAR_S)
     if not len(pairs[0]):
         raise InputError(
-            f"{files[1][0].parent}: no depth image is of the time of an image, to 20 ms, by their "
-            "names; name folders of one recording."
+            f"{files[1][0].parent}: by the times in their names, no depth image is within 20 ms of "
+            "an image; name folders of one recording."
         )
     return [[side[k] for k in chosen] for side, chosen in zip(files, pairs, strict=True)]
 
@@ -257,10 +258,10 @@ def _find_times(folder: Path, files: list[Path]) -> NDArray[np.float64]:
 def _times_of_file(path: Path, n: int) -> NDArray[np.float64]:
     times = read_table(path, (1,), "a time in seconds")[:, 0]
     if len(times) != n:
-        raise InputError(f"{path}: {len(times)} times for {n} images; write one a line for each.")
+        raise InputError(f"{path}: {len(times)} times for {n} images; write one line per image.")
     if n > 1 and (interval := float(np.median(np.diff(times)))) > _SLOWEST_S:
         raise InputError(
-            f"{path}: {interval:g} s from image to image, as if the times were in milliseconds or "
+            f"{path}: the images are {interval:g} s apart, as if the times were in milliseconds or "
             "nanoseconds; write seconds, or give --fps."
         )
     return times
@@ -287,6 +288,6 @@ def _time_of_exif(path: Path) -> float | None:
             tags = image.getexif().get_ifd(_EXIF)
         day = datetime.strptime(str(tags[_DATE_TIME_ORIGINAL]), "%Y:%m:%d %H:%M:%S")
         fraction = float(f"0.{str(tags.get(_SUB_SEC_TIME_ORIGINAL, 0)).strip()}")
-    except Exception:  # Pillow raises a dozen kinds of errors
+    except Exception:  # Pillow raises many kinds of errors
         return None
     return day.replace(tzinfo=UTC).timestamp() + fraction

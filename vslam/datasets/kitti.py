@@ -63,9 +63,9 @@ def open_kitti_images(
     """Open the images of a sequence without its calibration; only the selected frames must be
     complete.
 
-    Frame k belongs to row k of ``times.txt`` and of the poses. Where those files have more rows
-    than there are images, k is the number in the file name, so that an excerpt of a sequence
-    works with the files of the whole one.
+    Frame k has row k of ``times.txt`` and of the poses. If those files have more rows than there
+    are images, k is the number in the file name, so that an excerpt of a sequence works with the
+    files of the whole one.
 
     Args:
         root: folder that holds ``sequences`` (or ``dataset/sequences``, as KITTI's archives unpack)
@@ -77,7 +77,8 @@ def open_kitti_images(
         monocular: read the left camera alone; the right camera's images need not exist.
 
     Raises:
-        InputError: data missing, images unequal or empty, times or poses unusable.
+        InputError: data is missing, the sides have different images, or times or poses are
+            unusable.
         UnreadableImageError: the first pair cannot be decoded.
     """
     base = _find_root(root)
@@ -128,7 +129,8 @@ def read_calibration(
         monocular: read P0 alone; P1 need not be there.
 
     Raises:
-        InputError: missing or malformed file, NaN, or numbers that no rectified pair can have.
+        InputError: the file is missing or malformed, or its values are not those of a rectified
+            pair.
     """
     fix = "take calib.txt of this sequence from KITTI's calibration files"
     try:
@@ -171,7 +173,7 @@ def _find_root(root: Path | str) -> Path:
         if (base / "sequences").is_dir():
             return base
     raise InputError(
-        f"{root}: no KITTI odometry data here (no folder 'sequences'); download the grayscale "
+        f"{root}: holds no KITTI odometry data (no folder 'sequences'); download the grayscale "
         f"images (22 GB), calibration files and ground truth poses from {_HOME}, unpack them into "
         "one folder and name it with --data or $KITTI_ROOT; --dataset synthetic needs no download."
     )
@@ -209,8 +211,8 @@ def _check_frames(
         if first:
             fix += f" and those after it, or add --max-frames {first}"
         raise InputError(
-            f"{folder}: unequal counts, {len(sides[0])} left and {len(sides[1])} right images of "
-            f"which {len(sides[0].keys() & sides[1].keys())} frames have both; {fix}."
+            f"{folder}: unequal counts, {len(sides[0])} left and {len(sides[1])} right images, and "
+            f"{len(sides[0].keys() & sides[1].keys())} frames have both; {fix}."
         )
     return [tuple(side[stem] for stem in stems) for side in sides]
 
@@ -234,7 +236,7 @@ def _row_numbers(path: Path, stems: list[str], n_rows: int) -> NDArray[np.int64]
         return np.arange(len(stems))
     rows = np.array([int(stem) for stem in stems])
     if rows[-1] >= n_rows:
-        raise InputError(f"{path}: {n_rows} rows, none for image {stems[-1]}; {fix}.")
+        raise InputError(f"{path}: has {n_rows} rows but none for image {stems[-1]}; {fix}.")
     return rows
 
 
@@ -246,7 +248,7 @@ def _read_ground_truth(
     poses = read_kitti_poses(path)
     if len(poses) not in (n_times, len(stems)):
         raise InputError(
-            f"{path}: poses of another length, {len(poses)} for {len(stems)} images and "
-            f"{n_times} times; take the file of this sequence, or remove it to run without."
+            f"{path}: has {len(poses)} poses, which fit neither {len(stems)} images nor {n_times} "
+            "times; take the file of this sequence, or remove it to run without ground truth."
         )
     return poses[_row_numbers(path, stems, len(poses))[chosen]]

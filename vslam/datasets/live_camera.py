@@ -1,6 +1,6 @@
-"""Live cameras: a device of this machine, or a URL, of one camera or a pair side by side.
+"""Live cameras: a local device or a URL, with one camera or a stereo pair side by side.
 
-Time stamps are those of the machine's monotonic clock when an image arrives.
+A frame's time stamp is the machine's monotonic clock when the image arrives.
 """
 
 from __future__ import annotations
@@ -20,10 +20,9 @@ _DEVICES = Path("/dev")
 
 
 def open_camera(device: str, *, side_by_side: bool = False, monocular: bool = False) -> RawSource:
-    """Open a camera and take a first image; its frames can be had once.
+    """Open a camera and take a first image; its frames can be read only once.
 
-    The source is named by the device's number, or by host and path of the URL: never by user and
-    password.
+    The source is named by the device's number or by the URL without user name and password.
 
     Args:
         device: a number, or a URL.
@@ -31,21 +30,21 @@ def open_camera(device: str, *, side_by_side: bool = False, monocular: bool = Fa
         monocular: read the left images alone.
 
     Raises:
-        InputError: there is no such device, it is busy, it gives no image, or one image a frame
-            where two are needed.
+        InputError: there is no such device, it is busy or gives no image, or it has one image per
+            frame but two are needed.
     """
     name = _name(device)
     if not side_by_side and not monocular:
         raise InputError(
-            f"camera {name}: a camera has one image a frame; say --side-by-side if it holds both "
-            "of a stereo pair, or run with --sensor mono."
+            f"camera {name}: a camera has one image per frame; use --side-by-side if it holds both "
+            "images of a stereo pair, or run with --sensor mono."
         )
     capture = _open_device(int(device)) if device.isdecimal() else _open_url(device, name)
     decoded, image = capture.read()
     if not decoded:
         capture.release()
         raise InputError(
-            f"camera {name}: gives no image; end other programs that use it, or name another."
+            f"camera {name}: gives no image; end other programs that use it, or name another one."
         )
     return RawSource(
         dataset="camera",
@@ -68,9 +67,7 @@ def _play(capture: Capture, name: str, side_by_side: bool, monocular: bool) -> I
             n += 1
     finally:
         capture.release()
-    raise BrokenSourceError(
-        f"camera {name}: no image came after {n}; look at its cable or network."
-    )
+    raise BrokenSourceError(f"camera {name}: no image came after {n}; check its cable or network.")
 
 
 def _name(device: str) -> str:
@@ -88,7 +85,7 @@ def _open_device(number: int) -> Capture:
         return capture
     if (_DEVICES / f"video{number}").exists():
         raise InputError(
-            f"camera {number}: the device is busy, or no camera; end other programs that use it, "
+            f"camera {number}: the device is busy or not a camera; end other programs that use it, "
             "or name another number with --data."
         )
     there = sorted(path.name.removeprefix("video") for path in _DEVICES.glob("video*"))
@@ -103,6 +100,6 @@ def _open_url(url: str, name: str) -> Capture:
     capture = open_capture(url, *(number for key in timeouts for number in (key, _TIMEOUT_MS)))
     if capture is None:
         raise InputError(
-            f"camera {name}: cannot be opened; look whether the URL plays in another program."
+            f"camera {name}: cannot be opened; check whether the URL plays in another program."
         )
     return capture

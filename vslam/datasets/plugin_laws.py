@@ -17,7 +17,7 @@ _PROBE = (48, 64)  # rows and columns of the image that a law is tried on
 
 
 def plugin_laws() -> dict[str, Callable[[float, tuple[int, int]], PlugInLaw]]:
-    """By name, what makes a law of a strength and of the seed of its random stream."""
+    """By name, functions that make a law from a strength and the seed of its random stream."""
     return {name: partial(_make, plugin) for name, plugin in find_plugins(PERTURBATIONS).items()}
 
 
@@ -25,12 +25,13 @@ def _make(plugin: PlugIn, strength: float, stream: tuple[int, int]) -> PlugInLaw
     """Make a law and try it on a grey image.
 
     Raises:
-        InputError: the package is broken, or what it makes is no law.
+        InputError: the package is broken, or the object that it makes is not a law.
     """
     law = plugin.call(strength, stream)
     if not callable(law):
         raise InputError(
-            f"{plugin}: made {type(law).__name__}, no function; repair or uninstall the package."
+            f"{plugin}: made a {type(law).__name__}, which is not a function; repair or uninstall "
+            "the package."
         )
     checked = partial(_apply, plugin, law)
     checked(0, 0.0, 0, np.full(_PROBE, 128, np.uint8))
@@ -38,10 +39,10 @@ def _make(plugin: PlugIn, strength: float, stream: tuple[int, int]) -> PlugInLaw
 
 
 def _apply(plugin: PlugIn, law: PlugInLaw, frame: int, t: float, side: int, image: Image) -> Image:
-    """What the law makes of an image.
+    """Apply a law to an image.
 
     Raises:
-        UnreadableImageError: it fails, or gives no image of this size: the frame is skipped.
+        UnreadableImageError: the law fails or returns no image of this size; the frame is skipped.
     """
     view = image.view()
     view.flags.writeable = False

@@ -1,4 +1,4 @@
-"""Sources that a reader of another package opens, checked as vslam's own are."""
+"""Sources opened by readers of other packages, with the same checks as vslam's own sources."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def open_plugin(
 ) -> Source:
     """Let the package open a source, and select frames of it.
 
-    Whatever fails in the package later costs one frame of a source that can seek, and ends a
-    stream.
+    A later failure in the package costs one frame of a source that can seek, and ends a stream.
 
     Raises:
-        InputError: as the reader says; the package is broken, or what it gives is no `Source`.
+        InputError: the reader refuses its input, the package is broken, or the result is no
+            `Source`.
         UnreadableImageError: the first frame of a source that can seek cannot be read.
     """
     raw = plugin.call(root, name)
@@ -55,7 +55,7 @@ def open_plugin(
 
 
 def _wrong_source(raw: object) -> str:
-    """What is wrong with what a package gives; empty if nothing is."""
+    """What is wrong with the object that a package returned; empty if nothing is."""
     if not isinstance(raw, Source):
         return f"gave {type(raw).__name__}, not vslam.datasets.frames.Source"
     if not isinstance(raw.camera, Camera):
@@ -77,7 +77,7 @@ def _play(plugin: PlugIn, raw: Source, checked: partial[TimedFrame]) -> Iterator
             return
         except (InputError, BrokenSourceError):
             raise
-        except Exception as error:  # a package of other people raises what it likes
+        except Exception as error:  # other people's packages may raise anything
             raise BrokenSourceError(f"{plugin} failed ({reason(error)}).") from error
         if not np.isfinite(timestamp):
             raise BrokenSourceError(f"{plugin} gave a frame of {timestamp} s.")
@@ -85,14 +85,14 @@ def _play(plugin: PlugIn, raw: Source, checked: partial[TimedFrame]) -> Iterator
 
 
 def _checked(plugin: PlugIn, root: Path, camera: Camera, frame: TimedFrame, at: str) -> TimedFrame:
-    """A frame that is refused, once it is read, unless it has the camera's size and type."""
+    """A frame whose images are checked for the camera's size and type when they are read."""
 
     def read(image_map: ImageMap) -> Images:
         try:
             left, second = frame.read(image_map)
         except UnreadableImageError:
             raise
-        except Exception as error:  # a package of other people raises what it likes
+        except Exception as error:  # other people's packages may raise anything
             why = f"{plugin} failed at {at} ({reason(error)})."
             raise UnreadableImageError(root, why) from error
         second = None if camera.monocular else second

@@ -1,9 +1,9 @@
-"""Decoding the PNG files that rectified stereo sequences consist of: grey, 8 bits, not interlaced.
+"""Decoding PNG files as in rectified stereo sequences: grey, 8 bits, not interlaced.
 
-OpenCV's decoder spends as much time on undoing the filters of the lines as on inflating, because
-every pixel waits for the one on its left. Here 32 lines are decoded at once, each one pixel behind
-the line above, so that a register holds a pixel of each (a wavefront). Where no pixel is predicted
-from two others, as in all that OpenCV writes, a line at a time is faster.
+OpenCV's decoder spends as much time on undoing the line filters as on decompression, because every
+pixel depends on the one on its left. Here 32 lines are decoded at once, each one pixel behind the
+line above, so that a register holds one pixel of each (a wavefront). If no pixel is predicted from
+two others, as in all files that OpenCV writes, decoding line by line is faster.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from vslam.untrusted import MOST_PIXELS
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 GREY_8_BITS = (8, 0, 0, 0, 0)  # depth, colour type, compression, filter method, no interlacing
-# Chunks that change no pixel. Others may (transparency, orientation, animation).
+# Chunks that do not change pixels. Others may (transparency, orientation, animation).
 WITHOUT_EFFECT = {b"gAMA", b"cHRM", b"sRGB", b"pHYs", b"tIME", b"tEXt", b"bKGD"}
 LANES = 32  # lines decoded at once
 _CHECK_SUM, _CHUNK, _NEXT_CHUNK = map(struct.Struct, (">I", ">I4s", ">II4s"))
-_WIDEST = 1 << 15  # pixels: the buffers hold 65 bytes for each, of a line of any image
+_WIDEST = 1 << 15  # pixels per line; the buffers need 65 bytes per pixel of a line
 
 
 def decode_png(data: bytes) -> NDArray[np.uint8] | None:
     """Decode a file: ``(H, W)`` uint8, exactly as libpng does.
 
-    None for all that is not an undamaged PNG of 8-bit grey levels, not interlaced: every check sum
-    is looked at. What becomes of such a file, another decoder may say.
+    None unless the data is an undamaged (by all check sums), not interlaced PNG of 8-bit grey
+    levels; another decoder may be able to read it.
     """
     import deflate
 
@@ -74,7 +74,7 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
     """Kind and contents of every chunk but the last one.
 
     Raises:
-        ValueError, struct.error: cut off, or a check sum is wrong.
+        ValueError, struct.error: the file is truncated, or a check sum is wrong.
     """
     import deflate
 
@@ -97,8 +97,8 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
 
 
 def is_cut_off(data: bytes) -> bool:
-    """Whether a file is a PNG with a chunk that says it is longer than what is left: libpng would
-    take memory for all of it, up to 2 GB, before it reads on."""
+    """Whether a file is a PNG with a chunk whose stated length exceeds the rest of the file.
+    libpng would allocate the stated length, up to 2 GB, before it reads the chunk."""
     at = len(SIGNATURE)
     while data.startswith(SIGNATURE) and at + _CHUNK.size <= len(data):
         length, kind = _CHUNK.unpack_from(data, at)
@@ -111,8 +111,8 @@ def is_cut_off(data: bytes) -> bool:
 
 
 def decode_with_opencv(data: bytes, flags: int) -> NDArray[Any] | None:
-    """``cv2.imdecode`` of the bytes of a file of any format, without the memory that a PNG promises
-    in vain; None where it cannot be decoded.
+    """Decode a file of any format by ``cv2.imdecode``; None if it cannot be decoded. Truncated PNG
+    files (`is_cut_off`) are refused first.
 
     Raises:
         cv2.error: the image is too large, or the file is empty.
@@ -124,13 +124,14 @@ def decode_with_opencv(data: bytes, flags: int) -> NDArray[Any] | None:
 
 @kernel
 def unfilter(lines, image):
-    """Undo the filters of ``(H, W + 1)`` uint8 lines, which begin with the number of their filter.
+    """Undo the filters of ``(H, W + 1)`` uint8 lines, each of which begins with its filter number.
 
-    Lane l of step s is pixel s - l of the l-th line of a block, so that the pixels it needs are
-    done: the left one by the same lane, the two above by the lane before, one and two steps ago.
+    Lane l of step s decodes pixel s - l of the l-th line of a block. The pixels that it needs are
+    then decoded: the left one by the same lane, the two above by the previous lane, one and two
+    steps before.
 
     Args:
-        image: ``(H, W)`` uint8, written.
+        image: ``(H, W)`` uint8, output.
 
     Returns:
         Whether all filters are known.
@@ -138,8 +139,8 @@ def unfilter(lines, image):
     height, width = image.shape
     n = np.uintp(width)
     steps = width + LANES - 1
-    # Of each step all lanes; the decoded ones behind a lane that holds the line above the block,
-    # and behind two steps of zeros, the pixels left of the image.
+    # All lanes of each step. The decoded pixels follow a lane with the line above the block, and
+    # two steps of zeros, which stand for the pixels left of the image.
     coded = np.zeros(steps * LANES, np.uint8)
     decoded = np.zeros((steps + 2) * (LANES + 1), np.uint8)
     left, above = np.zeros(LANES, np.int16), np.zeros(LANES, np.int16)
@@ -173,7 +174,7 @@ def unfilter(lines, image):
 
 @inner_kernel
 def largest_filter(lines):
-    """The largest number of a filter of some lines."""
+    """The largest filter number of some lines."""
     largest = np.uint8(0)
     for y in range(len(lines)):
         largest = max(largest, lines[y, 0])
@@ -182,7 +183,7 @@ def largest_filter(lines):
 
 @inner_kernel
 def add_prediction(line, line_above, out, is_first):
-    """Decode a line that is not filtered, or by Sub or Up."""
+    """Decode a line with filter None, Sub or Up."""
     n, one = np.uintp(len(out)), np.uintp(1)
     if line[0] == 1:
         value = np.uint8(0)
@@ -201,8 +202,8 @@ def add_prediction(line, line_above, out, is_first):
 def choose_filter(number, lane, left, above, corner, is_average):
     """Set the masks of a lane for a filter of the PNG specification, section 9.2.
 
-    Paeth's predictor with the pixels above taken for zeros is the left pixel (Sub), with the others
-    taken for zeros the one above (Up).
+    With zeros for the pixels above, Paeth's predictor is the left pixel (Sub); with zeros for the
+    left pixels, it is the pixel above (Up).
     """
     left[lane] = 255 if number == 1 or number == 4 else 0
     above[lane] = 255 if number == 2 or number == 4 else 0

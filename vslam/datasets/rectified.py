@@ -1,4 +1,4 @@
-"""Images as the cameras took them, rectified as they are decoded."""
+"""Rectification of images when they are decoded."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from vslam.datasets.depth_images import with_depth
 from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame
 from vslam.errors import InputError
 
-_CUT = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}  # columns and rows cut off
+_CUT = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}  # by missing (columns, rows)
 
 
 def rectified(raw: RawSource, calibration: Calibration) -> Source:
     """A source whose images are rectified as they are read; the maps are computed once.
 
-    Images that are rectified already are handed on unchanged.
+    Images that are already rectified stay unchanged.
 
     Raises:
-        InputError: the images are not of the calibrated size, the calibration of the right camera
+        InputError: the images do not have the calibrated size, the calibration of the right camera
             is missing, or as `vslam.calibration.rectification.rectify`.
     """
-    if raw.depth:  # depth has its pixels where the left image has them
+    if raw.depth:  # depth is registered to the left image
         alone = _rectification_for(calibration, raw.sizes[:1])
         rectification = replace(alone, camera=with_depth(alone.camera, calibration))
     else:
@@ -56,8 +56,8 @@ def _rectification_for(calibration: Calibration, sizes: Several[Size]) -> Rectif
         calibration = calibration.left_alone()
     if len(sizes) == 2 and calibration.right is None:
         raise InputError(
-            f"{calibration.source}: the calibration of the right camera is missing; give that of "
-            "both, or run on the left camera alone with --sensor mono."
+            f"{calibration.source}: the calibration of the right camera is missing; give the "
+            "calibration of both, or run on the left camera alone with --sensor mono."
         )
     models = [model for model in (calibration.left, calibration.right) if model is not None]
     for model, (width, height) in zip(models, sizes, strict=True):
@@ -67,10 +67,10 @@ def _rectification_for(calibration: Calibration, sizes: Several[Size]) -> Rectif
             if max(cut) == 1 and min(cut) >= 0:
                 fix = (
                     f"an encoder seems to have cut off the last {_CUT[cut]}; write this size into "
-                    "the calibration, whose other numbers stay the same"
+                    "the calibration and keep its other numbers"
                 )
             elif (2 * model.width, model.height) == (width, height):
-                fix = "say --side-by-side if each holds both of a stereo pair"
+                fix = "use --side-by-side if each holds both images of a stereo pair"
             raise InputError(
                 f"{calibration.source}: made for {model.width}x{model.height} pixels but the "
                 f"images have {width}x{height}; {fix}."
@@ -85,8 +85,7 @@ def _rectified_frame(rectification: Rectification, frame: TimedFrame) -> TimedFr
 
 
 def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) -> Images:
-    """Both images rectified, or the left one if there is no second one; depth by the nearest
-    pixel."""
+    """Rectify the images of a frame; depth takes the nearest pixel."""
     left, second = frame.read(image_map)
     left_side: Callable[[], Image | DepthImage] = partial(rectification.left, left)
     if second is None:

@@ -20,10 +20,10 @@ SOURCES = ("images", "video", "bag", "camera")
 
 
 class SourceOptions(BaseModel):
-    """What a user says about a source of frames.
+    """The options that select and describe a source of frames.
 
     Attributes:
-        data: folder or file, number of a device, or URL; rendered towns need none.
+        data: folder, file, number of a device, or URL; not needed for rendered towns.
         dataset: one of `vslam.datasets.known_datasets` or of `SOURCES`; None detects it from
             ``data``.
         seq: name of the sequence of a data set; None as for `vslam.datasets.open_sequence`.
@@ -32,12 +32,12 @@ class SourceOptions(BaseModel):
         depth: folder of the depth images.
         fps: frames per second, instead of time stamps.
         side_by_side: each frame holds the left image and, right of it, the right one.
-        topics: topics of the left images of a bag and of the right images or the depth, separated
-            by a comma.
-        depth_scale: how many units of the depth images make a metre.
-        sensor: ``stereo``, ``rgbd`` or ``mono``, which reads the left images alone; None takes all
-            that the source has.
-        start, every, max_frames: selection of every N-th frame from a first one on.
+        topics: topic of a bag's left images and topic of its right images or depth, separated by a
+            comma.
+        depth_scale: units of the depth images per metre.
+        sensor: ``stereo``, ``rgbd`` or ``mono``, which reads the left images alone; None reads all
+            images of the source.
+        start, every, max_frames: selects every N-th frame, from a first one on, up to a number.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -78,8 +78,8 @@ def open_source(
         on_render: see `vslam.datasets.open_sequence`.
 
     Raises:
-        InputError: an option does not apply to this source, its sensor is another, the calibration
-            is missing or of other images, or as the reader says.
+        InputError: an option does not apply to this source, the source has another sensor, the
+            calibration is missing or does not fit the images, or the reader refuses the data.
     """
     o = options
     dataset = o.dataset or detect_dataset(o.data)
@@ -100,8 +100,8 @@ def open_source(
         )  # fmt: skip
     if o.sensor not in (None, source.camera.sensor):
         raise InputError(
-            f"--sensor {o.sensor}: {source.name} is of sensor {source.camera.sensor}; leave it "
-            "out, or take mono."
+            f"--sensor {o.sensor}: {source.name} has the sensor {source.camera.sensor}; leave the "
+            "option out, or use mono."
         )
     return source
 
@@ -201,7 +201,7 @@ def _check_options(dataset: str, options: SourceOptions) -> None:
                 f"{option}: only for --dataset {' or '.join(kinds)}, not {dataset}; leave it out."
             )
         if options.sensor == "mono" and name in _NOT_MONOCULAR:
-            raise InputError(f"{option}: of no use with --sensor mono; leave one of them out.")
+            raise InputError(f"{option}: contradicts --sensor mono; leave one of them out.")
         if isinstance(value, float) and not 0.0 < value < float("inf"):
             raise InputError(f"{option} {value:g}: must be a positive number.")
 
@@ -225,6 +225,6 @@ def _calibration(
         where = " (nor camera_info in the bag)" if dataset == "bag" else ""
         raise InputError(
             f"--calib: no calibration{where}; name a file with the cameras' focal lengths, "
-            "centres, distortion and, of two cameras, baseline, as docs/howto/cameras.md describes."
+            "centres, distortion and, for two cameras, baseline (docs/howto/cameras.md)."
         )
     return own

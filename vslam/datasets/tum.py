@@ -1,9 +1,9 @@
 """RGB-D sequences of TUM, and all data in their layout [Sturm et al., IROS 2012].
 
-FOLDER/rgb.txt, depth.txt    a time in seconds and an image file a line
+FOLDER/rgb.txt, depth.txt    on each line, a time in seconds and an image file
 FOLDER/groundtruth.txt       optional: t tx ty tz qx qy qz qw
-FOLDER/calibration.yaml      optional: the camera (docs/howto/cameras.md); without it one of TUM's
-                             three, by "freiburg1", "freiburg2" or "freiburg3" in the folder's name
+FOLDER/calibration.yaml      optional: the camera (docs/howto/cameras.md); the default is TUM's
+                             camera freiburg1, freiburg2 or freiburg3 by the folder's name
 """
 
 from __future__ import annotations
@@ -59,25 +59,27 @@ def open_tum(
     (`vslam.datasets.ground_truth.poses_at`).
 
     Args:
-        root: the sequence's folder, or one with several.
-        name: name of the sequence in it; None for the folder itself, or the only one in it.
+        root: folder of the sequence, or of several sequences.
+        name: name of the sequence in ``root``; None for ``root`` itself, or its only sequence.
         start: first frame, counted over the pairs.
         every: take every N-th frame.
         max_frames: largest number of frames, None for all.
         monocular: read the colour images alone; depth images need not exist.
         calib: calibration file, which replaces the folder's own and those of TUM's cameras.
-        depth_scale: how many units of the depth images make a metre; None takes the calibration's
-            value, or 5000.
+        depth_scale: units of the depth images per metre; None takes the calibration's value, or
+            5000.
 
     Raises:
-        InputError: data missing or malformed, no pairs, calibration or ground truth unusable.
-        UnreadableImageError: a file is empty, the first pair cannot be decoded or does not fit.
+        InputError: data is missing or malformed, there are no pairs, or the calibration or the
+            ground truth is unusable.
+        UnreadableImageError: a file is empty, or the first pair cannot be decoded or differs in
+            size.
     """
     root = Path(root)
     folder = find_sequence(root, name, is_tum)
     if folder is None:
         raise InputError(
-            f"{root}: no data in TUM's RGB-D layout here (no rgb.txt); download a sequence from "
+            f"{root}: holds no data in TUM's RGB-D layout (no rgb.txt); download a sequence from "
             f"{_HOME}, unpack it and name its folder with --data."
         )
     times, colour_files = _read_list(folder / "rgb.txt")
@@ -159,6 +161,6 @@ def _known_camera(folder: Path) -> Calibration:
         if name in folder.resolve().name:
             return Calibration(model, source=f"TUM's camera {name}")
     raise InputError(
-        f"{folder}: of no known camera (no {', '.join(_CAMERAS)} in its name, no {CALIBRATION}); "
-        "name a calibration with --calib."
+        f"{folder}: the camera is unknown (no {', '.join(_CAMERAS)} in its name, no {CALIBRATION});"
+        " name a calibration with --calib."
     )

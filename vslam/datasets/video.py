@@ -1,4 +1,4 @@
-"""Video files that FFmpeg decodes, of one camera or of a stereo pair side by side."""
+"""Video files of one camera or of a stereo pair side by side, decoded by FFmpeg."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from vslam.untrusted import MOST_PIXELS
 
 _log = logging.getLogger(__name__)
 
-_CONVERT = "convert the video, with ffmpeg -i VIDEO -c:v libx264 -crf 12 NEW.mp4 for example"
+_CONVERT = "convert the video, for example with ffmpeg -i VIDEO -c:v libx264 -crf 12 NEW.mp4"
 _SAME_RATE = 0.02  # 30 and 29.97 frames per second are the same
-_MISSING_SHARE = 0.05  # what the end may lack of the frames that the file speaks of: it estimates
+_MISSING_SHARE = 0.05  # tolerated at the end, because the file's number of frames is an estimate
 
 
 def open_video(
@@ -31,18 +31,18 @@ def open_video(
     """Open a video and decode its first frames.
 
     Args:
-        fps: frames per second, instead of the file's time stamps; None uses these.
+        fps: frames per second, instead of the file's time stamps; None uses the time stamps.
         side_by_side: each frame holds the left image and, right of it, the right one.
         monocular: read the left images alone.
 
     Raises:
-        InputError: no such file, no decoder for it, no time stamps and no ``fps``, or one image a
-            frame where two are needed.
+        InputError: the file is missing or cannot be decoded, there are neither time stamps nor
+            ``fps``, or a frame has one image but two are needed.
     """
     if not side_by_side and not monocular:
         raise InputError(
-            f"{path}: a video has one image a frame; say --side-by-side if it holds both of a "
-            "stereo pair, or run with --sensor mono."
+            f"{path}: a video has one image per frame; use --side-by-side if it holds both images "
+            "of a stereo pair, or run with --sensor mono."
         )
     path = Path(path)
     capture = _open(path)
@@ -79,7 +79,7 @@ def _play(
         n += 1
     if n_expected is not None and n + 1 < (1.0 - _MISSING_SHARE) * n_expected:
         raise BrokenSourceError(
-            f"{path}: the video breaks off after {n} of about {n_expected} frames; copy it again."
+            f"{path}: the video ends after {n} of about {n_expected} frames; copy it again."
         )
 
 
@@ -89,22 +89,21 @@ def _open(path: Path) -> Capture:
     capture = open_capture(str(path))
     if capture is None:
         raise InputError(
-            f"{path}: no video, cut off, or of a codec that FFmpeg in OpenCV does not know; "
-            f"{_CONVERT}."
+            f"{path}: not a video, truncated, or in a codec unknown to OpenCV's FFmpeg; {_CONVERT}."
         )
     return capture
 
 
 def _check_size(path: Path, capture: Capture) -> None:
-    """Before the first frame takes the memory that the header asks for."""
+    """Refuse large frames before decoding allocates the memory that the header asks for."""
     import cv2
 
     kinds = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
     width, height = (capture.get(kind) for kind in kinds)
     if width * height > MOST_PIXELS:
         raise InputError(
-            f"{path}: frames of {width:.0f}x{height:.0f} pixels; {MOST_PIXELS / 1e6:.0f} million "
-            "are the limit, so scale the video down."
+            f"{path}: frames of {width:.0f}x{height:.0f} exceed the limit of "
+            f"{MOST_PIXELS / 1e6:.0f} million pixels; scale the video down."
         )
 
 
@@ -116,7 +115,7 @@ def _count(capture: Capture) -> int | None:
 
 
 def _own_rate(capture: Capture) -> float:
-    """Frames per second by the file, 0 if it does not say."""
+    """Frames per second stated in the file, 0 if it states none."""
     import cv2
 
     return float(capture.get(cv2.CAP_PROP_FPS))
@@ -125,8 +124,8 @@ def _own_rate(capture: Capture) -> float:
 def _compare_rates(path: Path, fps: float, own: float) -> None:
     if own > 0 and abs(fps - own) > _SAME_RATE * own:
         _log.warning(
-            "%s: --fps %g contradicts the %.4g frames per second of the video itself; leave it "
-            "out unless those are wrong.",
+            "%s: --fps %g contradicts the video's own %.4g frames per second; leave the option out "
+            "unless the video is wrong.",
             path,
             fps,
             own,
@@ -134,7 +133,7 @@ def _compare_rates(path: Path, fps: float, own: float) -> None:
 
 
 def _images(capture: Capture) -> Iterator[tuple[float, Image]]:
-    """Times in seconds and images as decoded; closes the capture."""
+    """Yield times in seconds and decoded images; then close the capture."""
     import cv2
 
     try:

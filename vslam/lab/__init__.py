@@ -1,4 +1,4 @@
-"""The laboratory: many runs and their page, stress tests, loop detectors on images.
+"""The laboratory: benchmarks of many runs, stress tests, loop detectors compared on images.
 
-No run needs it: only the command line imports it (tests/test_dependencies.py).
+No run needs it; only the command line imports it (tests/test_dependencies.py).
 """

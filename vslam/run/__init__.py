@@ -1,1 +1,1 @@
-"""A run over a sequence: frames prepared, tracked and recorded, and what came of it."""
+"""A run over a sequence: it prepares, tracks and records the frames, and collects the results."""

@@ -1,11 +1,10 @@
-"""What a run leaves on the disk while it goes on, so that a killed one costs a minute at most.
+"""Saving the state of a run at intervals, so that a killed run loses at most a minute of work.
 
-``trajectory_online.tum`` has the pose of each frame as it was tracked, a line when it comes. Every
-so often the map is copied between two frames, if possible while no keyframe is being mapped, and a
-thread writes it with all that the report tells of the frames so far: ``autosave_progress.npz``,
-then ``autosave.npz``, a map file as any other. Each takes the place of the one before in one step.
-A run killed between the two finds the progress of a few frames more than the map has, and passes
-over them.
+``trajectory_online.tum`` gets a line with the pose of each frame when it is tracked. At intervals,
+the map is copied between two frames, if possible while no keyframe is being mapped. A thread then
+writes what the report needs about the frames so far (``autosave_progress.npz``) and the map
+(``autosave.npz``, an ordinary map file). Each file replaces the previous one atomically. If a run
+is killed between the two, its progress has a few frames more than its map; they are ignored.
 """
 
 from __future__ import annotations
@@ -31,16 +30,16 @@ from vslam.trajectory import tum_line
 
 MAP, PROGRESS, ONLINE = "autosave.npz", "autosave_progress.npz", "trajectory_online.tum"
 LOCK = ".lock"
-_BEGIN = 0.75  # of the period: writing, and waiting for a merge, take the rest
-_PATIENCE = 0.95  # of the period: until then no global bundle adjustment is cut off
-_MISSED = 5  # frames that end while a keyframe is mapped, until its mapping is waited for
+_BEGIN = 0.75  # share of the period; the rest is left for waiting for a merge and for writing
+_PATIENCE = 0.95  # share of the period before which no global bundle adjustment is interrupted
+_MISSED = 5  # frames that end during mapping before the save waits for the mapping to end
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Unfinished:
-    """What a run left that was cut off: a map file, and the report's part of the same frames."""
+    """The files of an interrupted run: its map, and its progress at the same frame."""
 
     map: Path
     progress: Progress
@@ -48,28 +47,28 @@ class Unfinished:
 
 @contextmanager
 def lock_run(folder: Path) -> Iterator[None]:
-    """Keep a run from being resumed while it goes on. Where no lock can be made, on a full disk
-    for example, it goes on without.
+    """Lock the folder of a run, so that nobody resumes the run while it is in progress. If the
+    lock cannot be created, for example on a full disk, the run continues without it.
 
     Raises:
         InputError: another living process runs in the folder.
     """
     with ExitStack() as lock:
         with suppress(OSError):
-            lock.enter_context(locked(folder / LOCK, folder, "runs here still"))
+            lock.enter_context(locked(folder / LOCK, folder, "is still running here"))
         yield
 
 
 def find_unfinished(folder: Path) -> Unfinished:
-    """What to go on from in the folder of a run. Poses of frames that are to be tracked once more
-    are taken out of ``trajectory_online.tum``.
+    """Find the saved state from which a run can be resumed. Poses of frames that will be tracked
+    again are removed from ``trajectory_online.tum``.
 
     Raises:
         InputError: nothing was saved, or it is damaged.
     """
     file = folder / MAP
     if not file.is_file():
-        raise InputError(f"{folder}: no {MAP} here: nothing was saved, or the run is finished.")
+        raise InputError(f"{folder}: has no {MAP}; nothing was saved yet, or the run is finished.")
     frames = load_map(file).frames
     progress = read_progress(folder / PROGRESS)
     if frames is None or len(frames.timestamp) > len(progress.tracks):
@@ -86,16 +85,16 @@ def _forget_poses(path: Path, frames: int) -> None:
 
 
 class Autosave:
-    """Told of every frame of a run, in order; this one keeps nothing."""
+    """Interface to save a run, called for every frame in order; this base class saves nothing."""
 
     def frame(self, result: TrackResult) -> None:
-        """A frame was tracked."""
+        """Called after a frame was tracked."""
 
     def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
-        """The frame is done with: this is the moment to save, if it is time."""
+        """Save if it is time; called when a frame is finished."""
 
     def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
-        """The run is over, and finished; if ``resumable``, it ended early with a complete map."""
+        """Called at the end of the run; ``resumable`` if it ended early with a complete map."""
 
 
 NO_AUTOSAVE = Autosave()
@@ -104,21 +103,21 @@ NO_AUTOSAVE = Autosave()
 class FolderAutosave(Autosave):
     """Saves into the folder of a run.
 
-    What cannot be written, on a full disk for example, is told once; the run goes on, and the next
-    time is another try.
+    If writing fails, for example on a full disk, one warning is logged, the run continues, and
+    saving is tried again the next time.
     """
 
     def __init__(self, folder: Path, seconds: float, drive: str) -> None:
         """
         Args:
-            seconds: what a killed run loses at most; 0: no map is saved.
-            drive: what the images are, for the map file.
+            seconds: most that a killed run can lose; 0 saves no map.
+            drive: name of the drive in the map file.
         """
         self._folder, self._seconds, self._drive = folder, seconds, drive
         self._last = time.monotonic()
         self._writer = ThreadPoolExecutor(1, "autosave")
         self._writing: Future[None] | None = None
-        self._missed = 0  # frames since it is time at whose end a keyframe was being mapped
+        self._missed = 0  # frames, since saving is due, that ended during mapping
         self._warned: set[str] = set()
         self._online: TextIO | None = None
         try:
@@ -132,7 +131,7 @@ class FolderAutosave(Autosave):
         try:
             self._online.write(tum_line(result.timestamp, result.T_wc))
             self._online.flush()
-        except Exception as error:  # nothing that is only saved may end a run
+        except Exception as error:  # a failure to save must not end the run
             self._warn(ONLINE, error)
             self._online = None
 
@@ -161,7 +160,7 @@ class FolderAutosave(Autosave):
         stored, done = slam.stored_map(self._drive), progress()
         frames, n_done = stored.frames, len(done.tracks)
         if frames is not None and len(frames.timestamp) > n_done:
-            # A step that failed had placed its frame already: it is to be tracked once more.
+            # A step that failed had already added its frame, which must be tracked again.
             stored = replace(stored, frames=frames.until(n_done), checkpoint=None)
         try:
             self._writing = self._writer.submit(self._write, _copy(stored), done)
@@ -179,15 +178,15 @@ class FolderAutosave(Autosave):
         if name not in self._warned:
             self._warned.add(name)
             _log.warning(
-                "%s: cannot be written (%s); the run goes on without.",
+                "%s: cannot be written (%s); the run continues without it.",
                 self._folder / name,
                 getattr(error, "strerror", None) or str(error) or type(error).__name__,
             )
 
 
 def remove_autosave(folder: Path) -> None:
-    """Remove what only a run that was cut off needs, half-written files of killed runs included;
-    its results are written."""
+    """Remove the files that only resuming needs, and half-written files of killed runs, once the
+    results are written."""
     for name in (MAP, PROGRESS):
         (folder / name).unlink(missing_ok=True)
         for part in folder.glob(f".{name}.*.part"):
@@ -195,7 +194,7 @@ def remove_autosave(folder: Path) -> None:
 
 
 def _copy(stored: StoredMap) -> StoredMap:
-    """A copy of the map as it is, for another thread to make compact."""
+    """A plain copy of the map, which another thread compacts."""
     tables = {
         name: replace(table, first=table.first.copy(), values=table.values.copy())
         for name, table in stored.detector.tables.items()

@@ -22,7 +22,7 @@ _LINE_OPACITY = 0.35
 
 @dataclass(frozen=True)
 class LoopPicture:
-    """What the picture of a closed loop is drawn from.
+    """The data from which the picture of a closed loop is drawn.
 
     Attributes:
         query_frame: the frame of this run that closed the loop.
@@ -45,15 +45,15 @@ def loop_matches(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The pixels at which the two keyframes of a closed loop see the same landmarks.
 
-    After the loop was closed, the features of the query that verified it observe the landmarks of
-    the place. A landmark that the match does not observe itself, but another keyframe of the place
-    does, is projected into the match. Features that lost their landmark in the bundle adjustment
-    after the loop, and landmarks out of sight of the match, are left out.
+    After a loop is closed, the query's inlier features observe the landmarks of the place. A
+    landmark that another keyframe of the place observes, but not the match itself, is projected
+    into the match. Features that lost their landmark in the bundle adjustment after the loop, and
+    landmarks outside the view of the match, are left out.
 
     Args:
-        map_: after the correction of the loop.
+        map_: the map after the correction of the loop.
         edge: an accepted loop.
-        camera: of the keyframes.
+        camera: the camera of both keyframes.
 
     Returns:
         ``(N, 2)`` float64 pixels in the image of the query, and ``(N, 2)`` in that of the match.
@@ -73,8 +73,8 @@ def loop_matches(
 
 
 def spread(xy: NDArray[np.float64], most: int) -> NDArray[np.int64]:
-    """Which of ``(N, 2)`` points to show so that at most ``most`` cover the image evenly: each one
-    is the point that lies farthest from those chosen before it."""
+    """Choose at most ``most`` of ``(N, 2)`` points that cover the image evenly, by farthest-point
+    sampling; returns their indices."""
     if len(xy) <= most:
         return np.arange(len(xy))
     chosen = [0]
@@ -104,14 +104,14 @@ def draw_picture(picture: LoopPicture) -> bytes:
         cv2.circle(canvas, point, 5 << (_SUBPIXEL - 1), _GREEN, -1, cv2.LINE_AA, _SUBPIXEL)
     _label(canvas, f"frame {picture.match_frame}", 0)
     _label(canvas, f"frame {picture.query_frame}", _PANEL_WIDTH + _GUTTER)
-    # Colours are stored at full resolution, or thin lines would lose theirs.
+    # Chroma subsampling would take the colour from thin lines.
     options = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
     options += [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
     return cv2.imencode(".jpg", canvas, options)[1].tobytes()
 
 
 def _panel(jpeg: bytes) -> tuple[NDArray[np.uint8], float]:
-    """A small image in the width of half a picture, and how many times larger it is there."""
+    """An image scaled to the width of a panel, and the scale factor."""
     image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert image is not None
     scale = _PANEL_WIDTH / image.shape[1]

@@ -1,4 +1,4 @@
-"""Small images of keyframes, for the page that people look at: some moments, and closed loops."""
+"""Small images of keyframes for the report: some moments of the run, and the closed loops."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ _WIDTH = 360  # pixels
 _QUALITY = 55
 _MOST_POINTS = 400
 
-# Images of closed loops have half the size: OpenCV averages 2x2 pixels five times faster than it
-# reduces an image by another factor. A keyframe of KITTI takes 0.2 ms and 15 kB.
+# Images of closed loops have half the original size, because OpenCV averages 2x2 pixels five times
+# faster than it scales by other factors. A keyframe of KITTI takes 0.2 ms and 15 kB.
 _LOOP_SCALE = 0.5
 _LOOP_QUALITY = 60
-_MOST_LOOP_IMAGES = 2000  # 30 MB; then every second image of those kept is dropped
+_MOST_LOOP_IMAGES = 2000  # 30 MB; beyond this, every second image is dropped
 _MOST_MATCHES = 60  # more lines hide the images
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A keyframe as the page shows it.
+    """A keyframe as the report shows it.
 
     Attributes:
-        frame: of the run.
+        frame: index of its frame in the run.
         jpeg: its left image, 360 pixels wide or less.
         points: ``(N, 2)`` uint8 keypoints in 255ths of width and height.
-        tracked: ``(N,)`` whether each is an inlier of the map.
+        tracked: ``(N,)`` bool, whether each keypoint is an inlier match of a landmark.
     """
 
     frame: int
@@ -48,8 +48,8 @@ class Moment:
 
 
 class MomentRecorder(Recorder):
-    """Keeps every keyframe at first and, whenever there are too many, every second of those kept:
-    what is kept depends on the keyframes alone, and lies evenly over a run of any length."""
+    """Keeps every keyframe and, whenever there are too many, drops every second one, so that the
+    kept ones are spread evenly over a run of any length."""
 
     def __init__(self) -> None:
         self.moments: list[Moment] = []
@@ -89,13 +89,13 @@ def _moment(
 
 
 class LoopPictureRecorder(Recorder):
-    """Keeps a small image of each keyframe, and of each closed loop what its picture shows.
+    """Keeps a small image of each keyframe, and the data for a picture of each closed loop.
 
-    There is no picture of a loop whose earlier image is not kept: that of another drive, of the
-    part of a run before it was resumed, or one that a very long run has dropped.
+    A loop has no picture if its earlier image is not available: because it belongs to another
+    drive or to the part of a run before it was resumed, or was dropped in a very long run.
 
     Attributes:
-        pictures: of the loops that were closed, in order.
+        pictures: pictures of the closed loops, in order.
     """
 
     def __init__(self) -> None:

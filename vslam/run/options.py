@@ -1,4 +1,4 @@
-"""The options of ``vslam run`` that a run depends on, kept in its folder to be resumed with."""
+"""The options of ``vslam run``, saved in the folder of the run so that it can be resumed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OPTIONS = "run.json"
 
 
 class RunOptions(SourceOptions):
-    """As the command line has them; paths are absolute in a file."""
+    """The options as given on the command line; in the file, paths are absolute."""
 
     perturb: str = "none"
     seed: int = 0
@@ -34,10 +34,10 @@ class RunOptions(SourceOptions):
 
 
 def settings_of(options: RunOptions, source: Source, perturb: str) -> RunSettings:
-    """What a run of a source with these options tells of itself.
+    """The settings that the report shows for a run of a source with these options.
 
     Args:
-        perturb: name of the perturbation, laws with their strengths.
+        perturb: name of the perturbation: its laws with their strengths.
     """
     return RunSettings(
         dataset=source.dataset,
@@ -81,8 +81,8 @@ def write_options(folder: Path, options: RunOptions) -> None:
         (folder / OPTIONS).write_text(text + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(
-            f"{folder / OPTIONS}: cannot be written ({error.strerror}); name a folder with some "
-            "space with --out."
+            f"{folder / OPTIONS}: cannot be written ({error.strerror}); use --out to name a folder "
+            "on a disk with free space."
         ) from error
 
 
@@ -90,14 +90,14 @@ def resumed_options(folder: Path) -> RunOptions:
     """The options of a run that is to be resumed.
 
     Raises:
-        InputError: as `read_options`, or the folder holds a link: the run would write to wherever
-            it leads.
+        InputError: as `read_options`, or the folder contains a symbolic link, through which the
+            run would write outside the folder.
     """
     for path in folder.rglob("*"):
         if path.is_symlink():
             raise InputError(
-                f"{path}: this is a link, and a resumed run writes into its own folder only; put "
-                "the file itself there."
+                f"{path}: this is a link, but a resumed run writes only into its own folder; "
+                "replace the link by the file."
             )
     return read_options(folder)
 
@@ -116,4 +116,4 @@ def read_options(folder: Path) -> RunOptions:
             f"{path}: cannot be read ({error.strerror}); name the folder of a run."
         ) from error
     except ValidationError as error:
-        raise InputError(f"{path}: damaged, or of another version; run again.") from error
+        raise InputError(f"{path}: damaged or from another version; start a new run.") from error

@@ -1,4 +1,4 @@
-"""What one finished run says: the type that reports are made from."""
+"""The outcome of a finished run, from which reports are made."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vslam.config import Config
 from vslam.datasets.frames import Source
-from vslam.features import TrackResult
+from vslam.features import TrackingState, TrackResult
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.map import Map
 from vslam.maps.stored_map import StoredMap, World
@@ -47,42 +47,42 @@ class RunSettings:
 
     @property
     def alignment(self) -> str:
-        """What is fitted before a trajectory is compared with the ground truth."""
+        """How a trajectory is aligned with the ground truth before they are compared."""
         return alignment_of(self.sensor)
 
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """All that the report needs.
+    """All data that the report needs.
 
     Attributes:
-        trajectory: final pose of every frame done, lost ones included; as they were tracked where
-            there is no map.
-        keyframes: final keyframe poses, likewise.
-        tracks: one result a frame.
-        warnings: faults of the rig that the run has shown, in sentences.
-        skipped: messages of the frames whose images could not be read.
-        latency_ms: of each frame tracked in a real-time run, from its time to its pose.
-        wall_s, cpu_s: seconds from the first frame read to the last one tracked and mapped, by
-            all detectors where several are compared.
+        trajectory: final pose of every processed frame, including lost ones; poses as they were
+            tracked if there is no map.
+        keyframes: final poses of the keyframes.
+        tracks: one result per frame.
+        warnings: faults of the rig that the run detected, as sentences.
+        skipped: messages for the frames whose images could not be read.
+        latency_ms: from the time of each tracked frame to its pose, in a real-time run.
+        wall_s, cpu_s: seconds from reading the first frame until the last one is tracked and
+            mapped; the sum of all detectors if several are compared.
         step_s: wall seconds of this detector's own steps: tracking, waiting for its mapping, and
-            completing the map at the end. Reading images and extracting features is not in it.
+            completing the map at the end. Reading images and extracting features is excluded.
         startup_s: seconds from the start of the process to the first frame.
-        peak_memory_mb: of the process.
-        n_landmarks, n_keyframes: in the final map.
-        map: the final map, None for a trajectory from elsewhere or after mapping failed.
-        world: where the map that the run went on in lies, as far as that is known.
-        in_map: ``(N,)`` bool, frames placed in the map that the run went on in, at the end; None
-            for a run that began a map.
-        stored: the map with all that is needed to go on in it; None where it was only localised in.
-        loops: all that became of loop candidates, in the order of their decision.
-        corrections: what the accepted ones did to the map, in order.
-        keyframe_frames: ``(K,)`` int64, the frame of this run that each keyframe was, culled ones
-            included: loops speak of keyframes, people of frames. -1 for those of earlier drives.
-        n_submaps: how often mapping began, the first time included; 0 before the first keyframe.
-        interrupted: why the run ended early ("Ctrl-C", a file cut off), or None.
+        peak_memory_mb: peak memory of the process.
+        n_landmarks, n_keyframes: size of the final map.
+        map: the final map; None for a trajectory from another system or after mapping failed.
+        world: place of the continued map in the world of a ground truth, if known.
+        in_map: ``(N,)`` bool, frames localised at the end in the map that the run continued; None
+            for a run that started a new map.
+        stored: the map with all data needed to continue it; None if the run only localised in it.
+        loops: accepted and rejected loop candidates, in the order of their decision.
+        corrections: corrections of the map by the accepted loops, in order.
+        keyframe_frames: ``(K,)`` int64, the frame of this run behind each keyframe, including
+            culled ones; -1 for keyframes of earlier drives.
+        n_submaps: how often a map or sub-map was started; 0 before the first keyframe.
+        interrupted: why the run ended early ("Ctrl-C", a truncated file), or None.
         compared: the runs of the detectors of ``settings.compare`` on the same frames, without
-            their maps; none in a run that was resumed.
+            their maps; empty for a resumed run.
     """
 
     settings: RunSettings
@@ -111,18 +111,23 @@ class RunOutcome:
     step_s: float = 0.0
     compared: tuple[RunOutcome, ...] = ()
 
+    @property
+    def n_tracked(self) -> int:
+        """The number of frames whose pose was found in their images."""
+        found = (TrackingState.OK, TrackingState.WEAK)
+        return sum(track.state in found for track in self.tracks)
+
 
 def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:
-    """The pose of each frame as it was given at the time, in the map as it stood then: later
-    corrections, by bundle adjustment or a loop, are not in it. A lost or dropped frame has its
-    predicted pose."""
+    """The pose of each frame as it was tracked, without later corrections by bundle adjustment or
+    loop closing. A lost or dropped frame has its predicted pose."""
     times = np.array([track.timestamp for track in tracks], np.float64)
     poses = [track.T_wc for track in tracks]
     return Trajectory(times, np.array(poses, np.float64).reshape(-1, 4, 4))
 
 
 def ground_truth_of(source: Source) -> Trajectory | None:
-    """The ground truth of all frames that have one, None without any."""
+    """The ground truth of all frames that have one; None if there is none."""
     if source.ground_truth is None:
         return None
     known = np.flatnonzero(np.isfinite(source.ground_truth).all((1, 2)))
@@ -130,7 +135,7 @@ def ground_truth_of(source: Source) -> Trajectory | None:
 
 
 def matched_ground_truth(outcome: RunOutcome) -> Trajectory | None:
-    """The ground truth of just the frames that ``outcome.trajectory`` has, None without any."""
+    """The ground truth of the frames of ``outcome.trajectory``; None if there is none."""
     truth = ground_truth_of(outcome.sequence)
     if truth is None:
         return None

@@ -1,7 +1,7 @@
-"""What a run has done so far, as arrays: what its report tells of the frames, for a file.
+"""The progress of a run: the data of its frames that the report needs, as arrays in a file.
 
-A run that is cut off leaves it beside its map, and one that is resumed begins with it. Frames are
-written down as they come: saving them copies arrays, however many there are.
+An interrupted run leaves this file beside its map, and a resumed run starts from it. Frames are
+added to arrays as they come, so that saving them only copies arrays.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from vslam.untrusted import ARCHIVE_ERRORS, read_json, read_npz
 SCHEMA = 2
 _STATES = tuple(TrackingState)
 _BLACK = ("", "left", "right")
-_POSE, _NUMBERS = 16, 9  # of a frame: its pose, then what else is known of it
+_POSE, _NUMBERS = 16, 9  # columns of a frame: its pose, then the other numbers
 
 
 @dataclass(frozen=True)
 class TrackTable:
-    """What became of N frames, in order.
+    """Tracking results of N frames, in order.
 
     Attributes:
         rows: ``(N, 25)`` float64: ``T_wc`` row by row; time, state, features, stereo features,
             matches, inliers, flags (1 keyframe, 2 relocalised), darker stops, black side.
-        stages: names of the stages that took time.
-        stage_ms: ``(N, S)`` float64 milliseconds, NaN for a stage that a frame did not pass.
+        stages: names of the timed stages.
+        stage_ms: ``(N, S)`` float64 milliseconds, NaN for a stage that a frame skipped.
     """
 
     rows: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, _POSE + _NUMBERS)))
@@ -56,21 +56,21 @@ class TrackTable:
         return replace(self, rows=self.rows[:frames], stage_ms=self.stage_ms[:frames])
 
     def results(self) -> list[TrackResult]:
-        """The frames as tracking gave them."""
+        """The frames as tracking returned them."""
         return [
             _track(index, row, dict(zip(self.stages, ms, strict=True)))
             for index, (row, ms) in enumerate(zip(self.rows, self.stage_ms.tolist(), strict=True))
         ]
 
     def sides(self) -> list[Sides]:
-        """How the sides compared, of the frames that were not dropped."""
+        """The comparison of left and right image, for each frame that was not dropped."""
         came = self.rows[:, _POSE + 1] != _STATES.index(TrackingState.DROPPED)
         told = self.rows[came, _POSE + 7 :].tolist()
         return [Sides(stops, _BLACK[int(black)]) for stops, black in told]  # type: ignore[arg-type]
 
 
 class TrackLog:
-    """A ``TrackTable`` that grows."""
+    """A ``TrackTable`` to which frames can be appended."""
 
     def __init__(self, before: TrackTable) -> None:
         self._rows = array("d", before.rows.tobytes())
@@ -81,7 +81,7 @@ class TrackLog:
         self._n = len(before)
 
     def append(self, track: TrackResult, sides: Sides) -> None:
-        """Write the next frame down."""
+        """Append the next frame."""
         self._rows.extend(track.T_wc.ravel())
         self._rows.extend((
             track.timestamp, _STATES.index(track.state), track.n_features, track.n_stereo,
@@ -107,13 +107,14 @@ class TrackLog:
 
 @dataclass(frozen=True)
 class Progress:
-    """What a report tells of the first frames of a run.
+    """The data that a report needs about the first frames of a run.
 
     Attributes:
-        tracks: the frames.
-        skipped, latency_ms, wall_s, cpu_s: as of ``RunOutcome``.
-        loops: with frames of the run in the place of keyframes, -1 where that is none of its own.
-        corrections: of some of these loops, alike.
+        tracks: results of the frames.
+        skipped, latency_ms, wall_s, cpu_s: see ``RunOutcome``.
+        loops: loops with frame numbers of the run instead of keyframe numbers; -1 for keyframes of
+            earlier drives.
+        corrections: corrections by some of these loops, with frame numbers likewise.
     """
 
     tracks: TrackTable = field(default_factory=TrackTable)
@@ -125,7 +126,7 @@ class Progress:
     corrections: list[LoopCorrection] = field(default_factory=list)
 
     def until(self, frames: int) -> Progress:
-        """What it was after so many frames."""
+        """The progress after the first ``frames`` frames."""
         return replace(
             self,
             tracks=self.tracks.until(frames),
@@ -140,7 +141,7 @@ def _frame_of(message: str) -> int:
 
 
 def frames_of(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[LoopEdge]:
-    """Loops with the frames ``(K,)`` of keyframes in their place, and without features."""
+    """Replace keyframe numbers in loops by the frames ``(K,)`` of the keyframes; drop features."""
     return [
         replace(
             loop,
@@ -156,7 +157,7 @@ def frames_of(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[LoopEdge
 def in_frames(
     loops: list[LoopEdge], corrections: list[LoopCorrection], frames: NDArray[np.int64]
 ) -> tuple[list[LoopEdge], list[LoopCorrection]]:
-    """``frames_of`` loops and of what they corrected."""
+    """Apply ``frames_of`` to loops and to their corrections."""
     edges = frames_of([one.edge for one in corrections], frames)
     moved = [
         replace(one, edge=edge, keyframes=frames[one.keyframes])
@@ -166,7 +167,7 @@ def in_frames(
 
 
 def write_progress(path: Path, progress: Progress) -> None:
-    """Write an ``.npz``, in place of what is there.
+    """Write an ``.npz``, replacing an existing file.
 
     Raises:
         OSError: it cannot be written.
@@ -201,13 +202,13 @@ def read_progress(path: Path) -> Progress:
     """Read what ``write_progress`` wrote.
 
     Raises:
-        InputError: no such file, a damaged one, or of another version.
+        InputError: the file is missing, damaged or from another version.
     """
     arrays = read_npz(path, "the progress of a run", "there is nothing to resume")
     try:
         header = read_json(arrays["header"])
         if header["kind"] != "vslam progress" or header["schema"] != SCHEMA:
-            raise InputError(f"{path}: of another version of vslam; resume with that.")
+            raise InputError(f"{path}: from another version of vslam; resume with that version.")
         wall_s, cpu_s = arrays["seconds"].tolist()
         return Progress(
             tracks=_checked_table(arrays["frames"], header["stages"], arrays["stage_ms"]),
@@ -233,11 +234,11 @@ def _correction(entry: dict[str, Any], arrays: dict[str, NDArray], number: int) 
 
 def _checked_table(rows: NDArray, stages: list[str], stage_ms: NDArray) -> TrackTable:
     if rows.dtype != np.float64 or rows.ndim != 2 or rows.shape[1] != _POSE + _NUMBERS:
-        raise ValueError("its frames are not rows of numbers")
+        raise ValueError("the frames are not rows of numbers")
     if stage_ms.dtype != np.float64 or stage_ms.shape != (len(rows), len(stages)):
-        raise ValueError("the stages are not those of its frames")
+        raise ValueError("the stages do not match the frames")
     table = TrackTable(rows, tuple(map(str, stages)), stage_ms)
-    table.results(), table.sides()  # every state and side is one that there is
+    table.results(), table.sides()  # raise an error for an unknown state or side
     return table
 
 

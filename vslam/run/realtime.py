@@ -1,4 +1,4 @@
-"""Frames as a camera sends them: one that a newer one overtakes is dropped."""
+"""Playback of frames in real time: a frame is dropped if a newer one arrives before it is used."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Played(Generic[T]):
-    """What became of a frame.
+    """A frame that was played.
 
     Attributes:
-        timestamp: seconds, of the frame.
-        made: what was prepared of it, or None: it was dropped.
-        came: when it came (``time.perf_counter``).
+        timestamp: its time, seconds.
+        made: the prepared frame; None if the frame was dropped.
+        came: its arrival by ``time.perf_counter``.
     """
 
     timestamp: float
@@ -43,22 +43,22 @@ def play(
     *,
     live: bool = False,
 ) -> Iterator[Played[T]]:
-    """Frames as they come; of several that wait only the newest is prepared.
+    """Play frames at their own times; if several are waiting, only the newest is prepared.
 
-    One frame is prepared while the one before it is used, so that a frame waits for at most one
-    other. A frame that waits is held, one that was dropped is not.
+    One frame is prepared while the previous one is used, so that a frame waits for at most one
+    other. Dropped frames are not kept in memory.
 
     Args:
-        frames: waited for, each from its time on; the first comes at once.
-        prepare: what is done to a frame when it has come, in a thread of its own.
-        threads: with one, a frame is not prepared before the last one was used.
-        live: each frame comes when ``frames`` yields it.
+        frames: frames to play; the first one arrives at once, the others at their timestamps.
+        prepare: function that prepares a frame after its arrival, called in a separate thread.
+        threads: with 1, a frame is prepared only after the previous one was used.
+        live: each frame arrives when ``frames`` yields it.
 
     Yields:
-        Every frame in order, dropped ones just before the one that overtook them.
+        Every frame in order; dropped frames come just before the one that replaced them.
 
     Raises:
-        Exception: of ``prepare`` or ``frames``, after all frames before it.
+        Exception: raised by ``prepare`` or ``frames``, after all earlier frames were yielded.
     """
     free = threading.Semaphore(min(threads, 2))
     mailbox = _Mailbox()
@@ -92,7 +92,7 @@ def play(
                     return
                 missed = [Played[T](timestamp, None, newest.came) for timestamp in dropped]
                 coming.put((missed, newest, pool.submit(prepare, newest.frame)))
-        except Exception as error:  # nobody else would end the wait for the next frame
+        except Exception as error:  # otherwise the consumer would wait for ever
             coming.put(error)
 
     with ThreadPoolExecutor(min(threads, 2), "extraction") as pool:
@@ -117,19 +117,19 @@ def play(
 
 
 class _Mailbox:
-    """Between the thread that films and the one that hands on: holds the newest frame alone."""
+    """Holds the newest frame, between the thread that plays frames and the one that uses them."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._newest: _Arrival | None = None
-        self._dropped: list[float] = []  # times of frames overtaken since the last one was taken
+        self._dropped: list[float] = []  # times of frames dropped since the last one was taken
         self._first = True
         self._ended = False
         self.stopped = False
         self.error: Exception | None = None
 
     def put(self, arrival: _Arrival) -> None:
-        """Replace the newest frame; the first of a run is always taken."""
+        """Replace the newest frame, but wait until the first frame of a run has been taken."""
         with self._changed:
             if self._newest is not None:
                 self._dropped.append(self._newest.frame.timestamp)
@@ -138,7 +138,7 @@ class _Mailbox:
             self._changed.wait_for(lambda: not self._first or self.stopped)
 
     def take(self) -> tuple[list[float], _Arrival | None]:
-        """The newest frame and the times of those it overtook; None after the last one."""
+        """The times of the dropped frames, and the newest frame (None after the last one)."""
         with self._changed:
             self._changed.wait_for(lambda: self._newest or self._ended or self.stopped)
             newest, self._newest = (None if self.stopped else self._newest), None
@@ -153,13 +153,13 @@ class _Mailbox:
             self._changed.wait_for(lambda: self.stopped, max(0.0, when - time.perf_counter()))
 
     def end(self, error: Exception | None) -> None:
-        """Say that there are no more frames, and why."""
+        """Announce the end of the frames, with the error that caused it."""
         with self._changed:
             self._ended, self.error = True, error
             self._changed.notify_all()
 
     def stop(self) -> None:
-        """Say that nobody takes frames any more."""
+        """Announce that no more frames will be taken."""
         with self._changed:
             self.stopped = True
             self._changed.notify_all()

@@ -1,23 +1,23 @@
 """Compile every kernel before the first frame, so that no run is timed while it compiles.
 
-Compiling takes longer than anything else in a first run, and one process compiles one kernel at a
-time: Numba holds a lock. Two processes, ``python -m vslam.run.warmup first`` and ``... second``,
-share the work and find each other's in Numba's cache. The process that is to run then calls
-``EVERYTHING``: it loads what was compiled, and compiles what the two did not, all of it if there
-were none. It holds no compiler's memory. Later runs load a kernel when they first call it.
+Compiling takes longer than anything else in a first run, and a process compiles one kernel at a
+time because Numba holds a lock. Two processes, ``python -m vslam.run.warmup first`` and
+``... second``, therefore share the work through Numba's cache. The process of the run then calls
+``EVERYTHING``, which loads the compiled kernels and compiles missing ones; this process then does
+not hold the compiler's memory. Later runs load a kernel when they first call it.
 
-A module with new kernels adds a function that calls them to the shorter of ``COMPILE_SHARES`` (and
-to ``EVERYTHING``, if the small SLAM there does not reach them; and its last kernel to
-``COLD_PROBES``). Which one is shorter:
+For new kernels, add a function that calls them to the shorter of ``COMPILE_SHARES``, to
+``EVERYTHING`` if the small SLAM run does not call them, and a module's last kernel to
+``COLD_PROBES``. This shows which share is shorter:
 
     for share in first second; do
         time NUMBA_CACHE_DIR=$(mktemp -d) python -m vslam.run.warmup $share
     done
 
-Monocular runs call no others: their two views and similarities are NumPy's work.
+Monocular runs call no other kernels: their initialisation and similarities use NumPy.
 
-A kernel that both need is compiled by whoever comes to it first. Both must call it with the same
-types: for one signature two writers of Numba's cache cannot harm each other, for two they can.
+A kernel that both processes need is compiled by the first one to call it. Both must call it with
+the same types, because Numba's cache is safe for two writers only if they write one signature.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ from vslam.slam import Slam
 
 WIDTH, HEIGHT, DISPARITY, STEP, FRAMES = 480, 240, 12, 6, 6
 CAMERA = Camera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
-# A process that takes longer is stuck: both have less than a minute's work on a slow machine.
+# A process that takes longer is stuck: each has less than a minute of work on a slow machine.
 PATIENCE_S = 300.0
 
 
@@ -80,9 +80,9 @@ def compile_kernels(*, processes: int = 2, load: bool = False) -> None:
     """Call every kernel once, unless all are compiled; Numba caches what it compiles.
 
     Args:
-        processes: with 1 no other process is started, nor if there is one core only.
-        load: where all are compiled, load them now, and GTSAM, too. A kernel takes 2 ms when it is
-            first called, calling all here 0.3 s: worth it where no frame may wait.
+        processes: with 1, or on a single core, no other process is started.
+        load: load compiled kernels and GTSAM now, which takes 0.3 s, instead of 2 ms per kernel
+            at its first call; for runs in which no frame may wait.
     """
     if load:
         load_optimiser()
@@ -98,8 +98,8 @@ def compile_kernels(*, processes: int = 2, load: bool = False) -> None:
 
 
 def is_cold() -> bool:
-    """Whether kernels must be compiled: one of ``COLD_PROBES`` is not in Numba's cache, or older
-    there than its source."""
+    """Whether kernels must be compiled: whether one of ``COLD_PROBES`` is missing in Numba's cache
+    or older there than its source."""
     return any(
         all(index.stat().st_mtime < source.stat().st_mtime for index in indexes)
         for source, indexes in map(cached, COLD_PROBES)
@@ -107,8 +107,8 @@ def is_cold() -> bool:
 
 
 def mark_warm() -> None:
-    """Date what is cached now: Numba compares the content of a source, and keeps a kernel whose
-    source has only a new date, as after a change of branch."""
+    """Update the dates of the cached kernels. Numba compares the content of sources and keeps a
+    kernel if only the date of its source has changed, for example by switching branches."""
     for _, indexes in map(cached, COLD_PROBES):
         for index in indexes:
             with suppress(OSError):
@@ -126,7 +126,7 @@ def cached(kernel: tuple[ModuleType, str]) -> tuple[Path, list[Path]]:
 def compile_shares() -> None:
     """Run each of ``COMPILE_SHARES`` in a process of its own and wait for both.
 
-    One that fails costs only its help. An exception, Ctrl-C above all, ends them.
+    If one fails, the calling process compiles its share. An exception such as Ctrl-C ends both.
     """
     # The executable of a frozen application is not Python.
     if not sys.executable or getattr(sys, "frozen", False):
@@ -135,7 +135,7 @@ def compile_shares() -> None:
     quiet = subprocess.DEVNULL
     try:
         for name in COMPILE_SHARES:
-            # -P: not from a folder "vslam" that happens to be where we are.
+            # -P: do not import a folder "vslam" in the current directory.
             command = [sys.executable, "-P", "-m", "vslam.run.warmup", name]
             process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)
             processes.append(process)
@@ -150,25 +150,22 @@ def compile_shares() -> None:
 
 
 def run_everything() -> None:
-    """Run SLAM on a few small images with a keyframe at each.
-
-    A camera slides along a textured wall: enough for tracking, triangulation, fusion and bundle
-    adjustment to take all their branches.
-    """
+    """Run SLAM on a few small images, each a keyframe, of a camera that slides along a textured
+    wall. This reaches all branches of tracking, triangulation, fusion and bundle adjustment."""
     every_frame = KeyframeConfig(max_interval_s=0.05, merge_after_frames=1)
     run_slam(Config(keyframes=every_frame), FRAMES)
     decode_image()
 
 
 def compile_tracking() -> None:
-    """Extraction, stereo, matching, pose and tracking: the small SLAM with one keyframe."""
+    """Compile extraction, stereo, matching, pose and tracking by a SLAM run with one keyframe."""
     decode_image()
     no_other = KeyframeConfig(max_interval_s=1e9, max_tracked_ratio=1e-6, min_tracked_close=0)
     run_slam(Config(keyframes=no_other), 3)
 
 
 def decode_image() -> None:
-    """Two lines of a PNG."""
+    """Decode two lines of a PNG."""
     unfilter(np.zeros((2, 5), np.uint8), np.empty((2, 4), np.uint8))
 
 
@@ -187,29 +184,27 @@ def run_slam(config: Config, frames: int) -> None:
 
 
 def compile_depth() -> None:
-    """Depth of keypoints."""
+    """Compile the depth of keypoints."""
     depth, scale = np.ones((8, 8), np.float32), np.ones(1)
     columns_of_depth(np.zeros((1, 2), np.float32), scale, depth, CAMERA, DepthConfig())
 
 
 def compile_insertion() -> None:
-    """What inserting a keyframe needs, in tracking's time."""
+    """Compile the insertion of a keyframe, which is part of tracking."""
     map_synthetic(1)
 
 
 def compile_local_mapping() -> None:
-    """What follows an insertion: triangulation, fusion, bundle adjustment, culling."""
+    """Compile local mapping: triangulation, fusion, bundle adjustment and culling."""
     map_synthetic(4)
 
 
 def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     """Map a camera that moves sideways past a cloud of points, without images.
 
-    Returns the map, and what the last keyframe saw.
-
     Every keyframe sees all points. The first half of them are near and have a stereo match, the
-    rest are left for triangulation. A keyframe is redundant from one landmark, so that the fourth
-    insertion culls one.
+    rest are left for triangulation. One landmark suffices to make a keyframe redundant, so that
+    the fourth insertion culls one. Returns the map and the features of the last keyframe.
     """
     config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
     verifier = verifier_for(config, CAMERA)
@@ -244,7 +239,7 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
 
 
 def compile_recognition() -> None:
-    """Loop detection, verification and relocalisation: a keyframe is compared with itself."""
+    """Compile detection, verification and relocalisation by comparing a keyframe with itself."""
     config = Config()
     map_, features = map_synthetic(1)
     verify(map_, LoopCandidate(0, 0, 1.0), CAMERA, config.verification)
@@ -259,7 +254,7 @@ def compile_recognition() -> None:
 
 
 def compile_learned_matching() -> None:
-    """What learned descriptors are matched with; they are made up, no network is loaded."""
+    """Compile the matching of learned descriptors, with random ones instead of a network's."""
     rng = np.random.default_rng(0)
     coarse, fine = (rng.standard_normal((rows, 2 * rows, 4), np.float32) for rows in (4, 16))
     maps = DescriptorMaps(coarse, fine, 1.0)
@@ -269,9 +264,9 @@ def compile_learned_matching() -> None:
 
 
 def compile_correction() -> None:
-    """Pose graph, loop fusion and global bundle adjustment: the steps of ``LoopClosing``.
+    """Compile pose graph, loop fusion and global bundle adjustment: the steps of ``LoopClosing``.
 
-    GTSAM alone is left out: it takes a second to import and has nothing to compile.
+    GTSAM is left out, because it takes a second to import and has nothing to compile.
     """
     config = Config()
     map_, _ = map_synthetic(3)
@@ -294,7 +289,7 @@ def smallest_vocabulary() -> Vocabulary:
 
 
 def compile_bundle_adjustment() -> None:
-    """A problem of one free camera and two points, as ``assemble`` makes them."""
+    """Compile bundle adjustment with a problem of one free camera and two points."""
     points = np.array([[-1.0, 0.5, 8.0], [1.0, -0.5, 9.0]])
     uvr = np.repeat(CAMERA.project(points), 2, axis=0)
     problem = BundleProblem(
@@ -310,8 +305,8 @@ def compile_bundle_adjustment() -> None:
     adjust(problem, iterations=1)
 
 
-# The second starts with what it needs alone: when it comes to insert keyframes, the kernels for
-# that are in the cache, because the first starts with them.
+# The second process starts with kernels that only it needs: by the time it inserts keyframes, the
+# first one, which starts with the insertion, has cached those kernels.
 COMPILE_SHARES: dict[str, tuple[Callable[[], None], ...]] = {
     "first": (compile_insertion, compile_tracking, compile_depth, compile_recognition),
     "second": (
@@ -328,7 +323,7 @@ EVERYTHING: tuple[Callable[[], None], ...] = (
     compile_learned_matching,
     compile_correction,
 )
-# Of each module with much to compile the kernel that is compiled last.
+# The kernel that is compiled last in each module with much to compile.
 COLD_PROBES: tuple[tuple[ModuleType, str], ...] = (
     (bundle_adjustment, "_adjust"),
     (sim3_ransac, "_ransac"),
@@ -342,7 +337,7 @@ COLD_PROBES: tuple[tuple[ModuleType, str], ...] = (
 
 
 if __name__ == "__main__":
-    # Searching for garbage is 14 % of compiling, which keeps most of what it makes.
+    # Garbage collection would take 14 % of the time and find little garbage.
     gc.disable()
     for share in COMPILE_SHARES[sys.argv[1]]:
         share()

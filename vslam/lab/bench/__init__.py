@@ -1,1 +1,1 @@
-"""Many runs: a grid of sequences, perturbations, detectors and seeds, each run in its process."""
+"""Many runs: a grid of sequences, perturbations, detectors and seeds, one process per run."""

@@ -1,7 +1,7 @@
-"""The same cells on a Dask cluster: workers run them, results come back here.
+"""Running the cells of a benchmark on a Dask cluster; the workers send their results back.
 
-The scheduler gives a cell to another worker when the one that had it dies. Nothing but the data
-must be on the workers, under the same path, and vslam with the extra ``cluster``.
+If a worker dies, the scheduler gives its cell to another one. The workers need vslam with the
+extra ``cluster``, and the data under the same path.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from vslam.lab.bench.execute import CellOutcome, Failed, RunOptions, publish, ru
 from vslam.lab.bench.grid import Cell
 
 _CONNECT_S = 10
-_ASK_S = 2.0  # each question whether to stop goes to the scheduler
+_ASK_S = 2.0  # between questions whether to stop, since each one goes to the scheduler
 
 
 def run_on_cluster(
     cells: Collection[Cell], options: RunOptions, scheduler: str, out: Path
 ) -> Generator[CellOutcome, None, None]:
-    """Run cells on the workers of a scheduler, publish each here and yield it as it arrives.
+    """Run cells on the workers of a scheduler; publish and yield each one here when it arrives.
 
-    A worker takes as many cells at a time as it has threads. Leaving the iteration stops them.
+    A worker runs as many cells at a time as it has threads. Leaving the iteration stops them.
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers.
@@ -40,12 +40,12 @@ def run_on_cluster(
         ) from error
     _require_certificates(scheduler)
     try:
-        resolve_address(scheduler)  # a client of no address would not close without a traceback
+        resolve_address(scheduler)  # for a bad address, a client prints a traceback on closing
         client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"--scheduler {scheduler}: nothing answers there; start one with "
-            "'dask scheduler' and name it as it says, tcp://HOST:8786 for example."
+            f"--scheduler {scheduler}: nothing answers there; start one with 'dask scheduler' and "
+            "give the address that it prints, for example tcp://HOST:8786."
         ) from error
     stop = Event(f"vslam-bench-{uuid.uuid4().hex}", client=client)
     try:
@@ -54,34 +54,34 @@ def run_on_cluster(
         for future in as_completed(futures, loop=client.loop):
             cell, defect = cell_of[future.key], future.exception()
             outcome = future.result() if defect is None else Failed(cell, _said(defect))
-            future.release()  # or the death of a worker would run again all that it ever ran
+            future.release()  # otherwise Dask repeats the finished cells of a worker that dies
             publish(outcome, out)
             yield outcome
     finally:
-        with suppress(OSError):  # the scheduler is gone, and all that it ran with it
+        with suppress(OSError):  # the scheduler has ended, and with it all that it ran
             stop.set()
         client.close()
 
 
 def _require_certificates(scheduler: str) -> None:
-    """Refuse an address of TLS where Dask's client would have none, and not close."""
+    """Refuse a TLS address without certificates, because Dask's client would not close."""
     from distributed.security import Security
 
     if not scheduler.startswith("tls://"):
         return
     try:
         context = Security().get_connection_args("client")["ssl_context"]
-    except (OSError, ValueError):  # files that are missing, or no certificates
+    except (OSError, ValueError):  # the files are missing or are not certificates
         context = None
     if context is None:
         raise InputError(
-            f"--scheduler {scheduler}: Dask has no certificates for it; name them in its "
+            f"--scheduler {scheduler}: Dask has no certificates for it; name them in Dask's "
             "configuration (distributed.comm.tls), or start the scheduler with tcp://."
         )
 
 
 def _run_on_worker(cell: Cell, options: RunOptions, stop: str) -> CellOutcome:
-    """Run a cell where this is called, until the benchmark sets the event ``stop``."""
+    """Run a cell on this worker, until the benchmark sets the event ``stop``."""
     from distributed import Event
 
     event = Event(stop)

@@ -1,4 +1,4 @@
-"""How long a grid will take and how much disk, before it starts and while it runs."""
+"""Estimates of the time and disk space that a grid needs, before it starts and while it runs."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from vslam.errors import InputError
 from vslam.lab.bench.grid import Cell
 from vslam.report.schema import ReportJson
 
-# Before any cell of the grid is finished: two threads of a Xeon, KITTI's images, loops closed.
+# Used before any cell is finished: two threads of a Xeon, KITTI's images, with loop closing.
 _FRAME_S, _START_S = 0.06, 5.0
-# Measured, rounded up: kept files of a cell, and the map that a run writes and the grid drops.
+# Measured and rounded up: the kept files of a cell, and the map, which is deleted after the run.
 _CELL_BYTES, _FRAME_BYTES, _SCRATCH_FRAME_BYTES = 100_000, 1_000, 45_000
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """``seconds`` with all jobs at work; ``kept`` and ``scratch`` in bytes; ``basis`` in words."""
+    """``seconds`` with all jobs busy; ``kept`` and ``scratch`` bytes; ``basis`` as a text."""
 
     seconds: float
     kept: int
@@ -33,16 +33,16 @@ def estimate(
     frames: Mapping[str, int],
     jobs: int,
 ) -> Estimate:
-    """Judge what is missing by what is finished, detector by detector where it can.
+    """Estimate the missing cells from the finished ones, separately by detector if possible.
 
     Args:
-        finished: cells and their reports.
-        frames: of each sequence.
-        jobs: cells at a time.
+        finished: finished cells and their reports.
+        frames: number of frames of each sequence.
+        jobs: cells that run at a time.
     """
     spent: dict[str, list[float]] = {}  # seconds a frame
     start: list[float] = []
-    for cell, report in list(finished.items()):  # the table is drawn while cells end
+    for cell, report in list(finished.items()):  # a copy, because cells end meanwhile
         if report.fps > 0:
             spent.setdefault(cell.detector, []).append(1.0 / report.fps)
             start.append(report.startup_s)
@@ -63,10 +63,10 @@ def estimate(
 
 
 def check_disk(needed: Estimate, out: Path) -> None:
-    """Refuse a grid that the disk has no room for.
+    """Refuse a grid that does not fit on the disk.
 
     Raises:
-        InputError: too little is free.
+        InputError: the free space is too small.
     """
     free = shutil.disk_usage(out).free
     if needed.kept + needed.scratch > free:
@@ -85,7 +85,7 @@ def duration(seconds: float) -> str:
 
 
 def size(n_bytes: float) -> str:
-    """In MB or GB."""
+    """A size in MB or GB, as a text."""
     return f"{n_bytes / 1e6:.0f} MB" if n_bytes < 1e9 else f"{n_bytes / 1e9:.1f} GB"
 
 

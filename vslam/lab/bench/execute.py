@@ -1,8 +1,8 @@
-"""Cells become folders: each runs in a process of its own, and its results appear all at once.
+"""Running cells: each in its own process, with its results published as one complete folder.
 
-A cell is finished when its folder is there, whole: what kills the benchmark in between costs the
-cells at work and no other. Runs come back as files in memory (a few MB), so that it does not matter
-which machine made them; only this module writes to the folder of the benchmark.
+A cell is finished when its folder exists, so that a killed benchmark loses only the cells that were
+running. Results are passed as files in memory (a few MB), whichever machine made them; only this
+module writes to the folder of the benchmark.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from vslam.errors import InputError, ResultsError
 from vslam.lab.bench.grid import Cell, is_finished, tracked_nothing
 
 _POLL_S = 0.1
-_NOT_KEPT = {"map.npz"}  # hundreds of MB on a long sequence, and no figure needs it
+_NOT_KEPT = {"map.npz"}  # hundreds of MB for a long sequence, and no figure needs it
 _PARTS, _FAILED = ".parts", "failed"
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What is the same for all cells.
+    """Options that all cells share.
 
     Attributes:
         data: root of the data set on the machine that runs the cell; None for rendered towns.
         config: thresholds, the text of a ``config.json``.
-        threads: of each run; its result does not depend on it.
-        command: program that takes the words of ``vslam``; None for vslam itself.
-        others: programs as ``command`` for the cells whose detector has such a name: other systems.
-        scratch: where runs write; None for the temporary folder of the machine.
-        source: words of ``vslam run`` on how the data is to be read.
+        threads: threads of each run; they do not change its result.
+        command: program that accepts the arguments of ``vslam``; None for vslam itself.
+        others: programs like ``command`` for other systems, by the detector name of their cells.
+        scratch: folder in which runs write; None for the machine's temporary folder.
+        source: arguments of ``vslam run`` that say how to read the data.
     """
 
     data: Path | None
@@ -53,7 +53,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Finished:
-    """A run that is complete: its files by path relative to ``folder``, where it was written."""
+    """A complete run: its files by path relative to ``folder``, in which they were written."""
 
     cell: Cell
     folder: str
@@ -62,7 +62,7 @@ class Finished:
 
 @dataclass(frozen=True)
 class Failed:
-    """A run without results: ``message`` in one line, ``log`` all that it said."""
+    """A run without results: ``message`` is one line, ``log`` its whole output."""
 
     cell: Cell
     message: str
@@ -75,10 +75,10 @@ CellOutcome = Finished | Failed
 def run_cell(
     cell: Cell, options: RunOptions, stopped: Callable[[], bool] = lambda: False
 ) -> CellOutcome:
-    """Run one cell and bring back its files; nothing stays on this machine.
+    """Run one cell and return its files; nothing is left on this machine.
 
     Args:
-        stopped: asked again and again; the run is killed once it says yes.
+        stopped: called repeatedly; the run is killed when it returns True.
     """
     if options.scratch is not None:
         options.scratch.mkdir(parents=True, exist_ok=True)
@@ -94,7 +94,7 @@ def run_cell(
         code = _call([*command, "--out", str(work / "runs")], work / "log.txt", stopped)
         log = (work / "log.txt").read_text(errors="replace")
         for folder in (path.parent for path in work.glob("runs/*/report.json")):
-            # A run in which nothing was tracked exits with 1, and is a result like any other.
+            # A run that tracked nothing exits with 1, but its report is a result like any other.
             done = code == 0 or (code == 1 and tracked_nothing(folder))
             if done and is_finished(cell, folder, options.config):
                 return Finished(cell, str(folder), _read(folder) | {"log.txt": log.encode()})
@@ -106,10 +106,10 @@ def run_cell(
 def run_here(
     cells: Collection[Cell], options: RunOptions, jobs: int, out: Path
 ) -> Generator[CellOutcome, None, None]:
-    """Run cells on this machine, ``jobs`` at a time, publish each and yield it as it ends.
+    """Run cells on this machine, ``jobs`` at a time; publish and yield each one when it ends.
 
-    Threads are enough: each only waits for a process. They publish, too, so that a cell that ends
-    while the caller is interrupted is not lost. Leaving the iteration kills what runs.
+    Threads suffice, because each one only waits for a process. They also publish, so that a cell
+    that ends while the caller is interrupted is not lost. Leaving the iteration kills the runs.
 
     Raises:
         ResultsError: as :func:`publish`.
@@ -119,7 +119,7 @@ def run_here(
     def run_and_publish(cell: Cell) -> CellOutcome:
         try:
             outcome = run_cell(cell, options, stop.is_set)
-        except OSError as error:  # it could not be started, or its files not read
+        except OSError as error:  # the run could not be started, or its files could not be read
             outcome = Failed(cell, error.strerror or str(error))
         if not stop.is_set() or isinstance(outcome, Finished):
             publish(outcome, out)
@@ -136,12 +136,12 @@ def run_here(
 
 
 def finished_cells(cells: Collection[Cell], out: Path, config: str) -> list[Cell]:
-    """Those whose results are in ``out`` already."""
+    """The cells whose results are already in ``out``."""
     return [cell for cell in cells if is_finished(cell, out / cell.name, config)]
 
 
 def publish(outcome: CellOutcome, out: Path) -> None:
-    """Write a finished cell into ``out``, whole or not at all; of a failed one what it said.
+    """Write a finished cell into ``out``, completely or not at all; for a failed one, its log.
 
     Raises:
         ResultsError: the folder cannot be written.
@@ -164,21 +164,21 @@ def publish(outcome: CellOutcome, out: Path) -> None:
             if path.suffix in (".json", ".md", ".html"):  # the command that reproduces the ATE
                 data = data.replace(outcome.folder.encode(), shlex.quote(str(target)).encode())
             path.write_bytes(data)
-        shutil.rmtree(target, ignore_errors=True)  # of other thresholds, or damaged
+        shutil.rmtree(target, ignore_errors=True)  # made with other thresholds, or damaged
         part.rename(target)
         failed.unlink(missing_ok=True)
     except OSError as error:
         raise ResultsError(
             f"{out}: the results of {cell.name} cannot be written ({error.strerror}); free some "
-            "space and give the same command again: finished cells are kept."
+            "space and repeat the command: finished cells are kept."
         ) from error
 
 
 def prepare(out: Path, data: str) -> None:
-    """Make the folder of a benchmark, clear what killed ones left, and hold it to one data set.
+    """Create the folder of a benchmark, remove the leftovers of killed ones and check the data.
 
     Args:
-        data: what tells this data from other data under the same names.
+        data: identifies the data, because other data may have the same names.
 
     Raises:
         InputError: the folder cannot be written, or holds runs on other data.
@@ -204,20 +204,20 @@ def prepare(out: Path, data: str) -> None:
 
 
 def scratch_folder(out: Path) -> Path:
-    """Where this process keeps what is not finished."""
+    """Folder in which this process keeps unfinished cells."""
     return out / _PARTS / str(os.getpid())
 
 
 def tidy(out: Path) -> None:
-    """Remove what this process kept there."""
+    """Remove the scratch folder of this process."""
     shutil.rmtree(scratch_folder(out), ignore_errors=True)
-    with suppress(OSError):  # another benchmark has its own in it
+    with suppress(OSError):  # the parent folder also holds those of other benchmarks
         (out / _PARTS).rmdir()
 
 
 def _call(command: list[str], log: Path, stopped: Callable[[], bool]) -> int:
-    """Run a command to its end, or kill it; the exit code. It gets a session of its own, so that
-    Ctrl-C reaches it through us only, and a pipe that tells it when we are gone."""
+    """Run a command to its end or kill it; returns the exit code. The command gets its own session,
+    so that Ctrl-C reaches it only through us, and a pipe that closes when we end."""
     with log.open("wb") as output:
         child = subprocess.Popen(
             command,

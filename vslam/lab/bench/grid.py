@@ -1,4 +1,4 @@
-"""The cells of a benchmark, and where the results of a finished one are."""
+"""The cells of a benchmark, and the folders of their results."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from vslam.report.schema import ReportJson
 
 @dataclass(frozen=True, order=True)
 class Cell:
-    """One run of the grid: all that its figures depend on, apart from thresholds and images.
+    """One run of the grid: everything that determines its figures, except thresholds and images.
 
     Attributes:
-        perturb: in canonical spelling, ``none`` or ``brightness:1.5,blur:0.5`` for example.
-        max_frames: frames from the first one, None for all.
-        weights: of a learned detector, a file that every worker has under this path; None for the
-            shipped ones.
-        digest: of these weights.
-        sensor: that the run is told to be of, None for all that the data has.
+        perturb: perturbation in canonical spelling, e.g. ``none`` or ``brightness:1.5,blur:0.5``.
+        max_frames: number of frames from the first one on, None for all.
+        weights: weights of a learned detector, a file that every worker has under this path; None
+            for the shipped ones.
+        digest: digest of these weights.
+        sensor: value of ``--sensor``; None for all images that the data has.
         calib: calibration files.
     """
 
@@ -42,7 +42,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Of its folder: what tells cells apart is in it, so that none overwrites another."""
+        """Name of its folder, different for different cells, so that none overwrites another."""
         light = self.perturb.replace(":", "").replace(",", "+")
         parts = [self.dataset, self.sequence, light, self.detector, f"seed{self.seed}"]
         parts += [f"{self.max_frames}frames"] if self.max_frames else []
@@ -51,7 +51,7 @@ class Cell:
         return "-".join(re.sub(r"[^A-Za-z0-9.+-]+", "_", part) for part in parts)
 
     def arguments(self) -> list[str]:
-        """Of ``vslam run``."""
+        """Arguments of ``vslam run``."""
         words = ["--dataset", self.dataset, "--perturb", self.perturb]
         words += ["--detector", self.detector, "--seed", str(self.seed)]
         words += [] if self.dataset in SOURCES else ["--seq", self.sequence]
@@ -65,29 +65,27 @@ def parse_sequences(text: str) -> list[str]:
     """``00-02,05,demo`` -> ``00 01 02 05 demo``: names and ranges of numbers, each once.
 
     Raises:
-        InputError: a range that runs backwards, or no name at all.
+        InputError: a range is reversed, or there is no name.
     """
     names: dict[str, None] = {}
     for item in filter(None, (part.strip() for part in text.split(","))):
         if ends := re.fullmatch(r"(\d+)-(\d+)", item):
             first, last = int(ends[1]), int(ends[2])
             if last < first:
-                raise InputError(
-                    f"--seqs {text}: {item} runs backwards; write {ends[2]}-{ends[1]}."
-                )
+                raise InputError(f"--seqs {text}: {item} is reversed; write {ends[2]}-{ends[1]}.")
             width = len(ends[1])
             names.update(dict.fromkeys(f"{k:0{width}d}" for k in range(first, last + 1)))
         else:
             names[item] = None
     if not names:
-        raise InputError("--seqs: no sequence; name some, 00-05 or demo,00 for example.")
+        raise InputError("--seqs: no sequence; name some, for example 00-05 or demo,00.")
     return list(names)
 
 
 def parse_perturbations(text: str) -> list[str]:
     """``none,brightness:2+blur`` -> ``none`` and ``brightness:2,blur:1``, in canonical spelling.
 
-    A comma separates entries of the grid, so that laws that act together are joined by ``+``.
+    A comma separates entries of the grid; ``+`` joins laws that act together.
 
     Raises:
         InputError: an entry that ``vslam run --perturb`` would refuse.
@@ -107,14 +105,14 @@ def make_grid(
     sensor: str | None = None,
     calib: tuple[str, ...] = (),
 ) -> list[Cell]:
-    """All cells, in the order in which they are worth most if the work is cut short: every
-    sequence with the first seed, then with the next.
+    """All cells, ordered so that an interrupted benchmark is as useful as possible: all sequences
+    with the first seed, then all with the next.
 
-    A perturbation that draws nothing gets one run: the same input gives the same bytes, and
-    counting them again would make a test believe in more than it has seen.
+    A perturbation without randomness gets one run. Its repetitions would be identical, and a
+    statistical test would count them as independent samples.
 
     Args:
-        weights: by detector, for those that do not use the shipped ones.
+        weights: weight files by detector, for detectors that do not use the shipped ones.
     """
     paths = {name: str(path) for name, path in (weights or {}).items()}
     digests = {name: _digest(path) for name, path in (weights or {}).items()}
@@ -152,7 +150,7 @@ def draws(perturb: str) -> bool:
 
 
 def read_report(folder: Path) -> ReportJson | None:
-    """The report of a run folder, None if there is none or it is of another schema."""
+    """The report of a run folder; None if there is none or it has another schema."""
     try:
         return ReportJson.read(folder / "report.json")
     except InputError:
@@ -166,7 +164,7 @@ def tracked_nothing(folder: Path) -> bool:
 
 
 def is_finished(cell: Cell, folder: Path, config: str) -> bool:
-    """Whether ``folder`` holds a complete run of just this cell.
+    """Whether ``folder`` holds a complete run of exactly this cell.
 
     Args:
         config: the thresholds, as in ``config.json`` of a run.

@@ -1,4 +1,4 @@
-"""The table that is on the screen while a grid runs."""
+"""The table on the terminal while a grid runs."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from vslam.report.schema import ReportJson
 
 
 class GridProgress:
-    """Which cells are finished, failed or missing, and what the finished ones say.
+    """Which cells are finished, failed or missing, and the reports of the finished ones.
 
     Attributes:
         cells: the whole grid.
-        reports: of the finished cells, in the order in which they ended.
-        failed: why, in one line each.
+        reports: reports of the finished cells, in the order in which they ended.
+        failed: reasons of failed cells, one line each.
     """
 
     def __init__(
@@ -43,11 +43,11 @@ class GridProgress:
 
     @property
     def missing(self) -> list[Cell]:
-        """Neither finished nor failed."""
+        """Cells that are neither finished nor failed."""
         return [c for c in self.cells if c not in self.reports and c not in self.failed]
 
     def add(self, outcome: CellOutcome) -> str:
-        """Take note of a cell that has been published; returns a line that says so."""
+        """Add a published cell; returns a line about it."""
         cell = outcome.cell
         if isinstance(outcome, Failed):
             self.failed[cell] = outcome.message
@@ -59,8 +59,8 @@ class GridProgress:
         return f"{len(self.reports) + len(self.failed)}/{len(self.cells)} {cell.name}: {said}"
 
     def table(self) -> Table:
-        """A row for each sequence and perturbation, a column for each detector: cells finished of
-        all, and the median of their ATE."""
+        """A row for each sequence and perturbation and a column for each detector, with the number
+        of finished cells and their median ATE."""
         detectors = list(dict.fromkeys(cell.detector for cell in self.cells))
         caption = f"{len(self.reports)} of {len(self.cells)} cells finished"
         caption += f", {len(self.failed)} failed" if self.failed else ""
@@ -89,9 +89,9 @@ class GridProgress:
 
 @contextmanager
 def shown_live(progress: GridProgress, *, shown: bool) -> Iterator[Callable[[str], None]]:
-    """Show the table on stderr and keep it up to date; where that is no terminal, print the lines
-    given to what this yields. At the end the table stays only if cells are missing or failed: a
-    finished grid is followed by its results."""
+    """Show the table on stderr and update it; yields a function that prints a line if stderr is not
+    a terminal. At the end, the table stays only if cells are missing or failed, because the results
+    follow a finished grid."""
     console = Console(stderr=True, quiet=not shown, highlight=False, soft_wrap=True)
     live = (
         Live(get_renderable=progress.table, console=console, refresh_per_second=1, transient=True)

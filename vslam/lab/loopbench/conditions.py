@@ -1,4 +1,4 @@
-"""What is done to the query images; the gallery stays as it is."""
+"""Conditions under which query images are changed; the gallery stays unchanged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vslam.loopclosure.siamese.images import turn_homography
 Image = NDArray[np.uint8]
 
 KINDS = ("none", "light", "clipping", "viewpoint", "occlusion", "noise", "blur", "change", "all")
-# Of `vslam run --perturb`, at strength 1.
+# Perturbations of `vslam run --perturb` at strength 1.
 _LAWS = {
     "light": {"brightness": 2.0, "gamma": 2.0},
     "occlusion": {"occlusion": 2.0},
@@ -23,9 +23,9 @@ _LAWS = {
     "blur": {"blur": 2.0},
 }
 _LAWS["all"] = {law: s / 2 for kind in _LAWS.values() for law, s in kind.items()}
-_OTHER_LANE, _TURN = 3.2, 30.0  # m and degrees, of viewpoint at strength 1
+_OTHER_LANE, _TURN = 3.2, 30.0  # metres and degrees of a change of viewpoint at strength 1
 _CLIPPED = 0.6  # share of the pixels that become white, or black, at strength 1
-_APART_S = 10.0  # between images: the walks of light forget in 2 s
+_APART_S = 10.0  # between images, so that they are independent: light decorrelates in 2 s
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Condition:
 
     @property
     def name(self) -> str:
-        """``none`` or ``viewpoint:0.5`` for example."""
+        """The name, for example ``none`` or ``viewpoint:0.5``."""
         return self.kind if self.kind == "none" else f"{self.kind}:{self.strength:g}"
 
     @property
@@ -47,32 +47,32 @@ class Condition:
 
     @property
     def lateral(self) -> tuple[float, float]:
-        """Metres to the right, drawn between; nobody drives twice on one line."""
+        """Range of metres to the right. It is never zero, as no two drives take the same line."""
         side = -_OTHER_LANE * self.view
         return (side, side) if self.view else (-0.3, 0.3)
 
     @property
     def heading(self) -> tuple[float, float]:
-        """Degrees to either side, drawn between."""
+        """Range of degrees to either side."""
         turn = _TURN * self.view
         return (turn, turn) if self.view else (0.0, 3.0)
 
     @property
     def change(self) -> float:
-        """Of the town, as of ``vslam synth --change``: 0.5 and 0.9 for strengths 0.5 and 1."""
+        """Value of ``vslam synth --change`` for the town: 0.5 and 0.9 for strengths 0.5 and 1."""
         strength = {"change": self.strength, "all": self.strength / 2}.get(self.kind)
         return 0.0 if strength is None else round(0.1 + 0.8 * strength, 3)
 
 
 def parse_conditions(kinds: str, strengths: str) -> list[Condition]:
-    """Conditions of every kind at every strength, ``none`` once and always first.
+    """Conditions of every kind at every strength, after a single ``none``.
 
     Args:
-        kinds: names with commas, of ``KINDS``.
-        strengths: numbers from 0 to 1 with commas.
+        kinds: names from ``KINDS``, separated by commas.
+        strengths: numbers from 0 to 1, separated by commas.
 
     Raises:
-        InputError: unknown kind, or a strength that is no number from 0 to 1.
+        InputError: a kind is unknown, or a strength is not a number from 0 to 1.
     """
     names = [name.strip() for name in kinds.split(",") if name.strip()]
     if wrong := [name for name in names if name not in KINDS]:
@@ -83,7 +83,7 @@ def parse_conditions(kinds: str, strengths: str) -> list[Condition]:
     try:
         levels = [float(text) for text in strengths.split(",") if text.strip()]
     except ValueError as error:
-        raise InputError(f"--strengths {strengths}: give numbers with commas.") from error
+        raise InputError(f"--strengths {strengths}: give numbers separated by commas.") from error
     if not levels or not all(0.0 < level <= 1.0 for level in levels):
         raise InputError(f"--strengths {strengths}: must be above 0 and at most 1.")
     chosen = [Condition(name, level) for name in names if name != "none" for level in levels]
@@ -93,12 +93,12 @@ def parse_conditions(kinds: str, strengths: str) -> list[Condition]:
 def apply(
     condition: Condition, images: Collection[Image], seed: int, *, rendered: bool
 ) -> list[Image]:
-    """The images under a condition, each drawn anew.
+    """The images under a condition, each with its own random change.
 
     Args:
-        condition: ``change`` leaves images as they are: a town is rendered changed.
+        condition: ``change`` leaves images unchanged, because the town is rendered changed.
         images: ``(H, W)`` uint8 each.
-        seed: of all that is random.
+        seed: seed of all random changes.
         rendered: the viewpoint was already changed when the images were rendered.
     """
     out = list(images)
@@ -118,10 +118,8 @@ def apply(
 
 
 def turned(image: Image, degrees: float) -> Image:
-    """The image of a camera turned to the right: exact for a camera that stays where it is.
-
-    What was outside the view is black.
-    """
+    """The image of a camera turned to the right, exact for a pure rotation; pixels outside the
+    original view are black."""
     import cv2
 
     height, width = image.shape
@@ -130,7 +128,7 @@ def turned(image: Image, degrees: float) -> Image:
 
 
 def clipped(image: Image, share: float, bright: bool) -> Image:
-    """Exposed so that a share of the pixels becomes white, or black."""
+    """Change the exposure so that a share of the pixels becomes white, or black."""
     grey = np.arange(256.0)
     if bright:
         white = max(float(np.quantile(image, 1.0 - share)), 1.0)

@@ -1,6 +1,6 @@
-"""Time and memory of one detector, in a process of its own so that nothing else is in them.
+"""CPU time and memory of one detector, measured in a separate process.
 
-Times are of the processor: what else the machine does hardly touches them.
+CPU time hardly depends on what else the machine does.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from vslam.lab.loopbench.detectors import DescribedImage
 
 KEYFRAMES = (1000, 5000)
-_DRIVE = (100, 500)  # images of `ibow`, which must see all of them first
+_DRIVE = (100, 500)  # sizes of the drives for `ibow`, which must process all images first
 _REPEATS = 60
 
 
@@ -129,8 +129,8 @@ def _lsgd() -> Cost:
 
 
 def _ibow() -> Cost:
-    """Of a drive of made up images: each has two thirds of its features from the one before, a
-    few bits changed, as consecutive images of a video have; the words are those of the drive."""
+    """Cost for a simulated drive, whose own words form the vocabulary. As in a video, each image
+    shares two thirds of its features with the previous one, with a few bits changed."""
     from vslam.machine import peak_memory_mb
 
     began = time.process_time()

@@ -12,15 +12,15 @@ from vslam.report import page
 from vslam.report.drawing import AMBER, BLUE, GREEN, GREY, INK, RED, VIOLET, Drawing, draw
 
 _COLORS = [GREY, BLUE, VIOLET, AMBER, GREEN, RED]
-_DASHES = ["-", "--", ":"]  # of the first six detectors, of the next six, of the rest
+_DASHES = ["-", "--", ":"]  # for the first six detectors, the next six, and the rest
 _VERIFIED = {"nothing": "-", "both": ":"}
 
-# Panel, curve, entry of the legend or nothing, colour and dashes.
+# Panel, curve, label in the legend (or empty), colour and dashes.
 Line = tuple[str, Curve | DecisionCurve, str, str, str]
 
 
 def draw_curves(report: LoopsJson) -> list[page.Figure]:
-    """Draw all that there is data for; each figure has a panel for each condition or drive."""
+    """Draw a figure for each set of images, with a panel per condition, and one for all drives."""
     return draw(_drawings(report))
 
 
@@ -28,8 +28,8 @@ def _drawings(report: LoopsJson) -> Iterator[Drawing]:
     if online := report.online:
         drives, names = _in_order(s.data for s in online), _in_order(s.detector for s in online)
         caption = (
-            "Precision and recall over images, along the decision threshold, a panel for each "
-            "drive; dotted: decisions verified by ORB or learned descriptors."
+            "Precision and recall over images at varying decision thresholds, with a panel for "
+            "each drive. Dotted: decisions verified by ORB or learned descriptors."
         )
         lines: Iterable[Line] = (
             (score.data, score.curve, score.detector if score.verified_by == "nothing" else "",
@@ -44,7 +44,7 @@ def _drawings(report: LoopsJson) -> Iterator[Drawing]:
         conditions = _in_order(score.condition for score in scores)
         columns = 2 if len(conditions) == 4 else min(3, len(conditions))
         caption = (
-            f"Precision against recall on {data}, descriptors alone; a panel for each condition."
+            f"Precision against recall on {data}, unverified, with a panel for each condition."
         )
         lines = []
         for score in scores:

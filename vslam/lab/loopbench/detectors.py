@@ -1,4 +1,4 @@
-"""Loop detectors as functions of images: how alike each query and each image of a gallery are."""
+"""Loop detectors as functions of images: the similarity of queries and gallery images."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from vslam.loopclosure.siamese.scoring import NetworkScorer
 
 
-_MATCHING_LEVEL = 2  # of the vocabulary: features of a node there, of about 100, are matched
-_KEPT_GALLERIES = 3  # the unchanged one survives two strengths of a condition with its own
+_MATCHING_LEVEL = 2  # vocabulary level with about 100 nodes; features are matched within a node
+_KEPT_GALLERIES = 3  # enough to keep the unchanged gallery beside those of two strengths
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class DescribedImage:
 
 
 def describe(images: list[Image], vocabulary: Vocabulary, threads: int) -> list[DescribedImage]:
-    """Extract the features of all images, as a run does."""
+    """Extract the features of all images as in a run."""
     node_of_word = vocabulary.ancestors(_MATCHING_LEVEL)
 
     def one(image: Image) -> DescribedImage:
@@ -71,14 +71,14 @@ class Scorer(Protocol):
     """Whether scores are probabilities, with thresholds at 0.5 and 0.9."""
 
     def store(self, gallery: list[DescribedImage]) -> Any:
-        """What it keeps of the gallery."""
+        """The data that the detector stores for the gallery."""
 
     def scores(self, queries: list[DescribedImage], stored: Any) -> NDArray[np.float64]:
-        """``(Q, G)``, greater is more alike."""
+        """``(Q, G)`` similarities; higher is more similar."""
 
 
 class BowScorer:
-    """tf-idf and the L1 score, as :class:`vslam.loopclosure.bow.BowDetector` has them."""
+    """The tf-idf weights and L1 score of :class:`vslam.loopclosure.bow.BowDetector`."""
 
     name = "bow"
     probability = False
@@ -115,7 +115,7 @@ def open_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scor
 
 
 class _ImageScorer:
-    """Hands the images themselves to a network."""
+    """Passes the images to a network."""
 
     probability = True
 
@@ -141,7 +141,7 @@ class LocalDescriptorCache:
         self._kept: dict[bytes, DescriptorMaps] = {}
 
     def of(self, image: Image) -> DescriptorMaps:
-        """Those of a grey image ``(H, W)``; the fine ones are left out.
+        """Coarse descriptors of a grey image ``(H, W)``.
 
         Raises:
             InputError: the network cannot be read.
@@ -157,17 +157,16 @@ class LocalDescriptorCache:
 
 
 class DetectorSet:
-    """The detectors of a benchmark, the first of which the others are compared with.
+    """The detectors of a benchmark; the others are compared with the first one.
 
-    Most conditions have the same gallery: what was made of the last few galleries is kept.
+    Most conditions share a gallery, so the data of the last few galleries are cached.
     """
 
     def __init__(self, scorers: list[Scorer], vocabulary: Vocabulary | None, threads: int) -> None:
-        """Keep nothing yet.
-
+        """
         Args:
-            vocabulary: None where all scorers look at images alone: no features are extracted.
-            threads: that extract them.
+            vocabulary: None if all scorers use images alone, so that no features are extracted.
+            threads: threads for the extraction of features.
         """
         self.scorers = tuple(scorers)
         self._vocabulary, self._threads = vocabulary, threads
@@ -175,7 +174,7 @@ class DetectorSet:
         self._kept: OrderedDict[bytes, tuple[list[DescribedImage], dict[str, Any]]] = OrderedDict()
 
     def gallery(self, images: list[Image]) -> tuple[list[DescribedImage], dict[str, Any]]:
-        """Features of the images, and what each detector keeps of them."""
+        """Features of the images, and the data that each detector stores for them."""
         hashed = hashlib.blake2b()
         for image in images:
             hashed.update(f"{image.shape}".encode())

@@ -15,7 +15,7 @@ from vslam.loopclosure.siamese.source_registry import open_source, split_spec
 if TYPE_CHECKING:
     from vslam.datasets.synthetic import Variation
 
-_ORDERED = ("kitti", "fabmap")  # of the kinds of sources, those whose images are in order
+_ORDERED = ("kitti", "fabmap")  # kinds of sources with images in order
 _OPTIONS = {"seed": "101", "aliased": "0", "change": "0", "every": "10"}
 
 
@@ -24,22 +24,22 @@ def open_drives(
 ) -> list[ImageSource]:
     """Open ``drive:ROUTE[seed=101,aliased=1,change=0.5,every=10]``, ``kitti:`` or ``fabmap:``.
 
-    Of a built-in route every so many frames are rendered on first use, the left camera alone.
+    Every ``every``-th frame of a built-in route is rendered on first use, for the left camera.
 
     Args:
         cache: folder of rendered towns.
         progress_bar: opened while a drive is rendered.
 
     Raises:
-        InputError: what is no drive, an unknown route or option, or data that is missing or
-            malformed.
+        InputError: ``spec`` is not a drive or has an unknown route or option, or the data is
+            missing or malformed.
     """
     kind, route, given = split_spec(spec)
     if kind in _ORDERED:
         return open_source(spec)
     if kind != "drive":
         raise InputError(
-            f"--data {spec}: --protocol online takes drives; name drive:ROUTE, kitti:DIR or "
+            f"--data {spec}: --protocol online needs drives; name drive:ROUTE, kitti:DIR or "
             "fabmap:DIR."
         )
     from vslam.datasets.synthetic import ROUTES, Variation

@@ -1,12 +1,12 @@
-"""An incremental bag of binary words: a vocabulary that grows with the drive and is never trained.
+"""An incremental bag of binary words, whose vocabulary grows during the drive without training.
 
-After iBoW-LCD (Garcia-Fidalgo and Ortiz, RA-L 2018), section III: a descriptor of an image that is
-clearly nearest to one word is merged into it by bitwise AND, any other becomes a word; words that
-no further image sees are dropped; an inverted index scores images by tf-idf; neighbouring images
-with high scores form islands, and the best island gives the decision. The features are those of
-every detector here. Two things differ. A decision is compared with a threshold by its tf-idf score
-rather than by inliers, which verification counts. And the island of the image before has priority
-whether or not it was verified.
+This follows iBoW-LCD (Garcia-Fidalgo and Ortiz, RA-L 2018), section III. A descriptor that is
+clearly nearest to one word is merged into it by bitwise AND; any other becomes a new word. Words
+that no further image sees are dropped. An inverted index scores images by tf-idf; neighbouring
+images with high scores form islands, and the best island gives the decision. All detectors here use
+the same features. There are two differences: the threshold applies to the tf-idf score instead of
+the number of inliers, which verification counts; and the island of the previous image has priority
+even if it was not verified.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from vslam.lab.loopbench.online import Detection
 from vslam.lab.loopbench.word_trees import empty_trees, insert, nearest_two, remove
 
 _RATIO = 0.8  # of the distances to the nearest and second nearest word (section III)
-_SEEN = 2  # a word is kept that so many images see, the one that made it counted,
-_AFTER = 2  # until so many images later (both as in the authors' libraries)
-_MIN_SCORE = 0.3  # of the scores of a query stretched to 0..1, that an island is made of
+_SEEN = 2  # a word is kept if this many images, including its first,
+_AFTER = 2  # have seen it this many images later (both as in the authors' libraries)
+_MIN_SCORE = 0.3  # lowest score in an island, after scaling the scores of a query to 0..1
 _REACH = 3  # images to either side: islands of 7 (default of the authors' library)
 
 
 class Island(NamedTuple):
-    """Images ``first`` to ``last`` with their mean ``score``, and the ``best`` of them."""
+    """Images ``first`` to ``last``, their mean ``score``, and the ``best`` image."""
 
     first: int
     last: int
@@ -38,7 +38,7 @@ class Island(NamedTuple):
 
 
 class IncrementalBow:
-    """Words and images of one drive; see the module."""
+    """Words and images of one drive; see the module's docstring."""
 
     name = "ibow"
 
@@ -49,8 +49,8 @@ class IncrementalBow:
         self._young: list[NDArray[np.int32]] = []  # words of the last images
         self._free = np.empty(0, np.int32)
         self._n_numbers = 0
-        # Of each word: how many images saw it, and its latest posting. Of each posting: its image
-        # and the posting before it.
+        # For each word: the number of images that saw it, and its latest posting. For each posting:
+        # its image and the previous posting.
         self._seen = np.zeros(0, np.int32)
         self._latest = np.zeros(0, np.int32)
         self._posted = np.empty(0, np.int32)
@@ -59,7 +59,7 @@ class IncrementalBow:
 
     @property
     def n_words(self) -> int:
-        """Words of the vocabulary."""
+        """Number of words in the vocabulary."""
         return self._n_numbers - len(self._free)
 
     def add(self, image: DescribedImage) -> None:
@@ -96,7 +96,7 @@ class IncrementalBow:
         return Detection(self._last.best, float(score[self._last.best]))
 
     def scores(self, image: DescribedImage) -> NDArray[np.float64]:
-        """``(G,)`` tf-idf of the words that an image shares with each image added."""
+        """``(G,)`` tf-idf scores over the words that the image shares with each added image."""
         score = np.zeros(len(self._sizes))
         word = self._matched(np.ascontiguousarray(image.descriptors).view(np.uint64))
         word, count = np.unique(word[word >= 0], return_counts=True)
@@ -106,12 +106,12 @@ class IncrementalBow:
         return score
 
     def _matched(self, descriptors: NDArray[np.uint64]) -> NDArray[np.int32]:
-        """The word that each descriptor is clearly nearest to, or -1."""
+        """The word to which each descriptor is clearly nearest, or -1."""
         word, bits = nearest_two(self._trees, descriptors)
         return np.where(bits[:, 0] < _RATIO * bits[:, 1], word, -1).astype(np.int32)
 
     def _numbers(self, n: int) -> NDArray[np.int32]:
-        """Numbers for ``n`` words; those of words that were dropped come first."""
+        """Numbers for ``n`` words; the numbers of dropped words are used first."""
         again, self._free = np.split(self._free, [min(n, len(self._free))])
         more = self._n_numbers + np.arange(n - len(again), dtype=np.int32)
         self._n_numbers += len(more)
@@ -137,11 +137,11 @@ class IncrementalBow:
 
 
 def islands(score: NDArray[np.float64]) -> list[Island]:
-    """Stretches of images that are alike, from the best image down (section III).
+    """Group similar neighbouring images into islands, from the best image down (section III).
 
-    The scores ``(G,)`` of one query are stretched to 0..1. Each image from 0.3 on falls into an
-    island or founds one, of seven images where others leave the room; its score is the mean of
-    its stretched scores, images below 0.3 counting nothing.
+    The scores ``(G,)`` of one query are scaled to 0..1. Each image with a score of at least 0.3
+    joins an island or starts a new one of up to seven images. The score of an island is the mean
+    over its images, in which scores below 0.3 count as 0.
     """
     if not len(score) or score.max() <= score.min():
         return []
@@ -163,7 +163,7 @@ def islands(score: NDArray[np.float64]) -> list[Island]:
 
 @kernel
 def _add_weights(score, word, weight, latest, posted, before):
-    """Add the weight of each word to every image that it was posted for."""
+    """Add the weight of each word to every image in its postings."""
     for k in range(len(word)):
         posting = latest[word[k]]
         while posting >= 0:

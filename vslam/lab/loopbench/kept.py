@@ -1,4 +1,4 @@
-"""What measurements were made of, kept beside them, so that two kinds never mix in one folder."""
+"""Conditions stored beside measurements, so that a folder never mixes different ones."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from vslam.errors import InputError
 
 
 def keep_conditions(path: Path, given: Mapping[str, Any]) -> None:
-    """Add conditions to those of a file, ``{name: JSON value}``; names it lacks are unknown.
+    """Add conditions, ``{name: JSON value}``, to those stored in a file.
 
     Raises:
-        InputError: the file has another value of one of them.
+        InputError: the file has a different value for one of them.
     """
     known = json.loads(path.read_text()) if path.exists() else {}
     for name, value in given.items():

@@ -1,22 +1,22 @@
-"""Histograms of superpixels on a grid (LSGD), compared place by place: trained on nothing.
+"""Grey-level histograms of superpixels on a grid (LSGD), compared cell by cell, without training.
 
-The descriptor of LSGDDN-LCD (Zhang, Dong, Qi, Li and Ma, arXiv:2304.03872). The stored text of the
-paper ends before its equations; sizes, distances and the similarity are those of the authors'
-programme (github.com/BaoshengZhang0/LSGDDN-LCD, commit d3c1b34), described here in our own words:
+This is the descriptor of LSGDDN-LCD (Zhang, Dong, Qi, Li and Ma, arXiv:2304.03872). We have the
+paper without its equations; sizes, distances and the similarity are those of the authors' program
+(github.com/BaoshengZhang0/LSGDDN-LCD, commit d3c1b34), described here in our own words:
 
-- *Grid.* Cells of about 100 pixels; in the middle of each a centre, which moves to that of its
-  eight neighbours that differs least from it for its distance.
-- *Superpixels* (SLIC, Achanta et al., TPAMI 2012, on grey images). A pixel belongs to the centre,
-  at most a cell away each way, with the least distance in grey and place together; centres move
-  to the mean of their pixels; ten times. A pixel leaves its centre only for one that is nearer
-  than its own was when it was chosen.
-- *Descriptor.* How many pixels of each superpixel have each of 256 grey levels.
+- *Grid.* Cells of about 100 pixels. Each has a centre in the middle, which moves to the one of its
+  eight neighbours with the smallest grey difference relative to its distance.
+- *Superpixels* (SLIC, Achanta et al., TPAMI 2012, on grey images). Each pixel is assigned to the
+  centre, at most one cell away in each direction, with the smallest combined distance in grey level
+  and position; centres move to the mean of their pixels. This is done ten times. A pixel changes
+  its centre only for one that is nearer than its own was when it was assigned.
+- *Descriptor.* The grey-level histogram (256 bins) of each superpixel.
 - *Similarity.* 1 / (1 + d), where d is the mean over the superpixels of the square root of the sum
   of absolute differences of the counts, over 256.
 
-What differs: grey takes the place of colour where centres settle, and a centre that has lost all
-its pixels stays. Every image is compared, as the programme does; the paper's dynamic nodes, which
-spare comparisons, are left out.
+Differences: centres settle by grey level instead of colour, and a centre that has lost all its
+pixels stays. All images are compared, as in the authors' program; the paper's dynamic nodes, which
+save comparisons, are left out.
 """
 
 from __future__ import annotations
@@ -77,12 +77,12 @@ def centres(image: Image) -> NDArray[np.int64]:
 
 
 def superpixels(image: Image, rounds: int) -> NDArray[np.int64]:
-    """``(H, W)`` superpixel of each pixel."""
+    """``(H, W)`` index of the superpixel of each pixel."""
     return _superpixels(image, centres(image), *grid(image), rounds)
 
 
 def histograms(image: Image, superpixel: NDArray[np.int64], n: int) -> Histograms:
-    """``(n, 256)`` pixels of each grey level in each superpixel."""
+    """``(n, 256)`` histogram of the grey levels of each superpixel."""
     counts = np.bincount((superpixel * _LEVELS + image).ravel(), minlength=n * _LEVELS)
     return counts.reshape(n, _LEVELS).astype(np.int32)
 
@@ -152,7 +152,7 @@ def _superpixels(image, centre, rows, columns, rounds):
 
 @kernel
 def _differences(queries, gallery):
-    """``(Q, G)`` means over the superpixels of the root of the absolute differences' sum."""
+    """``(Q, G)`` distances: see *Similarity* in the module's docstring."""
     superpixels, levels = gallery.shape[1:]
     found = np.zeros((len(queries), len(gallery)))
     for q in range(len(queries)):

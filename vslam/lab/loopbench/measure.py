@@ -1,4 +1,4 @@
-"""Measure loop detectors on test sets: descriptors alone, and after geometric verification."""
+"""Measure loop detectors on test sets, before and after geometric verification."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from vslam.loopclosure.precision_recall import (
 )
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
 
-MIN_SHARE = 0.18  # of the coarse cells; KITTI 00: 99.7 % of wrong best images have less
-MIN_MATCHES = 20  # that obey one epipolar geometry (ORB-SLAM, VII-B, asks for 20 in 3D)
+MIN_SHARE = 0.18  # of the coarse cells; on KITTI 00, 99.7 % of wrong best images have less
+MIN_MATCHES = 20  # that fit one epipolar geometry (ORB-SLAM, VII-B, requires 20 in 3D)
 _EPIPOLAR_PIXELS = 2.0
 _CURVE_POINTS = 200
-_RESAMPLES = 200  # of the queries, for the interval of a difference
+_RESAMPLES = 200  # bootstrap resamples of the queries
 
 
 def measure(
@@ -44,10 +44,10 @@ def measure(
     *,
     descriptors_only: bool = False,
 ) -> tuple[list[Score], list[Gain]]:
-    """All detectors on one set under one condition; nothing where that is not to be had.
+    """Measure all detectors on a set under a condition; empty if the set does not have it.
 
     Args:
-        descriptors_only: nothing is verified, and there are no intervals of differences.
+        descriptors_only: skip verification and the intervals of differences.
     """
     query_set = test_set.query_set(condition, seed)
     if query_set is None:
@@ -122,7 +122,7 @@ def _score(
 def _best_images(
     scores: Matrix, relation: NDArray[np.int8]
 ) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
-    """The best image of each query of which the truth is known, and its relation."""
+    """The best image of each query for which its relation is known, and this relation."""
     best = np.where(relation != UNKNOWN, scores, -np.inf).argmax(1)
     return best, relation[np.arange(len(best)), best]
 
@@ -130,8 +130,8 @@ def _best_images(
 def thinned(curve: PrecisionRecall) -> Curve:
     """The best precision at equal steps of recall, and the end where every pair is accepted.
 
-    Equal steps of the pairs would have a good detector's curve in the first of them: of thousands
-    of pairs it finds all true ones among the first few.
+    With equal steps over the pairs, the whole curve of a good detector would lie in the first step,
+    because it ranks the few true pairs before thousands of others.
     """
     points = drawn_points(curve)
     return Curve(
@@ -141,7 +141,7 @@ def thinned(curve: PrecisionRecall) -> Curve:
 
 
 def drawn_points(curve: PrecisionRecall) -> NDArray[np.int64]:
-    """Points of a curve that are nearest to equal steps of recall, and the first."""
+    """The first point of a curve, and the points nearest to equal steps of recall."""
     wanted = np.linspace(0.0, curve.recall[0], _CURVE_POINTS)
     reached = len(curve.recall) - 1 - np.searchsorted(curve.recall[::-1], wanted)
     return np.unique(np.append(reached, 0))
@@ -155,7 +155,7 @@ def _gain(
     found: dict[str, Matrix],
     relation: NDArray[np.int8],
 ) -> Gain:
-    """Difference in AP with a bootstrap interval: queries are drawn again, with their galleries."""
+    """Difference in AP with a bootstrap interval over the queries."""
     known, rng = relation != UNKNOWN, np.random.default_rng(0)
 
     def gain(rows: NDArray[np.integer]) -> float:
@@ -177,7 +177,7 @@ def _gain(
 
 
 class Verification:
-    """Whether two images show one place by their local descriptors; each pair is matched once."""
+    """Tests by local descriptors whether two images show one place; caches the results."""
 
     def __init__(
         self,
@@ -190,7 +190,7 @@ class Verification:
         self._by_learned: dict[tuple[int, int], bool] = {}
 
     def by_orb(self, query: int, image: int) -> bool:
-        """Whether enough ORB matches obey one epipolar geometry."""
+        """Whether enough ORB matches fit one epipolar geometry."""
         key = query, image
         if key not in self._by_orb:
             inliers = epipolar_inliers(self._queries[query], self._gallery[image])
@@ -198,7 +198,7 @@ class Verification:
         return self._by_orb[key]
 
     def by_learned(self, query: int, image: int) -> bool:
-        """Whether enough cells of the coarse grid obey one homography, roughly."""
+        """Whether enough cells of the coarse grid roughly fit one homography."""
         key = query, image
         if key not in self._by_learned:
             a = self._local.of(self._queries[query].image)
@@ -211,7 +211,7 @@ class Verification:
 def epipolar_inliers(
     a: DescribedImage, b: DescribedImage, config: VerificationConfig | None = None
 ) -> int:
-    """Matches of two images that obey the best fundamental matrix found."""
+    """Number of matches of two images that fit the best fundamental matrix found."""
     import cv2
 
     config = config or VerificationConfig()

@@ -1,4 +1,4 @@
-"""Measure loop detectors on drives: one decision an image, before and after verification."""
+"""Measure loop detectors on drives: one decision per image, before and after verification."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def measure_drive(
     threads: int,
     progress_bar: ProgressBar,
 ) -> list[OnlineScore]:
-    """All detectors on one drive.
+    """Measure all detectors on one drive.
 
     Args:
         drive: images in order.
-        starts: of the detectors.
-        window: the youngest images, which are not searched.
-        vocabulary: of the features that verification matches, and of ``bow``.
+        starts: functions that start the detectors.
+        window: the newest images, which are not searched.
+        vocabulary: vocabulary of ``bow`` and of the features that verification matches.
         progress_bar: opened for each detector.
 
     Raises:

@@ -1,7 +1,7 @@
-"""Matching along the vocabulary: the direct index of Galvez-Lopez and Tardos (T-RO 2012, IV).
+"""Matching by the direct index of a vocabulary (Galvez-Lopez and Tardos, T-RO 2012, IV).
 
-Features whose words lie under one node of the tree are compared, and no others. Runs compare every
-pair of descriptors, which finds a quarter more; a benchmark of thousands of pairs of images cannot.
+Only features whose words lie under the same node of the tree are compared. Runs compare all pairs
+of descriptors, which finds a quarter more matches but is too slow for thousands of pairs of images.
 """
 
 from __future__ import annotations
@@ -49,10 +49,11 @@ def match_by_node(
         node_a, feature_a: direct index of image a (``NodeIndex``); likewise b.
         descriptors_a, descriptors_b: ``(M, 4)`` and ``(N, 4)`` uint64, of all features.
         use_a, use_b: ``(M,)`` and ``(N,)`` bool, features that may be matched.
-        max_distance: bits; ratio: best over second best under the node (1 switches it off).
+        max_distance: bits.
+        ratio: largest ratio of the best to the second best distance under the node; 1 disables it.
 
     Returns:
-        ``(M,)`` int32 feature of b or -1, none twice (the closest keeps it).
+        ``(M,)`` int32 feature of b or -1; each feature of b occurs at most once (closest match).
     """
     matches = np.full(len(descriptors_a), -1, np.int32)
     distances = np.full(len(descriptors_a), 257, np.int64)

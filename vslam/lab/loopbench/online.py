@@ -1,16 +1,16 @@
-"""The protocol of the literature: images in order, one decision for each against those before.
+"""The usual protocol of the literature: one decision for each image of a drive, in order.
 
-An image is compared with the images that are older by a window in time. The best of them is its
-match, and its score is compared with a threshold. With a ground truth that marks which images show
-one place:
+An image is compared with all images before a time window. The most similar one is its match, and
+the score of the match is compared with a threshold. The ground truth marks which images show the
+same place:
 
-- the match is *right* if it is marked, else *wrong*;
-- precision is right / (right + wrong) of the images whose score reaches the threshold;
+- a match is *right* if it is marked, otherwise *wrong*;
+- precision is right / (right + wrong) over the images whose score reaches the threshold;
 - recall is right / (images that have a marked image before the window).
 
-Recall at 100 % precision is the highest recall of all thresholds that let no wrong match through
-(Cummins and Newman, IJRR 2008; Galvez-Lopez and Tardos, T-RO 2012; Garcia-Fidalgo and Ortiz, RA-L
-2018; An et al., IROS 2019). A detection that verification refuses is none at any threshold.
+Recall at 100 % precision is the highest recall over all thresholds without a wrong match (Cummins
+and Newman, IJRR 2008; Galvez-Lopez and Tardos, T-RO 2012; Garcia-Fidalgo and Ortiz, RA-L 2018; An
+et al., IROS 2019). A match that verification rejects counts as no match at any threshold.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME
 
 
 class Detection(NamedTuple):
-    """``match``, number of an image added before; ``score``, greater is more alike."""
+    """``match`` is the number of an earlier image; a higher ``score`` is more similar."""
 
     match: int
     score: float
 
 
 class OnlineDetector(Protocol):
-    """What a detector remembers of one drive. Images come in order, and twice: ``find`` asks for
-    each at once, ``add`` has it searched from the moment that it is older than the window."""
+    """A detector on one drive. ``find`` is called with each image in order; ``add`` is called with
+    the same image later, when it is older than the window and may be found."""
 
     name: str
 
     def add(self, image: DescribedImage) -> None:
-        """Remember an image; the first is number 0."""
+        """Store an image; the first one is number 0."""
 
     def find(self, image: DescribedImage) -> Detection | None:
-        """The image added that is most alike; None if there is none."""
+        """The most similar of the added images; None if there is none."""
 
 
 class ScoredDetector:
-    """A scorer without state as an online detector: all scores of a drive at once, then row by row
-    the greatest of the images added."""
+    """Makes an online detector of a scorer: computes all scores of a drive at once, then returns
+    the highest among the added images for each query."""
 
     def __init__(self, scorer: Scorer, images: list[DescribedImage]) -> None:
         self.name = scorer.name
@@ -73,10 +73,8 @@ class ScoredDetector:
 
 @dataclass(frozen=True)
 class Window:
-    """The youngest images that a query is not compared with.
-
-    ``amount`` images, or seconds if ``timed``.
-    """
+    """The newest images, with which a query is not compared: ``amount`` images, or seconds if
+    ``timed``."""
 
     amount: float
     timed: bool
@@ -85,23 +83,23 @@ class Window:
         return f"{self.amount:g} {'s' if self.timed else 'images'}"
 
     def searchable(self, n: int, times: NDArray[np.float64] | None) -> NDArray[np.int64]:
-        """``(n,)`` how many images, from the first on, each may be compared with.
+        """``(n,)`` number of images, from the first on, with which each image may be compared.
 
         Args:
-            n: images of the drive.
-            times: ``(n,)`` seconds, ascending; None counts one image a second, DLoopDetector's
+            n: number of images in the drive.
+            times: ``(n,)`` seconds, ascending; None assumes one image per second, DLoopDetector's
                 default.
         """
         clock = np.arange(n, dtype=np.float64) if times is None or not self.timed else times
-        # Times are multiples of an interval that binary fractions do not hold.
+        # Times are multiples of an interval that floating-point numbers do not represent exactly.
         return np.searchsorted(clock, clock - self.amount + 1e-6, side="right")
 
 
 def parse_window(text: str) -> Window:
-    """``20s`` or ``200``, seconds or images.
+    """Parse ``20s`` (seconds) or ``200`` (images).
 
     Raises:
-        InputError: neither.
+        InputError: the text is neither.
     """
     timed = text.endswith("s")
     try:
@@ -117,7 +115,7 @@ def parse_window(text: str) -> Window:
 
 @dataclass(frozen=True)
 class Decisions:
-    """One of each of N images.
+    """The decisions for N images.
 
     Attributes:
         match: ``(N,)`` int64 image found, -1 for none.
@@ -129,10 +127,10 @@ class Decisions:
 
     def __post_init__(self) -> None:
         if np.isnan(self.score).any():
-            raise InputError("loops bench: a score is NaN; look at the weights of the detector.")
+            raise InputError("loops bench: a score is NaN; check the weights of the detector.")
 
     def only(self, accepted: NDArray[np.bool_]) -> Decisions:
-        """Those accepted ``(N,)``; the others find nothing."""
+        """Keep the ``(N,)`` accepted decisions; the others become no match."""
         return Decisions(
             np.where(accepted, self.match, -1), np.where(accepted, self.score, -np.inf)
         )
@@ -144,10 +142,10 @@ def decide(
     searchable: NDArray[np.int64],
     on_image: Callable[[], None] = lambda: None,
 ) -> Decisions:
-    """Run a detector that remembers nothing yet over a drive.
+    """Run a new detector over a drive.
 
     Args:
-        searchable: ``(N,)`` as of :meth:`Window.searchable`.
+        searchable: ``(N,)``, see :meth:`Window.searchable`.
         on_image: called after each image.
     """
     match, score = np.full(len(images), -1, np.int64), np.full(len(images), -np.inf)
@@ -165,14 +163,14 @@ def decide(
 
 @dataclass(frozen=True)
 class Judged:
-    """Decisions held against the truth.
+    """Decisions compared with the ground truth.
 
     Attributes:
         score: ``(N,)`` float64, -inf for no decision.
         right: ``(N,)`` bool, the match is marked as the same place.
-        far: ``(N,)`` bool, the match is known to be another place. A match that is neither lies
-            near the place, but not near enough to be marked.
-        answerable: ``(N,)`` bool, images with a marked one before the window.
+        far: ``(N,)`` bool, the match is known to be another place. A match that is neither right
+            nor far lies near the place, but not near enough to be marked.
+        answerable: ``(N,)`` bool, images that have a marked image before the window.
     """
 
     score: NDArray[np.float64]
@@ -189,10 +187,10 @@ class Judged:
 def judge(
     decisions: Decisions, relation: NDArray[np.int8], searchable: NDArray[np.int64]
 ) -> Judged:
-    """Hold decisions against the relation ``(N, N)`` int8 of the images of a drive.
+    """Compare decisions with the relation ``(N, N)`` int8 of the images of a drive.
 
     Raises:
-        InputError: no image has a marked one before the window.
+        InputError: no image has a marked image before the window.
     """
     n = len(relation)
     before = np.arange(n)[None] < searchable[:, None]
@@ -213,8 +211,8 @@ def decision_curve(judged: Judged, *, near_is_wrong: bool = True) -> PrecisionRe
     """Precision and recall over images, at each distinct score from the lowest on.
 
     Args:
-        near_is_wrong: as in the literature, whatever is not marked; False leaves out matches that
-            are near the place.
+        near_is_wrong: count every unmarked match as wrong, as in the literature; False leaves out
+            matches near the place.
     """
     wrong = judged.far | (judged.near & near_is_wrong)
     counted = judged.right | wrong

@@ -1,8 +1,8 @@
-"""What the benchmark compares, by name: the loop detectors of runs, and baselines of its own.
+"""The detectors of the benchmark by name: the loop detectors of runs, and untrained baselines.
 
-The baselines were trained on nothing and show what training is worth. They are no detectors of
-runs: runs ask for several candidates of which none is covisible, and the islands of ``ibow`` give
-one; a thumbnail has nothing to verify.
+The baselines show the benefit of training. They cannot be used in runs, which need several
+candidates that are not covisible: the islands of ``ibow`` give only one, and thumbnails give no
+features to verify.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vslam.loopclosure.vocabulary import Vocabulary
 
 ProtocolName = Literal["retrieval", "online"]
 Start = Callable[[list[DescribedImage]], OnlineDetector]
-"""An online detector that remembers nothing yet, for the drive of these images."""
+"""A function that makes a new online detector for the drive of these images."""
 
 _UNTRAINED: dict[str, Callable[[], Scorer]] = {
     ThumbnailScorer.name: ThumbnailScorer,
@@ -32,17 +32,17 @@ _BASELINES = (*_UNTRAINED, IncrementalBow.name)
 
 
 def require_comparable(name: str, weights: Path | None, protocol: ProtocolName) -> None:
-    """Refuse what cannot be compared, before anything heavy is imported.
+    """Refuse a detector that cannot be compared, before large packages are imported.
 
     Raises:
-        InputError: no such detector, no weights for it, or none that the protocol can take.
+        InputError: the detector is unknown, has no weights or does not suit the protocol.
     """
     if name == "none":
-        raise InputError("--detectors none: finds nothing; leave it out.")
+        raise InputError("--detectors none: finds no loops; leave it out.")
     if name == "both":
         raise InputError("--detectors both: has no score of its own; name bow,capsule.")
     if name == IncrementalBow.name and protocol != "online":
-        raise InputError(f"--detectors {name}: its words grow with a drive; add --protocol online.")
+        raise InputError(f"--detectors {name}: learns during a drive; add --protocol online.")
     if name not in (*DETECTORS, *_BASELINES):
         known = (*DETECTORS[1:], *_BASELINES)
         raise InputError(
@@ -52,11 +52,11 @@ def require_comparable(name: str, weights: Path | None, protocol: ProtocolName) 
     if name not in _BASELINES:
         require_detector(name, weights, "--detectors")
     elif weights is not None:
-        raise InputError(f"--weights: the detector {name} has none; leave the option out.")
+        raise InputError(f"--weights: the detector {name} has no weights; leave the option out.")
 
 
 def comparable_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scorer:
-    """A detector of the protocol retrieval.
+    """Open a detector for the protocol ``retrieval``.
 
     Raises:
         InputError: no weights for it, or those of another network.
@@ -67,7 +67,7 @@ def comparable_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -
 
 
 def online_detector(name: str, weights: Path | None, vocabulary: Vocabulary) -> Start:
-    """What starts a detector of the protocol online.
+    """The function that starts a detector for the protocol ``online``.
 
     Raises:
         InputError: no weights for it, or those of another network.

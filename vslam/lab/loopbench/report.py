@@ -1,4 +1,4 @@
-"""The report of a comparison of loop detectors: Markdown, HTML, JSON, the same numbers in each."""
+"""The report of a comparison of loop detectors as Markdown, HTML and JSON."""
 
 from __future__ import annotations
 
@@ -17,34 +17,32 @@ from vslam.report.render import html, markdown, write_files
 
 MEAN = "mean of all"
 _ABOUT_AP = (
-    "Average precision, by the descriptors alone, over all pairs of a query and a gallery image "
-    "whose relation is known. Last columns: AP of a detector minus that of the first, with the "
-    "95 % interval of a bootstrap over the queries; * where the interval excludes 0."
+    "Average precision without verification, over all pairs of a query and a gallery image whose "
+    "relation is known. Last columns: AP of a detector minus that of the first one, with a 95 % "
+    "bootstrap interval over the queries; * if the interval excludes 0."
 )
 _ABOUT_RECALL = "The highest recall without a wrong pair, and the precision at a recall of 70 %."
 _ABOUT_VERIFIED = (
-    "Share of the queries with a place to find whose best image shows it; then the shares where "
-    f"in addition at least {MIN_MATCHES} ORB matches obey one epipolar geometry, where matches of "
-    f"learned local descriptors that obey one homography cover {100 * MIN_SHARE:.0f} % of the "
-    "image, and where at least one of the two tests passes."
+    "Share of the queries with a place in the gallery whose best image shows this place; then the "
+    f"shares for which, in addition, at least {MIN_MATCHES} ORB matches fit one epipolar geometry, "
+    "matches of learned local descriptors that fit one homography cover "
+    f"{100 * MIN_SHARE:.0f} % of the image, or at least one of the two tests passes."
 )
 _ABOUT_SEQUENCES = (
-    "Share of the queries whose best image shows their place, by single scores and by scores of a "
-    f"sequence of {LENGTH} queries (SeqSLAM). Images without order have no sequences."
+    "Share of the queries whose best image shows their place, by scores of single images and of "
+    f"sequences of {LENGTH} queries (SeqSLAM). Images without order have no sequences."
 )
 _ABOUT_WRONG = (
     "Number of queries whose best image shows another place and still passes those tests."
 )
 _ABOUT_ACCURACY = (
-    "Balanced accuracy: the mean of the shares of true and of false pairs that p classifies "
-    "correctly."
+    "Balanced accuracy: the mean of the shares of true and false pairs that are classified "
+    "correctly at a threshold on p."
 )
-_ABOUT_ACCEPTED = (
-    "Over the pairs with p of at least 0.9; where there are none, precision counts as 1."
-)
+_ABOUT_ACCEPTED = "Over the pairs with p of at least 0.9; if there are none, precision is 1."
 _ABOUT_COST = (
-    "Medians, each detector in its own process with one thread. Image: what is needed beyond the "
-    "ORB features that tracking extracts anyway. Parameters of bow: weights of its words."
+    "Medians, each detector in its own process with one thread. Image: time in addition to the ORB "
+    "features, which tracking extracts anyway. Parameters of bow: weights of its words."
 )
 
 
@@ -79,8 +77,8 @@ def title(report: LoopsJson) -> str:
 
 
 def words(report: LoopsJson) -> list[str]:
-    """For each detector but the first and each condition, what the intervals say; for each drive,
-    which detector decides best."""
+    """Sentences about the result of each detector but the first under each condition, and about the
+    best detector on each drive."""
     sentences = online_words(report.online)
     for first, second in dict.fromkeys((g.first, g.second) for g in report.gains):
         for condition in _conditions(report):

@@ -1,4 +1,4 @@
-"""What the report says of the protocol online."""
+"""The part of the report about the protocol ``online``."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from vslam.report.page import Section, Table
 
 _VERIFIED = ("nothing", "orb", "learned", "both")
 _ABOUT = (
-    "One decision for each image against the images before the window. Recall: the share of the "
-    "images with a true match there that are decided correctly. In brackets: unmarked matches that "
-    "lie near the place do not count as wrong."
+    "Each image is compared with the images before the window. Recall: among the images with a "
+    "true match there, the share with a right decision. In brackets: recall if unmarked matches "
+    "near the place do not count as wrong."
 )
 _ABOUT_COUNTS = (
-    "Decisions at the lowest threshold, by whether the match is marked, lies near, or is elsewhere."
+    "Numbers of decisions at the lowest threshold whose match is marked, near the place, or far."
 )
 
 
 def online_words(scores: Sequence[OnlineScore]) -> list[str]:
-    """For each drive and verification, which detector recalls most without a wrong match."""
+    """Sentences that name, for each drive and verification, the detector with the highest recall
+    without a wrong match."""
     sentences = []
     for data in _in_order(s.data for s in scores):
         for by in ("nothing", "both"):

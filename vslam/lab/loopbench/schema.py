@@ -1,4 +1,4 @@
-"""The schema of ``loops.json``: what scripts may rely on."""
+"""The schema of ``loops.json``, on which scripts may rely."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from vslam.report.document import Document, Record
 
 
 class Curve(Record):
-    """Precision and recall from the lowest threshold on, thinned out."""
+    """Precision and recall from the lowest threshold on, at selected points."""
 
     precision: list[float]
     recall: list[float]
 
 
 class Verified(Record):
-    """``right``: share of the queries that have a place in the gallery whose best image shows it
-    and passes verification; ``wrong``: queries whose best image shows another place and passes."""
+    """Best images that pass verification. ``right``: those that show the query's place, as a share
+    of the queries that have a place in the gallery; ``wrong``: number of those that show another
+    place."""
 
     right: float
     wrong: int
@@ -26,13 +27,13 @@ class Verified(Record):
 class Score(Record):
     """One detector on one set of images under one condition.
 
-    ``figures`` are those of :func:`vslam.loopclosure.precision_recall.summary`, of descriptors
-    alone; ``accuracy`` is balanced, at thresholds on p, None for detectors without. ``accepted``:
-    precision and recall of the pairs with p of at least 0.9, None likewise, and in older files.
-    ``first_right``: share of the ``queries`` that have a place in the gallery whose best image
-    shows it; ``sequence_right``: the same where scores are added along sequences, None of images
-    without order. ``verified``: by ``orb``, by ``learned`` local descriptors, by ``both``, one
-    of the two; empty where only descriptors are measured.
+    ``figures`` are those of :func:`vslam.loopclosure.precision_recall.summary`, without
+    verification. ``accuracy`` is balanced, by threshold on p; None for detectors without p.
+    ``accepted``: precision and recall of the pairs with p of at least 0.9; None without p and in
+    older files. ``first_right``: among the ``queries`` with a place in the gallery, the share whose
+    best image shows it; ``sequence_right``: the same for scores added along sequences, None for
+    images without order. ``verified``: by ``orb``, by ``learned`` local descriptors, or by at least
+    one of them (``both``); empty if nothing was verified.
     """
 
     data: str
@@ -49,7 +50,7 @@ class Score(Record):
 
 
 class DecisionCurve(Record):
-    """Precision and recall over images at thresholds on the score, ascending, thinned out."""
+    """Precision and recall over images at selected, ascending thresholds on the score."""
 
     threshold: list[float]
     precision: list[float]
@@ -57,14 +58,14 @@ class DecisionCurve(Record):
 
 
 class OnlineScore(Record):
-    """One detector on one drive, one decision an image (:mod:`vslam.lab.loopbench.online`).
+    """One detector on one drive, with one decision per image (:mod:`vslam.lab.loopbench.online`).
 
-    ``window``: the youngest images, which are not searched. ``verified_by``: ``nothing``, ``orb``,
-    ``learned`` local descriptors, ``both``, one of the two. Of the ``images``, ``answerable`` have
-    a true match before the window. At the lowest threshold ``right`` images have a true match,
-    ``near`` one that lies near the place but is not marked, ``far`` one of another place. Figures
-    count near as wrong, those that end in ``_far`` leave it out. ``max_f1_threshold`` is None
-    where nothing is found.
+    ``window``: the newest images, which are not searched. ``verified_by``: ``nothing``, ``orb``,
+    ``learned`` local descriptors, or ``both`` (at least one of the two). Of the ``images``,
+    ``answerable`` have a true match before the window. At the lowest threshold, ``right`` images
+    have a true match, ``near`` an unmarked one near the place, ``far`` one at another place.
+    Figures count near matches as wrong; those that end in ``_far`` leave them out.
+    ``max_f1_threshold`` is None if nothing is found.
     """
 
     data: str
@@ -85,7 +86,7 @@ class OnlineScore(Record):
 
 
 class Gain(Record):
-    """AP of ``second`` minus that of ``first``, with the 95 % interval over the queries."""
+    """AP of ``second`` minus that of ``first``, with a 95 % bootstrap interval over the queries."""
 
     data: str
     condition: str
@@ -97,9 +98,9 @@ class Gain(Record):
 
 
 class Cost(Record):
-    """Of one detector in a process of its own, one thread; medians.
+    """Median costs of one detector in a separate process with one thread.
 
-    ``image_ms``: what is needed of an image beyond the ORB features that tracking has anyway;
+    ``image_ms``: time for an image in addition to the ORB features, which tracking extracts anyway;
     ``query_ms``: by number of keyframes.
     """
 
@@ -112,10 +113,8 @@ class Cost(Record):
 
 
 class LoopsJson(Document):
-    """``kind`` distinguishes this file from those of runs.
-
-    ``cells``, ``gains`` and ``costs`` are of the protocol retrieval, ``online`` of the other one.
-    """
+    """``kind`` distinguishes this file from those of runs. ``cells``, ``gains`` and ``costs``
+    belong to the protocol ``retrieval``, ``online`` to the other one."""
 
     kind: Literal["loops"] = "loops"
     schema_version: int = 3

@@ -1,8 +1,8 @@
-"""Scores of queries that follow each other: a place is a stretch of the way, not an image.
+"""Scores of sequences of queries, which recognise a stretch of the way instead of one image.
 
-After SeqSLAM (Milford and Wyeth, ICRA 2012): the scores of a query and of those before it are
-added along lines through the gallery, one for each speed. Length and speeds are those of
-OpenSeqSLAM (Sünderhauf et al., ICRA 2013 workshop), not chosen here.
+As in SeqSLAM (Milford and Wyeth, ICRA 2012), the scores of a query and its predecessors are added
+along lines through the gallery, one for each speed. Length and speeds are those of OpenSeqSLAM
+(Sünderhauf et al., ICRA 2013 workshop).
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from vslam.geometry import Matrix
 
 LENGTH = 10  # queries
 SPEEDS = (0.8, 0.9, 1.0, 1.1, 1.2)  # images of the gallery for each query
-_LEAST_P = 1e-6  # probabilities nearer to 0 or 1 say no more than this
+_LEAST_P = 1e-6  # probabilities nearer to 0 or 1 are clipped
 
 
 def sequence_scores(scores: Matrix) -> Matrix:
-    """The mean score of each image and the way that led to it.
+    """The mean score along the best line that ends at each query and image.
 
     Args:
-        scores: ``(Q, G)`` of queries and images in the order of the way, greater is more alike.
+        scores: ``(Q, G)`` of queries and images in driving order; higher is more similar.
 
     Returns:
-        ``(Q, G)``. Where a line leaves the gallery, the mean score of the query stands for what is
-        not there; the first queries have shorter lines.
+        ``(Q, G)``. Outside the gallery, a line takes the mean score of the query; the first queries
+        have shorter lines.
     """
     n_queries, n_images = scores.shape
     usual = scores.mean(1)
@@ -40,6 +40,6 @@ def sequence_scores(scores: Matrix) -> Matrix:
 
 
 def log_odds(p: Matrix) -> Matrix:
-    """Of probabilities: what adds up over independent looks."""
+    """Log odds of probabilities, which can be added over independent observations."""
     p = np.clip(p, _LEAST_P, 1.0 - _LEAST_P)
     return np.asarray(np.log(p / (1.0 - p)))

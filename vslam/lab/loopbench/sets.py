@@ -1,4 +1,4 @@
-"""Images to test loop detectors on: rendered towns, drives and collections with ground truth."""
+"""Image sets for testing loop detectors: rendered towns, drives, collections with ground truth."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from vslam.loopclosure.siamese.image_source import UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.source_registry import open_source, split_spec
 
 ProgressBar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
-"""``(what, how many)`` opens a bar; what it yields is called after each of them."""
+"""``(text, number)`` opens a bar; the function that it yields is called after each step."""
 
-_GAP = 50  # images of a drive before a query that are not searched: it was just there
+_GAP = 50  # images of a drive just before a query, which are not searched
 _OPTIONS = {"seed": "0", "aliased": "0", "places": "150"}
 
 
 @dataclass(frozen=True)
 class QuerySet:
-    """Query images, the gallery that is searched for their places, and what is true.
+    """Query images, the gallery that is searched for their places, and the ground truth.
 
     Attributes:
         queries: Q images ``(H, W)`` uint8, under the condition.
-        gallery: G images as they were taken.
-        relation: ``(Q, G)`` int8, 1 same place, -1 another, 0 not known: left out.
-        in_order: whether queries and gallery were taken one after the other on a way.
+        gallery: G unchanged images.
+        relation: ``(Q, G)`` int8: 1 same place, -1 another place, 0 unknown (left out).
+        in_order: whether queries and gallery are in the order of a drive.
     """
 
     queries: list[Image]
@@ -44,20 +44,21 @@ class TestSet:
     """One set of images.
 
     Attributes:
-        title: of the report.
-        query_set: ``(condition, seed)`` to the images under it, None where the set has no such.
+        title: title in the report.
+        query_set: function of ``(condition, seed)`` that returns the images under the condition;
+            None if the set does not have it.
     """
 
-    __test__ = False  # no test, whatever pytest thinks of its name
+    __test__ = False  # pytest must not collect this class because of its name
 
     title: str
     query_set: Callable[[Condition, int], QuerySet | None]
 
 
 def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar) -> list[TestSet]:
-    """Open ``town:ROUTE[seed=101,aliased=1,places=150]`` or a source as of ``vslam train``.
+    """Open ``town:ROUTE[seed=101,aliased=1,places=150]`` or a source of ``vslam train``.
 
-    A town is rendered on first use, anew for each viewpoint and change, into ``cache``.
+    A town is rendered into ``cache`` on first use, once for each viewpoint and change.
 
     Args:
         cache: folder of rendered towns.

@@ -1,9 +1,9 @@
-"""Images reduced to thumbnails and correlated: a detector that was never trained on anything.
+"""An untrained detector that correlates thumbnails of images.
 
-As the simple mode of cuVSLAM (libs/slam/vpr, version 17): a grey image about eight times smaller,
-compared by zero-mean normalised cross-correlation, so that gain and offset do not matter. cuVSLAM
-compares thumbnails in place; here, as in OpenRatSLAM (Ball et al., Autonomous Robots 2013), the
-view may be shifted by a few pixels, and the score is the highest correlation.
+As in the simple mode of cuVSLAM (libs/slam/vpr, version 17), grey images are reduced about eight
+times and compared by zero-mean normalised cross-correlation, which ignores gain and offset. cuVSLAM
+compares thumbnails without a shift; here, as in OpenRatSLAM (Ball et al., Autonomous Robots 2013),
+the score is the highest correlation over shifts by a few pixels.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from vslam.lab.loopbench.detectors import DescribedImage
 Float = NDArray[np.float32]
 
 _WIDTH, _HEIGHT = 128, 48  # pixels
-_ASIDE, _UP, _STEP = 8, 2, 2  # pixels of shift, and between the shifts tried
-_FLAT = 1.0  # grey levels: length below which a part shows nothing
-_TOGETHER = 16  # queries compared at a time, for memory
-# The parts of a thumbnail that the middle of another one is compared with; the middle is the 14th.
+_ASIDE, _UP, _STEP = 8, 2, 2  # largest shifts and step between shifts, pixels
+_FLAT = 1.0  # norm, in grey levels, below which a part has no texture
+_TOGETHER = 16  # queries compared at a time, to limit memory
+# The 27 shifted parts of a thumbnail; the 14th is the middle, which is compared with all parts.
 _PARTS = tuple(
     (slice(_UP + up, _HEIGHT - _UP + up), slice(_ASIDE + aside, _WIDTH - _ASIDE + aside))
     for up in range(-_UP, _UP + 1, _STEP)
@@ -32,8 +32,8 @@ _MIDDLE = _PARTS[len(_PARTS) // 2]
 
 
 class Gallery(NamedTuple):
-    """``rows`` (G, 6144) f4 thumbnails less their means; ``length`` (27, G) f4 of each part less
-    its own."""
+    """``rows`` (G, 6144) f4 thumbnails minus their means; ``length`` (27, G) f4 norm of each part
+    minus its own mean."""
 
     rows: Float
     length: Float
@@ -55,7 +55,7 @@ class ThumbnailScorer:
 
 
 def thumbnail(image: Image) -> Float:
-    """The image ``(H, W)`` in ``(48, 128)`` float32."""
+    """Reduce an image ``(H, W)`` to ``(48, 128)`` float32."""
     import cv2
 
     small = cv2.resize(image, (_WIDTH, _HEIGHT), interpolation=cv2.INTER_AREA)
@@ -63,18 +63,18 @@ def thumbnail(image: Image) -> Float:
 
 
 def remember(thumbnails: Float) -> Gallery:
-    """What correlation needs of thumbnails ``(G, 48, 128)``."""
+    """Precompute the data for correlation with thumbnails ``(G, 48, 128)``."""
     rows = _centred(thumbnails)
     length = [np.linalg.norm(_centred(thumbnails[:, y, x]), axis=1) for y, x in _PARTS]
     return Gallery(rows, np.maximum(np.stack(length), _FLAT))
 
 
 def correlations(queries: Float, gallery: Gallery) -> NDArray[np.float64]:
-    """``(Q, G)`` highest correlation of a query's middle with a part of that size, -1 to 1.
+    """``(Q, G)`` highest correlation, -1 to 1, of a query's middle with a part of an image.
 
     Args:
         queries: thumbnails ``(Q, 48, 128)``.
-        gallery: of :func:`remember`.
+        gallery: result of :func:`remember`.
     """
     middle = _centred(queries[:, *_MIDDLE])
     middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), _FLAT)
@@ -84,7 +84,7 @@ def correlations(queries: Float, gallery: Gallery) -> NDArray[np.float64]:
 
 
 def _best(middle: Float, gallery: Gallery) -> Float:
-    # The middle has mean 0: the mean of the part that it is laid on does not matter.
+    # The middle has mean 0, so the mean of the other part does not matter.
     laid = np.zeros((len(middle), len(_PARTS), _HEIGHT, _WIDTH), np.float32)
     for k, (y, x) in enumerate(_PARTS):
         laid[:, k, y, x] = middle
@@ -94,7 +94,7 @@ def _best(middle: Float, gallery: Gallery) -> Float:
 
 
 def _centred(images: Float) -> Float:
-    """``(N, D)`` with mean 0 each."""
+    """``(N, D)`` images, each with mean 0."""
     rows = images.reshape(len(images), -1)
     centred: Float = rows - rows.mean(1, keepdims=True)
     return centred

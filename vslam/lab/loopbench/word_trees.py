@@ -1,9 +1,9 @@
-"""Binary words that come and go, and the nearest of them: trees of random centres.
+"""Nearest-neighbour search among a changing set of binary words, by trees of random centres.
 
-After Muja and Lowe (Fast matching of binary features, CRV 2012): several trees whose inner nodes
-have words drawn at random as centres, searched together, the closest branch first. Theirs are built
-at once; these grow word by word, a leaf that is full becoming an inner node. iBoW-LCD keeps its
-words in such trees, too (Garcia-Fidalgo and Ortiz, RA-L 2018, section III).
+As in Muja and Lowe (Fast matching of binary features, CRV 2012), the inner nodes of several trees
+have randomly chosen words as centres, and all trees are searched together, nearest branch first.
+Their trees are built at once; these grow word by word, and a full leaf becomes an inner node.
+iBoW-LCD also uses such trees (Garcia-Fidalgo and Ortiz, RA-L 2018, section III).
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from vslam.kernels import hamming, inner_kernel, kernel
 from vslam.ransac import random_index
 
 _TREES, _BRANCHES, _LEAF = 4, 16, 150  # as in iBoW-LCD, section III
-_COMPARED = 512  # words compared with a descriptor, if there are as many
-_WAITING = 2048  # branches kept to be searched later
+_COMPARED = 512  # most words compared with a descriptor
+_WAITING = 2048  # most branches kept to be searched later
 _FIRST_WORDS, _FIRST_NODES = 4096, 256
 
 
 class WordTrees(NamedTuple):
-    """Room for W words and, in each of T trees, M nodes.
+    """Arrays for up to W words and, in each of T trees, M nodes.
 
-    ``words`` (W, 4) u8; ``leaf_of`` (T, W) i4; ``centre`` (T, M, 4) u8; ``child`` (T, M) i4 the
-    first of a node's children, -1 for a leaf; ``size`` (T, M) i4 and ``members`` (T, M, L) i4 of
-    leaves; ``used`` (T,) i8 nodes; ``random`` (T, 1) u8 state of the generators.
+    ``words`` (W, 4) u8; ``leaf_of`` (T, W) i4; ``centre`` (T, M, 4) u8; ``child`` (T, M) i4 first
+    child of a node, -1 for a leaf; ``size`` (T, M) i4 and ``members`` (T, M, L) i4 of leaves;
+    ``used`` (T,) i8 number of nodes; ``random`` (T, 1) u8 states of the generators.
     """
 
     words: NDArray[np.uint64]
@@ -55,11 +55,10 @@ def empty_trees() -> WordTrees:
 
 
 def insert(trees: WordTrees, word: NDArray[np.int32], descriptors: NDArray[np.uint64]) -> WordTrees:
-    """The trees with words that are not in them; the arrays given are changed or replaced.
+    """Insert new words; the arrays are changed in place or replaced by larger ones.
 
     Args:
-        trees: what holds them.
-        word: ``(N,)`` int32 numbers; their places in ``trees.words`` may lie beyond its end.
+        word: ``(N,)`` int32 numbers of the words; they may lie beyond the end of ``trees.words``.
         descriptors: ``(N, 4)`` uint64.
     """
     while len(word) and word.max() >= len(trees.words):
@@ -80,7 +79,7 @@ def insert(trees: WordTrees, word: NDArray[np.int32], descriptors: NDArray[np.ui
 
 
 def remove(trees: WordTrees, word: NDArray[np.int32]) -> None:
-    """Take words ``(N,)`` int32 out of the trees."""
+    """Remove words ``(N,)`` int32 from the trees."""
     _remove(trees.leaf_of, trees.size, trees.members, word)
 
 
@@ -90,8 +89,8 @@ def nearest_two(
     """The nearest words found for each of N descriptors ``(N, 4)`` uint64.
 
     Returns:
-        ``(N,)`` int32 word, -1 where there is none, and ``(N, 2)`` bits to it and to the second
-        nearest, 257 where there is none.
+        ``(N,)`` int32 nearest word, or -1, and ``(N, 2)`` distances in bits to the nearest and the
+        second nearest word, or 257.
     """
     return _nearest_two(
         trees.words, trees.centre, trees.child, trees.size, trees.members, descriptors
@@ -100,7 +99,7 @@ def nearest_two(
 
 @kernel
 def _insert(words, leaf_of, centre, child, size, members, used, random, word, descriptors, first):
-    """Insert from ``first`` on; returns the first that there is no room for, N if none."""
+    """Insert from ``first`` on; returns the first word for which there is no room, or N."""
     for i in range(first, len(word)):
         for t in range(len(used)):
             if used[t] + 4 * _BRANCHES > child.shape[1]:
@@ -125,7 +124,7 @@ def _insert(words, leaf_of, centre, child, size, members, used, random, word, de
 
 @inner_kernel
 def _leaf(centre, child, descriptor):
-    """The leaf that a descriptor comes to: always to the nearest centre."""
+    """The leaf of a descriptor, found by always descending to the nearest centre."""
     node = 0
     while child[node] >= 0:
         best, least = child[node], 257
@@ -139,7 +138,7 @@ def _leaf(centre, child, descriptor):
 
 @inner_kernel
 def _split(words, leaf_of, centre, child, size, members, node, first, random):
-    """Make a full leaf a node with children from ``first`` on, and give them its words."""
+    """Turn a full leaf into an inner node with children from ``first`` on, which take its words."""
     n = size[node]
     for k in range(_BRANCHES):
         drawn = k + random_index(random, n - k)
@@ -151,7 +150,7 @@ def _split(words, leaf_of, centre, child, size, members, node, first, random):
         best, least = first, 257
         for other in range(first, first + _BRANCHES):
             distance = hamming(centre[other], words[w])
-            # Equal centres share their words, or a leaf of equal ones would never divide.
+            # Equal centres share their words; otherwise a leaf of equal words could not be split.
             if distance < least or (distance == least and size[other] < size[best]):
                 best, least = other, distance
         members[best, size[best]] = w

@@ -1,1 +1,1 @@
-"""At which strength does a run fail: bisection over laws, systems and seeds, and its report."""
+"""Stress tests: bisection of the strength at which runs fail, for laws, systems and seeds."""

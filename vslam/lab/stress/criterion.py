@@ -1,4 +1,4 @@
-"""When a run has failed."""
+"""The criterion by which a run has failed."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from vslam.report.schema import ReportJson
 
 @dataclass(frozen=True)
 class Criterion:
-    """Limits, each against the same system's run on the images as they are.
+    """Limits relative to the same system's run on the unperturbed (clean) images.
 
     Attributes:
-        lost_percent: of the frames, that may be lost. Dropped frames are not lost.
-        ate_factor: times the clean ATE that a run may have.
-        ate_least_m: below this ATE no run fails by it: three times nothing is nothing.
+        lost_percent: largest allowed percentage of lost frames; dropped frames are not lost.
+        ate_factor: largest allowed ratio of the ATE to the clean ATE.
+        ate_least_m: no run fails because of an ATE below this, even if the clean ATE is tiny.
     """
 
     lost_percent: float = 5.0
@@ -26,13 +26,13 @@ class Criterion:
         """The criterion in one sentence."""
         return (
             f"A run fails if more than {self.lost_percent:g} % of its frames are lost, if its ATE "
-            f"is above {self.ate_factor:g} times that of the same system on the images as they are "
-            f"and above {self.ate_least_m:g} m, if it closes more wrong loops or finds fewer "
-            "revisits than on these, or if it ends with an error."
+            f"is above {self.ate_factor:g} times that of the same system on clean images and above "
+            f"{self.ate_least_m:g} m, if it closes more wrong loops or finds fewer revisits than "
+            "on clean images, or if it ends with an error."
         )
 
     def verdict(self, report: ReportJson, clean: ReportJson) -> str:
-        """Why a run failed, empty if it held."""
+        """Why a run failed; empty if it did not fail."""
         frames = max(1, report.frames - report.dropped_frames)
         if 100.0 * report.lost_frames > self.lost_percent * frames:
             return f"{100.0 * report.lost_frames / frames:.0f} % lost"
@@ -47,7 +47,7 @@ class Criterion:
         return ""
 
     def ate_limit(self, clean: ReportJson) -> float | None:
-        """Metres; None where the clean run has no ATE."""
+        """Largest allowed ATE in metres; None if the clean run has no ATE."""
         if clean.ate_rmse_m is None:
             return None
         return max(self.ate_least_m, self.ate_factor * clean.ate_rmse_m)

@@ -1,12 +1,12 @@
-"""Other systems: they read a folder in KITTI's format and write a trajectory.
+"""Running other systems, which read a folder in KITTI's format and write a trajectory.
 
 The command is a template with ``{folder}`` and ``{out}``. ``folder`` holds ``image_0``,
-``image_1``, ``calib.txt`` and ``times.txt`` of the frames as the perturbation leaves them; dropped
-ones are not there. The command writes into the folder ``out``:
+``image_1``, ``calib.txt`` and ``times.txt`` of the perturbed frames, without dropped ones. The
+command writes into the folder ``out``:
 
-- ``trajectory.txt``: a pose a frame in KITTI's format, or poses with times in TUM's;
-- ``causal.txt``, if it can: the same, as given at the time;
-- ``states.txt``, if it can: ``OK`` or ``LOST`` a frame.
+- ``trajectory.txt``: one pose per frame in KITTI's format, or poses with times in TUM's format;
+- ``causal.txt`` (optional): the same, with the poses as they were first estimated;
+- ``states.txt`` (optional): ``OK`` or ``LOST`` for each frame.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ _SAME_TIME_S = 1e-3
 
 @dataclass(frozen=True)
 class Poses:
-    """``T_wc`` of each frame of a run, and which of them are known."""
+    """``T_wc`` of each frame of a run, and a mask of the known ones."""
 
     T_wc: NDArray[np.float64]
     known: NDArray[np.bool_]
 
 
 def check_template(name: str, template: str) -> None:
-    """Refuse a command that cannot work.
+    """Refuse an invalid command template.
 
     Raises:
         InputError: a placeholder is missing or unknown.
@@ -64,7 +64,8 @@ def check_template(name: str, template: str) -> None:
         ) from error
     if "{folder}" not in template or "{out}" not in template:
         raise InputError(
-            f"--system {name}={template}: must hold {{folder}} and {{out}} (docs/howto/stress.md)."
+            f"--system {name}={template}: must contain {{folder}} and {{out}} "
+            "(docs/howto/stress.md)."
         )
 
 
@@ -76,10 +77,10 @@ def run_external(
     folder: Path,
 ) -> ReportJson:
     """Run another system on a perturbed sequence and write its run folder: ``report.json`` and
-    trajectories. Loops are not judged: nobody tells of them.
+    trajectories. Loops are not evaluated, because other systems do not report them.
 
     Raises:
-        InputError: the system ends with an error, or writes no trajectory.
+        InputError: the system ends with an error or writes no trajectory.
     """
     with tempfile.TemporaryDirectory(prefix="kitti.", dir=folder) as name:
         work = Path(name)
@@ -99,7 +100,7 @@ def run_external(
 
 
 def export_kitti(sequence: Source, perturbation: Perturbation, folder: Path) -> NDArray[np.int64]:
-    """Write the frames as the perturbation leaves them; returns which frames there are."""
+    """Write the perturbed frames; returns the indices of the frames that were not dropped."""
     import cv2
 
     times: list[float] = []
@@ -129,7 +130,7 @@ def _call(template: str, sequence: Path, out: Path) -> None:
         template.format(folder=shlex.quote(str(sequence)), out=shlex.quote(str(out)))
     )
     try:
-        # A system that reads its standard input to the end knows when we are gone.
+        # A system can read its standard input to notice when this process ends.
         with subprocess.Popen(
             words,
             stdin=subprocess.PIPE,
@@ -160,7 +161,7 @@ def _outcome(
     if (out / "states.txt").is_file():
         states = (out / "states.txt").read_text().split()
         if len(states) != len(kept):
-            raise InputError(f"{settings.detector}: {len(states)} states of {len(kept)} frames.")
+            raise InputError(f"{settings.detector}: {len(states)} states for {len(kept)} frames.")
         lost[kept] = np.array(states) != "OK"
     dropped = np.ones(len(times), bool)
     dropped[kept] = False
@@ -193,7 +194,7 @@ def _outcome(
 
 
 def _poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:
-    """Poses by frame; unknown ones are those of the nearest known frame before, or the first."""
+    """Poses by frame; an unknown pose is the last known one before it, or the first one."""
     T_wc, known = np.tile(np.eye(4), (len(times), 1, 1)), np.zeros(len(times), bool)
     try:
         found = read_trajectory(path, times[kept] - times[0])
@@ -211,7 +212,7 @@ def _poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> P
 
 
 def _last_known(poses: Poses) -> NDArray[np.float64]:
-    """Every pose replaced by the last known one at its time; before the first, by that."""
+    """Replace every pose by the last known one at its time, or before that by the first one."""
     if not poses.known.any():
         return poses.T_wc
     at = np.where(poses.known, np.arange(len(poses.known)), -1)

@@ -1,8 +1,8 @@
-"""The preset ``kitti-c``: those corruptions of RoboDepth's KITTI-C that have a law here.
+"""The preset ``kitti-c``: the corruptions of RoboDepth's KITTI-C for which vslam has a law.
 
 KITTI-C (Kong et al., NeurIPS 2023) has 18 corruptions in 5 severities, most of them with the
-numbers of ImageNet-C (Hendrycks and Dietterich, ICLR 2019). Where a law takes the same number, it
-is theirs; where it does not, the note says what stands in its place.
+parameters of ImageNet-C (Hendrycks and Dietterich, ICLR 2019). The strengths here are those
+parameters if a law has the same one; otherwise the note describes the difference.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from vslam.datasets.perturbation import parse_perturbation
 
 @dataclass(frozen=True)
 class Corruption:
-    """``specs`` as of ``--perturb``, weakest first, none without a law; ``note`` says how it
-    differs."""
+    """``specs`` are values of ``--perturb``, weakest first, empty without a law; ``note`` describes
+    the difference from KITTI-C."""
 
     specs: tuple[str, ...]
     note: str = ""
@@ -30,29 +30,29 @@ def _of(text: str, values: tuple[float, ...]) -> tuple[str, ...]:
     return tuple(text.format(value) for value in values)
 
 
-_SIGMA = (0.08, 0.12, 0.18, 0.26, 0.38)  # of white
+_SIGMA = (0.08, 0.12, 0.18, 0.26, 0.38)  # as a fraction of white
 
 CORRUPTIONS: dict[str, Corruption] = {
     "brightness": Corruption(_of("bias:{:g}", (25.5, 51.0, 76.5, 102.0, 127.5))),
     "dark": Corruption(
         _of("night:{:g}", (0.74, 1.0, 1.32, 1.74, 2.32)),
-        "light times 0.6 to 0.2 with our sensor's noise; theirs squares the image besides",
+        "light times 0.6 to 0.2 with our sensor's noise; theirs also squares the image",
     ),
     "fog": Corruption(
         _of("fog:{:g}", (600, 300, 150, 75, 40)),
-        "by distance, visibility 600 to 40 m; theirs is a cloud over the image, without depth",
+        "by distance, visibility 600 to 40 m; theirs is a cloud texture that ignores depth",
     ),
     "frost": Corruption((), "no law"),
     "snow": Corruption((), "no law"),
     "contrast": Corruption(_of("contrast:{:g}", (40, 30, 20, 10, 5))),
     "defocus_blur": Corruption(
         _of("blur:{:g}", (1.0, 1.33, 2.0, 2.67, 3.33)),
-        "Gaussian of the deviation of their discs of 3 to 10 pixels",
+        "Gaussian with the standard deviation of their discs of 3 to 10 pixels",
     ),
     "glass_blur": Corruption((), "no law"),
     "motion_blur": Corruption(
         _of("motion:{:g}", (20, 40, 60, 80, 100)),
-        "shutter of 20 to 100 ms by the true rate of turn; theirs has one direction and length",
+        "shutter of 20 to 100 ms at the true rotation; theirs has a fixed direction and length",
     ),
     "zoom_blur": Corruption((), "no law"),
     "elastic_transform": Corruption((), "no law"),

@@ -2,8 +2,8 @@
 
 usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--mono]
 
-This file is started by the interpreter that has pyorbslam3, which need not have vslam: it imports
-neither. It ends when its standard input does.
+The interpreter that has pyorbslam3 starts this file and need not have vslam, so nothing of vslam is
+imported here. The process ends when its standard input does.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def main(vocabulary: str, folder: Path, out: Path, *, mono: bool) -> None:
 
 
 def _keep_first_of_each_time(path: Path) -> None:
-    """After a loss ORB-SLAM3 writes some frames twice."""
+    """Remove duplicates, because ORB-SLAM3 writes some frames twice after a loss."""
     by_time: dict[float, str] = {}
     for line in path.read_text().splitlines():
         by_time.setdefault(float(line.split()[0]), line)

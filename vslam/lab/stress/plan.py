@@ -1,4 +1,4 @@
-"""Searches in progress: which cells they want next, and what they have found."""
+"""Searches in progress: the cells that they need next, and their results so far."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ Reports = Callable[[Cell], ReportJson | str | None]
 
 @dataclass
 class Search:
-    """One law, sequence, system and seed.
+    """The search for one law, sequence, system and seed.
 
     Attributes:
-        clean: the cell on the images as they are.
-        seed: of the perturbation.
-        law: by name.
-        verdicts: by position, of what was tested.
-        tested: its cells, by position.
+        clean: the cell on clean images.
+        seed: seed of the perturbation.
+        law: name of the law.
+        verdicts: verdicts of finished tests, by position.
+        tested: cells of finished tests, by position.
     """
 
     clean: Cell
@@ -37,18 +37,18 @@ class Search:
     tested: dict[float, Cell] = field(default_factory=dict)
 
     def cell(self, position: float) -> Cell:
-        """The run at a position from 0, weakest, to 1, strongest."""
+        """The run at a position from 0 (weakest) to 1 (strongest)."""
         strength = strength_at(law_kind(self.law), position)
         name = parse_perturbation(f"{self.law}:{strength:g}", self.seed).name
         return replace(self.clean, perturb=name, seed=self.seed)
 
     def wants(self) -> Cell | None:
-        """The next cell to run, None at the end."""
+        """The next cell to run; None if the search has ended."""
         position = next_position({p: bool(v) for p, v in self.verdicts.items()}, self.steps)
         return None if position is None else self.cell(position)
 
     def advance(self, reports: Reports, criterion: Criterion) -> bool:
-        """Judge what has run; whether anything had."""
+        """Judge the runs that have finished; returns whether there was any."""
         moved = False
         clean = reports(self.clean)
         while isinstance(clean, ReportJson):
@@ -67,22 +67,22 @@ class Search:
 
     @property
     def boundary(self) -> Boundary:
-        """What was found, when the search has ended."""
+        """The result, once the search has ended."""
         return boundary(self.verdicts, law_kind(self.law), self.steps)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be found out.
+    """The searches and runs of a stress test.
 
     Attributes:
-        laws: to search boundaries of, by name.
+        laws: names of the laws whose boundaries are searched.
         systems: loop detectors of vslam, and names of other systems.
-        repeated: those systems that differ from run to run: they get all seeds under every law.
+        repeated: systems that are not deterministic; they run with all seeds under every law.
         preset: ``kitti-c`` for fixed severities, or None.
-        sensor: ``mono`` for the left camera alone, None for all that the data has.
+        sensor: ``mono`` for the left camera alone, None for all images that the data has.
         calib: calibration files.
-        baseline: the system that errors of a preset are set against.
+        baseline: the system to which the errors of a preset are compared.
     """
 
     dataset: str
@@ -100,7 +100,7 @@ class Plan:
     calib: tuple[str, ...] = ()
 
     def clean_cells(self) -> list[Cell]:
-        """Each system on the images as they are."""
+        """The runs of each system on clean images."""
         return [
             Cell(
                 self.dataset,
@@ -117,8 +117,8 @@ class Plan:
         ]
 
     def searches(self) -> list[Search]:
-        """All searches. A law that draws nothing is searched once, save for systems that differ
-        from run to run."""
+        """All searches. A law without randomness is searched once, except for systems that are not
+        deterministic."""
         return [
             Search(clean, law, seed, self.steps)
             for seed in range(self.seeds)
@@ -128,7 +128,7 @@ class Plan:
         ]
 
     def preset_cells(self) -> list[Cell]:
-        """The runs of the preset, none without one."""
+        """The runs of the preset; empty without one."""
         if self.preset is None:
             return []
         specs = [spec for corruption in CORRUPTIONS.values() for spec in corruption.perturbations]
@@ -142,10 +142,10 @@ class Plan:
 
 
 def parse_laws(text: str) -> list[str]:
-    """``fog,rain`` or ``all``.
+    """Parse ``fog,rain`` or ``all``.
 
     Raises:
-        InputError: an unknown law, or none.
+        InputError: a law is unknown, or there is none.
     """
     names = list(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
     if names == ["all"]:
@@ -157,5 +157,5 @@ def parse_laws(text: str) -> list[str]:
                 f"all, {', '.join(all_laws())}; their strengths are searched for."
             )
     if not names:
-        raise InputError("--laws: no law; name some, fog,rain for example, or all.")
+        raise InputError("--laws: no law; name some, for example fog,rain, or all.")
     return names

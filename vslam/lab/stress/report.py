@@ -20,12 +20,12 @@ from vslam.report.render import csv_text, html, markdown, write_files
 
 _ABOUT = (
     "The weakest strength at which a run fails, found by bisection: the median over seeds, with "
-    "the smallest and the largest in brackets; > means that even the strongest one holds. It is "
-    "followed by the reason of one seed."
+    "the smallest and the largest in brackets, and the reason for one seed. > means that no "
+    "strength makes a run fail."
 )
 _NOT_MONOTONE = (
-    "Bisection assumes that a system that holds at one strength holds at all weaker ones. These "
-    "runs failed although a stronger one held."
+    "Bisection assumes that a system that withstands one strength withstands all weaker ones. "
+    "These runs failed although a run at a higher strength did not."
 )
 
 
@@ -35,7 +35,7 @@ def write_report(out: Path, report: StressJson, sequences: Mapping[str, Source])
     Args:
         out: an existing folder.
         report: the numbers.
-        sequences: by name, for images at the boundaries; those that are not there are left out.
+        sequences: sequences by name, for images at the boundaries; missing ones are left out.
 
     Raises:
         ResultsError: a file cannot be written.
@@ -51,7 +51,7 @@ def write_report(out: Path, report: StressJson, sequences: Mapping[str, Source])
             "report.md": markdown(page),
             "report.html": html(page),
         },
-        "free some space and give the same command again: finished runs are kept",
+        "free some space and repeat the command: finished runs are kept",
     )
 
 
@@ -78,14 +78,14 @@ def title(report: StressJson) -> str:
 def stress_page(
     report: StressJson, figures: Collection[Figure] = (), sheet: Collection[Figure] = ()
 ) -> Page:
-    """The page of a stress test, with its curves and its images at the boundaries."""
+    """The page of a stress test, with its curves and images at the boundaries."""
     return Page(
         title(report),
         [report.criterion],
         (
             *boundary_sections(report),
-            Section("Weaker and failed", [_not_monotone(report)]),
-            Section("Images as they are", [_clean(report)]),
+            Section("Failures at weaker strengths", [_not_monotone(report)]),
+            Section("Clean images", [_clean(report)]),
             Section("Images at the boundaries", [*sheet]),
             Section("", [*figures], wide=False),
             Section("Notes", [Bullets(report.notes)]),
@@ -95,12 +95,12 @@ def stress_page(
 
 
 def boundary_sections(report: StressJson) -> list[Section]:
-    """Where each system fails, and the errors by corruption: what the command line prints."""
+    """The boundaries of each system and the errors by corruption, which the command line prints."""
     return [*_boundaries(report), *_preset(report)]
 
 
 def groups(report: StressJson) -> dict[tuple[str, str, str], list[BoundaryEntry]]:
-    """Searches that differ in their seed alone, by sequence, law and system."""
+    """Searches grouped by sequence, law and system; those of a group differ in their seed."""
     found: dict[tuple[str, str, str], list[BoundaryEntry]] = {}
     for entry in report.boundaries:
         found.setdefault((entry.sequence, entry.law, entry.system), []).append(entry)
@@ -108,7 +108,7 @@ def groups(report: StressJson) -> dict[tuple[str, str, str], list[BoundaryEntry]
 
 
 def cell(entries: Collection[BoundaryEntry]) -> str:
-    """``60 (50-75), 12 % lost``: where the seeds fail."""
+    """The strengths at which the seeds fail, as ``60 (50-75), 12 % lost``."""
     if not entries:
         return ""
     law = law_kind(next(iter(entries)).law)
@@ -155,9 +155,9 @@ def _preset(report: StressJson) -> list[Section]:
         ("sequence", "corruption", *systems, "law"),
         rows,
         ("sequence", "corruption", "law"),
-        "ATE summed over the five severities, in percent of the baseline's, with the mean share of "
-        "lost frames in brackets. The mean is over the corruptions that have a law and an ATE for "
-        "each system.",
+        "ATE summed over the five severities, in percent of the baseline's sum, with the mean "
+        "share of lost frames in brackets. The mean includes the corruptions that have a law and "
+        "an ATE for each system.",
     )
     title = f"Corruption error against {report.baseline}, preset {report.preset}"
     return [Section(title, [table])]
@@ -173,7 +173,7 @@ def _not_monotone(report: StressJson) -> Table:
         for entry in report.boundaries
         if entry.also_failed
     ]  # fmt: skip
-    head = ("sequence", "law", "system", "seed", "also failed at", "held at")
+    head = ("sequence", "law", "system", "seed", "also failed at", "no failure at")
     return Table(head, rows, head[:3], _NOT_MONOTONE)
 
 
@@ -219,7 +219,7 @@ def _runs(report: StressJson) -> Table:
 
 def _sheet(report: StressJson, sequences: Mapping[str, Source]) -> list[Figure]:
     """A frame in the middle of the first sequence under each law, at the weakest strength at which
-    the first system failed, or at the strongest of all."""
+    the first system failed, or at the greatest strength if it did not fail."""
     specs: dict[str, str] = {}
     first = next(iter(sequences), None)
     for entry in report.boundaries:
@@ -230,10 +230,10 @@ def _sheet(report: StressJson, sequences: Mapping[str, Source]) -> list[Figure]:
         return []
     try:
         image = sheet_of_laws(sequences[first], list(specs.values()), len(sequences[first]) // 2, 0)
-    except InputError:  # the images went away while it ran: the numbers are worth more
+    except InputError:  # the images were removed meanwhile; write the numbers without them
         return []
     import cv2
 
     data = bytes(np.asarray(cv2.imencode(".jpg", image)[1]).tobytes())
-    caption = "For each law the image as it is, and both sides at the boundary."
+    caption = "For each law: the clean image, and both perturbed images at the boundary."
     return [Figure("boundaries", caption, data, file="boundaries.jpg")]

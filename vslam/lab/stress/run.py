@@ -1,4 +1,4 @@
-"""Runs searches to their end, all that are open at a time: each round runs what they want next."""
+"""Running all searches together: each round runs the next cell of every open search."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ RunCells = Callable[[Collection[Cell]], Generator[CellOutcome, None, None]]
 
 
 class Results:
-    """Reports of cells by cell: those in the folder, and failures of this session."""
+    """Results by cell: reports in the folder, and failures of this session."""
 
     def __init__(self, out: Path, config: str) -> None:
         self._out, self._config = out, config
         self._known: dict[Cell, ReportJson | str] = {}
 
     def __call__(self, cell: Cell) -> ReportJson | str | None:
-        """The report of a cell, why it failed, or None if it has not run."""
+        """The report of a cell, the reason why it failed, or None if it has not run."""
         if cell not in self._known:
             folder = self._out / cell.name
             if not is_finished(cell, folder, self._config):
@@ -34,7 +34,7 @@ class Results:
         return self._known[cell]
 
     def add(self, outcome: CellOutcome) -> None:
-        """Take note of a cell that has ended."""
+        """Add a cell that has ended."""
         if isinstance(outcome, Failed):
             self._known[outcome.cell] = outcome.message
         else:
@@ -50,9 +50,9 @@ def run_all(
     run: RunCells,
     say: Callable[[str], None] = lambda line: None,
 ) -> None:
-    """Run the clean cells, then round after round what searches want, then ``others``.
+    """Run the clean cells, then the cells of all searches in rounds, then ``others``.
 
-    What is finished already is not run again, whichever command made it.
+    Cells that are already finished are not run again, whichever command ran them.
     """
     _run(clean, results, run, say)
     while True:
@@ -66,7 +66,7 @@ def run_all(
 
 
 def _wanted(search: Search, results: Results) -> Cell | None:
-    """A search without a clean run has nothing to compare with, and ends."""
+    """The next cell of a search; None if there is no clean run to compare with."""
     return search.wants() if isinstance(results(search.clean), ReportJson) else None
 
 

@@ -1,4 +1,4 @@
-"""The schema of ``stress.json``: no times, no machine; equal runs give equal bytes."""
+"""The schema of ``stress.json``, without times or machine: equal runs give equal bytes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from vslam.report.document import Document, Record
 
 
 class Tested(Record):
-    """One run at one strength; ``verdict`` says why it failed, empty if it held."""
+    """One run at one strength; ``verdict`` is why it failed, empty if it did not."""
 
     strength: float
     verdict: str
@@ -47,8 +47,8 @@ class CleanEntry(Record):
 
 
 class CorruptionEntry(Record):
-    """One corruption of a preset: ATE summed over severities, medians over seeds, by system, and
-    that in percent of the baseline's; None without a law, or without an ATE."""
+    """One corruption of a preset. By system: the median ATE over seeds, summed over severities, and
+    this sum in percent of the baseline's; None without a law or an ATE."""
 
     sequence: str
     corruption: str

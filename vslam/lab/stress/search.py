@@ -1,4 +1,4 @@
-"""Bisection of the strength at which a run fails, from the outcomes of the runs made so far."""
+"""Bisection of the strength at which a run fails, from the outcomes of earlier runs."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from dataclasses import dataclass
 from vslam.datasets.perturbation import LawKind
 
 Verdict = str
-"""Why a run failed, empty if it held."""
+"""Why a run failed; empty if it did not fail."""
 
 
 @dataclass(frozen=True)
 class Boundary:
-    """Where a system fails under a law, by the strengths tested.
+    """The strength at which a system fails under a law.
 
     Attributes:
-        holds_to: strongest strength below which no tested one failed by the bisection; None if
-            only the images as they are hold.
-        fails_at: weakest strength that failed by the bisection; None if the strongest one held.
-        reason: of the failure there.
-        also_failed: weaker strengths that failed although a stronger one held.
+        holds_to: greatest strength at which, by the bisection, no run failed; None if runs fail at
+            every tested strength.
+        fails_at: least strength at which, by the bisection, a run failed; None if none failed.
+        reason: reason of the failure at ``fails_at``.
+        also_failed: strengths below ``holds_to`` at which a run failed nevertheless.
     """
 
     holds_to: float | None
@@ -30,7 +30,7 @@ class Boundary:
 
 
 def strength_at(kind: LawKind, position: float) -> float:
-    """Strength at a position from 0, weakest, to 1, strongest; three significant digits."""
+    """Strength at a position from 0 (weakest) to 1 (strongest), to three significant digits."""
     weak, strong = kind.weakest, kind.strongest
     if kind.logarithmic:
         value = weak * (strong / weak) ** position
@@ -40,14 +40,15 @@ def strength_at(kind: LawKind, position: float) -> float:
 
 
 def next_position(failed: Mapping[float, bool], steps: int) -> float | None:
-    """Where to test next, None when all is known.
+    """The next position to test; None at the end of the search.
 
-    The strongest first; where that fails, the middle of what is open, ``steps`` times; at last
-    half of what holds: bisection believes that what holds at one strength holds at all weaker ones.
+    The greatest strength is tested first. If it fails, the interval is bisected ``steps`` times.
+    The last test is at half of the position that holds, to check the assumption of bisection that
+    a system also withstands all weaker strengths.
 
     Args:
-        failed: by position, what was tested.
-        steps: halvings.
+        failed: whether the run failed, by tested position.
+        steps: number of bisections.
     """
     if 1.0 not in failed:
         return 1.0
@@ -64,10 +65,10 @@ def next_position(failed: Mapping[float, bool], steps: int) -> float | None:
 
 
 def boundary(verdicts: Mapping[float, Verdict], kind: LawKind, steps: int) -> Boundary:
-    """The boundary by finished tests.
+    """The boundary according to the finished tests.
 
     Args:
-        verdicts: by position.
+        verdicts: verdicts by position.
         kind: the law.
         steps: as in :func:`next_position`.
     """

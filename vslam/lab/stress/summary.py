@@ -1,4 +1,4 @@
-"""From finished searches to the numbers of the report."""
+"""Computing the numbers of the report from finished searches."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vslam.report.schema import ReportJson
 def summarise(
     plan: Plan, searches: Collection[Search], reports: Reports, notes: list[str]
 ) -> StressJson:
-    """Reduce the searches that have ended to the report, and add to ``notes``."""
+    """Make the report from the searches that have ended; its notes also name failed clean runs."""
     clean = plan.clean_cells()
     failed = [(cell, found) for cell in clean if isinstance(found := reports(cell), str)]
     notes = [*notes, *(f"{cell.name} is left out, it fails on clean images: {why}"
@@ -42,7 +42,7 @@ def summarise(
 def clean_entries(
     cells: Collection[Cell], reports: Reports, criterion: Criterion
 ) -> list[CleanEntry]:
-    """The clean runs that are finished."""
+    """Entries of the finished clean runs."""
     return [
         CleanEntry(
             dataset=cell.dataset,
@@ -155,7 +155,7 @@ def _corruption(
 
 
 def mean_error(entries: Collection[CorruptionEntry], system: str) -> float | None:
-    """mCE in percent: the mean over corruptions that every system has an error for."""
+    """mCE in percent: the mean over the corruptions for which every system has an error."""
     known = [e.error_percent[system] for e in entries if _complete(e.error_percent)]
     values = [value for value in known if value is not None]
     return statistics.fmean(values) if values else None

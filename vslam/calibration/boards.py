@@ -104,7 +104,8 @@ def board_points(board: Board) -> Array:
     if board.kind == "charuco":
         return np.asarray(_charuco(board).getChessboardCorners(), np.float64)
     across, down = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
-    points = np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)]) * board.square
+    flat = np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
+    points = np.asarray(flat * board.square, np.float64)
     if board.kind == "checkerboard":
         return points
     # The corners of a tag clockwise, from the lower right one on: where OpenCV begins with a tag
@@ -155,10 +156,9 @@ def _checkerboard_finder(board: Board) -> Finder:
 
     def find(image: Image) -> Corners | None:
         times = max(1.0, max(image.shape) / _SEARCHED_PX)
-        if times > 1.0:
-            image = cv2.resize(image, None, None, 1 / times, 1 / times, cv2.INTER_AREA)
+        small = cv2.resize(image, None, None, 1 / times, 1 / times, cv2.INTER_AREA)
         found, xy = cv2.findChessboardCornersSB(
-            image, (board.columns, board.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE
+            small, (board.columns, board.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE
         )
         if not found:
             return None
@@ -194,9 +194,9 @@ def _charuco_finder(board: Board) -> Finder:
         for detector in detectors[: 1 + (board.rows % 2 == 0)]:
             xy, ids, _, _ = detector.detectBoard(image)
             if ids is not None and len(ids) >= _FEWEST_CORNERS:
-                ids = ids.ravel().astype(np.int64)
-                if np.ptp(points[ids, :2], axis=0).all():  # corners in a row fix no pose
-                    return Corners(ids, xy.reshape(-1, 2).astype(np.float64))
+                rows = np.asarray(ids, np.int64).ravel()
+                if np.ptp(points[rows, :2], axis=0).all():  # corners in a row fix no pose
+                    return Corners(rows, xy.reshape(-1, 2).astype(np.float64))
         return None
 
     return find

@@ -177,7 +177,9 @@ def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
         out = _outliers(errors)
         if not out.any():
             names = tuple(pair.name for pair in pairs)
-            return PairFit(np.linalg.inv(T).round(9), names, errors, tuple(dropped))
+            return PairFit(
+                np.asarray(np.linalg.inv(T).round(9), np.float64), names, errors, tuple(dropped)
+            )
         dropped += [(pairs[k].name, float(errors[k])) for k in np.flatnonzero(out)]
         pairs = [pair for pair, bad in zip(pairs, out, strict=True) if not bad]
 
@@ -208,7 +210,8 @@ def _fit(points: Array, views: Sequence[View], size: Size, lens: Lens) -> Camera
         if lens == "fisheye":
             names: Any = cv2 if hasattr(cv2, "CALIB_FIX_SKEW") else cv2.fisheye  # OpenCV 5, 4
             flags = names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW
-            _, K, D, turns, shifts = cv2.fisheye.calibrate(
+            calibrate: Any = cv2.fisheye.calibrate  # its types know no None
+            _, K, D, turns, shifts = calibrate(
                 [p[None] for p in own], [p[None] for p in xy], size, None, None, flags=flags
             )
         else:

@@ -7,17 +7,18 @@ import shlex
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
 import typer
 
 from vslam.cli.console import console
 from vslam.cli.options import reads_source
-from vslam.errors import InputError
+from vslam.errors import BrokenSourceError, InputError
 
 if TYPE_CHECKING:
     from vslam.calibration.boards import Board, Finder
     from vslam.calibration.solve import View
+    from vslam.camera import Image
     from vslam.datasets.frames import RawSource, TimedFrame
     from vslam.datasets.sources import SourceOptions
 
@@ -144,9 +145,9 @@ def _board(
     stereo: bool,
 ) -> Board:
     """The board that the options describe."""
-    from vslam.calibration.boards import Board, read_board
+    from vslam.calibration.boards import Board, Kind, read_board
 
-    if kind not in ("checkerboard", "charuco", "aprilgrid"):
+    if kind not in get_args(Kind):
         if not Path(kind).is_file():
             raise InputError(
                 f"--board {kind}: neither checkerboard, charuco or aprilgrid nor a file; name one."
@@ -160,12 +161,9 @@ def _board(
     if (marker is None) != (kind == "checkerboard"):
         wanted = "of no use for a checkerboard; leave it out" if marker else "missing; measure it"
         raise InputError(f"--marker: is {wanted}.")
-    columns, rows = int(found[1]), int(found[2])
     side = 0.1 if square is None else square
-    if kind == "checkerboard":
-        return _checked(Board("checkerboard", columns, rows, side))
-    code = "charuco" if kind == "charuco" else "aprilgrid"
-    return _checked(Board(code, columns, rows, side, marker or 0.0, dictionary))
+    columns, rows = int(found[1]), int(found[2])
+    return _checked(Board(cast("Kind", kind), columns, rows, side, marker or 0.0, dictionary))
 
 
 def _checked(board: Board) -> Board:
@@ -183,12 +181,19 @@ def _checked(board: Board) -> Board:
 def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
     """Frames of a source, evenly spread."""
     every = -(-(raw.n_expected or 1) // most)
-    return (frame for k, frame in enumerate(raw.frames()) if k % every == 0)
+    n = 0
+    try:
+        for n, frame in enumerate(raw.frames()):
+            if n % every == 0:
+                yield frame
+    except BrokenSourceError as error:
+        if not n:
+            raise
+        typer.echo(f"warning: {error}", err=True)
 
 
 def _search(raw: RawSource, find: Finder) -> tuple[int, list[tuple[View | None, ...]]]:
     """How many images were searched, and the views of each that shows the board to a camera."""
-    from vslam.calibration.boards import Corners
     from vslam.calibration.solve import View
 
     total = min(raw.n_expected or _MOST_SEARCHED, _MOST_SEARCHED)
@@ -197,8 +202,7 @@ def _search(raw: RawSource, find: Finder) -> tuple[int, list[tuple[View | None, 
     with console(shown=True).count_bar("images", total) as advance:
         for frame in _frames(raw, _MOST_SEARCHED):
             name = frame.file.name if frame.file else f"{frame.timestamp:.2f} s"
-            images = [image for image in frame.read(map) if image is not None]
-            corners: list[Corners | None] = [find(image) for image in images]
+            corners = [find(cast("Image", image)) for image in frame.read(map) if image is not None]
             if any(corners):
                 seen.append(tuple(None if c is None else View(name, c) for c in corners))
             n += 1
@@ -217,9 +221,9 @@ def _choose(
     from vslam.calibration.boards import seen_instead
     from vslam.calibration.solve import diverse
 
-    sides = [[s[k] for s in seen if s[k] is not None] for k in range(len(raw.sizes))]
+    sides = [[s[k] for s in seen if s[k]] for k in range(len(raw.sizes))]
     if not any(sides):
-        images = (frame.read(map)[0] for frame in _frames(raw, _EXAMINED))
+        images = (f.read(map)[0] for f in _frames(raw, _EXAMINED))
         hint = seen_instead(board, images) or "check --board and --size, and that all of it is seen"
         raise InputError(f"no {board} in any of {n} images; {hint}.")
     for side, other, name in ((0, 1, "left"), (1, 0, "right")):
@@ -232,6 +236,6 @@ def _choose(
     chosen = [both[k] for k in diverse(board, both, raw.sizes, _MOST_VIEWS)]
     views = [[pair[k] for pair in chosen] for k in range(len(sides))]
     for k, size in enumerate(raw.sizes if len(sides) == 2 else ()):
-        alone = [s[k] for s in seen if s[k] is not None and not all(s)]
+        alone = [v for s in seen if (v := s[k]) is not None and not all(s)]
         views[k] += [alone[i] for i in diverse(board, [(v,) for v in alone], [size], _ALONE)]
     return views

@@ -19,6 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from vslam.cli import (
     bench,
+    calibrate,
     doctor,
     evaluate,
     export,
@@ -39,8 +40,8 @@ from vslam.plugins import reason
 from vslam.untrusted import require_utf8
 
 _GROUPS: tuple[ModuleType, ...] = (
-    run, evaluate, perturb, info, doctor, bench, stress, report, synth, train, export, map_,
-    vocabulary, loops,
+    run, evaluate, perturb, info, calibrate, doctor, bench, stress, report, synth, train, export,
+    map_, vocabulary, loops,
 )  # fmt: skip
 
 

@@ -151,7 +151,7 @@ def test_googlenet_halves_five_times():
 
 
 def test_images_that_are_too_small_are_refused():
-    with pytest.raises(InputError, match=r"alexnet: takes images of at least 64 pixels"):
+    with pytest.raises(InputError, match=r"alexnet: needs images of at least 64 pixels"):
         alexnet((63, 227))
 
 

@@ -266,7 +266,7 @@ def test_networks_for_flat_images_become_those_for_unrolled_ones(tmp_path):
 
 
 def test_flat_images_keep_their_height():
-    with pytest.raises(ValidationError, match=r"middle 0.9: is of unrolled images"):
+    with pytest.raises(ValidationError, match=r"middle 0.9: needs unrolled images"):
         CapsuleShape(middle=0.9)
 
 

@@ -279,7 +279,10 @@ def tables(
         if way == "images":
             lines += [line for image in images for line in (image, "")]
     lines += ["### Time of the network alone", "", *markdown_table(*pruning_table(pruned)), ""]
-    lines += [f"Medians of {_REPEATS} turns; less time: median of what each turn saves.", ""]
+    lines += [
+        f"Medians over {_REPEATS} alternating turns; *less time*: median saving per turn.",
+        "",
+    ]
     lines += ["### Training", "", *markdown_table(*training_table(training)), ""]
     return "\n".join(lines)
 

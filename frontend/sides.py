@@ -24,6 +24,10 @@ _LOW, _HIGH = 0.05, 0.95
 _WITHIN = 0.98  # upper quantile as a fraction of the share of pixels that are not overexposed
 _LEAST_SHARE = 0.25  # least share of the pixels from which a gain is estimated
 _LEAST_RANGE = 4.0  # grey levels; over a smaller range, rounding dominates the gain
+_QUANTILES = 11  # compared between the two images
+# The largest distance between the quantiles of the two images, as a fraction of their range: under
+# a gain at most 0.07 for 95 % of the images of KITTI, at least 0.22 if only one image shows a sky.
+_MOST_BENT = 0.12
 _SEES = 16.0  # least range of the grey values of an image that is not black
 
 
@@ -115,7 +119,16 @@ def _stops(ours: NDArray[np.float64], theirs: NDArray[np.float64], config: Stere
             return 0.0
         if abs(low - high) > config.max_gain_disagreement:
             return 0.0
-    return gain
+    return gain if _proportional(ours, theirs, top) else 0.0
+
+
+def _proportional(ours: NDArray[np.float64], theirs: NDArray[np.float64], top: float) -> bool:
+    """Whether the quantiles up to ``top`` are proportional, as a gain makes them. If one image
+    shows what the other does not, such as the sky beside a bridge, they are not."""
+    at = np.linspace(_LOW, top, _QUANTILES)
+    a, b = (np.array(_quantiles(shares, *at)) for shares in (ours, theirs))
+    a, b = a - a[0], b - b[0]
+    return bool(np.abs(a / a[-1] - b / b[-1]).max() <= _MOST_BENT)
 
 
 def _brightened(dark: Grey, bright: Grey, stops: float) -> Grey:

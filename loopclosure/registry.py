@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from vslam import plugins
 from vslam.config import Config
-from vslam.errors import InputError
+from vslam.errors import InputError, did_you_mean
 from vslam.loopclosure.detector import LoopDetector, NoDetector
 from vslam.loopclosure.plugin_detector import PlugInDetector, open_plugin
 from vslam.loopclosure.siamese.weights import NETWORKS, TO_THE_LETTER, find_weights
@@ -50,8 +50,11 @@ def require_detector(name: str, weights: Path | None = None, option: str = "--de
     if name not in DETECTORS:
         others = plugins.find_plugins(plugins.DETECTORS)
         if name not in others:
-            known = ", ".join((*DETECTORS, *others))
-            raise InputError(f"{option} {name}: unknown; choose one of {known}.")
+            known = (*DETECTORS, *others)
+            raise InputError(
+                f"{option} {name}: unknown{did_you_mean(name, known)}; choose one of "
+                f"{', '.join(known)}."
+            )
         open_plugin(others[name], Config(), weights)
     elif name in (*NETWORKS, "both"):
         find_weights(_network_of(name), weights)
@@ -171,8 +174,8 @@ def parse_weights(given: Collection[str], detectors: Collection[str]) -> dict[st
         name, equals, file = item.partition("=")
         if not equals or name not in detectors:
             raise InputError(
-                f"--weights {item}: must be NAME=FILE with a name of --detectors "
-                f"({', '.join(detectors)})."
+                f"--weights {item}: must be NAME=FILE with a name of --detectors"
+                f"{did_you_mean(name, detectors)}: {', '.join(detectors)}."
             )
         files[name] = Path(file).expanduser().absolute()
     return files

@@ -292,7 +292,7 @@ def bench(stub: Path, kitti_tree: Path, tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setattr("vslam.run.warmup.is_cold", lambda: False)
 
     def call(*words: object) -> tuple[int, str, str]:
-        line = ["vslam", "bench", "--data", kitti_tree, "--seqs", "00", "--runs", 2, *words]
+        line = ["vslam", "bench", "--data", kitti_tree, "--seqs", "00", "--seeds", 2, *words]
         monkeypatch.setattr(sys, "argv", list(map(str, line)))
         code: object = 0
         try:
@@ -416,7 +416,7 @@ def test_a_real_grid_killed_and_resumed(kitti_tree: Path, tmp_path: Path):
     out = tmp_path / "bench"
     command = [sys.executable, "-m", "vslam", "bench", "--data", str(kitti_tree), "--seqs", "00"]
     command += ["--max-frames", "6", "--perturb", "none,brightness", "--detectors", "none"]
-    command += ["--runs", "1", "--threads", "1", "--out", str(out)]
+    command += ["--seeds", "1", "--threads", "1", "--out", str(out)]
     first, second = (
         out / f"kitti-00-{light}-none-seed0-6frames" for light in ("none", "brightness1")
     )

@@ -87,6 +87,7 @@ def test_what_people_wrote_stays_on_the_page(speed, tmp_path):
     assert speed.written(page) == ("# Speed\n\nFast.\n\n", "\n## Limits\n\nBy hand.\n")
 
 
+@pytest.mark.slow
 def test_the_command_runs_the_systems_in_turn(speed, kitti_tree, monkeypatch, capsys):
     words = ["--case", f"ring={kitti_tree}:00:28", "--repeats", "1", "--also", "none"]
     monkeypatch.setattr(sys, "argv", ["bench_speed.py", *words])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,10 +13,12 @@ from conftest import StereoSequence
 
 from vslam.calibration.models import Calibration, CameraModel, project, unproject, without_zeros
 from vslam.calibration.rectification import rectify
+from vslam.camera import Camera, calibration_doubts
 from vslam.datasets.frames import RawSource, stored_frames
 from vslam.datasets.rectified import rectified
 from vslam.errors import InputError
 from vslam.geometry import se3_exp
+from vslam.run.rig import calibration_warnings
 
 RADTAN = (-0.283, 0.074, 0.00019, -0.0017, 0.002, 0.01, -0.02, 0.003)
 PINHOLE = CameraModel(458.654, 457.296, 367.215, 248.375, 752, 480)
@@ -233,3 +237,31 @@ def test_a_rectified_sequence(corridor: StereoSequence):
     alone = rectified(drawn(corridor, nothing), Calibration(model, model, np.eye(4)))
     assert alone.read(0)[1] is None
     assert alone.camera.monocular
+
+
+KITTI = Camera(707.1, 707.1, 601.9, 183.1, 0.537, 1241, 376)
+
+
+@pytest.mark.parametrize(
+    ("camera", "doubt"),
+    [
+        (replace(KITTI, cx=1203.8, cy=366.2, fx=1414.2, fy=1414.2), "images of twice this size"),
+        (replace(KITTI, cx=301.0, cy=91.5, fx=353.6, fy=353.6), "images of half this size"),
+        (replace(KITTI, cx=183.1, cy=601.9), "check the order of its numbers"),
+        (replace(KITTI, fx=8485.2), r"a field of view of 8 x 30 degrees"),
+        (replace(KITTI, fx=1.9, fy=1.9), r"a field of view of 180 x 179 degrees"),
+    ],
+)
+def test_an_implausible_calibration_is_named_with_its_file_and_its_cause(camera, doubt):
+    (said,) = calibration_warnings(camera, [Path("mine.yaml")], "drive.mp4")
+    assert said.startswith("mine.yaml: the ")
+    assert re.search(doubt, said)
+    assert calibration_warnings(camera, [], "06")[0].startswith("the calibration of 06: the ")
+
+
+def test_a_plausible_calibration_raises_no_doubt():
+    assert calibration_doubts(KITTI) == []
+    assert calibration_doubts(rectify(Calibration(FISHEYE)).camera) == []
+    assert (
+        calibration_doubts(rectify(Calibration(replace(PINHOLE, distortion=RADTAN))).camera) == []
+    )

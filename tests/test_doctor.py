@@ -158,6 +158,14 @@ def test_what_the_calibration_says_of_lengths_is_shown(clean, baseline, verdict)
     assert re.search(r"480x160 pixels see 90 x 37 degrees", finding.measured)
 
 
+def test_a_calibration_of_larger_images(clean):
+    c = clean.camera
+    twice = replace(clean, camera=replace(c, cx=2 * c.cx, cy=2 * c.cy, fx=2 * c.fx, fy=2 * c.fy))
+    found = {f.check: f for f in examine(twice, FEW).faults}
+    assert "images of twice this size" in found["calibration"].measured
+    assert "--calib" in found["calibration"].fix
+
+
 def test_how_late_the_right_side_is(clean):
     late = replace(clean, second=[*clean.second[2:], *clean.second[:2]])
     (finding,) = examine(late, FEW).faults
@@ -274,7 +282,8 @@ def test_one_camera_alone(clean):
     alone = replace(clean, second=[None] * len(clean))
     found = {f.check for f in examine(alone, FEW).findings}
     assert found == {
-        "images", "features", "sharpness", "order of times", "gaps", "jitter", "scale"
+        "images", "calibration", "features", "sharpness", "order of times", "gaps", "jitter",
+        "scale",
     }  # fmt: skip
 
 
@@ -347,7 +356,9 @@ def test_the_command_turns_bad_input_into_a_finding(kitti_tree, tmp_path):
     assert done.exit_code == 1
     assert "made for 640x480 pixels but the images have 480x160" in done.output
     assert "fix: take the calibration of these images" in done.output
-    assert "made for 640x480" in page.read_text()
+    text = page.read_text()
+    banner = text.index('role="alert"')
+    assert banner < text.index("made for 640x480") < text.index("Fix: take the calibration")
 
 
 @pytest.mark.slow

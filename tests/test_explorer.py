@@ -122,6 +122,7 @@ def test_a_run_without_ground_truth_and_a_short_one():
     assert np.isnan(numbers(data["floats"]["error"])).all()
     assert data["truth"] == {"x": "", "z": ""}
     assert explorer_data(make_outcome(1), None, None, []) is None
+    assert explorer_data(make_outcome(20, lost=slice(0, 20)), None, None, []) is None
 
 
 def test_every_frame_of_a_long_run_is_there_in_little_space():

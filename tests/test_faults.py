@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import subprocess
 import sys
 from contextlib import suppress
@@ -33,6 +34,18 @@ CORE = ("vslam.frontend.tracker.", "vslam.modes.", "vslam.mapping.", "vslam.shar
         "vslam.closing.", "vslam.loopclosure.verification.", "ring.")  # fmt: skip
 
 
+def test_every_point_names_a_function_that_exists():
+    for point in POINTS:
+        module, _, name = point.function.rpartition(".")
+        try:
+            owner = importlib.import_module(module)
+        except ModuleNotFoundError:  # a method
+            module, _, owner_name = module.rpartition(".")
+            owner = getattr(importlib.import_module(module), owner_name)
+        assert callable(getattr(owner, name)), point.name
+
+
+@pytest.mark.slow
 def test_what_fails_in_a_run_costs_itself_alone(tmp_path):
     """In a process of its own, which forks: this one may have threads."""
     table = tmp_path / "faults.csv"

@@ -112,7 +112,7 @@ def test_json_is_versioned_and_round_trips(written):
     report, out = written
     text = (out / "report.json").read_text()
     found = json.loads(text)
-    assert (found["kind"], found["schema_version"]) == ("overview", 3)
+    assert (found["kind"], found["schema_version"]) == ("overview", 4)
     assert OverviewJson.model_validate_json(text).model_dump_json(indent=2) + "\n" == text
     assert OverviewJson.model_validate_json(text) == report
 
@@ -250,7 +250,7 @@ def test_noise_is_not_called_a_win():
 
 def loops(found: int, missed: int, lost: int = 0, rpe: float = 0.02) -> dict[str, float]:
     counts = {"loops_found": found, "loops_missed": missed, "loops_wrong": 0}
-    return {**counts, "lost_frames": lost, "rpe_m": rpe}
+    return {**counts, "lost_frames": lost, "rpe_m": rpe, "rpe_deg": 0.05}
 
 
 @pytest.fixture
@@ -269,23 +269,25 @@ def two_conditions() -> list[RunEntry]:
 def test_a_row_for_each_sequence_and_condition_and_who_wins_over_all(two_conditions):
     (section,) = versus(summarize(Found(two_conditions, [])))
     table, points = section.parts
-    assert section.title == "both against bow"
+    assert section.title == "Side by side: bow / both"
     assert len(table.rows) == 12
     assert list(zip(table.head, table.rows[3], strict=True)) == [
         ("sequence", "01"), ("perturbation", "brightness:1"), ("lost, bow", "0.5"),
         ("lost, both", "0.5"), ("ATE (m), bow", "2.100"), ("ATE (m), both", "1.500"),
-        ("diff.", "-0.600"), ("RPE (mm), bow", "20.0"), ("RPE (mm), both", "20.0"),
-        ("diff.", "tie"), ("loops, bow", "0/1/0"), ("loops, both", "1/0/0"),
+        ("RPE (mm), bow", "20.0"), ("RPE (mm), both", "20.0"), ("RPE (°), bow", "0.050"),
+        ("RPE (°), both", "0.050"), ("loops, bow", "0 of 1"), ("loops, both", "1 of 1"),
     ]  # fmt: skip
-    assert table.rows[2][6] == "tie"  # without brightness
+    assert "Loops: revisits that were found, of those in the ground truth" in table.note
     lost, found, ate, rpe = points.sentences
     assert lost == "Lost frames: bow 6 in 18 runs, both 6 in 18 runs."
-    assert found.endswith("bow 6 / 12 / 0, both 18 / 0 / 0.")
+    assert found.endswith(": bow found 6 of 18, 0 wrong; both found 18 of 18, 0 wrong.")
     # Half of what brightness costs: the other condition is a tie.
-    assert ate.startswith("ATE over all conditions: both wins. Of 6 sequences, both has the small")
+    assert ate.startswith(
+        "ATE over all conditions, both against bow: both wins. Of 6 sequences, bo"
+    )
     assert "median -0.375 m (-0.500 to -0.250)" in ate
     assert "p = 0.0312" in ate
-    assert rpe.startswith("RPE over all conditions: a tie. Of 6 sequences, no difference on 6 (00")
+    assert rpe == "RPE over all conditions, both against bow: a tie on all 6 sequences."
 
 
 def test_the_table_of_a_short_name_fits_a_terminal_of_80_columns(two_conditions, capsys):
@@ -294,13 +296,12 @@ def test_the_table_of_a_short_name_fits_a_terminal_of_80_columns(two_conditions,
     lines = printed.splitlines()[2:18]
     assert max(map(len, lines)) <= 80
     assert lines[2].split() == [
-        "sequence", "perturbation", "bow", "both", "bow", "both", "diff.", "bow", "both", "diff.",
-        "bow", "both",
+        "sequence", "perturbation", *["bow", "both"] * 5,
     ]  # fmt: skip
     for head in lines[:3]:  # numbers and their headings end in one column
         ends = {match.end() for match in re.finditer(r"\S+", lines[4])}
         assert {match.end() for match in re.finditer(r"\S+", head[22:])} <= {e - 22 for e in ends}
-    assert "- RPE over all conditions: a tie." in printed
+    assert "- RPE over all conditions, both against bow: a tie on all 6 sequences." in printed
 
 
 def test_one_condition_is_not_called_all(two_conditions):
@@ -308,7 +309,7 @@ def test_one_condition_is_not_called_all(two_conditions):
     report = summarize(Found(runs, []))
     assert {c.perturb for c in report.comparisons} == {"none"}
     _, points = versus(report)[0].parts
-    assert points.sentences[2].startswith("ATE, images as they are: a tie. Of 6 sequences")
+    assert points.sentences[2].startswith("ATE, images as they are, both against bow: a tie")
 
 
 def test_the_winner_is_who_has_the_smaller_errors(two_conditions):
@@ -320,7 +321,7 @@ def test_the_winner_is_who_has_the_smaller_errors(two_conditions):
         for perturb in ("none", "brightness:1", ALL)
         for measure in ("ate_rmse_m", "rpe_m")
     }
-    assert versus(report)[0].title == "bow against both"
+    assert versus(report)[0].title == "Side by side: both / bow"
 
 
 def test_every_system_stands_beside_its_baseline():
@@ -329,9 +330,15 @@ def test_every_system_stands_beside_its_baseline():
     runs += [entry(name, "00", 1.0).model_copy(update=mono) for name in ("bow, mono", "both, mono")]
     runs.append(entry("alone", "01", 1.0))
     report = summarize(Found(runs, []), "bow")
-    assert [table.title for table in versus(report)] == [
-        "none against bow", "both against bow", "both, mono against bow, mono", "alone",
+    stereo, *others = versus(report)
+    assert [stereo.title, *(section.title for section in others)] == [
+        "Side by side: bow / none / both", "Side by side: bow, mono / both, mono", "alone",
     ]  # fmt: skip
+    *tables, points = stereo.parts
+    assert [len(table.head) for table in tables] == [2 + 3 * 3, 2 + 2 * 3]
+    light = "brightness:1"
+    assert points.sentences[1].startswith(f"ATE, {light}, none against bow: a tie")
+    assert points.sentences[2].startswith(f"ATE, {light}, both against bow: a tie")
     with pytest.raises(InputError, match="--baseline vgg16: no run of it; choose from none, bow"):
         summarize(Found(runs, []), "vgg16")
 
@@ -345,11 +352,44 @@ def test_what_a_run_does_not_have_is_not_made_up():
     (section,) = versus(summarize(Found(runs, [])))
     table, points = section.parts
     assert table.rows[0][2:] == (
-        "0", "n/a", "n/a", "1.000", "n/a", "20.0", "n/a", "n/a", "1/0/0", "n/a",
+        "0", "n/a", "n/a", "1.000", "20.0", "n/a", "0.050", "n/a", "1 of 1", "n/a",
     )  # fmt: skip
     assert table.rows[1][2:5] == ("n/a", "n/a", "1.000")
     assert points.sentences[0] == "Lost frames: bow 0 in 1 run, both n/a in 1 run."
     assert len(points.sentences) == 2  # nothing to compare
+
+
+@pytest.mark.parametrize(("ate", "part"), [(1.0, "cannot differ"), (1.5, "on shorter revisits")])
+def test_drives_without_a_revisit_are_told_once(ate, part):
+    runs = [
+        entry(name, sequence, value, perturb=light, **loops(0, 0))
+        for name, value in (("bow", 1.0), ("both", ate))
+        for sequence in ("01", "03")
+        for light in ("none", "fog:60")
+    ]
+    first, section = versus(summarize(Found(runs, [])))
+    (sentence,) = first.parts
+    assert sentence.startswith("No drive has a revisit of 20 m or more")
+    assert part in sentence
+    assert section.parts[0].rows[0][-2:] == ("-", "-")
+
+
+def test_wrong_loops_stand_beside_those_found():
+    counts = {**loops(1, 1), "loops_wrong": 2}
+    (section,) = versus(summarize(Found([entry("bow", "00", 1.0, **counts)], [])))
+    assert section.parts[0].rows[0][-1] == "1 of 2, 2 wrong"
+
+
+def test_comparisons_that_tie_everywhere_are_left_out_of_the_differences(two_conditions):
+    rows = table_of(summarize(Found(two_conditions, [])), "Differences").rows
+    assert {(row[1], row[2]) for row in rows} == {("brightness:1", "ATE RMSE"), ("all", "ATE RMSE")}
+
+
+def test_a_label_has_the_true_number_of_frames(run_folder: Path, tmp_path: Path):
+    for most in (100, 500):
+        copy_run(run_folder, tmp_path / str(most), max_frames=most, frames=100, seed=most)
+    runs = collect([tmp_path], []).runs
+    assert {run.drive.excerpt for run in runs} == {"100 frames"}
 
 
 def test_runs_of_different_thresholds_are_noted(run_folder: Path, tmp_path: Path):
@@ -574,7 +614,7 @@ def test_command_line(runs: Path, tmp_path: Path, monkeypatch, capsys):
     assert not stop.value.code
     output = capsys.readouterr()
     assert f"{tmp_path / 'made' / 'report.html'}: 3 runs" in output.out
-    for part in ("bow against none", "ORB-SLAM3 against none", "Lost frames: none "):
+    for part in ("Side by side: none / bow / ORB-SLAM3", "Lost frames: none "):
         assert part in output.out
     assert "note: " in output.err
     # A report of many runs is not a run.

@@ -60,14 +60,14 @@ ALWAYS = (
     (r"--seqs 00-05", "--seqs 00"),
     (r"--perturb none,brightness\b", "--perturb none"),
     (r"--detectors none,bow,capsule", "--detectors none"),
-    (r"--runs 3", f"--runs 1 --max-frames {N}"),
+    (r"--seeds 3", f"--seeds 1 --max-frames {N}"),
 )
 RULES = {
     "README.md": Rules(
         (
             (
                 "vslam bench    #",
-                f"vslam bench --seqs 00 --runs 1 --perturb none --max-frames {N} #",
+                f"vslam bench --seqs 00 --seeds 1 --perturb none --max-frames {N} #",
             ),
         ),
         not_run=(
@@ -91,13 +91,13 @@ RULES = {
     "docs/howto/bench.md": Rules(
         (
             # All frames: straight ahead alone no error is defined.
-            ("vslam bench --out bench/kitti", "vslam bench --seqs 00 --runs 1 --out bench/kitti"),
+            ("vslam bench --out bench/kitti", "vslam bench --seqs 00 --seeds 1 --out bench/kitti"),
             ("synthetic --out", f"synthetic --seqs block --max-frames {N} --perturb none --out"),
             (
                 "--seqs 00,05-07 --perturb brightness:1.5",
                 f"--seqs 00 --max-frames {N} --perturb none",
             ),
-            ("--runs 3", "--runs 1"),
+            ("--seeds 3", "--seeds 1"),
             (
                 "stereo.yaml --perturb none,brightness",
                 f"stereo.yaml --max-frames {N} --perturb none",

@@ -249,5 +249,8 @@ def test_contact_sheet():
     stored = stored_frames(TIMES, lambda k, image_map: (TEXTURE, RAMP))
     source = Source(dataset="drawn", name="drawn", camera=camera, stored=stored)
     sheet = contact_sheet(source, parse_perturbation("blur", 0), [0, 10, 20])
-    assert sheet.shape == (3 * 120, 3 * 480)
+    assert sheet.shape == (3 * (120 + 30), 4 * (480 + 8))  # a title and a margin each
     assert sheet.dtype == np.uint8
+    plain = contact_sheet(source, parse_perturbation("none", 0), [0])
+    change = plain[22 : 22 + 120, 3 * 488 : 3 * 488 + 480]
+    assert (change == 128).all()

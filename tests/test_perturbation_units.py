@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +9,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from vslam.camera import Camera
+from vslam.camera import Camera, ImageMap
+from vslam.datasets.frames import Source, stored_frames
 from vslam.datasets.perturbation import LAWS, Scene, laws_for, parse_perturbation
 from vslam.datasets.perturbation.depth import dense_depths, disparity
 from vslam.datasets.perturbation.kinds import Pair
@@ -37,37 +36,30 @@ def wall(metres: float) -> tuple[np.ndarray, np.ndarray]:
     return wide[:, 80:400], wide[:, 80 + int(d) : 400 + int(d)]
 
 
-@dataclass
-class Drive:
+def drive_of(camera: Camera = CAMERA, *, poses: bool = True) -> Source:
     """A camera that turns to the right; it looks at a wall that moves 4 pixels to the left a
     frame."""
+    timestamps = 5.0 + 0.1 * np.arange(20)
+    T_wc = np.tile(np.eye(4), (20, 1, 1))
+    turned = np.outer(RATE * (timestamps - 5.0), [0.0, 1.0, 0.0])
+    T_wc[:, :3, :3] = Rotation.from_rotvec(turned).as_matrix()
 
-    camera: Camera = CAMERA
-    dataset: str = "drawn"
-    name: str = "wall"
-    timestamps: np.ndarray = field(default_factory=lambda: 5.0 + 0.1 * np.arange(20))
-    poses: bool = True
-
-    @property
-    def ground_truth(self) -> np.ndarray | None:
-        if not self.poses:
-            return None
-        T = np.tile(np.eye(4), (20, 1, 1))
-        turned = np.outer(RATE * (self.timestamps - 5.0), [0.0, 1.0, 0.0])
-        T[:, :3, :3] = Rotation.from_rotvec(turned).as_matrix()
-        return T
-
-    def __len__(self) -> int:
-        return 20
-
-    def read(self, index: int, image_map: Callable = map) -> tuple[np.ndarray, np.ndarray | None]:
+    def read(index: int, image_map: ImageMap) -> tuple[np.ndarray, np.ndarray | None]:
         left = texture(3)[:, 4 * index : 4 * index + 320]
         right = texture(3)[:, 20 + 4 * index : 20 + 4 * index + 320]
-        return left, None if self.camera.monocular else right
+        return left, None if camera.monocular else right
+
+    return Source(
+        dataset="drawn",
+        name="wall",
+        camera=camera,
+        stored=stored_frames(timestamps, read),
+        ground_truth=T_wc if poses else None,
+    )
 
 
-def seen(spec: str, images: tuple, index: int = 3, seed: int = 0, drive: Drive | None = None):
-    law = parse_perturbation(spec, seed).bound_to(drive or Drive())
+def seen(spec: str, images: tuple, index: int = 3, seed: int = 0, drive: Source | None = None):
+    law = parse_perturbation(spec, seed).bound_to(drive or drive_of())
     return law.apply(index, 0.1 * index, *images)
 
 
@@ -90,7 +82,7 @@ def test_fog_takes_the_depth_image_where_there_is_one():
     depth[:, :100] = 0.0  # unknown: far
     camera = Camera(400.0, 400.0, 160.0, 80.0, 0.5, 320, 160, depth=True)
     left, _ = wall(20.0)
-    foggy, same = seen("fog:12", (left, depth), drive=Drive(camera))
+    foggy, same = seen("fog:12", (left, depth), drive=drive_of(camera))
     assert same is depth
     at = np.s_[75:85, 155:165]
     slope = np.polyfit(left[at].ravel(), foggy[at].ravel(), 1)[0]
@@ -107,7 +99,7 @@ def test_depth_of_stereo_is_that_of_both_sides():
 
 def test_night_takes_stops_and_counts_electrons():
     grey = np.full((400, 600), 200, np.uint8)
-    drive = Drive(Camera(400.0, 400.0, 300.0, 200.0, 0.5, 600, 400))
+    drive = drive_of(Camera(400.0, 400.0, 300.0, 200.0, 0.5, 600, 400))
     dark = seen("night:3", (grey, grey), drive=drive)
     assert dark[0].mean() == pytest.approx(25.0, abs=0.1)
     electrons = FULL_WELL / 255.0
@@ -154,7 +146,7 @@ def test_motion_blur_without_poses_takes_the_motion_of_the_image():
     """4 pixels in 0.1 s, 100 ms: 4 pixels."""
     point = np.zeros((160, 320), np.uint8)
     point[80, 160] = 255
-    drive = Drive(poses=False)
+    drive = drive_of(poses=False)
     law = parse_perturbation("motion:100", 0).bound_to(drive)
     columns = np.nonzero(law.apply(3, 0.3, point, point)[0][80] > 16)[0]
     assert np.ptp(columns) + 1 == pytest.approx(4.0, abs=1.0)
@@ -306,7 +298,7 @@ def test_a_longer_baseline_lengthens_disparities():
 
 
 def test_a_late_right_side_shows_what_comes_later():
-    drive = Drive()
+    drive = drive_of()
     images = drive.read(3)
     late = seen("desync:50", images, drive=drive)[1].astype(float)
     true = np.asarray(texture(3)[:, 20 + 14 : 20 + 14 + 320], float)  # 2 pixels later
@@ -317,7 +309,7 @@ def test_a_late_right_side_shows_what_comes_later():
 
 @pytest.mark.parametrize("side", [0, 1])
 def test_a_black_side_is_black_for_its_share_of_the_seconds(side):
-    law = parse_perturbation(f"black_{('left', 'right')[side]}:25", 0).bound_to(Drive())
+    law = parse_perturbation(f"black_{('left', 'right')[side]}:25", 0).bound_to(drive_of())
     left, right = wall(20.0)
     black = np.array(
         [[image.max() == 0 for image in law.apply(k, 0.5 * k, left, right)] for k in range(2000)]
@@ -329,7 +321,7 @@ def test_a_black_side_is_black_for_its_share_of_the_seconds(side):
 
 @pytest.mark.slow
 def test_every_law_is_repeatable_and_keeps_the_shape():
-    drive = Drive()
+    drive = drive_of()
     for name, kind in LAWS.items():
         spec = f"{name}:{kind.strongest:g}"
         for index in (0, 5, 19):
@@ -345,7 +337,7 @@ def test_every_law_is_repeatable_and_keeps_the_shape():
 
 
 def test_laws_that_draw_nothing_say_so():
-    drive = Drive()
+    drive = drive_of()
     for name, kind in LAWS.items():
         strength = (kind.weakest + kind.strongest) / 2.0
         pair = [seen(f"{name}:{strength:g}", drive.read(5), 5, s) for s in (0, 1)
@@ -356,7 +348,7 @@ def test_laws_that_draw_nothing_say_so():
 
 
 def test_what_the_data_lack_is_said():
-    mono = Drive(CAMERA.left_camera())
+    mono = drive_of(CAMERA.left_camera())
     fit, unfit = laws_for(mono)
     assert set(LAWS) - set(fit) == {
         "fog", "stereo_gain", "desync", "baseline", "yaw", "pitch", "black_right", "black_left",
@@ -365,7 +357,7 @@ def test_what_the_data_lack_is_said():
         parse_perturbation("fog", 0).bound_to(mono)
     with pytest.raises(InputError, match="--perturb yaw: needs the images of both sides"):
         parse_perturbation("brightness,yaw:3", 0).bound_to(mono)
-    assert laws_for(Drive()) == (list(LAWS), {})
+    assert laws_for(drive_of()) == (list(LAWS), {})
     assert list(unfit) == [law for law in LAWS if law not in fit]
     assert unfit["fog"].startswith("--perturb fog: needs depth")
 

@@ -151,10 +151,10 @@ def test_entities_and_their_frames(recording: Path) -> None:
         "state/loops": 6,
         "loops/images": 2,  # of those accepted
         "world/ground_truth": 1,
-        "world/trajectory": 1,
+        "world/trajectory": 1 + FRAMES,
         "points/inliers": 1 + FRAMES,
-        "stage_ms/extract": FRAMES,
-        "stage_ms/bundle": keyframes,
+        "stage_ms/extract": 1 + FRAMES,
+        "stage_ms/bundle": 1 + keyframes,
         "state": 3,
     }
     assert {entity: len(rows(recording, entity)) for entity in expected} == expected
@@ -177,6 +177,20 @@ def test_ground_truth_starts_where_the_estimate_does(recording: Path) -> None:
     (strip,) = rows(recording, "world/ground_truth")[0]["LineStrips3D:strips"]
     np.testing.assert_allclose(strip[0], [0.0, 0.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(strip[-1], _pose(FRAMES - 1)[:3, 3], atol=1e-4)
+
+
+def test_the_final_trajectory_grows_with_the_frames(recording: Path) -> None:
+    found = [row for row in rows(recording, "world/trajectory") if row.get("LineStrips3D:strips")]
+    for row in (found[0], found[60], found[-1]):
+        (strip,) = row["LineStrips3D:strips"]
+        assert len(strip) == row["frame"] + 1
+        np.testing.assert_allclose(strip[-1], _pose(row["frame"])[:3, 3], atol=1e-4)
+
+
+def test_each_stage_has_a_colour_of_its_own(recording: Path) -> None:
+    stages = ("extract", "track", "bundle")
+    colors = {rows(recording, f"stage_ms/{name}")[0]["SeriesLines:colors"][0] for name in stages}
+    assert len(colors) == len(stages)
 
 
 def _strips(row: dict[str, Any]) -> NDArray[np.float32]:

@@ -618,6 +618,7 @@ def test_of_all_frames_lost(tmp_path: Path) -> None:
     report = report_of(make_outcome(30, lost=slice(0, 30), ground_truth=False), tmp_path)
     assert (report.lost_frames, report.weak_frames) == (30, 0)
     assert "100.0 % of 30" in (tmp_path / "report.md").read_text()
+    assert "top_view" not in figures_of(tmp_path)
 
 
 def test_interrupted_before_the_first_frame(tmp_path: Path) -> None:

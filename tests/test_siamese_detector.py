@@ -124,6 +124,7 @@ def test_recent_covisible_dead_and_unseen_keyframes_are_not_asked():
     assert one.query(1, map_) == []
 
 
+@pytest.mark.slow
 def test_neighbours_of_a_candidate_do_not_crowd_out_other_places():
     places = [7, 7, 7, 7, 20, 21, 22, 23, 7]
     config = SiameseConfig(recent_keyframes=1, threshold=0.0, max_candidates=2)

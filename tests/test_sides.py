@@ -86,6 +86,20 @@ def test_a_bright_strip_that_one_side_sees_is_no_gain(side):
     assert balanced(*pair, CONFIG)[side] is pair[side]
 
 
+@pytest.mark.parametrize("side", [0, 1])
+@pytest.mark.parametrize("share", [0.4, 0.55, 0.7, 0.85])
+@pytest.mark.parametrize("sky", [160.0, 190.0, 220.0, 245.0])
+@pytest.mark.parametrize("noise", [1.0, 8.0])
+def test_a_sky_that_one_side_sees_is_no_gain(side, share, sky, noise):
+    """The other camera sees the underside of a bridge."""
+    pair = list(scene(mean=100.0, spread=25.0))
+    rows = int(share * 200)
+    grain = noise * np.random.default_rng(1).normal(size=(rows, 400))
+    pair[side][:rows] = np.clip(sky + grain, 0, 255)
+    assert compare_sides(*pair, CONFIG) == Sides()
+    assert balanced(*pair, CONFIG)[1 - side] is pair[1 - side]
+
+
 def test_a_gain_is_told_beside_glare_on_both_sides():
     left, right = scene()
     left[:, :100], right[:, :100] = 255, 255

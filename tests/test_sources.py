@@ -352,7 +352,7 @@ def test_a_contact_sheet_of_a_video(folder, tmp_path):
     words += ["--perturb", "blur", "--frames", "2", "--start", "3", "--out", tmp_path / "a.png"]
     done = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
     assert f"frames 3, {FRAMES - 1}" in done.output
-    assert cv2.imread(str(tmp_path / "a.png")).shape == (2 * 160, 3 * 480, 3)
+    assert cv2.imread(str(tmp_path / "a.png")).shape == (2 * (160 + 30), 4 * (480 + 8), 3)
 
 
 @pytest.mark.slow

@@ -64,7 +64,7 @@ def test_views_are_equally_far_apart():
         (1, 65, "view_width 65: one view is the whole image"),
         (2, 81, "view_width 81: must be less than the 81"),
         (3, 64, "view_width 64: 3 views in 81 columns must be a multiple of 1 columns apart"),
-        (2, 20, "view_width: Input should be greater than or equal to 32"),
+        (2, 20, "view_width: must be at least 32"),
     ],
 )
 def test_views_that_do_not_fit_are_refused(views, view_width, why):
@@ -270,6 +270,7 @@ def test_flat_images_keep_their_height():
         CapsuleShape(middle=0.9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "network",
     [small_network(**WIDE), lite_network(), small_network(**WIDE, half_angle=30.0, middle=0.9)],

@@ -74,7 +74,7 @@ def test_all_but_training_works_without_torch(kitti_tree: Path, pairs: Path, tmp
     vslam("map", "merge", mapped, darker, "--out", "merged.npz")
     vslam("doctor", kitti_tree)
     vslam("bench", *source, "--seqs", "00", "--detectors", "capsule-paper", "--perturb", "none",
-          "--runs", "1", "--max-frames", "8", "--out", "bench")  # fmt: skip
+          "--seeds", "1", "--max-frames", "8", "--out", "bench")  # fmt: skip
     vslam("report", "bench")
     vslam("loops", "bench", *images, "--perturb", "none",
           "--detectors", "bow,capsule,capsule-pruned,capsule-paper", "--out", "loops")  # fmt: skip

@@ -21,6 +21,11 @@ Sensor = Literal["stereo", "mono", "rgbd"]
 # has this weight (docs/research/motorway.md, tools/experiments/motorway/noise_model.py).
 DISPARITY_WEIGHT = 3.0
 
+_OFF_CENTRE = 0.2  # of the image size; a calibration of half the size gives 0.25, of twice it 0.5
+_SAME_RATIO = 1.25  # between the two axes, of the image sizes that the principal point suggests
+_FACTORS = {0.5: "half", 2.0: "twice"}
+_NARROWEST, _WIDEST = 10.0, 150.0  # degrees; fields of view of the cameras that vehicles carry
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -124,6 +129,46 @@ class Camera:
         x = (xy[:, 0] - self.cx) * z / self.fx
         y = (xy[:, 1] - self.cy) * z / self.fy
         return np.stack([x, y, z], axis=1)
+
+
+def calibration_doubts(camera: Camera) -> list[str]:
+    """What makes a calibration implausible, in sentences without a full stop; empty if nothing
+    does. Such a camera can exist, but more often the numbers belong to other images."""
+    sizes, centre = (camera.width, camera.height), (camera.cx, camera.cy)
+    shares = [c / size for c, size in zip(centre, sizes, strict=True)]
+    doubts = []
+    if max(abs(share - 0.5) for share in shares) > _OFF_CENTRE:
+        doubts.append(
+            f"the principal point ({camera.cx:.1f}, {camera.cy:.1f}) is far from the middle of the "
+            f"{camera.width}x{camera.height} images; {_cause(*shares)}"
+        )
+    fields = field_of_view(camera)
+    if not all(_NARROWEST <= angle <= _WIDEST for angle in fields):
+        doubts.append(
+            f"the focal lengths ({camera.fx:.1f}, {camera.fy:.1f}) give a field of view of "
+            f"{fields[0]:.0f} x {fields[1]:.0f} degrees; the calibration seems to be of images of "
+            "another size, or its focal lengths are not in pixels"
+        )
+    return doubts
+
+
+def _cause(across: float, down: float) -> str:
+    """Why a principal point lies at these shares of the image's width and height."""
+    if min(across, down) <= 0.0 or not 1 / _SAME_RATIO < across / down < _SAME_RATIO:
+        return "check the order of its numbers, and whether the images were cropped or turned"
+    ratio = across + down  # 1 for a principal point in the middle
+    names = [name for factor, name in _FACTORS.items() if abs(ratio / factor - 1.0) < 0.1]
+    times = names[0] if names else f"{ratio:.1f} times"
+    return f"the calibration seems to be of images of {times} this size"
+
+
+def field_of_view(camera: Camera) -> tuple[float, float]:
+    """Degrees that the image spans across and down."""
+    across, down = (
+        2 * math.degrees(math.atan(size / (2 * focal)))
+        for size, focal in ((camera.width, camera.fx), (camera.height, camera.fy))
+    )
+    return across, down
 
 
 def same_camera(one: Camera, other: Camera) -> bool:

@@ -46,3 +46,20 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
     near = get_close_matches(word.lower(), list(known), n=1)
     return f" (did you mean {near[0]}?)" if near else ""
+
+
+def plain_reason(message: str) -> str:
+    """What is wrong with a value, in our words instead of those of the library that checked it."""
+    message = message.removeprefix("Value error, ").partition(", unable to parse")[0]
+    for theirs, ours in (
+        ("Input should be", "must be"),
+        ("greater than or equal to", "at least"),
+        ("less than or equal to", "at most"),
+        ("greater than", "more than"),
+        ("a valid ", "a "),
+        ("an integer", "a whole number"),
+        ("a integer", "a whole number"),
+        ("a boolean", "true or false"),
+    ):
+        message = message.replace(theirs, ours)
+    return message

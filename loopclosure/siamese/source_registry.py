@@ -30,7 +30,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from vslam.errors import InputError
+from vslam.errors import InputError, did_you_mean
 from vslam.loopclosure.siamese.fabmap_source import read_fabmap
 from vslam.loopclosure.siamese.image_source import ImageSource
 from vslam.loopclosure.siamese.kitti_source import read_kitti
@@ -68,7 +68,8 @@ def open_source(spec: str) -> list[ImageSource]:
     kind, path, options = split_spec(spec)
     if kind not in _READERS or not path:
         raise InputError(
-            f"--data {spec}: must be KIND:PATH, where KIND is one of {', '.join(_READERS)}."
+            f"--data {spec}: must be KIND:PATH{did_you_mean(kind, _READERS)}, where KIND is one of "
+            f"{', '.join(_READERS)}."
         )
     reader, known = _READERS[kind]
     if wrong := [key for key in options if key not in known]:

@@ -15,7 +15,7 @@ from pydantic import (
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vslam.errors import InputError
+from vslam.errors import InputError, plain_reason
 from vslam.loopclosure.siamese.images import Size
 from vslam.loopclosure.training.capsules import CapsuleLayer
 from vslam.loopclosure.training.extractors import (
@@ -272,5 +272,5 @@ class CapsuleBranch(nn.Module):
 def _first(error: ValidationError) -> str:
     """The first error, as a clause."""
     first = error.errors()[0]
-    said = first["msg"].removeprefix("Value error, ")
+    said = plain_reason(first["msg"])
     return ": ".join([*map(str, first["loc"]), said])

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from vslam.errors import InputError
+from vslam.config.section import read_json
 from vslam.loopclosure.training.augmentation import STRONG, Augmentation
 from vslam.loopclosure.training.branches import CapsuleShape
 from vslam.loopclosure.training.siamese import Head
@@ -125,11 +125,4 @@ def load_settings(path: Path) -> TrainSettings:
     Raises:
         InputError: the file is missing or not JSON, a key is unknown, or a value is out of range.
     """
-    try:
-        return TrainSettings.model_validate_json(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the settings ({error.strerror}).") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "file"
-        raise InputError(f"{path}: {where}: {first['msg']}.") from error
+    return read_json(TrainSettings, path, "settings")

@@ -9,12 +9,20 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.options import (
+    METHOD,
+    OUTPUT,
+    Jobs,
+    Quiet,
+    Scheduler,
+    Seeds,
+    ThreadsOfRun,
     Thresholds,
     Weights,
     kind_of_source,
     names_in,
     open_given,
     reads_source,
+    sequences,
 )
 from vslam.cli.report import write_overview_of
 from vslam.errors import InputError
@@ -31,18 +39,13 @@ _UNKNOWN_LENGTH = 1000  # frames of a stream that does not say, for the estimate
 _FIRST_SEQUENCES = "00-05"
 _EXAMPLES = """
 [b]Examples[/b]
+  vslam bench                        KITTI 00-05 in $KITTI_ROOT
+  vslam bench --dataset synthetic    the same routes through rendered towns
+  vslam bench --seqs 00,05-07 --perturb brightness:1.5+blur:0.5 --jobs 4
+  vslam bench --dataset synthetic --seqs demo --detectors bow,capsule,both
+  vslam bench --data drive.mp4 --side-by-side --calib stereo.yaml --seeds 1
 
-  vslam bench                                     (KITTI 00-05 in $KITTI_ROOT: the paper's Table 7)
-
-  vslam bench --dataset synthetic                 (the same on rendered towns, without any data)
-
-  vslam bench --data ~/kitti --seqs 00,05-07 --perturb brightness:1.5+blur:0.5 --jobs 4
-
-  vslam bench --dataset synthetic --seqs demo --perturb none --detectors bow,none,capsule,both
-
-  vslam bench --data drive.mp4 --side-by-side --calib stereo.yaml --runs 1
-
-The same command again continues where it was stopped. docs/howto/bench.md tells more.
+The same command continues a benchmark that was stopped (docs/howto/bench.md).
 """
 
 
@@ -54,43 +57,36 @@ def register(app: typer.Typer) -> None:
 @reads_source(without=("seq", "start", "every"))
 def bench(
     given: SourceOptions,
-    seqs: Annotated[
-        str | None,
-        typer.Option(
-            help="Sequences of a data set, 00-05 or 00,demo for example.",
-            show_default="00-05; of euroc and tum the only one there",
-        ),
-    ] = None,
+    seqs: Annotated[str | None, sequences("00-05")] = None,
     perturb: Annotated[
         str,
         typer.Option(
-            help="Perturbations as of [b]vslam run[/b]; a comma separates them, + joins laws."
+            metavar="LIST",
+            help="Perturbations, separated by commas; + joins several in one, such as "
+            "fog:60+blur:0.5 ([b]vslam perturb --list[/b]).",
+            rich_help_panel=METHOD,
         ),
     ] = "none,brightness",
     detectors: Annotated[
         str,
-        typer.Option(help="Loop detectors, with commas; the others are set against the first."),
+        typer.Option(
+            metavar="NAMES",
+            help="Loop detectors, separated by commas; the first is the baseline.",
+            rich_help_panel=METHOD,
+        ),
     ] = "bow,both",
     weights: Weights = None,
-    runs: Annotated[int, typer.Option(min=1, help="Seeds of each random perturbation.")] = 3,
-    jobs: Annotated[
-        int, typer.Option(min=1, help="Runs at a time; give 1 for frames per second that count.")
-    ] = 1,
-    threads: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="Threads of each run.", show_default="cores for each job, up to 4"
-        ),
-    ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(help="Dask scheduler, tcp://HOST:8786, whose workers run the cells."),
-    ] = None,
+    seeds: Seeds = 3,
     config: Thresholds = None,
-    out: Annotated[Path, typer.Option(help="Folder of the benchmark.")] = Path("bench"),
-    quiet: Annotated[bool, typer.Option("--quiet", help="No table.")] = False,
+    jobs: Jobs = 1,
+    threads: ThreadsOfRun = None,
+    scheduler: Scheduler = None,
+    out: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Folder to write to.", rich_help_panel=OUTPUT)
+    ] = Path("bench"),
+    quiet: Quiet = False,
 ) -> None:
-    """Run sequences under perturbations with loop detectors, and show which detector wins."""
+    """Compare loop detectors on sequences under perturbations."""
     chosen = names_in(detectors)
     from vslam.cli.console import console
     from vslam.lab.bench import execute
@@ -112,7 +108,7 @@ def bench(
     frames = {name: source.n_expected or _UNKNOWN_LENGTH for name, source in opened.items()}
     options = cell_options(kind, given, config, threads, jobs, scheduler, out)
     cells = make_grid(
-        kind, frames, laws, chosen, runs, given.max_frames, files,
+        kind, frames, laws, chosen, seeds, given.max_frames, files,
         sensor=given.sensor, calib=tuple(map(str, given.calib)),
     )  # fmt: skip
     execute.prepare(out, identity_of(kind, given))
@@ -224,7 +220,7 @@ def open_all(
     from vslam.cli.console import console
     from vslam.lab.bench.grid import parse_sequences
 
-    once = f"--data {given.data}: a camera cannot be seen twice; record a video or a bag."
+    once = f"--data {given.data}: a live camera gives each image once; record a video or a bag."
     if kind == "camera":
         raise InputError(once)
     opened = {}

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from vslam.cli.console import console
-from vslam.cli.options import Thresholds, open_given, reads_source, require_data
+from vslam.cli.options import OUTPUT, Thresholds, open_given, reads_source, require_data
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,11 +17,8 @@ if TYPE_CHECKING:
 
 _EXAMPLES = """
 [b]Examples[/b]
-
   vslam doctor ~/euroc/V1_01_easy
-
   vslam doctor drive.mp4 --side-by-side --calib stereo.yaml
-
   vslam doctor ~/kitti --seq 06 --calib camchain.yaml --out doctor.html
 """
 
@@ -34,7 +32,15 @@ def register(app: typer.Typer) -> None:
 def doctor(
     given: SourceOptions,
     config: Thresholds = None,
-    out: Annotated[Path, typer.Option(help="HTML page to write.")] = Path("doctor.html"),
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="HTML page to write; replaces an earlier one.",
+            show_default="doctor.html, or doctor-2.html and so on",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
 ) -> None:
     """Check images, calibration and times before a run; exit code 1 if there is a fault."""
     from vslam.config import Config, load_config
@@ -54,9 +60,16 @@ def doctor(
         typer.echo(f"{finding.verdict:<8} {finding.check:<16} {finding.measured}")
         if finding.fix:
             typer.echo(f"{'':<8} {'':<16} fix: {finding.fix}")
+    page = out or _free(Path("doctor.html"))
     # The page comes after the findings, because a disk may be full.
-    write_page(diagnosis, f"Doctor: {given.data or given.dataset}", out)
+    write_page(diagnosis, f"Doctor: {given.data or given.dataset}", page)
     n = len(diagnosis.faults)
-    typer.echo(f"{out}: {n or 'no'} fault{'' if n == 1 else 's'}")
+    typer.echo(f"{page}: {n or 'no'} fault{'' if n == 1 else 's'}")
     if diagnosis.faults:
         raise typer.Exit(1)
+
+
+def _free(path: Path) -> Path:
+    """The path itself, or the first one with a number that does not exist yet."""
+    numbered = (path.with_stem(f"{path.stem}-{n}") for n in count(2))
+    return next(one for one in chain((path,), numbered) if not one.exists())

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Literal
 
 import typer
@@ -30,6 +31,7 @@ class Output:
 
     record: bool
     view: Literal["native", "web"] | None
+    keep_open: bool
     pages: bool
     ply: bool
     save_map: Path | None
@@ -91,10 +93,14 @@ def drive(
             remove_autosave(folder)
     if not output.quiet:
         print_summary(report, folder)
+    if viewer is not None and output.keep_open and outcome.interrupted != "Ctrl-C":
+        told.announce(f"{viewer.address} stays open until Ctrl-C")
+        with suppress(KeyboardInterrupt):
+            Event().wait()
     if why and output.quiet:  # else the summary has said it
         raise ResultsError(f"{why}.")
     if outcome.interrupted and outcome.interrupted != "Ctrl-C":
-        go_on = f"; vslam run --resume {folder} goes on" if (folder / MAP).exists() else ""
+        go_on = f"; vslam run --resume {folder} continues it" if (folder / MAP).exists() else ""
         raise ResultsError(f"{folder}: ended early: {outcome.interrupted}{go_on}.")
     if why or outcome.interrupted:
         raise typer.Exit(1)
@@ -114,7 +120,7 @@ def _refuse_camera(source: Source, resume: Path | None) -> None:
     """What a camera has shown is gone."""
     if source.live and resume is not None:
         raise InputError(
-            f"--resume {resume}: what a camera has shown is gone; go on in its map with "
+            f"--resume {resume}: the images of a live camera are gone; continue its map with "
             "--map FOLDER/autosave.npz."
         )
 

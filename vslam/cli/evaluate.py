@@ -9,10 +9,7 @@ import typer
 
 from vslam.cli.options import AlignmentName
 
-_EXAMPLE = (
-    "[b]Example[/b]\n\n  vslam eval runs/latest/trajectory_kitti.txt "
-    "--gt runs/latest/ground_truth_kitti.txt"
-)
+_EXAMPLE = "[b]Example[/b]\n  vslam eval runs/latest/trajectory.tum --gt groundtruth.tum"
 
 
 def register(app: typer.Typer) -> None:
@@ -21,15 +18,25 @@ def register(app: typer.Typer) -> None:
 
 
 def evaluate_files(
-    estimate: Annotated[Path, typer.Argument(help="Trajectory, KITTI or TUM format.")],
-    gt: Annotated[Path, typer.Option(help="Ground truth, KITTI or TUM format.")],
+    estimate: Annotated[Path, typer.Argument(help="Trajectory in the format of KITTI or TUM.")],
+    gt: Annotated[
+        Path, typer.Option(metavar="FILE", help="Ground truth in the format of KITTI or TUM.")
+    ],
     align: Annotated[
-        AlignmentName, typer.Option(help="What is fitted first; [b]sim3[/b] fits the scale, too.")
+        AlignmentName,
+        typer.Option(
+            metavar="se3|sim3|none",
+            help="Alignment with the ground truth; [b]sim3[/b] also fits the scale.",
+        ),
     ] = "se3",
     times: Annotated[
-        Path | None, typer.Option(help="times.txt of a KITTI file, to compare it with a TUM file.")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="times.txt of the sequence, to compare a KITTI file with a TUM file.",
+        ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Compare a trajectory with the ground truth: ATE, RPE and KITTI drift."""
     import json
@@ -43,7 +50,7 @@ def evaluate_files(
     if as_json:
         typer.echo(json.dumps(evaluation.summary(), indent=2))
         return
-    matched = f"{evaluation.frames} matched of {len(trajectory)}"
+    matched = f"{evaluation.frames} of {len(trajectory)} have a ground truth"
     rows = [
         ("frames", matched),
         ("alignment", align),
@@ -56,7 +63,8 @@ def evaluate_files(
     else:
         rows.append(("t_rel", f"{evaluation.t_rel_percent:.3f} %"))
         rows.append(("r_rel", f"{evaluation.r_rel_deg_per_100m:.3f} deg/100 m"))
-    # evo compares files of one format only.
-    if (format_ := trajectory_format(gt)) == trajectory_format(estimate):
+    # evo compares files of one format, and no straight lines.
+    format_ = trajectory_format(gt)
+    if format_ == trajectory_format(estimate) and not evaluation.on_one_line:
         rows.append(("reproduce", evo_command(estimate, gt, align, format_)))
     print_rows(rows)

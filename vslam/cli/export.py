@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from vslam.cli.options import INPUT, OUTPUT, Quiet
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
     from vslam.report.finished_run import FinishedRun
 
 commands = typer.Typer(
-    help="Export the map of a run for other programs (docs/howto/exports.md), a trained network, "
-    "or images to train on.",
+    help="Export maps for other programs (docs/howto/exports.md), trained networks, and images to "
+    "train on.",
     no_args_is_help=True,
 )
 
@@ -34,13 +35,20 @@ RunOrFile = Annotated[
 Data = Annotated[
     str | None,
     typer.Option(
-        help="Where the images of the run are now.", show_default="where they were, by run.json"
+        metavar="DATA",
+        help="Where the images of the run are now.",
+        show_default="where the run read them",
+        rich_help_panel=INPUT,
     ),
 ]
 Link = Annotated[
-    bool, typer.Option("--link", help="Link the image files of the data set, do not copy them.")
+    bool,
+    typer.Option(
+        "--link",
+        help="Link the images of the data set in place of copies.",
+        rich_help_panel=OUTPUT,
+    ),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -49,19 +57,31 @@ def register(app: typer.Typer) -> None:
 
 
 def _out(default: str) -> typer.models.OptionInfo:
-    return typer.Option("--out", help="Where to write.", show_default=f"RUN/{default}")
+    is_file = "." in default
+    return typer.Option(
+        "--out",
+        metavar="FILE" if is_file else "FOLDER",
+        help=f"{'File' if is_file else 'Folder'} to write{'' if is_file else ' to'}.",
+        show_default=f"RUN/{default}",
+        rich_help_panel=OUTPUT,
+    )
 
 
-@commands.command(epilog="[b]Example[/b]\n\n  vslam export colmap runs/latest")
+@commands.command(epilog="[b]Example[/b]\n  vslam export colmap runs/latest")
 def colmap(
     run: Run,
     data: Data = None,
     out: Annotated[Path | None, _out("colmap")] = None,
-    text: Annotated[bool, typer.Option("--text", help="Text files, not binary ones.")] = False,
+    text: Annotated[
+        bool,
+        typer.Option(
+            "--text", help="Write text files in place of binary ones.", rich_help_panel=OUTPUT
+        ),
+    ] = False,
     link: Link = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write keyframe images, and a sparse model for COLMAP and what reads its models."""
+    """Write keyframe images and a sparse model in COLMAP's format."""
     from vslam.maps.colmap import save_colmap
     from vslam.maps.new_output import new_folder
 
@@ -77,7 +97,7 @@ def colmap(
     _say(target, reconstruction, quiet=quiet)
 
 
-@commands.command(epilog="[b]Example[/b]\n\n  vslam export nerfstudio runs/latest")
+@commands.command(epilog="[b]Example[/b]\n  vslam export nerfstudio runs/latest")
 def nerfstudio(
     run: Run,
     data: Data = None,
@@ -99,17 +119,22 @@ def nerfstudio(
     _say(target, reconstruction, quiet=quiet)
 
 
-@commands.command(epilog="[b]Example[/b]\n\n  vslam export ply runs/latest")
+@commands.command(epilog="[b]Example[/b]\n  vslam export ply runs/latest")
 def ply(
     run: RunOrFile,
     data: Data = None,
     out: Annotated[Path | None, _out("landmarks.ply")] = None,
     colours: Annotated[
-        bool, typer.Option(help="Colours from the images; without, no image is needed.")
+        bool,
+        typer.Option(
+            "--colours/--no-colours",
+            help="Colour the landmarks from the images, which are otherwise not needed.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = True,
     quiet: Quiet = False,
 ) -> None:
-    """Write landmarks with the colours that they have in the images."""
+    """Write the landmarks with the colours that they have in the images."""
     from vslam.maps.keyframe_images import landmark_colours
     from vslam.maps.new_output import new_file
     from vslam.maps.ply import save_ply
@@ -128,13 +153,13 @@ def ply(
     _say(target, reconstruction, quiet=quiet)
 
 
-@commands.command(epilog="[b]Example[/b]\n\n  vslam export g2o runs/latest")
+@commands.command(epilog="[b]Example[/b]\n  vslam export g2o runs/latest")
 def g2o(
     run: RunOrFile,
     out: Annotated[Path | None, _out("pose_graph.g2o")] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write keyframe poses, odometry and loop edges with information."""
+    """Write keyframe poses with odometry and loop edges and their information matrices."""
     import numpy as np
 
     from vslam.backend.pose_graph import LOOP
@@ -154,13 +179,16 @@ def g2o(
         typer.echo(f"{target}: {len(ids)} vertices, {len(graph.edges)} edges, {loops} of loops")
 
 
-@commands.command(epilog="[b]Example[/b]\n\n  vslam export euroc runs/latest")
+@commands.command(epilog="[b]Example[/b]\n  vslam export euroc runs/latest")
 def euroc(
     run: Run,
     out: Annotated[Path | None, _out("trajectory_euroc.csv")] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write the trajectory as EuRoC's csv; in the formats of TUM and KITTI every run writes it."""
+    """Write the trajectory in EuRoC's csv format.
+
+    Every run writes it in the formats of TUM and KITTI.
+    """
     from vslam.maps.new_output import new_file
     from vslam.trajectory import read_trajectory, write_euroc
 
@@ -259,8 +287,8 @@ def _image_of(frame: TimedFrame) -> NDArray[np.uint8]:
 def _own_file(frame: TimedFrame, finished: FinishedRun) -> Path:
     if frame.file is None:
         raise InputError(
-            f"--link: images of {finished.report.dataset} are not used as they lie there; leave it "
-            "out."
+            f"--link: vslam changes the images of {finished.report.dataset}, so they cannot be "
+            "linked; leave it out."
         )
     return frame.file
 

@@ -21,10 +21,14 @@ def register(app: typer.Typer) -> None:
 def info(
     data: Annotated[
         Path | None,
-        typer.Option(help="Folder with KITTI's data.", show_default="$KITTI_ROOT or data/kitti"),
+        typer.Option(
+            metavar="FOLDER",
+            help="Folder with KITTI's data.",
+            show_default="$KITTI_ROOT, else data/kitti",
+        ),
     ] = None,
 ) -> None:
-    """Show versions, cores, compiled kernels and the data found."""
+    """Show versions, cores, compiled kernels, and the KITTI data that is found."""
     from vslam import machine, plugins
     from vslam.datasets.kitti import list_kitti
 

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
 
-from vslam.cli.options import Weights, names_in
+from vslam.cli.options import (
+    INPUT,
+    METHOD,
+    OUTPUT,
+    AllThreads,
+    Quiet,
+    Seed,
+    Weights,
+    names_in,
+)
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,13 +32,9 @@ if TYPE_CHECKING:
 
 _EXAMPLES = """
 [b]Examples[/b]
-
   vslam loops bench --detectors bow,capsule
-
-  vslam loops bench --data "kitti:~/kitti\\[seq=00,frames=0-249+1500-1699,truth=kitti00.mat]"
-
-  vslam loops bench --detectors capsule,alexnet --weights alexnet=training/alexnet.onnx
-
+  vslam loops bench --data "kitti:~/kitti\\[seq=00,truth=kitti00.mat]"
+  vslam loops bench --detectors capsule,alexnet --weights alexnet=alexnet.onnx
   vslam loops bench --protocol online --detectors bow,capsule,ibow
 """
 DATA = ("town:demo[seed=101]", "town:05[seed=102]", "town:demo[seed=103,aliased=1]")
@@ -54,47 +59,67 @@ def bench(
     protocol: Annotated[
         Literal["retrieval", "online"],
         typer.Option(
-            help="retrieval: every query against a gallery; online: images of a drive in order, "
-            "one decision each against those before."
+            metavar="retrieval|online",
+            help="[b]retrieval[/b] searches a gallery for every query; [b]online[/b] decides once "
+            "per image of a drive, searching the images before it.",
+            rich_help_panel=METHOD,
         ),
     ] = "retrieval",
     data: Annotated[
         list[str] | None,
         typer.Option(
-            help="Images: [b]town:ROUTE\\[seed=101,aliased=1,places=150][/b], rendered, or a "
-            "source as of [b]vslam train[/b]; with --protocol online "
-            "[b]drive:ROUTE\\[seed=101,aliased=1,change=0.5,every=10][/b], rendered, kitti:DIR or "
-            "fabmap:DIR; again for more.",
+            metavar="SOURCE",
+            help="Images: rendered places, [b]town:ROUTE\\[seed=101,aliased=1,places=150][/b], "
+            "or a source of [b]vslam train[/b]. With online: a rendered drive, "
+            "[b]drive:ROUTE\\[seed=101,aliased=1,change=0.5,every=10][/b], kitti:DIR or "
+            "fabmap:DIR. Repeat for more.",
             show_default="three towns, or two drives",
+            rich_help_panel=INPUT,
         ),
     ] = None,
     detectors: Annotated[
-        str, typer.Option(help="With commas; the first is what others are compared with.")
+        str,
+        typer.Option(
+            metavar="NAMES",
+            help="Loop detectors, separated by commas; the first is the baseline.",
+            rich_help_panel=METHOD,
+        ),
     ] = "bow,capsule,capsule-pruned",
     weights: Weights = None,
     perturb: Annotated[
         str,
         typer.Option(
-            help="What is done to the query images: light, clipping, viewpoint, occlusion, "
-            "noise, blur, change (rendered towns only), all; with commas."
+            metavar="NAMES",
+            help="Changes of the query images: light, clipping, viewpoint, occlusion, noise, blur, "
+            "change (rendered towns only), all.",
+            rich_help_panel=METHOD,
         ),
     ] = PERTURB,
-    strengths: Annotated[str, typer.Option(help="From 0 to 1, with commas.")] = STRENGTHS,
+    strengths: Annotated[
+        str,
+        typer.Option(
+            metavar="NUMBERS",
+            help="Strengths of these changes, from 0 to 1, separated by commas.",
+            rich_help_panel=METHOD,
+        ),
+    ] = STRENGTHS,
     window: Annotated[
         str,
         typer.Option(
-            help="With --protocol online: how much older than its query an image must be to be "
-            "searched, in seconds (20s) or images (200)."
+            metavar="AGE",
+            help="With online: search images that are at least this much older than the query, in "
+            "seconds (20s) or images (200).",
+            rich_help_panel=METHOD,
         ),
     ] = WINDOW,
-    seed: Annotated[int, typer.Option(min=0, help="Of what is drawn.")] = 0,
-    threads: Annotated[int | None, typer.Option(min=1, help="Threads.", show_default="cores")] = (
-        None
-    ),
-    out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("loops-bench"),
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
+    seed: Seed = 0,
+    threads: AllThreads = None,
+    out: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Folder to write to.", rich_help_panel=OUTPUT)
+    ] = Path("loops-bench"),
+    quiet: Quiet = False,
 ) -> None:
-    """Precision and recall of loop detectors, on places under changes or on drives."""
+    """Measure precision and recall of loop detectors on images of places or drives."""
     from vslam.lab.loopbench.conditions import parse_conditions
     from vslam.lab.loopbench.online import parse_window
     from vslam.lab.loopbench.registry import require_comparable
@@ -107,11 +132,11 @@ def bench(
     conditions, youngest = parse_conditions(perturb, strengths), parse_window(window)
     if protocol == "online" and (perturb, strengths, seed) != (PERTURB, STRENGTHS, 0):
         raise InputError(
-            "--perturb, --strengths, --seed: change the queries of --protocol retrieval; leave "
-            "them out with online."
+            "--perturb, --strengths, --seed: only for --protocol retrieval; leave them out with "
+            "online."
         )
     if protocol == "retrieval" and window != WINDOW:
-        raise InputError("--window: is of --protocol online; add that or leave it out.")
+        raise InputError("--window: only for --protocol online; add that or leave it out.")
 
     _require_writable(out)
     from vslam.cli.console import console

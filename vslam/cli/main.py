@@ -33,7 +33,7 @@ from vslam.cli import (
     vocabulary,
 )
 from vslam.cli import map as map_
-from vslam.errors import InputError, ResultsError, did_you_mean
+from vslam.errors import InputError, ResultsError, did_you_mean, plain_reason
 from vslam.machine import keep_memory
 from vslam.plugins import reason
 from vslam.untrusted import require_utf8
@@ -45,7 +45,13 @@ _GROUPS: tuple[ModuleType, ...] = (
 
 
 class _Command(TyperCommand):
-    """A command that says of a misspelt choice which one may be meant."""
+    """A command with our own help, which suggests a name for a misspelt choice."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """See ``TyperCommand.format_help``."""
+        from vslam.cli.help import show_help
+
+        show_help(self, ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """See ``TyperCommand.parse_args``."""
@@ -57,8 +63,8 @@ class _Command(TyperCommand):
 
 
 def _plain(message: str) -> str:
-    """What the parser says of a value, without the name of the library that it has it from."""
-    message = message.removeprefix("Value error, ")
+    """What the parser says of a value, in our words and with a suggestion for a misspelt name."""
+    message = plain_reason(message)
     word, found, choices = message.partition(" is not one of ")
     if not found:
         return message

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.options import Thresholds
+from vslam.cli.options import METHOD, OUTPUT, Quiet, Thresholds
 from vslam.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
@@ -23,13 +23,17 @@ if TYPE_CHECKING:
     from vslam.maps.stored_map import StoredMap
 
 commands = typer.Typer(
-    help="Look at the maps of runs, make several one, cut parts out (docs/howto/maps.md).",
+    help="Show, merge and crop the maps of runs (docs/howto/maps.md).",
     no_args_is_help=True,
 )
 
-Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bar.")]
-Out = Annotated[Path, typer.Option(help="The map to write; it must not be there yet.")]
-MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="A map.npz, or the folder of a run.")]
+Out = Annotated[
+    Path,
+    typer.Option(
+        metavar="FILE", help="Map to write; it must not exist yet.", rich_help_panel=OUTPUT
+    ),
+]
+MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a run, or a map.npz.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -37,16 +41,16 @@ def register(app: typer.Typer) -> None:
     app.add_typer(commands, name="map")
 
 
-@commands.command(epilog="[b]Example[/b]\n\n  vslam map info runs/latest")
+@commands.command(epilog="[b]Example[/b]\n  vslam map info runs/latest")
 def info(
-    run: Annotated[Path, typer.Argument(metavar="RUN|FILE", help="Folder of a run, or a map.npz.")],
+    map_file: MapFile,
 ) -> None:
-    """Show what a map holds: keyframes, landmarks, observations, length, sub-maps, sizes."""
+    """Show what a map contains: keyframes, landmarks, length, extent and more."""
     from vslam.cli.tables import print_rows
     from vslam.maps.reconstruction import reconstruction_of
     from vslam.maps.storage import load_map, map_file_of
 
-    file = map_file_of(run)
+    file = map_file_of(map_file)
     stored = load_map(file)
     map_, camera = stored.map, stored.camera
     reconstruction = reconstruction_of(map_, camera)
@@ -107,24 +111,31 @@ def _extent(T_wc: NDArray[np.float64]) -> list[str]:
 
 
 @commands.command(
-    epilog="[b]Example[/b]\n\n  vslam map merge runs/monday runs/tuesday --out town.npz"
+    epilog="[b]Example[/b]\n  vslam map merge runs/monday runs/tuesday --out town.npz"
 )
 def merge(
     maps: Annotated[
         list[Path],
-        typer.Argument(metavar="MAP...", help="Maps, or folders of runs; the first is the world."),
+        typer.Argument(
+            metavar="MAP", help="Maps, or folders of runs; the first one gives the world frame."
+        ),
     ],
     out: Out,
     config: Thresholds = None,
     weights: Annotated[
-        Path | None, typer.Option(help="Weights of the detector that the maps were made with.")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="ONNX file of the network of the detector that made the maps.",
+            rich_help_panel=METHOD,
+        ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Make several maps one, by verified loops between them.
+    """Merge several maps into one by verified loops between them.
 
-    A map that meets no other is left out and named; if none meets the first, nothing is written
-    and the exit code is 1. The files of the maps stay as they are.
+    A map without a loop to the others is left out and named. If no map has a loop to the first
+    one, nothing is written and the exit code is 1. The files of the maps are not changed.
     """
     from vslam.cli.console import console
     from vslam.config import Config, load_config
@@ -133,7 +144,7 @@ def merge(
     from vslam.merging import Memory, merge_maps
 
     if len(maps) < 2:
-        raise InputError(f"{maps[0]}: one map alone; name two or more to make them one.")
+        raise InputError(f"{maps[0]}: this is one map; name two or more to merge.")
     _require_free(out)
     thresholds = Config() if config is None else load_config(config)
     # No camera waits: the network may see all keyframes at once.
@@ -142,13 +153,15 @@ def merge(
     files = [map_file_of(path) for path in maps]
     for number, file in enumerate(files):
         if file.resolve() in [other.resolve() for other in files[:number]]:
-            raise InputError(f"{file}: named twice; a map meets itself everywhere.")
+            raise InputError(f"{file}: named twice; a map cannot be merged with itself.")
     stored = [load_map(file) for file in files]
     if not stored[0].map.n_keyframes:
-        raise InputError(f"{files[0]}: the map is empty; name one that others can be joined to.")
+        raise InputError(f"{files[0]}: the map is empty; name one that others can be merged into.")
     name = stored[0].detector.name
     if name == "none":
-        raise InputError(f"{files[0]}: made with the detector none, which finds nothing again.")
+        raise InputError(
+            f"{files[0]}: made with the detector none, which finds no loops; name another map."
+        )
 
     def create() -> Memory:
         return detector_with_images(name, thresholds, weights)
@@ -158,45 +171,64 @@ def merge(
         with console(shown=not quiet).count_bar("keyframes", keyframes) as advance:
             merged = merge_maps(stored, thresholds, create, advance)
     except ValueError as error:
-        raise InputError(f"{files[0]} and the others are not to be merged: {error}.") from error
+        raise InputError(f"{files[0]} and the others cannot be merged: {error}.") from error
     for number in merged.joined:
         typer.echo(f"{files[number]}: joined by {len(merged.loops[number])} loops")
     for number in merged.left_out:
-        typer.echo(f"{files[number]}: left out, no verified loop leads to it; the file is kept")
+        typer.echo(f"{files[number]}: left out, no verified loop leads to it")
     if not merged.joined:
-        typer.echo("no map meets the first one: nothing was written")
+        typer.echo("no map has a loop to the first one: nothing was written")
         raise typer.Exit(1)
     _save(save_map, out, merged.stored)
 
 
 @commands.command(
-    epilog="[b]Examples[/b]\n\n  vslam map crop town.npz --box=-50,50,0,200 --out street.npz\n\n"
-    "  vslam map crop town.npz --point 20,140 --within 60 --out crossing.npz\n\n"
+    epilog="[b]Examples[/b]\n  vslam map crop town.npz --box=-50,50,0,200 --out street.npz\n"
+    "  vslam map crop town.npz --point 20,140 --within 60 --out crossing.npz\n"
     "  vslam map crop town.npz --frames 300:500 --within 10 --out way.npz"
 )
 def crop(
     map_file: MapFile,
     out: Out,
     box: Annotated[
-        str, typer.Option(metavar="X,X,Z,Z", help="Keep keyframes between two x and two z.")
+        str,
+        typer.Option(metavar="X,X,Z,Z", help="Keep the keyframes between two x and two z."),
     ] = "",
-    point: Annotated[str, typer.Option(metavar="X,Z", help="Keep those --within of it.")] = "",
+    point: Annotated[
+        str,
+        typer.Option(metavar="X,Z", help="Keep the keyframes --within a distance of this point."),
+    ] = "",
     frames: Annotated[
         str,
-        typer.Option(metavar="FIRST:LAST", help="Keep those --within of these frames' keyframes."),
+        typer.Option(
+            metavar="FIRST:LAST",
+            help="Keep the keyframes --within a distance of those of these frames.",
+        ),
     ] = "",
-    drive: Annotated[int, typer.Option(min=0, help="The drive that --frames are of.")] = 0,
-    within: Annotated[float, typer.Option(min=0.0, help="Metres, or units of the map.")] = 0.0,
+    drive: Annotated[
+        int,
+        typer.Option(
+            min=0, metavar="N", help="Number of the drive that [b]--frames[/b] refers to."
+        ),
+    ] = 0,
+    within: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            metavar="NUMBER",
+            help="Distance in metres, or in the units of a monocular map.",
+        ),
+    ] = 0.0,
 ) -> None:
-    """Cut a part out of a map: its keyframes, and the landmarks that they see.
+    """Cut out a part of a map: some keyframes and the landmarks that they see.
 
-    x is right and z ahead of the map's first camera; its height does not count.
+    x points to the right of the first camera and z ahead; the height does not matter.
     """
     from vslam.maps.crop import in_box, near_frames, near_point
     from vslam.maps.storage import load_map, map_file_of, save_map
 
     if sum(map(bool, (box, point, frames))) != 1:
-        raise InputError("--box, --point or --frames: name one of them to say what is kept.")
+        raise InputError("--box, --point, --frames: give exactly one, which says what is kept.")
     _require_free(out)
     file = map_file_of(map_file)
     stored = load_map(file)
@@ -208,7 +240,7 @@ def crop(
         first, last = _numbers("--frames", frames, 2, separator=":")
         kept = near_frames(stored.map, drive, first, last, within)
     if not len(kept):
-        raise InputError(f"{file}: no keyframe lies there; 'vslam map info' tells its extent.")
+        raise InputError(f"{file}: no keyframe lies there; 'vslam map info' shows its extent.")
     _save(save_map, out, stored.select(kept))
 
 
@@ -226,7 +258,7 @@ def _require_free(out: Path) -> None:
     from vslam.maps.new_output import require_place
 
     if out.exists():
-        raise InputError(f"{out}: exists already; remove it, or name another place with --out.")
+        raise InputError(f"{out}: exists already; remove it, or name another file with --out.")
     require_place(out, "--out")
 
 

@@ -26,45 +26,108 @@ def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
 
 _DATASETS = _with_plugins(("kitti", "euroc", "tum", "synthetic"), plugins.READERS)
 _SOURCES = ("images", "video", "bag", "camera")
-_DETECTORS = _with_plugins(
+DETECTOR_NAMES = _with_plugins(
     (
         "none", "bow", "both", "capsule", "capsule-pruned", "capsule-paper", "alexnet", "vgg16",
         "darknet19", "googlenet", "mobilenet", "squeezenet", "pcanet",
     ),
     plugins.DETECTORS,
 )  # fmt: skip
-_LAWS = _with_plugins(
-    (
-        "brightness", "gamma", "flicker", "noise", "blur", "occlusion", "fog", "rain", "night",
-        "exposure", "motion", "flare", "vignetting", "dirt", "jpeg", "resolution", "drop",
-        "outage", "bias", "contrast", "shot", "impulse", "bits", "stereo_gain", "desync",
-        "baseline", "yaw", "pitch", "black_right", "black_left",
-    ),
-    plugins.PERTURBATIONS,
-)  # fmt: skip
-
 if TYPE_CHECKING:
     SourceName = str
     DetectorName = str
 else:  # what is installed decides
     SourceName = Literal[(*_DATASETS, *_SOURCES)]
-    DetectorName = Literal[_DETECTORS]
+    DetectorName = Literal[DETECTOR_NAMES]
+# Panels of --help.
+INPUT, METHOD, MAP, OUTPUT, EXECUTION = "Input", "Method", "Map", "Output", "Execution"
+
 Perturb = Annotated[
     str,
     typer.Option(
-        help="Laws of light, weather, glass, sensor and stereo rig, each with a strength in its "
-        f"unit (docs/howto/stress.md), joined by commas: {', '.join(_LAWS)}. Example: "
-        "[b]brightness:1.5,fog:60[/b]"
+        metavar="LAWS",
+        help="Perturbations, each with a strength, such as [b]fog:60,blur:0.5[/b]; [b]vslam "
+        "perturb --list[/b] shows them all.",
+        rich_help_panel=METHOD,
     ),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of all that is random.")]
+Seed = Annotated[
+    int,
+    typer.Option(min=0, metavar="N", help="Seed of the random numbers.", rich_help_panel=METHOD),
+]
 Thresholds = Annotated[
     Path | None,
-    typer.Option("--config", help="JSON file with thresholds, as config.json of a run."),
+    typer.Option(
+        "--config",
+        metavar="FILE",
+        help="JSON file with thresholds, such as the config.json of a run.",
+        rich_help_panel=METHOD,
+    ),
 ]
 Weights = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME=FILE", help="Weights of a detector, not the shipped ones."),
+    typer.Option(
+        metavar="NAME=FILE",
+        help="Weights of a detector in place of the shipped ones; repeat for more.",
+        rich_help_panel=METHOD,
+    ),
+]
+Seeds = Annotated[
+    int,
+    typer.Option(
+        min=1, metavar="N", help="Seeds of each random perturbation.", rich_help_panel=METHOD
+    ),
+]
+Jobs = Annotated[
+    int,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="Runs at a time. Only with 1 are the frames per second comparable.",
+        rich_help_panel=EXECUTION,
+    ),
+]
+Threads = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="Threads; they do not change the result.",
+        show_default="all cores, at most 4",
+        rich_help_panel=EXECUTION,
+    ),
+]
+AllThreads = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="Threads; they do not change the result.",
+        show_default="all cores",
+        rich_help_panel=EXECUTION,
+    ),
+]
+ThreadsOfRun = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="Threads of each run.",
+        show_default="the cores shared by --jobs, at most 4",
+        rich_help_panel=EXECUTION,
+    ),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Dask scheduler, such as tcp://HOST:8786, whose workers do the runs.",
+        rich_help_panel=EXECUTION,
+    ),
+]
+Quiet = Annotated[
+    bool,
+    typer.Option("--quiet", help="Show no progress and no summary.", rich_help_panel=OUTPUT),
 ]
 SensorName = Literal["stereo", "mono", "rgbd"]
 ViewerName = Literal["native", "web"]
@@ -88,6 +151,16 @@ def kitti_root() -> str:
     return os.environ.get("KITTI_ROOT") or KITTI_ROOT
 
 
+def sequences(default: str) -> Any:
+    """The option ``--seqs`` of a command whose default is ``default``."""
+    return typer.Option(
+        metavar="LIST",
+        help="Sequences of a data set, such as 00-05 or 00,demo.",
+        show_default=f"{default}; the only one of EuRoC and TUM",
+        rich_help_panel=INPUT,
+    )
+
+
 def _source_options(
     source: Annotated[
         str | None,
@@ -96,74 +169,84 @@ def _source_options(
     data: Annotated[
         str | None,
         typer.Option(
-            help="Data set, folder of images, video, bag, number of a camera or URL, see "
-            "docs/howto/sources.md.",
-            show_default="$KITTI_ROOT or data/kitti, for KITTI alone",
+            metavar="DATA",
+            help="Data set, folder of images, video, bag, or a camera's number or URL "
+            "(docs/howto/sources.md).",
+            show_default="$KITTI_ROOT, else data/kitti",
         ),
     ] = None,
     dataset: Annotated[
         SourceName | None,
-        typer.Option(help="What it is.", show_default="detected from the files"),
+        typer.Option(
+            metavar="KIND",
+            help=f"Kind of data: {', '.join((*_DATASETS, *_SOURCES))}.",
+            show_default="detected from the files",
+        ),
     ] = None,
     seq: Annotated[
         str | None,
         typer.Option(
-            help="Sequence of a data set, 00 for example.",
-            show_default="00; of euroc and tum the only one there",
+            metavar="NAME",
+            help="Sequence of a data set.",
+            show_default="00; the only one of EuRoC and TUM",
         ),
     ] = None,
     calib: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Calibration to rectify images with, see docs/howto/cameras.md; twice for a file "
-            "of each camera, left first.",
+            metavar="FILE",
+            help="Calibration of the cameras (docs/howto/cameras.md). Give it twice for one file "
+            "per camera, the left one first.",
         ),
     ] = None,
     right: Annotated[
         Path | None,
-        typer.Option(help="Folder of the right images; [b]--data[/b] names the left ones."),
+        typer.Option(
+            metavar="FOLDER", help="Right images; [b]--data[/b] then names the left ones."
+        ),
     ] = None,
     depth: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of the depth images; [b]--data[/b] names the images they belong to."
+            metavar="FOLDER", help="Depth images; [b]--data[/b] then names the grey or colour ones."
         ),
     ] = None,
     fps: Annotated[
         float | None,
-        typer.Option(help="Frames per second of images or a video without time stamps."),
+        typer.Option(metavar="NUMBER", help="Frames per second where the data has no time stamps."),
     ] = None,
     side_by_side: Annotated[
         bool,
-        typer.Option(
-            "--side-by-side", help="Each image of the video or camera holds both sides of a pair."
-        ),
+        typer.Option("--side-by-side", help="Each image holds the left and the right one."),
     ] = False,
     topics: Annotated[
         str,
         typer.Option(
             metavar="LEFT,RIGHT",
-            help="Image topics of a bag: one with mono, COLOUR,DEPTH with rgbd.",
+            help="Image topics of a bag: one for mono, COLOUR,DEPTH for RGB-D.",
         ),
     ] = "",
     depth_scale: Annotated[
         float | None,
         typer.Option(
-            help="Units of the depth images per metre.",
-            show_default="the calibration's; of tum 5000, of a bag as its encoding says",
+            metavar="NUMBER",
+            help="Value of a depth pixel at one metre.",
+            show_default="by the calibration, data set or encoding",
         ),
     ] = None,
     sensor: Annotated[
         SensorName | None,
         typer.Option(
-            help="[b]mono[/b] reads the left camera alone; its scale is arbitrary.",
+            metavar="stereo|mono|rgbd",
+            help="Images to use. With [b]mono[/b], the left ones alone, the scale is arbitrary.",
             show_default="all that the data has",
         ),
     ] = None,
-    start: Annotated[int, typer.Option(min=0, help="First frame.")] = 0,
-    every: Annotated[int, typer.Option(min=1, help="Take every N-th frame.")] = 1,
+    start: Annotated[int, typer.Option(min=0, metavar="N", help="First frame.")] = 0,
+    every: Annotated[int, typer.Option(min=1, metavar="N", help="Use every N-th frame only.")] = 1,
     max_frames: Annotated[
-        int | None, typer.Option(min=1, help="Stop after so many frames.")
+        int | None,
+        typer.Option(min=1, metavar="N", help="Stop after N frames.", show_default="all"),
     ] = None,
 ) -> SourceOptions:
     """What the options say about the source."""
@@ -200,7 +283,7 @@ def reads_source(
         source = [p for p in _parameters(_source_options) if p.name not in without]
         own = [p for p in _parameters(command) if p.name != "given"]
         for parameter in source:
-            parameter.annotation.__metadata__[0].rich_help_panel = "Input"
+            parameter.annotation.__metadata__[0].rich_help_panel = INPUT
 
         def called(**values: Any) -> None:
             given = {parameter.name: values.pop(parameter.name) for parameter in source}

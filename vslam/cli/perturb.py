@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.console import console
-from vslam.cli.options import Perturb, Seed, open_given, reads_source
+from vslam.cli.options import OUTPUT, Perturb, Seed, open_given, reads_source
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,9 +16,8 @@ if TYPE_CHECKING:
 
 _EXAMPLE = """
 [b]Examples[/b]
-
+  vslam perturb --list
   vslam perturb --seq 00 --perturb brightness:1.5 --out sheet.png
-
   vslam perturb --seq 00 --perturb all --start 100
 """
 
@@ -33,13 +32,31 @@ def preview(
     given: SourceOptions,
     perturb: Perturb = "brightness",
     seed: Seed = 0,
-    frames: Annotated[int, typer.Option(min=1, help="Frames to show, evenly spread.")] = 8,
-    out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("perturbation.png"),
+    frames: Annotated[
+        int,
+        typer.Option(
+            min=1, metavar="N", help="Number of frames, evenly spaced.", rich_help_panel=OUTPUT
+        ),
+    ] = 8,
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="PNG file to write.", rich_help_panel=OUTPUT)
+    ] = Path("perturbation.png"),
+    list_: Annotated[
+        bool,
+        typer.Option(
+            "--list",
+            help="List the perturbations with their default strengths, and do nothing else.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = False,
 ) -> None:
-    """Preview a perturbation: the left image as it is beside both images perturbed.
+    """Show a perturbation in pictures: the left image, and both images perturbed.
 
-    [b]--perturb all[/b] shows one frame under every law at its default strength.
+    [b]--perturb all[/b] shows one frame under every perturbation at its default strength.
     """
+    if list_:
+        _list_laws()
+        return
     import cv2
     import numpy as np
 
@@ -76,3 +93,13 @@ def preview(
         ) from error
     frames_shown = ", ".join(str(given.start + given.every * frame) for frame in shown)
     typer.echo(f"{out}: {name}, seed {seed}, frames {frames_shown}")
+
+
+def _list_laws() -> None:
+    from vslam.cli.tables import show_sections
+    from vslam.datasets.perturbation import all_laws
+    from vslam.report.page import Section, Table
+
+    rows = [(name, f"{kind.default:g}", kind.unit, kind.about) for name, kind in all_laws().items()]
+    head = ("perturbation", "default", "unit", "what it does")
+    show_sections([Section("", [Table(head, rows, (head[0], *head[2:]))])])

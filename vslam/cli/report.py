@@ -7,15 +7,13 @@ from typing import Annotated
 
 import typer
 
+from vslam.cli.options import OUTPUT, Quiet
+
 _EXAMPLES = """
 [b]Examples[/b]
-
   vslam report bench
-
   vslam report runs/20261121-1* other/bench --baseline bow --out comparison
-
   vslam report runs --serve
-
   vslam report bench --trajectory ORB-SLAM3@00=orbslam3/00.txt
 """
 
@@ -26,39 +24,52 @@ def register(app: typer.Typer) -> None:
 
 
 def report(
-    runs: Annotated[list[Path], typer.Argument(help="Folders of runs, or folders of those.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="FOLDER", help="Folders of runs, at any depth."),
+    ],
     trajectory: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME[@SEQ[@PERTURB]]=FILE",
-            help="Trajectory of another system, KITTI or TUM format, to compare with; aligned as "
-            "the runs of that sequence are, or with scale if its name ends in ', mono'.",
+            metavar="NAME=FILE",
+            help="Trajectory of another system, in the format of KITTI or TUM. "
+            "NAME@SEQ@PERTURB says of which sequence and perturbation. It is aligned as the runs "
+            "of its sequence are; a name that ends in ', mono' also fits the scale.",
         ),
     ] = None,
     baseline: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Detector or system that the others are set against.",
-            show_default="the simplest",
+            help="Detector or system that the others are compared with.",
+            show_default="the simplest detector",
         ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("report"),
+    out: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Folder to write to.", rich_help_panel=OUTPUT)
+    ] = Path("report"),
     serve: Annotated[
         bool,
         typer.Option(
             "--serve",
-            help="Show a page of all runs, to be compared side by side, on this machine alone, "
-            "until Ctrl-C; nothing is written.",
+            help="Write nothing, but serve a page of all runs on this machine until Ctrl-C.",
+            rich_help_panel=OUTPUT,
         ),
     ] = False,
     port: Annotated[
         int,
-        typer.Option(min=0, max=65535, help="Of --serve.", show_default="any that is free"),
+        typer.Option(
+            min=0,
+            max=65535,
+            metavar="N",
+            help="Port of [b]--serve[/b].",
+            show_default="any free one",
+            rich_help_panel=OUTPUT,
+        ),
     ] = 0,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing.")] = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Write one report of finished runs: detectors side by side, trajectories, curves."""
+    """Compare finished runs in one report, with detectors side by side."""
     if serve:
         serve_runs(runs, port)
         return
@@ -70,11 +81,11 @@ def serve_runs(folders: list[Path], port: int) -> None:
     from vslam.lab.overview.serve import make_server
 
     with make_server(folders, port) as server:
-        typer.echo(f"http://127.0.0.1:{server.server_port}/ shows the runs; Ctrl-C ends it")
+        typer.echo(f"http://127.0.0.1:{server.server_port}/ shows the runs until Ctrl-C")
         try:
             server.serve_forever()
         except KeyboardInterrupt:
-            typer.echo("ended")
+            typer.echo("stopped")
 
 
 def write_overview_of(
@@ -85,8 +96,7 @@ def write_overview_of(
     baseline: str | None = None,
     quiet: bool,
 ) -> None:
-    """Write the report of finished runs; unless ``quiet``, show its first tables and say where it
-    is."""
+    """Write the report of finished runs; unless ``quiet``, print its first tables and its path."""
     from vslam.cli.tables import show_sections
     from vslam.lab.overview import write_overview
     from vslam.lab.overview.versus import versus

@@ -8,7 +8,21 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from vslam.cli.drive import Output, drive
-from vslam.cli.options import DetectorName, Perturb, Seed, Thresholds, ViewerName, reads_source
+from vslam.cli.options import (
+    DETECTOR_NAMES,
+    EXECUTION,
+    MAP,
+    METHOD,
+    OUTPUT,
+    DetectorName,
+    Perturb,
+    Quiet,
+    Seed,
+    Threads,
+    Thresholds,
+    ViewerName,
+    reads_source,
+)
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,25 +30,16 @@ if TYPE_CHECKING:
 
 _EXAMPLES = """
 [b]Examples[/b]
-
-  vslam run --data ~/kitti --seq 00
-
-  vslam run --data ~/kitti --seq 06 --perturb brightness:1.5,blur:0.5 --seed 3
-
   vslam run --dataset synthetic --seq demo
-
-  vslam run --data ~/kitti --seq 00 --perturb brightness --compare bow
-
-  vslam run --dataset euroc --data ~/euroc/V1_01_easy
-
-  vslam run --seq 00 --max-frames 200 --no-record --quiet
-
-  vslam run --resume runs/20261123-101500-kitti-00-none-bow
-
   vslam run drive.mp4 --side-by-side --calib stereo.yaml
-
+  vslam run --data ~/euroc/V1_01_easy
+  vslam run --data ~/kitti --seq 06 --perturb brightness:1.5,blur:0.5 --seed 3
+  vslam run --data ~/kitti --seq 00 --perturb brightness --compare bow
   vslam run --data ~/kitti --seq 00 --map runs/latest --localize
+  vslam run --resume runs/20261123-101500-kitti-00-none-bow
 """
+
+_OTHER_DETECTORS = ", ".join(name for name in DETECTOR_NAMES if name not in ("none", "both"))
 
 
 def register(app: typer.Typer) -> None:
@@ -48,87 +53,129 @@ def run(
     given: SourceOptions,
     perturb: Perturb = "none",
     seed: Seed = 0,
-    threads: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="Threads; the result does not depend on it.", show_default="cores, up to 4"
-        ),
-    ] = None,
     detector: Annotated[
         DetectorName | None,
         typer.Option(
-            help="Loop detector: [b]both[/b] is the capsule network beside the bag of words, "
-            "[b]none[/b] odometry only; those after capsule-paper need [b]--weights[/b].",
+            metavar="NAME",
+            help="Loop detector: [b]both[/b] joins the capsule network and the bag of words, "
+            f"[b]none[/b] closes no loops. Others: {_OTHER_DETECTORS}.",
             show_default="both, or that of --map",
+            rich_help_panel=METHOD,
         ),
     ] = None,
     weights: Annotated[
         Path | None,
-        typer.Option(help="ONNX file of a learned detector ([b]vslam train[/b])."),
+        typer.Option(
+            metavar="FILE",
+            help="ONNX file of the detector's network, written by [b]vslam train[/b].",
+            rich_help_panel=METHOD,
+        ),
     ] = None,
     local_weights: Annotated[
         Path | None,
         typer.Option(
-            help="ONNX file of the local descriptors that verify loops "
-            "(docs/research/local_descriptors.md)."
+            metavar="FILE",
+            help="ONNX file of the local descriptors that verify loops.",
+            rich_help_panel=METHOD,
         ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Where the folders of the runs go.")] = Path("runs"),
     config: Thresholds = None,
     compare: Annotated[
         str,
         typer.Option(
-            metavar="DETECTORS",
-            help="Loop detectors to run beside it on the same frames, joined by commas, each with "
-            "a map of its own: a table of all. [b]none[/b] is odometry only.",
+            metavar="NAMES",
+            help="Other loop detectors to run on the same frames, separated by commas, and to "
+            "compare in one table.",
+            rich_help_panel=METHOD,
         ),
     ] = "",
     map_file: Annotated[
         Path | None,
-        typer.Option(
-            "--map", metavar="FILE", help="Go on in this map, the map.npz of a run for example."
-        ),
+        typer.Option("--map", metavar="FILE", help="Continue this map.", rich_help_panel=MAP),
     ] = None,
     localize: Annotated[
         bool,
-        typer.Option("--localize", help="Only track in the map of --map; it stays as it is."),
+        typer.Option(
+            "--localize", help="Track in the map without changing it.", rich_help_panel=MAP
+        ),
     ] = False,
     save_map: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write the map to this file, too, in place of another."),
+        typer.Option(
+            metavar="FILE",
+            help="Save the map to this file too, and replace what is there.",
+            rich_help_panel=MAP,
+        ),
     ] = None,
     autosave: Annotated[
         float,
         typer.Option(
-            min=0, metavar="SECONDS", help="What a killed run loses at most; 0 saves at the end."
+            min=0,
+            metavar="SECONDS",
+            help="Save the map this often; 0 saves it at the end only.",
+            rich_help_panel=MAP,
         ),
     ] = 60.0,
     resume: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Go on at the next frame of a run that was cut off.",
+            help="Continue a run that was interrupted.",
+            rich_help_panel=MAP,
         ),
     ] = None,
+    threads: Threads = None,
     realtime: Annotated[
         bool,
-        typer.Option("--realtime", help="Play frames at their times; drop overtaken ones."),
+        typer.Option(
+            "--realtime",
+            help="Play the frames at their times and drop those that come too fast.",
+            rich_help_panel=EXECUTION,
+        ),
     ] = False,
-    record: Annotated[bool, typer.Option(help="Write a Rerun recording.")] = True,
     view: Annotated[
         ViewerName | None,
-        typer.Option(help="Show the run live in Rerun, in a window or in the browser, too."),
+        typer.Option(
+            metavar="native|web",
+            help="Show the run live in Rerun, in a window or in a browser on this machine.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
+    keep_open: Annotated[
+        bool,
+        typer.Option(
+            "--keep-open",
+            help="Keep the page of [b]--view web[/b] open until Ctrl-C.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = False,
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="FOLDER", help="Folder that gets a folder for each run.", rich_help_panel=OUTPUT
+        ),
+    ] = Path("runs"),
+    record: Annotated[
+        bool,
+        typer.Option(
+            "--record/--no-record",
+            help="Write a Rerun recording, or none.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = True,
     pages: Annotated[
         bool,
         typer.Option(
             "--report/--no-report",
-            help="Write report.html, report.md and figures; without, of the report only its JSON, "
-            "which is all that [b]vslam report[/b] needs of a run.",
+            help="Write a report with figures, or report.json alone.",
+            rich_help_panel=OUTPUT,
         ),
     ] = True,
-    ply: Annotated[bool, typer.Option("--ply", help="Write the landmarks as map.ply.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
+    ply: Annotated[
+        bool,
+        typer.Option("--ply", help="Write the landmarks as map.ply.", rich_help_panel=OUTPUT),
+    ] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Run SLAM on a sequence and write trajectory, map, recording and report to a folder."""
     from vslam.loopclosure.registry import DEFAULT_DETECTOR, require_detector
@@ -137,7 +184,12 @@ def run(
         from vslam.maps.new_output import require_place
 
         require_place(save_map, "--save-map")
-    output = Output(record=record, view=view, pages=pages, ply=ply, save_map=save_map, quiet=quiet)
+    if keep_open and view != "web":
+        raise InputError("--keep-open: only for --view web; a window stays open by itself.")
+    output = Output(
+        record=record, view=view, keep_open=keep_open, pages=pages, ply=ply, save_map=save_map,
+        quiet=quiet,
+    )  # fmt: skip
     if resume is not None:
         _refuse_beside_resume(context)
         from vslam.run.options import resumed_options
@@ -185,7 +237,7 @@ def run(
     drive(options, output, out=out)
 
 
-_BESIDE_RESUME = {"resume", "record", "view", "pages", "ply", "save_map", "quiet"}
+_BESIDE_RESUME = {"resume", "record", "view", "keep_open", "pages", "ply", "save_map", "quiet"}
 
 
 def _refuse_beside_resume(context: typer.Context) -> None:

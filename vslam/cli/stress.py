@@ -12,8 +12,22 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from vslam.cli.bench import absolute, cell_options, identity_of, open_all, outcomes_of
-from vslam.cli.options import Thresholds, kind_of_source, names_in, open_given, reads_source
-from vslam.errors import InputError
+from vslam.cli.options import (
+    METHOD,
+    OUTPUT,
+    Jobs,
+    Quiet,
+    Scheduler,
+    Seeds,
+    ThreadsOfRun,
+    Thresholds,
+    kind_of_source,
+    names_in,
+    open_given,
+    reads_source,
+    sequences,
+)
+from vslam.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from vslam.datasets.frames import Source
@@ -23,19 +37,15 @@ if TYPE_CHECKING:
 
 _EXAMPLES = """
 [b]Examples[/b]
+  vslam stress --data ~/kitti --seqs 00 --laws fog,rain,night --jobs 2
+  vslam stress --dataset synthetic --seqs demo --detectors bow,capsule,both
+  vslam stress --seqs 00 --systems vslam,orbslam3 --vocabulary voc.txt
+  vslam stress --seqs 00 --preset kitti-c --detectors bow,both
 
-  vslam stress --data ~/kitti --seqs 00 --max-frames 216 --laws fog,rain,night --jobs 2
-
-  vslam stress --dataset synthetic --seqs demo --laws all --detectors bow,capsule,both
-
-  vslam stress --seqs 00 --systems vslam,orbslam3 --orbslam3-python ~/orb/bin/python \\
-      --vocabulary voc.txt
-
-  vslam stress --seqs 00 --preset kitti-c --baseline bow
-
-The same command again goes on where it was stopped. docs/howto/stress.md tells more.
+The same command continues a stress test that was stopped (docs/howto/stress.md).
 """
 _ORBSLAM3 = "orbslam3"
+_FAILURE = "Failure"  # a panel of --help
 
 
 def register(app: typer.Typer) -> None:
@@ -47,69 +57,122 @@ def register(app: typer.Typer) -> None:
 @reads_source(without=("seq", "start", "every"))
 def stress(
     given: SourceOptions,
-    seqs: Annotated[
-        str | None,
-        typer.Option(
-            help="Sequences of a data set, 00-05 or 00,demo for example.",
-            show_default="00; of euroc and tum the only one there",
-        ),
-    ] = None,
+    seqs: Annotated[str | None, sequences("00")] = None,
     laws: Annotated[
-        str, typer.Option(help="Laws without strengths, with commas, or [b]all[/b].")
+        str,
+        typer.Option(
+            metavar="NAMES",
+            help="Perturbations to test, without strengths ([b]vslam perturb --list[/b]).",
+            rich_help_panel=METHOD,
+        ),
     ] = "all",
-    detectors: Annotated[str, typer.Option(help="Loop detectors of vslam, with commas.")] = "both",
+    detectors: Annotated[
+        str,
+        typer.Option(
+            metavar="NAMES",
+            help="Loop detectors of vslam, separated by commas.",
+            rich_help_panel=METHOD,
+        ),
+    ] = "both",
     systems: Annotated[
-        str, typer.Option(help="[b]vslam[/b], [b]orbslam3[/b], names of --system, with commas.")
+        str,
+        typer.Option(
+            metavar="NAMES",
+            help="Systems to test: [b]vslam[/b], [b]orbslam3[/b] and those of --system.",
+            rich_help_panel=METHOD,
+        ),
     ] = "vslam",
     system: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=COMMAND",
-            help="Another system: a command with {folder}, in KITTI's format, and {out}, see "
-            "docs/howto/stress.md.",
+            help="Another system: a command that reads {folder}, in KITTI's format, and writes "
+            "{out} (docs/howto/stress.md).",
+            rich_help_panel=METHOD,
         ),
     ] = None,
     orbslam3_python: Annotated[
-        Path | None, typer.Option(help="Interpreter that has pyorbslam3.", show_default="this one")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Python interpreter that has pyorbslam3.",
+            show_default="this one",
+            rich_help_panel=METHOD,
+        ),
     ] = None,
     vocabulary: Annotated[
-        Path | None, typer.Option(help="Vocabulary of ORB-SLAM3, DBoW2's text format.")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Vocabulary of ORB-SLAM3, in DBoW2's text format.",
+            rich_help_panel=METHOD,
+        ),
     ] = None,
     preset: Annotated[
         Literal["kitti-c"] | None,
-        typer.Option(help="Fixed severities of a benchmark instead of --laws."),
+        typer.Option(
+            metavar="kitti-c",
+            help="Test the fixed severities of a published benchmark in place of --laws.",
+            rich_help_panel=METHOD,
+        ),
     ] = None,
     baseline: Annotated[
         str | None,
-        typer.Option(help="System that errors of a preset are set against.", show_default="first"),
-    ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Seeds of each random law.")] = 3,
-    steps: Annotated[int, typer.Option(min=1, max=10, help="Halvings of each bisection.")] = 5,
-    max_lost: Annotated[
-        float, typer.Option(min=0.0, help="Percent of the frames that may be lost.")
-    ] = 5.0,
-    ate_factor: Annotated[
-        float, typer.Option(min=1.0, help="Times the clean ATE that a run may have.")
-    ] = 3.0,
-    ate_least: Annotated[
-        float, typer.Option(min=0.0, help="Metres of ATE below which no run fails by it.")
-    ] = 0.25,
-    jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 1,
-    threads: Annotated[
-        int | None,
         typer.Option(
-            min=1, help="Threads of each run.", show_default="cores for each job, up to 4"
+            metavar="NAME",
+            help="Detector or system that the errors of a preset are divided by.",
+            show_default="the first",
+            rich_help_panel=METHOD,
         ),
     ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(help="Dask scheduler, tcp://HOST:8786, whose workers run the cells."),
-    ] = None,
+    seeds: Seeds = 3,
+    steps: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            max=10,
+            metavar="N",
+            help="Bisection steps of each search.",
+            rich_help_panel=METHOD,
+        ),
+    ] = 5,
+    max_lost: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            metavar="PERCENT",
+            help="A run fails if it loses more than this share of its frames.",
+            rich_help_panel=_FAILURE,
+        ),
+    ] = 5.0,
+    ate_factor: Annotated[
+        float,
+        typer.Option(
+            min=1.0,
+            metavar="NUMBER",
+            help="A run fails if its ATE exceeds that of the clean run by this factor.",
+            rich_help_panel=_FAILURE,
+        ),
+    ] = 3.0,
+    ate_least: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            metavar="METRES",
+            help="An ATE below this one is never a failure.",
+            rich_help_panel=_FAILURE,
+        ),
+    ] = 0.25,
     config: Thresholds = None,
-    out: Annotated[Path, typer.Option(help="Folder of the stress test.")] = Path("stress"),
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing while it runs.")] = False,
+    jobs: Jobs = 1,
+    threads: ThreadsOfRun = None,
+    scheduler: Scheduler = None,
+    out: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Folder to write to.", rich_help_panel=OUTPUT)
+    ] = Path("stress"),
+    quiet: Quiet = False,
 ) -> None:
-    """Find the strength of each perturbation at which a run fails, and report on it."""
+    """Find the strength of each perturbation at which a run fails."""
     from vslam.cli.console import console
     from vslam.cli.tables import show_sections
     from vslam.datasets.frames import first_frames
@@ -129,11 +192,14 @@ def stress(
     if clash := [name for name in chosen if name in others]:
         raise InputError(f"--system {clash[0]}: a detector of this test has that name; rename it.")
     if not names:
-        raise InputError("--systems: no system; name vslam, orbslam3 or one of --system.")
+        raise InputError("--systems: names no system; name vslam, orbslam3 or one of --system.")
     if baseline is not None and baseline not in names:
-        raise InputError(f"--baseline {baseline}: not tested; choose from {', '.join(names)}.")
+        raise InputError(
+            f"--baseline {baseline}: not tested{did_you_mean(baseline, names)}; choose from "
+            f"{', '.join(names)}."
+        )
     if given.sensor == "mono" and others:
-        raise InputError("--sensor mono: of vslam alone; other systems get both sides.")
+        raise InputError("--sensor mono: only vslam runs so; other systems read both cameras.")
     out = out.absolute()
     kind = kind_of_source(given)
     given = absolute(given)
@@ -175,7 +241,7 @@ def stress(
     write_report(out, report, {name: first_frames(source) for name, source in opened.items()})
     if not quiet:
         show_sections(boundary_sections(report))
-        ended = f"{len(report.boundaries)} of {len(searches)} searches ended"
+        ended = f"{len(report.boundaries)} of {len(searches)} searches finished"
         typer.echo(f"{out / 'report.html'}: {ended}")
     if stopped or len(report.boundaries) < len(searches):
         raise typer.Exit(1)
@@ -238,13 +304,14 @@ def _others(
             )
         interpreter = python or Path(sys.executable)
         if not interpreter.exists():
-            raise InputError(f"--orbslam3-python {interpreter}: not there.")
+            raise InputError(f"--orbslam3-python {interpreter}: no such file; name an interpreter.")
         words = [interpreter.absolute(), Path(orbslam3.__file__), vocabulary.absolute()]
         templates[_ORBSLAM3] = f"{shlex.join(map(str, words))} {{folder}} {{out}}"
     for name in systems:
         if name != "vslam" and name not in templates:
             raise InputError(
-                f"--systems {name}: unknown; name vslam, orbslam3, or give --system {name}=COMMAND."
+                f"--systems {name}: unknown{did_you_mean(name, ('vslam', _ORBSLAM3, *templates))}; "
+                f"name vslam, orbslam3, or give --system {name}=COMMAND."
             )
     return {name: templates[name] for name in [*systems, *templates] if name in templates}
 

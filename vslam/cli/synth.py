@@ -7,27 +7,21 @@ from typing import Annotated
 
 import typer
 
+from vslam.cli.options import OUTPUT, Quiet, Threads
 from vslam.errors import InputError
 
 _EXAMPLES = """
 [b]Examples[/b]
-
   vslam synth --list
-
   vslam synth 05 --change 0.5 --dynamic 6
-
   vslam synth mine --trajectory poses/07.txt --calibration 04-12
-
   vslam synth block --side-by-side block.mkv
-
   vslam synth block --fisheye --out fisheye
-
   vslam synth demo --rgbd --out rgbd
-
   vslam synth demo --pairs 1000 --aliased --change 0.8 --out pairs
-
   vslam synth 05 --pairs 500 --lateral=-3.2:1.4 --heading 0:30 --out pairs
 """
+_DRIVE, _TOWN, _PAIRS = "Drive", "Town", "Pairs of images"  # panels of --help
 
 
 def register(app: typer.Typer) -> None:
@@ -36,84 +30,155 @@ def register(app: typer.Typer) -> None:
 
 
 def synth(
-    route: Annotated[str, typer.Argument(help="Built-in route, or a name for --trajectory.")] = "",
+    route: Annotated[
+        str, typer.Argument(help="Built-in route, or a name for that of --trajectory.")
+    ] = "",
     trajectory: Annotated[
-        Path | None, typer.Option(help="KITTI poses to drive along, at 10 Hz.")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Poses in KITTI's format, 10 per second, to drive along.",
+            rich_help_panel=_DRIVE,
+        ),
     ] = None,
     calibration: Annotated[
         str,
         typer.Option(
-            metavar="NN",
-            help="Camera of which KITTI sequences, with --trajectory: 00-02, 03 or 04-12.",
+            metavar="00-02|03|04-12",
+            help="KITTI sequences whose cameras drive along --trajectory.",
+            rich_help_panel=_DRIVE,
         ),
     ] = "00-02",
     max_frames: Annotated[
-        int | None, typer.Option(min=1, help="Render only so many frames; more can follow later.")
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Stop after N frames; a later command can render the others.",
+            show_default="all",
+            rich_help_panel=_DRIVE,
+        ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the town.")] = 0,
-    aliased: Annotated[bool, typer.Option("--aliased", help="Few facades, again and again.")] = (
-        False
-    ),
-    dynamic: Annotated[int, typer.Option(min=0, help="Number of moving cars.")] = 0,
+    seed: Annotated[
+        int,
+        typer.Option(min=0, metavar="N", help="Seed of the random numbers.", rich_help_panel=_TOWN),
+    ] = 0,
+    aliased: Annotated[
+        bool,
+        typer.Option(
+            "--aliased",
+            help="Repeat a few facades, so that places look alike.",
+            rich_help_panel=_TOWN,
+        ),
+    ] = False,
+    dynamic: Annotated[
+        int,
+        typer.Option(min=0, metavar="N", help="Number of moving cars.", rich_help_panel=_TOWN),
+    ] = 0,
     change: Annotated[
         float,
-        typer.Option(min=0, max=1, help="Change between passes; above 0.7 it grows dark."),
+        typer.Option(
+            min=0,
+            max=1,
+            metavar="0-1",
+            help="How much the town changes between two passes; above 0.7 it grows dark.",
+            rich_help_panel=_TOWN,
+        ),
     ] = 0.0,
-    depth: Annotated[bool, typer.Option("--depth", help="Write 16-bit depth (cm), too.")] = False,
+    depth: Annotated[
+        bool,
+        typer.Option(
+            "--depth",
+            help="Also write 16-bit depth images in centimetres.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = False,
     side_by_side: Annotated[
         Path | None,
         typer.Option(
             metavar="VIDEO",
-            help="Write both cameras' images as one video without loss, too, with its calibration.",
+            help="Also write a lossless video with both images in each frame, and its calibration.",
+            rich_help_panel=OUTPUT,
         ),
     ] = None,
     fisheye: Annotated[
         bool,
         typer.Option(
             "--fisheye",
-            help="Write an unrectified fisheye pair in EuRoC's layout with Kalibr's camchain.yaml.",
+            help="Write unrectified fisheye images in EuRoC's layout, with Kalibr's camchain.yaml.",
+            rich_help_panel=OUTPUT,
         ),
     ] = False,
     rgbd: Annotated[
         bool,
-        typer.Option("--rgbd", help="Write images with depth in TUM's layout; stereo/ beside."),
+        typer.Option(
+            "--rgbd",
+            help="Write images with depth in TUM's layout, and the stereo pairs beside.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = False,
     pairs: Annotated[
-        int, typer.Option(min=0, help="Render so many labelled pairs for training instead.")
+        int,
+        typer.Option(
+            min=0,
+            metavar="N",
+            help="Render N labelled pairs of images to train on, and no sequence.",
+            rich_help_panel=_PAIRS,
+        ),
     ] = 0,
     lateral: Annotated[
         str,
         typer.Option(
             metavar="LOW:HIGH",
-            help="With --pairs: metres that second views are moved to the right; -3.2 is the "
-            "other lane.",
+            help="Metres that the second view is moved to the right; -3.2 is the other lane.",
+            rich_help_panel=_PAIRS,
         ),
     ] = "-1.4:1.4",
     heading: Annotated[
         str,
         typer.Option(
-            metavar="LOW:HIGH", help="With --pairs: degrees that they are turned, to either side."
+            metavar="LOW:HIGH",
+            help="Degrees that the second view is turned to either side.",
+            rich_help_panel=_PAIRS,
         ),
     ] = "0:14",
     out: Annotated[
-        Path | None, typer.Option(help="Folder to write to.", show_default="user's cache")
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Folder to write to.",
+            show_default="the user's cache",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
-    list_: Annotated[bool, typer.Option("--list", help="List routes and what is rendered.")] = (
-        False
-    ),
+    list_: Annotated[
+        bool,
+        typer.Option(
+            "--list",
+            help="List the routes and what has been rendered, and do nothing else.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = False,
     clean: Annotated[
-        bool, typer.Option("--clean", help="Remove what is rendered, of ROUTE or all.")
+        bool,
+        typer.Option(
+            "--clean",
+            help="Remove what has been rendered, of ROUTE or of all routes.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = False,
     verify: Annotated[
         bool,
-        typer.Option("--verify", help="Compare all checksums; render damaged frames again."),
+        typer.Option(
+            "--verify",
+            help="Compare all checksums and render damaged frames again.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = False,
-    threads: Annotated[
-        int | None, typer.Option(min=1, help="Threads; the bytes do not depend on it.")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
+    threads: Threads = None,
+    quiet: Quiet = False,
 ) -> None:
-    """Render a town in KITTI format, with exact ground truth."""
+    """Render a drive through a town in KITTI's format, with exact ground truth."""
     from vslam.cli.console import console
     from vslam.datasets.synthetic import (
         DRIVES,
@@ -146,7 +211,7 @@ def synth(
         typer.echo(f"{cache}: {freed / 1e6:.0f} MB removed")
         return
     if side_by_side is not None and (pairs or fisheye):
-        raise InputError("--side-by-side: a video of a sequence; leave out --pairs and --fisheye.")
+        raise InputError("--side-by-side: writes a sequence; leave out --pairs and --fisheye.")
     if not route:
         raise InputError(f"vslam synth: name a route, one of {', '.join(ROUTES)}, or --list.")
     drive = (
@@ -220,5 +285,5 @@ def _range(option: str, given: str, least: float) -> tuple[float, float]:
     except ValueError as error:
         raise InputError(f"{option} {given}: must be LOW:HIGH, two numbers.") from error
     if not least <= found[0] <= found[1] <= 45.0:
-        raise InputError(f"{option} {given}: must not fall, from {least:g} on.")
+        raise InputError(f"{option} {given}: must be two rising numbers from {least:g} to 45.")
     return found

@@ -9,11 +9,12 @@ from __future__ import annotations
 import time
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import typer
 
 from vslam.cli.export import commands as export
+from vslam.cli.options import EXECUTION, INPUT, METHOD, OUTPUT, AllThreads, Quiet
 
 if TYPE_CHECKING:
     from vslam.loopclosure.training.data import Collection
@@ -22,23 +23,17 @@ if TYPE_CHECKING:
 
 _TRAIN_EXAMPLES = """
 [b]Examples[/b]
-
-  vslam train capsule --data "kitti:~/kitti\\[seq=00,first=250,last=1500]" --data photos:~/places
-
-  vslam train capsule --data pairs:town1 --data pairs:town2 --preset best --device cuda
-
+  vslam train capsule --data "kitti:~/kitti\\[seq=00,first=250,last=1500]"
+  vslam train capsule --data pairs:town1 --data pairs:town2 --preset best
   vslam train capsule --data pairs:town1 --out training/capsule --resume
-
-  vslam train capsule-pruned --weights training/capsule/capsule.safetensors --data pairs:town1
+  vslam train capsule-pruned --weights capsule.safetensors --data pairs:town1
 """
 _EXPORT_EXAMPLES = """
 [b]Example[/b]
-
   vslam export onnx --weights training/capsule/capsule.safetensors
 """
 _PLACES_EXAMPLES = """
 [b]Example[/b]
-
   vslam export places --data "kitti:~/kitti\\[first=250,last=1500]" --data photos:~/places
 """
 
@@ -52,76 +47,153 @@ NetworkName = Literal[
     "capsule", "capsule-pruned", "capsule-paper", "alexnet", "vgg16", "darknet19", "googlenet",
     "mobilenet", "squeezenet", "pcanet",
 ]  # fmt: skip
+NETWORK_NAMES = get_args(NetworkName)
 PresetName = Literal["paper", "best", "pretrained", "rivals"]
 DeviceName = Literal["cpu", "cuda"]
 FitName = Literal["squash", "crop"]
 DataSources = Annotated[
     list[str],
     typer.Option(
-        "--data", help="Source of images, [b]KIND:PATH\\[options][/b]; again for more. Kinds: "
-        "kitti, fabmap, pairs, photos, pack (docs/howto/training.md).",
+        "--data",
+        metavar="KIND:PATH",
+        help="Source of images: kitti, fabmap, pairs, photos or pack, with options in brackets "
+        "(docs/howto/training.md). Repeat for more.",
+        rich_help_panel=INPUT,
     ),
-]  # fmt: skip
+]
 
 
 def train(
-    network: Annotated[NetworkName, typer.Argument(help="What to train.", show_default=False)],
+    network: Annotated[
+        NetworkName,
+        typer.Argument(
+            metavar="NETWORK",
+            help=f"Network to train: {', '.join(NETWORK_NAMES)}.",
+            show_default=False,
+        ),
+    ],
     data: DataSources,
     preset: Annotated[
         PresetName,
         typer.Option(
-            help="Settings; [b]paper[/b]'s, better ones, or one recipe for all "
-            "(docs/research/rivals.md)."
+            metavar="NAME",
+            help="Settings: [b]paper[/b] as published, [b]best[/b], [b]pretrained[/b], or "
+            "[b]rivals[/b], one recipe for all networks (docs/research/rivals.md).",
+            rich_help_panel=METHOD,
         ),
     ] = "paper",
     settings: Annotated[
-        Path | None, typer.Option(help="JSON with settings, instead of the preset's.")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="JSON file with settings in place of a preset.",
+            rich_help_panel=METHOD,
+        ),
     ] = None,
-    epochs: Annotated[int | None, typer.Option(min=1, help="At most so many.")] = None,
-    pairs: Annotated[int | None, typer.Option(min=2, help="Pairs of an epoch.")] = None,
+    epochs: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Greatest number of epochs.",
+            show_default="of the settings",
+            rich_help_panel=METHOD,
+        ),
+    ] = None,
+    pairs: Annotated[
+        int | None,
+        typer.Option(
+            min=2,
+            metavar="N",
+            help="Pairs of images in each epoch.",
+            show_default="of the settings",
+            rich_help_panel=METHOD,
+        ),
+    ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, help="Of all that is random.", show_default="that of the settings"),
-    ] = None,
-    device: Annotated[DeviceName, typer.Option(help="Where to train.")] = "cpu",
-    threads: Annotated[
-        int | None, typer.Option(min=1, help="Threads.", show_default="cores")
+        typer.Option(
+            min=0,
+            metavar="N",
+            help="Seed of the random numbers.",
+            show_default="of the settings",
+            rich_help_panel=METHOD,
+        ),
     ] = None,
     weights: Annotated[
         Path | None,
         typer.Option(
-            help="Network to start from; for capsule-pruned and capsule-paper the one to prune; "
-            "for alexnet and vgg16 a weight file of torchvision."
+            metavar="FILE",
+            help="Network to start from: the one to prune for capsule-pruned and capsule-paper, "
+            "a file of torchvision for alexnet and vgg16.",
+            rich_help_panel=METHOD,
         ),
     ] = None,
     pixels: Annotated[
         str | None,
         typer.Option(
-            metavar="SIDE|HEIGHTxWIDTH",
+            metavar="SIDE|HxW",
             help="Size of the images; smaller ones train faster.",
+            rich_help_panel=METHOD,
         ),
     ] = None,
     prune_share: Annotated[
         float | None,
-        typer.Option(min=0.01, max=0.99, help="Share of the capsules that pruning removes."),
+        typer.Option(
+            min=0.01,
+            max=0.99,
+            metavar="SHARE",
+            help="Share of the capsules that pruning removes.",
+            show_default="of the settings",
+            rich_help_panel=METHOD,
+        ),
+    ] = None,
+    allow_test_data: Annotated[
+        bool,
+        typer.Option(
+            "--allow-test-data",
+            help="Also train on the frames that are kept for testing.",
+            rich_help_panel=METHOD,
+        ),
+    ] = False,
+    device: Annotated[
+        DeviceName,
+        typer.Option(metavar="cpu|cuda", help="Where to train.", rich_help_panel=EXECUTION),
+    ] = "cpu",
+    threads: AllThreads = None,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Continue from the checkpoint in [b]--out[/b].",
+            rich_help_panel=EXECUTION,
+        ),
+    ] = False,
+    max_minutes: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            metavar="NUMBER",
+            help="Stop after this time with a checkpoint.",
+            rich_help_panel=EXECUTION,
+        ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder to write to.", show_default="training/NETWORK-PRESET"),
+        typer.Option(
+            metavar="FOLDER",
+            help="Folder to write to.",
+            show_default="training/NETWORK-PRESET",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")
-    ] = False,
-    max_minutes: Annotated[
-        float | None, typer.Option(min=0, help="Stop after so long, with a checkpoint.")
-    ] = None,
-    allow_test_data: Annotated[
-        bool, typer.Option("--allow-test-data", help="Train on the frames kept for testing.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Train a loop detector; writes weights (.safetensors to go on from, .onnx for runs), log,
-    pairs, checkpoints and a model card."""
+    """Train a loop detector.
+
+    Writes weights (.safetensors to continue from, .onnx for runs), a log, the pairs, checkpoints
+    and a model card.
+    """
     _require_libraries("train")
     from vslam.loopclosure.siamese.images import parse_size
     from vslam.loopclosure.siamese.source_registry import open_source
@@ -166,7 +238,7 @@ def train(
     if quiet:
         return
     if not outcome.finished:
-        typer.echo(f"{folder}: stopped in epoch {outcome.progress.epoch}; go on with --resume")
+        typer.echo(f"{folder}: stopped in epoch {outcome.progress.epoch}; --resume continues")
         return
     for name, value in outcome.figures.items():
         typer.echo(f"{name:<28}{value:.4f}")
@@ -196,7 +268,9 @@ def _refuse_of_pcanet(given: dict[str, object]) -> None:
     from vslam.errors import InputError
 
     for option in (name for name, value in given.items() if value is not None):
-        raise InputError(f"vslam train pcanet: learns once, not in epochs; leave out {option}.")
+        raise InputError(
+            f"vslam train pcanet: learns in one step, without epochs; leave out {option}."
+        )
 
 
 def _train(
@@ -247,12 +321,23 @@ def _train(
 
 @export.command("onnx", epilog=_EXPORT_EXAMPLES)
 def onnx(
-    weights: Annotated[Path, typer.Option(help="Weights, .safetensors.")],
+    weights: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE", help="Weights of a training, .safetensors.", rich_help_panel=INPUT
+        ),
+    ],
     out: Annotated[
-        Path | None, typer.Option(help="File to write.", show_default="WEIGHTS as .onnx")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="File to write.",
+            show_default="as --weights, with .onnx",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
 ) -> None:
-    """Write the ONNX file that runs use, and check it against torch."""
+    """Write the ONNX file that runs use and compare its output with torch's."""
     _require_libraries("export onnx")
     from vslam.loopclosure.training.export import export_onnx
     from vslam.loopclosure.training.siamese import load_network
@@ -269,10 +354,18 @@ def onnx(
 
 @export.command("weights")
 def weights_(
-    weights: Annotated[Path, typer.Option(help="Weights of a training, .safetensors.")],
-    out: Annotated[Path, typer.Option(help="File to write, .safetensors.")],
+    weights: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE", help="Weights of a training, .safetensors.", rich_help_panel=INPUT
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(metavar="FILE", help="File to write, .safetensors.", rich_help_panel=OUTPUT),
+    ],
 ) -> None:
-    """Write weights in half precision, with model card and ONNX file, as vslam ships them."""
+    """Write weights as vslam ships them: in half precision, with model card and ONNX file."""
     _require_libraries("export weights")
     import shutil
 
@@ -298,14 +391,21 @@ def weights_(
 def places(
     data: DataSources,
     fit: Annotated[
-        FitName, typer.Option(help="The whole view [b]squash[/b]ed into a square, or its middle.")
+        FitName,
+        typer.Option(
+            metavar="squash|crop",
+            help="Squash the whole image into a square, or crop its middle.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = "squash",
     pixels: Annotated[
-        str, typer.Option(metavar="SIDE|HEIGHTxWIDTH", help="Size of the images.")
+        str, typer.Option(metavar="SIDE|HxW", help="Size of the images.", rich_help_panel=OUTPUT)
     ] = "227",
-    out: Annotated[Path, typer.Option(help="File to write.")] = Path("places.npz"),
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="File to write.", rich_help_panel=OUTPUT)
+    ] = Path("places.npz"),
 ) -> None:
-    """Write sources of images as one small file, for training on another machine."""
+    """Pack images into one small file for training on another machine."""
     from vslam.loopclosure.siamese.images import parse_size
     from vslam.loopclosure.siamese.pack import write_pack
     from vslam.loopclosure.siamese.source_registry import open_source

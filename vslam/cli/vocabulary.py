@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from vslam.cli.options import OUTPUT, Quiet, Seed
 from vslam.errors import InputError, UnreadableImageError
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 _IMAGES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
 
 commands = typer.Typer(
-    help="Train, convert and look at vocabularies of visual words.", no_args_is_help=True
+    help="Train, convert and show vocabularies of visual words.", no_args_is_help=True
 )
 
 
@@ -30,20 +31,28 @@ def register(app: typer.Typer) -> None:
 
 
 @commands.command(
-    epilog="[b]Examples[/b]\n\n  vslam vocabulary train photos kitti/sequences/01/image_0"
-    "\n\n  vslam vocabulary train 'photos/*/*.jpg' --levels 6 --out mine.npz"
+    epilog="[b]Examples[/b]\n  vslam vocabulary train photos kitti/sequences/01/image_0"
+    "\n  vslam vocabulary train 'photos/*/*.jpg' --levels 6 --out mine.npz"
 )
 def train(
-    images: Annotated[list[str], typer.Argument(help="Image files, folders or globs.")],
-    k: Annotated[int, typer.Option(min=2, max=20, help="Children of a node.")] = 10,
-    levels: Annotated[int, typer.Option(min=1, max=10, help="Levels: k^levels words.")] = 5,
-    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same words.")] = 0,
-    out: Annotated[Path, typer.Option(help="File to write, .npz or .txt.")] = Path(
-        "vocabulary.npz"
-    ),
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
+    images: Annotated[
+        list[str], typer.Argument(metavar="IMAGES", help="Image files, folders or globs.")
+    ],
+    k: Annotated[int, typer.Option(min=2, max=20, metavar="N", help="Children of each node.")] = 10,
+    levels: Annotated[
+        int,
+        typer.Option(
+            min=1, max=10, metavar="N", help="Levels of the tree, which gets k^levels words."
+        ),
+    ] = 5,
+    seed: Seed = 0,
+    out: Annotated[
+        Path,
+        typer.Option(metavar="FILE", help="File to write, .npz or .txt.", rich_help_panel=OUTPUT),
+    ] = Path("vocabulary.npz"),
+    quiet: Quiet = False,
 ) -> None:
-    """Train a vocabulary on images: better on many places than on many views of one."""
+    """Train a vocabulary on images, best of many different places."""
     from vslam.cli.console import console
     from vslam.config import OrbConfig
     from vslam.loopclosure import vocabulary_training
@@ -51,7 +60,7 @@ def train(
 
     is_text(out)  # refuse what cannot be written before the work, not after
     if not out.parent.is_dir():
-        raise InputError(f"{out}: there is no folder {out.parent}; make it or choose another.")
+        raise InputError(f"{out}: there is no folder {out.parent}; create it or choose another.")
     paths = _find(images)
     descriptors, unreadable = [], 0
     shown = console(shown=not quiet)
@@ -82,12 +91,12 @@ def train(
     )
 
 
-@commands.command(epilog="[b]Example[/b]\n\n  vslam vocabulary convert ORBvoc.txt orbvoc.npz")
+@commands.command(epilog="[b]Example[/b]\n  vslam vocabulary convert ORBvoc.txt orbvoc.npz")
 def convert(
     source: Annotated[Path, typer.Argument(help="Vocabulary, .npz or .txt (DBoW2).")],
     target: Annotated[Path, typer.Argument(help="File to write, .npz or .txt (DBoW2).")],
 ) -> None:
-    """Convert between vslam's npz and the text format of DBoW2 and ORB-SLAM."""
+    """Convert a vocabulary between vslam's npz and the text format of DBoW2 and ORB-SLAM."""
     from vslam.loopclosure.vocabulary_text import is_text, read_vocabulary, write_vocabulary
 
     is_text(target)
@@ -99,10 +108,11 @@ def convert(
 @commands.command()
 def info(
     file: Annotated[
-        Path | None, typer.Argument(help="Vocabulary.", show_default="the one of vslam")
+        Path | None,
+        typer.Argument(help="Vocabulary, .npz or .txt.", show_default="the shipped one"),
     ] = None,
 ) -> None:
-    """Show what a vocabulary holds."""
+    """Show the size and the weights of a vocabulary."""
     import time
 
     import numpy as np

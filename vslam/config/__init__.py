@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from vslam.config.closing import LoopConfig, PoseGraphConfig
 from vslam.config.depth import DepthConfig, StereoConfig
 from vslam.config.detection import BowConfig, SiameseConfig
@@ -17,14 +15,13 @@ from vslam.config.initialization import InitializationConfig
 from vslam.config.keyframes import KeyframeConfig
 from vslam.config.mapping import MappingConfig
 from vslam.config.relocalization import RelocalizationConfig
-from vslam.config.section import Section
+from vslam.config.section import Section, read_json
 from vslam.config.tracking import AlignmentConfig, TrackingConfig
 from vslam.config.verification import (
     ConsistencyConfig,
     LearnedMatchingConfig,
     VerificationConfig,
 )
-from vslam.errors import InputError
 
 __all__ = [
     "AlignmentConfig",
@@ -78,11 +75,4 @@ def load_config(path: Path | str) -> Config:
         InputError: the file is missing or is not JSON, a key is unknown, or a value is out of
             range.
     """
-    try:
-        return Config.model_validate_json(Path(path).read_bytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the configuration ({error.strerror}).") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "file"
-        raise InputError(f"{path}: {where}: {first['msg']}.") from error
+    return read_json(Config, Path(path), "configuration")

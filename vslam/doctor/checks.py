@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, Image
+from vslam.camera import Camera, Image, calibration_doubts, field_of_view
 from vslam.config import OrbConfig
 from vslam.doctor.findings import Finding, judge
 from vslam.doctor.focal_length import FocalFit
@@ -96,11 +96,7 @@ def check_scale(camera: Camera, matches: Matches | None) -> Finding:
     Args:
         matches: matches of the stereo pair; None for a monocular or RGB-D camera.
     """
-    angles = (
-        2 * np.degrees(np.arctan(size / (2 * focal)))
-        for size, focal in ((camera.width, camera.fx), (camera.height, camera.fy))
-    )
-    across, down = angles
+    across, down = field_of_view(camera)
     measured = f"{camera.width}x{camera.height} pixels see {across:.0f} x {down:.0f} degrees"
     if matches is None:
         return Finding("scale", "good", measured)
@@ -114,6 +110,21 @@ def check_scale(camera: Camera, matches: Matches | None) -> Finding:
         not NEAREST_M <= camera.baseline <= FARTHEST_M,
         measured,
         "give the baseline in metres: a checkerboard calibration has the unit of the squares",
+    )
+
+
+def check_calibration(camera: Camera) -> Finding:
+    """Check whether the principal point and the focal lengths are plausible for the image size."""
+    doubts = calibration_doubts(camera)
+    measured = (
+        f"principal point ({camera.cx:.1f}, {camera.cy:.1f}), focal lengths ({camera.fx:.1f}, "
+        f"{camera.fy:.1f}) for {camera.width}x{camera.height} images"
+    )
+    return judge(
+        "calibration",
+        bool(doubts),
+        "; ".join(doubts) or measured,
+        "give the calibration of these images with --calib, and write their size into it",
     )
 
 

@@ -24,7 +24,8 @@ _FEWEST, _MOST = 30, 200  # least number of common points of such a pair; most t
 _PICTURES = 2
 _LEAST_DISPARITY = 1.0  # px
 _DRAWN = 60  # matches in a picture
-_GREEN, _RED, _BLUE = (80, 200, 60), (60, 60, 230), (230, 150, 50)  # BGR
+_GAP = 48  # px between the two images of a picture
+_GREEN, _RED = (80, 200, 60), (60, 60, 230)  # BGR
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
             f"{len(frames) - len(problems)} of {len(frames)} examined frames can be read"
             + "".join(f"; {problem.rstrip('.')}" for problem in problems[:1]),
             "replace the damaged files",
-        )
+        ),
+        checks.check_calibration(sequence.camera),
     ]
     lefts = {frame: left for frame, (left, _) in read.items()}
     if lefts:
@@ -210,27 +212,27 @@ def _rows_by_lag(by_lag: dict[int, list[_Pair]]) -> dict[int, float]:
 
 
 def _stereo_picture(pair: _Pair) -> Picture:
-    """Both images side by side, with rows, and with matches in green if their rows agree."""
+    """Both images with the matches, and between the images a line for each match: green and
+    horizontal if its rows agree."""
     left, right, matches = pair.left, pair.right, pair.matches
-    height = max(left.shape[0], right.shape[0])
-    canvas = np.zeros((height, left.shape[1] + right.shape[1]), np.uint8)
-    canvas[: left.shape[0], : left.shape[1]] = left
-    canvas[: right.shape[0], left.shape[1] :] = right
+    height, width = left.shape
+    begin = width + _GAP  # of the right image
+    canvas = np.full((max(height, right.shape[0]), begin + right.shape[1]), 255, np.uint8)
+    canvas[:height, :width] = left
+    canvas[: right.shape[0], begin:] = right
     drawn = cv2.cvtColor(canvas, cv2.COLOR_GRAY2BGR)
-    for row in range(height // 12, height, height // 6):
-        cv2.line(drawn, (0, row), (drawn.shape[1] - 1, row), _BLUE, 1)
     off = np.abs(matches.left[:, 1] - matches.right[:, 1])
     for k in np.linspace(0, len(matches) - 1, min(_DRAWN, len(matches))).astype(int):
         color = _GREEN if off[k] <= checks.ROWS_PX else _RED
         a = np.rint(matches.left[k]).astype(int).tolist()
-        b = np.rint(matches.right[k] + (left.shape[1], 0)).astype(int).tolist()
+        b = np.rint(matches.right[k] + (begin, 0)).astype(int).tolist()
         cv2.circle(drawn, a, 4, color, 1, cv2.LINE_AA)
         cv2.circle(drawn, b, 4, color, 1, cv2.LINE_AA)
-        cv2.line(drawn, a, b, color, 1, cv2.LINE_AA)
+        cv2.line(drawn, (width, a[1]), (begin - 1, b[1]), color, 1, cv2.LINE_AA)
     other = f" with the right image of frame {pair.frame + pair.lag}" if pair.lag else ""
     caption = (
-        f"Frame {pair.frame}{other}: rows in blue; matches in green if their rows agree to "
-        f"{checks.ROWS_PX} px, otherwise in red. In a rectified pair all matches are horizontal."
+        f"Frame {pair.frame}{other}: matches in green if their rows agree to {checks.ROWS_PX} px, "
+        "otherwise in red. Between the images, the lines of a rectified pair are horizontal."
     )
     return Picture(caption, np.asarray(drawn, np.uint8))
 

@@ -10,7 +10,6 @@ from vslam.datasets.frames import Source
 from vslam.doctor.checks import check_sides
 from vslam.doctor.matching import joined, match_images
 from vslam.errors import InputError
-from vslam.features import TrackingState
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 
@@ -20,9 +19,8 @@ _FRAMES = 3  # examined frames; each shows the sign of hundreds of disparities
 def why_nothing_was_tracked(outcome: RunOutcome, options: RunOptions) -> str | None:
     """One sentence that explains why no frame of a run was tracked and what to do; None if a frame
     was tracked."""
-    tracked = {TrackingState.OK, TrackingState.WEAK}
     n = len(outcome.tracks)
-    if n == 0 or any(track.state in tracked for track in outcome.tracks):
+    if n == 0 or outcome.n_tracked:
         return None
     said = f"nothing was tracked in {n} frame{'' if n == 1 else 's'}"
     if len(outcome.skipped) == n:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ class Evaluation:
     Attributes:
         frames: N, number of compared frames.
         alignment: ``se3``, ``sim3`` or ``none``, the transformation fitted before the comparison.
+        on_one_line: the positions leave the rotation about their line open, so it was fitted to the
+            orientations; evo refuses such trajectories.
         timestamps: ``(N,)`` seconds, of the estimate.
         ate_rmse_m, ate_mean_m, ate_max_m: RMSE, mean and maximum of ``errors_m``.
         errors_m: ``(N,)`` distance of each aligned position from the ground truth.
@@ -42,6 +44,7 @@ class Evaluation:
 
     frames: int
     alignment: str
+    on_one_line: bool
     timestamps: NDArray[np.float64]
     ate_rmse_m: float
     ate_mean_m: float
@@ -74,7 +77,7 @@ def evaluate_trajectory(
 
     Raises:
         InputError: the alignment is unknown, the trajectories have no common frames, or there is
-            too little motion to align them.
+            too little motion to compare them.
     """
     from evo import EvoException
     from evo.core.metrics import APE, RPE, PoseRelation
@@ -90,8 +93,7 @@ def evaluate_trajectory(
         for t in (ground_truth, estimate)
     )
     try:
-        if alignment != "none":
-            aligned.align(reference, correct_scale=alignment == "sim3")
+        on_one_line = alignment != "none" and _align(aligned, reference, alignment == "sim3")
         ape = APE(PoseRelation.translation_part)
         ape.process_data((reference, aligned))
         rpe_m, rpe_deg = RPE(PoseRelation.translation_part), RPE(PoseRelation.rotation_angle_deg)
@@ -99,8 +101,8 @@ def evaluate_trajectory(
             rpe.process_data((reference, aligned))
     except EvoException as error:
         raise InputError(
-            f"--align {alignment}: {len(estimate)} frames with too little motion to compare; "
-            "alignment needs three positions that are not on one line, --align none needs two."
+            f"{len(estimate)} frames with too little motion to compare; the camera must move "
+            "between two frames."
         ) from error
 
     T_wc_aligned = np.array(aligned.poses_se3)
@@ -110,6 +112,7 @@ def evaluate_trajectory(
     return Evaluation(
         frames=len(errors),
         alignment=alignment,
+        on_one_line=on_one_line,
         timestamps=estimate.timestamps,
         ate_rmse_m=_rmse(errors),
         ate_mean_m=float(errors.mean()),
@@ -122,6 +125,37 @@ def evaluate_trajectory(
         t_rel_percent=None if drift is None else drift[0],
         r_rel_deg_per_100m=None if drift is None else drift[1],
     )
+
+
+def _align(estimate: Any, reference: Any, with_scale: bool) -> bool:
+    """Align a trajectory of evo in place; returns whether the positions lie on one line.
+
+    The rotation about that line changes no position error. To determine it, points on short axes
+    of the cameras are aligned together with the positions.
+    """
+    from evo import EvoException
+    from evo.core.geometry import umeyama_alignment
+    from evo.core.lie_algebra import se3
+
+    try:
+        estimate.align(reference, correct_scale=with_scale)
+    except EvoException:
+        rotation, translation, scale = umeyama_alignment(
+            _with_axes(estimate), _with_axes(reference), with_scale
+        )
+        if with_scale:
+            estimate.scale(scale)
+        estimate.transform(se3(rotation, translation))
+        return True
+    return False
+
+
+def _with_axes(trajectory: Any) -> NDArray[np.float64]:
+    """``(3, 3N)`` positions, and points to the right of and below each of them."""
+    T_wc = np.array(trajectory.poses_se3)
+    at = T_wc[:, :3, 3]
+    short = 1e-3 * np.linalg.norm(at.std(axis=0))
+    return np.concatenate([at, at + short * T_wc[:, :3, 0], at + short * T_wc[:, :3, 1]]).T
 
 
 def path_length(T_wc: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -32,7 +32,7 @@ def explorer(
     ground_truth: Trajectory | None,
     moments: Collection[Moment],
 ) -> list[Section]:
-    """The section of the page with the explorer; empty for fewer than two frames. See
+    """The section of the page with the explorer; empty if fewer than two frames were tracked. See
     :func:`explorer_data`."""
     data = explorer_data(outcome, evaluation, ground_truth, moments)
     if data is None:
@@ -49,7 +49,8 @@ def explorer_data(
     ground_truth: Trajectory | None,
     moments: Collection[Moment],
 ) -> dict[str, Any] | None:
-    """Numbers and images for ``explorer.js``, ready for JSON; None for fewer than two frames.
+    """Numbers and images for ``explorer.js``, ready for JSON; None if fewer than two frames were
+    tracked.
 
     ``floats`` holds seconds, metres, the heading in degrees (0 looks along z, 90 along x) and the
     error, NaN where there is none.
@@ -61,7 +62,7 @@ def explorer_data(
         moments: of a `vslam.run.moments.MomentRecorder`.
     """
     n = len(outcome.trajectory)
-    if n < 2 or len(outcome.tracks) != n:
+    if outcome.n_tracked < 2 or len(outcome.tracks) != n:
         return None
     times = outcome.trajectory.timestamps
     T_wc, errors = outcome.trajectory.T_wc, np.full(n, np.nan)

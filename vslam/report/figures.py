@@ -65,7 +65,7 @@ def _drawings(
     ground_truth: Trajectory | None,
     verdict: LoopEvaluation | None,
 ) -> Iterator[Drawing]:
-    if len(outcome.trajectory):
+    if len(outcome.trajectory) and (outcome.n_tracked or not outcome.tracks):
         caption = "Seen from above, at equal scale; z points ahead of the first camera."
         if evaluation is not None and evaluation.alignment != "none":
             caption += f" Estimate after {evaluation.alignment.upper()} alignment."

@@ -229,8 +229,8 @@ def write_trajectories(written: Results, outcome: RunOutcome) -> None:
 
 
 def _evo_command(folder: Path, outcome: RunOutcome, evaluation: Evaluation | None) -> str | None:
-    """The command that repeats the evaluation with evo."""
-    if evaluation is None:
+    """The command that repeats the evaluation with evo, None where evo cannot."""
+    if evaluation is None or evaluation.on_one_line:
         return None
     if evaluation.frames == len(outcome.trajectory):
         estimate, truth = folder / "trajectory_kitti.txt", folder / "ground_truth_kitti.txt"

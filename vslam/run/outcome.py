@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vslam.config import Config
 from vslam.datasets.frames import Source
-from vslam.features import TrackResult
+from vslam.features import TrackingState, TrackResult
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.map import Map
 from vslam.maps.stored_map import StoredMap, World
@@ -110,6 +110,12 @@ class RunOutcome:
     interrupted: str | None = None
     step_s: float = 0.0
     compared: tuple[RunOutcome, ...] = ()
+
+    @property
+    def n_tracked(self) -> int:
+        """The number of frames whose pose was found in their images."""
+        found = (TrackingState.OK, TrackingState.WEAK)
+        return sum(track.state in found for track in self.tracks)
 
 
 def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:

@@ -34,7 +34,13 @@ from vslam.run.preparation import PreparedFrame, in_their_time
 from vslam.run.progress import Progress, TrackLog, in_frames
 from vslam.run.realtime import Played
 from vslam.run.recorder import Recorder
-from vslam.run.rig import delay_warnings, measure_rig, residual_warnings, rig_warnings
+from vslam.run.rig import (
+    calibration_warnings,
+    delay_warnings,
+    measure_rig,
+    residual_warnings,
+    rig_warnings,
+)
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory
 
@@ -326,6 +332,7 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
         trajectory=run.trajectory(),
         keyframes=slam.keyframe_trajectory(),
         warnings=[
+            *calibration_warnings(camera, settings.calib, outcome.sequence.name),
             *slam.problems,
             *rig_warnings(run.sides),
             *_map_warnings(slam, camera),

@@ -48,6 +48,7 @@ _IMAGE_SCALE = 0.5
 _JPEG_QUALITY = 75
 _MAX_POINTS_PER_MAP = 30_000  # the last map is complete
 
+_TRAJECTORY_STEPS = 100  # 0.6 MB for 1,000 frames
 _REJECTED_SHOWN_FRAMES = 20  # then the lines of rejected loops vanish
 _VIEWER_PORT, _WEB_PORT = 9876, 9090  # rerun's own, where they are free
 _VIEWER_STARTS_S = 20.0
@@ -57,6 +58,8 @@ _RESERVED_BYTES = 64 * 2**20  # left on the disk for the map, the trajectories a
 _GREEN, _AMBER, _RED = (16, 185, 129), (245, 158, 11), (239, 68, 68)
 _BLUE, _GREY = (59, 130, 246), (148, 163, 184)
 _FAINT_RED = (239, 68, 68, 80)
+_VIOLET, _PINK, _CYAN, _LIME = (139, 92, 246), (236, 72, 153), (6, 182, 212), (132, 204, 22)
+_STAGE_COLORS = (_BLUE, _AMBER, _GREEN, _VIOLET, _PINK, _CYAN, _LIME, _RED, _GREY)
 _STATE_COLORS = {TrackingState.OK: _GREEN, TrackingState.WEAK: _AMBER, TrackingState.LOST: _RED}
 _POINT_SERIES = {"stereo": _GREY, "matches": _AMBER, "inliers": _BLUE}
 
@@ -276,10 +279,10 @@ class RerunRecorder(Recorder):
     ``untracked`` keypoints (keyframes, half size), ``world/landmarks`` and ``world/keyframes``
     (every 25 keyframes, after a loop and at the end), ``world/loops/accepted`` (green, from the
     loop on) and ``rejected`` (faint red, for 20 frames), ``loops/images`` (the two images of each
-    closed loop with their matches, until the next loop), ``world/ground_truth`` and
-    ``world/trajectory`` (static), ``points/*`` and ``stage_ms/*`` (every frame), ``state`` (on
-    change) and ``state/loops`` (each with its reason). The world is the one of the estimate: first
-    frame of the run, x right, y down, z forward.
+    closed loop with their matches, until the next loop), ``world/ground_truth`` (static),
+    ``world/trajectory`` (the final one, up to the frame shown), ``points/*`` and ``stage_ms/*``
+    (every frame), ``state`` (on change) and ``state/loops`` (each with its reason). The world is
+    the one of the estimate: first frame of the run, x right, y down, z forward.
 
     Failing to write never ends a run. Rerun writes in a thread of its own, whose errors only a
     later flush reports, and after an error waiting for that thread can last forever. Therefore the
@@ -306,6 +309,7 @@ class RerunRecorder(Recorder):
         self._state: TrackingState | None = None
         self._index = 0  # of the last frame
         self._frames: list[tuple[TrackResult, NDArray[np.float64]]] = []
+        self._stages: list[str] = []  # each has a colour of its own
         self._keyframes = 0
         self._mapped_keyframes = -self._pace.keyframes
         self._accepted: list[LoopEdge] = []
@@ -344,6 +348,7 @@ class RerunRecorder(Recorder):
         log("world/landmarks", rr.Points3D.from_fields(colors=[_GREY], radii=[-1.2]))
         for name, color in _POINT_SERIES.items():
             log(f"points/{name}", rr.SeriesLines(colors=[color], names=[name]))
+        log("world/trajectory", rr.LineStrips3D.from_fields(colors=[_BLUE], radii=[-1.0]))
         if ground_truth is not None and len(ground_truth):
             # The ground truth's world is the first camera of the data set, not of the run.
             T_wc = np.linalg.inv(ground_truth.T_wc[0]) @ ground_truth.T_wc
@@ -424,8 +429,25 @@ class RerunRecorder(Recorder):
     def finish(self, trajectory: Trajectory, map_: Map | None) -> None:
         if map_ is not None:
             self._log_map(map_, map_.n_landmarks)
-        self._recording.log("world/trajectory", _path(trajectory.T_wc, _BLUE), static=True)
+        self._log_trajectory(trajectory)
         self._close()
+
+    def _log_trajectory(self, trajectory: Trajectory) -> None:
+        """The final trajectory up to each of a hundred frames, so that it grows as the run is
+        replayed."""
+        import rerun as rr
+
+        n = len(trajectory)
+        if not n:
+            return
+        ends = np.unique(np.linspace(0, n - 1, min(n, _TRAJECTORY_STEPS)).round().astype(int))
+        points = trajectory.T_wc[:, :3, 3].astype(np.float32)
+        strips = rr.LineStrips3D.columns(strips=[points[: end + 1] for end in ends])
+        times = [
+            rr.TimeColumn("frame", sequence=ends),
+            rr.TimeColumn("time", duration=trajectory.timestamps[ends]),
+        ]
+        self._recording.send_columns("world/trajectory", times, strips)
 
     def _set_time(self, result: TrackResult) -> None:
         self._recording.set_time("frame", sequence=result.index)
@@ -481,6 +503,11 @@ class RerunRecorder(Recorder):
             scalars = rr.Scalars.columns(scalars=counts)
             self._recording.send_columns(f"points/{name}", _times(results), scalars)
         for stage in dict.fromkeys(name for result in results for name in result.stage_ms):
+            if stage not in self._stages:
+                color = _STAGE_COLORS[len(self._stages) % len(_STAGE_COLORS)]
+                self._stages.append(stage)
+                line = rr.SeriesLines(colors=[color], names=[stage])
+                self._recording.log(f"stage_ms/{stage}", line, static=True)
             timed = [result for result in results if stage in result.stage_ms]
             scalars = rr.Scalars.columns(scalars=[result.stage_ms[stage] for result in timed])
             self._recording.send_columns(f"stage_ms/{stage}", _times(timed), scalars)

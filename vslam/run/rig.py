@@ -5,11 +5,12 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
+from vslam.camera import Camera, calibration_doubts
 from vslam.frontend.side_delay import SideDelay
 from vslam.frontend.sides import Sides
 from vslam.geometry import compose, inverse, orthonormalised, se3_log
@@ -99,6 +100,18 @@ def _twists(map_: Map) -> NDArray[np.float64]:
                 step = compose(T_cw[behind], inverse(T_cw[before]))
                 twists[keyframe] = se3_log(orthonormalised(step)) / elapsed
     return twists
+
+
+def calibration_warnings(camera: Camera, calib: Sequence[Path], name: str) -> list[str]:
+    """What is implausible about a calibration, nothing for a plausible one.
+
+    Args:
+        camera: as calibrated.
+        calib: the files of ``--calib``; if none was given, the data set has its own.
+        name: of the sequence.
+    """
+    source = ", ".join(map(str, calib)) or f"the calibration of {name}"
+    return [f"{source}: {doubt}." for doubt in calibration_doubts(camera)]
 
 
 def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:

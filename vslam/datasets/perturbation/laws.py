@@ -113,6 +113,12 @@ def _read_perturbed(
     return perturbation.apply(index, t, *frame.read(image_map))
 
 
+# Of contact sheets: pixels, grey values, and the factor of a change about the middle grey.
+_TITLE, _GUTTER = 22, 8
+_PAPER, _MIDDLE = 255, 128
+_AMPLIFIED = 4.0
+
+
 def contact_sheet(
     sequence: Source,
     perturbation: Perturbation,
@@ -120,7 +126,8 @@ def contact_sheet(
     start: int = 0,
     every: int = 1,
 ) -> Image:
-    """A grey image with a row for each frame: left image as it is, both images perturbed.
+    """A grey image with a row for each frame: left image as it is, both images perturbed, and the
+    amplified change of one of them.
 
     Args:
         indices: frames of the sequence.
@@ -140,8 +147,8 @@ def contact_sheet(
 
 
 def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: int) -> Image:
-    """A grey image with a row for each perturbation: a frame as it is, both its images perturbed.
-    The rows stand in two columns where there are several.
+    """A grey image with a row for each perturbation: a frame as it is, both its images perturbed,
+    and the amplified change of one of them. Several rows stand in two columns.
 
     Raises:
         InputError: the sequence lacks what a law needs.
@@ -154,7 +161,7 @@ def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: in
     if len(rows) == 1:
         return rows[0]
     if len(rows) % 2:
-        rows.append(np.zeros_like(rows[0]))
+        rows.append(np.full_like(rows[0], _PAPER))
     half = len(rows) // 2
     return np.hstack([np.vstack(rows[:half]), np.vstack(rows[half:])])
 
@@ -173,25 +180,36 @@ def laws_for(sequence: Source) -> tuple[list[str], dict[str, str]]:
 
 
 def _row(sequence: Source, perturbation: Perturbation, index: int, label: str, width: int) -> Image:
-    import cv2
-
     t = float(sequence.timestamps[index] - sequence.timestamps[0])
     left, second = sequence.read(index)
-    height = round(width * left.shape[0] / left.shape[1])
     try:
-        images = perturbation.apply(index, t, left, second)
+        first, other = perturbation.apply(index, t, left, second)
     except DroppedFrameError:
-        images = (np.zeros_like(left), None if second is None else np.zeros_like(left))
-    row = np.hstack(
-        [
-            cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-            for image in (left, *images)
-            if image is not None and image.dtype == np.uint8
-        ]
+        first, other = np.zeros_like(left), None if second is None else np.zeros_like(left)
+    pairs = {"left": (left, first)}
+    if other is not None and other.dtype == np.uint8:
+        pairs["right"] = np.asarray(second, np.uint8), np.asarray(other, np.uint8)
+    changes = {side: after.astype(float) - before for side, (before, after) in pairs.items()}
+    side = max(changes, key=lambda name: float(np.abs(changes[name]).mean()))
+    change = np.clip(_MIDDLE + _AMPLIFIED * changes[side], 0, 255).astype(np.uint8)
+    panels = {f"{label}: left as it is": left}
+    panels |= {f"{name} perturbed": after for name, (_, after) in pairs.items()}
+    panels[f"change of {side}, times {_AMPLIFIED:g}"] = change
+    return np.hstack([_titled(title, image, width) for title, image in panels.items()])
+
+
+def _titled(title: str, image: Image, width: int) -> Image:
+    """An image on paper, of the width in pixels without the margin, under its title."""
+    import cv2
+
+    height = round(width * image.shape[0] / image.shape[1])
+    panel = np.full((_TITLE + height + _GUTTER, width + _GUTTER), _PAPER, np.uint8)
+    panel[_TITLE : _TITLE + height, :width] = cv2.resize(
+        image, (width, height), interpolation=cv2.INTER_AREA
     )
-    row[:20, : max(150, 10 + 8 * len(label))] = 0
-    cv2.putText(row, label, (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, 255, 1)
-    return np.asarray(row, np.uint8)
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(panel, title, (2, _TITLE - 7), font, 0.45, 0, 1, cv2.LINE_AA)
+    return panel
 
 
 def _parse_strength(spec: str, kind: LawKind, text: str) -> float:

@@ -135,7 +135,8 @@ def _is_overview(path: Path) -> bool:
 def _entry(report: ReportJson, folder: Path) -> RunEntry:
     parts = [f"frames from {report.start}"] if report.start else []
     parts += [f"every {report.every}"] if report.every > 1 else []
-    parts += [f"{report.max_frames} frames"] if report.max_frames else []
+    if report.max_frames:  # the sequence may be shorter
+        parts.append(f"{min(report.max_frames, report.frames)} frames")
     detector = report.detector + (MONOCULAR if report.sensor == "mono" else "")
     sequence, town = report.sequence, None
     laws: list[str] = []

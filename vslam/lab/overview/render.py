@@ -26,7 +26,8 @@ ALIGNMENTS = {"se3": "SE3", "sim3": "Sim3"}
 _TESTED = (
     "Wilcoxon's signed-rank test on sequences, each with the median of its runs, because runs of "
     "one sequence are not independent. Over all conditions a sequence counts once, with the mean "
-    f"of its medians. Two-sided, level {ALPHA:g}, not corrected for the number of tests."
+    f"of its medians. Two-sided, level {ALPHA:g}, not corrected for the number of tests. "
+    "Comparisons in which all sequences tie are left out."
 )
 
 
@@ -119,6 +120,7 @@ def _compared(report: OverviewJson) -> Section:
             c.winner or "-",
         )
         for c in report.comparisons
+        if c.ties < len(c.pairs)
     ]
     return Section("Differences", [Table((*head, "winner"), rows, texts, _TESTED)])
 

@@ -14,6 +14,7 @@ MEASURES: tuple[Measure, ...] = (
     ("ate_rmse_m", "ATE RMSE", "m", 3),
     ("causal_ate_rmse_m", "causal ATE", "m", 3),
     ("rpe_m", "RPE", "m", 4),
+    ("rpe_deg", "RPE", "°", 4),
     ("t_rel_percent", "t_rel", "%", 3),
     ("r_rel_deg_per_100m", "r_rel", "°/100 m", 3),
     ("loops_found", "loops found", "", 0),
@@ -122,7 +123,7 @@ class OverviewJson(Document):
     order in which they are compared, the baseline first."""
 
     kind: Literal["overview"] = "overview"
-    schema_version: int = 3
+    schema_version: int = 4
 
     notes: list[str]
     systems: list[str]

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from itertools import combinations
 from typing import NamedTuple
 
-from vslam.errors import InputError
+from vslam.errors import InputError, did_you_mean
 from vslam.lab.overview.collect import MONOCULAR, Found
 from vslam.lab.overview.schema import (
     ALL,
@@ -34,19 +34,20 @@ _KNOWN = ("none", "bow", *NETWORKS, "both")
 
 
 class Shown(NamedTuple):
-    """How a compared error is printed: the metres of the measure times ``scale``."""
+    """How an error is printed: the value of the measure times ``scale``."""
 
     title: str
     unit: str
     scale: float
     decimals: int
 
-    def text(self, metres: float, sign: str = "") -> str:
+    def text(self, value: float, sign: str = "") -> str:
         """The figure without its unit; ``sign`` is ``+`` for differences."""
-        return f"{self.scale * metres:{sign}.{self.decimals}f}"
+        return f"{self.scale * value:{sign}.{self.decimals}f}"
 
 
 COMPARED = {"ate_rmse_m": Shown("ATE", "m", 1.0, 3), "rpe_m": Shown("RPE", "mm", 1e3, 1)}
+ROTATION = {"rpe_deg": Shown("RPE", "°", 1.0, 3)}
 
 
 def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
@@ -61,7 +62,10 @@ def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
     """
     names = systems(found.runs, baseline)
     if baseline not in (None, names[0].removesuffix(MONOCULAR)):
-        raise InputError(f"--baseline {baseline}: no run of it; choose from {', '.join(names)}.")
+        meant = did_you_mean(baseline, names)
+        raise InputError(
+            f"--baseline {baseline}: no run of it{meant}; choose from {', '.join(names)}."
+        )
     rows = make_rows(found.runs)
     laws = list(dict.fromkeys(row.drive.perturb for row in rows))
     compared: list[Comparison] = []
@@ -245,13 +249,12 @@ def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
         if some
     ]
     counts += [f"no difference on {len(ties)} ({named(ties)})"] if ties else []
-    verdict = "no winner" if untied else "a tie"
-    if found.winner:
-        verdict = f"{found.winner} wins"
-    text = f"{what}{light}: {verdict}. Of {n} sequence{'s' if n > 1 else ''}, "
-    text += "; ".join(counts) + ". "
+    beginning = f"{what}{light}, {second} against {first}:"
     if not untied:
-        return text.rstrip()
+        return f"{beginning} a tie on {f'all {n} sequences' if n > 1 else 'the only sequence'}."
+    verdict = f"{found.winner} wins" if found.winner else "no winner"
+    text = f"{beginning} {verdict}. Of {n} sequence{'s' if n > 1 else ''}, "
+    text += "; ".join(counts) + ". "
     differences = sorted(pair.difference for pair in found.pairs)
     least, greatest = (shown.text(differences[k], "+") for k in (0, -1))
     median = shown.text(found.median_difference, "+")

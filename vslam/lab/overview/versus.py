@@ -1,38 +1,50 @@
-"""Each system beside the baseline: a row for each sequence and perturbation, and who wins."""
+"""Systems side by side: a row for each sequence and perturbation, then who wins."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from vslam.lab.overview.schema import Drive, OverviewJson, Row, Spread
-from vslam.lab.overview.summary import COMPARED, is_tie
+from vslam.evaluation.loops import LoopLimits
+from vslam.lab.overview.schema import Comparison, Drive, OverviewJson, Row, Spread
+from vslam.lab.overview.summary import COMPARED, ROTATION
 from vslam.report.page import Bullets, Section, Table
 
 _TEXTS = ("sequence", "perturbation")
-_LOOPS = ("loops_found", "loops_missed", "loops_wrong")
-_NOTE = "Medians over runs. Lost: number of lost frames. Loops: found / missed / wrong."
+_SHOWN = {**COMPARED, **ROTATION}
+_MEASURES = ("lost_frames", *_SHOWN, "loops_found")
+_COLUMNS = 10  # at most so many columns of figures, which fit a terminal of 80 characters
+_NOTES = {
+    "lost_frames": "Lost: number of lost frames.",
+    "rpe_m": "RPE: error of the motion from one frame to the next.",
+    "loops_found": (
+        "Loops: revisits that were found, of those in the ground truth; - where there are none."
+    ),
+}
 
 Key = tuple[Drive, str]
+Rows = dict[str, dict[Key, Row]]
 
 
 def versus(report: OverviewJson) -> list[Section]:
-    """A table for each system with its baseline, and sentences on which of them wins over all.
+    """The systems that have run on the same drives side by side, and which of them wins.
 
-    The baseline of a system is the first one that has run on the same drive and was aligned in the
-    same way. A system without such a partner stands alone.
+    Systems share a section if they share a drive and were aligned in the same way. A sentence comes
+    first where no drive has a revisit, so that loop detectors cannot differ.
     """
-    rows: dict[str, dict[Key, Row]] = {name: {} for name in report.systems}
+    rows: Rows = {name: {} for name in report.systems}
     for row in report.rows:
         rows[row.system][row.drive, row.alignment] = row
-    opponents = dict(_pairs(report.systems, rows))
-    paired = {*opponents, *opponents.values()}
-    found = []
+    groups: list[list[str]] = []
     for name in report.systems:
-        if name in opponents:
-            found.append(_section(report, rows, (opponents[name], name)))
-        elif name not in paired:
-            found.append(_section(report, rows, (name,)))
-    return found
+        for group in groups:
+            if any(rows[name].keys() & rows[other].keys() for other in group):
+                group.append(name)
+                break
+        else:
+            groups.append([name])
+    sections = [_section(report, rows, group) for group in groups]
+    first = Section("", [_without_revisits(report)])
+    return [first, *sections] if first.parts[0] else sections
 
 
 def median_text(spread: Spread | None, decimals: int) -> str:
@@ -42,60 +54,72 @@ def median_text(spread: Spread | None, decimals: int) -> str:
     return f"{spread.median:.{1 if decimals == 0 and spread.median % 1 else decimals}f}"
 
 
-def _pairs(names: list[str], rows: dict[str, dict[Key, Row]]) -> Iterator[tuple[str, str]]:
-    """Each system that has a baseline, and that."""
-    for k, name in enumerate(names):
-        for baseline in names[:k]:
-            if rows[baseline].keys() & rows[name].keys():
-                yield name, baseline
-                break
+def _without_revisits(report: OverviewJson) -> str:
+    """Why loop detectors do not differ, or hardly; empty where a drive has a revisit or nobody
+    could judge it."""
+    judged = [row for row in report.rows if row.measures["loops_found"] is not None]
+    names = {row.system for row in judged}
+    counts = [row.measures[name] for row in judged for name in ("loops_found", "loops_missed")]
+    if len(names) < 2 or any(count.greatest for count in counts if count is not None):
+        return ""
+    none = f"No drive has a revisit of {LoopLimits().min_length_m:.0f} m or more"
+    compared = [c for c in report.comparisons if {c.first, c.second} <= names]
+    if all(_is_tie(one) for one in compared):
+        return f"{none}, so there is no loop to find and the loop detectors cannot differ."
+    return (
+        f"{none}. Loop detectors can differ only by wrong loops and by loops on shorter revisits."
+    )
 
 
-def _section(
-    report: OverviewJson, rows: dict[str, dict[Key, Row]], names: tuple[str, ...]
-) -> Section:
-    pair = len(names) == 2
-    head = [*_TEXTS, *(f"lost, {name}" for name in names)]
-    for shown in COMPARED.values():
-        title = f"{shown.title} ({shown.unit})"
-        head += [*(f"{title}, {name}" for name in names), *(["diff."] if pair else [])]
-    head += [f"loops, {name}" for name in names]
+def _is_tie(one: Comparison) -> bool:
+    return one.ties == len(one.pairs)
+
+
+def _section(report: OverviewJson, rows: Rows, names: list[str]) -> Section:
     order = {(row.drive, row.alignment): None for row in report.rows if row.system in names}
-    lines = [_line(key, [rows[name].get(key) for name in names]) for key in order]
-    note = f"{_NOTE} Differences: {names[1]} minus {names[0]}." if pair else _NOTE
-    points = Bullets(tuple(_points(report, rows, names)))
-    title = f"{names[1]} against {names[0]}" if pair else names[0]
-    return Section(title, (Table(tuple(head), lines, _TEXTS, note), points))
+    each = max(1, _COLUMNS // len(names))  # measures of one table
+    tables = []
+    for k in range(0, len(_MEASURES), each):
+        measures = _MEASURES[k : k + each]
+        head = [*_TEXTS, *(f"{_title(one)}, {name}" for one in measures for name in names)]
+        lines = [
+            (
+                key[0].place,
+                key[0].perturb,
+                *(_cell(rows[name].get(key), one) for one in measures for name in names),
+            )
+            for key in order
+        ]
+        notes = [_NOTES[one] for one in measures if one in _NOTES]
+        note = " ".join(("Medians over runs.", *notes))
+        tables.append(Table(tuple(head), lines, _TEXTS, note))
+    title = f"Side by side: {' / '.join(names)}" if len(names) > 1 else names[0]
+    return Section(title, (*tables, Bullets(tuple(_points(report, rows, names)))))
 
 
-def _line(key: Key, rows: list[Row | None]) -> tuple[str, ...]:
-    drive, _ = key
-    spreads = [row.measures if row else {} for row in rows]
-    cells = [drive.place, drive.perturb]
-    cells += [median_text(each.get("lost_frames"), 0) for each in spreads]
-    for measure, shown in COMPARED.items():
-        found = [each.get(measure) for each in spreads]
-        cells += ["n/a" if spread is None else shown.text(spread.median) for spread in found]
-        if len(rows) == 2:
-            cells.append(_difference(found[0], found[1], measure))
-    for each in spreads:
-        loops = [median_text(each.get(name), 0) for name in _LOOPS]
-        cells.append("n/a" if "n/a" in loops else "/".join(loops))
-    return tuple(cells)
+def _title(measure: str) -> str:
+    if measure in _SHOWN:
+        return f"{_SHOWN[measure].title} ({_SHOWN[measure].unit})"
+    return {"lost_frames": "lost", "loops_found": "loops"}[measure]
 
 
-def _difference(first: Spread | None, second: Spread | None, measure: str) -> str:
-    if first is None or second is None:
+def _cell(row: Row | None, measure: str) -> str:
+    spread = None if row is None else row.measures[measure]
+    if row is None or spread is None:
         return "n/a"
-    difference = second.median - first.median
-    return "tie" if is_tie(difference, measure) else COMPARED[measure].text(difference, "+")
+    if measure in _SHOWN:
+        return _SHOWN[measure].text(spread.median)
+    if measure == "lost_frames":
+        return median_text(spread, 0)
+    missed, wrong = row.measures["loops_missed"], row.measures["loops_wrong"]
+    revisits = spread.median + (missed.median if missed else 0.0)
+    text = f"{median_text(spread, 0)} of {revisits:g}" if revisits else "-"
+    return f"{text}, {wrong.median:g} wrong" if wrong and wrong.median else text
 
 
-def _points(
-    report: OverviewJson, rows: dict[str, dict[Key, Row]], names: tuple[str, ...]
-) -> Iterator[str]:
-    """Totals over the runs on the drives that all of ``names`` share, lost frames first, then the
-    comparisons of two systems."""
+def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]:
+    """Totals over the runs on the drives that all of ``names`` share, lost frames first, then each
+    system compared with its baseline: the first one that shares a drive."""
     shared = set.intersection(*(set(rows[name]) for name in names))
     runs = {
         name: [
@@ -106,23 +130,33 @@ def _points(
         for name in names
     }
 
-    def total(name: str, measure: str) -> str:
+    def total(name: str, measure: str) -> float | None:
         known = [value for each in runs[name] if (value := each[measure]) is not None]
-        return f"{sum(known):.0f}" if known else "n/a"
+        return sum(known) if known else None
 
-    lost = (
-        f"{name} {total(name, 'lost_frames')} in {len(runs[name])} run"
-        + ("s" if len(runs[name]) != 1 else "")
-        for name in names
-    )
-    yield f"Lost frames: {', '.join(lost)}."
-    loops = (f"{name} {' / '.join(total(name, loop) for loop in _LOOPS)}" for name in names)
-    yield f"Loops found / missed / wrong in these runs: {', '.join(loops)}."
-    for measure in COMPARED:
-        found = [
-            one
-            for one in report.comparisons
-            if (one.first, one.second, one.measure) == (*names, measure)
-        ]
-        if found:
-            yield found[-1].words  # over all conditions where there are several
+    lost = []
+    loops = []
+    for name in names if shared else ():
+        frames, n = total(name, "lost_frames"), len(runs[name])
+        count = "n/a" if frames is None else f"{frames:.0f}"
+        lost.append(f"{name} {count} in {n} run{'s' if n != 1 else ''}")
+        found, missed, wrong = (
+            total(name, measure) for measure in ("loops_found", "loops_missed", "loops_wrong")
+        )
+        if found is not None and missed is not None and wrong is not None:
+            loops.append(f"{name} found {found:.0f} of {found + missed:.0f}, {wrong:.0f} wrong")
+    if lost:
+        yield f"Lost frames: {', '.join(lost)}."
+    if loops:
+        yield f"Revisits in these runs: {'; '.join(loops)}."
+    for k, name in enumerate(names):
+        sharing = (other for other in names[:k] if rows[other].keys() & rows[name].keys())
+        baseline = next(sharing, None)
+        for measure in COMPARED:
+            found_ = [
+                one
+                for one in report.comparisons
+                if (one.first, one.second, one.measure) == (baseline, name, measure)
+            ]
+            if found_:
+                yield found_[-1].words  # over all conditions where there are several

@@ -1,0 +1,74 @@
+"""The ``--help`` of a command: a panel for each group of options, without a column of types."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+from rich.highlighter import RegexHighlighter
+from rich.padding import Padding
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+from rich.theme import Theme
+
+_THEME = Theme({"option": "bold cyan"})
+
+
+class _Options(RegexHighlighter):
+    """Option names stand out in the descriptions."""
+
+    highlights = [r"(?P<option>(?<![\w-])--[a-z][a-z-]*)"]  # noqa: RUF012  # as rich declares it
+
+
+def show_help(command: Any, context: Any) -> None:
+    """Print the help of a command on stdout.
+
+    Args:
+        command: a ``TyperCommand``; the ``rich_help_panel`` of a parameter names its panel.
+        context: the click context of the command.
+    """
+    console = Console(theme=_THEME, highlighter=_Options())
+    console.print(Padding(Text(command.get_usage(context), "bold"), (1, 1)))
+    for paragraph in command.help.split("\n\n"):
+        console.print(Padding(Text.from_markup(" ".join(paragraph.split())), (0, 1, 1, 1)))
+    panels: dict[str, list[Any]] = {}
+    for parameter in command.get_params(context):
+        if not parameter.hidden and parameter.name != "help":
+            is_option = parameter.param_type_name == "option"
+            title = parameter.rich_help_panel or ("Options" if is_option else "Arguments")
+            panels.setdefault(title, []).append(parameter)
+    width = max((len(_name(one)) for some in panels.values() for one in some), default=0)
+    for title, parameters in panels.items():
+        table = Table.grid(padding=(0, 2))
+        table.add_column(width=width, style="bold cyan", no_wrap=True)
+        table.add_column(overflow="fold")
+        for parameter in parameters:
+            table.add_row(Text(_name(parameter)), _described(parameter))
+        console.print(Panel(table, title=title, title_align="left", border_style="dim"))
+    if command.epilog:
+        console.print(Padding(Text.from_markup(command.epilog.strip()), (1, 1)))
+
+
+def _name(parameter: Any) -> str:
+    """``--record/--no-record``, ``--map FILE`` or ``RUN``."""
+    if parameter.param_type_name == "argument":
+        name = parameter.metavar or parameter.name.upper()
+        return f"{name}..." if parameter.nargs != 1 else str(name)
+    names = "/".join((*parameter.opts, *parameter.secondary_opts))
+    return f"{names} {parameter.metavar}" if parameter.metavar else names
+
+
+def _described(parameter: Any) -> Text:
+    """What a parameter is for, then its default or that it must be given."""
+    text = Text.from_markup(parameter.help or "")
+    default = parameter.default
+    if isinstance(parameter.show_default, str):
+        default = parameter.show_default
+    elif not parameter.show_default or isinstance(default, bool):
+        default = None  # a flag is off
+    if parameter.required:
+        text.append(" [required]", "red")
+    elif default not in (None, "", ()):
+        text.append(f" [default: {default}]", "dim")
+    return text

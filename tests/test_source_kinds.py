@@ -1,4 +1,4 @@
-"""What a source is, is found out from what is there."""
+"""Detection of the kind of a source from its files."""
 
 from __future__ import annotations
 

@@ -168,7 +168,7 @@ class CapsuleShape(BaseModel):
 
     @property
     def places(self) -> int:
-        """Places of the grid."""
+        """Number of places in the grid."""
         rows, columns = self.grid
         return rows * columns
 

@@ -67,7 +67,7 @@ WAYS = {
     "images": "Same number of images shown",
     "minutes": "Same time of a core",
     "untrained": "Hand-crafted, without training",
-    "shipped": "What vslam ships (trained differently, so not comparable with the others)",
+    "shipped": "Trained differently, so not comparable with the others: what vslam ships",
 }
 SHIPPED = ("bow", "capsule", "capsule-pruned")
 UNTRAINED = ("lsgd",)

@@ -372,7 +372,7 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     )
     nothing = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
     assert nothing.returncode == 2
-    assert "no autosave.npz here" in nothing.stderr
+    assert "has no autosave.npz" in nothing.stderr
     # As if it had been cut off after these frames, of more to come.
     drive_until(kitti_tree, folder, 11)
     write_options(folder, read_options(folder).model_copy(update={"max_frames": None}))

@@ -341,7 +341,7 @@ def test_a_drive_is_measured_before_and_after_verification_and_reported(tmp_path
         (["--protocol", "online", "--window", "x"], "--window x: must be above 0"),
         (["--protocol", "online", "--detectors", "magic"], "--detectors magic: unknown"),
         (["--protocol", "online", "--data", "town:demo"], "--protocol online needs drives"),
-        (["--window", "30s"], "--window: only for --protocol online"),
+        (["--window", "30s"], "--window: is of --protocol online"),
         (["--detectors", "ibow"], "--detectors ibow: learns during a drive"),
         (["--detectors", "thumbnail", "--weights", "thumbnail=x"], "the detector thumbnail has"),
     ],

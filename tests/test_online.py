@@ -336,7 +336,10 @@ def test_a_drive_is_measured_before_and_after_verification_and_reported(tmp_path
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--protocol", "online", "--perturb", "light"], "--perturb, --strengths, --seed: only for"),
+        (
+            ["--protocol", "online", "--perturb", "light"],
+            "--perturb, --strengths, --seed: only for",
+        ),
         (["--protocol", "online", "--seed", "1"], "--perturb, --strengths, --seed: only for"),
         (["--protocol", "online", "--window", "x"], "--window x: must be above 0"),
         (["--protocol", "online", "--detectors", "magic"], "--detectors magic: unknown"),

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
@@ -60,6 +61,20 @@ def ground_truth(outcome: RunOutcome) -> Trajectory:
     poses = outcome.sequence.ground_truth
     assert poses is not None
     return Trajectory(outcome.sequence.timestamps, poses)
+
+
+def test_a_run_warns_of_the_calibration_of_other_images(kitti_tree):
+    frames = open_sequence("kitti", kitti_tree, "00", max_frames=3)
+    c = frames.camera
+    twice = replace(c, fx=2 * c.fx, fy=2 * c.fy, cx=2 * c.cx, cy=2 * c.cy)
+    settings = RunSettings(
+        "kitti", "00", "none", "none", "stereo", 0, 1, 0, 1, 3, Config(), calib=(Path("a.yaml"),)
+    )
+    source = replace(frames, camera=twice)
+    outcome = run_sequence(source, parse_perturbation("none", 0), settings, Recorder())
+    (said,) = outcome.warnings
+    assert said.startswith("a.yaml: the principal point")
+    assert "images of twice this size" in said
 
 
 @pytest.mark.slow

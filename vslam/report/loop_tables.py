@@ -15,10 +15,10 @@ _MAX_REJECTED = 12
 def loop_sections(report: ReportJson) -> list[Section]:
     """Revisits, closed loops, why candidates were rejected, and which of them came near."""
     return [
+        Section("Loops closed", [_closed(report)]),
         Section("Revisits", [_revisits(report)], wide=False),
-        Section("Loops closed", [_closed(report)], wide=False),
         Section("Loops rejected", [_reasons(report)], wide=False),
-        Section("Rejected with the most inliers", [_nearly(report)], folded=True, wide=False),
+        Section("Rejected with the most inliers", [_nearly(report)], folded=True),
     ]
 
 

@@ -368,7 +368,7 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     refused = vslam("run", "--resume", folder, "--seed", 2, *brief, cwd=tmp_path)
     assert refused.returncode == 2
     assert refused.stderr == (
-        "error: --seed: a run that is resumed goes on with its own options; leave it out.\n"
+        "error: --seed: a resumed run continues with its own options; leave it out.\n"
     )
     nothing = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
     assert nothing.returncode == 2

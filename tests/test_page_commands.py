@@ -42,6 +42,7 @@ HOURS = "it takes hours"
 AGAIN = "each town takes seconds, and this form runs on another page or above"
 REAL = "it needs real KITTI"
 ORBSLAM = "it needs pyorbslam3, which vslam does not depend on"
+BOARDS = "test_calibrate.py renders boards for it"
 INSTALL = "`make test` builds and installs the wheel"
 
 
@@ -73,6 +74,7 @@ RULES = {
         not_run=(
             ("git clone", "it needs the address of the repository"),
             ("make ", "CI runs it, and this test in it"),
+            ("vslam calibrate", BOARDS),
             ("source .venv", "there is no other environment here"),
             ("vslam report runs --serve", "it serves until it is stopped"),
         ),
@@ -106,6 +108,7 @@ RULES = {
             (" --threads 4 ...", f" --seqs 00 --perturb none --max-frames {N}"),
         ),
     ),
+    "docs/howto/calibrate.md": Rules(not_run=(("vslam calibrate", BOARDS),)),
     "docs/howto/cameras.md": Rules(
         not_run=(
             ("vslam synth block --fisheye", AGAIN),
@@ -489,6 +492,7 @@ PREPARE: dict[str, Callable[[Path, object], None]] = {
     "README.md": _videos,
     "datasets.md": _straight_route,
     "docs/howto/bench.md": _earlier_run,
+    "docs/howto/calibrate.md": _videos,
     "docs/explanation/design.md": _image,
     "docs/howto/rgbd.md": _depth_sources,
     "docs/howto/sources.md": _pair_sources,

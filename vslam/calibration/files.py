@@ -1,4 +1,4 @@
-"""Reading calibration files, whose format is recognised by their keys."""
+"""Reading calibration files, whose format is recognised by their keys, and writing our own."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from vslam.calibration.formats import (
     read_own,
     read_ros,
 )
-from vslam.calibration.models import Calibration
-from vslam.errors import InputError
+from vslam.calibration.models import Calibration, CameraModel
+from vslam.errors import InputError, ResultsError
 
 _Reader = Callable[[Sequence[Document], Size | None], Calibration]
 # Keys of a format, its reader and its largest number of files; the first format whose keys are all
@@ -75,6 +75,35 @@ def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> C
         "format (docs/howto/cameras.md), Kalibr's camchain, OpenCV's YAML, EuRoC's sensor.yaml, "
         "ROS's camera_info or the settings of ORB-SLAM."
     )
+
+
+def write_calibration(path: Path, calibration: Calibration) -> None:
+    """Write the camera or the stereo pair in vslam's own format.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
+    lines = ["left:", *_camera_lines(calibration.left)]
+    if calibration.right is not None and calibration.T_left_right is not None:
+        lines += ["right:", *_camera_lines(calibration.right)]
+        lines += ["T_left_right:  # maps points of the right camera to the left one; metres"]
+        lines += [f"  - {row}" for row in calibration.T_left_right.tolist()]
+    try:
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ResultsError(
+            f"{path}: cannot be written ({error.strerror}); name another file with --out."
+        ) from error
+
+
+def _camera_lines(model: CameraModel) -> list[str]:
+    return [
+        f"  lens: {model.lens}",
+        f"  size: [{model.width}, {model.height}]",
+        f"  focal: [{model.fx!r}, {model.fy!r}]",
+        f"  centre: [{model.cx!r}, {model.cy!r}]",
+        f"  distortion: {list(model.distortion)}",
+    ]
 
 
 def _in_folder(folder: Path) -> list[Path]:

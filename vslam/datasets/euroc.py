@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
-from vslam.datasets.frames import Source
+from vslam.datasets.frames import RawSource, Source
 from vslam.datasets.ground_truth import poses_at
 from vslam.datasets.image_files import checked_files, find_sequence, select_frames
 from vslam.datasets.rectified import rectified
@@ -56,6 +56,42 @@ def open_euroc(
             unusable.
         UnreadableImageError: the first pair cannot be decoded.
     """
+    base, found, stamps, files = _select(root, name, start, every, max_frames, monocular)
+    truth = _read_ground_truth(base, stamps)
+    raw = checked_files("euroc", found, stamps.astype(np.float64) * 1e-9, truth, files)
+    sensors = calib or [base / f"cam{side}" / "sensor.yaml" for side in range(len(files))]
+    return rectified(raw, read_calibration(sensors, raw.sizes[0]))
+
+
+def open_raw_euroc(
+    root: Path | str,
+    name: str | None = None,
+    *,
+    start: int = 0,
+    every: int = 1,
+    max_frames: int | None = None,
+    monocular: bool = False,
+) -> RawSource:
+    """The images of a sequence as the cameras took them, without calibration and ground truth; see
+    `open_euroc`."""
+    _, found, stamps, files = _select(root, name, start, every, max_frames, monocular)
+    return checked_files("euroc", found, stamps.astype(np.float64) * 1e-9, None, files)
+
+
+def is_euroc(root: Path) -> bool:
+    """Whether a folder holds the left camera of a sequence in this layout."""
+    return any((base / "cam0" / "data.csv").is_file() for base in (root / "mav0", root))
+
+
+def _select(
+    root: Path | str,
+    name: str | None,
+    start: int,
+    every: int,
+    max_frames: int | None,
+    monocular: bool,
+) -> tuple[Path, str, NDArray[np.int64], list[tuple[Path, ...]]]:
+    """Folder with ``cam0``, the sequence's name, and times (ns) and files of the chosen frames."""
     base, found = _find(Path(root), name)
     cameras = [base / f"cam{side}" for side in range(1 if monocular else 2)]
     listed = [_read_list(camera) for camera in cameras]
@@ -66,15 +102,7 @@ def open_euroc(
         for camera, (_, names), rows in zip(cameras, listed, chosen.T, strict=True)
     ]
     stamps = listed[0][0][chosen[:, 0]]
-    truth = _read_ground_truth(base, stamps)
-    raw = checked_files("euroc", found, stamps.astype(np.float64) * 1e-9, truth, files)
-    sensors = calib or [camera / "sensor.yaml" for camera in cameras]
-    return rectified(raw, read_calibration(sensors, raw.sizes[0]))
-
-
-def is_euroc(root: Path) -> bool:
-    """Whether a folder holds the left camera of a sequence in this layout."""
-    return any((base / "cam0" / "data.csv").is_file() for base in (root / "mav0", root))
+    return base, found, stamps, files
 
 
 def _find(root: Path, name: str | None) -> tuple[Path, str]:

@@ -12,6 +12,7 @@ from vslam.calibration.models import Calibration
 from vslam.datasets import DATASETS, open_plugin_source, open_sequence
 from vslam.datasets.detection import detect_dataset
 from vslam.datasets.frames import RawSource, Source, selected
+from vslam.datasets.image_files import list_images
 from vslam.datasets.rectified import rectified
 from vslam.errors import InputError
 
@@ -117,6 +118,55 @@ def _open_images(dataset: str, options: SourceOptions) -> Source:
         )  # fmt: skip
         calibration = _calibration(dataset, o, found.size)
         return rectified(found.source(o.depth_scale or calibration.depth_scale), calibration)
+    raw, own = _open_stream(dataset, o, monocular)
+    return rectified(raw, _calibration(dataset, o, raw.sizes[0], own))
+
+
+def open_raw(options: SourceOptions) -> RawSource:
+    """Open images as the cameras took them, to calibrate these; times play no part.
+
+    Without ``sensor``, a video or camera is that of a single camera unless ``side_by_side`` is set,
+    and a folder that holds images itself is that of a single camera unless ``right`` is named.
+
+    Raises:
+        InputError: an option does not apply to this source, it has no unrectified images of one
+            camera or a pair, or as the reader says.
+    """
+    o = options
+    dataset = o.dataset or detect_dataset(o.data)
+    _check_options(dataset, o)
+    if dataset == "images":
+        from vslam.datasets.image_folders import open_images
+
+        alone = o.right is None and bool(list_images(Path(o.data)))
+        return open_images(
+            Path(o.data), o.right, fps=o.fps or 1.0, start=o.start, every=o.every,
+            max_frames=o.max_frames, sensor=o.sensor or ("mono" if alone else "stereo"),
+        ).source(None)  # fmt: skip
+    if dataset == "euroc":
+        from vslam.datasets.euroc import open_raw_euroc
+
+        return open_raw_euroc(
+            o.data, o.seq, start=o.start, every=o.every, max_frames=o.max_frames,
+            monocular=o.sensor == "mono",
+        )  # fmt: skip
+    if dataset not in SOURCES:
+        raise InputError(
+            f"{o.data}: {dataset} has a calibration; name a video, a bag, folders of images or "
+            "EuRoC's layout with images of a board."
+        )
+    monocular = o.sensor == "mono" or (dataset != "bag" and not o.side_by_side)
+    raw, _ = _open_stream(dataset, o, monocular)
+    if raw.depth:
+        raise InputError(f"{o.data}: the second images are depth; say --sensor mono.")
+    return raw
+
+
+def _open_stream(
+    dataset: str, options: SourceOptions, monocular: bool
+) -> tuple[RawSource, Calibration | None]:
+    """A video, bag or camera, and the calibration in a bag."""
+    o = options
     raw: RawSource
     own: Calibration | None = None
     if dataset == "video":
@@ -135,8 +185,7 @@ def _open_images(dataset: str, options: SourceOptions) -> Source:
         from vslam.datasets.live_camera import open_camera
 
         raw = open_camera(o.data, side_by_side=o.side_by_side, monocular=monocular)
-    raw = selected(raw, start=o.start, every=o.every, max_frames=o.max_frames)
-    return rectified(raw, _calibration(dataset, o, raw.sizes[0], own))
+    return selected(raw, start=o.start, every=o.every, max_frames=o.max_frames), own
 
 
 def _check_options(dataset: str, options: SourceOptions) -> None:

@@ -158,8 +158,8 @@ class PreparedRoute:
         spec = LIGHT if light else "none"
         changed = perturbed(self._route.frames(), parse_perturbation(spec, self._seed + light))
         for _, prepared in prepared_frames(changed, self._context, self._threads):
-            assert prepared.extracted is not None, prepared.problem
-            yield prepared.extracted
+            assert prepared.images is not None, prepared.problem
+            yield prepared.images.extracted
 
 
 def resident_mb() -> float:

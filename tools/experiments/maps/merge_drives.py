@@ -82,7 +82,7 @@ def drive(sequence: Source, frames: range, detector: str, perturb: str, seed: in
     slam = Slam(sequence.camera, Config(), made, images=images)
     lit = lit_frames(sequence, frames, perturb, seed)
     for timestamp, prepared in prepared_frames(lit, slam.context, 2):
-        slam.step_features(prepared.extracted, timestamp, prepared.image)
+        slam.step_images(prepared.images, timestamp)
     slam.finish()
     stored = slam.stored_map(f"{sequence.name} {frames.start}-{frames[-1]}").compact()
     stored.map.frames[:] = [frames[k] for k in stored.map.frames]

@@ -47,7 +47,7 @@ def main() -> None:
         fx, fy = sequence.camera.fx * factor, sequence.camera.fy * factor
         slam = Slam(replace(sequence.camera, fx=fx, fy=fy), Config())
         for timestamp, prepared in prepared_frames(sequence.frames(), slam.context, 2):
-            slam.step_features(prepared.extracted, timestamp)
+            slam.step_images(prepared.images, timestamp)
         slam.finish()
         estimate = slam.trajectory()
         by_turn, by_metre = scale_drift(estimate.T_wc, truth.T_wc, options.piece)

@@ -1,0 +1,270 @@
+"""``vslam calibrate`` on rendered boards of known truth."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rendered_boards import Renderer
+from source_files import write_images, write_video
+
+from vslam.calibration.boards import Board, Corners, board_points, read_board, same_order
+from vslam.calibration.files import read_calibration, write_calibration
+from vslam.calibration.models import Calibration, CameraModel, project, unproject
+from vslam.calibration.solve import View, diverse, fit_camera, fit_pair
+from vslam.cli import main as cli
+from vslam.doctor.calibration_page import Calibrated, findings_of
+from vslam.errors import InputError
+
+PINHOLE = CameraModel(
+    300.0, 300.6, 193.2, 142.8, 384, 288, "pinhole", (-0.25, 0.07, 0.0005, -0.0004)
+)
+FISHEYE = CameraModel(150.0, 150.6, 193.2, 142.8, 384, 288, "fisheye", (0.02, -0.01, 0.003, -0.001))
+CHECKERBOARD = Board("checkerboard", 9, 6, 0.03)
+CHARUCO = Board("charuco", 7, 5, 0.04, 0.03, "4X4_50")
+APRILGRID = Board("aprilgrid", 4, 3, 0.078, 0.06)
+KALIBR = "target_type: 'aprilgrid'\ntagCols: 4\ntagRows: 3\ntagSize: 0.06\ntagSpacing: 0.3\n"
+T_LEFT_RIGHT = np.eye(4)
+T_LEFT_RIGHT[:3, :3] = cv2.Rodrigues(np.array([0.01, -0.03, 0.02]))[0]
+T_LEFT_RIGHT[:3, 3] = 0.06, 0.001, -0.002
+
+
+def poses(board: Board, model: CameraModel, n: int) -> list[np.ndarray]:
+    """``T_camera_board`` of views spread over the image and tilted in all directions."""
+    points = board_points(board)
+    middle, extent = points.mean(axis=0), float(np.ptp(points, axis=0).max())
+    upright = np.diag([1.0, -1.0, -1.0]) if board.kind == "aprilgrid" else np.eye(3)
+    found = []
+    for k in range(n):
+        x, y = (-0.18, 0.0, 0.18)[k % 3], (-0.15, 0.15, 0.0)[k // 3 % 3]
+        xy = np.array([[model.cx + x * model.width, model.cy + y * model.height]])
+        ray = unproject(model, xy)[0]
+        angle = 2.4 * k  # the golden angle
+        tilt = cv2.Rodrigues(0.55 * np.array([np.cos(angle), np.sin(angle), 0.2]))[0]
+        # Turned towards the camera, a board off the axis is seen whole.
+        R = cv2.Rodrigues(np.cross([0, 0, 1], ray))[0] @ tilt @ upright
+        T = np.eye(4)
+        reach = (1.15 + 0.1 * (k % 2)) * model.fx * extent / (0.6 * model.width)
+        T[:3, :3], T[:3, 3] = R, reach * ray - R @ middle
+        found.append(T)
+    return found
+
+
+def rendered(board: Board, model: CameraModel, views: list[np.ndarray], seed: int) -> list:
+    renderer, rng = Renderer(board, model), np.random.default_rng(seed)
+    return [renderer.image(T, rng) for T in views]
+
+
+def seen_at(board: Board, model: CameraModel, T: np.ndarray, noise: float, rng) -> Corners:
+    """Exact corners with noise, without an image."""
+    points = board_points(board)
+    xy = project(model, points @ T[:3, :3].T + T[:3, 3])
+    return Corners(np.arange(len(xy)), xy + rng.normal(0.0, noise, xy.shape))
+
+
+@pytest.fixture
+def call(monkeypatch, capsys, tmp_path):
+    """Run ``vslam calibrate`` in an empty folder: (exit code, stdout, stderr)."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["vslam", "calibrate", *map(str, words)])
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        output = capsys.readouterr()
+        return code, output.out, output.err
+
+    return run
+
+
+def check_camera(found: CameraModel, truth: CameraModel) -> None:
+    assert (found.width, found.height, found.lens) == (truth.width, truth.height, truth.lens)
+    assert [found.fx, found.fy] == pytest.approx([truth.fx, truth.fy], rel=0.002)
+    assert [found.cx, found.cy] == pytest.approx([truth.cx, truth.cy], abs=0.6)
+
+
+def check_pair(found: Calibration, truth: CameraModel) -> None:
+    assert found.right is not None
+    assert found.T_left_right is not None
+    check_camera(found.left, truth)
+    check_camera(found.right, truth)
+    baseline = np.linalg.norm(found.T_left_right[:3, 3])
+    assert baseline == pytest.approx(np.linalg.norm(T_LEFT_RIGHT[:3, 3]), rel=0.005)
+    turn = cv2.Rodrigues(found.T_left_right[:3, :3] @ T_LEFT_RIGHT[:3, :3].T)[0]
+    assert np.linalg.norm(turn) < 2e-3
+
+
+def test_checkerboard_filmed_by_one_camera(call, tmp_path):
+    images = rendered(CHECKERBOARD, PINHOLE, poses(CHECKERBOARD, PINHOLE, 14), 0)
+    write_images(tmp_path, {"board": images}, [f"{k}.png" for k in range(14)])
+    code, out, _ = call("board", "--board", "checkerboard", "--size", "9x6")
+    assert code == 0, out
+    assert "vslam run DRIVE --sensor mono --calib calibration.yaml" in out
+    check_camera(read_calibration(["calibration.yaml"]).left, PINHOLE)
+    page = Path("calibration.html").read_text()
+    assert "checkerboard of 9x6 inner corners" in page
+    assert page.count("<svg") == 2
+    code, _, err = call("board", "--board", "checkerboard", "--size", "9x6")
+    assert (code, "calibration.yaml: exists already" in err) == (2, True)
+
+
+def test_charuco_board_in_a_side_by_side_video(call, tmp_path):
+    views = poses(CHARUCO, PINHOLE, 14)
+    right = [np.linalg.inv(T_LEFT_RIGHT) @ T for T in views]
+    sides = rendered(CHARUCO, PINHOLE, views, 1), rendered(CHARUCO, PINHOLE, right, 2)
+    write_video(tmp_path / "pair.mkv", [np.hstack(pair) for pair in zip(*sides, strict=True)])
+    sizes = ("--size", "7x5", "--square", 0.04, "--marker", 0.03, "--dictionary", "4X4_50")
+    words = ("pair.mkv", "--side-by-side", "--board", "charuco", *sizes, "--out", "stereo.yaml")
+    code, out, _ = call(*words)
+    assert code == 0, out
+    check_pair(read_calibration(["stereo.yaml"]), PINHOLE)
+
+
+def test_aprilgrid_of_kalibr_in_euroc_layout_by_fisheye_cameras(call, tmp_path):
+    views = poses(APRILGRID, FISHEYE, 14)
+    right = [np.linalg.inv(T_LEFT_RIGHT) @ T for T in views]
+    names = [f"{10**18 + 10**8 * k}.png" for k in range(14)]
+    for side, of_side in enumerate((views, right)):
+        folder = tmp_path / "mav0" / f"cam{side}"
+        write_images(folder, {"data": rendered(APRILGRID, FISHEYE, of_side, side)}, names)
+        (folder / "data.csv").write_text("".join(f"{Path(n).stem},{n}\n" for n in names))
+    (tmp_path / "april.yaml").write_text(KALIBR)
+    board = read_board(tmp_path / "april.yaml")
+    assert (board.columns, board.rows) == (4, 3)
+    assert (board.square, board.marker) == pytest.approx((APRILGRID.square, APRILGRID.marker))
+    code, out, _ = call(tmp_path, "--board", "april.yaml", "--lens", "fisheye")
+    assert code == 0, out
+    check_pair(read_calibration(["calibration.yaml"]), FISHEYE)
+
+
+def test_written_calibration_is_read_as_the_same(tmp_path):
+    pair = Calibration(PINHOLE, FISHEYE, T_LEFT_RIGHT)
+    for calibration in (pair, pair.left_alone()):
+        write_calibration(tmp_path / "a.yaml", calibration)
+        found = read_calibration([tmp_path / "a.yaml"])
+        assert (found.left, found.right) == (calibration.left, calibration.right)
+        if calibration.T_left_right is not None:
+            np.testing.assert_allclose(found.T_left_right, T_LEFT_RIGHT, atol=1e-12)
+
+
+def test_views_that_do_not_fit_are_dropped_and_named():
+    rng = np.random.default_rng(0)
+    views = [
+        View(str(k), seen_at(CHECKERBOARD, PINHOLE, T, 0.05, rng))
+        for k, T in enumerate(poses(CHECKERBOARD, PINHOLE, 14))
+    ]
+    bent = views[5].corners
+    views[5] = View("5", replace(bent, xy=bent.xy + rng.normal(0.0, 2.0, bent.xy.shape)))
+    fit = fit_camera(CHECKERBOARD, views, (384, 288), "pinhole")
+    check_camera(fit.model, PINHOLE)
+    assert [name for name, _ in fit.dropped] == ["5"]
+    other = fit_camera(CHECKERBOARD, views[:5] + views[6:], (384, 288), "pinhole")
+    assert fit.model.fx == pytest.approx(other.model.fx, abs=2e-5)
+    found = findings_of(Calibrated(CHECKERBOARD, Calibration(fit.model), (fit,), None, (14, 14)))
+    assert {f.verdict for f in found} == {"good"}
+    assert "dropped because they do not fit: 5 (" in found[0].measured
+
+
+def test_pairs_that_were_not_taken_together_are_dropped():
+    rng = np.random.default_rng(0)
+    views = poses(CHECKERBOARD, PINHOLE, 14)
+    right = [np.linalg.inv(T_LEFT_RIGHT) @ T for T in views]
+    late = np.eye(4)
+    late[0, 3] = 0.01
+    right[3] = late @ right[3]
+    fits = [
+        fit_camera(
+            CHECKERBOARD,
+            [
+                View(str(k), seen_at(CHECKERBOARD, PINHOLE, T, 0.05, rng))
+                for k, T in enumerate(side)
+            ],
+            (384, 288),
+            "pinhole",
+        )
+        for side in (views, right)
+    ]
+    pair = fit_pair(CHECKERBOARD, *fits)
+    assert [name for name, _ in pair.dropped] == ["3"]
+    both = Calibration(fits[0].model, fits[1].model, pair.T_left_right)
+    check_pair(both, PINHOLE)
+
+
+def test_checkerboard_numbered_from_the_other_end_is_renumbered():
+    board = Board("checkerboard", 8, 6, 0.03)
+    (T,) = poses(board, PINHOLE, 1)
+    left = seen_at(board, PINHOLE, T, 0.0, np.random.default_rng(0))
+    assert np.array_equal(same_order(board, left, replace(left, xy=left.xy[::-1])).xy, left.xy)
+
+
+def test_diverse_views_leave_out_a_board_that_stands_still():
+    rng = np.random.default_rng(0)
+    moving = poses(CHECKERBOARD, PINHOLE, 9)
+    film = [moving[0]] * 30 + moving[1:]
+    views = [(View("", seen_at(CHECKERBOARD, PINHOLE, T, 0.05, rng)),) for T in film]
+    chosen = diverse(CHECKERBOARD, views, [(384, 288)], 60)
+    assert (len(chosen), chosen[1:]) == (9, list(range(30, 38)))
+    assert len(diverse(CHECKERBOARD, views, [(384, 288)], 4)) == 4
+
+
+def test_doubtful_calibration_is_judged_in_plain_words():
+    rng = np.random.default_rng(0)
+    T = poses(CHECKERBOARD, PINHOLE, 9)[4]
+    tilted = poses(CHECKERBOARD, PINHOLE, 2)
+    same = [
+        View(str(k), seen_at(CHECKERBOARD, PINHOLE, U, 0.05, rng)) for k, U in enumerate(tilted)
+    ]
+    flat = np.eye(4)
+    flat[:3, 3] = T[:3, 3]
+    same.append(View("2", seen_at(CHECKERBOARD, PINHOLE, flat, 0.05, rng)))
+    fit = fit_camera(CHECKERBOARD, same, (384, 288), "pinhole")
+    result = Calibrated(CHECKERBOARD, Calibration(fit.model), (fit,), None, (3, 3))
+    faults = {f.check: f.measured for f in findings_of(result) if f.verdict == "fault"}
+    assert faults["views"] == "3 views, too few"
+    assert faults["tilt"] == "2 views are tilted by more than 15 degrees"
+    assert faults["coverage"].startswith("corners in ")
+
+
+def test_too_few_views_and_another_board_are_errors():
+    rng = np.random.default_rng(0)
+    views = [
+        View(str(k), seen_at(APRILGRID, PINHOLE, T, 0.05, rng))
+        for k, T in enumerate(poses(APRILGRID, PINHOLE, 8))
+    ]
+    with pytest.raises(InputError, match="is found in 2 views that fit, where 3 are the least"):
+        fit_camera(APRILGRID, views[:2], (384, 288), "pinhole")
+    other = replace(APRILGRID, columns=3, rows=4)
+    with pytest.raises(InputError, match="do not fit a flat AprilGrid of 3x4 tags"):
+        fit_camera(other, views, (384, 288), "pinhole")
+
+
+def test_images_without_the_board_are_an_error_that_says_what_was_looked_for(call, tmp_path):
+    blank = np.full((288, 384), 128, np.uint8)
+    images = rendered(CHECKERBOARD, PINHOLE, poses(CHECKERBOARD, PINHOLE, 2), 0)
+    write_images(tmp_path, {"blank": [blank] * 2, "board": images}, ["0.png", "1.png"])
+    write_images(tmp_path / "pair", {"left": images, "right": [blank] * 2}, ["0.png", "1.png"])
+    write_images(tmp_path, {"mixed": [blank, blank[:100]]}, ["0.png", "1.png"])
+    rest = ("--board", "checkerboard", "--size")
+    for words, said in (
+        (("blank", *rest, "9x6"), "blank: no checkerboard of 9x6 inner corners in any of 2 images"),
+        (("board", *rest, "10x7"), "a board of 9x6 inner corners is seen: give --size 9x6"),
+        (
+            ("pair", *rest, "9x6", "--square", 0.03),
+            "the right camera never sees the checkerboard of 9x6 inner corners, which the other",
+        ),
+        (("mixed", *rest, "9x6"), "384x100 pixels where the first image has 384x288"),
+        (("pair", *rest, "9x6"), "--square: is missing"),
+        (("pair", *rest, "9x6", "--square", 30), "must be in metres (0.025 for 25 mm)"),
+        (("pair", *rest, "9"), "--size 9: give columns and rows as 9x6."),
+        (("pair", "--board", "none.yaml"), "--board none.yaml: neither checkerboard, charuco"),
+    ):
+        code, _, err = call(*words)
+        message = err[err.index("error: ") :]
+        assert (code, said in message, message.count("\n")) == (2, True, 1), message

@@ -1,0 +1,241 @@
+"""The command ``vslam calibrate``."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
+
+import typer
+
+from vslam.cli.console import console
+from vslam.cli.options import reads_source
+from vslam.errors import BrokenSourceError, InputError
+
+if TYPE_CHECKING:
+    from vslam.calibration.boards import Board, Finder
+    from vslam.calibration.solve import View
+    from vslam.camera import Image
+    from vslam.datasets.frames import RawSource, TimedFrame
+    from vslam.datasets.sources import SourceOptions
+
+_EXAMPLES = """
+[b]Examples[/b]
+
+  vslam calibrate board.mp4 --board checkerboard --size 9x6 --square 0.025
+
+  vslam calibrate pair.mkv --side-by-side --board charuco --size 7x5 --square 0.04 --marker 0.03
+
+  vslam calibrate cam_april/mav0 --board april_6x6.yaml --lens fisheye --out stereo.yaml
+"""
+_MOST_SEARCHED = 300  # images, spread evenly; a minute or two
+_MOST_VIEWS = 60
+_ALONE = 20  # of these, views of one camera of a pair alone
+_LARGEST_M = 0.5  # side of a square; larger ones were meant in millimetres
+_EXAMINED = 10  # images in which another board is looked for
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the application."""
+    app.command(epilog=_EXAMPLES)(calibrate)
+
+
+@reads_source(without=("calib", "depth", "depth_scale"))
+def calibrate(
+    given: SourceOptions,
+    board: Annotated[
+        str,
+        typer.Option(
+            metavar="KIND|FILE",
+            help="[b]checkerboard[/b], [b]charuco[/b], [b]aprilgrid[/b], or the YAML of a target "
+            "of Kalibr, which has all sizes.",
+        ),
+    ],
+    size: Annotated[
+        str,
+        typer.Option(
+            metavar="COLUMNSxROWS",
+            help="Inner corners of a checkerboard, squares of a ChArUco board, tags of an "
+            "AprilGrid.",
+        ),
+    ] = "",
+    square: Annotated[
+        float | None,
+        typer.Option(
+            help="Side of a square in metres; of an AprilGrid, from one tag to the next. A single "
+            "camera does not need it for a checkerboard.",
+            show_default=False,
+        ),
+    ] = None,
+    marker: Annotated[
+        float | None,
+        typer.Option(help="Side of a marker or tag in metres.", show_default=False),
+    ] = None,
+    dictionary: Annotated[
+        str, typer.Option(help="Markers of a ChArUco board, by OpenCV's name without DICT_.")
+    ] = "5X5_1000",
+    lens: Annotated[
+        Literal["pinhole", "fisheye"],
+        typer.Option(
+            help="[b]pinhole[/b] has radial-tangential distortion; [b]fisheye[/b] is equidistant, "
+            "for angles of view above about 120 degrees."
+        ),
+    ] = "pinhole",
+    out: Annotated[
+        Path, typer.Option(help="Calibration to write; the page beside it ends in .html.")
+    ] = Path("calibration.yaml"),
+) -> None:
+    """Calibrate a camera or a stereo pair from images of a board; exit code 1 if the result is
+    doubtful."""
+    from vslam.calibration.boards import corner_finder
+    from vslam.calibration.files import write_calibration
+    from vslam.calibration.models import Calibration
+    from vslam.calibration.solve import fit_camera, fit_pair
+    from vslam.datasets.sources import open_raw
+    from vslam.doctor.calibration_page import Calibrated, findings_of, write_page
+
+    if given.sensor == "rgbd":
+        raise InputError("--sensor rgbd: depth is not calibrated; say mono or stereo.")
+    if out.exists():
+        raise InputError(f"{out}: exists already; name another file with --out, or remove it.")
+    raw = open_raw(given)
+    if raw.live and given.max_frames is None:
+        raise InputError(f"{given.data}: a camera never ends; give --max-frames, 300 for example.")
+    made = _board(board, size, square, marker, dictionary, stereo=len(raw.sizes) == 2)
+    n, seen = _search(raw, corner_finder(made))
+    try:
+        chosen = _choose(made, raw, seen, n)
+        fits = tuple(
+            fit_camera(made, views, raw.sizes[side], lens) for side, views in enumerate(chosen)
+        )
+        pair = fit_pair(made, *fits) if len(fits) == 2 else None
+    except InputError as error:
+        raise InputError(f"{given.data}: {error}") from error
+    calibration = Calibration(fits[0].model, source=str(out))
+    if pair is not None:
+        calibration = replace(calibration, right=fits[1].model, T_left_right=pair.T_left_right)
+    result = Calibrated(made, calibration, fits, pair, (len(seen), n))
+    findings = findings_of(result)
+    write_calibration(out, calibration)
+    for finding in findings:
+        typer.echo(f"{finding.verdict:<8} {finding.check:<16} {finding.measured}")
+        if finding.fix:
+            typer.echo(f"{'':<8} {'':<16} fix: {finding.fix}")
+    page = out.with_suffix(".html")
+    write_page(result, findings, out.read_text("utf-8"), page)
+    options = " --side-by-side" if given.side_by_side else ""
+    options += " --sensor mono" if pair is None else ""
+    typer.echo(f"{out}: the calibration; {page}: residuals and coverage. Next, with a drive:")
+    typer.echo(f"  vslam doctor DRIVE{options} --calib {shlex.quote(str(out))}")
+    typer.echo(f"  vslam run DRIVE{options} --calib {shlex.quote(str(out))}")
+    if any(finding.verdict == "fault" for finding in findings):
+        raise typer.Exit(1)
+
+
+def _board(
+    kind: str,
+    size: str,
+    square: float | None,
+    marker: float | None,
+    dictionary: str,
+    *,
+    stereo: bool,
+) -> Board:
+    """The board that the options describe."""
+    from vslam.calibration.boards import Board, Kind, read_board
+
+    if kind not in get_args(Kind):
+        if not Path(kind).is_file():
+            raise InputError(
+                f"--board {kind}: neither checkerboard, charuco or aprilgrid nor a file; name one."
+            )
+        return _checked(read_board(Path(kind)))
+    found = re.fullmatch(r"(\d+)x(\d+)", size)
+    if found is None:
+        raise InputError(f"--size {size or 'is missing'}: give columns and rows as 9x6.")
+    if square is None and (stereo or kind != "checkerboard"):
+        raise InputError("--square: is missing; measure the board and give it in metres.")
+    if (marker is None) != (kind == "checkerboard"):
+        wanted = "of no use for a checkerboard; leave it out" if marker else "missing; measure it"
+        raise InputError(f"--marker: is {wanted}.")
+    side = 0.1 if square is None else square
+    columns, rows = int(found[1]), int(found[2])
+    return _checked(Board(cast("Kind", kind), columns, rows, side, marker or 0.0, dictionary))
+
+
+def _checked(board: Board) -> Board:
+    if not 0 <= board.marker < board.square <= _LARGEST_M:
+        raise InputError(
+            f"--square {board.square:g} and --marker {board.marker:g}: must be in metres (0.025 "
+            "for 25 mm), and the marker smaller."
+        )
+    least = 1 if board.kind == "aprilgrid" else 3
+    if not least <= min(board.columns, board.rows) <= max(board.columns, board.rows) <= 100:
+        raise InputError(f"--size {board.columns}x{board.rows}: give {least} to 100 of each.")
+    return board
+
+
+def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
+    """Frames of a source, evenly spread."""
+    every = -(-(raw.n_expected or 1) // most)
+    n = 0
+    try:
+        for n, frame in enumerate(raw.frames()):
+            if n % every == 0:
+                yield frame
+    except BrokenSourceError as error:
+        if not n:
+            raise
+        typer.echo(f"warning: {error}", err=True)
+
+
+def _search(raw: RawSource, find: Finder) -> tuple[int, list[tuple[View | None, ...]]]:
+    """How many images were searched, and the views of each that shows the board to a camera."""
+    from vslam.calibration.solve import View
+
+    total = min(raw.n_expected or _MOST_SEARCHED, _MOST_SEARCHED)
+    seen: list[tuple[View | None, ...]] = []
+    n = 0
+    with console(shown=True).count_bar("images", total) as advance:
+        for frame in _frames(raw, _MOST_SEARCHED):
+            name = frame.file.name if frame.file else f"{frame.timestamp:.2f} s"
+            corners = [find(cast("Image", image)) for image in frame.read(map) if image is not None]
+            if any(corners):
+                seen.append(tuple(None if c is None else View(name, c) for c in corners))
+            n += 1
+            advance()
+    return n, seen
+
+
+def _choose(
+    board: Board, raw: RawSource, seen: list[tuple[View | None, ...]], n: int
+) -> list[list[View]]:
+    """The views of each camera to calibrate with: of a pair, above all those of both.
+
+    Raises:
+        InputError: the board is not seen, or not by both cameras.
+    """
+    from vslam.calibration.boards import seen_instead
+    from vslam.calibration.solve import diverse
+
+    sides = [[s[k] for s in seen if s[k]] for k in range(len(raw.sizes))]
+    if not any(sides):
+        images = (f.read(map)[0] for f in _frames(raw, _EXAMINED))
+        hint = seen_instead(board, images) or "check --board and --size, and that all of it is seen"
+        raise InputError(f"no {board} in any of {n} images; {hint}.")
+    for side, other, name in ((0, 1, "left"), (1, 0, "right")):
+        if len(sides) == 2 and not sides[side]:
+            raise InputError(
+                f"the {name} camera never sees the {board}, which the other one sees in "
+                f"{len(sides[other])} of {n} images; hold it where both do, or say --sensor mono."
+            )
+    both = [tuple(v for v in s if v is not None) for s in seen if all(s)]
+    chosen = [both[k] for k in diverse(board, both, raw.sizes, _MOST_VIEWS)]
+    views = [[pair[k] for pair in chosen] for k in range(len(sides))]
+    for k, size in enumerate(raw.sizes if len(sides) == 2 else ()):
+        alone = [v for s in seen if (v := s[k]) is not None and not all(s)]
+        views[k] += [alone[i] for i in diverse(board, [(v,) for v in alone], [size], _ALONE)]
+    return views

@@ -1,0 +1,201 @@
+"""The verdicts on a calibration from images of a board, and its page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vslam.calibration.boards import Board
+from vslam.calibration.models import Array, Calibration
+from vslam.calibration.rectification import rectify
+from vslam.calibration.solve import CameraFit, PairFit, rms
+from vslam.doctor.findings import Finding, judge
+from vslam.errors import InputError
+from vslam.report.drawing import BLUE, GREY, LOW, RED, Drawing, draw, new_figure
+from vslam.report.page import Code, Page, Row, Section, Table, Tile, Tiles
+from vslam.report.render import html, write_files
+
+_FEW_VIEWS = 10
+_TILT, _FEW_TILTED = 15.0, 3  # degrees; a board that is never tilted fixes no focal length
+_CELLS = (8, 6)  # of the image, across and down
+_COVERED = 0.6  # share of the cells; corners hardly reach the outermost pixels
+_LARGE_PX = 1.0  # RMS; half a pixel is usual for a video
+_APART_PX = 2.0  # RMS, between the cameras
+_BENT = 2.0  # residuals in the outer half of the corners over those in the inner half
+_MOST_DROPPED = 0.25
+_ARROW = 0.02  # of the image width: length of an arrow of the RMS error
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A calibration and what it was estimated from.
+
+    Attributes:
+        board: what was filmed.
+        calibration: the result.
+        fits: the estimate of each camera, left first.
+        pair: the estimate of the transformation; None for a single camera.
+        n_seen: images that show the board, and images searched.
+    """
+
+    board: Board
+    calibration: Calibration
+    fits: tuple[CameraFit, ...]
+    pair: PairFit | None
+    n_seen: tuple[int, int]
+
+
+def findings_of(result: Calibrated) -> list[Finding]:
+    """The verdicts, for each camera and then for the pair."""
+    found = [finding for side, fit in _sides(result) for finding in _camera(side, fit)]
+    if result.pair is not None:
+        n, error = len(result.pair.names), _total(result.pair.errors)
+        fix = "trigger both cameras together, or hold the board still"
+        found += [
+            _kept("pairs", n, result.pair.dropped),
+            judge("synchronisation", error > _APART_PX, f"{error:.2f} px between the cameras", fix),
+        ]
+    try:
+        rectify(result.calibration)
+    except InputError as error:
+        measured, _, fix = str(error).rstrip(".").rpartition("; ")
+        found.append(Finding("rectification", "fault", measured, fix))
+    return found
+
+
+def write_page(result: Calibrated, findings: Sequence[Finding], text: str, path: Path) -> None:
+    """Write the page as self-contained HTML.
+
+    Args:
+        text: the calibration file.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
+    tiles = []
+    for side, fit in _sides(result):
+        m = fit.model
+        tiles += [
+            Tile(
+                f"{side}focal length".capitalize(),
+                f"{m.fx:.2f}, {m.fy:.2f} px",
+                f"{m.width}x{m.height}",
+            ),
+            Tile(
+                f"{side}error".capitalize(),
+                f"{_total(fit.errors):.3f} px",
+                f"RMS of {len(fit.views)} views",
+            ),
+        ]
+    if result.calibration.T_left_right is not None:
+        baseline = float(np.linalg.norm(result.calibration.T_left_right[:3, 3]))
+        tiles.append(Tile("Baseline", f"{baseline:.4f} m"))
+    head = ("check", "verdict", "measured", "fix")
+    rows: list[Row] = [(f.check, f.verdict, f.measured, f.fix) for f in findings]
+    page = Page(
+        "Calibration",
+        [str(result.board), "the board is seen in {} of {} images".format(*result.n_seen)],
+        [
+            Section("", [Tiles(tiles)]),
+            Section("Verdicts", [Table(head, rows, head)]),
+            Section("", draw(_drawings(result)), wide=False),
+            Section("Calibration file", [Code(text)]),
+        ],
+    )
+    write_files(path.parent, {path.name: html(page)}, "name another file with --out")
+
+
+def _sides(result: Calibrated) -> list[tuple[str, CameraFit]]:
+    names = ("left ", "right ") if len(result.fits) == 2 else ("",)
+    return list(zip(names, result.fits, strict=True))
+
+
+def _total(errors: Array) -> float:
+    return float(np.sqrt((errors**2).mean()))
+
+
+def _camera(side: str, fit: CameraFit) -> list[Finding]:
+    m, n, error = fit.model, len(fit.views), _total(fit.errors)
+    views = _kept(f"{side}views", n, fit.dropped)
+    if n < _FEW_VIEWS:
+        fix = f"film the board in at least {_FEW_VIEWS} different places and directions"
+        views = Finding(views.check, "fault", f"{views.measured}, too few", fix)
+    cosines = np.abs(fit.T_camera_board[:, 2, 2]).clip(0.0, 1.0)
+    tilted = int((np.degrees(np.arccos(cosines)) > _TILT).sum())
+    xy = np.concatenate([view.corners.xy for view in fit.views])
+    share, emptiest = _coverage(xy / (m.width, m.height))
+    # Of a model that does not fit, residuals grow towards the border.
+    residuals, far = np.concatenate(fit.residuals), np.linalg.norm(xy - (m.cx, m.cy), axis=1)
+    outer = far > np.median(far)
+    ratio = rms(residuals[outer]) / rms(residuals[~outer])
+    other = "pinhole" if m.lens == "fisheye" else "fisheye"
+    return [
+        views,
+        judge(
+            f"{side}tilt", tilted < _FEW_TILTED,
+            f"{tilted} views are tilted by more than {_TILT:.0f} degrees",
+            "tilt the board: without that, focal length and distance cannot be told apart",
+        ),
+        judge(
+            f"{side}coverage", share < _COVERED, f"corners in {share:.0%} of the image",
+            f"film the board everywhere, above all at the {emptiest} of the image",
+        ),
+        judge(
+            f"{side}residuals", error > _LARGE_PX, f"{error:.3f} px RMS",
+            "check that the board is flat, sharp and still, and its columns and rows",
+        ),
+        judge(
+            f"{side}lens", ratio > _BENT,
+            f"{m.lens}; residuals in the outer half are {ratio:.1f} times those in the inner half",
+            f"try --lens {other}",
+        ),
+    ]  # fmt: skip
+
+
+def _kept(check: str, n: int, dropped: Sequence[tuple[str, float]]) -> Finding:
+    measured = f"{n} {check.split()[-1]}"
+    if dropped:
+        named = ", ".join(f"{name} ({error:.1f} px)" for name, error in dropped)
+        measured += f"; dropped because they do not fit: {named}"
+    fix = "keep the board flat and still, and film it in good light"
+    return judge(check, len(dropped) > _MOST_DROPPED * (n + len(dropped)), measured, fix)
+
+
+def _coverage(at: Array) -> tuple[float, str]:
+    """The share of the image that corners cover, and where they cover least.
+
+    Args:
+        at: ``(N, 2)``, from 0 to 1.
+    """
+    cells = np.zeros(_CELLS, bool)
+    cells[tuple((at * _CELLS).astype(int).clip(0, np.subtract(_CELLS, 1)).T)] = True
+    parts = {"left": cells[:2], "right": cells[-2:], "top": cells[:, :2], "bottom": cells[:, -2:]}
+    return float(cells.mean()), min(parts, key=lambda name: float(parts[name].mean()))
+
+
+def _drawings(result: Calibrated) -> Iterator[Drawing]:
+    for side, fit in _sides(result):
+        m, name = fit.model, side.strip() or "camera"
+        figure, axes = new_figure(f"Corners and residuals: {name}", "x (px)", "y (px)", LOW + 0.8)
+        xy = np.concatenate([view.corners.xy for view in fit.views])
+        times = _ARROW * m.width / _total(fit.errors)
+        axes.quiver(
+            *xy.T, *(times * np.concatenate(fit.residuals).T), angles="xy", scale_units="xy",
+            scale=1, color=BLUE, width=0.002,
+        )  # fmt: skip
+        axes.set(xlim=(0, m.width), ylim=(m.height, 0), aspect="equal")
+        yield (
+            f"corners-{name}",
+            f"Every corner of all views with its residual, enlarged {times:.0f} times. Arrows "
+            "should point anywhere, and corners should fill the image.",
+            figure,
+        )
+        figure, axes = new_figure(f"Error of each view: {name}", "view", "RMS (px)", LOW)
+        errors = [*fit.errors, *(error for _, error in fit.dropped)]
+        colours = [BLUE] * len(fit.views) + [RED] * len(fit.dropped)
+        axes.bar(np.arange(len(errors)), errors, color=colours)
+        axes.axhline(float(np.median(fit.errors)), color=GREY)
+        yield f"errors-{name}", "Line: the median. Red: views that were dropped.", figure

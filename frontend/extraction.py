@@ -2,18 +2,62 @@
 
 from __future__ import annotations
 
+from functools import cached_property, partial
+
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import ImageMap
-from vslam.features import Extracted, Features, Side
+from vslam.camera import DepthImage, Image, ImageMap
+from vslam.features import Extracted, Features, Pyramid, Side
 from vslam.frontend.depth import columns_of_depth
-from vslam.frontend.orb import Extraction
+from vslam.frontend.orb import Extraction, build_pyramid
+from vslam.frontend.pose_alignment import coarse_levels
 from vslam.frontend.side_delay import row_offsets
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import match_stereo
 from vslam.frontend.tracking import TrackingContext
 from vslam.frontend.weak_images import extract_in_any_light
+
+
+class FrameImages:
+    """The images of one moment. Their features are extracted when they are first asked for: a frame
+    that is tracked by patches needs none.
+
+    Attributes:
+        left: ``(H, W)`` uint8.
+        pyramid: of the left image; None if frames are not tracked by patches.
+        coarse: ``coarse_levels`` of that pyramid, or None.
+    """
+
+    def __init__(
+        self,
+        left: Image,
+        second: Image | DepthImage | None,
+        context: TrackingContext,
+        image_map: ImageMap = map,
+        sides: Sides | None = None,
+    ) -> None:
+        """For the arguments see ``extract_features``."""
+        self.left = left
+        self.pyramid: Pyramid | None = None
+        self.coarse: Pyramid | None = None
+        self._second = second
+        self._extract = partial(extract_features, left, second, context, image_map, sides)
+        if context.tracks_patches:
+            self.pyramid = build_pyramid(left, context.config.orb)
+            self.coarse = coarse_levels(self.pyramid)
+
+    @cached_property
+    def extracted(self) -> Extracted:
+        """The features."""
+        return self._extract()
+
+    @property
+    def image(self) -> Image:
+        """``(H, W)`` uint8 that the features are extracted from."""
+        if self.extracted.side == Side.LEFT:
+            return self.left
+        return np.array(self._second, np.uint8)  # a copy: the right image is the caller's
 
 
 def extract_features(

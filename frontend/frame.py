@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import NewType
+from dataclasses import dataclass, fields, replace
+from typing import NewType, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
+from vslam.camera import Camera, Image
 from vslam.features import Extracted, FeatureGrid, Features, Pyramid, Side
 from vslam.geometry import Matrix, inverse
+
+
+class FeatureSource(Protocol):
+    """The images of a frame, whose features are extracted when they are first asked for.
+
+    Attributes:
+        extracted: the features.
+        image: ``(H, W)`` uint8 that they are extracted from.
+    """
+
+    @property
+    def extracted(self) -> Extracted: ...
+
+    @property
+    def image(self) -> Image: ...
 
 
 @dataclass
@@ -38,6 +53,10 @@ class Frame:
             match was not aligned; None if no match was.
         twist: ``(6,)`` velocity of the camera when the frame was tracked, per second; None if
             unknown.
+        source: where ``extract`` takes the features from; None once they are there. Until then the
+            features are those landmarks that were found by their patches.
+        coarse: ``coarse_levels`` of the image, by which the next frame is aligned; None if it is
+            not.
     """
 
     index: int
@@ -56,6 +75,8 @@ class Frame:
     delay_removed: bool = False
     shift: NDArray[np.float32] | None = None
     twist: Matrix | None = None
+    source: FeatureSource | None = None
+    coarse: Pyramid | None = None
 
     @classmethod
     def of(
@@ -89,14 +110,24 @@ class Frame:
         T: Matrix = self.T_camera_left @ self.T_cw
         return T
 
+    def extract(self, camera: Camera) -> None:
+        """Extract the features of the images, if that has not been done. They replace the landmarks
+        that were found by their patches, and track nothing yet; the pose stays."""
+        if self.source is None:
+            return
+        new = Frame.of(self.source.extracted, camera, image=self.source.image)
+        for name in _OF_FEATURES:
+            setattr(self, name, getattr(new, name))
+        self.source = None
+
     def snapshot(self) -> Frame:
         """A copy of the frame that later changes of its pose and matches do not affect."""
         return replace(self, landmark=self.landmark.copy(), xyz=self.xyz.copy())
 
     def restore(self, snapshot: Frame) -> None:
-        """Restore the pose and the matches that the frame had when the snapshot was taken."""
-        self.T_cw, self.shift = snapshot.T_cw, snapshot.shift
-        self.landmark, self.xyz = snapshot.landmark, snapshot.xyz
+        """Restore what the frame was when the snapshot was taken."""
+        for field in fields(self):
+            setattr(self, field.name, getattr(snapshot, field.name))
 
     def set_camera_pose(self, T_camera_w: Matrix) -> None:
         """Set the pose of the frame from the ``(4, 4)`` pose of the camera."""
@@ -129,6 +160,21 @@ class Frame:
         """Number of features with a stereo match (or a depth)."""
         return int(np.count_nonzero(np.isfinite(self.features.u_right)))
 
+
+_OF_FEATURES = (
+    "image",
+    "features",
+    "grid",
+    "pyramid",
+    "row_offset",
+    "side",
+    "T_camera_left",
+    "landmark",
+    "xyz",
+    "disparity_offset",
+    "delay_removed",
+    "shift",
+)
 
 PlacedFrame = NewType("PlacedFrame", Frame)
 """A frame whose pose has been recorded (``Mapper.append_pose``). Only such a frame can become a

@@ -9,6 +9,7 @@ import numpy as np
 from vslam.config import KeyframeConfig
 from vslam.frontend.frame import Frame
 from vslam.frontend.tracking import TrackingContext, feature_depth
+from vslam.geometry import transform
 from vslam.map_view import MapView
 from vslam.states import PolicyState
 
@@ -23,19 +24,22 @@ class KeyframeEvidence:
         n_reference: number of landmarks of the reference keyframe that at least three keyframes
             observe (in a young map: of all its landmarks).
         tracked_close: number of close stereo features of this frame that track a landmark.
-        untracked_close: number of close stereo features that do not.
+        untracked_close: number of close stereo features that do not; None for a frame without
+            features, which was tracked by patches: there are always some.
         mapping_idle: whether local mapping of the last keyframe is finished and merged.
         gained_close: number of close points that the first frame after a keyframe tracks, a running
             mean over the last keyframes; infinite if unknown.
+        first_close: how many the first frame after the last keyframe tracks.
     """
 
     seconds_since_keyframe: float
     n_inliers: int
     n_reference: int
     tracked_close: int
-    untracked_close: int
+    untracked_close: int | None
     mapping_idle: bool
     gained_close: float = np.inf
+    first_close: int = 0
 
 
 def needs_keyframe(
@@ -62,8 +66,13 @@ def needs_keyframe(
     tracked_far = evidence.n_inliers - evidence.tracked_close
     if evidence.gained_close < wanted <= tracked_far:
         wanted = config.min_kept_close * evidence.gained_close
-    starved = evidence.tracked_close < wanted and evidence.untracked_close > config.min_new_close
+    by_patches = evidence.untracked_close is None
+    plenty = evidence.untracked_close is None or evidence.untracked_close > config.min_new_close
+    starved = evidence.tracked_close < wanted and plenty
     moved_on = evidence.n_inliers < config.max_tracked_ratio * evidence.n_reference
+    if by_patches:
+        # Patches are found for longer than features are, so that counts of the map tell little.
+        moved_on |= evidence.tracked_close < config.patch_kept_close * evidence.first_close
     if evidence.seconds_since_keyframe >= max_interval_s:
         return True
     if not (moved_on or starved):
@@ -98,11 +107,13 @@ class CloseGain:
 
     Attributes:
         mean: the moving average.
+        latest: the number of the last keyframe.
         awaited: whether the next frame is the first one after a keyframe.
     """
 
     def __init__(self, config: KeyframeConfig) -> None:
         self.mean = config.first_gain * config.min_tracked_close
+        self.latest = 0
         self.awaited = False
         self._weight = config.gain_weight
 
@@ -115,7 +126,7 @@ class CloseGain:
         keyframe."""
         if self.awaited:
             self.mean += self._weight * (tracked_close - self.mean)
-            self.awaited = False
+            self.latest, self.awaited = tracked_close, False
 
 
 @dataclass(frozen=True)
@@ -162,8 +173,14 @@ class KeyframePolicy:
         self, frame: Frame, view: MapView, *, seconds_since_keyframe: float, mapping_idle: bool
     ) -> KeyframeEvidence:
         """Take a tracked frame into account and return the evidence for ``wants_keyframe``."""
-        depth = feature_depth(frame.features, self._context.camera)
-        close, tracked = depth < self._context.close_depth, frame.landmark >= 0
+        tracked = frame.landmark >= 0
+        if frame.source is None:
+            depth = feature_depth(frame.features, self._context.camera)
+            close = depth < self._context.close_depth
+            untracked_close: int | None = int(np.count_nonzero(close & ~tracked))
+        else:
+            close = transform(frame.T_cw, frame.xyz)[:, 2] < self._context.close_depth
+            untracked_close = None
         tracked_close = int(np.count_nonzero(close & tracked))
         self._gain.add(tracked_close)
         return KeyframeEvidence(
@@ -171,9 +188,10 @@ class KeyframePolicy:
             n_inliers=int(np.count_nonzero(tracked)),
             n_reference=view.n_reference,
             tracked_close=tracked_close,
-            untracked_close=int(np.count_nonzero(close & ~tracked)),
+            untracked_close=untracked_close,
             mapping_idle=mapping_idle,
             gained_close=self._gain.mean,
+            first_close=self._gain.latest,
         )
 
     def wants_keyframe(self, evidence: KeyframeEvidence) -> bool:
@@ -193,8 +211,9 @@ class KeyframePolicy:
 
     def state(self) -> PolicyState:
         """The state, for a saved map or a checkpoint."""
-        return PolicyState(self._gain.mean, self._gain.awaited)
+        return PolicyState(self._gain.mean, self._gain.awaited, self._gain.latest)
 
     def restore(self, state: PolicyState) -> None:
         """Continue from a state that ``state`` returned."""
         self._gain.mean, self._gain.awaited = state.gained_close, state.gain_awaited
+        self._gain.latest = state.first_close

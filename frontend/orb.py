@@ -100,6 +100,11 @@ def _layout(
     return int(sizes.sum()), offsets, shapes, scales
 
 
+def level_shapes(size: tuple[int, int], config: OrbConfig) -> NDArray[np.int64]:
+    """``(L, 2)`` heights and widths of the pyramid's levels, from those of the image."""
+    return _layout(*size, config.n_levels, config.scale_factor)[2]
+
+
 def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
     """Build the pyramid of an ``(H, W)`` uint8 image: each level is resized bilinearly from the
     one before."""

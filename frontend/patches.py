@@ -101,6 +101,7 @@ class RecentPatches:
             view * width + row - arrays.first_row[keyframes[view]],
             view,
             map_.scales[arrays.octave[row]],
+            arrays.angle[row],
             self._pixels.reshape(-1, PATCH_PIXELS),
             self._shift.reshape(-1, 2),
             arrays.T_cw[keyframes],

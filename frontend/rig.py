@@ -41,6 +41,11 @@ class RigCalibration:
         self._camera = camera
         self._scales = scales
 
+    def extract(self, frame: Frame, twist: Matrix | None) -> None:
+        """Extract the features of a frame, if that has not been done, and ``prepare`` it."""
+        frame.extract(self._camera)
+        self.prepare(frame, twist)
+
     def prepare(self, frame: Frame, twist: Matrix | None) -> None:
         """Correct ``u_right`` of a frame for the disparity offset and, if the motion is known, for
         the delay of the right image. Calling this again has no effect.

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frame_poses import FramePoses
 from vslam.frontend.frame import Frame
+from vslam.frontend.orb import level_shapes
+from vslam.frontend.patch_tracking import track_patches
+from vslam.frontend.pose_alignment import align_pose, coarse_pyramid, coarse_shapes
 from vslam.frontend.tracking import (
     TrackingContext,
     track_descriptors,
@@ -123,6 +126,40 @@ class Tracker:
         elapsed = timestamp - frames.timestamp(-1)
         return orthonormalised(se3_exp(self.twist * elapsed) @ T_last)
 
+    def track_patches(self, frame: Frame, T_cw: Matrix, view: MapView) -> Found:
+        """Track a frame that is expected at ``T_cw`` by the image patches of landmarks, without
+        features of its own. It is LOST if that fails, or is not possible: there must be a frame
+        before that was tracked."""
+        last, config = self.last, self._config.tracking
+        if frame.pyramid is None or frame.source is None or not len(view.patches.ids):
+            return Found(TrackingState.LOST)
+        if last is None or last.twist is None or self.status is not TrackerStatus.TRACKING:
+            return Found(TrackingState.LOST)
+        camera = self._context.camera
+        if frame.coarse is not None and last.coarse is not None:
+            size = camera.height, camera.width
+            seen = last.xyz[last.landmark >= 0]
+            T_cw = align_pose(
+                frame.coarse, last.coarse, seen, last.T_cw, T_cw, camera.intrinsics, size
+            )
+        track = track_patches(frame.pyramid, T_cw, view, self._context)
+        n_inliers = len(track.ids)
+        if n_inliers < max(
+            config.patch_min_inliers, config.patch_min_inlier_ratio * track.n_matches
+        ):
+            return Found(TrackingState.LOST, track.n_matches, n_inliers)
+        frame.T_cw, frame.features = track.T_cw, track.features
+        frame.landmark, frame.xyz = track.ids, track.xyz
+        return Found(TrackingState.OK, track.n_matches, n_inliers, track.visible)
+
+    def match_features(self, frame: Frame, view: MapView) -> bool:
+        """Match the landmarks of the local map to the features of a frame whose pose is known;
+        returns whether the frame is still tracked."""
+        n_matches, n_inliers, _ = track_local_map(
+            frame, view.local_landmarks, self._context, patches=view.patches
+        )
+        return judge(n_matches, n_inliers, self._context) != TrackingState.LOST
+
     def track(self, frame: Frame, T_cw: Matrix, view: MapView, frames: FramePoses) -> Found:
         """Track a frame that is expected at ``T_cw``: first against the last frame or the reference
         keyframe, then against all landmarks of the local map.
@@ -187,6 +224,7 @@ class Tracker:
             twist=None if last.twist is None else last.twist.copy(),
             lost_frames=self.lost_frames,
             n_tracked=self._n_tracked,
+            coarse=np.empty(0, np.uint8) if last.coarse is None else last.coarse.pixels,
         )
 
     def restore(self, state: TrackerState, xyz: Matrix) -> Frame:
@@ -200,6 +238,11 @@ class Tracker:
         last = Frame.of(extracted, self._context.camera, state.index, state.timestamp)
         last.T_cw, last.landmark, last.xyz = state.T_cw, state.landmark, xyz
         last.twist = state.twist
+        if len(state.coarse):
+            camera = self._context.camera
+            size = camera.height, camera.width
+            shapes = coarse_shapes(level_shapes(size, self._config.orb))
+            last.coarse = coarse_pyramid(state.coarse, shapes, size)
         self.start_from(last)
         self.lost_frames, self._n_tracked = state.lost_frames, state.n_tracked
         if self.lost_frames:

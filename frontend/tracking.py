@@ -47,6 +47,12 @@ class TrackingContext:
         return cls(camera, config, scale_factors(config.orb))
 
     @property
+    def tracks_patches(self) -> bool:
+        """Whether frames are tracked by patches where that is possible. The cameras of RGB-D
+        sensors have a rolling shutter, which moves points by more than alignment corrects."""
+        return self.config.tracking.method == "patches" and not self.camera.depth
+
+    @property
     def close_depth(self) -> float:
         """Depth below which a stereo point is close, metres (ORB-SLAM2, III-A)."""
         return self.config.stereo.close_depth_baselines * self.camera.baseline

@@ -80,8 +80,8 @@ class CombinedDetector:
 
 
 def _joined(first: LoopCandidate, second: LoopCandidate) -> LoopCandidate:
-    """The first of two candidates at the same place, with the second detector's name and, if the
-    first has no ``alike`` of its own, that of the second."""
+    """Join two candidates at the same place: the first one, with the names of both detectors and,
+    if it has no ``alike``, that of the second one."""
     names = first.proposed_by.split("+")
     if second.proposed_by not in names:
         names.append(second.proposed_by)

@@ -48,7 +48,7 @@ class PlugInDetector:
         return self._candidates(-1, map_, self._detector.locate, _read_only(image), features, map_)
 
     def memory(self) -> DetectorMemory:
-        """The memory of the package's detector; if it has none, only the detector's name."""
+        """The saved state of the package's detector, or only its name if it saves no state."""
         bare = DetectorMemory(self.name)
         if not callable(getattr(self._detector, "memory", None)):
             return bare

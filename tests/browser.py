@@ -1,4 +1,4 @@
-"""A page as Chromium shows it, for tests; they are skipped where there is no Chromium."""
+"""Pages as Chromium renders them; tests that use it are skipped without Chromium."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def dumped(
     timeout: float = 180.0,
     on_request: Callable[[str], object] = lambda path: None,
 ) -> str:
-    """What a page of a folder, served on this machine, has become; what else was said behind it.
+    """The rendered HTML of a page in a folder, which is served locally.
 
     Args:
         milliseconds: virtual time that its scripts get.

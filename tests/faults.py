@@ -1,9 +1,9 @@
-"""Every part of a run made to fail once: by name, at a call drawn from a seed.
+"""Injection of faults: each part of a run fails once, at a call drawn from a seed.
 
-A run drives along a ring of points (tests/ring.py): its images only say which frame they are, and
-features are those that the ring shows there, so that a lap with a closed loop, lost frames and all
-results takes two seconds. Each injection runs in a fork of one process that has loaded everything,
-through the command line's own entry point. ``inject`` judges what the run said and left.
+A run drives along a ring of points (tests/ring.py). Its images only encode the number of the frame,
+from which the features are computed, so that a lap with a closed loop, lost frames and all results
+takes two seconds. Each injection runs the command line's entry point in a fork of a process that
+has loaded everything. ``inject`` judges the messages and files of the run.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ POINTS = (
 
 @dataclass(frozen=True)
 class Row:
-    """What became of an injection.
+    """The outcome of an injection.
 
     Attributes:
         call: the call that failed.
@@ -176,7 +176,7 @@ def failing(
     fault: Callable[[], Exception],
     set_attribute: Callable[[Any, str, Any], None] = setattr,
 ) -> None:
-    """Let a call of a function raise, and no other, from now on."""
+    """Let exactly one of the coming calls of a function raise."""
     owner, name = _owner(point.function)
     function = getattr(owner, name)
     calls, lock = [0], threading.Lock()
@@ -205,7 +205,7 @@ def _owner(path: str) -> tuple[Any, str]:
 
 
 def write_ring(root: Path) -> None:
-    """A KITTI sequence of images that say which frame they are."""
+    """A KITTI sequence whose images encode the number of the frame."""
     folder = root / "sequences" / "00"
     for side in ("image_0", "image_1"):
         (folder / side).mkdir(parents=True)
@@ -266,8 +266,8 @@ def view(k: int) -> Features:
 
 
 def load_everything() -> None:
-    """Load in this process what its forks need: modules, kernels, and what the ring shows. It
-    starts no thread, which a fork would lack."""
+    """Load the modules, kernels and features that forks need, without starting threads, which
+    forks would lack."""
     from vslam.cli import main  # noqa: F401
     from vslam.report import explorer, figures, render, seen_loops  # noqa: F401
 

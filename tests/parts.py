@@ -1,4 +1,4 @@
-"""A small world and stand-ins with which one part of SLAM is tested alone."""
+"""A small world and test doubles for testing one part of SLAM in isolation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ALL, NOTHING = slice(None), slice(0, 0)  # of the points of a ``Points``
 
 
 class InstantExecutor(Executor):
-    """A thread so fast that it is done before ``submit`` returns."""
+    """An executor whose job is finished before ``submit`` returns."""
 
     def __init__(self, *_: object) -> None:
         pass
@@ -49,7 +49,7 @@ def ahead(metres: float, turn: float = 0.0) -> np.ndarray:
 
 
 class OneKeyframe:
-    """What frames are placed by in a map of one keyframe, at the origin."""
+    """The keyframe poses of a map with one keyframe at the origin."""
 
     n_keyframes = 1
     reference = 0

@@ -1,4 +1,4 @@
-"""In place of ``vslam run``: writes the folder of a run in a moment, with figures made up.
+"""A stub for ``vslam run`` that quickly writes the folder of a run with invented figures.
 
 Files in ``$STUB_FOLDER`` change what a run does, NAME being sequence, perturbation, detector and
 seed joined by ``-``: ``fail-NAME``, ``interrupt-NAME``, ``lost-NAME`` (in all frames),

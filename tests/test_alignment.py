@@ -332,8 +332,8 @@ def test_an_aligned_frame_observes_where_matches_were_aligned_to():
 
 
 def test_a_pose_follows_aligned_matches():
-    """Of matches that say one thing half a pixel beside what another half says, the aligned ones
-    have four times the weight."""
+    """Half of the matches contradict the other half by half a pixel; aligned ones have four times
+    the weight."""
     rng = np.random.default_rng(0)
     n = 100
     frame = Frame.of(extracted_at(100, 50, 0, n), CAMERA)

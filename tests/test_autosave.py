@@ -368,11 +368,11 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     refused = vslam("run", "--resume", folder, "--seed", 2, *brief, cwd=tmp_path)
     assert refused.returncode == 2
     assert refused.stderr == (
-        "error: --seed: a run that is resumed goes on with its own options; leave it out.\n"
+        "error: --seed: a resumed run continues with its own options; leave it out.\n"
     )
     nothing = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
     assert nothing.returncode == 2
-    assert "no autosave.npz here" in nothing.stderr
+    assert "has no autosave.npz" in nothing.stderr
     # As if it had been cut off after these frames, of more to come.
     drive_until(kitti_tree, folder, 11)
     write_options(folder, read_options(folder).model_copy(update={"max_frames": None}))

@@ -258,7 +258,14 @@ def test_table_counts_cells(stub: Path, tmp_path: Path):
     console = Console(width=100, record=True, file=io.StringIO())
     console.print(progress.table())
     text = console.export_text()
-    for part in ("1/1  1.", "1 failed", "0/2", "1 of 12 cells finished, 1 failed, about", "left"):
+    for part in (
+        "1 of 1  1.",
+        "1 failed",
+        "0 of 2",
+        "finished runs",
+        "1 of 12 cells finished, 1 failed, about",
+        "left",
+    ):
         assert part in text
 
 
@@ -363,7 +370,7 @@ def test_bench_counts_failures_and_ends_with_1(bench, stub: Path):
     code, out, err = bench()
     assert code == 1
     assert "failed: kitti-00-brightness1-bow-seed1: images of the moon" in err
-    assert "5 of 6 cells finished, 1 failed; the same command continues" in out
+    assert "5 of 6 cells finished, 1 failed; repeat the command to continue" in out
     (stub / "fail-00-brightness:1-bow-1").unlink()
     assert bench()[0] == 0
     assert len(started(stub)) == 7
@@ -486,7 +493,7 @@ def test_a_video_is_a_grid_of_one_sequence(corridor, tmp_path: Path, monkeypatch
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        ("--data 0", "--data 0: a camera cannot be seen twice; record a video or a bag"),
+        ("--data 0", "--data 0: a live camera gives each image once; record a video"),
         ("--dataset video --data a.mkv --seqs 00", "--seq 00: only for data sets, not video"),
     ],
 )

@@ -168,7 +168,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--data nowhere", ["nowhere", "no such file or folder", "--data"]),
         ("--data .", ["the folder is empty", "--data"]),
         ("nowhere", ["nowhere", "no such file or folder", "--data"]),
-        ("nowhere --data .", ["nowhere: --data says what to read, too"]),
+        ("nowhere --data .", ["nowhere: --data also names what to read"]),
         ("--data ..", ["no known data set", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
@@ -303,6 +303,7 @@ def test_help_is_grouped_and_short(call, monkeypatch):
         "Input", "Method", "Map", "Execution", "Output",
     ]  # fmt: skip
     assert len(out.splitlines()) <= 110
+    assert "<" not in out + call("--help")[1] + call("map", "--help")[1]  # types
     assert "│ --map FILE " in out
     assert "First frame. [default: 0]" in out
 
@@ -452,7 +453,7 @@ def with_detector(pipeline) -> SimpleNamespace:
 def test_summary_counts_loops(call, root, with_detector):
     code, out, err = call("run", "--data", root, "--max-frames", 10, "--detector", "bow")
     assert code == 0, err
-    assert re.search("Loops +1 closed .* 0 missed, 0 wrong, 2 candidates rejected\n", out)
+    assert re.search("Loops +1 closed .* no revisit .*, 0 wrong, 2 candidates rejected\n", out)
     assert re.search("Map +99 +landmarks, .* 2 sub-maps", out)
     assert "detector bow (the bag of words)" in out
     assert "detectors together" not in out
@@ -587,7 +588,7 @@ def test_eval(call, tmp_path):
     write_kitti(tmp_path / "estimate.txt", T_wc)
     code, out, _ = call("eval", "estimate.txt", "--gt", "gt.txt")
     assert code == 0
-    assert "50 matched of 50" in out
+    assert "50 of 50 have a ground truth" in out
     assert "0.100 m" in out
     assert "evo_ape kitti gt.txt estimate.txt --align\n" in out
     code, out, _ = call("eval", "estimate.txt", "--gt", "gt.txt", "--json")
@@ -601,7 +602,7 @@ def test_eval_of_two_formats_names_no_evo_command(call, tmp_path):
     np.savetxt(tmp_path / "times.txt", truth.timestamps)
     code, out, err = call("eval", "estimate.tum", "--gt", "gt.txt", "--times", "times.txt")
     assert code == 0, err
-    assert "50 matched of 50" in out
+    assert "50 of 50 have a ground truth" in out
     assert "evo_ape" not in out  # evo compares files of one format only
 
 
@@ -629,7 +630,7 @@ def test_info(call, root):
         assert package in out
     code, out, _ = call("info", "--data", "nowhere")
     assert code == 0
-    assert "nowhere: no KITTI odometry data" in out
+    assert "nowhere: holds no KITTI odometry data" in out
 
 
 def test_two_opencv_wheels_are_noticed():

@@ -1,4 +1,4 @@
-"""The offset of all disparities that the camera's own motion tells."""
+"""The common offset of all disparities, estimated from the camera's own motion."""
 
 from __future__ import annotations
 

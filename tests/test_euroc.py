@@ -106,7 +106,7 @@ def test_the_folder_itself_can_be_named(root, inner, name):
 
 @pytest.mark.parametrize("inner", ["V9_01", "V9_01/mav0"])
 def test_the_folder_of_another_sequence_is_refused(root, inner):
-    with pytest.raises(InputError, match=r"--seq MH_05: .* is the sequence V9_01 itself; leave"):
+    with pytest.raises(InputError, match=r"--seq MH_05: .* is itself the sequence V9_01; leave"):
         open_euroc(root / inner, "MH_05")
 
 

@@ -1,4 +1,4 @@
-"""The rendered fisheye pair: rectified by its own calibration it is what a pinhole pair sees."""
+"""The rendered fisheye pair: after rectification by its calibration, it equals a pinhole pair."""
 
 from __future__ import annotations
 

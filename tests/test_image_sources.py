@@ -88,7 +88,7 @@ def test_bad_sources_are_named(tmp_path, spec, message):
 
 def test_test_frames_and_both_collections_are_refused(tmp_path):
     write_kitti_root(tmp_path, frames=range(248, 256))
-    with pytest.raises(InputError, match="frames 248 to 255 hold test data"):
+    with pytest.raises(InputError, match="frames 248 to 255 contain test data"):
         refuse_test_data(open_source(f"kitti:{tmp_path}[seq=00]"))
     sources = []
     for name in ("CityCentre", "NewCollege"):
@@ -96,7 +96,7 @@ def test_test_frames_and_both_collections_are_refused(tmp_path):
             write_image(tmp_path / name / f"{k:04d}.jpg")
         savemat(tmp_path / name / "truth.mat", {"truth": np.eye(2)})
         sources += open_source(f"fabmap:{tmp_path / name}")
-    with pytest.raises(InputError, match="leave none to test on"):
+    with pytest.raises(InputError, match="leave no test data"):
         refuse_test_data(sources)
 
 
@@ -193,7 +193,7 @@ def test_sources_together(tmp_path):
     assert collection.images.shape == (12, 20, 20)
     assert (collection.relation[:4, 4:8] == 0).all()  # landmarks of one family: not known
     assert (collection.relation[:8, 8:] == -1).all()
-    with pytest.raises(InputError, match="two sources are called"):
+    with pytest.raises(InputError, match="two sources have the name"):
         load([sources[0], sources[0]], (20, 20), "crop")
     with pytest.raises(InputError, match="at least one source"):
         load([], (20, 20), "crop")

@@ -50,6 +50,14 @@ def test_a_well_tracked_frame_is_no_keyframe():
     assert not decide(mapping_idle=False)
 
 
+def test_a_frame_without_features_is_judged_by_the_close_points_that_are_left():
+    by_patches = {"untracked_close": None, "first_close": 300}
+    assert not decide(**by_patches)
+    assert decide(**by_patches, tracked_close=int(CONFIG.patch_kept_close * 300) - 1)
+    assert not decide(**by_patches, tracked_close=int(CONFIG.patch_kept_close * 300))
+    assert not decide(first_close=300, tracked_close=101)  # it has features
+
+
 @pytest.mark.parametrize("idle", [True, False])
 def test_time_alone_makes_a_keyframe(idle):
     assert not decide(seconds_since_keyframe=0.999, mapping_idle=idle)

@@ -1,4 +1,4 @@
-"""Coarse-to-fine matching of local descriptors, on fields of descriptors that are made up."""
+"""Coarse-to-fine matching of local descriptors, on synthetic fields of descriptors."""
 
 from __future__ import annotations
 

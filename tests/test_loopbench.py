@@ -282,7 +282,7 @@ def test_report_says_who_wins_in_all_three_files(vocabulary, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--detectors", "none"], "--detectors none: finds nothing"),
+        (["--detectors", "none"], "--detectors none: finds no loops"),
         (["--detectors", "magic"], "--detectors magic: unknown"),
         (["--detectors", ""], "unknown"),
         (["--detectors", "vgg16"], "vslam ships no weights"),

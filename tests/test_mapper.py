@@ -196,8 +196,8 @@ def test_a_keyframe_merges_the_one_before():
 
 
 def trace_on_the_ring(executor, look: Callable[[Mapper], object] = lambda mapper: None) -> list:
-    """What tracking sees at each frame of a drive on the ring, where images are noisy, and the map
-    at its end; ``look`` is called after each frame."""
+    """Drive on the ring with noisy features; returns what tracking sees at each frame, and the
+    final map. ``look`` is called after each frame."""
     drive = Drive(
         executor,
         camera=ring.CAMERA,

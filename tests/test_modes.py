@@ -53,7 +53,7 @@ class Building(Drive):
 
 
 def found(frame: Frame) -> Found:
-    """That a frame was tracked by the landmarks that it has, and should see all of these."""
+    """The result of a frame that is tracked by all the landmarks that it should see."""
     landmarks = frame.landmark[frame.landmark >= 0]
     return Found(TrackingState.OK, len(landmarks), len(landmarks), landmarks)
 

@@ -267,8 +267,8 @@ def test_times_of_a_sequence_are_those_of_its_images(tmp_path):
 @pytest.mark.parametrize(
     ("spec", "said"),
     [
-        ("town:demo", "--protocol online takes drives"),
-        ("photos:x", "--protocol online takes drives"),
+        ("town:demo", "--protocol online needs drives"),
+        ("photos:x", "--protocol online needs drives"),
         ("drive:nowhere", "must be drive:ROUTE with a route of demo"),
         ("drive:demo[places=3]", "must be drive:ROUTE"),
         ("drive:demo[every=x]", "an option is not a number"),
@@ -336,12 +336,15 @@ def test_a_drive_is_measured_before_and_after_verification_and_reported(tmp_path
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--protocol", "online", "--perturb", "light"], "--perturb, --strengths, --seed: change"),
-        (["--protocol", "online", "--seed", "1"], "--perturb, --strengths, --seed: change"),
+        (
+            ["--protocol", "online", "--perturb", "light"],
+            "--perturb, --strengths, --seed: only for",
+        ),
+        (["--protocol", "online", "--seed", "1"], "--perturb, --strengths, --seed: only for"),
         (["--protocol", "online", "--window", "x"], "--window x: must be above 0"),
         (["--protocol", "online", "--detectors", "magic"], "--detectors magic: unknown"),
-        (["--protocol", "online", "--data", "town:demo"], "--protocol online takes drives"),
-        (["--window", "30s"], "--window: is of --protocol online"),
+        (["--protocol", "online", "--data", "town:demo"], "--protocol online needs drives"),
+        (["--window", "30s"], "--window: only for --protocol online"),
         (["--detectors", "ibow"], "--detectors ibow: learns during a drive"),
         (["--detectors", "thumbnail", "--weights", "thumbnail=x"], "the detector thumbnail has"),
     ],

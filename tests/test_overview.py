@@ -549,7 +549,7 @@ FIGURES = {
 def test_html_has_every_figure_and_loads_nothing(written):
     html = (written[1] / "report.html").read_text()
     assert set(re.findall('<figure class="card ([^"]*)"', html)) == FIGURES
-    assert html.count("<table>") == 6
+    assert html.count("<table>") == 7
     assert not re.search("<(script|iframe|object|embed|img)", html)
 
 
@@ -558,7 +558,7 @@ _PROBE = """<!doctype html><link rel="icon" href="data:,"><body>
 const page = document.getElementById("page");
 page.onload = () => {
   const inner = page.contentDocument;
-  const boxes = [...inner.querySelectorAll("figure svg")].map(x => x.getBoundingClientRect());
+  const boxes = [...inner.querySelectorAll("figure")].map(x => x.getBoundingClientRect());
   document.getElementById("found").textContent = "FOUND" + JSON.stringify({
     shown: inner.documentElement.clientWidth,
     needed: inner.documentElement.scrollWidth,

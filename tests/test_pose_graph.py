@@ -64,8 +64,8 @@ def chain_graph(T_wc: np.ndarray, loops=(), measured=(), reach: int = 1, weak=()
 
 
 def test_translation_error_spreads_evenly():
-    """Twelve keyframes in a circle without rotation, all edges alike: each, the loop's too, takes
-    a twelfth of what is missing."""
+    """Twelve keyframes in a circle without rotation have equal edges. Each edge, including the
+    loop's, takes a twelfth of the error."""
     n = 12
     angle = 2 * np.pi * np.arange(n) / n
     T_wc = np.array([translation(10 * np.sin(a), 0, 10 * np.cos(a)) for a in angle])

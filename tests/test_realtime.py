@@ -1,4 +1,4 @@
-"""A sequence played in real time: nothing before its time, and who is late misses frames."""
+"""A sequence played in real time: no frame comes early, and late consumers miss frames."""
 
 from __future__ import annotations
 

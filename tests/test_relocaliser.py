@@ -1,4 +1,4 @@
-"""The relocaliser alone: what it finds, what it moves, and that all else stays as it was."""
+"""The relocaliser alone: what it finds and moves, and that it changes nothing else."""
 
 from __future__ import annotations
 

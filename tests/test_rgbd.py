@@ -221,7 +221,7 @@ def test_depth_scale_and_colour_alone(tree):
 
 def test_tums_cameras_are_known_by_the_folder(copy):
     (copy / "calibration.yaml").unlink()
-    refused(copy, "no known camera", "freiburg1", "--calib")
+    refused(copy, "camera is unknown", "freiburg1", "--calib")
     known = copy.rename(copy.with_name("rgbd_dataset_freiburg3_corridor"))
     refused(known, "TUM's camera freiburg3", "640x480", "480x160")
 
@@ -229,7 +229,7 @@ def test_tums_cameras_are_known_by_the_folder(copy):
 def test_sequences_are_found_by_name(tree):
     for root in (tree, tree.parent):
         assert open_tum(root).name == open_tum(root, "corridor").name == "corridor"
-    with pytest.raises(InputError, match=r"--seq desk: .* is the sequence corridor itself"):
+    with pytest.raises(InputError, match=r"--seq desk: .* is itself the sequence corridor"):
         open_tum(tree, "desk")
     with pytest.raises(InputError, match="desk: no such sequence; choose one with --seq: corridor"):
         open_tum(tree.parent, "desk")

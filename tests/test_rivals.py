@@ -131,8 +131,8 @@ def test_operations_are_those_that_the_papers_count():
 
 
 def test_inceptions_are_those_of_table_1():
-    """Depths of its output column exactly; its parameters, in units of 1,024, roughly: they depart
-    from what its own widths come to by up to 7 %."""
+    """The depths of its output column are exact. Its parameters, in units of 1,024, agree roughly,
+    because the table departs from its own widths by up to 7 %."""
     inputs, found, outputs = 192, [], []
     for widths in INCEPTIONS:
         if widths is not None:
@@ -151,13 +151,13 @@ def test_googlenet_halves_five_times():
 
 
 def test_images_that_are_too_small_are_refused():
-    with pytest.raises(InputError, match=r"alexnet: takes images of at least 64 pixels"):
+    with pytest.raises(InputError, match=r"alexnet: needs images of at least 64 pixels"):
         alexnet((63, 227))
 
 
 def test_principal_filters_are_those_of_scikit_learn():
-    """PCANet's patches lose their own mean, not that of all patches: those and their negatives
-    together have none to lose."""
+    """PCANet subtracts from each patch its own mean, not the mean of all patches, which is zero for
+    patches together with their negatives."""
     rng = np.random.default_rng(0)
     images = torch.from_numpy(rng.standard_normal((6, 1, 24, 31))).float().cumsum(3)
     filters = principal_filters_of(iter(images.split(4)))

@@ -1,5 +1,5 @@
-"""A right side that is late shows in the rows of stereo matches; a delay that the calibration gives
-costs a drive little."""
+"""The delay of the right image is measured from the rows of stereo matches, and a delay given in
+the calibration costs a drive little."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A stereo rig whose sides see different light is noticed and mended."""
+"""A stereo rig with different brightness on both sides is detected and corrected."""
 
 from __future__ import annotations
 

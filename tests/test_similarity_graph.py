@@ -58,8 +58,8 @@ def test_similarities_compose_by_matrix_product():
 
 
 def test_scale_alone_spreads_by_the_variances():
-    """Keyframes in one place: what the loop says of the scale is shared out as least squares of a
-    chain has it, sigma^2 of each edge over the sum of all, the loop's included."""
+    """With all keyframes in one place, least squares distributes the scale error of the loop over
+    the chain: each edge gets its sigma^2 divided by the sum of all, including the loop's."""
     n, drift = 9, 0.02
     config = CONFIG.model_copy(update={"robust_scale": 1e3})  # Gaussian, for the closed form
     graph = chain(np.tile(np.eye(4), (n, 1, 1)), np.eye(4), np.exp(drift))
@@ -71,8 +71,8 @@ def test_scale_alone_spreads_by_the_variances():
 
 
 def drifted_lap(growth: float, n: int = 120):
-    """A circle of radius 30, driven once, as odometry has it whose unit shrinks: each step is
-    ``growth`` times as many units as the one before. Returns truth and estimate, ``T_wc`` each."""
+    """A lap on a circle of radius 30, and its odometry with a shrinking unit: each step is
+    ``growth`` times as many units as the previous one. Returns true and estimated ``T_wc``."""
     step = se3_exp(np.array([0.0, 0.0, 2 * np.pi * 30 / n, 0.0, 2 * np.pi / n, 0.0]))
     truth, estimate = [np.eye(4)], [np.eye(4)]
     for k in range(n):

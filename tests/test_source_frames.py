@@ -64,7 +64,7 @@ def test_the_length_of_a_stream_may_be_unknown():
     endless = streamed(n_expected=None)
     assert selected(endless, start=1).n_expected is None
     assert selected(endless, max_frames=4).n_expected == 4
-    with pytest.raises(InputError, match="x has no frame there"):
+    with pytest.raises(InputError, match="x has no such frame"):
         numbers(selected(endless, start=N))
 
 

@@ -1,4 +1,4 @@
-"""What a source is, is found out from what is there."""
+"""Detection of the kind of a source from its files."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_what_is_not_known_is_told_what_was_looked_for(tmp_path):
         detect_dataset(str(tmp_path / "drive.tar.gz"))
     (tmp_path / "drive" / "left").mkdir(parents=True)
     (tmp_path / "drive" / "left" / "1.png").touch()
-    with pytest.raises(InputError, match=r"but .*drive is one of images \(name that\)"):
+    with pytest.raises(InputError, match=r"but .*drive looks like images \(name that\)"):
         detect_dataset(str(tmp_path))
     (tmp_path / "sequences" / "00").mkdir(parents=True)
     with pytest.raises(InputError, match="looks like KITTI's"):

@@ -1,9 +1,9 @@
-"""A guard against a method that became ten times as slow: a kernel that compiles at each call, or
-work that grows with the square of the map.
+"""Guards against changes that make a method ten times as slow, for example a kernel that compiles
+at each call, or work that grows with the square of the map.
 
-It measures CPU time of this thread in units of a fixed kernel, in turn with it, so that a slower or
-busier machine slows both. The ratio differs by a factor of two or three between kinds of
-processors, and the limit leaves room for that; `tools/bench_speed.py` measures finer differences.
+The CPU time of this thread is measured relative to a fixed kernel, alternately, so that a slower or
+busier machine slows both. The ratio differs by a factor of two or three between processors, for
+which the limit leaves room; `tools/bench_speed.py` measures finer differences.
 """
 
 from __future__ import annotations

@@ -397,7 +397,7 @@ rows = [f"1 0 0 {0.1 * (i % 3) + (i > 6)} 0 1 0 0 0 0 1 {i}" for i in k]
         ("sys.exit('no vocabulary')", "exit code 1: no vocabulary"),
         ("sys.stdout.buffer.write(b'\\xff'); sys.stdout.flush(); sys.exit(3)", "exit code 3"),
         ("", "no trajectory.txt"),
-        (DRIVES + "(out / 'states.txt').write_text('OK')", "1 states of 12 frames"),
+        (DRIVES + "(out / 'states.txt').write_text('OK')", "1 states for 12 frames"),
         ("(out / 'trajectory.txt').write_text('a b')", "trajectory.txt"),
     ],
 )

@@ -69,7 +69,7 @@ def test_a_share_of_what_was_learned_is_kept(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"learned_share": 0.5}, "there is no network to go back towards"),
+        ({"learned_share": 0.5}, "needs a network to start from"),
         ({"emphasis": {"bulbs": 3.0}}, "no source bulbs; there are blobs"),
     ],
 )
@@ -120,7 +120,7 @@ def test_a_gpu_without_bfloat16_is_not_asked_for_it(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda: False)
     cuda = torch.device("cuda")
     assert training._mixed_precision(small_settings(), cuda) is False
-    with pytest.raises(InputError, match="this GPU has no bfloat16"):
+    with pytest.raises(InputError, match="does not support bfloat16"):
         training._mixed_precision(small_settings(mixed_precision=True), cuda)
 
 

@@ -35,7 +35,7 @@ SHIFT = 16  # columns between the two views of 81
 
 
 def wide_images(n: int, seed: int = 0, width: int = 81) -> torch.Tensor:
-    """Noise that is as bright and as deep in every column: no part stands out from the whole."""
+    """Noise with equal mean and contrast in every column, so that no part stands out."""
     x = torch.randn(n, 1, 48, width, generator=torch.Generator().manual_seed(seed))
     x = (x - x.mean(2, keepdim=True)) / x.std(2, keepdim=True)
     return (0.5 + 0.1 * x).expand(-1, 3, -1, -1)
@@ -266,7 +266,7 @@ def test_networks_for_flat_images_become_those_for_unrolled_ones(tmp_path):
 
 
 def test_flat_images_keep_their_height():
-    with pytest.raises(ValidationError, match=r"middle 0.9: is of unrolled images"):
+    with pytest.raises(ValidationError, match=r"middle 0.9: needs unrolled images"):
         CapsuleShape(middle=0.9)
 
 

@@ -198,8 +198,8 @@ def test_a_drive_that_was_lost_is_tracked(corridor, change, lost):
 def test_what_the_frame_before_did_not_see_is_matched_around_the_prediction(
     corridor, window, monkeypatch
 ):
-    """One half of a frame is dark, in the next one the other half: they share nothing, but the map
-    has both. Without a window around the prediction the second is lost."""
+    """One half of a frame is dark, and the other half of the next one. They have nothing in common,
+    but the map has both. Without a search around the prediction, the second frame is lost."""
     slam = Slam(
         corridor.camera,
         Config(orb=ORB, tracking=TrackingConfig(predicted_window=window)),

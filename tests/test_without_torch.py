@@ -1,4 +1,4 @@
-"""What a plain installation does without the extra ``train``: everything but training."""
+"""Without the extra ``train``, an installation does everything except training."""
 
 from __future__ import annotations
 

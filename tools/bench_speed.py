@@ -1,15 +1,15 @@
-"""Measure vslam beside ORB-SLAM3 (pyorbslam3), and write it down as Markdown.
+"""Measure the speed of vslam and ORB-SLAM3 (pyorbslam3), and write the results as Markdown.
 
     python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" [--also capsule] \
         [--repeats 3] [--write docs/research/performance.md] \
         [--orbslam3-python PY --orbslam3-script run_orbslam3.py --vocabulary voc.txt]
 
-A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run in
-turn, one at a time, after one round that is not counted; vslam with its report, with
-``--no-report``, and in the last round with ``--realtime``, which takes as long as the drive; with
-``--also`` once more without a report and with another detector than ``bow``. What the script of
-ORB-SLAM3 takes and prints is said in systems.py; ``track_ms_median`` and ``track_ms_p95`` are taken
-where it prints them. What people wrote on the page, from "Limits" on, is kept.
+A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run one
+at a time and alternate, after one round that is not counted. vslam runs with its report, with
+``--no-report``, with ``--no-report`` and each detector of ``--also`` instead of ``bow``, and in the
+last round with ``--realtime``, which takes as long as the drive. systems.py describes what the
+script of ORB-SLAM3 takes and prints; its ``track_ms_median`` and ``track_ms_p95`` are optional. The
+hand-written parts of the page, at its beginning and from "Limits" on, are kept.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from systems import Case, OrbSlam3, Run
 FULL, LEAN, LIVE, ORBSLAM3 = "vslam", "vslam --no-report", "vslam --realtime", "ORB-SLAM3"
 HEAD = """## How it was measured
 
-The command at the end of this page writes it. It runs one process at a time. *Load* is the load \
-of the machine when the command began. *Whole process* is the time from the start of Python to \
-its end, including the vocabulary, the kernels from Numba's cache and all files written. *Frame \
-loop* is the time from the first image to the last pose. vslam runs with the detector `bow`, \
-because ORB-SLAM3 always looks for loops. Its report judges the trajectory by the ground truth and \
-draws figures. ORB-SLAM3 does neither, nor does vslam with `--no-report`, from which the ground \
-truth is hidden here. *Reading images* is the CPU time that decoding both \
-images of a frame takes, measured in separate processes: vslam's own reader for vslam, \
-`cv2.imread` for ORB-SLAM3; it is subtracted from each system's time. The real-time run is \
-done once per case, and so is the profile, in one thread, by `tools/profile_frame.py`.
+The command below, under *Setting*, writes these sections. It runs one process at a time. *Load* \
+is the load of the machine when the command began. *Whole process* is the time from the start of \
+Python to its end, including the vocabulary, the kernels from Numba's cache and all files written. \
+*Frame loop* is the time from the first image to the last pose. vslam runs with the detector \
+`bow`, because ORB-SLAM3 always looks for loops. For its report, vslam evaluates the trajectory by \
+the ground truth and draws figures. ORB-SLAM3 does neither; for a fair comparison, vslam with \
+`--no-report` gets no ground truth. *Reading images* is the CPU time for decoding both images of a \
+frame, measured in separate processes with vslam's own reader for vslam and `cv2.imread` for \
+ORB-SLAM3. The rows without reading images subtract it. The real-time run and the profile, which \
+`tools/profile_frame.py` takes with one thread, are done once per case.
 """
-BEGIN, END = "## How it was measured\n", "\n## Limits\n"  # what is outside was written by hand
+BEGIN, END = "## How it was measured\n", "\n## Limits\n"  # the rest of the page is hand-written
 READING = """
 import sys, time, cv2
 from pathlib import Path
@@ -85,7 +85,7 @@ def parse_case(text: str) -> Case:
         raise argparse.ArgumentTypeError(f"{text}: write TITLE=DATA:SEQ:FRAMES")
     data = Path(parts[0]).absolute()
     if not (data / "sequences" / parts[1]).is_dir():
-        raise argparse.ArgumentTypeError(f"{data / 'sequences' / parts[1]}: not there")
+        raise argparse.ArgumentTypeError(f"{data / 'sequences' / parts[1]}: no such folder")
     case = Case(title, data, parts[1], int(parts[2]))
     here = min(len(list(side.iterdir())) for side in sides(case))
     if not 2 <= case.frames <= here:
@@ -99,7 +99,7 @@ def sides(case: Case) -> list[Path]:
 
 
 def reading_ms(case: Case, system: str) -> float:
-    """CPU milliseconds that decoding both images of a frame takes a system, in one thread."""
+    """CPU milliseconds in which a system decodes both images of a frame, in one thread."""
     files = [str(path) for side in sides(case) for path in sorted(side.iterdir())[: case.frames]]
     reader = "opencv" if system == ORBSLAM3 else "vslam"
     command = [sys.executable, "-c", READING, reader]
@@ -110,7 +110,7 @@ def reading_ms(case: Case, system: str) -> float:
 
 
 def run_vslam(case: Case, scratch: str, *words: str) -> Run:
-    """Run vslam; without the ground truth where it draws no page: ORB-SLAM3 judges nothing."""
+    """Run vslam. Without a report, it gets no ground truth, as ORB-SLAM3 evaluates nothing."""
     if "--no-report" in words:
         data = Path(scratch, "data")
         data.mkdir()
@@ -127,7 +127,7 @@ def measure_case(
     words = {FULL: (), LEAN: ("--no-report",), LIVE: ("--no-report", "--realtime")}
     for name in also:
         runs[title := f"{LEAN} --detector {name}"] = []
-        # Of two detectors on the command line the last one counts.
+        # If the command line has two detectors, the last one counts.
         words[title] = ("--no-report", "--detector", name)
     if orbslam3 is None:
         del runs[ORBSLAM3]
@@ -157,7 +157,7 @@ def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
 
 
 def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
-    """A table of medians, with the ratios to ORB-SLAM3 where it ran."""
+    """A table of medians, with the ratios to ORB-SLAM3 if it ran."""
     ours = [system for system in measured if system != ORBSLAM3]
     columns = ours + [ORBSLAM3] * (ORBSLAM3 in measured)
     head = [
@@ -176,7 +176,7 @@ def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
 
 
 def latency(runs: dict[str, list[Run]], case: Case) -> str:
-    """Milliseconds from the time of an image to its pose, and what ORB-SLAM3 says of its frames."""
+    """Milliseconds from the time of an image to its pose, and ORB-SLAM3's own tracking times."""
     ours = [run.report for run in runs[LIVE]]
     values = [
         systems.spread([report["latency_ms"][key] for report in ours], ".0f")
@@ -199,13 +199,13 @@ def latency(runs: dict[str, list[Run]], case: Case) -> str:
 
 
 def rate(case: Case) -> float:
-    """Frames a second of the recording."""
+    """Frames per second of the recording."""
     times = (case.data / "sequences" / case.seq / "times.txt").read_text().split()[: case.frames]
     return (len(times) - 1) / (float(times[-1]) - float(times[0]))
 
 
 def stages(report: dict[str, Any]) -> str:
-    """Milliseconds of each stage, wall time: stages of the pool overlap with the others."""
+    """Wall milliseconds of each stage; stages in the thread pool overlap with the others."""
     lines = ["| stage, ms | mean | p50 | p95 | p99 |", "|---|---|---|---|---|"]
     for name, ms in report["stage_ms"].items():
         cells = [f"{ms[key]:.1f}" for key in ("mean", "median", "p95", "p99")]
@@ -214,21 +214,20 @@ def stages(report: dict[str, Any]) -> str:
 
 
 def memory(run: Run) -> str:
-    """How much a keyframe costs: from what is held at the first frame to the most ever held."""
+    """Memory per keyframe: the growth from the first frame to the peak, divided by keyframes."""
     before = [mb for seconds, mb in run.process.held if seconds <= run.report["startup_s"]]
     if not before or not run.report["keyframes"]:
-        return "The run was too short to tell what a keyframe holds."
+        return "The run was too short to measure the memory of a keyframe."
     grown = run.process.memory_mb - before[-1]
     kept = run.report["keyframes"]
     return (
         f"Memory: {before[-1]:.0f} MB before the first frame, {run.process.memory_mb:.0f} MB at "
-        f"its peak, with {kept} keyframes in the final map: {grown / kept:.2f} MB for each "
-        "keyframe."
+        f"its peak, with {kept} keyframes in the final map: {grown / kept:.2f} MB per keyframe."
     )
 
 
 def section(case: Case, runs: dict[str, list[Run]]) -> str:
-    """All that is said of a case."""
+    """The section of a case."""
     reading = {system: reading_ms(case, system) for system in (FULL, ORBSLAM3)}
     measured = {
         s: [figures(run, case, reading[ORBSLAM3 if s == ORBSLAM3 else FULL]) for run in runs[s]]
@@ -244,7 +243,7 @@ def section(case: Case, runs: dict[str, list[Run]]) -> str:
 
 
 def profile(case: Case) -> str:
-    """Where the CPU time of a frame goes; nothing if that fails, after all that was measured."""
+    """The CPU time of a frame by stage; empty on failure, so that the measurements are not lost."""
     tool = str(Path(__file__).with_name("profile_frame.py"))
     command = [sys.executable, tool, str(case.data), case.seq, str(case.frames)]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -270,7 +269,7 @@ def parse_options() -> argparse.Namespace:
 
 
 def anonymous(command: str) -> str:
-    """A command without the paths of this machine."""
+    """Remove the paths of this machine from a command."""
     for name in ("KITTI_ROOT", "HOME"):
         if path := os.environ.get(name, "").rstrip("/"):
             command = command.replace(path, f"${name}")
@@ -278,7 +277,7 @@ def anonymous(command: str) -> str:
 
 
 def written(page: Path) -> tuple[str, str]:
-    """What people wrote on a page: before ``BEGIN``, and from ``END`` on."""
+    """The hand-written parts of a page: before ``BEGIN``, and from ``END`` on."""
     text = page.read_text(encoding="utf-8") if page.exists() else ""
     above, begin, rest = text.partition(BEGIN)
     _, end, below = rest.partition(END)
@@ -289,7 +288,7 @@ def main() -> None:
     options = parse_options()
     load = os.getloadavg()[0]
     orbslam3 = systems.orbslam3_of(options)
-    # Nothing heavy is imported before the last run: see systems.measure.
+    # No large package may be imported before the last run; see systems.measure.
     measured = [
         (case, measure_case(case, orbslam3, options.repeats, options.also)) for case in options.case
     ]

@@ -1,8 +1,8 @@
-"""Feed damaged files to every reader: an answer or one sentence must come, and soon.
+"""Fuzz every reader with damaged files: it must soon return a result or raise an `InputError`.
 
-Each input is a valid small file, changed by a seeded mutation. Success and `InputError` are right.
-Everything else is a failure: another exception, a crash, more than SECONDS of CPU time or MEGABYTES
-of memory. Readers run in a process of their own, so that a crash is a line in the table.
+Each input is a small valid file, changed by a seeded mutation. Any other outcome is a failure:
+another exception, a crash, more than SECONDS of CPU time or MEGABYTES of memory. Readers run in a
+separate process, so that a crash becomes a line in the table.
 
 usage: python tools/fuzz.py [--inputs 1000] [--seed 0] [--readers kitti,video] [--keep FOLDER]
 """
@@ -39,16 +39,16 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import valid_files
 
 SECONDS, MEGABYTES = 20, 600
-WALL_SECONDS = 300  # for what waits and does nothing; a busy machine is slow
-ADDRESS_SPACE = 8 * 2**30  # beyond it there is a MemoryError: this machine stays usable
+WALL_SECONDS = 300  # for readers that wait without using CPU time; a busy machine is slow
+ADDRESS_SPACE = 8 * 2**30  # limit beyond which a MemoryError protects this machine
 _NUMBERS = ["nan", "inf", "-inf", "1e999", "-1", "0", "1e-320", "9" * 30, "2147483648", "0x10", ""]
 _SPECIAL = [0, 1, 0x7F, 0xFF, 0x7FFFFFFF, 0xFFFFFFFF, 0x80000000, 0x7FFFFFFFFFFFFFFF]
 
 
 @dataclass(frozen=True)
 class Reader:
-    """What is fuzzed: ``write`` makes valid files in a folder, ``read`` reads them, and one of
-    those that match ``changed`` is mutated, by ``mutate`` unless ``mutation`` is another one."""
+    """A reader to fuzz: ``write`` makes valid files in a folder, one file that matches ``changed``
+    is mutated by ``mutation``, and ``read`` reads the files."""
 
     write: Callable[[Path], object]
     read: Callable[[Path], object]
@@ -60,7 +60,7 @@ class Reader:
 
 
 def _use(source) -> None:
-    """Every frame of it; a frame may be refused, alone."""
+    """Read every frame of a source; single frames may be refused."""
     from vslam.errors import InputError, UnreadableImageError
 
     try:
@@ -74,7 +74,7 @@ def _use(source) -> None:
 
 
 def _each(read: Callable[[str], object], names: Iterable[str]) -> None:
-    """Read all files; the refusal of one is told after the last."""
+    """Read all files; if one is refused, raise its error after the last."""
     from vslam.errors import InputError
 
     refused = None
@@ -129,8 +129,8 @@ def _read_map(folder: Path) -> None:
 
 
 def _use_map(folder: Path) -> None:
-    """Use a map in every way there is: export it, resume its drive, start a new drive in it,
-    localise in it, and merge it with another map."""
+    """Use a map in every way: export it, resume its drive, start a new drive in it, localise in it,
+    and merge it with another map."""
     with tempfile.TemporaryDirectory(dir=folder) as out:
         _use_map_in(folder / "map.npz", folder / "other.npz", Path(out))
 
@@ -230,7 +230,7 @@ def _bag(kind: str, encoding: str, data: str, changed: str, compression: str = "
     return Reader(write, partial(_read_source, "bag", data), changed)
 
 
-# -- a mutation that reads the map ---------------------------------------------------------------
+# -- mutations of the content of maps ------------------------------------------------------------
 
 _INTEGERS = [-(2**62), -(2**31), -2, -1, 0, 1, 2, 7, 255, 2**31 - 1, 2**40, 2**62]
 _FLOATS = [np.nan, np.inf, -np.inf, 0.0, -0.0, -1.0, 0.5, 5e-324, 1e-30, 1e6, 1e30, 1e200, -1e200]
@@ -241,8 +241,8 @@ _OF_HEADER = [
 
 
 def _mutate_meaning(data: bytes, rng: np.random.Generator, name: str) -> bytes:
-    """One to three changes that leave kind and shape of every array as they were: what an array
-    says is wrong, or what the header says."""
+    """One to three changes of values in arrays or in the header that keep the type and shape of
+    every array."""
     with np.load(io.BytesIO(data)) as file:
         arrays = {name: file[name].copy() for name in file.files}
     for _ in range(int(rng.integers(1, 3))):
@@ -284,7 +284,7 @@ def _change(flat: np.ndarray, rng: np.random.Generator, length: int) -> None:
 
 
 def _other_number(value: object, rng: np.random.Generator) -> object:
-    """JSON with another value somewhere."""
+    """Change one value in JSON data."""
     if isinstance(value, dict | list) and value and rng.random() < 0.95:
         keys = list(value) if isinstance(value, dict) else list(range(len(value)))
         key = keys[int(rng.integers(len(keys)))]
@@ -327,7 +327,7 @@ READERS: dict[str, Reader] = {
 
 
 def mutate(data: bytes, rng: np.random.Generator, name: str) -> bytes:
-    """A file with one to four changes; now and then one that knows the format."""
+    """Apply one to four changes to a file; sometimes one that is specific to its format."""
     if name.endswith(".npz") and rng.random() < 0.6:
         return _mutate_npz(data, rng)
     if data[:8] == b"\x89PNG\r\n\x1a\n" and rng.random() < 0.3:
@@ -382,7 +382,7 @@ def _insert(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _number(data: bytes, rng: np.random.Generator) -> bytes:
-    """Another number in place of one."""
+    """Replace a number by another one."""
     found = list(re.finditer(rb"-?\d+(\.\d+)?(e[-+]?\d+)?", data))
     if not found:
         return data
@@ -391,7 +391,7 @@ def _number(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _lines(data: bytes, rng: np.random.Generator) -> bytes:
-    """A line moved, doubled or left out."""
+    """Move, duplicate or remove a line."""
     lines = data.split(b"\n")
     at, to = (int(rng.integers(len(lines))) for _ in range(2))
     line = lines[at] if rng.random() < 0.3 else lines.pop(at)
@@ -401,7 +401,7 @@ def _lines(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _nest(data: bytes, rng: np.random.Generator) -> bytes:
-    """Deep brackets, or YAML's aliases that grow at every level."""
+    """Insert deeply nested brackets, or YAML aliases that grow at every level."""
     bombs = (
         b"[" * 20_000,
         b'{"a":' * 20_000,
@@ -418,7 +418,7 @@ def _nest(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _alias(data: bytes, rng: np.random.Generator) -> bytes:
-    """A number of YAML that is an alias of a list that grows."""
+    """Replace a number in YAML by an alias of a growing list."""
     head = b"\n".join(
         [b"a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]"]
         + [b"a%d: &a%d [%s]" % (k, k, b", ".join([b"*a%d" % (k - 1)] * 9)) for k in range(1, 9)]
@@ -431,7 +431,7 @@ _TEXT = [_number, _number, _lines, _nest, _alias]
 
 
 def _mutate_npz(data: bytes, rng: np.random.Generator) -> bytes:
-    """One array of other values, shape or kind, or a member that promises too much."""
+    """Change the values, shape or type of an array, or claim too large a size in a header."""
     with np.load(io.BytesIO(data)) as file:
         arrays = dict(file)
     name = str(rng.choice(sorted(arrays)))
@@ -462,7 +462,7 @@ def _mutate_npz(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _promising(arrays: dict[str, np.ndarray], name: str) -> bytes:
-    """A header that speaks of 100 GB."""
+    """A header that claims a size of 100 GB."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for key, array in arrays.items():
@@ -480,7 +480,7 @@ def _promising(arrays: dict[str, np.ndarray], name: str) -> bytes:
 
 
 def _mutate_png(data: bytes, rng: np.random.Generator) -> bytes:
-    """Another size, depth or kind in a header whose checksum is right."""
+    """Change the size, depth or colour type in a header, with a correct checksum."""
     sizes = [0, 1, 47, 64, 65, 11_000, 100_000, 2**31 - 1]
     width, height = (int(rng.choice(sizes)) for _ in range(2))
     depth, kind = int(rng.choice([1, 8, 16])), int(rng.choice([0, 2, 3, 6]))
@@ -504,7 +504,7 @@ def _forget_peak() -> None:
 
 
 def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
-    """Try inputs and say of each, a JSON line: its number, before it and what came of it."""
+    """Try inputs; print a JSON line with the number of each before it, and its outcome after it."""
     from vslam.errors import InputError
 
     logging.disable(logging.CRITICAL)
@@ -515,7 +515,7 @@ def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
     valid.mkdir(parents=True, exist_ok=True)
     if not any(valid.iterdir()):
         reader.write(valid)
-    reader.read(valid)  # must succeed; imports and compiles what is needed
+    reader.read(valid)  # must succeed; also imports and compiles everything needed
     files = sorted(p for p in valid.glob(reader.changed) if p.is_file())
     for number in range(first, inputs):
         print(json.dumps({"begin": number}), flush=True)
@@ -551,11 +551,11 @@ def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
         print(json.dumps(line), flush=True)
 
 
-# -- in the process that watches ------------------------------------------------------------------
+# -- in the parent process ------------------------------------------------------------------------
 
 
 def fuzz(name: str, inputs: int, seed: int, keep: Path | None = None) -> dict[str, object]:
-    """Outcomes of a reader: how many inputs were read and refused, and every failure."""
+    """Fuzz a reader; returns the numbers of inputs read and refused, and all failures."""
     tried, read, refused, slowest, most = 0, 0, 0, 0.0, 0.0
     failures: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory(prefix="vslam-fuzz-") as scratch:

@@ -1,9 +1,9 @@
-"""Kill a run at random moments, every other time while it saves, and resume it: what is lost?
+"""Kill a run at random moments, every other time during an autosave, and resume it.
 
-Each time ``kill -9`` ends the run once it has done a number of frames drawn from a seed, or in the
-middle of the next autosave. All that it left is read, and the run resumed. The table has the frame
-of the kill, the frames saved, the seconds of the run that are lost, the ATE of the whole run, and
-whether its trajectory is that of the undisturbed run, byte for byte.
+``kill -9`` ends the run after a random number of frames, or in the middle of the next autosave.
+Then all its files are read, and the run is resumed. The table has the frame of the kill, the saved
+frames, the lost seconds, the ATE of the whole run, and whether the trajectory is byte for byte that
+of the undisturbed run.
 
     python tools/kill_test.py --kills 10 --autosave 4 -- --dataset synthetic --seq demo
 """
@@ -42,7 +42,7 @@ def trajectory_of(folder: Path) -> bytes:
 
 
 def frames_done(folder: Path) -> int:
-    """Frames that a run has tracked so far."""
+    """Number of frames that a run has tracked so far."""
     try:
         return (folder / ONLINE).read_bytes().count(b"\n")
     except OSError:
@@ -70,7 +70,7 @@ def kill_at(words: list[str], out: Path, frame: int, saving: bool) -> tuple[Path
 
 
 def saved_frames(folder: Path) -> tuple[int, float]:
-    """Read everything that a killed run left: frames saved, and seconds it had taken for them."""
+    """Read all files of a killed run; returns the saved frames and the seconds spent on them."""
     read_trajectory(folder / ONLINE)
     if not (folder / MAP).exists():
         return 0, 0.0

@@ -18,7 +18,7 @@ TABLE = Path(__file__).parents[1] / "docs" / "howto" / "laws.csv"
 
 
 def table() -> str:
-    """A line for each law; between weakest and strongest ``vslam stress`` searches."""
+    """A row for each law; ``vslam stress`` searches between the weakest and strongest value."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(

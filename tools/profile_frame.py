@@ -1,11 +1,11 @@
-"""Where the CPU time of a run goes, as a Markdown table: ms per frame of each stage.
+"""Profile the CPU time of a run: a Markdown table with the milliseconds per frame of each stage.
 
     python tools/profile_frame.py DATA SEQ FRAMES [--detector bow] [--report]
 
-DATA is a folder in KITTI's format. One thread does all, so that its CPU clock sees every stage;
-what a stage calls of another one counts for that one alone. The whole is the process, from the
-start of Python to the last file written, with the kernels from Numba's cache: run it twice. A
-kernel is loaded in the stage that calls it first.
+DATA is a folder in KITTI's format. One thread does all the work, so that its CPU clock measures
+every stage; the time of a stage called by another one counts only for the inner one. The total is
+that of the process, from the start of Python to the last file written. Run it twice, so that
+kernels come from Numba's cache; a kernel is loaded in the first stage that calls it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-# Stage, and the functions whose time it is: module, and name or Class.name there.
+# Stages and the functions that belong to them: module, and name or Class.name in it.
 STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("start: vocabulary", (("vslam.run.pipeline", "detector_with_images"),)),
     ("read both images", (("vslam.datasets.image_files", "read_files"),)),
@@ -46,7 +46,7 @@ STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
 
 
 class StageClock:
-    """CPU seconds of this thread by stage; a stage within a stage is taken out of the outer one."""
+    """CPU seconds of this thread by stage; the time of an inner stage is not in the outer one."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
@@ -67,7 +67,7 @@ class StageClock:
         return call
 
     def measure(self, stage: str, module_name: str, name: str) -> None:
-        """Put the clock around a function, where its module or class finds it."""
+        """Replace a function in its module or class by a timed one."""
         owner: Any = importlib.import_module(module_name)
         *classes, last = name.split(".")
         for each in classes:

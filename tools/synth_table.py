@@ -58,7 +58,7 @@ Row = dict[str, Any]
 
 
 class Drive(NamedTuple):
-    """A rendered sequence: its title, the KITTI tree it lies in, its name there."""
+    """A rendered sequence: its title, its KITTI tree, and its name in the tree."""
 
     title: str
     root: Path
@@ -130,7 +130,7 @@ def _drives(options: argparse.Namespace) -> Iterator[Drive]:
 
 @contextmanager
 def _in_light(drive: Drive, light: str) -> Iterator[Path]:
-    """A KITTI tree with the drive's images as they are or, in a temporary folder, changed.
+    """A KITTI tree with the drive's images: unchanged, or changed in a temporary folder.
 
     ``cut:N`` takes N frames out, a third of the way; ``black:N`` blackens N frames there;
     ``every:N`` keeps every N-th. Anything else is a perturbation of ``vslam run``.

@@ -1,17 +1,16 @@
-"""vslam and ORB-SLAM3 (pyorbslam3) as processes, what they cost and how good they are, and changed
-drives to run them over: shared by the scripts that compare them.
+"""Shared code of the scripts that compare vslam and ORB-SLAM3 (pyorbslam3): running both as
+processes, measuring their cost and accuracy, and changing drives.
 
-Wall time, CPU time and peak memory are the kernel's figures for the whole process: start,
-vocabulary, files written and all. Errors come from vslam.evaluation.trajectories for both, on the
-trajectory files that they wrote.
+Wall time, CPU time and peak memory are those of the whole process, as the kernel reports them. The
+errors of both are computed by vslam.evaluation.trajectories from their trajectory files.
 
-ORB-SLAM3 is run by a script that takes VOCABULARY SEQUENCE_FOLDER OUT --frames N, writes a pose a
-frame to OUT in KITTI's format and prints a JSON object with frames, fps, cpu_ms_per_frame and
-lost. A monocular run gives it ``--mono --rate 20`` (it loses its way when images come faster than
-its mapping), and it writes its keyframes in TUM's format: its ATE is that of its keyframes alone.
-Loops are found, missed and wrong by the ground truth for vslam (vslam.evaluation.loops); of
-ORB-SLAM3 only the closed ones are known: ``loops`` of that object, or the lines that ORB-SLAM3
-prints for them.
+ORB-SLAM3 is run by a script that takes VOCABULARY SEQUENCE_FOLDER OUT --frames N, writes one pose
+per frame to OUT in KITTI's format and prints a JSON object with frames, fps, cpu_ms_per_frame and
+lost. In a monocular run, it gets ``--mono --rate 20``, because ORB-SLAM3 gets lost if images come
+faster than its mapping. It then writes only keyframes, in TUM's format, and its ATE is that of the
+keyframes. The loops of vslam are evaluated by the ground truth (vslam.evaluation.loops). For
+ORB-SLAM3, only the number of closed loops is known, from ``loops`` in the JSON object or from its
+messages.
 """
 
 from __future__ import annotations
@@ -54,8 +53,8 @@ class OrbSlam3(NamedTuple):
 
 
 class Process(NamedTuple):
-    """A process that has ended: its output and the kernel's account of it and its children;
-    ``held`` is the memory it held at times since its start, as (s, MB)."""
+    """A process that has ended: its output, and the resources used by it and its children;
+    ``held`` has its memory over time, as (s, MB)."""
 
     output: str
     wall_s: float
@@ -65,9 +64,9 @@ class Process(NamedTuple):
 
 
 class Run(NamedTuple):
-    """One run: what the system reports of itself (``frames``, ``fps`` and ``cpu_ms_per_frame`` of
-    the frame loop, and more), its lost frames, its loops closed, missed and wrong (None where it
-    does not say), and its trajectory, in KITTI's format or, with times, in TUM's."""
+    """One run: the system's own report (``frames``, ``fps`` and ``cpu_ms_per_frame`` of the frame
+    loop, and more), lost frames, numbers of closed, missed and wrong loops (None if unknown), and
+    the trajectory in KITTI's or TUM's format."""
 
     process: Process
     report: dict[str, Any]
@@ -77,8 +76,8 @@ class Run(NamedTuple):
 
 
 def measure(command: list[str], folder: Path) -> Process:
-    """Run a command to its end and account for it. Nothing heavy may be imported before: the
-    peak memory of a child starts at that of its parent."""
+    """Run a command to its end and measure it. No large package may be imported before, because
+    the peak memory of a child starts at that of its parent."""
     log = folder / "output.txt"
     # Modules are compiled once, as when pip installs them.
     environment = {key: os.environ[key] for key in os.environ if key != "PYTHONDONTWRITEBYTECODE"}
@@ -93,7 +92,7 @@ def measure(command: list[str], folder: Path) -> Process:
         try:
             _, status, usage = os.wait4(child.pid, 0)
             wall = time.perf_counter() - start
-        finally:  # Ctrl-C, too
+        finally:  # also after Ctrl-C
             ended.set()
             watch.join()
         child.returncode = os.waitstatus_to_exitcode(status)
@@ -106,7 +105,7 @@ def measure(command: list[str], folder: Path) -> Process:
 def sample_memory(
     pid: int, ended: threading.Event, start: float, held: list[tuple[float, float]]
 ) -> None:
-    """Note twice a second what a process holds."""
+    """Record the memory of a process twice a second."""
     while not ended.wait(0.5):
         with suppress(OSError):
             status = Path(f"/proc/{pid}/status").read_text()
@@ -166,10 +165,10 @@ def figures(run: Run, case: Case, sensor: str = "stereo") -> dict[str, float]:
         file.flush()
         try:
             estimate = read_trajectory(Path(file.name), sequence.timestamps)
-        except InputError:  # too few poses: which belongs to which frame is not known
+        except InputError:  # with too few poses, it is unknown which frames they belong to
             return found
     truth = Trajectory(sequence.timestamps, sequence.ground_truth)
-    if sensor == "mono":  # without a unit, and of ORB-SLAM3 keyframes alone
+    if sensor == "mono":  # the scale is unknown, and ORB-SLAM3 writes only keyframes
         return found | {"ate_m": evaluate_trajectory(estimate, truth, "sim3").ate_rmse_m}
     errors = evaluate_trajectory(estimate, truth)
     t_rel = errors.t_rel_percent
@@ -178,7 +177,7 @@ def figures(run: Run, case: Case, sensor: str = "stereo") -> dict[str, float]:
 
 
 def spread(values: list[float], form: str) -> str:
-    """Median (least - greatest), the median alone where they are the same as printed."""
+    """Median (least - greatest), or the median alone if both are equal as printed."""
     low, high = format(min(values), form), format(max(values), form)
     median = format(statistics.median(values), form)
     return median if low == high else f"{median} ({low} - {high})"
@@ -255,15 +254,15 @@ def run_over(
 
 
 def add_orbslam3_options(parser: argparse.ArgumentParser) -> None:
-    """Where ORB-SLAM3 is; without these it is left out."""
+    """Add the options that locate ORB-SLAM3; without them, it is left out."""
     for name in ("orbslam3-python", "orbslam3-script", "vocabulary"):
-        # Runs have working folders of their own. A link to the interpreter is what makes an
-        # environment: it is not followed.
+        # Paths must be absolute, because each run has its own working folder. Links must not be
+        # resolved, because the link to the interpreter determines the virtual environment.
         parser.add_argument(f"--{name}", type=lambda text: Path(text).absolute())
 
 
 def orbslam3_of(options: argparse.Namespace) -> OrbSlam3 | None:
-    """What :func:`add_orbslam3_options` was given; None without any of it."""
+    """ORB-SLAM3 by the options of :func:`add_orbslam3_options`; None without them."""
     given = (options.orbslam3_python, options.orbslam3_script, options.vocabulary)
     if not any(given):
         return None

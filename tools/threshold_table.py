@@ -39,7 +39,7 @@ The other numbers of the method are constants in the code: mathematics, numerica
 
 
 class Row(NamedTuple):
-    """One threshold: dotted name, default as JSON has it, meaning with unit, source."""
+    """One threshold: dotted name, default in JSON, meaning with unit, source."""
 
     name: str
     default: str
@@ -48,7 +48,7 @@ class Row(NamedTuple):
 
 
 def descriptions(model: type[BaseModel]) -> dict[str, str]:
-    """The docstring below each field that a class defines, on one line; "" where there is none."""
+    """The docstring below each field of a class, on one line; "" if there is none."""
     (definition,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
     assert isinstance(definition, ast.ClassDef)
     found = {}

@@ -1,11 +1,11 @@
 """Build the wheel, install it into a clean environment and run it from another folder.
 
-What the tests cannot see: files left out of the wheel, dependencies that only the development
-environment has, imports that work only in the checkout. The sequence is a textured wall that a
-stereo camera passes; shifts are whole pixels, so that its true trajectory is exact.
+This finds errors that the tests cannot see: files missing in the wheel, dependencies that only the
+development environment has, and imports that work only in the checkout. A stereo camera passes a
+textured wall; the image moves by whole pixels, so that the true trajectory is exact.
 
-Other Pythons get an environment each. With ``--runners`` the wheel is also started by pipx and
-uvx, of those that are installed.
+Each additional Python gets its own environment. With ``--runners``, the wheel is also started by
+pipx and uvx, if installed.
 
 usage: python tools/wheel_test.py [--python python3.12 ...] [--runners]
 """
@@ -28,12 +28,12 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 WIDTH, HEIGHT, FOCAL, BASELINE = 480, 240, 240.0, 0.5
 DISPARITY = 12  # pixels: the wall is 10 m away
-FRAMES, STEP = 12, 4  # pixels a frame to the right, and up and down in turn
+FRAMES, STEP = 12, 4  # pixels per frame to the right, and alternately up and down
 MAX_ATE_M = 0.02
 
 
 def run(*command: str | Path, cwd: Path, **environment: str) -> str:
-    """Standard output of a command; ends the test with what it said if it fails."""
+    """Run a command and return its output; if it fails, print its output and exit."""
     start = time.perf_counter()
     done = subprocess.run(
         list(map(str, command)), cwd=cwd, capture_output=True, text=True,
@@ -47,7 +47,7 @@ def run(*command: str | Path, cwd: Path, **environment: str) -> str:
 
 
 def write_sequence(root: Path) -> None:
-    """KITTI's layout, sequence 00 with ground truth."""
+    """Write sequence 00 in KITTI's layout, with ground truth."""
     noise = np.random.default_rng(0).uniform(0, 255, (HEIGHT + 60, WIDTH + 120)).astype(np.float32)
     fine, coarse = (cv2.GaussianBlur(noise, (0, 0), sigma) for sigma in (1.0, 3.0))
     wall = np.clip(128 + 2.0 * (fine - 128) + 4.0 * (coarse - 128), 0, 255).astype(np.uint8)
@@ -75,7 +75,7 @@ def write_sequence(root: Path) -> None:
 
 
 def check_run(folder: Path) -> None:
-    """The files are there and the figures right."""
+    """Check that all files exist and that the figures are right."""
     wanted = (
         "report.json report.md report.html config.json map.npz recording.rrd "
         "trajectory_kitti.txt trajectory.tum keyframes.tum"

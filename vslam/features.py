@@ -137,6 +137,7 @@ class LandmarkPatches(NamedTuple):
         where: ``(N,)`` int64, row of each landmark in ``pixels`` and ``shift``.
         view: ``(N,)`` int64, index into ``T_cw`` of the keyframe that the patch was taken from.
         size: ``(N,)`` float64, full-resolution pixels per pixel of the patch.
+        angle: ``(N,)`` float32, orientation of the feature in radians.
         pixels: ``(P, PATCH_PIXELS)`` uint8, as in ``KeyframePatches``.
         shift: ``(P, 2)`` float32, as in ``KeyframePatches``.
         T_cw: ``(K, 4, 4)`` float64 poses of the keyframes.
@@ -146,6 +147,7 @@ class LandmarkPatches(NamedTuple):
     where: NDArray[np.int64]
     view: NDArray[np.int64]
     size: NDArray[np.float64]
+    angle: NDArray[np.float32]
     pixels: NDArray[np.uint8]
     shift: NDArray[np.float32]
     T_cw: NDArray[np.float64]
@@ -156,6 +158,7 @@ NO_PATCHES = LandmarkPatches(
     np.empty(0, np.int64),
     np.empty(0, np.int64),
     np.empty(0),
+    np.empty(0, np.float32),
     np.empty((0, PATCH_PIXELS), np.uint8),
     np.empty((0, 2), np.float32),
     np.empty((0, 4, 4)),

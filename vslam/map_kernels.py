@@ -221,7 +221,7 @@ def collect_landmarks(a, keyframes, n_landmarks):
 
 @kernel
 def count_seen_by(a, keyframe, needed):
-    """Number of a keyframe's landmarks that at least ``needed`` keyframes observe, with itself."""
+    """Number of a keyframe's landmarks that ``needed`` keyframes or more observe, this one included."""
     count = 0
     for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
         if a.landmark[row] < 0:

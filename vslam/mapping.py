@@ -82,7 +82,7 @@ class Mapper:
         self._camera = context.camera
         self._config = context.config
         self._closing = closing
-        self._rig = rig
+        self.rig = rig
         self._aligner = Aligner(context.config.alignment)
         self._is_merged = True
         self._held: tuple[Frame, ...] = ()
@@ -163,7 +163,7 @@ class Mapper:
         """
         self.hold(last, frame)
         self.merge_if_due(frame.index)
-        self._rig.prepare(frame, twist)
+        self.rig.prepare(frame, twist)
 
     def append_pose(self, frame: Frame, *, tracked: bool, near: int = -1) -> PlacedFrame:
         """Record the pose of the next frame, and return it as a frame with a recorded pose.
@@ -306,7 +306,7 @@ class Mapper:
         local = local_map(map_, keyframe, config.local_keyframes)
         patches = self._aligner.patches_of(map_, local.ids)
         self.view = view_of(map_, keyframe, local, patches, monocular=self._camera.monocular)
-        self._rig.disparity_offset = map_.scalars.disparity_offset
+        self.rig.disparity_offset = map_.scalars.disparity_offset
 
     def refer_to_nearest(self, frame: Frame) -> None:
         """Make the keyframe that shares the most landmarks with a frame the reference (ORB-SLAM,
@@ -367,7 +367,7 @@ class Mapper:
         """Update a frame after the map moved. A frame whose pose is recorded follows its keyframe,
         any other the reference keyframe."""
         grown = self.view.unit_scale / before.unit_scale
-        self._rig.correct_offset(frame)
+        self.rig.correct_offset(frame)
         update_landmarks(frame, self.map)
         if frame.index < len(self.frames):
             frame.T_cw = self.frames.pose(frame.index)

@@ -145,9 +145,23 @@ class MapBuilding:
             if self.policy.is_known(PlaceEvidence(n_inliers, place.n_shared, place.n_place)):
                 self._mapper.use_existing_keyframe(place, frame)
                 return False
+        if not self._match_features(frame):
+            return False
         self._mapper.insert(frame)
         self.policy.keyframe_made()
         return True
+
+    def _match_features(self, frame: PlacedFrame) -> bool:
+        """Give a frame that was tracked by patches the features that a keyframe needs. Returns
+        False, and leaves the frame as it is, if they do not match the map."""
+        if frame.source is None:
+            return True
+        before = frame.snapshot()
+        self._mapper.rig.extract(frame, frame.twist)
+        if self._tracker.match_features(frame, self._mapper.view):
+            return True
+        frame.restore(before)
+        return False
 
     def state(self) -> PolicyState | None:
         """The state of the keyframe policy; None while the starter keeps a frame and waits for a

@@ -13,8 +13,8 @@ from vslam.camera import Camera, DepthImage, Image, check_images
 from vslam.closing import LoopClosing
 from vslam.config import Config
 from vslam.errors import InputError
-from vslam.features import Extracted, Side, TrackingState, TrackResult
-from vslam.frontend.extraction import extract_features
+from vslam.features import Extracted, TrackingState, TrackResult
+from vslam.frontend.extraction import FrameImages
 from vslam.frontend.frame import Frame
 from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.rig import RigCalibration
@@ -185,11 +185,20 @@ class Slam:
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         check_images(left, second, self.context.camera)
-        clock = StageClock()
-        extracted = extract_features(left, second, self.context)
-        clock.lap("extract")
-        image = np.array(second if extracted.side == Side.RIGHT else left, np.uint8)
-        return self.step_features(extracted, timestamp, image, clock.ms)
+        return self.step_images(FrameImages(np.array(left), second, self.context), timestamp)
+
+    def step_images(
+        self, images: FrameImages, timestamp: float, stage_ms: dict[str, float] | None = None
+    ) -> TrackResult:
+        """``step`` for images that were prepared before, in another thread for example.
+
+        Args:
+            images: they are not copied: do not write to them afterwards.
+            timestamp, stage_ms: as for ``step_features``.
+        """
+        frame = self._next_frame(Extracted.nothing(), timestamp, images.left)
+        frame.source, frame.pyramid, frame.coarse = images, images.pyramid, images.coarse
+        return self._step(frame, StageClock(dict(stage_ms or {})))
 
     def step_features(
         self,
@@ -207,21 +216,30 @@ class Slam:
                 need it. It is not copied: do not write to it afterwards.
             stage_ms: wall time of the stages so far in milliseconds, which the result includes.
         """
-        clock = StageClock(dict(stage_ms or {}))
         frame = self._next_frame(extracted, timestamp, image)
+        return self._step(frame, StageClock(dict(stage_ms or {})))
+
+    def _step(self, frame: Frame, clock: StageClock) -> TrackResult:
         mapper, tracker = self._mapper, self._tracker
         mapper.admit(frame, tracker.last, tracker.twist)
         clock.lap("wait_for_mapping")
         if not mapper.n_keyframes:
+            self.rig.extract(frame, tracker.twist)
+            clock.lap("extract")
             begun = self._mode.begin(mapper.append_pose(frame, tracked=False))
             found = Found.at_start(frame, begun=begun)
             clock.lap("keyframe")
             return result_of(frame, found, not found.is_lost, clock.ms)
 
-        T_predicted = tracker.predict(timestamp, mapper.frames, mapper.view)
-        tracked = tracker.track(frame, T_predicted, mapper.view, mapper.frames)
+        T_predicted = tracker.predict(frame.timestamp, mapper.frames, mapper.view)
+        tracked = tracker.track_patches(frame, T_predicted, mapper.view)
+        if tracked.is_lost:
+            clock.lap("track")
+            self.rig.extract(frame, tracker.twist)
+            clock.lap("extract")
+            tracked = tracker.track(frame, T_predicted, mapper.view, mapper.frames)
         if tracked.is_lost and self._mode.map_far_points():
-            T_predicted = tracker.predict(timestamp, mapper.frames, mapper.view)
+            T_predicted = tracker.predict(frame.timestamp, mapper.frames, mapper.view)
             tracked = tracker.track(frame, T_predicted, mapper.view, mapper.frames)
         clock.lap("track")
         found = self._relocaliser.relocalise_if_needed(frame, tracked, mapper)

@@ -28,6 +28,7 @@ class TrackerState:
         twist: ``(6,)`` twist of the camera at that time, per second; None if unknown.
         lost_frames: number of lost frames since then.
         n_tracked: number of landmarks that the frame tracked.
+        coarse: ``(Q,)`` uint8, the pixels of its ``coarse_levels``; empty if there are none.
     """
 
     index: int
@@ -38,6 +39,7 @@ class TrackerState:
     twist: Matrix | None
     lost_frames: int
     n_tracked: int
+    coarse: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
 
 
 @dataclass(frozen=True)
@@ -65,10 +67,12 @@ class PolicyState:
     Attributes:
         gained_close: mean number of close points that the first frame after a keyframe tracks.
         gain_awaited: whether the next frame is the first after a keyframe.
+        first_close: how many close points the first frame after the last keyframe tracked.
     """
 
     gained_close: float
     gain_awaited: bool
+    first_close: int = 0
 
 
 @dataclass(frozen=True)

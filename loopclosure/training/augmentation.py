@@ -1,4 +1,4 @@
-"""Random changes of an image that do not change its place: viewpoint, light, occlusion, sensor."""
+"""Random changes of an image that keep its place: viewpoint, light, occlusion, sensor."""
 
 from __future__ import annotations
 
@@ -13,28 +13,31 @@ _ZOOMED = 0.5  # likewise
 
 
 class Augmentation(BaseModel):
-    """Strengths; 0 leaves a change out. The paper has projective changes, luminance and masks."""
+    """Strengths of the changes; 0 disables one. The paper uses projective changes, luminance and
+    masks."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     homography: float = Field(
-        0.10, ge=0, le=0.4, description="Largest move of a corner, of each side."
+        0.10, ge=0, le=0.4, description="Largest move of a corner, relative to each side."
     )
-    shift: float = Field(0.10, ge=0, le=0.5, description="Largest horizontal shift, of width.")
+    shift: float = Field(0.10, ge=0, le=0.5, description="Largest shift, relative to the width.")
     turn: float = Field(0.0, ge=0, le=45, description="Largest turn of the camera, degrees.")
-    zoom: float = Field(0.0, ge=0, le=1, description="Largest logarithm of a zoom: driven on.")
-    log_gain: float = Field(0.35, ge=0, description="Deviation of the logarithm of the gain.")
-    bias: float = Field(20.0, ge=0, description="Deviation, grey levels.")
-    log_gamma: float = Field(0.25, ge=0, description="Deviation of the logarithm of gamma.")
+    zoom: float = Field(0.0, ge=0, le=1, description="Largest log of a zoom, as by driving on.")
+    log_gain: float = Field(0.35, ge=0, description="Standard deviation of the log gain.")
+    bias: float = Field(20.0, ge=0, description="Standard deviation of the bias, grey levels.")
+    log_gamma: float = Field(0.25, ge=0, description="Standard deviation of log gamma.")
     masks: int = Field(3, ge=0, description="Largest number of masks.")
-    mask_area: float = Field(0.10, ge=0, le=0.5, description="Largest area of a mask, of image.")
-    noise: float = Field(6.0, ge=0, description="Largest deviation, grey levels.")
-    blur: float = Field(1.0, ge=0, description="Largest deviation of a Gaussian blur, pixels.")
+    mask_area: float = Field(
+        0.10, ge=0, le=0.5, description="Largest share of a mask in the image."
+    )
+    noise: float = Field(6.0, ge=0, description="Largest standard deviation of noise, grey levels.")
+    blur: float = Field(1.0, ge=0, description="Largest sigma of a Gaussian blur, pixels.")
     mirror: bool = Field(True, description="Mirror both images of every second pair.")
 
 
-# Light and dirt stronger, sensor as above: at the size of the network a camera's noise and blur are
-# averaged away, and rendered pairs bring viewpoints of their own.
+# Stronger light and occlusion, the same sensor: at the network's resolution, a camera's noise and
+# blur are averaged out, and rendered pairs already differ in viewpoint.
 STRONG = Augmentation(
     homography=0.08, shift=0.12, log_gain=0.5, bias=30.0, log_gamma=0.5, masks=3, mask_area=0.15,
 )  # fmt: skip
@@ -45,8 +48,8 @@ def augment(
 ) -> NDArray[np.uint8]:
     """Change an image ``(H, W)`` at random.
 
-    The order is that of the world: viewpoint, then what stands in the way, then light, lens and
-    sensor, then 8 bits.
+    The changes follow the order of image formation: viewpoint, occlusion, light, lens, sensor, and
+    quantisation to 8 bits.
     """
     import cv2
 
@@ -59,10 +62,10 @@ def augment(
     edge = cv2.BORDER_REFLECT_101
     if strength.turn > 0 and rng.random() < _TURNED:
         H = H @ turn_homography(width, height, rng.uniform(-1, 1) * strength.turn)
-        # Black, or a mirror image: nobody knows what was beside the view.
+        # What lies beyond the border is unknown; it becomes black or a mirror image.
         edge = cv2.BORDER_CONSTANT if rng.random() < 0.5 else edge
     if strength.zoom > 0 and rng.random() < _ZOOMED:
-        # What is far ahead grows around the middle when the camera drives on, the rest likewise.
+        # Driving on is approximated by enlarging the image around its middle.
         factor = np.exp(rng.uniform(0, strength.zoom))
         x, y = (1.0 - factor) * width / 2, (1.0 - factor) * height / 2
         H = H @ np.array([[factor, 0, x], [0, factor, y], [0, 0, 1.0]])
@@ -75,7 +78,7 @@ def augment(
     curve = np.exp(strength.log_gain * rng.standard_normal()) * curve
     curve += strength.bias * rng.standard_normal()
     out = np.asarray(cv2.LUT(out, np.clip(np.rint(curve), 0, 255).astype(np.uint8)), np.uint8)
-    # Every second image stays sharp and clean: most real ones are.
+    # Every second image stays sharp and clean, as most real ones are.
     blur, noise = rng.uniform(-1, 1, 2) * (strength.blur, strength.noise)
     if blur > 0.2:
         out = np.asarray(cv2.GaussianBlur(out, (0, 0), float(blur)), np.uint8)

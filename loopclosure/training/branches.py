@@ -1,4 +1,4 @@
-"""How networks read images, and the capsule branch: what turns an image into a descriptor."""
+"""Layouts in which networks read images, and the capsule branch, which computes a descriptor."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from vslam.loopclosure.training.lite import (
 )
 from vslam.loopclosure.training.preprocessing import Unrolling, standardised, textured
 
-_LEAST_SHARE = 0.02  # of texture in a view: where no view shows any, all still count alike
+_LEAST_SHARE = 0.02  # of texture in a view, so that views without any texture count equally
 
 
 class Layout(NamedTuple):
@@ -40,9 +40,9 @@ class Layout(NamedTuple):
 
     Attributes:
         size: height and width of the image.
-        views: parts of it that have a descriptor each, from left to right and equally far apart.
-        view_width: columns of a part; None for the whole image as the only one.
-        half_angle, middle: how it is unrolled (:class:`preprocessing.Unrolling`); 0 leaves it flat.
+        views: number of parts with a descriptor each, evenly spaced from left to right.
+        view_width: columns of a part; None if the whole image is the only part.
+        half_angle, middle: see :class:`preprocessing.Unrolling`; half_angle 0 leaves it flat.
     """
 
     size: Size
@@ -53,34 +53,34 @@ class Layout(NamedTuple):
 
 
 class CapsuleShape(BaseModel):
-    """Everything that the weights of a capsule branch depend on; stored beside them."""
+    """The structure of a capsule branch; stored beside its weights."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     extractor: Literal["light", "original", "lite0"] = "light"
     pixels: int = Field(227, ge=32, description="Height of the input.")
-    width: int | None = Field(None, ge=32, description="Of the input; None for a square.")
+    width: int | None = Field(None, ge=32, description="Width of the input; None: a square.")
     views: int = Field(1, ge=1, le=16, description="Parts of the image, from left to right.")
-    view_width: int | None = Field(None, ge=32, description="Of a part; None: of the image.")
+    view_width: int | None = Field(None, ge=32, description="Columns of a part; None: all.")
     half_angle: float = Field(
-        0.0, ge=0, le=60, description="Degrees from middle to side when unrolled; 0: left flat."
+        0.0, ge=0, le=60, description="Degrees from middle to side when unrolled; 0: flat."
     )
     middle: float = Field(
-        1.0, gt=0, le=1, description="Share of the height that its middle column keeps then."
+        1.0, gt=0, le=1, description="Share of the height that the middle column keeps."
     )
     blocks: tuple[tuple[int, int, int], ...] = LIGHT_BLOCKS
     types: int = Field(32, ge=1, description="Types of primary capsules.")
-    size: int = Field(8, ge=1, description="Numbers of a primary capsule.")
+    size: int = Field(8, ge=1, description="Dimension of a primary capsule.")
     outputs: int = Field(64, ge=1, description="Output capsules.")
-    depth: int = Field(16, ge=1, description="Numbers of an output capsule.")
-    iterations: int = Field(3, ge=1, description="Of the routing.")
+    depth: int = Field(16, ge=1, description="Dimension of an output capsule.")
+    iterations: int = Field(3, ge=1, description="Iterations of the routing.")
     over: Literal["primary", "output"] = "primary"
     kept: int | None = Field(None, description="Places kept of each type; None before pruning.")
 
     @model_validator(mode="before")
     @classmethod
     def _without_what_is_gone(cls, given: Any) -> Any:
-        """Weights of before say that no channel and no block was left out of the extractor."""
+        """Drop keys of older weights, by which no channel or block of the extractor is missing."""
         if not isinstance(given, dict):
             return given
         nothing = {key for key in ("inner", "skipped") if not given.get(key, True)}
@@ -89,7 +89,7 @@ class CapsuleShape(BaseModel):
     @model_validator(mode="after")
     def _flat_images_keep_their_height(self) -> CapsuleShape:
         if self.middle < 1 and self.half_angle == 0:
-            raise ValueError(f"middle {self.middle:g}: is of unrolled images; give half_angle")
+            raise ValueError(f"middle {self.middle:g}: needs unrolled images; give half_angle")
         return self
 
     @model_validator(mode="after")
@@ -112,43 +112,42 @@ class CapsuleShape(BaseModel):
 
     @property
     def input(self) -> Size:
-        """Height and width of the images it takes."""
+        """Height and width of its input images."""
         return self.pixels, self.width or self.pixels
 
     @property
     def layout(self) -> Layout:
-        """How it reads them."""
+        """How it reads images."""
         return Layout(self.input, self.views, self.view_width, self.half_angle, self.middle)
 
     @property
     def view(self) -> Size:
-        """Height and width of what a descriptor sees."""
+        """Height and width of a view."""
         return self.pixels, self.view_width or self.input[1]
 
     @property
     def cut_stride(self) -> int:
-        """Pixels of the image per column of what the views are cut from.
+        """Stride, in pixels, of the array from which the views are cut.
 
-        Those are early features of lite0, computed once for all views. Other extractors begin with
-        the pixels of a view.
+        For lite0, these are its early features, computed once for all views; for other extractors,
+        the pixels themselves.
         """
         return EARLY_STRIDE if self.extractor == "lite0" else 1
 
     @property
     def cuts(self) -> list[slice]:
-        """Columns of the views there."""
+        """Columns of the views in that array."""
         width, view = self.input[1], self.view[1]
         apart = (width - view) // self.cut_stride // max(1, self.views - 1)
         columns = (view - 1) // self.cut_stride + 1
         return [slice(k * apart, k * apart + columns) for k in range(self.views)]
 
     def for_images_of(self, size: Size) -> CapsuleShape:
-        """The same branch for images of another height and width.
-
-        Views have the same share of the width, as nearly as they fit.
+        """The same branch for images of another height and width. Views keep their share of the
+        width as nearly as possible.
 
         Raises:
-            InputError: views that become too narrow.
+            InputError: the views become too narrow.
         """
         view = None
         if self.view_width is not None:
@@ -169,15 +168,15 @@ class CapsuleShape(BaseModel):
 
     @property
     def places(self) -> int:
-        """Places of the grid."""
+        """Number of places in the grid."""
         rows, columns = self.grid
         return rows * columns
 
     def with_layout(self, layout: Layout) -> CapsuleShape:
-        """The same branch that reads images in another way.
+        """The same branch with another layout.
 
         Raises:
-            InputError: views that do not fit the image.
+            InputError: the views do not fit the image.
         """
         height, width = layout.size
         given = {
@@ -195,12 +194,13 @@ class CapsuleShape(BaseModel):
 
 
 class CapsuleBranch(nn.Module):
-    """Extractor, primary capsules, routing; the descriptor is all output capsules, flattened.
+    """Extractor, primary capsules and routing; the flattened output capsules are the descriptor.
 
-    With several views, those of the leftmost view first, and each as long as the share of the view
-    that shows texture: a wall of fog, or what covers the lens, tells no place from another. Views
-    of lite0 are cut from early features of the whole image: computed once, and with what lies just
-    beyond a view in place of padding. Where things are in a view is what later layers add.
+    With several views, those of the leftmost view come first. The part of each view is scaled by
+    the share of the view that shows texture, because fog or a covered lens does not distinguish
+    places. For lite0, views are cut from the early features of the whole image. They are thus
+    computed once, with the surroundings of a view instead of padding, and only later layers depend
+    on the position in the view.
     """
 
     def __init__(self, shape: CapsuleShape) -> None:
@@ -219,7 +219,7 @@ class CapsuleBranch(nn.Module):
             grid = LiteExtractor() if lite else LightExtractor(shape.blocks)
             self.extractor = grid
             self.primary = PrimaryCapsules(grid.out_channels, shape.types, shape.size)
-        # Depthwise convolutions are faster so, forward by a third and backward by a quarter.
+        # With channels last, depthwise convolutions take a third less forward, a quarter backward.
         for module in (self.extractor, self.primary):
             module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.capsules = CapsuleLayer(
@@ -246,7 +246,7 @@ class CapsuleBranch(nn.Module):
         return grey
 
     def _primary_capsules(self, grey: Tensor, shown: Tensor) -> Tensor:
-        """``(V N, T, P, A)`` of ``(N, 1, H, W)`` images and where they are :func:`textured`."""
+        """``(V N, T, P, A)`` from ``(N, 1, H, W)`` images and their :func:`textured` masks."""
         if isinstance(self.extractor, LiteExtractor):
             x = standardised(grey, shown).contiguous(memory_format=torch.channels_last)
             x = self.extractor.late(self._views(self.extractor.early(x)))
@@ -256,7 +256,7 @@ class CapsuleBranch(nn.Module):
         return capsules
 
     def _textured_share(self, shown: Tensor) -> Tensor:
-        """Of each view, ``(N, V)``."""
+        """``(N, V)`` share of each view that shows texture."""
         firsts = [cut.start * self.shape.cut_stride for cut in self.shape.cuts]
         width = self.shape.view[1]
         shares = [shown[..., k : k + width].mean((1, 2, 3)) for k in firsts]
@@ -270,7 +270,7 @@ class CapsuleBranch(nn.Module):
 
 
 def _first(error: ValidationError) -> str:
-    """What is wrong, in a clause."""
+    """The first error, as a clause."""
     first = error.errors()[0]
     said = plain_reason(first["msg"])
     return ": ".join([*map(str, first["loc"]), said])

@@ -1,11 +1,11 @@
 """Capsules and dynamic routing.
 
-Zhou and Sun, Sci Rep 15, 7644 (2025), equations 4 to 9, after Sabour et al., NIPS 2017.
-N images, I primary capsules of A numbers, J output capsules of D numbers. Primary capsules come in
-T types (learned by the extractor) at P places of a grid: i = t P + p.
+Zhou and Sun, Sci Rep 15, 7644 (2025), equations 4 to 9, after Sabour et al., NIPS 2017. There are N
+images, I primary capsules of dimension A, and J output capsules of dimension D. Primary capsules
+have T types (channels of the extractor) at P places of a grid: i = t P + p.
 
-``route`` uses the sums that matrices shared by the places of a type allow, and never forms the
-prediction vectors. ``tests/reference_routing.py`` has the paper's equations as they are written.
+The places of a type share their matrices, so ``route`` sums over places first and never forms the
+prediction vectors. ``tests/reference_routing.py`` implements the paper's equations literally.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 Over = Literal["primary", "output"]
-_DEVIATION = 0.12  # of a prediction vector at the start, over the root of the capsules
+_DEVIATION = 0.12  # initial deviation of a prediction vector, divided by sqrt(capsules)
 TINY = 1e-12  # keeps the square root differentiable at 0
 
 
@@ -36,19 +36,19 @@ def route(
 ) -> tuple[Tensor, Tensor]:
     """Dynamic routing; gradients flow through the last iteration only.
 
-    ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and ``û_j|i · v_j = u_tp · (W_tjᵀ v_j)``: sums over places
-    of A numbers take the place of ``I J D`` numbers written once and read five times.
+    ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and ``û_j|i · v_j = u_tp · (W_tjᵀ v_j)``: sums of A numbers
+    over places replace ``I J D`` numbers that would be written once and read five times.
 
     Args:
         u: ``(N, T, P, A)`` primary capsules.
         W: ``(J, T, A, D)``, shared by the places of a type.
         iterations: at least 1.
-        over: what the coupling coefficients are normalised over: ``primary``, their sum over i is
-            1, as the paper writes; ``output``, their sum over j is 1, as in Sabour et al.
-        alive: ``(I,)`` bool; a capsule that is not takes no part, as if it were removed.
+        over: normalisation of the coupling coefficients: ``primary``, their sum over i is 1, as in
+            the paper; ``output``, their sum over j is 1, as in Sabour et al.
+        alive: ``(I,)`` bool; capsules that are False are ignored, as if they were removed.
 
     Returns:
-        Output capsules ``v`` ``(N, J, D)`` and the coupling coefficients ``(N, J, I)`` behind them.
+        Output capsules ``v`` ``(N, J, D)`` and their coupling coefficients ``(N, J, I)``.
     """
     v, e, total = _route_undivided(u, W, iterations, over, alive)
     return v, _divided(e, total)
@@ -64,8 +64,8 @@ def _route_undivided(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Output capsules ``(N, J, D)``, and couplings as ``e / total``.
 
-    ``e`` is ``(N, T, J, P)``, ``total`` ``(N, 1, J, 1)`` or ``(1,)``: what is divided here are sums
-    over P, a sixth of the numbers.
+    ``e`` is ``(N, T, J, P)``, ``total`` ``(N, 1, J, 1)`` or ``(1,)``. Dividing sums over P instead
+    of ``e`` takes a sixth of the divisions.
     """
     n, types, places, size = u.shape
     outputs, _, _, depth = W.shape
@@ -89,14 +89,14 @@ def _route_undivided(
     def couplings(b: Tensor) -> tuple[Tensor, Tensor]:
         """Eq. 6 for logits ``(N, T, J, P)``.
 
-        In place: they lose a constant for each output, which changes no softmax, now or later.
+        Works in place and subtracts a constant from each output, which does not change a softmax.
         """
         if over == "output":
             c = torch.softmax(b, dim=2)
             return c if present is None else c * present, b.new_ones(1)
         if present is not None:
             b.masked_fill_(~present, -torch.inf)
-        # One axis at a time: along the last one is several times faster than along two apart.
+        # Reducing one axis at a time is several times faster than two that are not adjacent.
         b -= b.amax(3, keepdim=True).amax(1, keepdim=True)
         e = torch.exp(b)
         return e, e.sum(3, keepdim=True).sum(1, keepdim=True)
@@ -105,8 +105,8 @@ def _route_undivided(
         if iterations == 1:
             e, total = couplings(u.new_zeros((n, types, outputs, places)))
         else:
-            # With b = 0 all capsules count alike: the first sums are means, the same for all
-            # outputs, without a softmax.
+            # With b = 0, all couplings are equal: the first sums are means, the same for all
+            # outputs, and need no softmax.
             here = rows
             if present is not None:
                 here = rows * present.view(types, places, 1).repeat(n, 1, 1)
@@ -124,17 +124,17 @@ def _route_undivided(
 class CapsuleLayer(nn.Module):
     """From primary to output capsules.
 
-    ``W_ij = W_t(i)j diag(g_i)``: a matrix for each type and output, and a gain of A numbers for
-    each primary capsule, which tells its place apart. (A matrix for each i and j would be tens of
-    millions of parameters.) A pruned capsule has no row in ``gains`` and ``place``: it takes part
-    in no product and no softmax.
+    ``W_ij = W_t(i)j diag(g_i)``: a matrix for each type and output, and a gain vector of size A for
+    each primary capsule, which distinguishes its place. (A matrix for each i and j would need tens
+    of millions of parameters.) A pruned capsule has no row in ``gains`` and ``place`` and takes no
+    part in any product or softmax.
 
     Attributes:
         W: ``(J, T, A, D)``.
-        gains: ``(T, K, A)``, K places kept of each type, all of them before pruning.
-        place: ``(T, K)`` int64 buffer, the places that are kept.
-        alive: ``(T K,)`` bool buffer, capsules that are not masked: the reference that physical
-            removal is tested against.
+        gains: ``(T, K, A)`` for the K kept places of each type (all places before pruning).
+        place: ``(T, K)`` int64 buffer, the kept places.
+        alive: ``(T K,)`` bool buffer, capsules that are not masked. Masking is the reference by
+            which physical removal is tested.
     """
 
     place: Tensor
@@ -154,8 +154,8 @@ class CapsuleLayer(nn.Module):
         super().__init__()
         kept = places if kept is None else kept
         self.iterations, self.over, self.places = iterations, over, places
-        # A mean over thousands of capsules is short, and short outputs agree with nobody: with
-        # half of this the couplings stay equal, with twice as much a few capsules take all.
+        # A mean over thousands of capsules is a short vector, and short outputs have no agreement:
+        # with half this deviation, couplings stay equal; with twice, a few capsules take all.
         deviation = _DEVIATION * (types * places / size) ** 0.5 if over == "primary" else 1.0
         self.W = nn.Parameter(torch.randn(outputs, types, size, depth) * deviation)
         self.gains = nn.Parameter(torch.ones(types, kept, size))
@@ -179,7 +179,7 @@ class CapsuleLayer(nn.Module):
             rows = u.flatten(1, 2).index_select(1, (first + self.place).flatten())
             u = rows.unflatten(1, (types, kept))  # torch.gather takes five times as long
         alive = self.alive if self.masked else None
-        # It sums thousands of products: never in half precision.
+        # Never in half precision, because it sums thousands of products.
         with torch.autocast(u.device.type, enabled=False):
             u = u.float() * self.gains
             return _route_undivided(u, self.W, self.iterations, self.over, alive)

@@ -18,7 +18,7 @@ CHECKPOINT = "checkpoint.pt"
 
 @dataclass
 class TrainingProgress:
-    """Where a training stands: what a checkpoint holds beside weights and moments."""
+    """The progress of a training: the content of a checkpoint besides weights and moments."""
 
     epoch: int = 0
     step: int = 0
@@ -38,13 +38,13 @@ def save_checkpoint(
     progress: TrainingProgress,
     pairs: Pairs | None,
 ) -> None:
-    """Write everything that a killed training goes on from.
+    """Write everything needed to resume a killed training.
 
     Args:
-        pairs: of the epoch that is under way; None between two.
+        pairs: pairs of the current epoch; None between epochs.
 
     Raises:
-        ResultsError: the file cannot be written; the one before it stays.
+        ResultsError: the file cannot be written; the previous one is kept.
     """
     content = {
         "settings": settings.model_dump_json(),
@@ -68,32 +68,32 @@ def load_checkpoint(
     network: SiameseNetwork,
     optimiser: torch.optim.Optimizer,
 ) -> tuple[TrainingProgress, Pairs | None]:
-    """Read one into the network and the optimiser; the pairs are those of the epoch under way.
+    """Load a checkpoint into the network and the optimiser; returns the pairs of its epoch.
 
     Raises:
-        InputError: damaged, or written by another version or with other settings.
+        InputError: the file is damaged, or from another version or other settings.
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         written = TrainSettings.model_validate_json(content["settings"])
     except ValidationError as error:
-        raise InputError(f"{path}: of another version of vslam; use another --out.") from error
-    except Exception as error:  # torch raises half a dozen kinds
+        raise InputError(f"{path}: from another version of vslam; use another --out.") from error
+    except Exception as error:  # torch raises many kinds of errors
         raise InputError(f"{path}: not a readable checkpoint; remove it to start anew.") from error
-    # A lower learning rate is what a diverged training is resumed with; what is done at its end may
-    # be decided there.
+    # The learning rate may change, to resume a diverged training, and so may settings that apply
+    # only at the end.
     free = {key: getattr(settings, key) for key in ("learning_rate", "patience", "learned_share")}
     if written.model_copy(update=free) != settings:
         raise InputError(
-            f"{path}: written with other settings; use those of settings.json beside it, or "
-            "another --out."
+            f"{path}: written with other settings; use the settings.json beside it, or another "
+            "--out."
         )
     try:
         network.load_state_dict(content["network"])
         optimiser.load_state_dict(content["optimiser"])
     except (RuntimeError, ValueError) as error:
         raise InputError(
-            f"{path}: of another network, or of another version of vslam; use another --out."
+            f"{path}: from another network or another version of vslam; use another --out."
         ) from error
     stored = content["pairs"]
     pairs = None if stored is None else Pairs(*(x.numpy() for x in stored))

@@ -1,4 +1,4 @@
-"""Training of PCANet: principal components in place of gradients."""
+"""Training of PCANet by principal components instead of gradients."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from vslam.loopclosure.training.training import (
     write_log,
 )
 
-_LEARNED_IMAGES = 1500  # that components are learned from, at most: 200 MB
+_LEARNED_IMAGES = 1500  # most images from which components are learned: 200 MB
 
 
 def learn_components(
     collection: Collection, settings: TrainSettings, folder: Path, *, device: str = "cpu"
 ) -> TrainingOutcome:
-    """Learn PCANet from the training images, as :func:`training.train` without
-    gradients and epochs.
+    """Learn PCANet from the training images, like :func:`training.train` but without gradients and
+    epochs.
 
     Raises:
         InputError: too little data, or an unknown device.
-        ResultsError: a full disk.
+        ResultsError: the results cannot be written.
     """
     where = open_device(device)
     train_images, validation = divide(collection, settings.seed, settings.validation_share)

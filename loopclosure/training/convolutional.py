@@ -1,7 +1,7 @@
-"""Convolutional branches: networks made for classification, as descriptors of images.
+"""Convolutional branches: classification networks that compute descriptors of images.
 
-All take grey images as the capsule network does, standardised, and end in one linear layer to the
-descriptor in place of the one that names classes. So what differs is the architecture.
+Like the capsule network, all take standardised grey images. A linear layer to the descriptor
+replaces the classification layer, so that only the architectures differ.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from vslam.loopclosure.training.branches import Layout
 from vslam.loopclosure.training.preprocessing import standardised
 from vslam.loopclosure.training.torch_files import read_pth
 
-DIMENSIONS = 1024  # of the descriptor, as many as the capsule network's
+DIMENSIONS = 1024  # of the descriptor, as in the capsule network
 _LEAST_SIDE = 64  # of an image: AlexNet's last pooling needs 63
 
 
 class ConvolutionalBranch(nn.Module):
     """Features, pooling, fully connected layers (none after a global average), a linear layer.
 
-    There is no dropout: before training it moves a descriptor farther (cosine 0.5) than another
-    image does (0.97), and nothing is learned. Random weights are drawn as in He et al., ICCV 2015;
-    with torch's own, images differ by 0.003.
+    There is no dropout, because the network would not learn: at the start, dropout changes a
+    descriptor more (to a cosine of 0.5) than another image does (0.97). Weights are initialised as
+    in He et al., ICCV 2015; with torch's default, descriptors of images differ by only 0.003.
 
     Attributes:
-        width: numbers that the last layer reads, in classification and here.
+        width: input dimension of the last layer, as in the original classifier.
     """
 
     def __init__(
@@ -47,16 +47,16 @@ class ConvolutionalBranch(nn.Module):
         """Draw random weights.
 
         Args:
-            pooled: side of the grid that pooling leaves.
+            pooled: side of the grid after pooling.
             classifier: fully connected layers before the last one.
 
         Raises:
-            InputError: images that are too small.
+            InputError: the images are too small.
         """
         super().__init__()
         if min(size) < _LEAST_SIDE:
             raise InputError(
-                f"{name}: takes images of at least {_LEAST_SIDE} pixels a side, not "
+                f"{name}: needs images of at least {_LEAST_SIDE} pixels per side, not "
                 f"{size[0]}x{size[1]}."
             )
         self.name, self.width = name, width
@@ -82,13 +82,13 @@ class ConvolutionalBranch(nn.Module):
         return cast(Tensor, self.descriptor(x))
 
     def load_torchvision(self, path: Path) -> None:
-        """Take over the weights of a torchvision file (``alexnet-*.pth``, ``vgg16-*.pth``).
+        """Load the weights of a torchvision file (``alexnet-*.pth``, ``vgg16-*.pth``).
 
-        The last layer, which names ImageNet's classes, is left out. The branch standardises each
-        image instead of normalising it as for ImageNet: they only serve as a start for training.
+        The classification layer is left out. The weights only initialise training, because the
+        branch standardises each image instead of normalising it as for ImageNet.
 
         Raises:
-            InputError: no such file, not a weight file, or one of another network.
+            InputError: the file is missing, not a weight file, or of another network.
         """
         fix = f"name torchvision's weight file of {self.name}"
         state = read_pth(path, fix)
@@ -96,12 +96,12 @@ class ConvolutionalBranch(nn.Module):
         if not isinstance(state, dict) or any(
             key not in state or state[key].shape != value.shape for key, value in own.items()
         ):
-            raise InputError(f"{path}: layers of another network; {fix}.")
+            raise InputError(f"{path}: has the layers of another network; {fix}.")
         self.load_state_dict({key: state[key] for key in own}, strict=False)
 
 
 def alexnet(size: Size) -> ConvolutionalBranch:
-    """Krizhevsky et al., NIPS 2012, in one tower (Krizhevsky 2014), laid out as in torchvision."""
+    """Krizhevsky et al., NIPS 2012, in one tower (Krizhevsky 2014), with torchvision's layout."""
     features = nn.Sequential(
         nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2),
         nn.Conv2d(64, 192, 5, 1, 2), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2),
@@ -109,7 +109,7 @@ def alexnet(size: Size) -> ConvolutionalBranch:
         nn.Conv2d(384, 256, 3, 1, 1), nn.ReLU(inplace=True),
         nn.Conv2d(256, 256, 3, 1, 1), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2),
     )  # fmt: skip
-    classifier = nn.Sequential(  # nothing in place of its dropout
+    classifier = nn.Sequential(  # without dropout
         nn.Identity(), nn.Linear(256 * 36, 4096), nn.ReLU(inplace=True),
         nn.Identity(), nn.Linear(4096, 4096), nn.ReLU(inplace=True),
     )  # fmt: skip
@@ -117,7 +117,7 @@ def alexnet(size: Size) -> ConvolutionalBranch:
 
 
 def vgg16(size: Size) -> ConvolutionalBranch:
-    """Simonyan and Zisserman, ICLR 2015, configuration D, laid out as in torchvision."""
+    """Simonyan and Zisserman, ICLR 2015, configuration D, with torchvision's layout."""
     layers: list[nn.Module] = []
     inputs = 3
     for outputs, repeats in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
@@ -136,8 +136,8 @@ def vgg16(size: Size) -> ConvolutionalBranch:
 def darknet19(size: Size) -> ConvolutionalBranch:
     """Redmon and Farhadi, YOLO9000, CVPR 2017, Table 6, up to its last convolution.
 
-    Each 3x3 convolution widens, each 1x1 between two of them compresses; batch normalisation and
-    leaky ReLU follow all of them.
+    The 3x3 convolutions increase the number of channels, the 1x1 convolutions between them reduce
+    it; batch normalisation and leaky ReLU follow each convolution.
     """
     layers: list[nn.Module] = []
     inputs = 3
@@ -197,7 +197,7 @@ INCEPTIONS: tuple[tuple[int, int, int, int, int, int] | None, ...] = (
 def googlenet(size: Size) -> ConvolutionalBranch:
     """Szegedy et al., CVPR 2015, Table 1 and Figure 3, without the auxiliary classifiers.
 
-    As there: local response normalisation, no batch normalisation.
+    As in the paper, it has local response normalisation and no batch normalisation.
     """
     layers: list[nn.Module] = [
         _convolution(3, 64, 7, 2), _halving(), nn.LocalResponseNorm(5),
@@ -216,7 +216,7 @@ def googlenet(size: Size) -> ConvolutionalBranch:
 def mobilenet(size: Size) -> ConvolutionalBranch:
     """Howard et al., MobileNets, arXiv:1704.04861, Table 1: width and resolution multiplier 1.
 
-    The last depthwise convolution has stride 1: the table says 2, but not its sizes.
+    The last depthwise convolution has stride 1: the table says 2, but its sizes imply 1.
     """
     layers: list[nn.Module] = _normalised(3, 32, 3, stride=2)
     inputs = 32
@@ -229,7 +229,7 @@ def mobilenet(size: Size) -> ConvolutionalBranch:
 
 
 class Fire(nn.Module):
-    """Squeeze by 1x1, expand by as many 1x1 as 3x3 (Iandola et al. 2016, section 3.2)."""
+    """Squeeze by 1x1, expand by equally many 1x1 and 3x3 filters (Iandola et al. 2016, 3.2)."""
 
     def __init__(self, inputs: int, squeezed: int, expanded: int) -> None:
         super().__init__()
@@ -245,7 +245,7 @@ class Fire(nn.Module):
 def squeezenet(size: Size) -> ConvolutionalBranch:
     """Iandola et al., arXiv:1602.07360, in the authors' version 1.1, up to fire9.
 
-    Version 1.1 of their release begins with 64 filters of 3x3 and pools after 1, 3, 5.
+    Version 1.1 begins with 64 filters of 3x3 and has pooling after layers 1, 3 and 5.
     """
     layers: list[nn.Module] = [nn.Conv2d(3, 64, 3, 2), nn.ReLU(inplace=True)]
     inputs = 64

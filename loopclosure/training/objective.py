@@ -1,4 +1,4 @@
-"""What training minimises, and how a network is judged and calibrated."""
+"""The losses of training, and the validation and calibration of a network."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vslam.loopclosure.training.data import Collection
 from vslam.loopclosure.training.preprocessing import to_tensor
 from vslam.loopclosure.training.siamese import DistanceHead, SiameseNetwork
 
-_MOST_SAME = 5  # images of its place that a validation image is to find
+_MOST_SAME = 5  # most images of its place that count for a validation image
 
 
 def cross_entropy(logits: Tensor, same: Tensor) -> Tensor:
@@ -25,12 +25,12 @@ def cross_entropy(logits: Tensor, same: Tensor) -> Tensor:
 
 
 def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) -> Tensor:
-    """Each pair of one place against all images of other places in the batch (InfoNCE).
+    """InfoNCE: contrasts each pair of one place with all images of other places in the batch.
 
     Van den Oord et al. 2018, symmetric as in CLIP. Not in the paper.
 
     Args:
-        alike: ``(2 N, 2 N)`` cosines of the images of N pairs: the first of each, then the second.
+        alike: ``(2 N, 2 N)`` cosines of the images of N pairs: all first ones, then all second.
         same: ``(N,)`` bool.
         relation: ``(2 N, 2 N)`` int8 of the same images.
     """
@@ -79,11 +79,11 @@ def validate(
     strength: Augmentation,
     device: torch.device,
 ) -> tuple[dict[str, float], NDArray[np.float32], NDArray[np.bool_]]:
-    """Retrieval among the validation images: each, augmented, is a query.
+    """Measure retrieval among the validation images; the augmented images are the queries.
 
-    All pairs whose relation is known count, not a balanced choice: many more of two places than
-    of one, as in a SLAM run; of its own place at most five. The augmentations and this choice are
-    the same at every call.
+    All pairs with a known relation count, but for each query at most five of its own place. Most
+    pairs thus show two places, as in a SLAM run. Augmentations and choice are the same at every
+    call.
 
     Returns:
         Figures of :func:`vslam.loopclosure.precision_recall.summary`, and the scores and labels
@@ -97,7 +97,7 @@ def validate(
     scores = score_matrix(network, embed_all(network, changed, device), gallery, device)
     relation = collection.relation[np.ix_(chosen, chosen)].copy()
     for k, row in enumerate(relation):
-        # Fifty pictures of one webcam would outweigh all streets.
+        # Otherwise, fifty pictures of one webcam would outweigh all streets.
         others = np.flatnonzero(row == SAME)
         dropped = np.random.default_rng([8, k]).permutation(others)[_MOST_SAME:]
         row[dropped] = UNKNOWN
@@ -112,10 +112,10 @@ def validate(
 
 @torch.no_grad()
 def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> None:
-    """Go back towards the weights ``before``, to ``share`` of the way from them; in place.
+    """Interpolate in place between the weights ``before`` (share 0) and the current ones (1).
 
-    Between a network and what fine-tuning made of it lie some that lose less on what the one knew
-    and keep most of what the other learned (WiSE-FT, Wortsman et al., CVPR 2022).
+    Between a network and its fine-tuned version, there are weights that forget less and keep most
+    of what was learned (WiSE-FT, Wortsman et al., CVPR 2022).
     """
     after = network.state_dict()
     mixed = {
@@ -127,10 +127,10 @@ def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> N
 
 
 def calibrate(network: SiameseNetwork, score: NDArray, same: NDArray) -> None:
-    """Fit a and b of ``p = sigmoid(a - b d)`` to scores, true and false pairs weighing the same.
+    """Fit a and b of ``p = sigmoid(a - b d)`` in place, with equal weight for true and false pairs.
 
-    In place. The order of scores and so AP stay; what 0.9 means is set. Heads without a and b are
-    left as they are.
+    The order of the scores, and so AP, does not change; p becomes a calibrated probability. Heads
+    without a and b are left unchanged.
     """
     head = network.head
     if not isinstance(head, DistanceHead):

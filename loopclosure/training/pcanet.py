@@ -1,9 +1,9 @@
 """PCANet: filters by principal components of patches, binary hashing, histograms of blocks.
 
-Chan et al., PCANet, IEEE Transactions on Image Processing 24(12), 2015. Nothing is learned by
-gradient. Its features were used to detect loops by Xia et al., IJCNN 2016. Two stages of 8 filters
-of 7x7 and the whitened components that reduce the histograms are as in the paper's experiments on
-faces (section III); 4x4 blocks and 512 components are ours.
+Chan et al., PCANet, IEEE Transactions on Image Processing 24(12), 2015. It learns without
+gradients. Xia et al. (IJCNN 2016) used its features to detect loops. The two stages of 8 filters of
+7x7 and the whitened components that reduce the histograms are those of the paper's experiments on
+faces (section III); the 4x4 blocks and 512 components are our choice.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _BATCH = 16
 
 
 class PcaNetBranch(nn.Module):
-    """Two stages of filters, hashing, histograms, whitened components.
+    """Two stages of filters, hashing, histograms and whitened components.
 
-    Filters and components are zero until :meth:`learn` was called. They count as parameters, but
-    have no gradient.
+    Filters and components are zero until :meth:`learn` is called. They are parameters without
+    gradients.
     """
 
     block: Tensor
@@ -55,7 +55,7 @@ class PcaNetBranch(nn.Module):
         return (self.histograms(images) - self.mean) @ self.components.T
 
     def histograms(self, images: Tensor) -> Tensor:
-        """How often each code is in each block: ``(N, 3, H, W)`` to ``(N, F)`` float32."""
+        """Histograms ``(N, F)`` float32 of the codes in each block, from ``(N, 3, H, W)``."""
         n = len(images)
         maps = _filtered(standardised(images.mean(1, keepdim=True)), self.first)
         hashed = _filtered(maps.flatten(0, 1)[:, None], self.second) > 0
@@ -78,7 +78,7 @@ class PcaNetBranch(nn.Module):
         histograms = torch.cat([self.histograms(to_tensor(batch)) for batch in batches])
         mean = histograms.mean(0)
         centred = histograms - mean
-        # Of the (N, N) products, since there are fewer images than numbers.
+        # Eigenvectors of the (N, N) Gram matrix, since there are fewer images than dimensions.
         variance, vectors = torch.linalg.eigh((centred @ centred.T).double())
         kept = min(COMPONENTS, len(images) - 1)
         variance, vectors = variance[-kept:].flip(0), vectors[:, -kept:].flip(1)
@@ -89,12 +89,12 @@ class PcaNetBranch(nn.Module):
 
 
 def principal_filters(batches: Iterator[Tensor]) -> Tensor:
-    """The leading eigenvectors of all patches, each without its mean: ``(8, 1, 7, 7)``.
+    """The leading eigenvectors ``(8, 1, 7, 7)`` of all patches, each minus its mean.
 
-    Signs are such that the largest number of a filter is positive.
+    Signs are chosen so that the largest element of a filter is positive.
 
     Args:
-        batches: of images, ``(N, 1, H, W)`` each.
+        batches: batches of images, ``(N, 1, H, W)`` each.
     """
     moments = torch.zeros(KERNEL**2, KERNEL**2, dtype=torch.float64)
     for images in batches:

@@ -1,4 +1,4 @@
-"""What is done to grey images before a network looks for features in them."""
+"""Preprocessing of grey images before the extraction of features."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from vslam.loopclosure.siamese.images import Size
 
-_TEXTURE = 1.5 / 255.0  # between one grey level, which is noise, and two
+_TEXTURE = 1.5 / 255.0  # a difference of one grey level is noise, of two is texture
 
 
 def to_tensor(images: NDArray[np.uint8]) -> Tensor:
@@ -22,23 +22,23 @@ def to_tensor(images: NDArray[np.uint8]) -> Tensor:
 
 
 class Unrolling(nn.Module):
-    """Cylindrical projection, where a camera that turns moves everything alike.
+    """Cylindrical projection, in which turning the camera shifts the image.
 
-    Szeliski, Image Alignment and Stitching: A Tutorial, 2006, section 2.3. On a flat image what
-    moves to the side becomes wider and taller, so that an image turned by 30 degrees is no moved
-    copy of what it was, and no alignment of views fits all of it. (Not in the paper.)
+    Szeliski, Image Alignment and Stitching: A Tutorial, 2006, section 2.3. In a flat image, objects
+    become wider and taller towards the sides, so that turning by 30 degrees does not merely shift
+    the image, and no alignment of views fits all of it. (Not in the paper.)
 
-    Column ``x`` in [-1, 1] is the direction ``x half_angle``; there, with the sides of the flat
-    image at ``tan(half_angle)``, row ``y`` shows the flat row ``middle y / cos(x half_angle)``.
-    What lies beyond the image is black.
+    Column ``x`` in [-1, 1] shows the direction ``x half_angle``. There, row ``y`` shows the flat
+    row ``middle y / cos(x half_angle)``; the sides of the flat image are at ``tan(half_angle)``.
+    Pixels outside the flat image are black.
 
     Args:
         size: height and width of the images.
-        half_angle: degrees from the middle to either side; 0 leaves images flat. One for all
-            cameras, since one that is not calibrated may ask, too: turning is a shift exactly
-            where it is the camera's own, and nearly so elsewhere.
-        middle: share of the height that the column in the middle keeps. With the cosine of
-            ``half_angle`` the sides keep all of it and nothing is black; with 1 the middle does.
+        half_angle: degrees from the middle to either side; 0 leaves images flat. The same value is
+            used for all cameras, because some are not calibrated. Turning is exactly a shift if it
+            is the camera's own half angle, and nearly so otherwise.
+        middle: share of the height that the middle column keeps. With the cosine of ``half_angle``,
+            the sides keep their whole height and nothing is black; with 1, the middle keeps it.
     """
 
     grid: Tensor | None
@@ -64,27 +64,25 @@ class Unrolling(nn.Module):
 
 
 def textured(images: Tensor) -> Tensor:
-    """``(N, 1, H, W)`` in [0, 1] to 1.0 where a pixel differs from one beside or below it, else 0.
-
-    By more than a grey level: what is black, white or covered does not.
-    """
+    """Mask of ``(N, 1, H, W)`` images in [0, 1]: 1.0 where a pixel differs by more than one grey
+    level from its right or lower neighbour, else 0, as in black, white or covered areas."""
     beside = functional.pad((images[..., 1:] - images[..., :-1]).abs(), (0, 1))
     below = functional.pad((images[..., 1:, :] - images[..., :-1, :]).abs(), (0, 0, 0, 1))
     return (torch.maximum(beside, below) > _TEXTURE).to(images.dtype)
 
 
 def standardised(images: Tensor, shown: Tensor | None = None) -> Tensor:
-    """Each image with mean 0 and deviation 1 where it shows texture.
+    """Scale each image to mean 0 and standard deviation 1 over its textured pixels.
 
-    Gain and bias of the camera drop out, and what is overexposed or covered does not change the
+    This removes the camera's gain and bias, and overexposed or covered areas do not change the
     rest.
 
     Args:
         images: ``(N, 1, H, W)``.
-        shown: what :func:`textured` says of them, where that is known.
+        shown: result of :func:`textured`, if already computed.
     """
     shown = textured(images) if shown is None else shown
-    weight = shown + 1e-3  # of an image without any all pixels count
+    weight = shown + 1e-3  # in an image without texture, all pixels count
     weight = weight / weight.sum((1, 2, 3), keepdim=True)
     centred = images - (images * weight).sum((1, 2, 3), keepdim=True)
     deviation = torch.sqrt((centred * centred * weight).sum((1, 2, 3), keepdim=True))

@@ -1,7 +1,7 @@
-"""Pruning: primary capsules that no output listens to are taken out of the network.
+"""Pruning: removal of the primary capsules with the lowest coupling coefficients.
 
-The paper ranks primary capsules by their coupling coefficients, drops the lowest 20 % and sets
-their W_ij to 0. A zero costs as much time as any number: here they are removed.
+The paper ranks primary capsules by their coupling coefficients and sets the W_ij of the lowest 20 %
+to 0. Since a zero costs as much time as any number, they are removed here.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor
     """Activity of each primary capsule, ``(T, K)``: mean of c_ij over images and outputs j.
 
     Args:
-        network: of a capsule branch, in eval mode.
+        network: network with a capsule branch, in eval mode.
         batches: images of the training set, ``(N, 3, H, W)`` each.
 
     Raises:
-        InputError: no images, or a network without capsules.
+        InputError: there are no images, or the network has no capsules.
     """
     branch = _capsules_of(network)
     total, count = None, 0
@@ -43,8 +43,8 @@ def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor
 def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
     """``(T, K)`` bool, the least active ``fraction`` of the capsules of each type.
 
-    The same number of each type (the paper does not say): what is left is still one dense product
-    for all types. Ties go to the lower index.
+    The number is the same for each type (the paper leaves this open), so that the rest is still one
+    dense product for all types. Of equal capsules, those with lower indices are chosen.
     """
     dropped = round(fraction * activity.shape[1])
     order = torch.argsort(activity, dim=1, stable=True)
@@ -53,7 +53,7 @@ def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
 
 
 def masked(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
-    """A copy in which the capsules of ``drop`` ``(T, K)`` are silenced but still computed."""
+    """A copy in which the capsules of ``drop`` ``(T, K)`` are masked but still computed."""
     copied = copy.deepcopy(network)
     layer = _capsules_of(copied).capsules
     layer.alive.copy_(~drop.flatten())
@@ -62,13 +62,13 @@ def masked(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
 
 
 def pruned(network: SiameseNetwork, drop: Tensor, name: str = "capsule-pruned") -> SiameseNetwork:
-    """A copy without the capsules of ``drop`` ``(T, K)``, as many of each type.
+    """A copy without the capsules of ``drop`` ``(T, K)``, which has the same number in each type.
 
     Args:
-        name: of the copy, one of ``PRUNED``.
+        name: name of the copy, one of ``PRUNED``.
 
     Raises:
-        InputError: a network without capsules.
+        InputError: the network has no capsules.
     """
     branch = _capsules_of(network)
     layer = branch.capsules
@@ -86,13 +86,10 @@ def pruned(network: SiameseNetwork, drop: Tensor, name: str = "capsule-pruned") 
 
 
 def with_iterations(network: SiameseNetwork, iterations: int) -> SiameseNetwork:
-    """A copy that routes with so many iterations.
-
-    Not in the paper: removing capsules makes an iteration cheaper, each one left out saves it
-    whole.
+    """A copy with another number of routing iterations. (Not in the paper.)
 
     Raises:
-        InputError: a network without capsules.
+        InputError: the network has no capsules.
     """
     copied = copy.deepcopy(network)
     branch = _capsules_of(copied)

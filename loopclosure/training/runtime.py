@@ -1,4 +1,4 @@
-"""Threads of torch, and how long an image takes."""
+"""Threads of torch, and the time that an image takes."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from vslam.loopclosure.training.siamese import SiameseNetwork
 
 
 def set_threads(threads: int) -> None:
-    """Threads that torch computes with from now on."""
+    """Set the number of threads with which torch computes."""
     torch.set_num_threads(threads)
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Compute on one thread within: the sums, and so the bits, do not depend on the machine's."""
+    """Compute with one thread, so that sums do not depend on the machine's number of threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -29,10 +29,10 @@ def one_thread() -> Iterator[None]:
 
 @torch.no_grad()
 def milliseconds_per_image(*networks: SiameseNetwork, repeats: int = 50) -> list[float]:
-    """Least time to embed one image on one core for each network.
+    """Shortest time to embed one image on one core for each network.
 
-    In turn, so that all of them meet the same load of the machine; the least of the repeats,
-    because other processes can only add to it.
+    Networks take turns, so that the load of the machine affects all of them equally. The shortest
+    time counts, because other processes can only add to it.
     """
     best = [float("inf")] * len(networks)
     with one_thread():

@@ -1,4 +1,4 @@
-"""What a training depends on beside its data."""
+"""The settings of a training."""
 
 from __future__ import annotations
 
@@ -20,48 +20,48 @@ class TrainSettings(BaseModel):
 
     network: str = Field("capsule", description="Network to train.")
     shape: CapsuleShape = Field(
-        CapsuleShape(), description="Of a capsule branch; others take its size of images only."
+        CapsuleShape(), description="Shape of a capsule branch; others only use its image size."
     )
-    head: Head | None = Field(None, description="Compares descriptors; null: the network's own.")
+    head: Head | None = Field(None, description="How descriptors are compared; null: default.")
     fit: Literal["squash", "crop"] = Field(
-        "squash", description="Whole view, or its middle in the aspect of the input."
+        "squash", description="Whole view, or its middle with the input's aspect ratio."
     )
-    seed: int = Field(0, ge=0, description="Of weights, division, pairs and augmentation.")
-    loss: Literal["bce", "bce+contrast"] = Field("bce", description="Eq. 3, or with contrast.")
-    temperature: float = Field(0.07, gt=0, description="Of the contrast.")
-    learning_rate: float = Field(3e-4, gt=0, description="Of Adam. [paper]")
-    extractor_rate: float = Field(1.0, ge=0, description="Of the extractor, times that rate.")
+    seed: int = Field(0, ge=0, description="Seed of weights, division, pairs, augmentation.")
+    loss: Literal["bce", "bce+contrast"] = Field("bce", description="Eq. 3, or plus contrast.")
+    temperature: float = Field(0.07, gt=0, description="Temperature of the contrast.")
+    learning_rate: float = Field(3e-4, gt=0, description="Learning rate of Adam. [paper]")
+    extractor_rate: float = Field(1.0, ge=0, description="Factor for the extractor's rate.")
     learned_share: float = Field(
-        1.0, gt=0, le=1, description="Of what training changed; 1 keeps nothing of the start."
+        1.0, gt=0, le=1, description="Share of the change by training; 1 keeps all of it."
     )
-    frozen: int = Field(0, ge=0, description="Blocks of a lite0 extractor that stay, and its stem.")
+    frozen: int = Field(0, ge=0, description="First blocks of lite0 that stay fixed.")
     schedule: Literal["constant", "cosine"] = "constant"
     mixed_precision: bool | None = Field(
-        None, description="bfloat16, but for the routing; null: on a GPU that can."
+        None, description="bfloat16 except for routing; null: if the GPU supports it."
     )
     batch: int = Field(64, ge=2, description="Pairs. [paper]")
     epochs: int = Field(40, ge=1, description="At most.")
-    pairs: int = Field(4096, ge=2, description="Pairs of an epoch.")
-    same_share: float = Field(0.5, gt=0, le=1, description="Of the pairs: of one place. [paper]")
-    together: int = Field(1, ge=1, description="Pairs in a row that are of one source.")
+    pairs: int = Field(4096, ge=2, description="Pairs per epoch.")
+    same_share: float = Field(0.5, gt=0, le=1, description="Share of pairs of one place. [paper]")
+    together: int = Field(1, ge=1, description="Consecutive pairs from one source.")
     emphasis: dict[str, Annotated[float, Field(gt=0)]] = Field(
-        {}, description="Of sources by name: how often their images are drawn; 1 for others."
+        {}, description="By source: relative frequency of its images; default 1."
     )
     patience: int = Field(6, ge=1, description="Epochs without a better validation AP.")
-    hard_share: float = Field(0.5, ge=0, le=1, description="Of the pairs of two places: mined.")
+    hard_share: float = Field(0.5, ge=0, le=1, description="Share of mined pairs of two places.")
     mined_images: int = Field(4000, ge=2, description="Images embedded for mining, at most.")
-    validation_share: float = Field(0.15, gt=0, lt=1, description="Of the units of each source.")
+    validation_share: float = Field(0.15, gt=0, lt=1, description="Share of each source's units.")
     validation_images: int = Field(800, ge=2, description="At most.")
     augmentation: Augmentation = Augmentation()
     prune_share: float = Field(
-        0.2, gt=0, lt=1, description="Of the capsules, removed when pruning. [paper]"
+        0.2, gt=0, lt=1, description="Share of the capsules that pruning removes. [paper]"
     )
     prune_iterations: int | None = Field(
-        None, ge=1, description="Of the routing after pruning; null: as many as before."
+        None, ge=1, description="Routing iterations after pruning; null: unchanged."
     )
 
 
-# Small networks need mild changes to learn anything in so short a time (docs/research/training.md).
+# Small networks learn in such a short time only from mild changes (docs/research/training.md).
 _MILD = Augmentation(
     homography=0.05, shift=0.05, log_gain=0.2, bias=10.0, log_gamma=0.2, masks=1, noise=3.0,
     blur=0.5,
@@ -80,15 +80,15 @@ _BEST = TrainSettings(
     validation_images=400,
 )
 PRESETS = {
-    # What the paper writes; augmentation strengths and mining are ours, it gives none.
+    # As in the paper, except for augmentation strengths and mining, which it does not give.
     "paper": TrainSettings(),
-    # Every image of a batch is compared with every other, under stronger changes. Most pairs are
-    # of one place, since the contrast finds the other places in the batch; half of a batch is
-    # of one source, where other places look most alike. Smaller batches and shorter epochs, with
-    # less mining and validation, suit the two cores that it was trained on.
+    # Every image of a batch is compared with every other, under stronger changes. Most pairs show
+    # one place, since the contrast uses the other places in the batch. Half of a batch is from one
+    # source, because other places look most similar there. Small batches, short epochs and little
+    # mining and validation suit the two cores on which it was trained.
     "best": _BEST,
-    # The same from ImageNet weights (--weights). Filters for edges and corners stay as they are,
-    # the rest of the extractor learns slowly. 129 pixels: see docs/research/training.md.
+    # The same from ImageNet weights (--weights). Filters for edges and corners stay fixed, and the
+    # rest of the extractor learns slowly. For the 129 pixels see docs/research/training.md.
     "pretrained": _BEST.model_copy(
         update={
             "shape": CapsuleShape(extractor="lite0", pixels=129),
@@ -99,9 +99,9 @@ PRESETS = {
             "augmentation": STRONG.model_copy(update={"turn": 30.0}),
         }
     ),
-    # One recipe for all architectures, from random weights and with one head
-    # (docs/research/rivals.md). No pairs are mined and few images validate, since that would cost
-    # slow networks the most.
+    # The same settings for all architectures, with random weights and one head
+    # (docs/research/rivals.md). There is no mining and little validation, since these would take
+    # most time with slow networks.
     "rivals": _BEST.model_copy(
         update={
             "shape": CapsuleShape(pixels=129),
@@ -123,6 +123,6 @@ def load_settings(path: Path) -> TrainSettings:
     """Read settings in JSON; keys left out keep their defaults.
 
     Raises:
-        InputError: missing file, no JSON, unknown key or value out of range.
+        InputError: the file is missing or not JSON, a key is unknown, or a value is out of range.
     """
     return read_json(TrainSettings, path, "settings")

@@ -1,4 +1,4 @@
-"""A Siamese network: one branch for both images, and what compares their descriptors."""
+"""A Siamese network: one branch for both images, and a head that compares their descriptors."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from vslam.loopclosure.training.extractors import fold_batch_norms
 from vslam.loopclosure.training.pcanet import PcaNetBranch
 
 Head = Literal["distance", "concatenation"]
-"""What compares two descriptors: :class:`DistanceHead` or :class:`ConcatenationHead`."""
+"""How two descriptors are compared: :class:`DistanceHead` or :class:`ConcatenationHead`."""
 
 _OWN_HEAD: dict[str, Head] = {"alexnet": "concatenation", "vgg16": "concatenation"}  # Eq. 1
-_SOFTNESS = 0.04  # of the maximum over alignments, in cosines
+_SOFTNESS = 0.04  # temperature of the soft maximum over alignments, in cosines
 
 
 def aligned(alike: Tensor, most: Tensor) -> Tensor:
-    """Cosine of two images whose views have the products ``alike`` ``(..., V, V)``.
+    """Cosine of two images under the best alignment of their views.
 
-    The views of one lie on those of the other, or moved by some to the left or right: a camera
-    that has turned sees elsewhere what was in its middle. Of each such alignment the products of
-    the views that meet, at least half of them, count together. The soft maximum of all alignments
-    is taken: a camera that has turned by half of the distance of two views, or has driven on, is
-    nearly aligned in two of them. So it can be a little above 1. (Not in the paper, which compares
-    whole images only.)
+    A camera that has turned sees the same objects in another view. Therefore all alignments are
+    considered in which the views of one image are shifted to the left or right and at least half of
+    them overlap. The cosine of an alignment is taken over its overlapping views. The result is the
+    soft maximum over the alignments, since a camera that has turned by half the spacing of the
+    views, or has driven on, nearly fits two of them; it can slightly exceed 1. (Not in the paper,
+    which compares whole images only.)
 
     Args:
-        alike: scalar products of the views.
-        most: products of their lengths, ``(..., V, V)``.
+        alike: ``(..., V, V)`` scalar products of the views.
+        most: ``(..., V, V)`` products of their lengths.
     """
     views = alike.shape[-1]
     v = torch.arange(views, device=alike.device)
@@ -55,7 +55,7 @@ def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
     if views == 1:
         return a @ b.T
     a, b = _by_view(a, views), _by_view(b, views)
-    # In this order: b is a map of thousands of keyframes, a the query.
+    # b comes first because it is a map of thousands of keyframes, and a is the query.
     alike = (b.flatten(0, 1) @ a.flatten(0, 1).T).view(len(b), views, len(a), views)
     most = _lengths(a)[:, None, :, None] * _lengths(b)[None, :, None, :]
     return aligned(alike.permute(2, 0, 3, 1), most)
@@ -72,15 +72,15 @@ def _lengths(views: Tensor) -> Tensor:
 
 
 class DistanceHead(nn.Module):
-    """``p = sigmoid(a - b d)`` (Eq. 2) of the distance d of two descriptors (Eq. 10), a, b > 0.
+    """``p = sigmoid(a - b d)`` (Eq. 2) with the distance d of two descriptors (Eq. 10), a, b > 0.
 
-    With several views d is that of their :func:`aligned` cosine.
+    With several views, d follows from their :func:`aligned` cosine.
     """
 
     def __init__(self, views: int = 1) -> None:
         super().__init__()
         self.views = views
-        # p = 0.5 at d = 1.1, between pairs of one and of two places under random weights.
+        # p = 0.5 at d = 1.1, which separates pairs of one and of two places with random weights.
         self.log_a = nn.Parameter(torch.tensor(1.5))
         self.log_b = nn.Parameter(torch.tensor(1.4))
 
@@ -96,8 +96,8 @@ class DistanceHead(nn.Module):
         return self.log_a.exp() - self.log_b.exp() * d
 
     def compare(self, query: Tensor, gallery: Tensor, lengths: Tensor) -> Tensor:
-        """Logits ``(M,)`` of one ``(V, d)`` descriptor, by view, with each of ``(M, V, d)``, whose
-        views have the ``lengths`` ``(M, V)``: one product."""
+        """Logits ``(M,)`` of one ``(V, d)`` descriptor with a gallery ``(M, V, d)``, both by view,
+        by one product; ``lengths`` ``(M, V)`` are those of the gallery's views."""
         alike = (gallery @ query.T).transpose(1, 2)
         most = _lengths(query[None])[:, :, None] * lengths[:, None]
         return self.of_cosine(aligned(alike, most))
@@ -106,7 +106,7 @@ class DistanceHead(nn.Module):
 class ConcatenationHead(nn.Module):
     """Both vectors concatenated, fully connected layers with batch normalisation (Eq. 1).
 
-    The mean over both orders of the pair, so that the answer does not depend on it.
+    The result is the mean over both orders of the pair, so that the order does not matter.
     """
 
     def __init__(self, dimensions: int, hidden: int = 256) -> None:
@@ -130,12 +130,12 @@ class ConcatenationHead(nn.Module):
 
 
 class SiameseNetwork(nn.Module):
-    """One contract for all branches: ``embed`` and ``similarity``.
+    """Common interface of all branches: ``embed`` and ``similarity``.
 
     Attributes:
         name: one of ``NETWORKS``.
-        size: height and width of the images it takes.
-        dimensions: D of its descriptors.
+        size: height and width of the input images.
+        dimensions: dimension D of the descriptors.
     """
 
     def __init__(
@@ -153,11 +153,11 @@ class SiameseNetwork(nn.Module):
         return functional.normalize(self.branch(images).float(), dim=1)
 
     def cosines(self, a: Tensor, b: Tensor) -> Tensor:
-        """``(N, M)`` of descriptors ``(N, D)`` and ``(M, D)``, aligned."""
+        """``(N, M)`` aligned cosines of descriptors ``(N, D)`` and ``(M, D)``."""
         return cosines(a, b, self.branch.views)
 
     def logits(self, a: Tensor, b: Tensor) -> Tensor:
-        """Logit of ``similarity``, what training works on."""
+        """Logits of ``similarity``, which training uses."""
         return self.head(a, b)
 
     def similarity(self, a: Tensor, b: Tensor) -> Tensor:
@@ -186,11 +186,11 @@ def build_network(
 
     Args:
         name: one of ``NETWORKS``.
-        shape: of a capsule branch; others take its size of images only.
-        head: None for the paper's: concatenation for AlexNet and VGG16, else distance.
+        shape: shape of a capsule branch; others only use its image size.
+        head: None for the paper's head: concatenation for AlexNet and VGG16, else distance.
 
     Raises:
-        InputError: unknown name, or images that are too small.
+        InputError: the name is unknown, or the images are too small.
     """
     shape = shape or CapsuleShape()
     branch: CapsuleBranch | ConvolutionalBranch | PcaNetBranch
@@ -210,7 +210,7 @@ def build_network(
 def save_network(
     network: SiameseNetwork, path: Path, about: dict[str, Any], *, half: bool = False
 ) -> None:
-    """Write weights as safetensors, with what rebuilds the network and ``about`` as metadata.
+    """Write weights as safetensors; the metadata has the structure of the network and ``about``.
 
     Args:
         half: store in half precision, for shipping.
@@ -233,7 +233,7 @@ def save_network(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_suffix(".part")
-        # Not save_file, whose files only their owner can read.
+        # Files of save_file would be readable only by their owner.
         temporary.write_bytes(save({k: v.cpu().contiguous() for k, v in tensors.items()}, metadata))
         temporary.replace(path)
     except (OSError, SafetensorError) as error:
@@ -241,10 +241,10 @@ def save_network(
 
 
 def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
-    """Read what :func:`save_network` wrote; returns the network in eval mode and ``about``.
+    """Read a file of :func:`save_network`; returns the network in eval mode and ``about``.
 
     Raises:
-        InputError: missing or damaged file, or not one of ours.
+        InputError: the file is missing, damaged or not from this version of vslam.
     """
     fix = "train it with 'vslam train', or name another file"
     try:
@@ -269,7 +269,7 @@ def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
 
 
 def for_inference(network: SiameseNetwork) -> SiameseNetwork:
-    """Eval mode, no gradients, normalisations folded into convolutions; in place."""
+    """Prepare a network in place: eval mode, no gradients, normalisations folded in."""
     network.eval().requires_grad_(False)
     fold_batch_norms(network)
     return network

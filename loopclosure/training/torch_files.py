@@ -14,12 +14,12 @@ def read_pth(path: Path, fix: str) -> Any:
     """Read a weight file of PyTorch without executing anything in it.
 
     Args:
-        fix: what to do if it cannot be read, for the message.
+        fix: advice for the error message.
 
     Raises:
-        InputError: no such file, or not a weight file.
+        InputError: the file is missing or not a weight file.
     """
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises half a dozen kinds
+    except Exception as error:  # torch raises many kinds of errors
         raise InputError(f"{path}: not a readable weight file; {fix}.") from error

@@ -1,8 +1,8 @@
-"""Training: an epoch of pairs after the other, checkpoints that a killed run goes on from.
+"""Training in epochs of pairs, with checkpoints from which a killed training resumes.
 
-Everything random is drawn from the seed, the epoch and the number of the step or pair: a
-checkpoint needs no state of a generator beside them, and a resumed training has the bits of one
-that was never interrupted (same machine, same number of threads).
+All random numbers depend only on the seed, the epoch and the number of the step or pair. A
+checkpoint therefore needs no generator states, and a resumed training gives the same bits as an
+uninterrupted one (on the same machine with the same number of threads).
 """
 
 from __future__ import annotations
@@ -62,19 +62,19 @@ OnStep = Callable[[int, int, int, float], None]
 """``(epoch, step, steps of the epoch, loss)``"""
 
 _CHECKPOINT_EVERY_S = 300.0
-_HEAD_RATE = 30.0  # a and b are logarithms of single numbers: Adam's steps are small for them
+_HEAD_RATE = 30.0  # factor for a and b, single logarithms for which Adam's steps are too small
 
 
 @dataclass(frozen=True)
 class TrainingOutcome:
-    """What a training came to.
+    """The outcome of a training.
 
     Attributes:
-        finished: False if it was asked to stop before its end; a call with ``resume`` goes on.
-        figures: validation figures of the best epoch, calibrated.
-        progress: with the figures of every epoch.
+        finished: False if it was stopped early; a call with ``resume`` continues it.
+        figures: validation figures of the best epoch, after calibration.
+        progress: progress with the figures of every epoch.
         weights: file of the best network.
-        train, validation: images of the division.
+        train, validation: indices of the training and validation images.
     """
 
     finished: bool
@@ -97,27 +97,28 @@ def train(
     on_step: OnStep | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> TrainingOutcome:
-    """Train a network and write it, its log, its lists of pairs and checkpoints to a folder.
+    """Train a network; write its weights, log, lists of pairs and checkpoints to a folder.
 
     Args:
         collection: images and their relations.
-        settings: see there.
-        folder: to write to; ``settings.network`` names the file of the weights.
+        settings: settings of the training.
+        folder: output folder; ``settings.network`` names the file of the weights.
         device: ``cpu`` or ``cuda``.
-        threads: that augment images.
-        resume: go on from the folder's checkpoint, if there is one.
+        threads: threads for the augmentation of images.
+        resume: continue from the folder's checkpoint, if there is one.
         start: network to start from instead of random weights (fine-tuning).
         on_step: called after each step.
-        should_stop: asked after each step; a checkpoint is written before stopping.
+        should_stop: called after each step; if True, a checkpoint is written and training stops.
 
     Raises:
-        InputError: too little data, an unknown device or source, a device without bfloat16 where
-            the settings ask for it, a checkpoint of other settings, or a learned share without a
-            network to start from.
-        ResultsError: the loss is not finite (the last good checkpoint stays), or a full disk.
+        InputError: there is too little data, the device or a source is unknown, the settings need
+            bfloat16 but the device lacks it, the checkpoint has other settings, or
+            ``learned_share`` is set without a network to start from.
+        ResultsError: the loss is not finite (the last good checkpoint is kept), or the results
+            cannot be written.
     """
     if settings.learned_share < 1 and start is None:
-        raise InputError("learned_share: there is no network to go back towards; give --weights.")
+        raise InputError("learned_share: needs a network to start from; give --weights.")
     where = open_device(device)
     half = _mixed_precision(settings, where)
     check_emphasis(collection, settings.emphasis)
@@ -133,7 +134,7 @@ def train(
     weights = folder / f"{settings.network}.safetensors"
     if resume and checkpoint.exists():
         progress, pairs = load_checkpoint(checkpoint, settings, network, optimiser)
-    else:  # so that there is one to keep, whatever the first steps do
+    else:  # so that a good checkpoint exists even if the first steps diverge
         save_checkpoint(checkpoint, settings, network, optimiser, progress, None)
     saved = time.monotonic()
     with ThreadPoolExecutor(threads) as pool:
@@ -172,7 +173,7 @@ def train(
             write_log(folder / "log.csv", progress.history)
     best, about = load_network(weights)
     best.to(where)
-    if before is not None and "learned_share" not in about:  # resumed after its end
+    if before is not None and "learned_share" not in about:  # not yet blended before resuming
         blend(best, before, settings.learned_share)
         about["learned_share"] = settings.learned_share
     figures = calibrated(best, about, collection, validation, settings, weights, where)
@@ -188,10 +189,7 @@ def calibrated(
     weights: Path,
     device: torch.device,
 ) -> dict[str, float]:
-    """Calibrate a network and write it.
-
-    Returns:
-        Its validation figures.
+    """Calibrate a network, write it and return its validation figures.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -205,8 +203,8 @@ def calibrated(
 
 @dataclass(frozen=True)
 class _Training:
-    """A training under way: what its steps read, and the network, optimiser and progress that they
-    change."""
+    """The state of a training: the data that steps read, and the network, optimiser and progress
+    that they change."""
 
     collection: Collection
     settings: TrainSettings
@@ -220,11 +218,11 @@ class _Training:
 
     @property
     def steps(self) -> int:
-        """Of an epoch."""
+        """Number of steps in an epoch."""
         return max(1, self.settings.pairs // self.settings.batch)
 
     def step(self, pairs: Pairs) -> float:
-        """One step of Adam; weights and progress are untouched where the loss is not finite."""
+        """One step of Adam; weights and progress stay unchanged if the loss is not finite."""
         settings, network, progress = self.settings, self.network, self.progress
         first = progress.step * settings.batch
         a, b, same_place = (x[first : first + settings.batch] for x in vars(pairs).values())
@@ -271,10 +269,10 @@ class _Training:
         return to_tensor(np.stack(list(self.pool.map(one, jobs))))
 
     def pairs_of_epoch(self) -> Pairs:
-        """Those to learn from next."""
+        """The pairs of the current epoch."""
         settings, network, images, hard = self.settings, self.network, self.images, None
         rng = np.random.default_rng([settings.seed, 4, self.progress.epoch])
-        # Random weights find nothing hard.
+        # With random weights, mining would not find hard pairs.
         if self.progress.epoch > 0 and settings.hard_share > 0:
             if len(images) > settings.mined_images:
                 images = np.sort(rng.choice(images, settings.mined_images, replace=False))
@@ -288,7 +286,7 @@ class _Training:
         )  # fmt: skip
 
     def end_epoch(self, validation: NDArray[np.int64], weights: Path) -> None:
-        """Validate, and write the weights if they are the best so far."""
+        """Validate; write the weights if they are the best so far."""
         network, progress = self.network, self.progress
         augmentation = self.settings.augmentation
         figures = validate(network, self.collection, validation, augmentation, self.device)[0]
@@ -319,7 +317,7 @@ def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.
     others = [p for p in network.parameters() if p.requires_grad and id(p) not in apart]
     sets = [(others, 1.0), (given, settings.extractor_rate), (single, _HEAD_RATE)]
     groups: list[dict[str, Any]] = [{"params": p, "factor": f} for p, f in sets if p]
-    # One pass over the weights: a step of VGG16 takes half the time.
+    # The fused optimiser passes over the weights once, so that a step of VGG16 takes half the time.
     return torch.optim.Adam(groups, lr=settings.learning_rate, fused=True)
 
 
@@ -327,7 +325,7 @@ def open_device(name: str) -> torch.device:
     """The device of that name.
 
     Raises:
-        InputError: it is unknown, or not there.
+        InputError: the device is unknown or not available.
     """
     if name not in ("cpu", "cuda"):
         raise InputError(f"--device {name}: must be cpu or cuda.")
@@ -340,7 +338,7 @@ def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
     """Whether to compute in bfloat16."""
     can = device.type == "cpu" or torch.cuda.is_bf16_supported()
     if settings.mixed_precision and not can:
-        raise InputError("mixed_precision: this GPU has no bfloat16; leave it out.")
+        raise InputError("mixed_precision: this GPU does not support bfloat16; leave it out.")
     if settings.mixed_precision is None:
         return can and device.type == "cuda"
     return settings.mixed_precision

@@ -1,8 +1,8 @@
 """Render pairs of views with exact correspondences, for training the local descriptors.
 
-Each pair shows one place of a rendered town twice: from the other lane, turned, driven on, with
-other cars and posters, in another light, at dusk and at night. Images, depths and the motion
-between the cameras go into one ``.npz`` for each town; ``train_local.py`` reads them.
+Each pair shows one place of a rendered town twice, with differences such as another lane, direction
+or position, other cars and posters, another light, dusk or night. The images, depths and relative
+poses of each town are written to one ``.npz``, which ``train_local.py`` reads.
 
     python tools/training/render_matches.py --out matches --pairs 48
 """
@@ -27,8 +27,8 @@ from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.solids import turn
 from vslam.datasets.synthetic.town import Town, build_town
 
-WIDTH = 640  # pixels: what the network reads
-# Seeds that no test town has; the route, change and whether few facades repeat.
+WIDTH = 640  # pixels, the network's input
+# Seeds (of no test town), route, change, and whether the town repeats a few facades.
 TOWNS = [
     (61, "demo", 0.95, False), (62, "05", 1.0, False), (63, "00", 0.9, False),
     (64, "demo", 1.0, True), (65, "02", 1.0, False), (66, "05", 0.6, True),
@@ -42,11 +42,11 @@ TOWNS = [
 LATERAL = (-3.6, 1.4)  # m to the right; -3.2 is the other lane
 FORWARD = (-4.0, 4.0)  # m
 HEADING = 25.0  # degrees to either side, at most
-_EXPOSURE = 0.3  # deviation of the logarithm
+_EXPOSURE = 0.3  # standard deviation of the log exposure
 
 
 def moved(T_wc: NDArray[np.float64], lateral: float, forward: float, degrees: float) -> NDArray:
-    """A camera beside, before and turned against one at ``T_wc``."""
+    """The pose ``T_wc`` shifted to the right and forward, and turned."""
     out = T_wc.copy()
     out[:3, :3] = turn(np.radians(degrees)) @ T_wc[:3, :3]
     out[:3, 3] += lateral * T_wc[:3, 0] + forward * T_wc[:3, 2]
@@ -57,7 +57,7 @@ def view(
     renderer: Renderer, route: Route, passes: Passes, T_wc: NDArray[np.float64], when: int,
     exposure: float, key: tuple[int, int, int],
 ) -> tuple[NDArray[np.uint8], NDArray[np.float16]]:  # fmt: skip
-    """Image and depth at the size that the network reads."""
+    """Image and depth at the network's input size."""
     from dataclasses import replace
 
     moment = passes.at(when)
@@ -71,7 +71,7 @@ def view(
 
 
 def render_town(town: tuple[int, str, float, bool], pairs: int, folder: Path, threads: int) -> Path:
-    """Render the pairs of one town, unless they are there."""
+    """Render the pairs of one town, unless they exist."""
     seed, name, change, aliased = town
     path = folder / f"{seed}.npz"
     if path.exists():

@@ -1,15 +1,15 @@
 """Train the local descriptors: ``local.safetensors`` and ``local.onnx``.
 
-The extractor of the shipped capsule network stays as it is, so that its features are computed
+The extractor of the shipped capsule network stays fixed, so that its features are computed only
 once. Pairs come from ``render_matches.py`` (exact correspondences) and from photographs: an image
-and a homography of it in another light, and of fixed cameras at different hours.
+and its homography in another light, or images of a fixed camera at different hours.
 
     python tools/training/render_matches.py --out matches --pairs 60
     python tools/training/train_local.py --rendered matches --photos PLACES --kitti $KITTI_ROOT \\
         --out local
 
-On two cores: 15 minutes of rendering, 7 of preparation, 30 of training. The shipped weights stopped
-after 4,500 steps of batch 4, on a machine that rendered beside it.
+On two cores, this takes 15 minutes of rendering, 7 of preparation and 30 of training. The training
+of the shipped weights ended after 4,500 steps of batch 4, on a machine that was also rendering.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ Points = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Pair:
-    """Two images ``SIZE``, and points of a ``(N, 2)`` with their places in b; and the other way."""
+    """Two images ``SIZE``, and points ``(N, 2)`` of each with their positions in the other."""
 
     unit: str
     images: tuple[Image, Image]
@@ -65,7 +65,7 @@ class Pair:
 
 
 def corners(image: Image, rng: np.random.Generator) -> Points:
-    """Where tracking would have keypoints, and some places more."""
+    """The keypoints that tracking would use, and additional random points."""
     found = cv2.goodFeaturesToTrack(image, 500, 0.002, 5)
     some = rng.uniform(0, 1, (100, 2)) * [SIZE[1] - 1, SIZE[0] - 1]
     return np.vstack([some, *([] if found is None else [found[:, 0]])]).astype(np.float32)
@@ -88,7 +88,7 @@ Warp = Callable[[Points], NDArray[np.float64]]
 def pair_of(
     unit: str, images: tuple[Image, Image], warps: tuple[Warp, Warp], rng: np.random.Generator
 ) -> Pair:
-    """``warps``: from points of a to points of b, NaN where unknown, and the other way."""
+    """``warps`` map points of a to points of b, NaN if unknown, and points of b to points of a."""
     grids, points = [], []
     for side in (0, 1):
         there = warps[side](cells())
@@ -104,7 +104,7 @@ def pair_of(
 
 @dataclass(frozen=True)
 class DepthWarp:
-    """From a pixel of one view, by its depth and the motion, to the pixel of another."""
+    """Maps pixels of one view to pixels of another by depth and relative pose."""
 
     intrinsics: NDArray[np.float64]  # fx, fy, cx, cy
     depth: NDArray[np.float64]  # of this view; 0 is sky
@@ -150,7 +150,7 @@ def rendered(folder: Path, rng: np.random.Generator) -> Iterator[Pair]:
 
 
 def relit(image: Image, rng: np.random.Generator) -> Image:
-    """Another light: gamma, gain, lamps and shadows, noise, blur."""
+    """Change the light of an image: gamma, gain, lamps and shadows, noise, blur."""
     height, width = image.shape
     x = (image / 255.0) ** np.exp(rng.normal(0, 0.5))
     if rng.random() < 0.7:
@@ -175,7 +175,7 @@ def homography(height: int, width: int, rng: np.random.Generator) -> NDArray[np.
 
 
 def homographic(unit: str, first: Image, second: Image, rng: np.random.Generator) -> Pair | None:
-    """Two aligned images; the second is warped, and both are cropped to ``SIZE``."""
+    """A pair of two aligned images, of which the second is warped; both are cropped to ``SIZE``."""
     scale = max(SIZE[1] / first.shape[1], SIZE[0] / first.shape[0])
     size = (
         max(SIZE[1], round(first.shape[1] * scale)),
@@ -235,7 +235,7 @@ def photographs(photos: Path, kitti: Path | None, rng: np.random.Generator) -> I
 
 @dataclass(frozen=True)
 class Prepared:
-    """All pairs: features of images (two after another), correspondences."""
+    """All pairs: features of the images (two per pair), and correspondences."""
 
     x4: Tensor
     x8: Tensor
@@ -263,7 +263,7 @@ def prepare(pairs: list[Pair], network: LocalNetwork) -> Prepared:
 
 
 def targets(there: Tensor) -> Tensor:
-    """``(B, cells, 2)`` pixels to the index of the cell there, or -1."""
+    """Index of the cell at each of ``(B, cells, 2)`` pixels, or -1."""
     cell = torch.round(there / COARSE_STRIDE)
     known = torch.isfinite(there).all(-1)
     index = cell[..., 1].nan_to_num(0) * COARSE[1] + cell[..., 0].nan_to_num(0)
@@ -285,7 +285,7 @@ def coarse_loss(coarse: Tensor, grid: Tensor) -> Tensor:
 
 
 def sampled(fine: Tensor, xy: Tensor) -> Tensor:
-    """``(N, C, h, w)`` at ``(N, P, 2)`` pixels, ``(N, P, C)`` of length 1."""
+    """Sample ``(N, C, h, w)`` at ``(N, P, 2)`` pixels; returns ``(N, P, C)`` of length 1."""
     size = torch.tensor([FINE[1] - 1, FINE[0] - 1]) * FINE_STRIDE
     at = 2 * xy / size - 1
     found = functional.grid_sample(fine, at[:, None], align_corners=True)[:, :, 0]
@@ -293,10 +293,8 @@ def sampled(fine: Tensor, xy: Tensor) -> Tensor:
 
 
 def fine_loss(fine: Tensor, points: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Cross entropy over a window of cells about a place near the true one, and over all points.
-
-    Returns the two, the second of which keeps the points of an image apart.
-    """
+    """Cross entropy over a window of cells near the true position, and over all points of an image;
+    the second one makes the points of an image distinguishable."""
     around = torch.arange(-WINDOW, WINDOW + 1)
     offset = torch.stack(torch.meshgrid(around, around, indexing="xy"), 2).reshape(-1, 2)
     near, apart = [], []
@@ -316,7 +314,7 @@ def fine_loss(fine: Tensor, points: Tensor, generator: torch.Generator) -> tuple
         window = window.view(*cell.shape[:3], -1)
         alike = torch.einsum("npc,npkc->npk", query, window) / TEMPERATURE
         alike = alike.masked_fill(~inside, -1e4)
-        # The four cells about the true place share it as in bilinear interpolation.
+        # The four cells around the true position are weighted as in bilinear interpolation.
         away = (xy_b[:, :, None] / FINE_STRIDE - cell).abs()
         share = (1 - away).clamp_min(0).prod(-1) * inside
         share = share / share.sum(-1, keepdim=True).clamp_min(1e-6)
@@ -333,8 +331,8 @@ def fine_loss(fine: Tensor, points: Tensor, generator: torch.Generator) -> tuple
 
 @torch.no_grad()
 def validate(head: LocalHead, data: Prepared, chosen: list[int]) -> dict[str, float]:
-    """Of mutual coarse matches: share within 24 pixels, number of those; of points searched in a
-    window about the true place: share found within 1.5 pixels."""
+    """Share of mutual coarse matches within 24 pixels, and their number; share of points that are
+    found within 1.5 pixels in a window around the true position."""
     right, count, hit, total = 0, 0, 0.0, 0
     for k in chosen:
         coarse, fine = head(*features_of(data, [k]))

@@ -6,12 +6,12 @@ KITTI_ROOT holds sequences/00 and poses/00.txt, DIR the sets of photographs (dat
 
 The script renders eight towns, trains from random weights with the settings paper.json beside this
 file (the preset ``paper`` in float32, with less patience and fewer images mined and validated),
-removes 20 % of the primary capsules, trains what is left for two epochs and exports it. Finished
-parts are skipped and an interrupted training resumes from its checkpoint, so the same command
-continues everything.
+removes 20 % of the primary capsules, trains the rest for two epochs and exports it. Finished parts
+are skipped and an interrupted training resumes from its checkpoint, so the same command continues
+everything.
 
-bfloat16 is no option on a CPU: of thirteen steps replayed with torch 2.13 one had a gradient of
-norm 5e32 where float32 gives 0.16, and the loss became NaN in the second epoch.
+bfloat16 fails on a CPU: in thirteen steps replayed with torch 2.13, one gradient had a norm of 5e32
+instead of 0.16 in float32, and the loss became NaN in the second epoch.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _FRAMES = "seq=00,first=250,last=1499,near=20"
 
 
 def main() -> None:
-    """Parse the command line and run what is left to do."""
+    """Parse the command line and run the unfinished parts."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--kitti", type=Path, required=True, help="folder with sequences/")
     parser.add_argument("--photos", type=Path, required=True, help="sets of photographs")
@@ -57,8 +57,8 @@ def main() -> None:
 
 
 def _commands(out: Path, kitti: Path, photos: Path) -> list[list[str]]:
-    """Those whose results are missing; the last file of a town is pairs.csv, of a training the
-    model card."""
+    """Commands whose results are missing. The last file of a town is pairs.csv, that of a training
+    is the model card."""
     towns = {name: out / "pairs" / name for name in _TOWNS}
     commands = [
         ["synth", *_TOWNS[name], "--out", str(folder)]

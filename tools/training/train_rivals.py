@@ -1,21 +1,21 @@
-"""Train every architecture of docs/research/rivals.md under equal conditions, in both of its ways.
+"""Train every architecture of docs/research/rivals.md under equal conditions, in two ways.
 
 python tools/training/train_rivals.py --data SOURCE [--data SOURCE ...] --out DIR
         [--networks NAMES] [--pixels N] [--images N] [--core-minutes M] [--epochs N]
         [--device cuda] [--dry-run]
 
-SOURCE is as of ``vslam train``. All networks have the preset ``rivals``: random weights, the same
-augmentation, loss, head and learning rate. In DIR/images each is shown the same number of images,
-as the same pairs in the same order, in DIR/minutes each computes for the same time of a core:
-validation and export come on top; ``--core-minutes 0`` leaves DIR/minutes out. DIR/rivals.csv has a
-row for each, DIR/progress.csv one for each of its epochs. ``capsule-pruned`` begins with the
-weights of ``capsule`` beside it and trains for one epoch more; its row counts that one alone.
-PCANet learns once, without gradients.
+SOURCE is a source of ``vslam train``. All networks use the preset ``rivals``: random weights, the
+same augmentation, loss, head and learning rate. For DIR/images, each network gets the same number
+of images, as the same pairs in the same order. For DIR/minutes, each network trains for the same
+time on one core, without validation and export; ``--core-minutes 0`` leaves DIR/minutes out.
+DIR/rivals.csv has a row for each network, DIR/progress.csv one for each of its epochs.
+``capsule-pruned`` starts from the weights of ``capsule`` in the same folder and trains for one more
+epoch; its row counts only that epoch. PCANet learns once, without gradients.
 
-How long a step takes is measured first and kept in DIR/plan.json. ``--dry-run`` only does that and
-prints what would follow. What is finished is skipped, a killed training goes on from its
-checkpoint: the same command resumes everything, and other ``--networks`` join. DIR/conditions.json
-keeps the other options; with others DIR is refused.
+The time of a step is measured first and stored in DIR/plan.json. ``--dry-run`` only does this and
+prints the plan. Finished trainings are skipped and a killed one resumes from its checkpoint, so the
+same command continues everything; ``--networks`` may be extended. DIR/conditions.json stores the
+other options, and DIR is refused if they differ.
 """
 
 from __future__ import annotations
@@ -57,10 +57,10 @@ class Job:
     """One training.
 
     Attributes:
-        way: ``images`` or ``minutes``: what is equal.
-        network: that is trained.
-        pairs: of an epoch; 0 for PCANet.
-        core_seconds: that its steps should take.
+        way: ``images`` or ``minutes``, the quantity that is equal for all networks.
+        network: name of the network.
+        pairs: pairs per epoch; 0 for PCANet.
+        core_seconds: planned time of its steps.
     """
 
     way: str
@@ -71,11 +71,11 @@ class Job:
 
 @dataclass(frozen=True)
 class Result:
-    """A row of rivals.csv; ``weights`` are relative to it.
+    """A row of rivals.csv; ``weights`` is a path relative to it.
 
-    ``core_seconds`` are of the steps alone, of PCANet all that it takes. Losses are means of the
-    first and the last epoch, validation APs are of the last two and of the best epoch, that of the
-    weights.
+    ``core_seconds`` is the time of the steps, or of the whole training for PCANet. Losses are means
+    over the first and the last epoch. Validation APs are those of the last two epochs and of the
+    best epoch, from which the weights are.
     """
 
     way: str
@@ -93,14 +93,14 @@ class Result:
 
 
 class StepClock:
-    """Core seconds of a step: the median, since what runs beside it on the machine only adds."""
+    """Core seconds of a step, as the median, because other processes can only add to the time."""
 
     def __init__(self) -> None:
         self._last, self._epoch = time.process_time(), -1
         self._taken: list[float] = []
 
     def __call__(self, epoch: int, step: int, steps: int, loss: float) -> None:
-        """Called after each step; the first of an epoch has mining and validation before it."""
+        """Called after each step; mining and validation precede the first step of an epoch."""
         present = time.process_time()
         if epoch == self._epoch:
             self._taken.append(present - self._last)
@@ -118,10 +118,10 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument(
         "--networks", default=",".join((*TRAINED, "pcanet")), help="in the order of training"
     )
-    parser.add_argument("--pixels", help="of the images; without: the preset's")
-    parser.add_argument("--images", type=int, default=65536, help="shown to each network")
-    parser.add_argument("--core-minutes", type=float, default=60.0, help="of each; 0: none")
-    parser.add_argument("--epochs", type=int, help="that these are divided into")
+    parser.add_argument("--pixels", help="image size; default: the preset's")
+    parser.add_argument("--images", type=int, default=65536, help="images for each network")
+    parser.add_argument("--core-minutes", type=float, default=60.0, help="of each; 0 for none")
+    parser.add_argument("--epochs", type=int, help="number of epochs")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--dry-run", action="store_true", help="print the plan only")
     args = parser.parse_args(words)
@@ -164,10 +164,10 @@ def main(words: list[str] | None = None) -> None:
 
 
 def known_networks(names: str) -> list[str]:
-    """Names between commas.
+    """Parse names separated by commas.
 
     Raises:
-        InputError: one is unknown, or the pruned network without what it continues.
+        InputError: a name is unknown, or ``capsule-pruned`` is not preceded by ``capsule``.
     """
     found = names.split(",")
     for name in found:
@@ -179,7 +179,7 @@ def known_networks(names: str) -> list[str]:
 
 
 def conditions(args: argparse.Namespace) -> dict[str, Any]:
-    """The options that decide what a training comes to."""
+    """The options that determine the result of a training."""
     named = ("data", "pixels", "images", "core_minutes", "epochs", "device")
     return {f"--{name.replace('_', '-')}": getattr(args, name) for name in named}
 
@@ -192,9 +192,9 @@ def plan(
     minutes: float,
     device: str,
 ) -> list[Job]:
-    """The jobs of these networks: those of a file, and those that it lacks, added to it.
+    """The jobs of these networks, from a file, to which missing ones are added.
 
-    How many pairs an epoch has follows from the number of images or from the time of a step.
+    The number of pairs per epoch follows from the number of images or the time of a step.
     """
     known = [Job(**job) for job in json.loads(path.read_text())] if path.exists() else []
     ways = ("images", "minutes") if minutes else ("images",)
@@ -218,7 +218,7 @@ def plan(
 
 
 def seconds_of_a_step(name: str, settings: TrainSettings, device: str) -> float:
-    """Core seconds of a step of training, without reading and augmenting its images."""
+    """Core seconds of a training step, without reading and augmenting images."""
     torch.manual_seed(0)
     network = build_network(name, settings.shape, settings.head).to(device).train()
     optimiser = torch.optim.Adam(network.parameters(), fused=True)
@@ -281,7 +281,7 @@ def result(
 
 
 def read_results(path: Path) -> list[Result]:
-    """Rows of rivals.csv; none where it is not there."""
+    """Rows of rivals.csv; empty if it does not exist."""
     if not path.exists():
         return []
     types = {"parameters": int, "images_shown": int, "epochs": int,

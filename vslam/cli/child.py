@@ -1,7 +1,7 @@
-"""``python -m vslam.cli.child run ...``: the command line of vslam, which ends with its parent.
+"""``python -m vslam.cli.child run ...``: the command line of vslam, ending with its parent process.
 
-The parent holds the other end of our standard input. When it is gone, however it went, the pipe
-closes: nobody is left to take the results, and the processor is free for the run that replaces us.
+The parent holds the other end of our standard input. When the parent ends, even if it is killed,
+the pipe closes. Nobody then reads the results, so this process ends and frees the processor.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Who tells how far a command is: ``progress.py`` by bars on stderr, ``quiet.py`` not at all."""
+"""Progress of a command: ``progress.py`` draws bars on stderr, ``quiet.py`` shows nothing."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class Console(Protocol):
-    """The functions of both modules."""
+    """The functions that both modules have."""
 
     def progress_bar(
         self, total: int | None
@@ -23,7 +23,7 @@ class Console(Protocol):
 
 
 def console(*, shown: bool) -> Console:
-    """What tells; where nothing is shown, without what takes time to import."""
+    """The module that shows progress, or the one that shows nothing and imports nothing slow."""
     if shown:
         from vslam.cli import progress
 

@@ -1,4 +1,4 @@
-"""What ``vslam run`` does once its options are known to make sense."""
+"""What ``vslam run`` does after it has checked its options."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Output:
-    """What a run shows and writes; another one may be wanted when it is resumed."""
+    """What a run shows and writes. A run that is resumed can have another one."""
 
     record: bool
     view: Literal["native", "web"] | None
@@ -48,16 +48,16 @@ def drive(
     """Open the images, run SLAM and write the results.
 
     Args:
-        out: where to make the folder of the run.
-        resume: the folder of the run to go on with instead.
+        out: the folder in which the folder of the run is created.
+        resume: the folder of an interrupted run to continue, in place of a new one.
     """
     if options.localize and output.save_map is not None:
-        raise InputError("--save-map: localising changes no map; leave it out.")
+        raise InputError("--save-map: localising does not change the map; leave it out.")
     told = console(shown=not output.quiet)
     source, perturbation = _open(options, told)
     _refuse_camera(source, resume)
 
-    # Bad input has been refused by now; what follows takes a second to import.
+    # These imports take a second, so they come after bad input has been refused.
     from vslam.cli.tables import print_summary
     from vslam.doctor.nothing_tracked import why_nothing_was_tracked
     from vslam.report.folder import write_results
@@ -75,7 +75,7 @@ def drive(
         folder = resume or _new_folder(options, settings, out, lock)
         moments, pictures = MomentRecorder(), LoopPictureRecorder()
         recorder = _recorder(folder, output, unfinished, viewer, moments, pictures)
-        # When only localising there is nothing to save but the poses.
+        # Localising changes no map, so there are only poses to save.
         period = 0.0 if options.localize else options.autosave
         autosave = FolderAutosave(folder, period, f"{settings.dataset} {source.name}")
         with told.progress_bar(source.n_expected) as on_frame:
@@ -97,7 +97,7 @@ def drive(
         told.announce(f"{viewer.address} stays open until Ctrl-C")
         with suppress(KeyboardInterrupt):
             Event().wait()
-    if why and output.quiet:  # else the summary has said it
+    if why and output.quiet:  # otherwise the summary has said it
         raise ResultsError(f"{why}.")
     if outcome.interrupted and outcome.interrupted != "Ctrl-C":
         go_on = f"; vslam run --resume {folder} continues it" if (folder / MAP).exists() else ""
@@ -107,7 +107,7 @@ def drive(
 
 
 def _open(options: RunOptions, told: Console) -> tuple[Source, Perturbation]:
-    """The images and what is done to them. Refuses laws that the data cannot serve."""
+    """Open the images and bind the perturbation to them; refuse laws that need other data."""
     from vslam.datasets.perturbation import parse_perturbation
 
     perturbation = parse_perturbation(options.perturb, options.seed)
@@ -117,7 +117,7 @@ def _open(options: RunOptions, told: Console) -> tuple[Source, Perturbation]:
 
 
 def _refuse_camera(source: Source, resume: Path | None) -> None:
-    """What a camera has shown is gone."""
+    """Refuse to resume a run of a live camera, whose images are gone."""
     if source.live and resume is not None:
         raise InputError(
             f"--resume {resume}: the images of a live camera are gone; continue its map with "
@@ -128,8 +128,10 @@ def _refuse_camera(source: Source, resume: Path | None) -> None:
 def _unfinished(
     options: RunOptions, source: Source, resume: Path | None, lock: ExitStack
 ) -> Unfinished | None:
-    """What to go on from, of a run that is resumed. Refuses images of another camera than that of
-    the map to go on in."""
+    """The saved state of the run to resume, None for a new run.
+
+    Images of another camera than that of the map that is continued are refused.
+    """
     from vslam.run.autosave import find_unfinished, lock_run
     from vslam.run.pipeline import require_camera
 
@@ -182,7 +184,7 @@ def _recorder(
     moments: Recorder,
     pictures: LoopPictureRecorder,
 ) -> Recorder:
-    """All that is to be told of the run: a file, a viewer, and what the report shows."""
+    """A recorder for the file, the viewer and the report of a run."""
     from vslam.run.recorder import Recorder, RerunRecorder, SeveralRecorders
 
     recorders: list[Recorder] = []
@@ -197,4 +199,4 @@ def _recorder(
         recorders.append(moments)
     if not recorders:
         return Recorder()
-    return SeveralRecorders((pictures, *recorders))  # pictures first, since the others show them
+    return SeveralRecorders((pictures, *recorders))  # the others use the pictures

@@ -201,12 +201,12 @@ def euroc(
 
 
 def _beside(run: Path, name: str) -> Path:
-    """In the folder of a run; of a map that is a file alone, beside it under its name."""
+    """A file in the folder of a run, or beside a map file under the name of the map."""
     return run / name if run.is_dir() else run.with_suffix(Path(name).suffix)
 
 
 def _graph(run: Path) -> tuple[PoseGraph, Map]:
-    """The pose graph of a run, or of a map that is a file alone, with the usual weights."""
+    """The pose graph of a run, or of a map file with the default weights."""
     from vslam.config import Config
     from vslam.maps.storage import load_map
     from vslam.report.finished_run import graph_of_map, pose_graph, read_run
@@ -256,7 +256,7 @@ def _write_images(
     link: bool,
     quiet: bool,
 ) -> tuple[list[str], NDArray[np.uint8]]:
-    """Write the keyframe images; returns their names, and the colours of the landmarks."""
+    """Write the keyframe images; returns their names and the colours of the landmarks."""
     from vslam.maps.keyframe_images import landmark_colours, save_image
 
     folder.mkdir()

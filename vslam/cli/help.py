@@ -22,29 +22,34 @@ class _Options(RegexHighlighter):
 
 
 def show_help(command: Any, context: Any) -> None:
-    """Print the help of a command on stdout.
+    """Print the help of a command, or of a group of commands, on stdout.
 
     Args:
-        command: a ``TyperCommand``; the ``rich_help_panel`` of a parameter names its panel.
+        command: a ``TyperCommand`` or ``TyperGroup``; the ``rich_help_panel`` of a parameter names
+            its panel.
         context: the click context of the command.
     """
     console = Console(theme=_THEME, highlighter=_Options())
     console.print(Padding(Text(command.get_usage(context), "bold"), (1, 1)))
     for paragraph in command.help.split("\n\n"):
         console.print(Padding(Text.from_markup(" ".join(paragraph.split())), (0, 1, 1, 1)))
-    panels: dict[str, list[Any]] = {}
+    panels: dict[str, list[tuple[str, Text]]] = {}
     for parameter in command.get_params(context):
         if not parameter.hidden and parameter.name != "help":
             is_option = parameter.param_type_name == "option"
             title = parameter.rich_help_panel or ("Options" if is_option else "Arguments")
-            panels.setdefault(title, []).append(parameter)
-    width = max((len(_name(one)) for some in panels.values() for one in some), default=0)
-    for title, parameters in panels.items():
+            panels.setdefault(title, []).append((_name(parameter), _described(parameter)))
+    for name, one in getattr(command, "commands", {}).items():
+        if not one.hidden:
+            summary = " ".join(one.help.split("\n\n")[0].split())
+            panels.setdefault("Commands", []).append((name, Text.from_markup(summary)))
+    width = max((len(name) for rows in panels.values() for name, _ in rows), default=0)
+    for title, rows in panels.items():
         table = Table.grid(padding=(0, 2))
         table.add_column(width=width, style="bold cyan", no_wrap=True)
         table.add_column(overflow="fold")
-        for parameter in parameters:
-            table.add_row(Text(_name(parameter)), _described(parameter))
+        for name, about in rows:
+            table.add_row(Text(name), about)
         console.print(Panel(table, title=title, title_align="left", border_style="dim"))
     if command.epilog:
         console.print(Padding(Text.from_markup(command.epilog.strip()), (1, 1)))

@@ -51,7 +51,7 @@ def register(app: typer.Typer) -> None:
 
 @commands.callback()
 def _group() -> None:
-    """Keep the name of the command: a group of one command would lose it."""
+    """Keep the name of the only command, which typer would otherwise drop."""
 
 
 @commands.command("bench", epilog=_EXAMPLES)
@@ -152,7 +152,7 @@ def bench(
         console(shown=not quiet).count_bar,
     )
     write = partial(_write, out, seed)
-    # Both write after every set, so that a run that is stopped has told what it found.
+    # The report is written after every set, so that a command that is stopped keeps its results.
     if protocol == "online":
         done = _on_drives(asked, data or DRIVES, youngest, write)
     else:
@@ -162,7 +162,7 @@ def bench(
 
 
 class _Asked(NamedTuple):
-    """What both protocols need: detectors and their weights, the vocabulary, threads, progress."""
+    """What both protocols need."""
 
     names: list[str]
     files: dict[str, Path]
@@ -175,7 +175,7 @@ class _Asked(NamedTuple):
 def _on_drives(
     asked: _Asked, data: Sequence[str], window: Window, write: Callable[..., None]
 ) -> str:
-    """Measure in the protocol of the literature; says on what."""
+    """Measure in the online protocol of the literature; returns what was measured on."""
     from vslam.datasets.synthetic import store
     from vslam.lab.loopbench.drives import open_drives
     from vslam.lab.loopbench.measure_online import measure_drive
@@ -206,7 +206,7 @@ def _on_sets(
     *,
     quiet: bool,
 ) -> str:
-    """Measure queries against galleries; says on what."""
+    """Measure queries against galleries; returns what was measured on."""
     from vslam.cli.console import console
     from vslam.datasets.synthetic import store
     from vslam.lab.loopbench.cost import cost
@@ -240,7 +240,7 @@ def _on_sets(
 
 
 def _require_writable(out: Path) -> None:
-    """Refuse what cannot be written before the work, not after."""
+    """Refuse an output folder that cannot be written, before the work begins."""
     try:
         there = next(path for path in (out, *out.absolute().parents) if path.exists())
         with TemporaryFile(dir=there):

@@ -15,7 +15,7 @@ from types import FrameType, ModuleType
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from vslam.cli import (
     bench,
@@ -63,6 +63,16 @@ class _Command(TyperCommand):
             raise
 
 
+class _Group(TyperGroup):
+    """Several commands under one name, with our own help."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """See ``TyperGroup.format_help``."""
+        from vslam.cli.help import show_help
+
+        show_help(self, ctx)
+
+
 def _plain(message: str) -> str:
     """What the parser says of a value, in our words and with a suggestion for a misspelt name."""
     message = plain_reason(message)
@@ -78,6 +88,7 @@ def application(groups: Collection[ModuleType]) -> typer.Typer:
     """The commands of some modules."""
     made = typer.Typer(
         help="Visual SLAM in pure Python.",
+        cls=_Group,
         add_completion=False,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
@@ -85,7 +96,9 @@ def application(groups: Collection[ModuleType]) -> typer.Typer:
     )
     for group in groups:
         group.register(made)
-    for commands in (made, *(group.typer_instance for group in made.registered_groups)):
+    for several in made.registered_groups:
+        several.cls = _Group
+    for commands in (made, *(several.typer_instance for several in made.registered_groups)):
         for command in commands.registered_commands if commands else ():
             command.cls = _Command
     made.callback(invoke_without_command=True)(version)
@@ -106,22 +119,21 @@ app = application(_GROUPS)
 
 
 def _treat_as_ctrl_c(signal_number: int, stack: FrameType | None) -> None:
-    """What a machine that shuts down sends (SIGTERM) ends a run as Ctrl-C does."""
+    """Let SIGTERM, which a machine sends when it shuts down, end a run as Ctrl-C does."""
     handler = signal.getsignal(signal.SIGINT)
-    if not callable(handler):  # a shell's background jobs ignore Ctrl-C
+    if not callable(handler):  # background jobs of a shell ignore Ctrl-C
         raise KeyboardInterrupt
     handler(signal.SIGINT, stack)
 
 
 def main() -> None:
     """Entry point: bad input becomes one line on stderr and exit code 2."""
-    # Imports and kernels from the cache make a million objects that stay. To look through them for
-    # garbage is a tenth of the start; frozen, they are not looked through when Python ends either,
-    # which takes 0.16 s.
+    # Imports and cached kernels create a million objects that stay alive. Searching them for
+    # garbage takes a tenth of the start-up, and another 0.16 s at the exit unless they are frozen.
     gc.set_threshold(200_000, 20, 100)
     atexit.register(gc.freeze)
     keep_memory()
-    # OpenBLAS's threads spin while they wait, and no product of a run is large enough to share.
+    # OpenBLAS threads spin while they wait, and no matrix of a run is large enough to share.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     signal.signal(signal.SIGTERM, _treat_as_ctrl_c)
     try:
@@ -129,7 +141,7 @@ def main() -> None:
             require_utf8(Path(word))
         with suppress(FileNotFoundError):  # the folder was removed
             require_utf8(Path.cwd())
-        # typer prepares every option of every command that it knows: 30 ms.
+        # typer prepares the options of every command that it knows, which takes 30 ms.
         (application((run,)) if sys.argv[1:2] == ["run"] else app)()
     except InputError as error:
         typer.echo(f"error: {error}", err=True)

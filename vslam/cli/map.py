@@ -94,7 +94,7 @@ def _contents(map_: Map, reconstruction: Reconstruction) -> Rows:
 
 
 def _weakest_place(map_: Map) -> Rows:
-    """Where the fewest landmarks hold the map together."""
+    """The keyframe that the fewest landmarks connect to earlier ones."""
     from vslam.backend.pose_graph import connectivity
 
     living = map_.living_keyframes()[1:]
@@ -147,7 +147,7 @@ def merge(
         raise InputError(f"{maps[0]}: this is one map; name two or more to merge.")
     _require_free(out)
     thresholds = Config() if config is None else load_config(config)
-    # No camera waits: the network may see all keyframes at once.
+    # No camera waits for the network, which may see all keyframes at once.
     seen = thresholds.siamese.model_copy(update={"embedded_at_once": sys.maxsize})
     thresholds = thresholds.model_copy(update={"siamese": seen})
     files = [map_file_of(path) for path in maps]

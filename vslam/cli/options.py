@@ -1,4 +1,4 @@
-"""Options that several commands share. The words that they allow are checked by the parser."""
+"""Options that several commands share, and the data source that they describe."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ DETECTOR_NAMES = _with_plugins(
 if TYPE_CHECKING:
     SourceName = str
     DetectorName = str
-else:  # what is installed decides
+else:  # installed packages add names
     SourceName = Literal[(*_DATASETS, *_SOURCES)]
     DetectorName = Literal[DETECTOR_NAMES]
 # Panels of --help.
@@ -133,7 +133,7 @@ SensorName = Literal["stereo", "mono", "rgbd"]
 ViewerName = Literal["native", "web"]
 AlignmentName = Literal["se3", "sim3", "none"]
 
-KITTI_ROOT = "data/kitti"  # where $KITTI_ROOT names no other folder
+KITTI_ROOT = "data/kitti"  # unless $KITTI_ROOT names another folder
 
 _WITHOUT_DATA = """there is nothing to read; name some images, or take rendered ones:
   --dataset synthetic    rendered drives, which need no download
@@ -142,12 +142,12 @@ _WITHOUT_DATA = """there is nothing to read; name some images, or take rendered 
 
 
 def names_in(text: str) -> list[str]:
-    """The names that commas separate, each once, in the order given."""
+    """The names in a list with commas, without repetitions, in their order."""
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
 def kitti_root() -> str:
-    """Where KITTI's data is if no option says it."""
+    """The folder of KITTI's data if no option names one."""
     return os.environ.get("KITTI_ROOT") or KITTI_ROOT
 
 
@@ -249,11 +249,11 @@ def _source_options(
         typer.Option(min=1, metavar="N", help="Stop after N frames.", show_default="all"),
     ] = None,
 ) -> SourceOptions:
-    """What the options say about the source."""
+    """The source that the options describe."""
     from vslam.datasets.sources import SourceOptions
 
     if source is not None and data is not None:
-        raise InputError(f"{source}: --data says what to read, too; leave one of them out.")
+        raise InputError(f"{source}: --data also names what to read; leave one of them out.")
     data = source if source is not None else data
     if data is None and dataset in (None, "kitti"):
         data = kitti_root()
@@ -267,13 +267,13 @@ def _source_options(
     )  # fmt: skip
 
 
-_NAMES = {"SourceOptions": object}  # of annotations that cost an import
+_NAMES = {"SourceOptions": object}  # annotations whose types are slow to import
 
 
 def reads_source(
     *, without: tuple[str, ...] = ()
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of a source, in place of its parameter ``given``.
+    """Replace the parameter ``given`` of a command by the options of a source.
 
     Args:
         without: options that the command does not take.
@@ -298,7 +298,7 @@ def reads_source(
 
 
 def _parameters(function: Callable[..., object]) -> list[inspect.Parameter]:
-    """The parameters of a function with their annotations evaluated."""
+    """The parameters of a function, with evaluated annotations."""
     hints = get_type_hints(function, localns=_NAMES, include_extras=True)
     return [
         parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
@@ -307,7 +307,7 @@ def _parameters(function: Callable[..., object]) -> list[inspect.Parameter]:
 
 
 def require_data(options: SourceOptions) -> None:
-    """Refuse a command that names no data where there is no KITTI either.
+    """Refuse a command that names no data if there is no KITTI data either.
 
     Raises:
         InputError: there is nothing to read.
@@ -317,10 +317,10 @@ def require_data(options: SourceOptions) -> None:
 
 
 def kind_of_source(options: SourceOptions) -> str:
-    """What the options say the data is, or what is found there.
+    """The kind of data that the options name, or that is detected.
 
     Raises:
-        InputError: there is nothing to read, or nothing that is known.
+        InputError: there is nothing to read, or its kind is unknown.
     """
     from vslam.datasets.detection import detect_dataset
 
@@ -329,7 +329,7 @@ def kind_of_source(options: SourceOptions) -> str:
 
 
 def open_given(options: SourceOptions, told: Console) -> Source:
-    """Open the source that the options name, with a bar while a town is rendered.
+    """Open the source that the options name; a bar shows the rendering of a town.
 
     Raises:
         InputError: as `vslam.datasets.sources.open_source`, or there is nothing to read.

@@ -1,4 +1,4 @@
-"""The progress bar of a run."""
+"""Progress bars of commands, drawn on stderr so that stdout stays for results."""
 
 from __future__ import annotations
 
@@ -30,11 +30,10 @@ class _FramesPerSecond(ProgressColumn):
 
 @contextmanager
 def progress_bar(total: int | None) -> Iterator[Callable[[TrackResult], None]]:
-    """Yield the callable to give each tracked frame to: frames, fps, tracking state, time left.
+    """Show frames, fps, tracking state and time left; yield the callable that takes each frame.
 
-    ``total`` is about how many frames there are, None where nobody knows.
-
-    The bar is drawn on stderr, so that stdout stays for results.
+    Args:
+        total: approximate number of frames, None if unknown.
     """
     columns = (
         MofNCompleteColumn(),
@@ -54,7 +53,7 @@ def progress_bar(total: int | None) -> Iterator[Callable[[TrackResult], None]]:
 
 @contextmanager
 def render_bar() -> Iterator[Callable[[int, int], None]]:
-    """Yield the callable that takes frames rendered and in all; no bar until its first call."""
+    """Yield the callable that takes the frames rendered and their total; it draws the bar."""
     columns = (
         TextColumn("rendering"),
         MofNCompleteColumn(),
@@ -80,7 +79,7 @@ def render_bar() -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def training_bar() -> Iterator[Callable[[int, int, int, float], None]]:
-    """Yield the callable that takes epoch, step, steps of the epoch and loss of a training."""
+    """Yield the callable that takes epoch, step, steps per epoch and loss of a training."""
     columns = (
         TextColumn("epoch {task.fields[epoch]}"),
         MofNCompleteColumn(),
@@ -101,7 +100,7 @@ def training_bar() -> Iterator[Callable[[int, int, int, float], None]]:
 
 @contextmanager
 def count_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """Yield the callable to call after each of ``total`` things."""
+    """Yield the callable that counts one of ``total`` items as done."""
     columns = (TextColumn(what), MofNCompleteColumn(), BarColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task("", total=total)
@@ -109,5 +108,5 @@ def count_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
 
 
 def announce(message: str) -> None:
-    """Say on stderr what takes a while."""
+    """Print a message on stderr."""
     Console(stderr=True).print(message)

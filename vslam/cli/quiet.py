@@ -1,5 +1,7 @@
-"""What ``progress.py`` draws, for a run that shows nothing: rich takes as long to import as forty
-frames to track."""
+"""The functions of ``progress.py`` for a command that shows nothing.
+
+Importing rich takes as long as tracking forty frames.
+"""
 
 from __future__ import annotations
 
@@ -36,4 +38,4 @@ def count_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
 
 
 def announce(message: str) -> None:
-    """Say nothing."""
+    """Print nothing."""

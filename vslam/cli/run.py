@@ -205,14 +205,14 @@ def run(
             raise InputError(
                 "--compare: a run that continues a map has the detector of that map; leave it out."
             )
-        map_file, detector = _map_to_go_on_in(map_file, detector)
+        map_file, detector = _map_to_continue(map_file, detector)
     detector = detector or DEFAULT_DETECTOR
     require_detector(detector, weights)
     beside = _compared(compare, detector)
     if beside and realtime:
         raise InputError(
-            "--compare: in real time each detector would cost the others frames; leave out "
-            "--realtime."
+            "--compare: in real time, each detector would make the others drop frames; leave "
+            "out --realtime."
         )
 
     from vslam.config import Config, load_config
@@ -241,19 +241,18 @@ _BESIDE_RESUME = {"resume", "record", "view", "keep_open", "pages", "ply", "save
 
 
 def _refuse_beside_resume(context: typer.Context) -> None:
-    """A run goes on with its own options."""
+    """Refuse options beside ``--resume``: the run continues with its own."""
     for option in context.command.params:
         source = context.get_parameter_source(option.name or "")
         given = source is not None and source.name == "COMMANDLINE"
         if given and option.name not in _BESIDE_RESUME:
             raise InputError(
-                f"{option.opts[0]}: a run that is resumed goes on with its own options; leave it "
-                "out."
+                f"{option.opts[0]}: a resumed run continues with its own options; leave it out."
             )
 
 
 def _compared(names: str, detector: str) -> tuple[str, ...]:
-    """The detectors of ``--compare``, each once."""
+    """The detectors of ``--compare``, without repetitions."""
     from vslam.loopclosure.registry import require_detector
     from vslam.loopclosure.siamese.weights import NETWORKS, SHIPPED
 
@@ -267,14 +266,16 @@ def _compared(names: str, detector: str) -> tuple[str, ...]:
         require_detector(name, option="--compare")
     if detector in found:
         raise InputError(
-            f"--compare {detector}: this is the detector that the run itself has; name another."
+            f"--compare {detector}: this is the detector of the run itself; name another."
         )
     return found
 
 
-def _map_to_go_on_in(file: Path, detector: DetectorName | None) -> tuple[Path, DetectorName]:
-    """The map of a file or of the folder of a run, and the detector that it was made with. The path
-    is absolute: ``runs/latest`` will be another folder once this run has one."""
+def _map_to_continue(file: Path, detector: DetectorName | None) -> tuple[Path, DetectorName]:
+    """The map of a file or of the folder of a run, and the detector that it was made with.
+
+    The path is absolute, because ``runs/latest`` changes when this run creates its folder.
+    """
     from vslam.maps.storage import made_with, map_file_of
 
     file = map_file_of(file)

@@ -1,4 +1,4 @@
-"""The command ``vslam stress``: at which strength of each law does a run fail."""
+"""The command ``vslam stress``: the strength of each law at which a run fails."""
 
 from __future__ import annotations
 
@@ -264,7 +264,7 @@ def foreign(
     no_report: Annotated[bool, typer.Option("--no-report")] = False,
     quiet: Annotated[bool, typer.Option("--quiet")] = False,
 ) -> None:
-    """Run another system as [b]vslam run[/b] would run vslam: for [b]vslam stress[/b]."""
+    """Run another system in the way [b]vslam run[/b] runs vslam, for [b]vslam stress[/b]."""
     from vslam.cli.console import console
     from vslam.config import load_config
     from vslam.datasets.perturbation import parse_perturbation
@@ -286,7 +286,7 @@ def foreign(
 def _others(
     systems: list[str], given: list[str], python: Path | None, vocabulary: Path | None
 ) -> dict[str, str]:
-    """Command templates of the systems that are not vslam."""
+    """Command templates of the other systems."""
     from vslam.lab.stress import orbslam3
     from vslam.lab.stress.external import check_template
 
@@ -321,7 +321,7 @@ def _program(name: str, template: str) -> tuple[str, ...]:
 
 
 def _fitting(laws: list[str], opened: Mapping[str, Source]) -> tuple[list[str], list[str]]:
-    """The laws that every sequence has the data for, and a note of each other one."""
+    """The laws that every sequence has the data for, and a note on each of the others."""
     from vslam.datasets.perturbation import laws_for
 
     notes: dict[str, None] = {}

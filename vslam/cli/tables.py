@@ -26,12 +26,12 @@ def show_sections(sections: Iterable[Section]) -> None:
 
 
 def print_rows(rows: Rows) -> None:
-    """Print names and values, the values one below the other."""
+    """Print names and values in two columns."""
     show_sections([Section("", [Pairs(rows)])])
 
 
 def print_summary(report: ReportJson, folder: Path) -> None:
-    """Print the first sections of the page of a run that is over; ``folder`` holds its results."""
+    """Print the first sections of the report of a finished run, whose results are in ``folder``."""
     from vslam.report.run_page import run_page
 
     page = run_page(report)
@@ -43,8 +43,8 @@ def print_summary(report: ReportJson, folder: Path) -> None:
 
 
 def _how_to_compare(report: ReportJson) -> Rows:
-    """What to type for a comparison, where the ground truth could judge one."""
-    refused = report.realtime or report.map is not None  # as of the command line
+    """How to compare detectors, if the run has a ground truth to judge them."""
+    refused = report.realtime or report.map is not None  # by the command line
     if report.detectors or report.compare or report.alignment is None or refused:
         return []
     if report.detector in ("bow", "none"):

@@ -1,6 +1,6 @@
 """The commands ``vslam train`` and ``vslam export`` of networks.
 
-The libraries of the extra ``train`` are imported inside the commands, since ``vslam`` has to start
+The libraries of the extra ``train`` are imported inside the commands, because ``vslam`` must start
 without them.
 """
 
@@ -246,10 +246,9 @@ def train(
 
 
 def _require_libraries(command: str) -> None:
-    """Refuse a command that the installed packages cannot carry out.
+    """Refuse a command for which a package is missing.
 
-    All of them are looked for before the command starts: the export that follows a training imports
-    onnxscript hours later.
+    All are checked before the command starts: a training needs onnxscript only hours later.
 
     Raises:
         InputError: one of the packages of the extra ``train`` is not installed.
@@ -264,7 +263,7 @@ def _require_libraries(command: str) -> None:
 
 
 def _refuse_of_pcanet(given: dict[str, object]) -> None:
-    """Refuse options of a training in steps; ``given`` are their values, None where not given."""
+    """Refuse options that need several steps of training; ``given`` has their values or None."""
     from vslam.errors import InputError
 
     for option in (name for name, value in given.items() if value is not None):

@@ -1,4 +1,4 @@
-"""The commands ``vslam vocabulary ...``: train, convert and look at visual vocabularies."""
+"""The commands ``vslam vocabulary ...``: train, convert and show visual vocabularies."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def train(
     from vslam.loopclosure import vocabulary_training
     from vslam.loopclosure.vocabulary_text import is_text, write_vocabulary
 
-    is_text(out)  # refuse what cannot be written before the work, not after
+    is_text(out)  # refuses an unknown ending before the work begins
     if not out.parent.is_dir():
         raise InputError(f"{out}: there is no folder {out.parent}; create it or choose another.")
     paths = _find(images)
@@ -138,7 +138,7 @@ def info(
 
 
 def _find(images: list[str]) -> list[Path]:
-    """Image files, those of a folder or glob in order of their names, each once."""
+    """The image files of all folders and globs, sorted by name and without repetitions."""
     import glob
 
     found: dict[Path, None] = {}

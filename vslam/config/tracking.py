@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from vslam.config.section import Section
@@ -10,6 +12,15 @@ from vslam.config.section import Section
 class TrackingConfig(Section):
     """Frame-to-map tracking."""
 
+    method: Literal["orb", "patches"] = "orb"
+    """How frames are tracked: `orb` matches ORB features in every frame; `patches` looks for image
+    patches of the landmarks, and extracts features only where a keyframe is due or patches fail
+    (Forster et al., T-RO 2017). RGB-D cameras are always tracked by features. [own]"""
+    patch_min_inliers: int = Field(40, ge=10)
+    """Features are extracted for a frame in which fewer patches than this are found. [own]"""
+    patch_min_inlier_ratio: float = Field(0.5, ge=0, le=1)
+    """Features are extracted for a frame of whose patches a smaller share than this agrees on a
+    pose. [own]"""
     match_distance: int = Field(100, ge=0, le=256)
     """Upper bound of the descriptor distance when landmarks are matched near their projections, in
     bits. [OS1 V-D, customary]"""

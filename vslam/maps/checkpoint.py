@@ -29,6 +29,7 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "descriptors": (np.uint8, ("N", 32)),
     "u_right": (np.float32, ("N",)),
     "landmark": (np.int32, ("N",)),
+    "coarse": (np.uint8, ("Q",)),
     "patch_keyframe": (np.int64, ("M",)),
     "patch_pixels": (np.uint8, ("R", PATCH_PIXELS)),
     "patch_shift": (np.float32, ("R", 2)),
@@ -47,6 +48,7 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
     return {
         **{name: getattr(tracker.features, name) for name in FEATURES},
         "landmark": tracker.landmark,
+        "coarse": tracker.coarse,
         "patch_keyframe": np.array([one.keyframe for one in patches], np.int64),
         "patch_pixels": np.concatenate([one.pixels for one in (none, *patches)]),
         "patch_shift": np.concatenate([one.shift for one in (none, *patches)]),
@@ -92,6 +94,7 @@ def checked_checkpoint(
     """
     sizes = {
         "N": len(arrays["landmark"]),
+        "Q": len(arrays["coarse"]),
         "M": len(arrays["patch_keyframe"]),
         "R": len(arrays["patch_shift"]),
     }
@@ -130,6 +133,7 @@ def checked_checkpoint(
             landmark=landmark,
             T_cw=_pose(T_cw),
             twist=None if twist is None else _numbers(twist, 6),
+            coarse=arrays["coarse"],
             **tracker,
         ),
         mapper=MapperState(
@@ -138,7 +142,9 @@ def checked_checkpoint(
             last_timestamp=-np.inf if last_timestamp == -np.inf else _number(last_timestamp),
             patches=_patches_of(arrays, map_.arrays.first_row[: map_.n_keyframes + 1]),
         ),
-        policy=PolicyState(_number(policy["gained_close"]), policy["gain_awaited"]),
+        policy=PolicyState(
+            _number(policy["gained_close"]), policy["gain_awaited"], _count(policy["first_close"])
+        ),
         closing=_closing_of(entry["closing"], map_.n_keyframes),
         rig=tuple(_numbers(entry["rig"]).tolist()),
     )

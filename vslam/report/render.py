@@ -119,8 +119,14 @@ def fill_template(template: str, **values: object) -> str:
         lstrip_blocks=True,
     )
     environment.filters["kind"] = lambda part: type(part).__name__
+    environment.filters["heading_lines"] = _heading_lines
     environment.tests["shown"] = _is_shown
     return environment.get_template(template).render(**values)
+
+
+def _heading_lines(name: str) -> list[str]:
+    """The heading of a column, broken at commas and brackets."""
+    return re.split(r", | (?=\()", name)
 
 
 def _is_shown(part: Part) -> bool:
@@ -191,7 +197,7 @@ def rich_table(table: Table, gap: int) -> RichTable:
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    heads = [re.split(r", | (?=\()", name) for name in table.head]
+    heads = [_heading_lines(name) for name in table.head]
     columns = zip(*table.rows, strict=True) if table.rows else [()] * len(heads)
     widths = [max(map(len, [*head, *cells])) for head, cells in zip(heads, columns, strict=True)]
     made = RichTable(

@@ -123,11 +123,8 @@ def _map_note(report: ReportJson) -> str:
 def _loops(report: ReportJson) -> Tile:
     notes = []
     if report.revisit_stretches is not None:
-        notes += [
-            _revisits(report),
-            f"{report.loops_missed} missed",
-            f"{report.loops_wrong} wrong",
-        ]
+        missed = [f"{report.loops_missed} missed"] if report.revisit_stretches else []
+        notes += [_revisits(report), *missed, f"{report.loops_wrong} wrong"]
     if report.detector == "none":
         return Tile("Loops", "off", "no detector; " + ", ".join(notes[:1]) if notes else "")
     notes.append(f"{report.loops_rejected} candidates rejected")

@@ -210,13 +210,11 @@ class _Run:
         timestamp, frame = played.timestamp, played.made
         if frame is None or frame.dropped:
             result, sides = self.slam.skip(timestamp, dropped=True), None
-        elif frame.extracted is None or frame.image is None:
+        elif frame.images is None:
             result, sides = self.slam.skip(timestamp), frame.sides
             self.skipped.append(f"frame {len(self.tracks)}: {frame.problem}")
         else:
-            result = self.slam.step_features(
-                frame.extracted, timestamp, frame.image, frame.stage_ms
-            )
+            result = self.slam.step_images(frame.images, timestamp, frame.stage_ms)
             sides = frame.sides
             if self.settings.realtime:
                 self.latency_ms.append(1e3 * (time.perf_counter() - played.came))
@@ -264,9 +262,9 @@ def _show(
 ) -> int:
     """Show the recorder a frame, and the map while it can be read; returns the loops told."""
     recorder.frame(result, result.T_wc)
-    left = None if played.made is None else played.made.image
-    if result.is_keyframe and slam.frame is not None and left is not None:
-        recorder.keyframe(result, left, slam.frame.features, slam.frame.landmark >= 0)
+    images = None if played.made is None else played.made.images
+    if result.is_keyframe and slam.frame is not None and images is not None:
+        recorder.keyframe(result, images.left, slam.frame.features, slam.frame.landmark >= 0)
     if slam.is_mapping:
         return n_told
     recorder.map(slam.map)

@@ -14,13 +14,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vslam.camera import DepthImage, Image, ImageMap
 from vslam.datasets.frames import TimedFrame
 from vslam.errors import DroppedFrameError, UnreadableImageError
-from vslam.features import Extracted, Side
-from vslam.frontend.extraction import extract_features
+from vslam.frontend.extraction import FrameImages
 from vslam.frontend.sides import Sides, compare_sides
 from vslam.frontend.tracking import TrackingContext
 from vslam.run.outcome import RunSettings
@@ -29,11 +27,10 @@ from vslam.run.realtime import Played, play
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame ready to be tracked, with the image that its features are of, or the reason why it
-    cannot be read; ``dropped`` by a perturbation."""
+    """A frame ready to be tracked, or the reason why it cannot be read; ``dropped`` by a
+    perturbation."""
 
-    image: NDArray[np.uint8] | None
-    extracted: Extracted | None
+    images: FrameImages | None
     stage_ms: dict[str, float]
     problem: str | None = None
     dropped: bool = False
@@ -90,14 +87,15 @@ def prepare_frame(
         left, second = frame.read(image_map)
     except UnreadableImageError as error:
         dropped = isinstance(error, DroppedFrameError)
-        return PreparedFrame(None, None, {}, str(error), dropped)
+        return PreparedFrame(None, {}, str(error), dropped)
     read = time.perf_counter()
     sides = _sides(left, second, context)
-    extracted = extract_features(left, second, context, image_map, sides)
+    images = FrameImages(left, second, context, image_map, sides)
+    if not context.tracks_patches:
+        images.extracted  # noqa: B018
     done = time.perf_counter()
     stage_ms = {"read": 1e3 * (read - start), "extract": 1e3 * (done - read)}
-    image = np.asarray(second, np.uint8) if extracted.side == Side.RIGHT else left
-    return PreparedFrame(image, extracted, stage_ms, sides=sides)
+    return PreparedFrame(images, stage_ms, sides=sides)
 
 
 def _sides(left: Image, second: Image | DepthImage | None, context: TrackingContext) -> Sides:

@@ -47,7 +47,7 @@ from vslam.backend.loop_correction import move_keyframes
 from vslam.backend.pose_graph import check_pose_graph, essential_graph, load_optimiser
 from vslam.camera import Camera
 from vslam.closing import LoopClosing
-from vslam.config import Config, DepthConfig, KeyframeConfig, MappingConfig
+from vslam.config import Config, DepthConfig, KeyframeConfig, MappingConfig, TrackingConfig
 from vslam.datasets.png import unfilter
 from vslam.features import Extracted, Features
 from vslam.frontend import pnp
@@ -154,6 +154,7 @@ def run_everything() -> None:
     wall. This reaches all branches of tracking, triangulation, fusion and bundle adjustment."""
     every_frame = KeyframeConfig(max_interval_s=0.05, merge_after_frames=1)
     run_slam(Config(keyframes=every_frame), FRAMES)
+    run_slam(Config(tracking=TrackingConfig(method="patches")), FRAMES)
     decode_image()
 
 

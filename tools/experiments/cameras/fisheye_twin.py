@@ -1,10 +1,10 @@
-"""SLAM on a rendered fisheye pair against its rectified twin: ATE of both.
+"""Compare the ATE on a rendered fisheye pair with that on its rectified twin.
 
     vslam synth block --fisheye --max-frames 100 --out fisheye
     python tools/experiments/cameras/fisheye_twin.py fisheye block
 
-The twin is cut out of the pinhole images that the fisheye ones were warped from, pixel by pixel
-without resampling: of the size of the fisheye images, about the route's own principal point.
+The twin is a crop, without resampling, of the pinhole images from which the fisheye images were
+warped. It has the size of the fisheye images and contains the route's principal point.
 """
 
 from __future__ import annotations

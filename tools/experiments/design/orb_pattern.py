@@ -1,10 +1,10 @@
 """Measure the 256 point pairs that OpenCV's ORB compares, and write them for vslam.frontend.
 
-vslam's extraction is its own, but its descriptors should mean the same as everybody's, so that
-vocabularies trained elsewhere stay usable. The sampling pattern (learned by Rublee et al., ICCV
-2011, section 4.3) is therefore observed from outside: one bright (dark) dot is moved over the
-patch of a keypoint at angle 0, and every bit tells for which positions its second (first) point
-outshines the other. OpenCV smooths the image before it samples, so that a dot acts within 3 px.
+vslam has its own extraction, but its descriptors should be compatible with others, so that
+vocabularies trained elsewhere can be used. The sampling pattern (learned by Rublee et al., ICCV
+2011, section 4.3) is therefore measured: one bright (dark) dot is moved over the patch of a
+keypoint at angle 0, and each bit shows at which positions its second (first) point is brighter.
+OpenCV smooths the image before sampling, so that a dot has an effect within 3 px.
 
 usage: python tools/experiments/design/orb_pattern.py frontend/orb_pattern.npy
 """
@@ -53,7 +53,7 @@ def expected(a: tuple[int, int], b: tuple[int, int]) -> np.ndarray:
 def solve(bright: np.ndarray, dark: np.ndarray) -> tuple[int, int, int, int]:
     """``x_a, y_a, x_b, y_b`` that explain the responses of one bit best.
 
-    The fit need not be exact: OpenCV smooths in integers, which breaks ties between two points
+    The fit need not be exact, because OpenCV's integer smoothing breaks ties between two points
     whose windows overlap.
     """
 

@@ -1,7 +1,6 @@
-r"""Let every part of a run fail once, and write down what the run says and leaves.
+r"""Let every part of a run fail once, and record the run's messages and results.
 
-The points and the judgement are those of the tests (tests/faults.py): this tool takes all of them,
-with every fault.
+This tool injects every fault at every point of tests/faults.py, which also judges the outcomes.
 
     python tools/experiments/lifelong/inject_faults.py --out docs/research/lifelong/faults.csv
 """
@@ -19,7 +18,7 @@ from collections.abc import Collection
 from dataclasses import astuple, fields
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads would not be in a fork
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # a fork would lack its threads
 sys.path.insert(0, str(Path(__file__).parents[3] / "tests"))
 from faults import FAULTS, POINTS, Row, inject, load_everything, run_in_fork, write_ring
 
@@ -27,11 +26,11 @@ from faults import FAULTS, POINTS, Row, inject, load_everything, run_in_fork, wr
 def inject_all(
     work: Path, points: Collection[str], faults: Collection[str], seed: int, *, once: bool
 ) -> list[Row]:
-    """Inject faults at each of the points that are named, and print what became of each.
+    """Inject faults at the given points, and print the outcome of each.
 
     Args:
         work: an empty folder.
-        once: one of the faults at each point, drawn from the seed, instead of all.
+        once: inject one fault per point, drawn from the seed, instead of all.
     """
     load_everything()
     rows = []
@@ -39,7 +38,7 @@ def inject_all(
     words = ["run", "--data", str(root), "--quiet", "--no-record", "--no-report"]
     code = run_in_fork([*words, "--out", str(work / "whole")], work / "log", lambda: None)
     if code != 0:
-        sys.exit(f"the run that is not disturbed fails: {(work / 'log').read_text()}")
+        sys.exit(f"the undisturbed run fails: {(work / 'log').read_text()}")
     whole = (work / "whole" / "latest" / "trajectory.tum").read_bytes()
     for point in POINTS:
         if point.name not in points:
@@ -58,11 +57,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", nargs="+", default=[point.name for point in POINTS])
     parser.add_argument("--faults", nargs="+", choices=FAULTS, default=list(FAULTS))
-    parser.add_argument("--once", action="store_true", help="one fault a point, drawn by the seed")
+    parser.add_argument(
+        "--once", action="store_true", help="one fault per point, drawn from the seed"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="CSV table of all injections")
     options = parser.parse_args()
-    work = Path(tempfile.mkdtemp())  # a TemporaryDirectory would go when a fork ends
+    work = Path(tempfile.mkdtemp())  # a fork that ends would delete a TemporaryDirectory
     try:
         rows = inject_all(work, options.points, options.faults, options.seed, once=options.once)
     finally:

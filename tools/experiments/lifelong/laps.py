@@ -1,17 +1,17 @@
-r"""Drive a route that closes on itself for ever: what the map, the time and the error do, by lap.
+r"""Drive many laps of a closed route, and record map size, time and error for each lap.
 
-The frames of a rendered route are linked into laps: where the route passes its own beginning again,
-its last frame is followed by the next one of the first pass, so that nothing leaps. Times and
-ground truth go on. With ``--lights N`` lap k is driven in light k mod N, the walk of ``brightness``
-of that seed, light 0 being as rendered. ``--incidents`` mixes in what happens to a camera: frames
-dropped, black images, and cuts to another place of the route, most of them to another light, too.
+The frames of a rendered route are linked into laps: where the route returns to its beginning, the
+last frame is followed by the matching frame of the first pass, so that the motion is continuous.
+Times and ground truth continue. With ``--lights N``, lap k is driven in light k mod N: light 0 is
+as rendered, the others are ``brightness`` with that seed. ``--incidents`` adds dropped frames,
+black images, and jumps to another place of the route, most of them with another light.
 
     python tools/experiments/lifelong/laps.py --laps 20 --out docs/research/lifelong/laps.csv
     python tools/experiments/lifelong/laps.py --laps 60 --lights 4 --incidents \
         --figure docs/research/lifelong/soak.svg
 
-A frame in a light is prepared once; the milliseconds are of tracking and mapping it. Ctrl-C ends
-after the lap under way, and what is done so far is written.
+Features are extracted once for each frame and light; the milliseconds are those of tracking and
+mapping. Ctrl-C ends the drive after the current lap, and the results so far are written.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from vslam.run.warmup import compile_kernels
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory
 
-DEGREE_M = 0.05  # what a degree counts for, where the seam is looked for
+DEGREE_M = 0.05  # metres that a degree counts for in the search for the seam
 MAX_SEAM_M, MAX_SEAM_DEG = 0.5, 2.0
 LIGHT = "brightness:1.0"
 BLACK = -1
@@ -55,16 +55,16 @@ COLUMNS = (
 
 
 def find_seam(T_wc: NDArray[np.float64]) -> tuple[int, int]:
-    """The two frames of a route that are most alike in pose, half a route apart at least.
+    """The two frames of a route with the most similar poses, at least half a route apart.
 
     Args:
         T_wc: ``(N, 4, 4)`` true poses.
 
     Returns:
-        The later frame and the earlier one that it lies on.
+        The later frame, and the earlier one at the same place.
 
     Raises:
-        InputError: the route does not pass its beginning again.
+        InputError: the route does not return to its beginning.
     """
     half = len(T_wc) // 2
     position, forward = T_wc[:, :3, 3], T_wc[:, :3, 2]
@@ -81,14 +81,14 @@ def find_seam(T_wc: NDArray[np.float64]) -> tuple[int, int]:
 
 @dataclass
 class Laps:
-    """N frames to be driven; those dropped are left out, their times are not.
+    """N frames to drive, without dropped ones, whose times still pass.
 
     Attributes:
-        frame: of the route, or BLACK.
-        place: of the route, where the camera is.
-        lap: from 1.
+        frame: frame of the route, or BLACK.
+        place: frame of the route at whose place the camera is.
+        lap: number of the lap, from 1.
         light: 0 is as rendered.
-        step: of the clock.
+        step: number of the clock tick.
     """
 
     frame: list[int] = field(default_factory=list)
@@ -107,13 +107,13 @@ class Laps:
 
 
 def plan_laps(seam: tuple[int, int], laps: int, lights: int, seed: int | None = None) -> Laps:
-    """Drive from frame 0 to the seam, then round and round.
+    """Drive from frame 0 to the seam, then in laps.
 
     Args:
-        seam: as of ``find_seam``.
-        seed: of the incidents; None for none. They begin with the third lap. About once in 100
-            frames up to 10 are dropped, or up to 15 are black; once in 400 the camera is somewhere
-            else, and has the light of another lap from there on.
+        seam: result of ``find_seam``.
+        seed: seed of the incidents, which begin in the third lap; None for no incidents. About once
+            in 100 frames, up to 10 frames are dropped or up to 15 are black; once in 400, the
+            camera jumps to another place and gets the light of another lap.
     """
     late, early = seam
     length, rng = late - early, np.random.default_rng(seed)
@@ -140,14 +140,14 @@ def plan_laps(seam: tuple[int, int], laps: int, lights: int, seed: int | None = 
 
 
 class PreparedRoute:
-    """Features of the frames of a route in each light, extracted when they are first wanted."""
+    """Features of the frames of a route in each light, extracted on first use."""
 
     def __init__(self, route: Source, context: TrackingContext, threads: int, seed: int) -> None:
         self._route, self._context, self._threads, self._seed = route, context, threads, seed
         self._lights: dict[int, list[Extracted]] = {}
 
     def extracted(self, frame: int, light: int) -> Extracted:
-        """Of a frame of the route, or of a black one."""
+        """Features of a frame of the route, or of a black image."""
         if frame == BLACK:
             return Extracted.nothing()
         if light not in self._lights:
@@ -158,8 +158,8 @@ class PreparedRoute:
         spec = LIGHT if light else "none"
         changed = perturbed(self._route.frames(), parse_perturbation(spec, self._seed + light))
         for _, prepared in prepared_frames(changed, self._context, self._threads):
-            assert prepared.extracted is not None, prepared.problem
-            yield prepared.extracted
+            assert prepared.images is not None, prepared.problem
+            yield prepared.images.extracted
 
 
 def resident_mb() -> float:
@@ -169,7 +169,7 @@ def resident_mb() -> float:
 
 @dataclass
 class Drive:
-    """Laps under way: SLAM, what it said of each frame, and what is true."""
+    """The state of a drive: SLAM, its result for each frame, and the ground truth."""
 
     slam: Slam
     laps: Laps
@@ -178,8 +178,8 @@ class Drive:
     tracks: list[TrackResult] = field(default_factory=list)
 
     def row(self, first: int, cpu_s: float) -> list[int | str]:
-        """``COLUMNS`` of the frames from ``first`` on; ``ate_m`` is of all tracked frames so far,
-        ``wrong_loops`` too."""
+        """``COLUMNS`` for the frames from ``first`` on; ``ate_m`` and ``wrong_loops`` are for all
+        frames so far."""
         slam, done, memory = self.slam, len(self.tracks), resident_mb()
         results = self.tracks[first:]
         waits = [result.stage_ms.get("wait_for_mapping", 0.0) for result in results]
@@ -208,7 +208,7 @@ class Drive:
 
 
 def drive(run: Drive, prepared: PreparedRoute) -> Iterator[list[int | str]]:
-    """Run SLAM over the laps; yields a row when each is done."""
+    """Run SLAM over the laps; yields a row at the end of each lap."""
     laps, slam, first, cpu = run.laps, run.slam, 0, 0.0
     for done in range(len(laps.frame)):
         extracted = prepared.extracted(laps.frame[done], laps.light[done])
@@ -218,14 +218,14 @@ def drive(run: Drive, prepared: PreparedRoute) -> Iterator[list[int | str]]:
         last = done + 1 == len(laps.frame)
         if last:
             slam.finish()
-        # The map can be looked at when no keyframe is being mapped: a frame or two later.
+        # The map can only be read when no keyframe is being mapped, a frame or two later.
         if last or (laps.lap[done] != laps.lap[first] and not slam.is_mapping):
             yield run.row(first, cpu)
             first, cpu = done + 1, 0.0
 
 
 def draw(rows: list[list[int | str]], path: Path) -> None:
-    """The map, the cost and the memory over the frames."""
+    """Plot map size, cost and memory over the frames."""
     import matplotlib as mpl
 
     mpl.use("Agg")

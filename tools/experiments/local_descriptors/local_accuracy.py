@@ -1,8 +1,8 @@
-r"""How well local descriptors match under each condition: learned ones and ORB, on rendered pairs.
+r"""Compare matching by learned local descriptors and by ORB on rendered pairs of views.
 
-Pairs of views of test towns, whose depth and motion are exact: share of the matches within 3 pixels
-of the truth, and the error of the pose that P3P and its refinement make of them. The keypoints of
-the first view are ORB's in both cases. Writes a CSV table.
+The pairs show test towns with exact depth and motion. For each condition, a CSV table gives the
+share of the matches within 3 pixels of the truth, and the error of the pose from P3P and its
+refinement. Both use the ORB keypoints of the first view.
 
     python tools/experiments/local_descriptors/local_accuracy.py --pairs 24 \
         --out docs/research/loops/local_descriptors.csv
@@ -44,11 +44,11 @@ from vslam.reprojection import stack_uvr
 
 CONFIG = Config()
 PIXELS = 3.0
-DEPTHS = 1.0, 80.0  # m, of keypoints that count
+DEPTHS = 1.0, 80.0  # range of the depths of evaluated keypoints, m
 
 
 class Condition(NamedTuple):
-    """What differs in the second view: metres to the right, degrees, town, hour of the drive."""
+    """Changes in the second view: metres to the right, degrees, town, hour of the drive."""
 
     name: str
     lateral: float
@@ -70,7 +70,7 @@ CONDITIONS = (
 
 
 class Errors(NamedTuple):
-    """Of one pair: matches, share of them within 3 pixels, metres and degrees of the pose."""
+    """For one pair: matches, share within 3 pixels, pose errors in metres and degrees."""
 
     matches: int
     within: float
@@ -82,7 +82,7 @@ def judged(
     points: NDArray[np.float64], uv: NDArray[np.float64], sigma: float, camera: Camera,
     T_b_a: NDArray[np.float64],
 ) -> tuple[Errors, NDArray[np.float64] | None]:  # fmt: skip
-    """What matches of points of the first view with pixels of the second are worth, and a pose."""
+    """Evaluate matches of points of the first view with pixels of the second; adds a pose."""
     n = len(points)
     if n < CONFIG.relocalization.min_matches:
         return Errors(n, 0.0, np.inf, np.inf), None
@@ -174,7 +174,7 @@ def refined_by_orb(
     T: NDArray[np.float64], points: NDArray[np.float64], a: Extraction, kept: NDArray[np.int64],
     b: Extraction, camera: Camera,
 ) -> NDArray[np.float64]:  # fmt: skip
-    """A pose that enough ORB matches near its projections agree with, else as it was."""
+    """The pose refined by ORB matches near the projections; unchanged if there are too few."""
     gates = CONFIG.verification
     uv = project(points, T, camera)
     inside = np.flatnonzero(np.isfinite(uv[:, 0]))
@@ -202,7 +202,7 @@ def refined_by_orb(
 def lifted(
     features: Extraction, depth: NDArray[np.float32], camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Keypoints with a depth as points of the camera, and which they are."""
+    """Points in the camera frame of the keypoints with a depth, and their indices."""
     z = depth[tuple(np.rint(features.xy).astype(int).T[::-1])].astype(np.float64)
     kept = np.flatnonzero((z > DEPTHS[0]) & (z < DEPTHS[1]))
     return camera.backproject(features.xy[kept], z[kept]), kept

@@ -1,5 +1,5 @@
-"""Write docs/research/loops/night_runs.csv: short loops that are hard to close, with every
-detector's candidates verified by ORB, by learned descriptors, or by both.
+"""Write docs/research/loops/night_runs.csv: short loops that are hard to close, for each detector
+with verification by ORB, by learned descriptors, or by both.
 
     vslam synth block --seed 501 --change 1    # and so on, with other seeds and drives
     python tools/experiments/local_descriptors/night_runs.py --runs FOLDER --seeds 501-516
@@ -36,7 +36,7 @@ COLUMNS = (
 
 
 def run(drive: str, seed: int, verified_by: str, detectors: list[str], runs: Path) -> ReportJson:
-    """The report of one comparison, which is made if it is not there."""
+    """The report of one comparison, which is run if its report does not exist."""
     folder = runs / f"{drive}-{seed}-{verified_by}".replace(":", "")
     if not (reports := sorted(folder.glob("*/report.json"))):
         config = runs / f"verified-by-{verified_by}.json"
@@ -55,7 +55,7 @@ def run(drive: str, seed: int, verified_by: str, detectors: list[str], runs: Pat
 def row(
     drive: str, detector: str, verified_by: str, reports: dict[int, ReportJson]
 ) -> dict[str, Any]:
-    """The line of a detector through the towns of a drive."""
+    """The row of a detector over the towns of a drive."""
     figures = [
         one for report in reports.values() for one in report.detectors if one.detector == detector
     ]
@@ -83,7 +83,7 @@ def row(
 
 
 def rendered(drive: str, seed: int) -> bool:
-    """Whether all frames of a drive in the town of that seed are there."""
+    """Whether all frames of a drive in the town of that seed are rendered."""
     route, variation = parse_drive(f"{drive}+seed:{seed}")
     root = cache_folder() / folder_name(variation)
     stored = list_stored(cache_folder())

@@ -1,15 +1,15 @@
-"""One route as a camera sees it that is carried about: its parts, out of order, in one sequence.
+"""Write the parts of a route out of order as one sequence, as if the camera were carried about.
 
     python tools/experiments/maps/cut_drive.py demo --parts 4 --overlap 60 --out cut
     vslam stress --data cut --seqs 00 --laws jpeg --steps 1 --seeds 1 --systems vslam,orbslam3 ...
     python tools/experiments/maps/cut_drive.py --score STRESS/kitti-00-none-*
 
-Writes a KITTI tree whose sequence 00 is the parts of ``merge_drives.py``, each in a light of its
-own, first those with even numbers: after each one the camera is somewhere else, a second later. A
-system that keeps several maps begins one after each cut, and joins them where they meet.
+Sequence 00 of the KITTI tree consists of the parts of ``merge_drives.py``, those with even numbers
+first, each in its own light. After each part, the camera is a second later at another place. A
+system with several maps starts a new one after each cut, and joins them where they meet.
 
-``--score`` prints lost frames and the ATE of the tracked ones of run folders: the pose of a frame
-lost between two places is anywhere between them.
+``--score`` prints, for run folders, the lost frames and the ATE of the tracked ones; frames that
+are lost between two places have no meaningful pose.
 """
 
 from __future__ import annotations

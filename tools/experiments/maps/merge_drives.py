@@ -1,12 +1,12 @@
-"""One route driven in parts, each in another light: are their maps made one, and how good is it?
+"""Drive a route in parts, each in another light, and measure how well their maps are merged.
 
     vslam synth 05                                    # once
     python tools/experiments/maps/merge_drives.py 05 --parts 4
 
-The parts overlap by ``--overlap`` frames, and meet where the route comes back. Each has a
-brightness walk of another seed; the long drive beside it has that of the first. Prints which pairs
-of drives truly meet and which were joined by loops of their own, wrong loops, and the ATE (m) of
-all keyframes, of each drive alone, merged, and of the long drive.
+The parts overlap by ``--overlap`` frames, and meet where the route returns. The brightness of each
+part changes with another seed; one long drive with the seed of the first part is the reference.
+Prints which pairs of drives truly meet, which pairs are joined by their own loops, the wrong loops,
+and the ATE (m) of the keyframes of each drive alone, of the merged map, and of the long drive.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ LIMITS = LoopLimits()
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("routes", nargs="+", help="more than one: they must not be joined")
+    parser.add_argument("routes", nargs="+", help="if several, they must not be joined")
     parser.add_argument("--parts", type=int, default=4)
     parser.add_argument("--overlap", type=int, default=100, help="frames")
     parser.add_argument("--detector", default="bow")
@@ -72,7 +72,7 @@ def memory(detector: str):
 
 
 def lit_frames(sequence: Source, frames: range, perturb: str, seed: int) -> Iterator[TimedFrame]:
-    """Some frames of a sequence, in a light of their own."""
+    """Some frames of a sequence, in a light drawn from the seed."""
     some = (frame for k, frame in enumerate(sequence.frames()) if k in frames)
     return perturbed(some, parse_perturbation(perturb, seed))
 
@@ -82,7 +82,7 @@ def drive(sequence: Source, frames: range, detector: str, perturb: str, seed: in
     slam = Slam(sequence.camera, Config(), made, images=images)
     lit = lit_frames(sequence, frames, perturb, seed)
     for timestamp, prepared in prepared_frames(lit, slam.context, 2):
-        slam.step_features(prepared.extracted, timestamp, prepared.image)
+        slam.step_images(prepared.images, timestamp)
     slam.finish()
     stored = slam.stored_map(f"{sequence.name} {frames.start}-{frames[-1]}").compact()
     stored.map.frames[:] = [frames[k] for k in stored.map.frames]
@@ -114,7 +114,7 @@ def tell(merged: MergedMaps, drives, whole: StoredMap | None) -> None:
 
 
 def true_meetings(drives) -> set[tuple[int, int]]:
-    """Pairs with at least 20 m within 5 m and 30 degrees of each other."""
+    """Pairs of drives that, over at least 20 m, are within 5 m and 30 degrees of each other."""
     from scipy.spatial import cKDTree
 
     met = set()
@@ -139,7 +139,7 @@ def is_right(loop: LoopEdge, map_: Map, order: list[int], truth) -> bool:
 
 def ate(map_: Map, T_true: np.ndarray) -> float:
     T_wc = inverses(map_.arrays.T_cw[: map_.n_keyframes])
-    times = np.arange(float(len(T_wc)))  # drives have clocks of their own
+    times = np.arange(float(len(T_wc)))  # because each drive has its own clock
     return evaluate_trajectory(Trajectory(times, T_wc), Trajectory(times, T_true), "se3").ate_rmse_m
 
 

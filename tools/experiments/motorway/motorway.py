@@ -1,14 +1,14 @@
-r"""Where the scale of a stereo drive goes wrong: errors of disparity and motion, and an offset.
+r"""Measure why the scale of a stereo drive is wrong: errors of disparity and matching, offset.
 
     python tools/experiments/motorway/motorway.py errors 01 --frames 10:200:8 \
         --csv docs/research/motorway.csv
     python tools/experiments/motorway/motorway.py offset runs/latest
 
-``errors`` extracts features of a rendered route and compares, with its exact depth and poses, the
-disparity of each and where its best match in the next frame lies: along the motion (away from the
-principal point is positive) and across it, in pixels of the feature's octave. ``offset`` adjusts
-the finished map of a run with all disparities shifted, and prints the offset that fits best, which
-needs no ground truth, with the scale of the keyframes where there is one.
+``errors`` extracts features of a rendered route with exact depth and poses. It measures the error
+of each disparity, and that of the best match in the next frame along the motion (positive away from
+the principal point) and across it, in pixels of the feature's octave. ``offset`` adjusts the
+finished map of a run with all disparities shifted and prints the shift that fits best, which needs
+no ground truth, and the scale of the keyframes if there is ground truth.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from vslam.maps.storage import load_map
 from vslam.trajectory import read_kitti_poses
 
 ZOOMS = (1.0, 1.07, 1.14, 1.22, 1.35)  # depth before over depth after
-WINDOW = 4.0  # px of the octave around the true place, in which a match is looked for
+WINDOW = 4.0  # half width, in px of the octave, of the window in which a match is searched
 MOST_BITS = 50
-FLAT = 0.15  # relative range of depth around a feature whose depth is clear
+FLAT = 0.15  # largest relative range of depth around a feature with a clear depth
 OFFSETS = (-0.2, -0.1, 0.0, 0.1, 0.2)
-SIGMA = 1.4826  # of a normal distribution, over the median of absolute errors
+SIGMA = 1.4826  # ratio of the standard deviation of Gaussian noise to its median absolute error
 SET_BITS = np.array([bin(byte).count("1") for byte in range(256)], np.uint8)
 
 
@@ -62,7 +62,7 @@ class Seen(NamedTuple):
 
 
 class Drive:
-    """A rendered route, drawn anew with its depth."""
+    """A route that is rendered with its depth."""
 
     def __init__(self, route: Route) -> None:
         town = build_town(route, Variation())
@@ -102,7 +102,7 @@ class Drive:
 
 
 def disparity_errors(seen: Seen, camera: Camera) -> NDArray[np.float64]:
-    """``(N, 2)`` octave and error in its pixels, of clear features."""
+    """``(N, 2)`` octave, and error in pixels of the octave, of features with a clear depth."""
     known = seen.clear & np.isfinite(seen.disparity)
     error = seen.disparity[known] - camera.bf / seen.depth[known]
     return np.column_stack([seen.octave[known], error / 1.2 ** seen.octave[known]])
@@ -111,7 +111,8 @@ def disparity_errors(seen: Seen, camera: Camera) -> NDArray[np.float64]:
 def motion_errors(
     one: Seen, two: Seen, T_2_1: NDArray[np.float64], camera: Camera
 ) -> NDArray[np.float64]:
-    """``(N, 4)`` rise in octave, zoom, error along and across, in pixels of the second octave."""
+    """``(N, 4)`` change of octave, zoom, and errors along and across the motion, in pixels of the
+    second octave."""
     points = camera.backproject(one.xy, one.depth) @ T_2_1[:3, :3].T + T_2_1[:3, 3]
     depth = np.maximum(points[:, 2], 0.1)
     expected = camera.project(np.column_stack([points[:, :2], depth]))[:, :2]
@@ -201,7 +202,7 @@ def scale_of(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> float
 
 
 def true_positions(folder: Path, timestamps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of keyframes, by their times."""
+    """True positions of keyframes, by their times."""
     times = np.loadtxt(folder / "trajectory.tum")[:, 0]
     frames = np.abs(times[None] - timestamps[:, None]).argmin(axis=1)
     return read_kitti_poses(folder / "ground_truth_kitti.txt")[frames, :3, 3]

@@ -1,15 +1,15 @@
-"""How sure the rows, columns and disparities of features are, told by finished stereo maps.
+"""Estimate the noise of the columns, rows and disparities of features from finished stereo maps.
 
     python tools/experiments/motorway/noise_model.py runs/one runs/two
 
-Adjusts the map of each run and prints the standard deviations of the errors of u, v and the
-disparity, in pixels of the feature's octave, that explain its residuals: variance components
-(W. Foerstner, "Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten", 1979). The
-squared residuals of a kind are divided by its redundancy, which is the number of its observations
-less what landmarks could follow, so that a kind is not called sure because it is trusted. The
-weights are then those found, and it begins again until they stay. Poses take a share of the
-redundancy that is left out: six numbers for hundreds of observations. u and v are those of aligned
-matches and of what was first seen; of others the variance is taken to be four times theirs.
+The map of each run is adjusted, and the standard deviations of u, v and the disparity, in pixels of
+the feature's octave, are estimated as variance components (W. Foerstner, "Ein Verfahren zur
+Schaetzung von Varianz- und Kovarianzkomponenten", 1979). The squared residuals of each kind are
+divided by its redundancy: the number of observations minus the part that landmarks can fit. A kind
+thus does not seem precise merely because it has a large weight. The adjustment is repeated with the
+new weights until they converge. The degrees of freedom of the poses are neglected, six for hundreds
+of observations. u and v are those of aligned matches and first observations; other matches are
+assumed to have four times their variance.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from vslam.maps.storage import load_map
 
 ROUNDS = 8
 START = (0.5, 0.5, 0.2)  # pixels, of u, v, disparity
-GATE = 4.0  # standard deviations beyond which a residual is an outlier, in any of the three
+GATE = 4.0  # standard deviations; an observation beyond it in any component is an outlier
 
 
 def variance_components(
     problem: BundleProblem, sigma: NDArray[np.float64]
 ) -> tuple[BundleProblem, NDArray[np.float64], int]:
-    """The adjusted problem under ``(3,)`` sigma of u, v, disparity; the ``(3,)`` sigma that its
-    residuals show; the number of stereo observations that count.
+    """Adjust the problem under the ``(3,)`` sigma of u, v, disparity. Returns the adjusted problem,
+    the ``(3,)`` sigma of its residuals, and the number of stereo observations without outliers.
 
-    The program trusts u and v alike, monocular ones, too: so does the adjustment.
+    As in vslam, u and v have the same weight, also in monocular observations.
     """
     pixel = float(np.sqrt(np.mean(sigma[:2] ** 2)))
     certainty = (DISPARITY_WEIGHT / problem.disparity_weights()) ** 2
@@ -94,7 +94,7 @@ def variance_components(
 
 
 def in_cameras(problem: BundleProblem) -> NDArray[np.float64]:
-    """``(O, 3)`` the point of each observation in its camera."""
+    """``(O, 3)`` point of each observation in its camera's frame."""
     point = np.repeat(np.arange(len(problem.points)), np.diff(problem.first))
     T = problem.T_cw[problem.camera]
     return np.einsum("nij,nj->ni", T[:, :3, :3], problem.points[point]) + T[:, :3, 3]

@@ -1,12 +1,12 @@
-"""How alike right and wrong best images are: what a threshold of the learned image test costs.
+"""Count the right and wrong best images that pass each threshold of the learned image test.
 
     python tools/experiments/online/image_test_shares.py block+change:1+seed:18:4:6 05:8:20 ...
 
-Each drive, every so many frames (4, 8), is asked as ``vslam loops bench --protocol online`` asks:
-of the images older by so many seconds (6, 20), the one most like by `capsule`, once among those of
-the same place (within 5 m and 30 degrees), once among those elsewhere (25 m or 60 degrees away).
-Printed is for each threshold on the share of coarse cells that one homography explains, how many of
-both pass. Drives must be rendered (`vslam synth`).
+Arguments are DRIVE:STEP:SECONDS. As in ``vslam loops bench --protocol online``, every STEP-th frame
+of a drive is a query among the images that are at least SECONDS older. Two images are chosen by
+`capsule`: the best one at the same place (within 5 m and 30 degrees) and the best one elsewhere (25
+m or 60 degrees away). For each threshold on the share of coarse cells that one homography explains,
+the numbers of both that pass are printed. Drives must be rendered (`vslam synth`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ THRESHOLDS = np.arange(0.10, 0.41, 0.02)
 
 
 def shares(tree: Path, route: str, step: int, seconds: float) -> tuple[list[float], list[float]]:
-    """Of the best right image of each frame that has one, and of its best wrong image."""
+    """Shares of the best right image of each frame that has one, and of its best wrong image."""
     capsule, local = open_network("capsule"), LocalDescriptors()
     least = LearnedMatchingConfig().coarse_alike
     files = sorted((tree / "sequences" / route / "image_0").iterdir())[::step]

@@ -1,13 +1,13 @@
-"""Does the scale of a monocular drive drift because the focal length is wrong?
+"""Measure how the scale of a monocular drive drifts if the focal length is wrong.
 
     python tools/experiments/results/focal_length.py --data $KITTI_ROOT --seq 00 --frames 500
     python tools/experiments/results/focal_length.py --dataset synthetic --seq 05 --frames 600
 
-Runs the left camera without loop closing, with its focal length as it is given and multiplied by
-``--factors``. Where the camera turns, a wrong focal length changes the scale; where it drives
-straight on, it does not. Prints the ATE after a Sim3 alignment and how much the scale grows by each
-quarter turn and by each 100 m: a linear fit to the logarithm of the length driven over the true
-one, in pieces of ``--piece`` frames.
+The left camera runs without loop closing, with its focal length multiplied by ``--factors``. A
+wrong focal length changes the scale where the camera turns, but not where it drives straight ahead.
+Prints the ATE after Sim3 alignment, and how much the scale grows with each quarter turn and each
+100 m: a linear fit to the logarithm of the ratio of estimated to true length, over pieces of
+``--piece`` frames.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from vslam.trajectory import Trajectory
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--dataset", default="kitti")
-    parser.add_argument("--data", type=Path, help="of the data set, if it has one")
+    parser.add_argument("--data", type=Path, help="folder of the data set, if it has one")
     parser.add_argument("--seq", default="00")
     parser.add_argument("--frames", type=int, default=500)
     parser.add_argument("--factors", type=float, nargs="+", default=[0.97, 1.0, 1.03])
@@ -47,7 +47,7 @@ def main() -> None:
         fx, fy = sequence.camera.fx * factor, sequence.camera.fy * factor
         slam = Slam(replace(sequence.camera, fx=fx, fy=fy), Config())
         for timestamp, prepared in prepared_frames(sequence.frames(), slam.context, 2):
-            slam.step_features(prepared.extracted, timestamp)
+            slam.step_images(prepared.images, timestamp)
         slam.finish()
         estimate = slam.trajectory()
         by_turn, by_metre = scale_drift(estimate.T_wc, truth.T_wc, options.piece)
@@ -59,12 +59,12 @@ def main() -> None:
 def scale_drift(
     T_wc: NDArray[np.float64], T_true: NDArray[np.float64], piece: int
 ) -> tuple[float, float]:
-    """By how much the logarithm of the scale grows with each radian turned, and each metre."""
+    """Growth of the logarithm of the scale per radian of turning, and per metre."""
     ours, theirs = path_length(T_wc), path_length(T_true)
     turned = np.concatenate([[0.0], np.cumsum([angle(*ends) for ends in pairwise(T_true)])])
     edges = np.arange(0, len(T_wc), piece)
     driven, true = np.diff(ours[edges]), np.diff(theirs[edges])
-    moved = (true > 1.0) & (driven > 0.0)  # the frames before a map begins stand still
+    moved = (true > 1.0) & (driven > 0.0)  # before the map begins, the estimate stands still
     middle = (edges[:-1] + piece // 2)[moved]
     columns = np.stack([np.ones(len(middle)), turned[middle], theirs[middle]], axis=1)
     fit = np.linalg.lstsq(columns, np.log(driven[moved] / true[moved]), rcond=None)[0]

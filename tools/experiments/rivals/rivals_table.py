@@ -3,14 +3,14 @@
 python tools/experiments/rivals/rivals_table.py --trained DIR --data SOURCE [--data SOURCE ...]
         [--page docs/research/rivals.md] [--section NAME] [--ways NAMES] [--retime]
 
-DIR is what tools/training/train_rivals.py wrote, SOURCE as of ``vslam loops bench``. Measured are,
-as that command does, descriptors alone: of the networks that were shown the same images, of those
-that computed for the same time, of what is trained on nothing, and of what vslam ships. DIR/bench
-keeps what is measured, a file for each of the four; a network that is there is not measured again,
-save its times with --retime. It also keeps --data and digests of the weights, and is refused with
-others. Tables take the place of what is between the marks in the page, their numbers are written as
-CSV, precision-recall curves and validation AP after each epoch as PNG to a folder beside the page,
-of its name. Another training has a section of its own: marks of that name, a folder in that folder.
+DIR is the output of tools/training/train_rivals.py, SOURCE is a source of ``vslam loops bench``. As
+in that command, descriptors are measured without verification, in four groups: networks trained on
+the same images, networks trained for the same time, untrained detectors, and what vslam ships. The
+measurements of each group are stored in a file in DIR/bench and not repeated, except for times with
+--retime. DIR/bench also stores --data and digests of the weights, and is refused if they differ.
+Tables replace the text between the marks in the page. A folder with the name of the page gets their
+numbers as CSV, and precision-recall curves and validation AP by epoch as PNG. Another training has
+its own section: marks with its name, and a subfolder.
 """
 
 from __future__ import annotations
@@ -66,28 +66,28 @@ KEYFRAMES = "5000"
 WAYS = {
     "images": "Same number of images shown",
     "minutes": "Same time of a core",
-    "untrained": "Hand-crafted, trained on nothing",
-    "shipped": "Other training, not to be compared with the others: what vslam ships",
+    "untrained": "Hand-crafted, without training",
+    "shipped": "Trained differently, so not comparable with the others: what vslam ships",
 }
 SHIPPED = ("bow", "capsule", "capsule-pruned")
 UNTRAINED = ("lsgd",)
 ABSENT = {"FLCNN": "no definition found"}  # of Table 6
 NOTES = {
     "images": "`pcanet` is outside the equal budget, `capsule-pruned` continues from `capsule`.",
-    "untrained": "A score is no probability: there is no accuracy at p = 0.5.",
-    "shipped": "Of the parameters of `bow`, 0.10 M are weights of words; its time of an image "
+    "untrained": "These scores are not probabilities, so there is no accuracy at p = 0.5.",
+    "shipped": "Of the parameters of `bow`, 0.10 M are weights of words; its time per image "
     "excludes the extraction of ORB features, which tracking needs anyway.",
 }
 NOTES["minutes"] = NOTES["images"]
 PAIR = ("capsule", "capsule-pruned")
 _REPEATS = 200
 _COLORS = (BLUE, RED, GREEN, AMBER, VIOLET, GREY)
-_DASHES = ("-", "--")  # of the first six networks, of the rest
+_DASHES = ("-", "--")  # for the first six networks, and the rest
 Row = tuple[str, ...]
 
 
 def main(words: list[str] | None = None) -> None:
-    """Parse the command line, run what is missing and write the tables."""
+    """Parse the command line, measure what is missing and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--trained", type=Path, required=True, help="folder with rivals.csv")
     parser.add_argument("--data", action="append", required=True, help="images to test on")
@@ -150,7 +150,7 @@ def table_of(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def draw_progress(progress: list[dict[str, str]]) -> Figure:
-    """Validation AP over the images shown, of the networks that were shown the same."""
+    """Plot validation AP over the number of images, for the networks trained on the same images."""
     rows = [row for row in progress if row["way"] == "images" and row["network"] not in PAIR[1:]]
     with style.context(STYLE, after_reset=True):
         figure, axes = new_figure("Validation after each epoch", "images shown", "AP", LOW)
@@ -167,7 +167,7 @@ def draw_progress(progress: list[dict[str, str]]) -> Figure:
 
 
 def weights_of(way: str, training: list[dict[str, str]], folder: Path) -> dict[str, Path | None]:
-    """Detectors of a way and their files, None for shipped ones. PCANet is the same in both."""
+    """Detectors of a group and their files, None for shipped ones. PCANet is in both groups."""
     if way in ("shipped", "untrained"):
         return dict.fromkeys(SHIPPED if way == "shipped" else UNTRAINED)
     files: dict[str, Path | None] = {
@@ -179,7 +179,7 @@ def weights_of(way: str, training: list[dict[str, str]], folder: Path) -> dict[s
 
 
 def conditions(detectors: dict[str, dict[str, Path | None]], data: list[str]) -> dict[str, Any]:
-    """What decides what is measured: images, and the weights of all networks there are."""
+    """The conditions of the measurements: images, and the weights of all existing networks."""
     files = {
         f"weights of {way}/{name}": digest(find_weights(name, path))
         for way, named in detectors.items() for name, path in named.items() if name in NETWORKS
@@ -190,7 +190,7 @@ def conditions(detectors: dict[str, dict[str, Path | None]], data: list[str]) ->
 def report(
     path: Path, detectors: dict[str, Path | None], data: list[str], retime: bool
 ) -> LoopsJson:
-    """What a file holds of the detectors, and what it lacks measured and added to it."""
+    """The measurements of the detectors in a file, after measuring and adding missing ones."""
     here = this_machine()
     empty = LoopsJson(
         seed=0, cells=[], gains=[], costs=[], machine=f"{here.cpu}, {here.cores} cores",
@@ -225,7 +225,7 @@ def measured(detectors: dict[str, Path | None], data: list[str]) -> list[Score]:
 def pruning(
     path: Path, detectors: dict[str, dict[str, Path | None]], retime: bool
 ) -> dict[str, list[float]]:
-    """What ``timed_in_turn`` says of ``PAIR`` in each way that has both; a file keeps it."""
+    """``timed_in_turn`` of ``PAIR`` in each group that has both; a file stores the results."""
     known = json.loads(path.read_text()) if path.exists() and not retime else {}
     for way, files in detectors.items():
         if way not in known and set(PAIR) <= set(files):
@@ -235,8 +235,8 @@ def pruning(
 
 
 def timed_in_turn(networks: list[OnnxNetwork]) -> list[float]:
-    """Milliseconds of two networks for an image, medians, and the median of the second's share of
-    the first's time. They take turns, so that what else the machine does slows both."""
+    """Median milliseconds per image of two networks, and the median ratio of the second's time to
+    the first's. They take turns, so that the load of the machine affects both."""
     rng = np.random.default_rng(0)
     images = [rng.integers(0, 256, network.size, np.uint8) for network in networks]
     taken = np.empty((_REPEATS, 2))
@@ -255,7 +255,7 @@ def tables(
     pruned: dict[str, list[float]],
     images: list[str],
 ) -> str:
-    """All tables in Markdown; ``images`` are lines that show the curves of the first way."""
+    """All tables in Markdown; ``images`` are lines that show the curves of the first group."""
     lines: list[str] = []
     head, *rows = table_6(reports, digits=3)
     lost_head, *lost = condition_table(reports)
@@ -279,7 +279,10 @@ def tables(
         if way == "images":
             lines += [line for image in images for line in (image, "")]
     lines += ["### Time of the network alone", "", *markdown_table(*pruning_table(pruned)), ""]
-    lines += [f"Medians of {_REPEATS} turns; less time: median of what each turn saves.", ""]
+    lines += [
+        f"Medians over {_REPEATS} alternating turns; *less time*: median saving per turn.",
+        "",
+    ]
     lines += ["### Training", "", *markdown_table(*training_table(training)), ""]
     return "\n".join(lines)
 
@@ -304,7 +307,7 @@ def table_6(reports: dict[str, LoopsJson], digits: int) -> list[Row]:
 
 
 def condition_table(reports: dict[str, LoopsJson]) -> list[Row]:
-    """Head and rows: what is left under each condition, means of the sets."""
+    """Head and rows: figures under each condition, means of the sets."""
     conditions = ("none", *(f"{kind}:1" for kind in CONDITIONS))
     rows: list[Row] = [("way", "network", *("none", *CONDITIONS))]
     for way, report in reports.items():
@@ -319,7 +322,7 @@ def condition_table(reports: dict[str, LoopsJson]) -> list[Row]:
 
 
 def training_table(training: list[dict[str, str]]) -> tuple[Row, list[Row]]:
-    """Head and rows: how far each network is; of a pruned one, what it continues is added."""
+    """Head and rows: the progress of each network; a pruned one includes its first training."""
     head = ("equal", "network", "images shown", "core minutes", "loss, first and last epoch",
             "validation AP, last two epochs")  # fmt: skip
     rows = []
@@ -364,7 +367,7 @@ def every_score(reports: dict[str, LoopsJson]) -> list[Row]:
 
 
 def accuracy(score: Score) -> float | None:
-    """Balanced, where a pair counts as one of one place at p of 0.5; none for bag of words."""
+    """Balanced accuracy at p = 0.5; None for the bag of words."""
     return score.accuracy["0.5"]
 
 

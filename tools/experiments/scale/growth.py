@@ -1,12 +1,12 @@
-"""How cost and memory grow with the keyframes of a map, by simulation.
+"""Simulate how cost and memory grow with the number of keyframes in a map.
 
     python tools/experiments/scale/growth.py --write docs/research/scale.md \
         --figure docs/research/scale.svg
 
-A town of streets that cross, each driven once: a keyframe every 5 m has 2,000 features, of which
-560 see landmarks, 140 of them new (565 and 132 in the rendered town along KITTI 05); at a crossing
-both streets see some in common. Words of features are drawn as often as training images had them.
-Every size is a process of its own.
+Each street of a town with crossings is driven once. A keyframe every 5 m has 2,000 features, of
+which 560 observe landmarks, 140 of them new (565 and 132 in the rendered town along KITTI 05). At a
+crossing, both streets observe some common landmarks. Words are drawn with their frequency in the
+training images. Each size runs in a separate process.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from vslam.map_view import local_map
 CONFIG = Config()
 CAMERA = Camera(718.856, 718.856, 607.2, 185.2, 0.54, 1241, 376)
 STEP_M, BLOCK = 5.0, 20  # between keyframes, and keyframes between crossings
-FEATURES, NEW, AHEAD = 2000, 140, 3  # landmarks made by a keyframe, keyframes that see them on
+FEATURES, NEW, AHEAD = 2000, 140, 3  # features, new landmarks, further keyframes that see these
 SHARED = 40  # landmarks of a keyframe at a crossing that the other street sees
 REPEATS = 30
 BEGIN, END = "<!-- growth -->\n", "<!-- /growth -->\n"
@@ -50,9 +50,8 @@ SIZES = (1250, 2500, 5000, 10000, 20000, 50000)
 
 @dataclass(frozen=True)
 class Town:
-    """K keyframes: ``T_cw`` (K, 4, 4); ``crossing`` (C, 2) those of two streets at one place;
-    ``observed`` (O, 2) keyframe and landmark, landmarks in order;
-    ``points`` (L, 3) these."""
+    """K keyframes ``T_cw`` (K, 4, 4); ``crossing`` (C, 2) keyframes of two streets at one place;
+    ``observed`` (O, 2) keyframe and landmark, in the order of landmarks; ``points`` (L, 3)."""
 
     T_cw: NDArray[np.float64]
     crossing: NDArray[np.int64]
@@ -61,7 +60,7 @@ class Town:
 
 
 def town(n: int) -> Town:
-    """As many streets along as across, as few as hold ``n`` keyframes."""
+    """A square grid with just enough streets for ``n`` keyframes."""
     streets = max(2, int(np.ceil(np.sqrt(n / (2 * BLOCK)))))
     length = -(-n // (2 * streets))
     street, along = np.divmod(np.arange(n), length)
@@ -91,7 +90,7 @@ def town(n: int) -> Town:
         if across[k] and (place := (round(x), round(z))) in where
     ]
     pairs = np.array(crossing, np.int64).reshape(-1, 2)
-    # One looks ahead and one to the right: what both see stands between.
+    # One camera looks ahead, one to the right; common landmarks are between the two directions.
     common = landmark[pairs[:, 0], :SHARED]
     between = rng.uniform([8, -2, 8], [20, 1, 20], (len(pairs), SHARED, 3))
     points[pairs[:, 0], :SHARED] = T_wc[pairs[:, 0], None, :3, 3] + between
@@ -105,7 +104,7 @@ def town(n: int) -> Town:
 
 
 def bundle(size: int) -> dict[str, float]:
-    """Global bundle adjustment: seconds to prepare, seconds an iteration, memory."""
+    """Global bundle adjustment: seconds of preparation, seconds per iteration, memory."""
     t, rng = town(size), np.random.default_rng(1)
     camera, landmark = t.observed.T
     T = t.T_cw[camera]
@@ -116,7 +115,7 @@ def bundle(size: int) -> dict[str, float]:
     del T, p, u, v
     first = np.searchsorted(landmark, np.arange(len(t.points) + 1))
     moved = se3_exp_many(rng.normal(0, [0.05, 0.05, 0.05, 2e-3, 2e-3, 2e-3], (size, 6)))
-    # The first keyframe is held: it comes last.
+    # The first keyframe is fixed, and fixed cameras come last.
     order = np.roll(np.arange(size), -1)
     number = np.argsort(order)
     T_cw = np.matmul(moved, t.T_cw)[order]
@@ -148,7 +147,7 @@ def bundle(size: int) -> dict[str, float]:
 
 
 def small_part(problem: BundleProblem) -> BundleProblem:
-    """A few points of the problem, alone."""
+    """A part of the problem with a few points."""
     last = int(problem.first[50])
     return BundleProblem(
         problem.T_cw, problem.n_free, problem.points[:50], problem.first[:51],
@@ -185,7 +184,7 @@ def mapped(t: Town) -> Map:
 
 
 def keyframe(size: int) -> dict[str, float]:
-    """What each new keyframe costs that depends on the map, and the memory of map and words."""
+    """Costs of a new keyframe that depend on the map, and the memory of map and words."""
     t = town(size)
     vocabulary = load()
     before = memory("VmRSS")
@@ -239,7 +238,7 @@ def median_ms(call: Callable[[int], object], keyframes: range) -> float:
 
 
 def memory(key: str) -> float:
-    """MB, of this process: ``VmRSS`` now, ``VmHWM`` at most."""
+    """MB of this process: ``VmRSS`` is the current memory, ``VmHWM`` the peak."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(f"{key}:"):
             return int(line.split()[1]) / 2**10
@@ -261,7 +260,7 @@ class Law:
         return self.at_10000 * (n / 1e4) ** self.exponent
 
 
-ROWS = (  # simulation, figure, what it is, unit
+ROWS = (  # simulation, figure, title, unit
     ("keyframe", "query_ms", "loop query, a keyframe", "ms"),
     ("keyframe", "covisible_ms", "covisible keyframes", "ms"),
     ("keyframe", "local_map_ms", "local map for tracking", "ms"),
@@ -278,7 +277,7 @@ Figures = dict[int, dict[str, float]]  # by size; figures by the name of their r
 
 
 def measure(sizes: list[int], limit_mb: float, kept: Path) -> Figures:
-    """Run all simulations that fit into the memory and are not in the file of figures yet."""
+    """Run all simulations that fit into memory and are not yet in the file of figures."""
     found: Figures = {}
     if kept.exists():
         found = {int(size): figures for size, figures in json.loads(kept.read_text()).items()}
@@ -289,7 +288,7 @@ def measure(sizes: list[int], limit_mb: float, kept: Path) -> Figures:
                 continue
             need = needed_mb(found, name, size)
             if need > limit_mb:
-                print(f"{name} {size}: left out, it would need {need / 1e3:.0f} GB")
+                print(f"{name} {size}: left out, because it would need {need / 1e3:.0f} GB")
                 continue
             words = [sys.executable, __file__, "--simulate", name, "--sizes", str(size)]
             done = subprocess.run(words, check=True, capture_output=True, text=True)
@@ -300,7 +299,7 @@ def measure(sizes: list[int], limit_mb: float, kept: Path) -> Figures:
 
 
 def needed_mb(found: Figures, name: str, size: int) -> float:
-    """As the largest size before says, with what is at work besides."""
+    """Estimated memory, extrapolated from the largest smaller size, plus a constant."""
     key = {"bundle": "mb", "keyframe": "map_mb", "loop": "map_mb"}[name]
     known = [(n, figures[key]) for n, figures in found.items() if key in figures and n < size]
     return 1.3 * known[-1][1] * size / known[-1][0] if known else 0.0
@@ -314,7 +313,7 @@ def law(found: Figures, key: str) -> Law:
 
 
 def table(found: Figures, keys: Collection[str] = ()) -> str:
-    """Rows of the figures named, all by default; what was not measured stands in parentheses."""
+    """Rows of the named figures (default: all); extrapolated values are in parentheses."""
     sizes = list(found)
     lines = [
         "| | " + " | ".join(f"{n:,}" for n in sizes) + " | grows as |",
@@ -373,9 +372,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="keyframes")
     parser.add_argument(
-        "--memory", type=float, default=8.0, metavar="GB", help="to be used at most"
+        "--memory", type=float, default=8.0, metavar="GB", help="most memory to use"
     )
-    parser.add_argument("--figures", type=Path, default=FIGURES, help="go on in this file")
+    parser.add_argument("--figures", type=Path, default=FIGURES, help="file of figures to extend")
     parser.add_argument("--write", type=Path, help="page whose table to replace")
     parser.add_argument("--figure", type=Path)
     parser.add_argument("--simulate", choices=SIMULATIONS, help=argparse.SUPPRESS)

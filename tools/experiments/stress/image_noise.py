@@ -1,5 +1,5 @@
-r"""Noise, spikes and contrast of a sequence's left images, as ``frontend/weak_images.py`` measures
-them, and the features that ``extract`` finds.
+r"""Print noise, spikes and contrast of a sequence's left images, measured as in
+``frontend/weak_images.py``, and the number of features that ``extract`` finds.
 
 python tools/experiments/stress/image_noise.py --data "$KITTI_ROOT" --seq 00 \
     --max-frames 216 --perturb night:3.75
@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("--seq", default="00")
     parser.add_argument("--max-frames", type=int)
     parser.add_argument("--perturb", default="none")
-    parser.add_argument("--images", type=int, default=12, help="images to look at, evenly spread")
+    parser.add_argument("--images", type=int, default=12, help="number of images, evenly spread")
     args = parser.parse_args()
     sequence = open_sequence(args.dataset, args.data, args.seq, max_frames=args.max_frames)
     perturbation = parse_perturbation(args.perturb, 0).bound_to(sequence)

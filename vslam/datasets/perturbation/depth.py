@@ -7,21 +7,21 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera, DepthImage, Image
 
-_SHRINK = 2  # half size: a fifth of the time, and fog has no edges finer than two pixels
+_SHRINK = 2  # half size takes a fifth of the time, and fog needs no edges finer than two pixels
 _BLOCK = 5
-_NEAREST_M = 3.0  # sets the range of disparities that are looked for
+_NEAREST_M = 3.0  # determines the range of disparities that are searched
 
 
 def dense_depths(
     camera: Camera, left: Image, second: Image | DepthImage | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Depth along z of each pixel of both images; infinite where nothing is near, as in the sky.
+    """Depth along z of each pixel of both images; infinite far away, for example in the sky.
 
     Args:
         camera: calibration of the images.
         left: ``(H, W)`` uint8.
-        second: the right image: both are matched (SGBM; Hirschmueller, PAMI 2008). Or the depth of
-            the left one's pixels, which is taken as it is, 0 as infinite.
+        second: the right image, which is matched with the left one (SGBM; Hirschmueller, PAMI
+            2008), or the depth of the left image's pixels, where 0 becomes infinite.
     """
     if second is not None and second.dtype != np.uint8:
         depth = np.asarray(second, np.float32)
@@ -36,8 +36,8 @@ def dense_depths(
 def disparity(
     camera: Camera, image: Image, other: Image, *, mirrored: bool = False
 ) -> NDArray[np.float32]:
-    """``(H, W)`` pixels that each pixel of ``image`` lies farther right than in ``other``; with
-    ``mirrored``, farther left: of a right image. 0 where nothing matches in a whole row."""
+    """``(H, W)`` disparities in pixels of ``image``, a left image, or a right one with
+    ``mirrored``, relative to ``other``. 0 in rows without any match."""
     import cv2
 
     height, width = image.shape
@@ -68,8 +68,8 @@ def disparity(
 
 
 def _filled(found: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Pixels without a match get the smaller disparity of the nearest matches in their row: what
-    is occluded belongs to the background (Geiger et al., CVPR 2012, the benchmark's own rule)."""
+    """Fill pixels without a match with the smaller disparity of the nearest matches in their row,
+    because occluded pixels belong to the background (rule of Geiger et al., CVPR 2012)."""
     known = found > 0
     columns = np.broadcast_to(np.arange(found.shape[1]), found.shape)
     before = np.maximum.accumulate(np.where(known, columns, -1), axis=1)

@@ -1,4 +1,4 @@
-"""Types of laws: laws of one image, and laws of a pair of images and the scene that they show."""
+"""Types of laws: laws of one image, and laws of a pair of images and their scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vslam.datasets.frames import Source
 from vslam.errors import InputError
 
 RandomStream = tuple[int, int]
-"""The user's seed and a number of the law's own; with further numbers, the seed of a generator."""
+"""The user's seed and the number of the law; further numbers complete a generator's seed."""
 
 Law = Callable[[int, float, int, Image], Image]
 """``(frame, t, side, image) -> image`` of the same shape; t is in seconds since the first frame,
@@ -24,7 +24,7 @@ side 0 is left, 1 is right."""
 
 @dataclass(frozen=True)
 class Pair:
-    """The images of one frame, which one law hands to the next.
+    """The images of one frame, which are passed from law to law.
 
     Attributes:
         index: number of the frame.
@@ -53,12 +53,12 @@ PairLaw = Callable[[Pair], Pair]
 
 @dataclass(frozen=True)
 class Scene:
-    """What a law may know of the source besides one frame's images.
+    """The data of the source that a law may use besides the images of a frame.
 
     Attributes:
         camera: calibration of the source.
         times: ``(N,)`` seconds since the first frame; None for a source that cannot seek.
-        T_wc: ``(N, 4, 4)`` true poses, NaN where unknown; None without any.
+        T_wc: ``(N, 4, 4)`` true poses, NaN where unknown; None if there are none.
         read: reads the images of any frame; None for a source that cannot seek.
     """
 
@@ -165,7 +165,7 @@ class LawKind:
 
 
 def each_side(law: Law) -> PairLaw:
-    """Apply a law of one image to both sides; a depth image stays as it is."""
+    """Apply a law of one image to both sides; a depth image is not changed."""
 
     def applied(pair: Pair) -> Pair:
         left = law(pair.index, pair.t, 0, pair.left)

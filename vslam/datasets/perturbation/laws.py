@@ -45,13 +45,13 @@ class Perturbation:
         self, index: int, t: float, left: Image, second: Image | DepthImage | None
     ) -> tuple[Image, Image | DepthImage | None]:
         """Perturb both ``(H, W)`` uint8 images of frame ``index``, ``t`` seconds after the first
-        one; safe in several threads. A depth image stays as it is: its sensor has its own light.
+        frame; thread-safe. Depth images stay unchanged, because their sensor has its own light.
 
-        The left one becomes the same whatever the second one is, save under fog, whose depth comes
-        from both.
+        The result for the left image does not depend on the second one, except for fog, whose depth
+        comes from both.
 
         Raises:
-            DroppedFrameError: the frame does not come at all.
+            DroppedFrameError: the perturbation drops the frame.
         """
         pair = Pair(index, t, left, second, (left, second))
         for law in self.laws:
@@ -68,8 +68,8 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
         seed: not negative; equal seeds give equal images.
 
     Raises:
-        InputError: unknown or repeated law, strength no number or not within the law's range, a
-            negative seed, or a broken package.
+        InputError: a law is unknown or repeated, a strength is not a number in the law's range, the
+            seed is negative, or a package is broken.
     """
     if seed < 0:
         raise InputError(f"--seed {seed}: must not be negative.")
@@ -167,7 +167,7 @@ def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: in
 
 
 def laws_for(sequence: Source) -> tuple[list[str], dict[str, str]]:
-    """Names of the laws that a source has the data for, and of the others why they do not apply."""
+    """Names of the laws that apply to a source, and the reasons why the others do not."""
     fit, unfit = [], {}
     for name in all_laws():
         try:

@@ -21,7 +21,7 @@ _TUNNELS_PER_S = 1.0 / 5.0
 
 
 def _pointwise(curve: Callable[[int, float], NDArray[np.float64]]) -> Law:
-    """A law that sends grey value v of frame k at time t to ``curve(k, t)[v]``."""
+    """A law that maps grey value v of frame k at time t to ``curve(k, t)[v]``."""
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
         import cv2
@@ -79,7 +79,7 @@ def _exposure(seconds: float, stream: RandomStream) -> Law:
 
 
 def _night(stops: float, stream: RandomStream) -> Law:
-    """Photon noise (Poisson) and read noise in electrons; exposure and gain stay as by day."""
+    """Photon noise (Poisson) and read noise in electrons, with the exposure and gain of the day."""
     electrons = FULL_WELL / 255.0
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
@@ -87,7 +87,7 @@ def _night(stops: float, stream: RandomStream) -> Law:
             return image
         rng = np.random.Generator(np.random.SFC64([*stream, frame, side]))
         mean = image * np.float32(electrons * 2.0**-stops)
-        # A normal number of variance m approximates Poisson well enough, since read noise is added.
+        # Since read noise is added, a normal number of variance m is a good approximation.
         noise = rng.standard_normal(image.shape, dtype=np.float32)
         counted = mean + noise * np.sqrt(mean + np.float32(READ_NOISE**2))
         return to_8_bits(counted / np.float32(electrons))

@@ -34,10 +34,10 @@ def neighbours(scene: Scene, frame: int) -> tuple[int, int]:
 
 
 def image_velocity(scene: Scene, frame: int) -> NDArray[np.float64]:
-    """``(2,)`` pixels a second by which the view turns past the middle of the image.
+    """``(2,)`` velocity of the image in its middle due to rotation, pixels per second.
 
-    From the true rotation where it is known, else the median of the optical flow to the next
-    frame; that of the drive straight ahead is then part of it.
+    It is computed from the true rotation if known. Otherwise it is the median optical flow to the
+    next frame, which also contains the flow from driving ahead.
     """
     assert scene.times is not None
     assert scene.read is not None
@@ -70,7 +70,7 @@ def forward_speed(scene: Scene, frame: int) -> float:
 
 
 def line_kernel(shift: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Weights of a filter that smears along ``shift`` pixels, with its middle at the pixel."""
+    """Weights of a centred filter that blurs along ``shift`` pixels."""
     reach = int(np.ceil(np.abs(shift).max() / 2.0)) + 1
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
     n = max(2, int(4 * np.hypot(*shift)) + 1)

@@ -1,4 +1,4 @@
-"""Faults of a stereo rig, which affect one side and not the other."""
+"""Faults of a stereo rig, which affect only one side."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _gain(stops: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def _desync(ms: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """The right image as it would be later: moved along the optical flow to the next frame."""
+    """The right image at a later time, by moving it along the optical flow to the next frame."""
     assert scene.times is not None
     assert scene.read is not None
     times, read = scene.times, scene.read
@@ -65,7 +65,7 @@ def _baseline(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def _moved(image: Image, shift: NDArray[np.float32]) -> Image:
-    """The image whose pixels have moved by ``(H, W, 2)`` pixels, looked up backwards."""
+    """Move the pixels of an image by ``(H, W, 2)`` pixels, by backward lookup."""
     import cv2
 
     y, x = np.mgrid[0 : image.shape[0], 0 : image.shape[1]].astype(np.float32)
@@ -85,7 +85,7 @@ def _turned(axis: int) -> Callable[[float, RandomStream, Scene], PairLaw]:
         camera = scene.camera
         K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
         R = Rotation.from_rotvec(np.eye(3)[axis] * np.radians(arc_minutes / 60.0)).as_matrix()
-        H = K @ R.T @ np.linalg.inv(K)  # of points: R turns the camera, points turn back
+        H = K @ R.T @ np.linalg.inv(K)  # R turns the camera, so R.T turns the points
 
         def turn(pair: Pair, right: Image) -> Image:
             import cv2

@@ -1,4 +1,4 @@
-"""Random numbers by their place in time: endless walks that do not depend on the order of reads."""
+"""Random numbers by time: endless walks that do not depend on the order of reads."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ def ou_walk(
     Args:
         deviation: stationary standard deviation; the walk begins in the stationary state.
         rng: generates its normal numbers, one for each step.
-        jumps: times in seconds, increasing, at which the walk is drawn anew, 1.5 times as wide.
+        jumps: increasing times in seconds at which the walk is redrawn with 1.5 times the
+            deviation.
     """
     decay = exp(-STEP_S / _TIME_CONSTANT_S)
     spread = (1.0 - decay**2) ** 0.5
@@ -41,8 +42,7 @@ def ou_walk(
 
 
 class Drawn:
-    """Random numbers by their place in a stream, drawn when they are first asked for; safe in
-    several threads."""
+    """Random numbers by their position in a stream, drawn on first use; thread-safe."""
 
     def __init__(self, numbers: Iterator[float]) -> None:
         self._numbers = numbers
@@ -56,8 +56,8 @@ class Drawn:
 
 
 def on_grid(t: float) -> int:
-    """The step of a walk that time t lies in."""
-    # The small offset keeps a time that lies on the grid from rounding into the cell before it.
+    """The step of a walk at time t."""
+    # The small offset prevents a time on the grid from rounding into the previous step.
     return floor(t / STEP_S + 1e-6)
 
 

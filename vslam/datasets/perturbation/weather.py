@@ -1,6 +1,6 @@
 """Laws of the weather: fog by distance, rain in front of the camera and on the glass.
 
-Grey values are taken as proportional to luminance, as KITTI's cameras give them.
+Grey values are assumed to be proportional to luminance, as in KITTI's images.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _CONTRAST_AT_VISIBILITY = 0.05  # meteorological optical range, WMO Guide No. 8,
 
 _SHUTTER_S = 0.01
 _NEAR_M, _FAR_M = 0.35, 3.0  # farther drops are fainter than a grey level
-_LEAST_MM = 1.0  # and so are smaller ones
+_LEAST_MM = 1.0  # smaller drops are fainter, too
 _STREAK_GREY = 220.0
-_OPACITY_STEPS = 1000.0  # of the drawing: opacities up to 0.255
+_OPACITY_STEPS = 1000.0  # opacities are drawn in thousandths, up to 0.255
 _GLASS_WIDTH_M, _WIPED_EVERY_S, _GLASS_DROP_M = 0.03, 3.0, 0.002
 
 
@@ -57,8 +57,8 @@ def _fog(visibility_m: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def drops_per_m3(mm_per_h: float) -> tuple[float, float]:
-    """Raindrops above 1 mm in a cubic metre, and the rate (1/mm) at which they become fewer with
-    diameter [Marshall and Palmer, J. Meteorology 1948]."""
+    """Number of raindrops above 1 mm per cubic metre, and the rate (1/mm) at which it decays with
+    the diameter [Marshall and Palmer, J. Meteorology 1948]."""
     rate = 4.1 * mm_per_h**-0.21
     return 8000.0 / rate * exp(-rate * _LEAST_MM), rate
 
@@ -86,14 +86,14 @@ def _rain(mm_per_h: float, stream: RandomStream, scene: Scene) -> PairLaw:
 def _streaks(
     mm_per_h: float, rng: np.random.Generator, side: int, frame: int, scene: Scene
 ) -> NDArray[np.float32]:
-    """Opacity of the drops that fall past while the shutter is open: the share of that time for
-    which a drop is before a pixel (Garg and Nayar, IJCV 2007). Both sides see the same drops."""
+    """Opacity of the drops that fall during the exposure: the share of the exposure for which a
+    drop covers a pixel (Garg and Nayar, IJCV 2007). Both sides see the same drops."""
     import cv2
 
     camera = scene.camera
     density, rate = drops_per_m3(mm_per_h)
     volume = 2.0 * camera.width * camera.height / (camera.fx * camera.fy)
-    volume *= (_FAR_M**3 - _NEAR_M**3) / 3.0  # twice as wide: the right camera sees others
+    volume *= (_FAR_M**3 - _NEAR_M**3) / 3.0  # twice the width, to cover the right camera's view
     n = rng.poisson(density * volume)
     diameter = np.minimum(_LEAST_MM + rng.exponential(1.0 / rate, n), 6.0)
     z = (rng.uniform(_NEAR_M**3, _FAR_M**3, n)) ** (1.0 / 3.0)
@@ -109,7 +109,7 @@ def _streaks(
     layer = np.zeros((camera.height, camera.width), np.uint8)
     levels = np.clip(np.rint(opacity * _OPACITY_STEPS), 1, 255).astype(int)
     thick = np.clip(np.rint(width), 1, 12).astype(int)
-    # Bright ones last, so that faint ones do not cut them.
+    # Bright drops are drawn last, so that faint ones do not cover them.
     key = 16 * np.unique(levels, return_inverse=True)[1].astype(int) + thick
     ends = np.rint(16.0 * np.stack([u, v, u_end, v_end], axis=1)).astype(np.int32)
     ends = np.clip(ends, -(1 << 18), 1 << 18).reshape(-1, 2, 2)
@@ -122,8 +122,8 @@ def _streaks(
 
 
 def glass_drops(mm_per_h: float, camera: Camera) -> float:
-    """Mean number of drops of 2 mm on a glass 30 mm wide, wiped every 3 s: the water that falls on
-    it, in drops."""
+    """Mean number of drops on a glass 30 mm wide that is wiped every 3 s, if all the water that
+    falls on it forms drops of 2 mm."""
     area = _GLASS_WIDTH_M**2 * camera.height / camera.width
     fallen = mm_per_h / 3.6e6 * area * _WIPED_EVERY_S
     return fallen / (np.pi / 6.0 * _GLASS_DROP_M**3)
@@ -132,7 +132,7 @@ def glass_drops(mm_per_h: float, camera: Camera) -> float:
 def _drops_on_glass(
     image: Image, mm_per_h: float, rng: np.random.Generator, camera: Camera
 ) -> Image:
-    """Each drop is a lens that shows the scene small, upside down and out of focus."""
+    """Draw drops as lenses that show the scene reduced, upside down and out of focus."""
     import cv2
 
     n = rng.poisson(glass_drops(mm_per_h, camera))

@@ -62,7 +62,8 @@ class GridProgress:
         """A row for each sequence and perturbation and a column for each detector, with the number
         of finished cells and their median ATE."""
         detectors = list(dict.fromkeys(cell.detector for cell in self.cells))
-        caption = f"{len(self.reports)} of {len(self.cells)} cells finished"
+        caption = "Each entry: finished runs, and their median ATE.\n"
+        caption += f"{len(self.reports)} of {len(self.cells)} cells finished"
         caption += f", {len(self.failed)} failed" if self.failed else ""
         if self.missing:
             left = estimate(self.missing, self.reports, self._frames, self._jobs).seconds
@@ -78,7 +79,8 @@ class GridProgress:
         done = [self.reports[cell] for cell in cells if cell in self.reports]
         failed = sum(cell in self.failed for cell in cells)
         ates = [report.ate_rmse_m for report in done if report.ate_rmse_m is not None]
-        text = f"{len(done)}/{len(cells)}" + (f"  {statistics.median(ates):.3f} m" if ates else "")
+        text = f"{len(done)} of {len(cells)}"
+        text += f"  {statistics.median(ates):.3f} m" if ates else ""
         return text + (f"  [red]{failed} failed[/red]" if failed else "")
 
     def _note(self, cell: Cell) -> None:

@@ -10,13 +10,17 @@ from vslam.lab.overview.versus import median_text, versus
 from vslam.report.page import Bullets, Figure, Page, Pairs, Section, Table, number
 from vslam.report.render import csv_text
 
+_MOTION = ("rpe_m", "rpe_deg", "t_rel_percent", "r_rel_deg_per_100m")
 _OTHER = ("loops_found", "loops_missed", "loops_wrong", "fps")
 _ABOUT_ERRORS = (
     "Medians over runs, with the smallest and the largest value in brackets. The ATE counts every "
     "frame, lost ones included, after the alignment named: SE3 keeps the scale; Sim3, for "
     "monocular runs, fits it. The causal ATE is that of the poses as they were estimated at the "
-    "time. Systems with different alignments are not compared. The RPE is from one frame to the "
-    "next."
+    "time. Systems with different alignments are not compared."
+)
+_ABOUT_MOTION = (
+    "The RPE is the error of the motion from one frame to the next; t_rel and r_rel are KITTI's "
+    "drift over 100 to 800 m."
 )
 _ABOUT_OTHERS = (
     "Loops are judged by the ground truth. fps is that of the frame loop; runs that share a "
@@ -24,10 +28,11 @@ _ABOUT_OTHERS = (
 )
 ALIGNMENTS = {"se3": "SE3", "sim3": "Sim3"}
 _TESTED = (
-    "Wilcoxon's signed-rank test on sequences, each with the median of its runs, because runs of "
-    "one sequence are not independent. Over all conditions a sequence counts once, with the mean "
-    f"of its medians. Two-sided, level {ALPHA:g}, not corrected for the number of tests. "
-    "Comparisons in which all sequences tie are left out."
+    "Better, worse, same: sequences on which the first system named has smaller, larger or equal "
+    "errors. p is that of Wilcoxon's signed-rank test on sequences, each with the median of its "
+    "runs, because runs of one sequence are not independent. Over all conditions a sequence counts "
+    f"once, with the mean of its medians. Two-sided, level {ALPHA:g}, not corrected for the "
+    "number of tests. Comparisons in which all sequences tie are left out."
 )
 
 
@@ -76,7 +81,7 @@ def render_csv(report: OverviewJson) -> str:
 
 
 def _results(report: OverviewJson) -> list[Section]:
-    """Two tables of the same rows, because one would be too wide to read."""
+    """Several tables of the same rows, because one would be too wide to read."""
     texts = ("sequence", "perturbation", "system")
 
     def table(name: str, measures: Collection[Measure], note: str, *, aligned: bool) -> Section:
@@ -95,10 +100,12 @@ def _results(report: OverviewJson) -> list[Section]:
         ]
         return Section(name, [Table((*texts, "runs", *columns), rows, texts, note)])
 
-    errors = [measure for measure in MEASURES if measure[0] not in _OTHER]
+    errors = [measure for measure in MEASURES if measure[0] not in (*_MOTION, *_OTHER)]
+    motion = [measure for measure in MEASURES if measure[0] in _MOTION]
     others = [measure for measure in MEASURES if measure[0] in _OTHER]
     return [
         table("Errors", errors, _ABOUT_ERRORS, aligned=True),
+        table("Motion and drift", motion, _ABOUT_MOTION, aligned=False),
         table("Loops and speed", others, _ABOUT_OTHERS, aligned=False),
     ]
 

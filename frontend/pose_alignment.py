@@ -1,0 +1,286 @@
+"""Sparse image alignment: the motion between two frames from the grey values around landmarks.
+
+Small windows around the landmarks of the last frame are moved over the new image until they agree
+with it, all at once, by a common motion of the camera (SVO: Forster et al., ICRA 2014, III-A, and
+T-RO 2017, IV-A). The images are small, coarsest first, so that a prediction may be wrong by some
+twenty pixels, as in a turn that has just begun. The mean of every window and the contrast of the
+image are removed, because the light may change between two frames.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.features import Pyramid
+from vslam.geometry import Matrix, compose, inverse, orthonormalised, se3_exp, solve_positive
+from vslam.kernels import inner_kernel, kernel
+
+WINDOW = 4  # pixels along each side
+PIXELS = WINDOW * WINDOW
+ITERATIONS = 10
+MIN_WINDOWS, MAX_WINDOWS = 20, 256
+MIN_CORRELATION = 0.6  # of all windows with the image; lower where the motion was not found
+STILL = 0.02  # pixels of the level; a smaller turn ends the iteration
+STILL_M = 0.005  # and a smaller shift, in the unit of the map
+ROBUST = 1.5  # windows that differ by more than this multiple of the median count less (Huber)
+
+
+def coarse_levels(pyramid: Pyramid) -> Pyramid:
+    """The images that frames are aligned by: half of the smallest level of a pyramid, that level,
+    and the one in the middle."""
+    height, width = pyramid.shapes[0]
+    last, middle = len(pyramid.shapes) - 1, len(pyramid.shapes) // 2
+    smallest = pyramid.level(last)
+    shapes = coarse_shapes(pyramid.shapes)
+    half = cv2.resize(smallest, (shapes[0, 1], shapes[0, 0]), interpolation=cv2.INTER_AREA)
+    levels = [np.asarray(half, np.uint8), smallest, pyramid.level(middle)]
+    pixels = np.concatenate([level.ravel() for level in levels])
+    return coarse_pyramid(pixels, shapes, (int(height), int(width)))
+
+
+def coarse_shapes(shapes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """``(3, 2)`` heights and widths of ``coarse_levels``, from those of the ``(L, 2)`` levels of
+    the whole pyramid."""
+    smallest, middle = shapes[-1], shapes[len(shapes) // 2]
+    return np.array([np.maximum(smallest // 2, 1), smallest, middle])
+
+
+def coarse_pyramid(
+    pixels: NDArray[np.uint8], shapes: NDArray[np.int64], size: tuple[int, int]
+) -> Pyramid:
+    """``coarse_levels`` from the pixels of all levels, and the height and width of the image.
+
+    Raises:
+        ValueError: the number of pixels is not that of the shapes.
+    """
+    counts = shapes.prod(axis=1)
+    if len(pixels) != counts.sum():
+        raise ValueError(f"{len(pixels)} pixels instead of {counts.sum()}")
+    offsets = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
+    return Pyramid(pixels, offsets, shapes, size[1] / shapes[:, 1])
+
+
+def align_pose(
+    now: Pyramid,
+    before: Pyramid,
+    xyz: Matrix,
+    T_before: Matrix,
+    T_cw: Matrix,
+    intrinsics: NDArray[np.float64],
+    size: tuple[int, int],
+) -> Matrix:
+    """Pose of a frame by sparse image alignment to another one.
+
+    Args:
+        now, before: ``coarse_levels`` of the frame and of the other one.
+        xyz: ``(N, 3)`` landmarks that the other frame tracks, in the world.
+        T_before: ``(4, 4)`` pose of the other frame.
+        T_cw: ``(4, 4)`` predicted pose of the frame.
+        intrinsics: ``(6,)``, see ``Camera.intrinsics``.
+        size: height and width of the whole images, pixels.
+
+    Returns:
+        ``(4, 4)`` pose ``T_cw``: the predicted one if the windows do not agree with the image.
+    """
+    every = -(-len(xyz) // MAX_WINDOWS) or 1
+    points = np.ascontiguousarray(xyz[::every] @ T_before[:3, :3].T + T_before[:3, 3])
+    T, correlation = T_cw @ inverse(T_before), 0.0
+    for level, (height, width) in enumerate(now.shapes.tolist()):
+        T, correlation = _align(
+            now.level(level),
+            before.level(level),
+            points,
+            T,
+            intrinsics,
+            size[1] / width,
+            size[0] / height,
+        )
+    return orthonormalised(T @ T_before) if correlation >= MIN_CORRELATION else T_cw
+
+
+@kernel
+def _align(image, before, points, T_start, intrinsics, wide, high):
+    """Gauss-Newton, inverse compositional: slopes and Jacobians are those of the image before.
+
+    Args:
+        image, before: ``(h, w)`` uint8.
+        points: ``(N, 3)`` in the camera of ``before``.
+        T_start: ``(4, 4)`` maps them to the camera of ``image``.
+        wide, high: full-resolution pixels for a pixel of the level.
+
+    Returns:
+        That motion, and the correlation of the windows with the image; the start and 0 if they do
+        not agree.
+    """
+    n = len(points)
+    template = np.empty((n, PIXELS), np.float32)
+    jacobian = np.empty((n, PIXELS, 6), np.float32)
+    hessian = np.empty((n, 6, 6), np.float32)
+    used = np.empty(n, np.int64)
+    m = 0
+    for i in range(n):
+        if _draw_template(before, points[i], intrinsics, wide, high, template[m], jacobian[m]):
+            _square(jacobian[m], hessian[m])
+            used[m] = i
+            m += 1
+    T = T_start.copy()
+    correlation = 0.0
+    seen, error = np.empty((n, PIXELS), np.float32), np.empty(n)
+    for _ in range(ITERATIONS):
+        product, energy, square = 0.0, 0.0, 0.0
+        count = 0
+        for i in range(m):
+            error[i] = -1.0
+            if not _read_window(image, T, points[used[i]], intrinsics, wide, high, seen[i]):
+                continue
+            error[i] = 0.0
+            count += 1
+            for k in range(PIXELS):
+                product += seen[i, k] * template[i, k]
+                energy += template[i, k] * template[i, k]
+                square += seen[i, k] * seen[i, k]
+        if count < MIN_WINDOWS or product <= 0.0:
+            return T_start, 0.0
+        contrast = product / energy
+        correlation = product / np.sqrt(energy * square)
+        step = _step(seen, template, jacobian, hessian, error, m, contrast)
+        T = compose(T, se3_exp(-step))
+        turn = max(abs(step[3]), abs(step[4]), abs(step[5])) * intrinsics[0] / wide
+        if turn < STILL and max(abs(step[0]), abs(step[1]), abs(step[2])) < STILL_M:
+            break
+    return T, correlation
+
+
+@inner_kernel
+def _corner(point, intrinsics, wide, high):
+    """Column and row, in the level, of the first pixel of the window around a projected point."""
+    u = intrinsics[0] * point[0] / point[2] + intrinsics[2]
+    v = intrinsics[1] * point[1] / point[2] + intrinsics[3]
+    middle = 0.5 + 0.5 * (WINDOW - 1)
+    return (u + 0.5) / wide - middle, (v + 0.5) / high - middle
+
+
+@inner_kernel
+def _draw_template(before, point, intrinsics, wide, high, template, jacobian):
+    """Grey values of the window around a point, and their derivatives by the motion, both without
+    their mean; returns whether the window lies in the image."""
+    height, width = before.shape
+    x, y, z = point[0], point[1], point[2]
+    if not z > 0.1:
+        return False
+    u, v = _corner(point, intrinsics, wide, high)
+    if not (1.0 <= u < width - WINDOW - 2 and 1.0 <= v < height - WINDOW - 2):
+        return False
+    left, top = int(u), int(v)
+    a, b = u - left, v - top
+    w00, w01, w10, w11 = (1.0 - b) * (1.0 - a), (1.0 - b) * a, b * (1.0 - a), b * a
+    fx, fy = intrinsics[0] / (wide * z), intrinsics[1] / (high * z)
+    mean = np.float32(0.0)
+    means = np.zeros(6, np.float32)
+    for r in range(WINDOW):
+        for c in range(WINDOW):
+            k, q, s = r * WINDOW + c, top + r, left + c
+            value, slope_u, slope_v = 0.0, 0.0, 0.0
+            for down in range(2):
+                for right in range(2):
+                    part = (w11 if right else w10) if down else (w01 if right else w00)
+                    p, t = q + down, s + right
+                    value += part * before[p, t]
+                    slope_u += part * (np.float64(before[p, t + 1]) - np.float64(before[p, t - 1]))
+                    slope_v += part * (np.float64(before[p + 1, t]) - np.float64(before[p - 1, t]))
+            # d(grey value)/d(v, w) for a point moved by exp([v, w]).
+            gu, gv = 0.5 * slope_u * fx, 0.5 * slope_v * fy
+            gz = -(gu * x + gv * y) / z
+            jacobian[k, 0], jacobian[k, 1], jacobian[k, 2] = gu, gv, gz
+            jacobian[k, 3] = gz * y - gv * z
+            jacobian[k, 4] = gu * z - gz * x
+            jacobian[k, 5] = gv * x - gu * y
+            template[k] = value
+            mean += template[k]
+            for j in range(6):
+                means[j] += jacobian[k, j]
+    for k in range(PIXELS):
+        template[k] -= mean / np.float32(PIXELS)
+        for j in range(6):
+            jacobian[k, j] -= means[j] / np.float32(PIXELS)
+    return True
+
+
+@inner_kernel
+def _read_window(image, T, p, intrinsics, wide, high, seen):
+    """Grey values where a moved point should be seen, without their mean; returns whether that lies
+    in the image."""
+    height, width = image.shape
+    x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+    y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+    z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+    if not z > 0.1:
+        return False
+    u, v = _corner((x, y, z), intrinsics, wide, high)
+    if not (0.0 <= u < width - WINDOW and 0.0 <= v < height - WINDOW):
+        return False
+    left, top = int(u), int(v)
+    a, b = np.float32(u - left), np.float32(v - top)
+    one = np.float32(1.0)
+    mean = np.float32(0.0)
+    for r in range(WINDOW):
+        for c in range(WINDOW):
+            q, s = top + r, left + c
+            above = (one - a) * np.float32(image[q, s]) + a * np.float32(image[q, s + 1])
+            below = (one - a) * np.float32(image[q + 1, s]) + a * np.float32(image[q + 1, s + 1])
+            value = (one - b) * above + b * below
+            seen[r * WINDOW + c] = value
+            mean += value
+    for k in range(PIXELS):
+        seen[k] -= mean / np.float32(PIXELS)
+    return True
+
+
+@inner_kernel
+def _square(jacobian, hessian):
+    """Normal matrix of one window, its lower half."""
+    for j in range(6):
+        for t in range(j + 1):
+            total = np.float32(0.0)
+            for k in range(PIXELS):
+                total += jacobian[k, j] * jacobian[k, t]
+            hessian[j, t] = total
+
+
+@inner_kernel
+def _step(seen, template, jacobian, hessian, error, m, contrast):
+    """``(6,)`` motion of the windows that explains what is seen; ``error`` is negative for windows
+    outside the image."""
+    inside = 0
+    scale = np.float32(1.0 / contrast)
+    sizes = np.empty(m)
+    for i in range(m):
+        if error[i] < 0.0:
+            continue
+        total = 0.0
+        for k in range(PIXELS):
+            difference = scale * seen[i, k] - template[i, k]
+            total += difference * difference
+        error[i] = np.sqrt(total)
+        sizes[inside] = error[i]
+        inside += 1
+    limit = ROBUST * np.median(sizes[:inside]) + 1e-6
+    H, b = np.zeros((6, 6)), np.zeros(6)
+    for i in range(m):
+        if error[i] < 0.0:
+            continue
+        weight = 1.0 if error[i] <= limit else limit / error[i]
+        for j in range(6):
+            product = np.float32(0.0)
+            for k in range(PIXELS):
+                product += jacobian[i, k, j] * (scale * seen[i, k] - template[i, k])
+            b[j] += weight * product
+            for t in range(j + 1):
+                H[j, t] += weight * hessian[i, j, t]
+    for j in range(6):
+        H[j, j] *= 1.0 + 1e-6
+        for t in range(j):
+            H[t, j] = H[j, t]
+    return solve_positive(H, b)

@@ -1,0 +1,140 @@
+"""Tracking by patches: the pose by sparse image alignment, then by the patches of landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from vslam.config import Config
+from vslam.features import TrackingState
+from vslam.frontend.extraction import FrameImages
+from vslam.frontend.orb import build_pyramid, level_shapes
+from vslam.frontend.pose_alignment import align_pose, coarse_levels, coarse_pyramid, coarse_shapes
+from vslam.frontend.tracking import TrackingContext, feature_depth
+from vslam.geometry import inverse, se3_exp, se3_log, transform
+from vslam.slam import Slam
+
+CONFIG = Config.model_validate({"tracking": {"method": "patches"}})
+FIRST, SECOND = 12, 13  # frames in the turn
+OFF = np.array([0.05, -0.03, 0.1, 0.01, 0.035, -0.01])  # of a prediction: two degrees, 12 cm
+
+
+def coarse(image):
+    return coarse_levels(build_pyramid(image, CONFIG.orb))
+
+
+@pytest.fixture(scope="module")
+def points(corridor):
+    """Stereo points of the first frame, in the world."""
+    context = TrackingContext.create(corridor.camera, CONFIG)
+    images = FrameImages(corridor.left[FIRST], corridor.right[FIRST], context)
+    features = images.extracted.features
+    depth = feature_depth(features, corridor.camera)
+    near = np.flatnonzero((depth > 0) & (depth < 15.0))
+    seen = corridor.camera.backproject(features.xy[near].astype(float), depth[near])
+    return transform(corridor.T_wc[FIRST], seen)
+
+
+def aligned(corridor, points, image, off=OFF):
+    """Turn (degrees) and shift (metres) between the pose that is found and the true one."""
+    T_true = inverse(corridor.T_wc[SECOND])
+    T_before, camera = inverse(corridor.T_wc[FIRST]), corridor.camera
+    T_predicted = se3_exp(off) @ T_true
+    size = camera.height, camera.width
+    before = coarse(corridor.left[FIRST])
+    T = align_pose(coarse(image), before, points, T_before, T_predicted, camera.intrinsics, size)
+    error = se3_log(T @ inverse(T_true))
+    return np.rad2deg(np.linalg.norm(error[3:])), np.linalg.norm(error[:3]), T, T_predicted
+
+
+@pytest.mark.parametrize(("gain", "bias"), [(1.0, 0.0), (0.5, 30.0), (1.3, -40.0)])
+def test_a_wrong_prediction_is_mended_whatever_the_light(corridor, points, gain, bias):
+    image = np.clip(gain * corridor.left[SECOND] + bias, 0, 255).astype(np.uint8)
+    turn, shift, *_ = aligned(corridor, points, image)
+    assert turn < 0.06
+    assert shift < 0.02
+
+
+def test_the_prediction_stays_where_the_image_shows_something_else(corridor, points):
+    noise = np.random.default_rng(0).integers(0, 256, corridor.left[0].shape, dtype=np.uint8)
+    *_, T, T_predicted = aligned(corridor, points, cv2.GaussianBlur(noise, (0, 0), 2.0))
+    np.testing.assert_array_equal(T, T_predicted)
+    *_, T, T_predicted = aligned(corridor, points[:10], corridor.left[SECOND])
+    np.testing.assert_array_equal(T, T_predicted)
+
+
+def test_small_images_are_known_by_their_pixels(corridor):
+    image = corridor.left[0]
+    made = coarse(image)
+    shapes = coarse_shapes(level_shapes(image.shape, CONFIG.orb))
+    again = coarse_pyramid(made.pixels, shapes, image.shape)
+    for level in range(3):
+        np.testing.assert_array_equal(again.level(level), made.level(level))
+    with pytest.raises(ValueError, match="pixels instead of"):
+        coarse_pyramid(made.pixels[1:], shapes, image.shape)
+
+
+def driven(corridor, config=CONFIG, *, threads=1, images=None, frames=None):
+    slam = Slam(corridor.camera, config, "none", threads=threads)
+    left = corridor.left if images is None else images
+    results = [
+        slam.step(left[k], corridor.right[k], corridor.timestamps[k])
+        for k in range(frames or len(corridor))
+    ]
+    if frames is None:
+        slam.finish()
+    return slam, results
+
+
+def test_few_frames_need_features_and_the_pose_is_as_good(corridor):
+    slam, results = driven(corridor)
+    assert all(result.state == TrackingState.OK for result in results)
+    extracted = [result.index for result in results if result.stage_ms.get("extract", 0.0) > 0.0]
+    keyframes = [result.index for result in results if result.is_keyframe]
+    assert len(results) > 2 * len(extracted)
+    assert len(keyframes) > 2
+    by_features, _ = driven(corridor, Config())
+    error, usual = (
+        np.linalg.norm(one.trajectory().T_wc[:, :3, 3] - corridor.T_wc[:, :3, 3], axis=1).max()
+        for one in (slam, by_features)
+    )
+    assert error < max(0.03, 1.5 * usual)
+
+
+def test_a_frame_that_shows_something_else_is_lost_and_the_next_is_not(corridor):
+    noise = np.random.default_rng(0).integers(0, 256, corridor.left[0].shape, dtype=np.uint8)
+    images = [*corridor.left]
+    images[10] = noise
+    _, results = driven(corridor, images=images)
+    states = [result.state for result in results]
+    assert states[10] == TrackingState.LOST
+    assert states[:10] + states[11:] == [TrackingState.OK] * (len(corridor) - 1)
+
+
+def test_the_same_bytes_with_two_threads_and_after_a_resume(corridor, tmp_path):
+    whole, _ = driven(corridor)
+    expected = whole.trajectory().T_wc.tobytes()
+    assert driven(corridor, threads=2)[0].trajectory().T_wc.tobytes() == expected
+    resumed = 0
+    for cut in range(6, 20):
+        slam, _ = driven(corridor, frames=cut)
+        if slam.stored_map().checkpoint is None:
+            continue  # a keyframe is being mapped
+        slam.save(tmp_path / "map.npz", resumable=True)
+        again = Slam.load(tmp_path / "map.npz", CONFIG, "none", resume=True, threads=1)
+        for k in range(cut, len(corridor)):
+            again.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
+        again.finish()
+        assert again.trajectory().T_wc.tobytes() == expected, cut
+        resumed += 1
+    assert resumed >= 3
+
+
+def test_depth_cameras_are_tracked_by_features(corridor):
+    camera = replace(corridor.camera, depth=True)
+    assert not TrackingContext.create(camera, CONFIG).tracks_patches
+    assert TrackingContext.create(corridor.camera.left_camera(), CONFIG).tracks_patches
+    assert not TrackingContext.create(corridor.camera, Config()).tracks_patches

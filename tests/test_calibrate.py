@@ -17,8 +17,10 @@ from vslam.calibration.files import read_calibration, write_calibration
 from vslam.calibration.models import Calibration, CameraModel, project, unproject
 from vslam.calibration.solve import View, diverse, fit_camera, fit_pair
 from vslam.cli import main as cli
+from vslam.cli.calibrate import _frames
+from vslam.datasets.frames import RawSource, TimedFrame
 from vslam.doctor.calibration_page import Calibrated, findings_of
-from vslam.errors import InputError
+from vslam.errors import BrokenSourceError, InputError
 
 PINHOLE = CameraModel(
     300.0, 300.6, 193.2, 142.8, 384, 288, "pinhole", (-0.25, 0.07, 0.0005, -0.0004)
@@ -66,6 +68,11 @@ def seen_at(board: Board, model: CameraModel, T: np.ndarray, noise: float, rng) 
     return Corners(np.arange(len(xy)), xy + rng.normal(0.0, noise, xy.shape))
 
 
+def exact_views(board: Board, model: CameraModel, views: list[np.ndarray]) -> list[View]:
+    rng = np.random.default_rng(0)
+    return [View(str(k), seen_at(board, model, T, 0.05, rng)) for k, T in enumerate(views)]
+
+
 @pytest.fixture
 def call(monkeypatch, capsys, tmp_path):
     """Run ``vslam calibrate`` in an empty folder: (exit code, stdout, stderr)."""
@@ -106,6 +113,8 @@ def test_checkerboard_filmed_by_one_camera(call, tmp_path):
     write_images(tmp_path, {"board": images}, [f"{k}.png" for k in range(14)])
     code, out, _ = call("board", "--board", "checkerboard", "--size", "9x6")
     assert code == 0, out
+    # One is cut off by the border of the image.
+    assert out.startswith("The checkerboard of 9x6 inner corners is seen in 13 of 14 images.\n")
     assert "vslam run DRIVE --sensor mono --calib calibration.yaml" in out
     check_camera(read_calibration(["calibration.yaml"]).left, PINHOLE)
     page = Path("calibration.html").read_text()
@@ -155,13 +164,10 @@ def test_written_calibration_is_read_as_the_same(tmp_path):
 
 
 def test_views_that_do_not_fit_are_dropped_and_named():
-    rng = np.random.default_rng(0)
-    views = [
-        View(str(k), seen_at(CHECKERBOARD, PINHOLE, T, 0.05, rng))
-        for k, T in enumerate(poses(CHECKERBOARD, PINHOLE, 14))
-    ]
+    views = exact_views(CHECKERBOARD, PINHOLE, poses(CHECKERBOARD, PINHOLE, 14))
     bent = views[5].corners
-    views[5] = View("5", replace(bent, xy=bent.xy + rng.normal(0.0, 2.0, bent.xy.shape)))
+    noise = np.random.default_rng(1).normal(0.0, 2.0, bent.xy.shape)
+    views[5] = View("5", replace(bent, xy=bent.xy + noise))
     fit = fit_camera(CHECKERBOARD, views, (384, 288), "pinhole")
     check_camera(fit.model, PINHOLE)
     assert [name for name, _ in fit.dropped] == ["5"]
@@ -173,22 +179,13 @@ def test_views_that_do_not_fit_are_dropped_and_named():
 
 
 def test_pairs_that_were_not_taken_together_are_dropped():
-    rng = np.random.default_rng(0)
     views = poses(CHECKERBOARD, PINHOLE, 14)
     right = [np.linalg.inv(T_LEFT_RIGHT) @ T for T in views]
     late = np.eye(4)
     late[0, 3] = 0.01
     right[3] = late @ right[3]
     fits = [
-        fit_camera(
-            CHECKERBOARD,
-            [
-                View(str(k), seen_at(CHECKERBOARD, PINHOLE, T, 0.05, rng))
-                for k, T in enumerate(side)
-            ],
-            (384, 288),
-            "pinhole",
-        )
+        fit_camera(CHECKERBOARD, exact_views(CHECKERBOARD, PINHOLE, side), (384, 288), "pinhole")
         for side in (views, right)
     ]
     pair = fit_pair(CHECKERBOARD, *fits)
@@ -205,26 +202,19 @@ def test_checkerboard_numbered_from_the_other_end_is_renumbered():
 
 
 def test_diverse_views_leave_out_a_board_that_stands_still():
-    rng = np.random.default_rng(0)
     moving = poses(CHECKERBOARD, PINHOLE, 9)
     film = [moving[0]] * 30 + moving[1:]
-    views = [(View("", seen_at(CHECKERBOARD, PINHOLE, T, 0.05, rng)),) for T in film]
+    views = [(view,) for view in exact_views(CHECKERBOARD, PINHOLE, film)]
     chosen = diverse(CHECKERBOARD, views, [(384, 288)], 60)
     assert (len(chosen), chosen[1:]) == (9, list(range(30, 38)))
     assert len(diverse(CHECKERBOARD, views, [(384, 288)], 4)) == 4
 
 
 def test_doubtful_calibration_is_judged_in_plain_words():
-    rng = np.random.default_rng(0)
-    T = poses(CHECKERBOARD, PINHOLE, 9)[4]
-    tilted = poses(CHECKERBOARD, PINHOLE, 2)
-    same = [
-        View(str(k), seen_at(CHECKERBOARD, PINHOLE, U, 0.05, rng)) for k, U in enumerate(tilted)
-    ]
     flat = np.eye(4)
-    flat[:3, 3] = T[:3, 3]
-    same.append(View("2", seen_at(CHECKERBOARD, PINHOLE, flat, 0.05, rng)))
-    fit = fit_camera(CHECKERBOARD, same, (384, 288), "pinhole")
+    flat[:3, 3] = -0.12, -0.08, 0.4
+    views = exact_views(CHECKERBOARD, PINHOLE, [*poses(CHECKERBOARD, PINHOLE, 2), flat])
+    fit = fit_camera(CHECKERBOARD, views, (384, 288), "pinhole")
     result = Calibrated(CHECKERBOARD, Calibration(fit.model), (fit,), None, (3, 3))
     faults = {f.check: f.measured for f in findings_of(result) if f.verdict == "fault"}
     assert faults["views"] == "3 views, too few"
@@ -232,17 +222,54 @@ def test_doubtful_calibration_is_judged_in_plain_words():
     assert faults["coverage"].startswith("corners in ")
 
 
+def test_lens_of_the_other_model_is_a_fault():
+    views = exact_views(CHECKERBOARD, FISHEYE, poses(CHECKERBOARD, FISHEYE, 14))
+    faults = {}
+    for lens in ("pinhole", "fisheye"):
+        fit = fit_camera(CHECKERBOARD, views, (384, 288), lens)
+        result = Calibrated(CHECKERBOARD, Calibration(fit.model), (fit,), None, (14, 14))
+        faults[lens] = [f.check for f in findings_of(result) if f.verdict == "fault"]
+    assert "lens" in faults["pinhole"]
+    assert faults["fisheye"] == []
+
+
+def test_swapped_cameras_are_a_fault():
+    views = poses(CHECKERBOARD, PINHOLE, 14)
+    left, right = (
+        fit_camera(CHECKERBOARD, exact_views(CHECKERBOARD, PINHOLE, side), (384, 288), "pinhole")
+        for side in ([np.linalg.inv(T_LEFT_RIGHT) @ T for T in views], views)
+    )
+    pair = fit_pair(CHECKERBOARD, left, right)
+    calibration = Calibration(left.model, right.model, pair.T_left_right)
+    found = findings_of(Calibrated(CHECKERBOARD, calibration, (left, right), pair, (14, 14)))
+    (fault,) = [f for f in found if f.verdict == "fault"]
+    assert (fault.check, "0.060 m to the left" in fault.measured) == ("rectification", True)
+
+
 def test_too_few_views_and_another_board_are_errors():
-    rng = np.random.default_rng(0)
-    views = [
-        View(str(k), seen_at(APRILGRID, PINHOLE, T, 0.05, rng))
-        for k, T in enumerate(poses(APRILGRID, PINHOLE, 8))
-    ]
+    views = exact_views(APRILGRID, PINHOLE, poses(APRILGRID, PINHOLE, 8))
     with pytest.raises(InputError, match="is found in 2 views that fit, where 3 are the least"):
         fit_camera(APRILGRID, views[:2], (384, 288), "pinhole")
     other = replace(APRILGRID, columns=3, rows=4)
     with pytest.raises(InputError, match="do not fit a flat AprilGrid of 3x4 tags"):
         fit_camera(other, views, (384, 288), "pinhole")
+
+
+def test_video_that_breaks_off_is_used_up_to_there(capsys):
+    def play(n: int):
+        for k in range(n):
+            yield TimedFrame(k / 30, lambda image_map: (np.zeros((288, 384), np.uint8), None))
+        raise BrokenSourceError("film.mp4: the video breaks off.")
+
+    def source(n: int) -> RawSource:
+        return RawSource(
+            dataset="video", name="film", sizes=((384, 288),), play=lambda: play(n), n_expected=600
+        )
+
+    assert [round(30 * frame.timestamp) for frame in _frames(source(9), 300)] == [0, 2, 4, 6, 8]
+    assert capsys.readouterr().err == "warning: film.mp4: the video breaks off.\n"
+    with pytest.raises(BrokenSourceError):
+        list(_frames(source(0), 300))
 
 
 def test_images_without_the_board_are_an_error_that_says_what_was_looked_for(call, tmp_path):

@@ -100,15 +100,10 @@ def diverse(
         return []
     outlines = np.array(
         [
-            np.concatenate(
-                [
-                    _outline(board, view.corners, size)
-                    for view, size in zip(seen, sizes, strict=True)
-                ]
-            )
+            [_outline(board, v.corners, size) for v, size in zip(seen, sizes, strict=True)]
             for seen in views
         ]
-    )
+    ).reshape(len(views), -1)
     chosen = [int(np.argmin(np.linalg.norm(outlines - np.median(outlines, axis=0), axis=1)))]
     far = np.linalg.norm(outlines - outlines[chosen[0]], axis=1)
     while len(chosen) < n and far.max() > _SAME_VIEW:

@@ -120,6 +120,7 @@ def calibrate(
     result = Calibrated(made, calibration, fits, pair, (len(seen), n))
     findings = findings_of(result)
     write_calibration(out, calibration)
+    typer.echo(f"The {made} is seen in {len(seen)} of {n} images.")
     for finding in findings:
         typer.echo(f"{finding.verdict:<8} {finding.check:<16} {finding.measured}")
         if finding.fix:

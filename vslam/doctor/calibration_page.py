@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.calibration.boards import Board
 from vslam.calibration.models import Array, Calibration
 from vslam.calibration.rectification import rectify
-from vslam.calibration.solve import CameraFit, PairFit, rms
+from vslam.calibration.solve import CameraFit, PairFit
 from vslam.doctor.findings import Finding, judge
 from vslam.errors import InputError
 from vslam.report.drawing import BLUE, GREY, LOW, RED, Drawing, draw, new_figure
@@ -22,9 +23,12 @@ _FEW_VIEWS = 10
 _TILT, _FEW_TILTED = 15.0, 3  # degrees; a board that is never tilted fixes no focal length
 _CELLS = (8, 6)  # of the image, across and down
 _COVERED = 0.6  # share of the cells; corners hardly reach the outermost pixels
-_LARGE_PX = 1.0  # RMS; half a pixel is usual for a video
+_LARGE_PX, _COMMON_WIDTH = (
+    0.5,
+    640,
+)  # RMS, in images of this width or less; wider ones may have more
 _APART_PX = 2.0  # RMS, between the cameras
-_BENT = 2.0  # residuals in the outer half of the corners over those in the inner half
+_SHARED = 0.2  # of the squared residuals, in neighbouring corners
 _MOST_DROPPED = 0.25
 _ARROW = 0.02  # of the image width: length of an arrow of the RMS error
 
@@ -127,10 +131,8 @@ def _camera(side: str, fit: CameraFit) -> list[Finding]:
     tilted = int((np.degrees(np.arccos(cosines)) > _TILT).sum())
     xy = np.concatenate([view.corners.xy for view in fit.views])
     share, emptiest = _coverage(xy / (m.width, m.height))
-    # Of a model that does not fit, residuals grow towards the border.
-    residuals, far = np.concatenate(fit.residuals), np.linalg.norm(xy - (m.cx, m.cy), axis=1)
-    outer = far > np.median(far)
-    ratio = rms(residuals[outer]) / rms(residuals[~outer])
+    most = max(_LARGE_PX, m.width * _LARGE_PX / _COMMON_WIDTH)
+    shared = _shared(xy / (m.width, m.height), np.concatenate(fit.residuals))
     other = "pinhole" if m.lens == "fisheye" else "fisheye"
     return [
         views,
@@ -144,12 +146,12 @@ def _camera(side: str, fit: CameraFit) -> list[Finding]:
             f"film the board everywhere, above all at the {emptiest} of the image",
         ),
         judge(
-            f"{side}residuals", error > _LARGE_PX, f"{error:.3f} px RMS",
+            f"{side}residuals", error > most, f"{error:.3f} px RMS",
             "check that the board is flat, sharp and still, and its columns and rows",
         ),
         judge(
-            f"{side}lens", ratio > _BENT,
-            f"{m.lens}; residuals in the outer half are {ratio:.1f} times those in the inner half",
+            f"{side}lens", shared > _SHARED,
+            f"{m.lens}; {shared:.0%} of the residuals depend on the place in the image",
             f"try --lens {other}",
         ),
     ]  # fmt: skip
@@ -165,15 +167,28 @@ def _kept(check: str, n: int, dropped: Sequence[tuple[str, float]]) -> Finding:
 
 
 def _coverage(at: Array) -> tuple[float, str]:
-    """The share of the image that corners cover, and where they cover least.
-
-    Args:
-        at: ``(N, 2)``, from 0 to 1.
-    """
+    """The share of the image that corners cover, and where they cover least; ``at`` is ``(N, 2)``,
+    from 0 to 1."""
     cells = np.zeros(_CELLS, bool)
-    cells[tuple((at * _CELLS).astype(int).clip(0, np.subtract(_CELLS, 1)).T)] = True
+    cells.flat[_cells(at)] = True
     parts = {"left": cells[:2], "right": cells[-2:], "top": cells[:, :2], "bottom": cells[:, -2:]}
     return float(cells.mean()), min(parts, key=lambda name: float(parts[name].mean()))
+
+
+def _shared(at: Array, residuals: Array) -> float:
+    """The share of the squared residuals that neighbours in the image have in common: about 0 for
+    noise, most of them for a model that does not fit the lens."""
+    cells = _cells(at)
+    n = np.bincount(cells)
+    sums = np.stack([np.bincount(cells, weights=column) for column in residuals.T], axis=1)
+    common = (sums[n > 0] ** 2 / n[n > 0, None]).sum() / (residuals**2).sum()
+    by_chance = np.count_nonzero(n) / len(at)
+    return float(max(0.0, (common - by_chance) / (1.0 - by_chance)))
+
+
+def _cells(at: Array) -> NDArray[np.int64]:
+    x, y = (at * _CELLS).astype(np.int64).clip(0, np.subtract(_CELLS, 1)).T
+    return np.asarray(x * _CELLS[1] + y, np.int64)
 
 
 def _drawings(result: Calibrated) -> Iterator[Drawing]:

@@ -100,7 +100,7 @@ POINTS = (
     Point("global adjustment, merge", "vslam.closing.merge_solution", 1, MAPLESS),
     Point("image source", "faults.next_image", 200, EARLY),
     Point("image reader", "faults.read_image", 200, EARLY),
-    Point("features thread", "vslam.run.preparation.extract_features", 200, EARLY),
+    Point("features thread", "vslam.frontend.extraction.extract_features", 200, EARLY),
     Point("camera thread", "vslam.run.realtime._Mailbox.put", 8, EARLY, options=REALTIME),
     Point("handing thread", "vslam.run.realtime._Mailbox.take", 8, EARLY, options=REALTIME),
     Point("progress of a frame", "faults.on_frame", 200, EARLY),
@@ -230,8 +230,9 @@ def stage(*, learned: bool) -> None:
     """Let this process drive along the ring whatever the images show, with a detector that knows
     the way; ``learned``: learned descriptors may verify its loops."""
     from vslam.cli import quiet
+    from vslam.frontend import extraction
     from vslam.loopclosure.registry import create_images
-    from vslam.run import pipeline, preparation
+    from vslam.run import pipeline
 
     def see(left: np.ndarray, *_: object) -> Extracted:
         return Extracted(view(int(left[0, 0]) | int(left[0, 1]) << 8))
@@ -253,7 +254,7 @@ def stage(*, learned: bool) -> None:
     def progress_bar(total: object) -> Iterator[Callable[[object], None]]:
         yield lambda result: on_frame()
 
-    preparation.extract_features = see
+    extraction.extract_features = see
     pipeline.detector_with_images = detector
     Source.frames = frames
     quiet.progress_bar = progress_bar

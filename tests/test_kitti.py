@@ -292,7 +292,9 @@ def test_missing_times(root):
 
 def test_poses_of_another_length(root):
     write_poses(root / "poses/00.txt", FRAMES - 1)
-    refused(root, "poses/00.txt", "fit neither", "5 for 6 images", "remove it")
+    refused(
+        root, "poses/00.txt", "fit neither", "has 5 poses, which fit neither 6 images", "remove it"
+    )
 
 
 @pytest.mark.parametrize(

@@ -135,5 +135,5 @@ def test_images_of_two_sizes_are_refused():
 def test_both_protocols_take_it():
     require_comparable("lsgd", None, "retrieval")
     require_comparable("lsgd", None, "online")
-    with pytest.raises(InputError, match="has none"):
+    with pytest.raises(InputError, match="has no weights"):
         require_comparable("lsgd", "file.onnx", "online")

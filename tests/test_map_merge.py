@@ -234,7 +234,7 @@ def test_refusals(files, tmp_path):
     assert "there is no folder" in refusal("map", "merge", *files[:2], *nowhere)
     assert "there is no folder" in refusal("map", "crop", files[0], "--box=0,1,0,1", *nowhere)
     assert "cannot be read" in refusal("map", "merge", files[0], tmp_path / "gone", *out)
-    assert "name one of them" in refusal("map", "crop", files[0], *out)
+    assert "give exactly one" in refusal("map", "crop", files[0], *out)
     assert "4 numbers" in refusal("map", "crop", files[0], "--box", "1,2,x", *out)
     assert "no keyframe lies there" in refusal(
         "map", "crop", files[0], "--point", "900,900", "--within", "5", *out

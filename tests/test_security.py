@@ -167,7 +167,9 @@ def test_a_video_of_absurd_size_is_refused_by_its_header(tmp_path: Path, monkeyp
 
     (tmp_path / "a.mp4").write_bytes(b"a video")
     monkeypatch.setattr("vslam.datasets.video.open_capture", lambda name: Capture())
-    with pytest.raises(InputError, match="134 million are the limit, so scale the video down"):
+    with pytest.raises(
+        InputError, match="exceed the limit of 134 million pixels; scale the video down"
+    ):
         open_video(tmp_path / "a.mp4", monocular=True)
 
 

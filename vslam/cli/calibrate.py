@@ -65,6 +65,7 @@ def calibrate(
     square: Annotated[
         float | None,
         typer.Option(
+            metavar="METRES",
             help="Side of a square in metres; of an AprilGrid, from one tag to the next. A single "
             "camera does not need it for a checkerboard.",
             show_default=False,
@@ -72,20 +73,29 @@ def calibrate(
     ] = None,
     marker: Annotated[
         float | None,
-        typer.Option(help="Side of a marker or tag in metres.", show_default=False),
+        typer.Option(
+            metavar="METRES", help="Side of a marker or tag in metres.", show_default=False
+        ),
     ] = None,
     dictionary: Annotated[
-        str, typer.Option(help="Markers of a ChArUco board, by OpenCV's name without DICT_.")
+        str,
+        typer.Option(
+            metavar="NAME", help="Markers of a ChArUco board, by OpenCV's name without DICT_."
+        ),
     ] = "5X5_1000",
     lens: Annotated[
         Literal["pinhole", "fisheye"],
         typer.Option(
+            metavar="pinhole|fisheye",
             help="[b]pinhole[/b] has radial-tangential distortion; [b]fisheye[/b] is equidistant, "
-            "for angles of view above about 120 degrees."
+            "for angles of view above about 120 degrees.",
         ),
     ] = "pinhole",
     out: Annotated[
-        Path, typer.Option(help="Calibration to write; the page beside it ends in .html.")
+        Path,
+        typer.Option(
+            metavar="FILE", help="Calibration to write; the page beside it ends in .html."
+        ),
     ] = Path("calibration.yaml"),
 ) -> None:
     """Calibrate a camera or a stereo pair from images of a board; exit code 1 if the result is
